@@ -1,4 +1,4 @@
-"""Cells that tests of the controller's parts look at, as the arrays their kernels take, and distances along motions."""
+"""Cells for tests of the controller's parts, as the arrays that the kernels take, and distances along motions."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ NAMES = ("dual_iiwa7", "dual_panda")
 
 
 class _Behind(KernelPointer):
-    """A pointer whose named tuple Python can read, too."""
+    """A pointer whose named tuple can also be read in Python."""
 
     def __getattr__(self, name: str) -> Any:
         found = getattr(self.value, name)
@@ -42,13 +42,16 @@ class _Behind(KernelPointer):
 
 
 def behind(value: _Tuple) -> _Tuple:
-    """A named tuple that kernels get by its address, as in the product. By value, they would compile for a minute."""
+    """Return a named tuple as kernels get it in the product: by its address.
+
+    By value, compiling would take a minute.
+    """
     pointer = pointer_to(value)
     return cast("_Tuple", _Behind(pointer.value, pointer.memory, pointer.numba_type))
 
 
 class CellArrays(NamedTuple):
-    """A robot and the arrays that the collision kernels read of it."""
+    """A robot and the arrays that the collision kernels read."""
 
     robot: Robot
     collision: CollisionModel
@@ -64,7 +67,7 @@ class CellArrays(NamedTuple):
 
 @cache
 def cell(name: str) -> CellArrays:
-    """One of ``NAMES``, loaded once."""
+    """Return one of ``NAMES``, which is loaded once."""
     robot = Robot.from_config(pandas() if name == "dual_panda" else load_config(f"config/{name}.yaml"))
     return arrays_of(robot)
 
@@ -75,19 +78,22 @@ def arrays_of(robot: Robot) -> CellArrays:
 
 @cache
 def kernel_model(name: str) -> KernelModel:
-    """The data of the controller's kernels about one of ``NAMES``, with the default settings."""
+    """Return the data of the controller's kernels about one of ``NAMES``, with the default settings."""
     return behind(kernel_model_of(cell(name).robot, ControllerSettings()))
 
 
 def kernel_data(name: str, q: Array, v: Array | None = None) -> KernelData:
-    """The controller's data with bodies and joints at ``q`` (nv,) and as fast as ``v``, nothing else computed."""
+    """Return the controller's data with bodies and joints at ``q`` (nv,) and velocity ``v``.
+
+    Nothing else is computed.
+    """
     data = behind(KernelData.empty(kernel_model(name)))
     move_data(name, data, q, v)
     return data
 
 
 def move_data(name: str, data: KernelData, q: Array, v: Array | None = None) -> None:
-    """Bring bodies and joints of ``data`` to ``q`` (nv,), as fast as ``v``. New data would take 20 ms to make."""
+    """Move bodies and joints of ``data`` to ``q`` (nv,) with velocity ``v``. Making new data would take 20 ms."""
     model, safety = kernel_model(name).safety, data.safety
     safety.state.q[:] = q
     safety.state.v[:] = 0.0 if v is None else v
@@ -96,7 +102,7 @@ def move_data(name: str, data: KernelData, q: Array, v: Array | None = None) -> 
 
 
 def pandas() -> Config:
-    """Two pandas with a table before them."""
+    """Return two pandas with a table in front of them."""
     arms = {
         side: {
             "model": "example-robot-data:panda",
@@ -110,19 +116,19 @@ def pandas() -> Config:
 
 
 def random_posture(robot: Robot, random: np.random.Generator) -> Array:
-    """Joint positions anywhere within the limits (nv,)."""
+    """Return random joint positions within the limits (nv,)."""
     return random.uniform(robot.position_lower, robot.position_upper)
 
 
 def placed(cell: CellArrays, q: Array) -> CollisionData:
-    """Joint frames and geometries in the world at ``q`` (nv,)."""
+    """Return joint frames and geometries in the world at ``q`` (nv,)."""
     data = behind(CollisionData.empty(cell.collision))
     update_placements(cell.collision, data, q)
     return data
 
 
 def distances(cell: CellArrays, motion: Array, exact_below: float = np.inf, pairs: IntArray | None = None) -> Array:
-    """Distance of every pair (s, p) [m], or of those ``pairs`` (p,), at every posture of ``motion`` (s, nv).
+    """Return the distance of every pair (s, p) [m], or of ``pairs`` (p,), at every posture of ``motion`` (s, nv).
 
     Pairs that are clearly farther apart than ``exact_below`` get a lower bound instead, which saves most of the time.
     """

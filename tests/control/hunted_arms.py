@@ -1,4 +1,4 @@
-"""Arms beside a hand that moves, and what is true of them, measured by Coal alone."""
+"""Arms beside a moving hand, with checks of their distances by Coal alone."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 from q2r2_control.verification.fault_injection import FaultySolver, WorstSolver, untimed
 
-RADIUS = 0.1  # of a hand [m]
+RADIUS = 0.1  # Radius of a hand [m].
 
 
 @cache
@@ -38,7 +38,7 @@ def controller_and_solver() -> tuple[CartesianController, FaultySolver]:
 
 
 def controller_at_home() -> CartesianController:
-    """Without an obstacle, and with a solver that works."""
+    """Return a controller without an obstacle and with a working solver."""
     made, solver = controller_and_solver()
     solver.fault = None
     made.move_obstacle("hand", None)
@@ -50,11 +50,11 @@ def hand(at: Array, speed: float = 0.25, **more: Any) -> MovingObstacle:
     return MovingObstacle(shape="sphere", size=(RADIUS,), position=tuple(at.tolist()), speed=speed, **more)
 
 
-BOX = (0.1, 0.3, 0.2)  # sides [m]
+BOX = (0.1, 0.3, 0.2)  # Lengths of the sides [m].
 
 
 class Coal:
-    """Distances of all bodies that move from a ball or a box, by Coal."""
+    """Distances of all moving bodies from a ball or a box, by Coal."""
 
     def __init__(self, controller: CartesianController, shape: coal.CollisionGeometry | None = None) -> None:
         self.model = controller.robot.model
@@ -66,18 +66,18 @@ class Coal:
         for body in bodies:
             self.collision_model.addCollisionPair(pin.CollisionPair(body, number))
         joints = [self.collision_model.geometryObjects[body].parentJoint for body in bodies]
-        self.moved_by = np.zeros((len(bodies), self.model.nv), dtype=bool)  # joints of each body
+        self.moved_by = np.zeros((len(bodies), self.model.nv), dtype=bool)  # The joints that move each body.
         for row, joint in enumerate(joints):
             self.moved_by[row, [self.model.joints[i].idx_v for i in list(self.model.supports[joint])[1:]]] = True
         self.kept = kept_by_obstacles(controller.robot, controller.settings).values
         self._data, self._geometry = self.model.createData(), self.collision_model.createData()
 
     def distances(self, q: Array, at: Array) -> Array:
-        """(bodies,) [m]."""
+        """Return the distances (bodies,) [m]."""
         return np.array([result.min_distance for result in self._results(q, at)])
 
     def towards_nearest(self, q: Array, at: Array) -> Array:
-        """Unit vector (3,) from the ball to the nearest body."""
+        """Return the unit vector (3,) from the ball to the nearest body."""
         results = self._results(q, at)
         nearest = results[int(np.argmin([result.min_distance for result in results]))]
         way = np.asarray(nearest.getNearestPoint1()) - at
@@ -90,7 +90,7 @@ class Coal:
 
 
 class Hunt:
-    """A hand that goes after the nearest body at its full speed, for a while, and then anywhere for another.
+    """A hand that chases the nearest body at full speed for a while, and then moves at random for a while.
 
     At every tick and in its middle: a body that moves is as far from it as it has to be, or comes no closer to where
     it was reported. A solver works against the arms; other pairs and joints keep their promises too.
@@ -99,7 +99,7 @@ class Hunt:
     def __init__(
         self, controller: CartesianController, solver: FaultySolver, seed: int, lie: float = 1.0, box: bool = False
     ) -> None:
-        """``lie``: how many times faster the hand, or a ``box``, is than it says."""
+        """``lie`` is the true speed of the hand, or of a ``box``, divided by the reported speed."""
         shape = coal.Box(*BOX) if box else coal.Sphere(RADIUS)
         self.controller, self.solver, self.coal, self.box = controller, solver, Coal(controller, shape), box
         self.random, self.lie = np.random.default_rng(seed), lie
@@ -109,11 +109,11 @@ class Hunt:
         solver.kept = self.coal.kept
         self.at = robot.tool_pose(robot.home, "left").translation + np.array([0.0, 0.9, 0.0])
         self.velocity, self.way = np.zeros(3), np.zeros(3)
-        self.broken: list[float] = []  # by how much a body that moved was too near [m]
+        self.broken: list[float] = []  # The distances by which a moving body was too near [m].
         self.nearest_moving, self.touched, self.moved, self.retreats = np.inf, 0, 0, 0
 
     def run(self, seconds: float, speed: float, period: float, acceleration: float | None = None) -> None:
-        """Reports come every ``period`` [s]."""
+        """Run the hunt. A report comes every ``period`` [s]."""
         controller, robot = self.controller, self.controller.robot
         targets = {arm: robot.tool_pose(robot.home, arm) for arm in robot.arms}
         q, v, t, due, change = robot.home, np.zeros(robot.model.nv), 0.0, 0.0, 0.0
@@ -140,7 +140,7 @@ class Hunt:
             q, v, t = reference.q, reference.v, t + dt
 
     def _move(self, q: Array, dt: float, speed: float, acceleration: float | None) -> tuple[Array, Array]:
-        """The hand after half of a tick and after all of it."""
+        """Return the hand after half of a tick and after all of it."""
         way = self.way if self.way.any() else self.coal.towards_nearest(q, self.at)
         wanted = speed * way / np.linalg.norm(way)
         change = wanted - self.velocity

@@ -1,4 +1,4 @@
-"""Named motions of the targets that hurt: from the controller's tools at the start to targets at time t."""
+"""Named hostile motions of the targets: each makes targets at time t from the controller's tools at the start."""
 
 from __future__ import annotations
 
@@ -33,38 +33,38 @@ def crossing(t: float, start: Mapping[str, pin.SE3]) -> Targets:
 
 
 def same_point(t: float, start: Mapping[str, pin.SE3]) -> Targets:
-    """Both tools are asked to be at one place."""
+    """Both tools are asked to be at the same place."""
     middle = 0.5 * (start["left"].translation + start["right"].translation)
     return {side: pin.SE3(pose.rotation, middle) for side, pose in start.items()}
 
 
 def teleport(t: float, start: Mapping[str, pin.SE3]) -> Targets:
-    """The targets are somewhere else every half second."""
+    """The targets jump every half second."""
     return dict(_PLACES[int(t / 0.5) % len(_PLACES)])
 
 
 def unreachable(t: float, start: Mapping[str, pin.SE3]) -> Targets:
-    """Metres beyond what the arms can reach."""
+    """The targets are metres beyond the reach of the arms."""
     return {"left": _moved(start["left"], (3.0, 1.0, 1.0)), "right": _moved(start["right"], (2.0, -3.0, 0.5))}
 
 
 def overhead(t: float, start: Mapping[str, pin.SE3]) -> Targets:
-    """Straight up, out of reach: both arms stretch out."""
+    """The targets are straight up and out of reach, so that both arms stretch out."""
     return {side: _moved(pose, (-0.4, 0.0, 5.0)) for side, pose in start.items()}
 
 
 def into_the_table(t: float, start: Mapping[str, pin.SE3]) -> Targets:
-    """Far below the table."""
+    """The targets are far below the table."""
     return {side: _moved(pose, (0.0, 0.0, -0.6)) for side, pose in start.items()}
 
 
 def one_arm_frozen(t: float, start: Mapping[str, pin.SE3]) -> Targets:
-    """The left arm holds; the right one is asked to be where the left one is."""
+    """The left arm holds, and the right arm is asked to be where the left one is."""
     return {"left": None, "right": pin.SE3(start["right"].rotation, start["left"].translation)}
 
 
 def not_a_number(t: float, start: Mapping[str, pin.SE3]) -> Targets:
-    """A moving target with bad ones in between."""
+    """A moving target, with invalid ones in between."""
     good = {side: _moved(pose, (0.0, 0.0, 0.1 * np.sin(6.0 * t))) for side, pose in start.items()}
     step = int(t / 0.05) % 4
     if step == 1:

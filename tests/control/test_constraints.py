@@ -1,4 +1,4 @@
-"""Constraints of a program's own are rows of the QP, or a condition of each step; no promise depends on them."""
+"""A program's own constraints are rows of the QP or a condition of each step. No promise depends on them."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from tests.control.test_problem import DT, crossing, solved_by
 
 
 class StillJoint:
-    """The joint's next velocity is 0."""
+    """A constraint that keeps the joint's next velocity 0."""
 
     def __init__(self, joint: int, hard: bool = False) -> None:
         self.joint, self.hard = joint, hard
 
     def rows(self, q: Array, v: Array) -> tuple[Array, Array]:
         A = np.zeros((2, len(q)))
-        A[0, self.joint], A[1, self.joint] = 3.0, -3.0  # of any norm
+        A[0, self.joint], A[1, self.joint] = 3.0, -3.0  # The norm of the rows is arbitrary.
         return A, np.zeros(2)
 
 
 class Answers:
-    """Returns whatever ``answer`` does, once it is told to."""
+    """A constraint that returns whatever ``answer`` returns, after it is switched on."""
 
     def __init__(self, answer: Callable[[int], Any], hard: bool = False) -> None:
         self.answer, self.hard, self.asked = answer, hard, False
@@ -68,7 +68,7 @@ NONSENSE: dict[str, Callable[[int], Any]] = {
 
 
 def driven(controller: CartesianController, ticks: int) -> tuple[Array, Array]:
-    """Velocities and postures of a run towards crossing targets, in which the contract holds."""
+    """Return velocities and postures of a run towards crossing targets, with the contract at every tick."""
     contract = Contract(controller, controller.robot.home)
     v, q = [], []
     for tick in range(ticks):
@@ -80,7 +80,7 @@ def driven(controller: CartesianController, ticks: int) -> tuple[Array, Array]:
 
 
 @pytest.mark.parametrize(("hard", "most"), [(False, 1e-3), (True, 1e-6)], ids=["soft", "hard"])
-def test_a_joint_that_may_not_turn_rests_while_the_others_move(robot: Robot, hard: bool, most: float) -> None:
+def test_a_joint_that_must_not_turn_rests_while_the_others_move(robot: Robot, hard: bool, most: float) -> None:
     free, _ = driven(CartesianController(robot), 400)
     held, _ = driven(CartesianController(robot, constraints=[StillJoint(3, hard)]), 400)
     assert np.abs(free[:, 3]).max() > 0.1
@@ -89,7 +89,7 @@ def test_a_joint_that_may_not_turn_rests_while_the_others_move(robot: Robot, har
 
 
 class Plane:
-    """The left elbow stays above a height [m]: J v+ >= -gain (z - height)."""
+    """A plane that keeps the left elbow above a height [m]: J v+ >= -gain (z - height)."""
 
     hard = True
 
@@ -106,7 +106,7 @@ class Plane:
         return J, np.array([-5.0 * room])
 
 
-def test_an_elbow_does_not_cross_a_plane_that_it_would_cross(robot: Robot) -> None:
+def test_an_elbow_does_not_cross_a_plane_that_it_would_otherwise_cross(robot: Robot) -> None:
     _, q = driven(CartesianController(robot), 600)
     plane = Plane(robot, 0.0)
     heights = [plane.elbow(at) for at in q]
@@ -143,7 +143,7 @@ def test_a_given_solution_that_breaks_a_hard_row_is_not_executed(robot: Robot) -
 
 
 class NoLess:
-    """The next velocities are to be as fast along ``along`` as was told last."""
+    """A constraint that keeps the next velocities at least as fast along ``along`` as the last given value."""
 
     hard = True
     along: Array | None = None
@@ -155,7 +155,10 @@ class NoLess:
 
 
 def test_a_certified_part_of_a_solution_that_breaks_a_hard_row_gives_way_to_the_stop_to_the_bit(robot: Robot) -> None:
-    """Solutions that know no pair: the certificate takes a part of each, which is slower than the row allows."""
+    """The given solutions consider no pair.
+
+    The certificate allows a part of each, which is slower than the row allows.
+    """
     constraints = NoLess(), NoLess()
     one, other = (CartesianController(robot, constraints=[constraint]) for constraint in constraints)
     daqp, contract, stops, follows = DaqpSolver(robot.model.nv), Contract(one), 0, 0
@@ -209,7 +212,7 @@ def test_osqp_keeps_a_hard_row_in_the_loop_too(robot: Robot) -> None:
 
 @pytest.mark.parametrize("hard", [False, True], ids=["soft", "hard"])
 @pytest.mark.parametrize("name", NONSENSE)
-def test_a_constraint_that_answers_nonsense_raises_nothing_and_is_named(robot: Robot, name: str, hard: bool) -> None:
+def test_a_constraint_with_an_invalid_answer_raises_nothing_and_is_named(robot: Robot, name: str, hard: bool) -> None:
     broken = Answers(NONSENSE[name], hard)
     controller = CartesianController(robot, constraints=[broken])
     driven(controller, 50)

@@ -1,4 +1,4 @@
-"""Pairs that may touch: how deep the reference gets, how fast it approaches, and what stays apart as ever."""
+"""Pairs that may touch: the depth and speed of the reference, and the distances of all other pairs."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from tests.support.driven import Driven
 CONFIG = load_config("config/dual_iiwa7.yaml")
 ROBOT = Robot.from_config(CONFIG)
 PAIRS = pair_names(ROBOT.collision_model)
-TABLE = 0.2  # height of its top [m]
+TABLE = 0.2  # Height of the table's top [m].
 FRAME_TO_TIPS = 0.013  # [m]
 DEPTH, SPEED = 0.012, 0.04  # [m], [m/s]
-DOWN = pin.rpy.rpyToMatrix(np.pi, 0.0, np.pi)  # as at home
+DOWN = pin.rpy.rpyToMatrix(np.pi, 0.0, np.pi)  # The tools point down as at home.
 DT = 0.002
 
 
@@ -33,7 +33,10 @@ def settings(*allowed: dict[str, Any]) -> ControllerSettings:
 
 
 def towards_the_table(controller: CartesianController, speed: float, seconds: float = 4.0) -> tuple[Array, Array]:
-    """Distances of the left fingers from the table [m] and closing speeds [m/s], the target ending 0.3 m inside."""
+    """Return distances of the left fingers from the table [m] and closing speeds [m/s].
+
+    The target ends 0.3 m inside.
+    """
     pairs = np.array([set(pair) > {"table_0"} and "left_hand_e_finger" in str(pair) for pair in PAIRS])
     run, heights = Driven(controller, dt=DT), []
     for i in range(round(seconds / DT)):
@@ -47,7 +50,7 @@ def towards_the_table(controller: CartesianController, speed: float, seconds: fl
 
 @pytest.mark.slow
 @pytest.mark.parametrize("speed", [0.2, 5.0])
-def test_a_finger_that_may_touch_gets_in_by_the_depth_and_no_faster_than_it_may(speed: float) -> None:
+def test_a_finger_that_may_touch_enters_by_the_depth_and_no_faster_than_allowed(speed: float) -> None:
     allowed = settings({"pair": ["left_*finger*", "table"], "depth": DEPTH, "speed": SPEED})
     heights, speeds = towards_the_table(CartesianController(ROBOT, allowed), speed)
     assert heights.min() == pytest.approx(-DEPTH, abs=5e-4)
@@ -57,7 +60,7 @@ def test_a_finger_that_may_touch_gets_in_by_the_depth_and_no_faster_than_it_may(
 
 
 def test_what_is_not_named_keeps_its_distance_to_the_same_table() -> None:
-    """The right fingers are asked down as the left ones are: the contract knows the distance of every pair."""
+    """The right fingers get the same targets as the left ones. The contract knows the distance of every pair."""
     controller = CartesianController(ROBOT, settings({"pair": ["left_*finger*", "table"], "depth": DEPTH}))
     goal = {arm: pin.SE3(DOWN, np.array([0.5, y, 0.1])) for arm, y in (("left", 0.25), ("right", -0.25))}
     Driven(controller, dt=DT).drive(3.0, goal)
@@ -68,12 +71,12 @@ def test_what_is_not_named_keeps_its_distance_to_the_same_table() -> None:
 
 @pytest.mark.slow
 def test_fingers_of_both_hands_may_touch_each_other() -> None:
-    """Hands that face each other: their tools are asked to change sides, and their fingers get in by the depth."""
+    """The hands face each other. Their tools are asked to change sides, and their fingers enter by the depth."""
     depth = 0.005
     controller = CartesianController(ROBOT, settings({"pair": ["*finger*", "*finger*"], "depth": depth}))
 
     def across(t: float, start: Mapping[str, pin.SE3]) -> dict[str, pin.SE3]:
-        """Turned about x until they point at each other."""
+        """Return targets that are turned about x, so that the tools point at each other."""
         gap = max(0.25 - 0.1 * t, -0.01)
         return {
             arm: pin.SE3(pin.rpy.rpyToMatrix(-sign, 0.0, 0.0) @ DOWN, np.array([0.5, sign * gap, 0.45]))
@@ -101,7 +104,7 @@ def test_fingers_of_both_hands_may_touch_each_other() -> None:
         ),
     ],
 )
-def test_names_and_depths_that_cannot_be_are_refused(
+def test_impossible_names_and_depths_are_refused(
     look: Callable[[Robot, ControllerSettings], object], allowed: dict[str, Any], says: str
 ) -> None:
     with pytest.raises(ConfigError, match=says):

@@ -1,4 +1,4 @@
-"""The controller's contract in particular: rest, recovery, faults, what the report says, the worst of all solvers."""
+"""Details of the controller's contract: rest, recovery, faults, the report, and the worst of all solvers."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def controller() -> CartesianController:
 
 
 def run(controller: CartesianController, scenario: Any, duration: float, dt: float, **start: Array) -> Contract:
-    """Run a scenario from a ``start`` q and v and assert the contract at every tick."""
+    """Run a scenario from a ``start`` q and v, and assert the contract at every tick."""
     driven = Driven(controller, dt=dt, **start)
     driven.drive(duration, scenario)
     return driven.contract
@@ -49,7 +49,7 @@ def run(controller: CartesianController, scenario: Any, duration: float, dt: flo
         pytest.param("one arm frozen", 10.0, id="against an arm that holds"),
     ],
 )
-def test_a_constant_target_ends_in_rest_reachable_or_not(
+def test_a_constant_target_ends_in_rest_whether_it_is_reachable_or_not(
     controller: CartesianController, name: str, duration: float
 ) -> None:
     assert run(controller, SCENARIOS[name], duration, 0.005).tail_acceleration() < 0.1
@@ -71,7 +71,7 @@ def test_a_reachable_target_is_reached_and_held(controller: CartesianController)
 
 
 @pytest.mark.parametrize("dt", [0.0, -0.001, float("nan"), float("inf"), "soon"], ids=str)
-def test_a_dt_that_is_no_time_moves_nothing_and_says_so(controller: CartesianController, dt: Any) -> None:
+def test_an_invalid_dt_moves_nothing_and_is_reported(controller: CartesianController, dt: Any) -> None:
     driven = Driven(controller, dt=0.001)
     for seconds in (0.0, 0.05):
         before = driven.drive(seconds, crossing) if seconds else controller.step({}, 0.0)
@@ -82,7 +82,7 @@ def test_a_dt_that_is_no_time_moves_nothing_and_says_so(controller: CartesianCon
     assert np.abs(before.a).max() > 1.0
 
 
-def test_a_dt_above_a_tenth_of_a_second_moves_no_further_than_that(controller: CartesianController) -> None:
+def test_a_dt_above_a_tenth_of_a_second_moves_no_further_than_a_tenth(controller: CartesianController) -> None:
     results = []
     for dt in (0.1, 5.0):
         driven = Driven(controller)
@@ -93,7 +93,7 @@ def test_a_dt_above_a_tenth_of_a_second_moves_no_further_than_that(controller: C
 
 @pytest.mark.parametrize("joint", [1, 6])
 @pytest.mark.parametrize("side", [-1.0, 1.0], ids=["lower", "upper"])
-def test_started_outside_a_position_limit_it_returns_without_a_jump(
+def test_a_joint_that_starts_outside_a_position_limit_returns_without_a_jump(
     controller: CartesianController, joint: int, side: float
 ) -> None:
     robot, q = controller.robot, controller.robot.home.copy()
@@ -106,15 +106,16 @@ def test_started_outside_a_position_limit_it_returns_without_a_jump(
     assert robot.position_lower[joint] + margin <= reference.q[joint] <= robot.position_upper[joint] - margin
 
 
-def test_it_leaves_a_stretched_posture_in_little_more_than_the_time_the_acceleration_limit_needs(
+def test_leaving_a_stretched_posture_takes_little_more_time_than_the_acceleration_limit_needs(
     controller: CartesianController,
 ) -> None:
     robot, q = controller.robot, controller.robot.home.copy()
     for arm in robot.arms.values():
-        q[arm.joints] = [0.0, 0.9, 0.0, 0.0, 0.0, 0.0, 0.0]  # elbow and wrist straight: the Jacobian has lost rank
+        # Elbow and wrist are straight, so that the Jacobian has lost rank.
+        q[arm.joints] = [0.0, 0.9, 0.0, 0.0, 0.0, 0.0, 0.0]
     driven = Driven(controller, q, dt=0.001)
     for pose, y in zip(driven.start.values(), (0.4, -0.4), strict=True):
-        inwards = np.array([0.0, y, 0.34]) - pose.translation  # to the shoulder
+        inwards = np.array([0.0, y, 0.34]) - pose.translation  # The direction leads to the shoulder.
         pose.translation = pose.translation + 0.15 * inwards / np.linalg.norm(inwards)
     error = 1.0
     while error > 0.01 and driven.ticks < 4000:
@@ -123,13 +124,13 @@ def test_it_leaves_a_stretched_posture_in_little_more_than_the_time_the_accelera
             float(np.linalg.norm(controller.tool_pose(arm).translation - pose.translation))
             for arm, pose in driven.start.items()
         )
-    # The joint with the longest way, at full acceleration half of it and at full deceleration the other half.
+    # The joint with the longest way accelerates fully for half of it, and decelerates fully for the other half.
     limit = robot.capped_acceleration(controller.settings.acceleration_limit)
     fastest = 2.0 * np.sqrt((np.abs(reference.q - q) / limit).max())
     assert 0.001 * driven.ticks < 1.2 * fastest
 
 
-def test_every_joint_keeps_the_smaller_one_of_its_own_limit_and_of_the_setting_and_uses_it() -> None:
+def test_every_joint_keeps_and_uses_the_smaller_of_its_own_acceleration_limit_and_the_setting() -> None:
     limits = {"A2": 1.5, "A3": 12.0, "A4": 4.0}
     cell = load_config("config/dual_iiwa7.yaml")
     arms = {side: arm.model_copy(update={"acceleration_limit": limits}) for side, arm in cell.arms.items()}
@@ -157,7 +158,7 @@ def test_a_solver_that_never_answers_brings_the_arms_to_rest_along_the_certified
     assert not reference.v.any()
 
 
-def test_the_report_names_what_holds_the_arms_back(controller: CartesianController) -> None:
+def test_the_report_names_the_limits_that_hold_the_arms_back(controller: CartesianController) -> None:
     report = Driven(controller, dt=0.005).drive(4.0, SCENARIOS["into the table"]).report
     assert any("envelope" in name and "table" in name for name in map(limit_name, report.binding))
     assert "table" in "|".join(report.closest_pair)
@@ -166,7 +167,7 @@ def test_the_report_names_what_holds_the_arms_back(controller: CartesianControll
 
 
 def least_margin(robot: Robot, settings: ControllerSettings, ticks: int, attack: str, seed: int) -> float:
-    """Least margin of a pair at any tick by Coal [m], all of which have a certificate."""
+    """Return the least margin of a pair at any tick by Coal [m]. All ticks have a certificate."""
     solver = FaultySolver(DaqpSolver(robot.model.nv), worst=WorstSolver(robot, np.random.default_rng(seed)))
     controller = CartesianController(robot, settings, solver=untimed(solver, robot.model.nv))
     solver.kept, solver.q = controller.kept_distances, robot.home
@@ -176,7 +177,7 @@ def least_margin(robot: Robot, settings: ControllerSettings, ticks: int, attack:
     least = np.inf
     for tick in range(ticks):
         dt = (0.001, 0.004, 0.0005, 0.01, 0.03)[tick // 150 % 5]
-        # There has to be an answer to repeat.
+        # There has to be an earlier answer to repeat.
         solver.fault = "towards_nearest" if attack == "again" and tick % 5 == 0 else attack
         reference = controller.step(targets, dt)
         contract.check(reference, dt)
@@ -187,12 +188,12 @@ def least_margin(robot: Robot, settings: ControllerSettings, ticks: int, attack:
 
 
 @pytest.mark.parametrize("attack", ATTACKS)
-def test_the_worst_solver_brings_no_pair_closer_than_it_keeps(attack: str) -> None:
+def test_the_worst_solver_brings_no_pair_closer_than_its_distance(attack: str) -> None:
     least = least_margin(robot_of("iiwa7"), load_config("config/dual_iiwa7.yaml").control, 1500, attack, seed=1)
     assert -ROUNDING <= least < 1e-4, "it has to get there, and no further"
 
 
-def test_a_pair_that_is_closer_by_rounding_keeps_its_certificate_and_its_distance() -> None:
+def test_a_pair_that_is_too_close_by_a_rounding_error_keeps_its_certificate_and_its_distance() -> None:
     robot = robot_of("iiwa7")
     nearest = float(robot.distance_values(robot.home).min())
     settings = ControllerSettings(min_distance=nearest + 1e-15)
@@ -205,14 +206,14 @@ def test_a_pair_that_is_closer_by_rounding_keeps_its_certificate_and_its_distanc
     assert -ROUNDING <= least_margin(robot, settings, 600, "towards_nearest", seed=2) < 0.0
 
 
-def test_a_start_whose_stop_is_not_proven_has_no_certificate_until_a_step_is_however_much_room_it_has() -> None:
+def test_a_start_with_an_unproven_stop_has_no_certificate_until_a_step_has_one_whatever_room_there_is() -> None:
     controller, solver = controller_of("iiwa7")
     q, turn = controller.robot.home.copy(), np.zeros(controller.robot.model.nv)
-    turn[[arm.joints[0] for arm in controller.robot.arms.values()]] = [-1.0, 1.0]  # towards each other
+    turn[[arm.joints[0] for arm in controller.robot.arms.values()]] = [-1.0, 1.0]  # The arms turn towards each other.
     for speed in np.arange(0.5, 1.0, 5e-4):
         controller.reset(q + 0.3 * turn, speed * turn)
         if not controller.step({}, 0.0).report.certified:
-            break  # a little too fast
+            break  # The start is a little too fast.
     solver.fault = "none"
     reports = [controller.step({}, 0.001).report for _ in range(5)]
     assert not any(report.certified for report in reports)
@@ -222,7 +223,7 @@ def test_a_start_whose_stop_is_not_proven_has_no_certificate_until_a_step_is_how
     assert all(report.certified and report.margin >= 0.0 for report in reports)
 
 
-def test_the_first_step_out_of_a_pair_that_is_too_close_has_no_certificate_and_the_next_one_has() -> None:
+def test_the_first_step_of_a_pair_that_is_too_close_has_no_certificate_and_the_next_one_has_one() -> None:
     robot = robot_of("iiwa7")
     settings = ControllerSettings(min_distance=float(robot.distance_values(robot.home).min()) + 1e-5)
     controller = CartesianController(robot, settings)

@@ -1,4 +1,4 @@
-"""An object counts while it is held: it begins with the room that there is, keeps more and more, and moves nothing."""
+"""A held object is monitored. It keeps the distance that it has, then more and more, and moves no arm."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def controller(robot: Robot) -> CartesianController:
 
 @pytest.fixture(scope="module")
 def at_grip(controller: CartesianController) -> Array:
-    """The left tool at rest where it grips a block on the table (nv,) [rad]."""
+    """Return a posture (nv,) [rad] in which the left tool is at rest and grips a block on the table."""
     return Driven(controller).drive(2.5, {"left": at(GRIP)}).q
 
 
@@ -43,12 +43,12 @@ def counting(controller: CartesianController) -> Array:
 
 
 def object_distances(controller: CartesianController, q: Array) -> Array:
-    """Of every pair of objects, by Coal [m]."""
+    """Return the distances of every pair of objects, by Coal [m]."""
     objects = controller.robot.objects
     return coal_distances(controller.robot, objects.geometry, q)[-len(objects.holders) :]
 
 
-def test_a_block_on_the_table_is_gripped_and_let_go_without_a_motion(
+def test_a_block_on_the_table_is_gripped_and_released_without_a_motion(
     controller: CartesianController, at_grip: Array
 ) -> None:
     run = Driven(controller, at_grip)
@@ -58,7 +58,7 @@ def test_a_block_on_the_table_is_gripped_and_let_go_without_a_motion(
         assert np.abs(reference.q - at_grip).max() < 1e-9
 
 
-def test_it_is_lifted_at_once_and_put_down_to_the_quarter_of_a_millimetre(
+def test_a_block_is_lifted_at_once_and_put_down_with_a_quarter_of_a_millimetre_of_error(
     controller: CartesianController, at_grip: Array
 ) -> None:
     run = Driven(controller, at_grip)
@@ -76,7 +76,7 @@ def test_it_is_lifted_at_once_and_put_down_to_the_quarter_of_a_millimetre(
     assert height(controller) == pytest.approx(GRIP - 0.015, abs=5e-4)
 
 
-def test_the_margin_that_a_report_tells_is_to_what_the_pairs_keep_at_that_tick(
+def test_the_margin_of_a_report_refers_to_the_distances_kept_at_that_tick(
     controller: CartesianController, at_grip: Array
 ) -> None:
     run = Driven(controller, at_grip)
@@ -86,7 +86,7 @@ def test_the_margin_that_a_report_tells_is_to_what_the_pairs_keep_at_that_tick(
         reference = run.drive(DT, {"left": at(GRIP + 0.02)})
         distances = object_distances(controller, reference.q)
         spare = distances - controller.object_distances
-        if distances[spare.argmin()] > 0.0:  # Coal's depth is another quantity
+        if distances[spare.argmin()] > 0.0:  # The depth of Coal is another quantity.
             assert reference.report.margin == pytest.approx(spare.min(), abs=2e-6)
             grown += int(counting(controller).min() > kept)
         kept = counting(controller).min()
@@ -94,7 +94,7 @@ def test_the_margin_that_a_report_tells_is_to_what_the_pairs_keep_at_that_tick(
 
 
 @pytest.mark.slow
-def test_one_that_is_drawn_too_large_may_overlap_the_table_as_it_is_gripped_and_no_more(robot: Robot) -> None:
+def test_an_object_that_is_too_large_may_overlap_the_table_only_as_much_as_when_it_was_gripped(robot: Robot) -> None:
     large = cell({"box": (0.04, 0.04, 0.08), "at": (0.0, 0.0, 0.013)})
     controller = CartesianController(Robot.from_config(large), large.control)
     run = Driven(controller)
@@ -111,7 +111,7 @@ def test_one_that_is_drawn_too_large_may_overlap_the_table_as_it_is_gripped_and_
 def test_gripped_in_mid_motion_the_stop_that_is_known_keeps_what_it_then_keeps(
     controller: CartesianController,
 ) -> None:
-    """Down towards the table at speed; Coal looks along the stop that is known."""
+    """The tool moves down towards the table at speed. Coal measures along the known stop."""
     controller.reset(controller.robot.home)
     z = height(controller)
     while height(controller) > GRIP + 0.003:
@@ -125,7 +125,7 @@ def test_gripped_in_mid_motion_the_stop_that_is_known_keeps_what_it_then_keeps(
         moving = np.minimum(time, np.abs(reference.v) / stop)
         q = reference.q + reference.v * moving - 0.5 * np.sign(reference.v) * stop * moving**2
         values = object_distances(controller, q)
-        seen = counts & (values > 0.0)  # Coal's depth is another quantity
+        seen = counts & (values > 0.0)  # The depth of Coal is another quantity.
         assert (values - kept)[seen].min() > -2e-6
         assert (kept[counts & (values <= 0.0)] < 0.0).all()
     for _ in range(500):
@@ -151,7 +151,7 @@ def test_a_hand_that_drives_a_held_bar_into_the_other_arm_stops_at_its_distance(
 
 
 @pytest.mark.slow
-def test_two_held_blocks_are_kept_apart_and_one_that_both_hold_leaves_them_free(
+def test_two_held_blocks_are_kept_apart_and_one_that_both_hands_hold_lets_them_touch(
     controller: CartesianController,
 ) -> None:
     run = Driven(controller)
@@ -179,7 +179,7 @@ def test_two_held_blocks_are_kept_apart_and_one_that_both_hold_leaves_them_free(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("forget", ["let go", "reset"])
-def test_once_it_is_let_go_no_report_names_a_pair_of_it_even_if_no_time_passes(
+def test_after_a_release_no_report_names_a_pair_of_the_object_even_if_no_time_passes(
     forget: str, controller: CartesianController, at_grip: Array
 ) -> None:
     run = Driven(controller, at_grip)
@@ -197,7 +197,7 @@ def test_once_it_is_let_go_no_report_names_a_pair_of_it_even_if_no_time_passes(
     assert not counting(controller).size
 
 
-def test_an_undone_step_takes_back_what_its_later_parts_let_the_block_keep(
+def test_an_undone_step_takes_back_the_distances_that_its_later_parts_allowed_the_block(
     controller: CartesianController, at_grip: Array
 ) -> None:
     controller.reset(at_grip)
@@ -210,7 +210,7 @@ def test_an_undone_step_takes_back_what_its_later_parts_let_the_block_keep(
         grown += bool((counting(controller) > before[np.isfinite(before)]).any())
         controller.withdraw(late)
         np.testing.assert_array_equal(controller.object_distances, before)
-        apart = distances > 0.0  # Coal's depth is another quantity
+        apart = distances > 0.0  # The depth of Coal is another quantity.
         assert (distances[apart] >= controller.object_distances[apart] - 1e-6).all()
         assert controller.step(lifted, DT).report.certified
     assert grown > 10

@@ -1,4 +1,4 @@
-"""Nothing that a caller hands the controller ends a tick with an exception, or a reset with any but the stated one."""
+"""No argument of a caller makes a tick raise, or makes a reset raise any exception other than the documented one."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def controller(robot: Robot) -> CartesianController:
 
 @pytest.fixture
 def contract(robot: Robot, controller: CartesianController) -> Iterator[Contract]:
-    """A controller whose arms are on their way, and that goes on in the same way afterwards."""
+    """Return a controller with moving arms. After the block, it goes on in the same way."""
     controller.reset(robot.home)
     contract = Contract(controller)
     going_on(contract, controller)
@@ -44,38 +44,32 @@ def going_on(contract: Contract, controller: CartesianController) -> None:
         contract.check(controller.step({"left": pin.SE3(pose.rotation, pose.translation + 0.1)}, 0.002), 0.002)
 
 
-def test_no_time_ends_a_tick_with_an_exception(
-    contract: Contract, controller: CartesianController, hostile: Any
-) -> None:
+def test_no_dt_makes_a_tick_raise(contract: Contract, controller: CartesianController, hostile: Any) -> None:
     contract.check(controller.step({}, hostile), 0.0)
 
 
-def test_no_target_ends_a_tick_with_an_exception(
-    contract: Contract, controller: CartesianController, hostile: Any
-) -> None:
+def test_no_target_makes_a_tick_raise(contract: Contract, controller: CartesianController, hostile: Any) -> None:
     for arm in SIDES:
         contract.check(controller.step({arm: hostile}, 0.002), 0.002)
 
 
-def test_no_posture_ends_a_tick_with_an_exception(
-    contract: Contract, controller: CartesianController, hostile: Any
-) -> None:
+def test_no_posture_makes_a_tick_raise(contract: Contract, controller: CartesianController, hostile: Any) -> None:
     contract.check(controller.step({}, 0.002, hostile), 0.002)
 
 
-def test_no_given_solution_ends_a_tick_with_an_exception(
+def test_no_given_solution_makes_a_tick_raise(
     contract: Contract, controller: CartesianController, hostile: Any
 ) -> None:
     contract.check(controller.advance(hostile, {}, 0.002), 0.002)
 
 
-def test_complex_numbers_are_refused_and_not_cut_to_their_real_parts(controller: CartesianController) -> None:
+def test_complex_numbers_are_refused_and_not_reduced_to_their_real_parts(controller: CartesianController) -> None:
     with pytest.raises(RobotError, match="finite numbers"):
         controller.reset(np.zeros(14, dtype=complex))
     assert controller.advance(np.zeros(14, dtype=complex), {}, 0.002).report.unsolved == 1
 
 
-def test_targets_that_are_no_mapping_are_refused_and_nothing_moves(
+def test_targets_that_are_not_a_mapping_are_refused_and_nothing_moves(
     contract: Contract, controller: CartesianController, hostile: Any
 ) -> None:
     if not isinstance(hostile, Mapping):
@@ -103,7 +97,7 @@ def test_targets_that_are_no_mapping_are_refused_and_nothing_moves(
     ids=["reset q", "reset v", "hold_at", "withdraw", "change distance", "change gain", "tool_pose", "opening arm",
          "opening from", "opening to", "holding arm", "obstacle name", "obstacle"],
 )  # fmt: skip
-def test_other_calls_refuse_with_one_of_our_errors_and_the_next_tick_keeps_every_promise(
+def test_other_calls_raise_our_errors_and_the_next_tick_keeps_every_promise(
     robot: Robot, controller: CartesianController, hostile: Any, call: Any
 ) -> None:
     controller.reset(robot.home)

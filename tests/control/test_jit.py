@@ -35,7 +35,7 @@ def _double(values: Array) -> None:
         values[i] *= 2.0
 
 
-def test_bound_machine_code_is_the_kernel_s_and_has_run_once() -> None:
+def test_bound_machine_code_belongs_to_the_kernel_and_has_run_once() -> None:
     values = np.ones(3)
     double = bound(_double, values)
     np.testing.assert_array_equal(values, [2.0, 2.0, 2.0])
@@ -48,7 +48,7 @@ def test_bound_machine_code_is_the_kernel_s_and_has_run_once() -> None:
 PAGE = Path(__file__).parents[2] / "docs" / "kernels.md"
 
 
-def test_the_template_compiles_and_sees_what_changes_in_the_model(tmp_path: Path) -> None:
+def test_the_template_compiles_and_sees_changes_in_the_model(tmp_path: Path) -> None:
     (template,) = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
     source = tmp_path / "spring.py"
     source.write_text(template)
@@ -62,7 +62,7 @@ def test_the_template_compiles_and_sees_what_changes_in_the_model(tmp_path: Path
 
 
 def test_numba_still_has_the_inner_modules_that_kernels_stand_on() -> None:
-    """Fails in one sentence where a newer Numba changed what kernels are compiled with."""
+    """The test fails with one clear sentence if a newer Numba has changed the modules that kernels need."""
     version = (
         f"control/kernel_compiler.py does not work with numba {numba.__version__}: keep to the bound in pyproject.toml"
     )

@@ -13,7 +13,7 @@ from q2r2_control.control import jit, kernel_cache
 
 @pytest.fixture
 def sources(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A copy of the package's sources that the cache folder is named after."""
+    """Return a copy of the package's sources, from which the name of the cache folder is computed."""
     package = Path(kernel_cache.__file__).parents[1]
     copy = tmp_path / "package"
     for room in ("control", "compliance"):
@@ -26,7 +26,7 @@ def sources(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.mark.parametrize(
     "name", ["control/kernel_model.py", "control/kernel_compiler.py", "compliance/impedance_law.py"]
 )
-def test_an_edit_of_a_compiled_source_leaves_yesterdays_machine_code_behind(sources: Path, name: str) -> None:
+def test_after_an_edit_of_a_compiled_source_old_machine_code_is_not_used(sources: Path, name: str) -> None:
     before = kernel_cache._cache_folder()
     (sources / name).write_text((sources / name).read_text() + "# edited\n")
     edited = kernel_cache._cache_folder()
@@ -41,15 +41,15 @@ def test_an_edit_of_a_source_without_kernels_compiles_nothing(sources: Path) -> 
 
 
 def name_of(source: Path) -> str:
-    """Dotted name of a module of the package."""
+    """Return the dotted name of a module of the package."""
     parts = source.relative_to(Path(kernel_cache.__file__).parents[2]).with_suffix("").parts
     return ".".join(parts)
 
 
 @pytest.mark.parametrize("source", kernel_cache.compiled_sources(), ids=name_of)
-def test_what_a_kernel_uses_is_covered_by_the_name_of_the_cache(source: Path) -> None:
+def test_the_name_of_the_cache_covers_everything_that_a_kernel_uses(source: Path) -> None:
     covered = {name_of(path) for path in kernel_cache.compiled_sources()}
-    # No constant of theirs enters a kernel, only what is handed to it.
+    # No constant of these modules is compiled into a kernel. Kernels use only their arguments.
     harmless = {
         f"q2r2_control.{name}"
         for name in (
@@ -66,7 +66,9 @@ def test_what_a_kernel_uses_is_covered_by_the_name_of_the_cache(source: Path) ->
     assert imported <= covered | harmless
 
 
-def test_a_cache_that_cannot_be_written_is_put_elsewhere(sources: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_cache_that_cannot_be_written_is_put_into_another_folder(
+    sources: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     occupied = sources.parent / "a_file"
     occupied.write_text("")
     monkeypatch.setenv("XDG_CACHE_HOME", str(occupied))
@@ -77,7 +79,7 @@ def test_a_cache_that_cannot_be_written_is_put_elsewhere(sources: Path, monkeypa
     folder.rmdir()
 
 
-def test_the_two_newest_versions_are_kept_and_nothing_else_is_deleted(sources: Path) -> None:
+def test_the_two_newest_versions_are_kept_and_only_older_ones_are_deleted(sources: Path) -> None:
     root = kernel_cache._cache_folder().parent
     (root / "notes").mkdir()
     for age, name in enumerate(("a" * 16, "b" * 16, "c" * 16), start=1):
@@ -102,14 +104,14 @@ def double(x):
 
 @pytest.fixture
 def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Use a cache folder and a list of kernels that belong to the test alone."""
+    """Use a cache folder and a list of kernels that belong to this test."""
     monkeypatch.setattr(kernel_cache, "_FOLDER", str(tmp_path / "machine_code"))
     monkeypatch.setattr(jit, "_kernels", [])
     return tmp_path
 
 
 def doubled_by(file: Path) -> list[tuple[int, int]]:
-    """Run the kernels of :data:`_DOUBLING` from a file; returns what is told of compiling them."""
+    """Run the kernels of :data:`_DOUBLING` from a file, and return the messages about compiling them."""
     file.parent.mkdir(exist_ok=True)
     file.write_text(_DOUBLING)
     told: list[tuple[int, int]] = []
@@ -124,7 +126,7 @@ def test_a_second_checkout_compiles_nothing(own_cache: Path) -> None:
     assert doubled_by(own_cache / "elsewhere" / "doubling.py") == []
 
 
-def test_a_touched_source_compiles_nothing(own_cache: Path) -> None:
+def test_a_touched_source_is_not_compiled_again(own_cache: Path) -> None:
     doubled_by(own_cache / "doubling.py")
     source = own_cache / "doubling.py"
     source.write_text(_DOUBLING)
@@ -134,6 +136,8 @@ def test_a_touched_source_compiles_nothing(own_cache: Path) -> None:
     assert sum(double.stats.cache_misses.values()) == 0
 
 
-def test_each_compiled_kernel_is_told_with_their_number_and_machine_code_from_the_cache_is_not(own_cache: Path) -> None:
+def test_each_compiled_kernel_is_reported_with_their_number_but_machine_code_from_the_cache_is_not(
+    own_cache: Path,
+) -> None:
     assert doubled_by(own_cache / "doubling.py") == [(0, 2), (1, 2), (2, 2)]
     assert doubled_by(own_cache / "doubling.py") == []

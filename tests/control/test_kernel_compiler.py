@@ -13,7 +13,7 @@ from q2r2_control.control.kernel_compiler import _PartLibrary
 
 @pytest.fixture
 def chain() -> tuple[Any, Any, Any]:
-    """Three new kernels, of which each but the first calls the one before."""
+    """Return three new kernels. Each of them except the first calls the one before."""
 
     @kernel
     def third(x: float) -> float:
@@ -31,7 +31,7 @@ def chain() -> tuple[Any, Any, Any]:
 
 
 def compiled(kinds: dict[Any, Any]) -> Any:
-    """The only compiled version of a kernel, among its wholes or its parts."""
+    """Return the only compiled version of a kernel, among its wholes or its parts."""
     (found,) = kinds.values()
     return found
 
@@ -46,7 +46,7 @@ def test_a_kernel_that_only_kernels_call_has_no_machine_code_of_its_own(chain: t
         assert library.get_pointer_to_function(compiled(part.parts).fndesc.llvm_func_name) == 0
 
 
-def test_a_part_that_python_calls_is_compiled_as_a_whole_and_gives_the_same(chain: tuple[Any, Any, Any]) -> None:
+def test_a_part_that_python_calls_is_compiled_as_a_whole_and_gives_the_same_result(chain: tuple[Any, Any, Any]) -> None:
     third, sixth, difference = chain
     numbers = np.random.default_rng(1).normal(size=100)
     differences = [difference(x) for x in numbers]
@@ -54,7 +54,7 @@ def test_a_part_that_python_calls_is_compiled_as_a_whole_and_gives_the_same(chai
     assert not isinstance(compiled(third.overloads).library, _PartLibrary)
 
 
-def test_a_kernel_that_was_called_first_becomes_part_of_another(chain: tuple[Any, Any, Any]) -> None:
+def test_a_kernel_that_was_called_first_becomes_part_of_another_one(chain: tuple[Any, Any, Any]) -> None:
     third, _, difference = chain
     assert (third(6.0), difference(6.0)) == (2.0, 1.0)
 
@@ -75,7 +75,7 @@ def test_a_kernel_with_a_builtin_that_was_called_first_becomes_part_of_two_other
     assert (at_least_one(5.0), halved(5.0), doubled(5.0)) == (10.0, 5.0, 30.0)
 
 
-def test_a_part_that_cannot_be_compiled_says_so_and_the_next_kernel_is_a_whole(chain: tuple[Any, Any, Any]) -> None:
+def test_a_part_that_cannot_be_compiled_raises_and_the_next_kernel_is_a_whole(chain: tuple[Any, Any, Any]) -> None:
     @kernel
     def wrong(x: float) -> float:
         return x.no_such_attribute  # type: ignore[attr-defined]

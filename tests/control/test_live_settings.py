@@ -1,4 +1,4 @@
-"""Distances and gains that change while the arms move: every promise at every tick, and nothing jumps."""
+"""Distances and gains change while the arms move: every promise holds at every tick, and nothing jumps."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ def controller() -> CartesianController:
 
 
 def margins(run: Driven) -> np.ndarray:
-    """Of every pair, to what all are asked to keep [m]."""
+    """Return the margin of every pair to the common distance that is asked for [m]."""
     return run.robot.distance_values(run.q) - kept_distances(run.robot, run.controller.settings).values
 
 
 @pytest.mark.slow
-def test_a_greater_distance_pushes_no_pair_apart_and_is_kept_once_the_pair_has_opened(
+def test_a_greater_distance_pushes_no_pair_apart_and_is_kept_when_the_pair_has_opened(
     controller: CartesianController,
 ) -> None:
     run = Driven(controller)
@@ -42,9 +42,9 @@ def test_a_greater_distance_pushes_no_pair_apart_and_is_kept_once_the_pair_has_o
     assert controller.change({"min_distance": FAR}) is None
     run.drive(1.5)
     assert np.abs(run.q - before).max() < 1e-4
-    assert margins(run).min() < -0.02  # nearer than asked for, and left so
+    assert margins(run).min() < -0.02  # The pair is nearer than asked for, and is left so.
     assert len(controller.narrow_pair or ()) == 2
-    assert controller.kept_distances.min() > 0.6 * pair.min()  # but no nearer than it is
+    assert controller.kept_distances.min() > 0.6 * pair.min()  # The pair comes no nearer than it is.
     run.drive(3.0, run.start)
     assert controller.narrow_pair is None
     assert controller.kept_distances.min() == FAR
@@ -53,7 +53,7 @@ def test_a_greater_distance_pushes_no_pair_apart_and_is_kept_once_the_pair_has_o
     assert run.contract.uncertified == 0
 
 
-def test_a_distance_grows_no_faster_than_it_may_and_falls_at_once(controller: CartesianController) -> None:
+def test_a_distance_grows_no_faster_than_allowed_and_falls_at_once(controller: CartesianController) -> None:
     run = Driven(controller)
     run.drive(0.1)
     assert controller.change({"min_distance": FAR}) is None
@@ -68,7 +68,7 @@ def test_a_distance_grows_no_faster_than_it_may_and_falls_at_once(controller: Ca
 
 
 @pytest.mark.slow
-def test_changes_drawn_at_random_in_mid_motion_break_no_promise(controller: CartesianController) -> None:
+def test_random_changes_during_motion_break_no_promise(controller: CartesianController) -> None:
     random, run = np.random.default_rng(3), Driven(controller)
     scenarios = [SCENARIOS[name] for name in ("crossing", "same point", "teleport", "into the table")] + [circle]
     for _ in range(30):
@@ -80,7 +80,7 @@ def test_changes_drawn_at_random_in_mid_motion_break_no_promise(controller: Cart
     assert run.contract.uncertified == 0
 
 
-def test_arms_that_close_in_are_slowed_by_a_smaller_gain_of_separation_and_not_with_a_jerk(
+def test_a_smaller_separation_gain_slows_approaching_arms_without_a_jerk(
     controller: CartesianController,
 ) -> None:
     closing, changes = {}, {}
@@ -100,8 +100,8 @@ def test_arms_that_close_in_are_slowed_by_a_smaller_gain_of_separation_and_not_w
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in LIVE if name != "min_distance"])
-def test_what_was_changed_is_what_a_controller_that_is_made_with_it_has(name: str) -> None:
-    """To the bit, after a reset, with one arm that gives way to the other one, out of reach and near it."""
+def test_a_changed_controller_equals_one_that_was_made_with_the_new_value(name: str) -> None:
+    """The comparison is exact to the bit. One arm gives way, out of reach and near the other arm."""
     usual = ControllerSettings(priority="left")
     value = 0.4 * getattr(usual, name)
     made = [CartesianController(robot_of("iiwa7"), usual.model_copy(update=update)) for update in ({name: value}, {})]
@@ -112,7 +112,7 @@ def test_what_was_changed_is_what_a_controller_that_is_made_with_it_has(name: st
     assert np.abs(ways[0] - ways[1]).max() > 1e-4
 
 
-def test_a_setting_is_live_if_the_model_of_a_task_has_it_in_an_array() -> None:
+def test_a_setting_is_live_if_the_model_of_a_task_keeps_it_in_an_array() -> None:
     usual = ControllerSettings(priority="left")
 
     def arrays(settings: ControllerSettings) -> bytes:
@@ -125,7 +125,9 @@ def test_a_setting_is_live_if_the_model_of_a_task_has_it_in_an_array() -> None:
 
 
 @pytest.mark.slow
-def test_after_a_reset_near_something_pairs_keep_what_the_posture_leaves_them(controller: CartesianController) -> None:
+def test_after_a_reset_near_a_body_pairs_keep_the_distance_that_the_posture_leaves_them(
+    controller: CartesianController,
+) -> None:
     run = Driven(controller)
     run.drive(4.0, SCENARIOS["crossing"])
     for changed in (FAR, NEAR, FAR):
@@ -143,7 +145,7 @@ def test_after_a_reset_near_something_pairs_keep_what_the_posture_leaves_them(co
 
 
 @pytest.mark.slow
-def test_a_distance_that_has_grown_falls_back_to_what_a_reset_leaves_it(controller: CartesianController) -> None:
+def test_a_distance_that_has_grown_falls_back_at_a_reset(controller: CartesianController) -> None:
     run = Driven(controller)
     run.drive(4.0, SCENARIOS["crossing"])
     near = run.q
@@ -159,7 +161,7 @@ def test_a_distance_that_has_grown_falls_back_to_what_a_reset_leaves_it(controll
 
 
 @pytest.mark.slow
-def test_arms_that_were_left_within_their_buffer_rest_after_a_reset_and_it_grows_as_they_part(
+def test_arms_within_their_buffer_rest_after_a_reset_and_the_buffer_grows_as_they_part(
     controller: CartesianController,
 ) -> None:
     run = Driven(controller)
@@ -176,17 +178,18 @@ def test_arms_that_were_left_within_their_buffer_rest_after_a_reset_and_it_grows
     assert left.contract.uncertified == 0
 
 
-def test_a_pair_that_closes_in_keeps_no_more_than_the_stop_leaves_it(controller: CartesianController) -> None:
+def test_an_approaching_pair_keeps_no_more_distance_than_its_stop_leaves(controller: CartesianController) -> None:
     run, robot = Driven(controller), controller.robot
     lost = np.zeros(0)
-    while run.ticks < 800 and not (lost > 0.004).any():  # by a pair that a stop from here brings nearer than asked for
+    # The loop ends when a stop would bring a pair nearer than it was asked to keep.
+    while run.ticks < 800 and not (lost > 0.004).any():
         run.drive(0.01, SCENARIOS["crossing"])
         stop = controller.stop_deceleration
         ends = robot.distance_values(run.q + run.v * np.abs(run.v) / (2.0 * stop))
         lost = np.where(ends < FAR - 0.004, robot.distance_values(run.q) - ends, 0.0)
     assert (lost > 0.004).any()
     assert controller.change({"min_distance": FAR}) is None
-    controller.reset(run.q, run.v)  # after which pairs keep at once all that they can
+    controller.reset(run.q, run.v)  # After the reset, pairs keep at once as much as they can.
     stop = controller.stop_deceleration
     for share in np.linspace(0.0, 1.0, 41):
         time = np.minimum(share * (np.abs(run.v) / stop).max(), np.abs(run.v) / stop)
@@ -204,7 +207,7 @@ def test_a_pair_that_closes_in_keeps_no_more_than_the_stop_leaves_it(controller:
     ],
     ids=["pairs are not watched", "not a live one", "out of range", "as a whole"],
 )
-def test_what_is_not_possible_is_refused_with_the_reason_and_changes_nothing(
+def test_an_impossible_change_is_refused_with_the_reason_and_changes_nothing(
     controller: CartesianController, values: dict[str, float], reason: str
 ) -> None:
     before = controller.settings
@@ -214,15 +217,16 @@ def test_what_is_not_possible_is_refused_with_the_reason_and_changes_nothing(
     assert controller.settings is before
 
 
-def test_a_distance_that_home_does_not_keep_is_refused_and_names_the_pair(controller: CartesianController) -> None:
+def test_a_distance_that_home_does_not_have_is_refused_and_names_the_pair(controller: CartesianController) -> None:
     nearest = min(controller.robot.distances(controller.robot.home), key=lambda pair: pair.distance)
-    refusal = controller.change({"min_distance": nearest.distance - 0.001})  # distance_buffer would not be left
+    # No room would be left for distance_buffer.
+    refusal = controller.change({"min_distance": nearest.distance - 0.001})
     assert refusal is not None
     assert nearest.name_a in refusal
 
 
 def _way(controller: CartesianController) -> np.ndarray:
-    """Positions while both arms reach across each other, and then upwards."""
+    """Return positions while both arms reach across each other, and then upwards."""
     start = {arm: controller.tool_pose(arm) for arm in controller.robot.arms}
     goals = [SCENARIOS[name](0.0, start) for name in ("crossing", "overhead") for _ in range(400)]
     return np.array([controller.step(goal, DT).q for goal in goals])

@@ -1,4 +1,4 @@
-"""Obstacles that move on their own: arms rest before they can be touched, and are usable beside them."""
+"""Obstacles that move on their own: arms rest before they can be touched, and can work beside them."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def controller() -> Iterator[CartesianController]:
         pytest.param(1.0, 0.033, 3.0, False, id="with a bound on its acceleration"),
     ],
 )
-def test_no_body_that_moves_comes_near_a_hand_that_hunts_it(
+def test_no_moving_body_comes_near_a_hand_that_chases_it(
     controller: CartesianController, speed: float, period: float, acceleration: float | None, box: bool
 ) -> None:
     hunt = Hunt(controller, controller_and_solver()[1], seed=1, box=box)
@@ -54,7 +54,7 @@ def test_no_body_that_moves_comes_near_a_hand_that_hunts_it(
 
 
 @pytest.mark.slow
-def test_a_hand_that_is_faster_than_it_says_gets_to_an_arm_that_moves(controller: CartesianController) -> None:
+def test_a_hand_that_is_faster_than_reported_reaches_a_moving_arm(controller: CartesianController) -> None:
     hunt = Hunt(controller, controller_and_solver()[1], seed=1, lie=5.0)
     hunt.run(6.0, 0.25, 0.1)
     assert hunt.broken, "or the test above could not fail"
@@ -67,7 +67,7 @@ def circle(t: float, start: dict[str, pin.SE3], radius: float = 0.05, turns: flo
 
 
 def worst_error(controller: CartesianController, obstacle: MovingObstacle | None, seconds: float = 3.0) -> float:
-    """Of the left tool on a circle that both hands lead [m], after the first second."""
+    """Return the worst error of the left tool on a circle that both hands lead [m], after the first second."""
     start, worst = {arm: controller.tool_pose(arm) for arm in controller.robot.arms}, 0.0
     for tick in range(round(seconds / 0.002)):
         if obstacle is not None and tick % 16 == 0:
@@ -83,7 +83,7 @@ def worst_error(controller: CartesianController, obstacle: MovingObstacle | None
     return worst
 
 
-def test_arms_follow_as_in_free_air_beside_a_slow_hand(controller: CartesianController) -> None:
+def test_arms_beside_a_slow_hand_follow_as_in_free_air(controller: CartesianController) -> None:
     free = worst_error(controller, None)
     controller.reset(controller.robot.home)
     side = controller.tool_pose("left").translation + np.array([0.0, 0.3 + RADIUS + 0.06, 0.0])
@@ -92,7 +92,7 @@ def test_arms_follow_as_in_free_air_beside_a_slow_hand(controller: CartesianCont
     assert beside < 1.5 * free + 1e-3
 
 
-def test_reports_that_cease_bring_arms_to_rest_and_the_report_names_the_pair(controller: CartesianController) -> None:
+def test_the_end_of_reports_brings_arms_to_rest_and_the_report_names_the_pair(controller: CartesianController) -> None:
     start = {arm: controller.tool_pose(arm) for arm in controller.robot.arms}
     far = start["left"].translation + np.array([0.0, 0.8, 0.0])
     controller.move_obstacle("hand", hand(far))
@@ -132,7 +132,7 @@ def test_an_obstacle_in_front_of_a_moving_arm_is_named_and_the_arm_brakes_along_
         before = now
 
 
-def test_a_box_that_is_put_down_is_an_obstacle_like_any_and_gone_when_taken_away(
+def test_a_new_box_is_an_obstacle_like_any_other_until_it_is_removed(
     controller: CartesianController,
 ) -> None:
     start = controller.tool_pose("left")
@@ -182,7 +182,7 @@ def test_the_reach_of_an_obstacle_is_that_of_a_point_that_gains_speed() -> None:
     assert hand(np.zeros(3), 1.0, speed_now=0.2).slower == 0.0
 
 
-def test_without_names_no_array_of_the_kernels_has_another_size() -> None:
+def test_without_names_no_array_of_the_kernels_changes_its_size() -> None:
     robot = robot_of_cell()
     without, one = (
         kernel_model_of(robot, ControllerSettings(moving_obstacles=names)).safety for names in ((), ("hand",))
@@ -203,7 +203,7 @@ def test_without_names_no_array_of_the_kernels_has_another_size() -> None:
         pytest.param({"shape": "sphere", "size": (0.1,), "speed": 0.1, "speed_now": 0.2}, "speed_now", id="too fast"),
     ],
 )
-def test_what_is_no_obstacle_is_refused_in_one_line(values: dict[str, Any], says: str) -> None:
+def test_an_invalid_obstacle_is_refused_in_one_line(values: dict[str, Any], says: str) -> None:
     with pytest.raises(ConfigError, match=says):
         MovingObstacle(**values)
 

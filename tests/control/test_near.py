@@ -1,4 +1,6 @@
-"""How near arms come to the table, the floor, obstacles, each other and their own links; the contract at every tick."""
+"""The distances that arms reach from table, floor, obstacles, each other and their own links, with the contract at
+every tick.
+"""
 
 from __future__ import annotations
 
@@ -19,10 +21,10 @@ from tests.control.scenarios import circle
 from tests.support.driven import Driven
 
 CONFIG = load_config("config/dual_iiwa7.yaml")
-SETTINGS = CONFIG.control.model_copy(update={"solve_time_limit": None})  # no outcome hangs on the clock
-TABLE = 0.2  # height of its top [m]
+SETTINGS = CONFIG.control.model_copy(update={"solve_time_limit": None})  # No result depends on the clock.
+TABLE = 0.2  # Height of the table's top [m].
 FRAME_TO_TIPS = 0.013  # [m]
-DOWN = pin.rpy.rpyToMatrix(np.pi, 0.0, np.pi)  # as at home
+DOWN = pin.rpy.rpyToMatrix(np.pi, 0.0, np.pi)  # The tools point down as at home.
 SIDES = (("left", 1.0), ("right", -1.0))
 
 
@@ -32,7 +34,7 @@ def controller() -> CartesianController:
 
 
 def driven(controller: CartesianController, goal: Mapping[str, pin.SE3], seconds: float) -> Reference:
-    """From home towards ``goal``, to rest."""
+    """Drive from home towards ``goal`` until the arms rest."""
     run = Driven(controller, dt=0.004, random=np.random.default_rng(1))
     reference, contract = run.drive(seconds, goal), run.contract
     assert contract.tail_acceleration() < 0.1
@@ -42,12 +44,12 @@ def driven(controller: CartesianController, goal: Mapping[str, pin.SE3], seconds
 
 
 def down_to(z: float, y: float = 0.25, x: float = 0.5) -> dict[str, pin.SE3]:
-    """Both tools point down at a height [m]."""
+    """Return targets at which both tools point down at a height [m]."""
     return {arm: pin.SE3(DOWN, np.array([x, side * y, z])) for arm, side in SIDES}
 
 
 def heights(controller: CartesianController) -> list[float]:
-    """Of both tools' tips [m]."""
+    """Return the heights of both tools' tips [m]."""
     tips = np.array([0.0, 0.0, FRAME_TO_TIPS])
     return [float((controller.tool_pose(arm) * tips)[2]) for arm in controller.robot.arms]
 
@@ -64,7 +66,7 @@ def test_tools_driven_down_onto_the_table_end_with_their_tips_between_1_and_2_mm
 
 @pytest.mark.slow
 def test_hands_driven_at_each_other_end_at_the_distance_that_fingers_keep(controller: CartesianController) -> None:
-    """Tools that point at each other, their tips asked to overlap by 50 mm."""
+    """The tools point at each other, and their tips are asked to overlap by 50 mm."""
     goal = {
         arm: pin.SE3(
             pin.rpy.rpyToMatrix(side * np.pi / 2, 0.0, 0.0), np.array([0.55, side * (FRAME_TO_TIPS - 0.025), 0.5])
@@ -78,7 +80,7 @@ def test_hands_driven_at_each_other_end_at_the_distance_that_fingers_keep(contro
 
 
 def test_the_nearest_pair_and_the_tightest_one_are_told_apart(controller: CartesianController) -> None:
-    """Fingers 12 mm above the table have more to spare than wrists 22 mm from each other."""
+    """Fingers 12 mm above the table have a larger margin than wrists 22 mm from each other."""
     reference = driven(controller, down_to(TABLE + FRAME_TO_TIPS + 0.012, y=0.0), 6.0)
     report, robot = reference.report, controller.robot
     assert "table_0" in report.closest_pair
@@ -98,7 +100,7 @@ def test_pairs_that_may_touch_come_to_rest_apart() -> None:
 
 Target = tuple[tuple[float, float, float], tuple[float, float, float]]
 
-# Where each tool is asked to be [m], and how far it is turned from home about which axis [rad].
+# Position that each tool is asked to reach [m], and its angle from home about an axis [rad].
 SLIDES: dict[str, tuple[Target, Target]] = {
     "while a joint is at its limit": (
         ((0.294, 0.219, 0.473), (-0.609, -0.206, 0.149)),
@@ -113,7 +115,7 @@ SLIDES: dict[str, tuple[Target, Target]] = {
 
 @pytest.mark.parametrize("slide", SLIDES)
 def test_joints_hardly_jolt_while_arms_slide_along_each_other(controller: CartesianController, slide: str) -> None:
-    dt, started = 0.001, 2000  # ticks until the slide has begun, and the targets' jump is over
+    dt, started = 0.001, 2000  # Number of ticks until the slide has begun and the targets' jump is over.
     run = Driven(controller, dt=dt)
     targets = {
         arm: pin.SE3(pin.exp3(np.array(turn)) @ run.start[arm].rotation, np.array(place))
@@ -121,7 +123,7 @@ def test_joints_hardly_jolt_while_arms_slide_along_each_other(controller: Cartes
     }
     v = np.array([controller.step(targets, dt).v for _ in range(4000)])
     assert np.linalg.norm(v[started:], axis=1).min() > 0.05, "they slide all the time"
-    # A new pair that comes to hold the arms may still make a jolt.
+    # A pair that begins to hold the arms may still cause a jolt.
     assert count_jolts(v, dt, started * dt) <= 0.01 * 2000, f"changes of more than {JOLT:g} rad/s^2"
 
 
@@ -129,7 +131,7 @@ def with_floor(floor: float | None) -> CartesianController:
     return CartesianController(Robot.from_config(CONFIG.model_copy(update={"floor": floor})), SETTINGS)
 
 
-def test_arms_asked_below_the_floor_beside_the_table_come_to_rest_above_it() -> None:
+def test_arms_with_targets_below_the_floor_beside_the_table_come_to_rest_above_it() -> None:
     floor = -0.15
     controller = with_floor(floor)
     reference = driven(controller, down_to(-0.3, y=1.0, x=0.1), 4.0)
@@ -139,7 +141,7 @@ def test_arms_asked_below_the_floor_beside_the_table_come_to_rest_above_it() -> 
 
 
 def hands_in_the_table(depth: float) -> Array:
-    """A posture with both tools pointing down ``depth`` [m] below the table's surface, its links with them."""
+    """Return a posture in which both tools point down ``depth`` [m] below the table's surface, with their links."""
     ghost = Robot.from_config(CONFIG)
     ghost.collision_model.removeAllCollisionPairs()
     controller = CartesianController(ghost, SETTINGS)
@@ -152,7 +154,7 @@ def hands_in_the_table(depth: float) -> Array:
 
 
 def test_hands_and_wrists_deep_in_the_table_come_out_through_its_top() -> None:
-    """The way out of a hand alone would be the underside, where the floor is, and the wrists' would be the top."""
+    """The shortest way out for a hand alone would be the underside, near the floor, and for the wrists the top."""
     controller = with_floor(0.0)
     home = {arm: controller.tool_pose(arm) for arm in controller.robot.arms}
     controller.reset(hands_in_the_table(0.18))
@@ -164,7 +166,7 @@ def test_hands_and_wrists_deep_in_the_table_come_out_through_its_top() -> None:
 
 
 def test_where_nothing_can_be_certified_the_report_names_the_pairs_that_hold_the_arms() -> None:
-    """Without a floor the underside is a way out, and hand and wrist hold each other in the table."""
+    """Without a floor, the underside is a way out, and hand and wrist hold each other in the table."""
     controller = with_floor(None)
     home = {arm: controller.tool_pose(arm) for arm in controller.robot.arms}
     controller.reset(hands_in_the_table(0.12))
@@ -190,12 +192,12 @@ def test_a_tool_pushed_into_an_obstacle_stops_before_it_and_rests(shape: str) ->
     goal["left"].translation = np.array([0.65, 0.1, 0.5])
     reference = driven(CartesianController(robot), goal, 4.0)
     assert "post" in "|".join(reference.report.closest_pair)
-    # The shapes of the cell lie inside what is watched: Coal measures them.
+    # The shapes of the cell lie inside the monitored bodies. Coal measures the shapes.
     assert min(pair.distance for pair in robot.distances(reference.q)) >= 0.02 - 1e-5
     assert reference.report.closest_distance < 0.03, "it goes as near as it may"
 
 
-def test_a_target_that_bends_the_hand_to_the_forearm_is_followed_to_the_distance_that_is_kept(
+def test_a_target_that_bends_the_hand_to_the_forearm_is_followed_up_to_the_kept_distance(
     controller: CartesianController,
 ) -> None:
     inwards = pin.SE3(pin.rpy.rpyToMatrix(0.0, 1.2, 0.0), np.zeros(3))
@@ -210,7 +212,7 @@ def test_a_target_that_bends_the_hand_to_the_forearm_is_followed_to_the_distance
 def test_a_circle_is_followed_no_worse_because_the_hand_is_near_its_own_forearm(
     controller: CartesianController,
 ) -> None:
-    """Half a metre in the air with 0.3 m/s, 6 mm of free distance at its top."""
+    """The circle is half a metre in the air. Its speed is 0.3 m/s, and 6 mm of distance are free at its top."""
     run, errors, nearest = Driven(controller, dt=0.001), [], np.inf
     for tick in range(4000):
         nearest = min(nearest, run.drive(0.001, circle).report.closest_distance)
@@ -221,8 +223,8 @@ def test_a_circle_is_followed_no_worse_because_the_hand_is_near_its_own_forearm(
     assert np.sqrt(np.mean(np.square(errors[1000:]))) < 0.004
 
 
-def test_what_an_arm_has_to_spare_is_the_least_of_its_pairs_with_others_less_what_they_keep() -> None:
-    """Links are named by their arm; the table and the floor are nobody's."""
+def test_the_margin_of_an_arm_is_the_least_margin_of_its_pairs_with_other_bodies() -> None:
+    """Links are named after their arm. The table and the floor belong to no arm."""
     robot, random, kept = cell("dual_iiwa7").robot, np.random.default_rng(5), 0.03
     controller = CartesianController(robot, ControllerSettings(min_distance=kept))
     for _ in range(60):

@@ -1,4 +1,7 @@
-"""Fingers that slide or turn count at the openings that they may have: more is proven first, and shown by Coal."""
+"""Fingers that slide or turn are monitored at all openings that they may have.
+
+A change is proven first; Coal checks it.
+"""
 
 from __future__ import annotations
 
@@ -53,7 +56,7 @@ def test_a_closed_gripper_gets_beside_a_block_where_one_that_may_open_does_not(c
     assert height(controller) == pytest.approx(BESIDE.translation[2], abs=5e-4)
 
 
-def test_beside_the_block_it_may_open_as_far_as_the_block_allows_and_above_it_at_will(
+def test_beside_the_block_the_gripper_opens_as_far_as_the_block_allows_and_above_it_fully(
     controller: CartesianController,
 ) -> None:
     run = Driven(controller)
@@ -74,7 +77,10 @@ def test_beside_the_block_it_may_open_as_far_as_the_block_allows_and_above_it_at
 
 
 def test_an_arm_at_speed_may_not_open_where_there_is_room_but_none_to_stop(controller: CartesianController) -> None:
-    """Towards the block with the gripper closed, asked at every tick; Coal looks at stops from what is accepted."""
+    """The closed gripper moves towards the block and asks at every tick.
+
+    Coal measures along stops from accepted openings.
+    """
     robot = controller.robot
     kept = kept_distances(robot, SETTINGS).values
     run = Driven(controller)
@@ -123,7 +129,7 @@ def test_a_reset_forgets_openings(controller: CartesianController) -> None:
         ("left", (None, 1.0), "finite numbers"),
     ],
 )
-def test_what_is_no_opening_is_refused_by_name(
+def test_an_invalid_opening_is_refused_by_name(
     controller: CartesianController, arm: str, interval: tuple[float, float], complaint: str
 ) -> None:
     with pytest.raises(RobotError, match=complaint):
@@ -131,7 +137,7 @@ def test_what_is_no_opening_is_refused_by_name(
 
 
 @pytest.mark.parametrize("below", [0.0, 5e-10])
-def test_fingers_at_their_distance_to_the_last_digits_part_again(robot: Robot, below: float) -> None:
+def test_fingers_at_their_exact_distance_can_part_again(robot: Robot, below: float) -> None:
     run = Driven(CartesianController(robot, SETTINGS))
     run.set_opening("left", 0.0, 0.0)
     report = run.drive(2.0, {"left": BESIDE}).report
@@ -144,24 +150,24 @@ def test_fingers_at_their_distance_to_the_last_digits_part_again(robot: Robot, b
     assert np.linalg.norm(near.controller.tool_pose("left").translation - ABOVE.translation) < 1e-3
 
 
-COAL = 2e-6  # how exactly our distances are Coal's [m]
+COAL = 2e-6  # Largest difference between our distances and those of Coal [m].
 
 
 class Cell(Driven):
-    """A run with its contract, and the fingers as they really are."""
+    """A run with its contract and the real positions of the fingers."""
 
     def __init__(self, config: Config) -> None:
-        # No outcome hangs on the clock.
+        # No result depends on the clock.
         robot, settings = Robot.from_config(config), config.control.model_copy(update={"solve_time_limit": None})
         self.real, self.kept = RealHands(robot), kept_distances(robot, settings).values
         super().__init__(CartesianController(robot, settings), dt=DT)
 
     def spare(self, openings: dict[str, float]) -> float:
-        """How much farther apart than it has to be the nearest pair of shapes as drawn is [m]."""
+        """Return the margin of the nearest pair of drawn shapes [m]."""
         return float((self.real.distances(self.q, openings) - self.kept).min())
 
     def spare_of_bodies(self) -> float:
-        """The same of the fingers' bodies."""
+        """Return the same margin of the fingers' bodies."""
         model = collision_model_at(self.robot.collision_model, self.robot.finger_bodies, self.controller.openings)
         return float((coal_distances(self.robot, model, self.q) - self.kept).min())
 
@@ -171,10 +177,10 @@ def cell(tmp_path: Path) -> Cell:
     return Cell(turning_cell(tmp_path))
 
 
-def test_an_open_gripper_may_not_close_into_the_table_and_may_where_there_is_room(cell: Cell) -> None:
+def test_an_open_gripper_does_not_close_into_the_table_and_closes_where_there_is_room(cell: Cell) -> None:
     assert cell.set_opening("left", 1.0, 1.0) is None
     cell.drive(1.8, {"left": above_table(0.006)})
-    # The closed fingers' tips would be 8 mm inside the table.
+    # The tips of the closed fingers would be 8 mm inside the table.
     assert cell.spare({"left": 1.0, "right": 1.0}) > 0.0 > cell.spare({"left": 0.0, "right": 1.0})
     for least in (0.0, 0.3):
         pair = cell.set_opening("left", least, 1.0)
@@ -189,7 +195,7 @@ def test_an_open_gripper_may_not_close_into_the_table_and_may_where_there_is_roo
 
 
 def test_less_that_reaches_nearer_is_refused_like_more_and_the_wider_body_stays(cell: Cell) -> None:
-    """Onto the table along a direction in which the capsules of a part of an interval reach farther than of all."""
+    """The gripper moves onto the table in a direction in which a smaller interval has capsules that reach farther."""
     wide, narrow, direction = (0.0, 0.7), (0.175, 0.7), np.array([-0.1135, 0.3231, 0.9395])
     fingers = [body for body in cell.robot.finger_bodies if isinstance(body, TurningBody) and body.arm == "left"]
     reach = {}
@@ -210,7 +216,7 @@ def test_less_that_reaches_nearer_is_refused_like_more_and_the_wider_body_stays(
     assert pair is not None
     assert "table_0" in pair
     assert cell.controller.openings["left"] == wide
-    assert cell.set_opening("left", 0.3, 0.4) is None  # much less is within
+    assert cell.set_opening("left", 0.3, 0.4) is None  # A much smaller opening lies within the wider body.
     assert cell.spare_of_bodies() >= -COAL
     assert cell.set_opening("left", *wide) is None
     cell.drive(0.4, {"left": high})
@@ -218,7 +224,7 @@ def test_less_that_reaches_nearer_is_refused_like_more_and_the_wider_body_stays(
 
 
 @pytest.mark.slow
-def test_with_hostile_targets_and_openings_no_finger_is_ever_too_near_wherever_it_really_is(cell: Cell) -> None:
+def test_with_hostile_targets_and_openings_no_finger_is_too_near_at_its_real_position(cell: Cell) -> None:
     random, refused = np.random.default_rng(5), 0
     goals: dict[str, pin.SE3] = {}
     for tick in range(1500):
@@ -233,7 +239,7 @@ def test_with_hostile_targets_and_openings_no_finger_is_ever_too_near_wherever_i
             interval = ((low, high), (low, 1.0), (0.0, high), ALL_OF_THE_WAY)[random.integers(4)]
             stop = cell.controller.stop_deceleration
             refused += cell.set_opening(str(random.choice(["left", "right"])), *interval) is not None
-            # The arms may be braking along it already.
+            # The arms may be braking along the stop already.
             np.testing.assert_array_equal(cell.controller.stop_deceleration, stop)
         cell.drive(DT, goals)
         if tick % 8 == 0:

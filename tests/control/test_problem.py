@@ -1,4 +1,4 @@
-"""The QP of a step can be read without a trace, and solved by anybody: the arms keep every promise."""
+"""The QP of a step can be read without side effects and solved by any program, and the arms keep every promise."""
 
 from __future__ import annotations
 
@@ -33,20 +33,20 @@ def crossing(robot: Robot, tick: int = 0) -> dict[str, pin.SE3]:
 
 
 def same(one: Reference, other: Reference) -> bool:
-    """Whether two references are equal to the bit, with all that their reports say of the motion."""
+    """Return whether two references are equal to the bit, with everything that their reports say about the motion."""
     arrays = all(np.array_equal(getattr(one, name), getattr(other, name)) for name in "qva")
     return arrays and replace(one.report, solve_time=0.0) == replace(other.report, solve_time=0.0)
 
 
 def solved_by(name: str, problem: qpsolvers.Problem) -> Array | None:
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of solvers that want sparse matrices
+        warnings.simplefilter("ignore")  # Some solvers warn because they want sparse matrices.
         x: Array | None = qpsolvers.solve_problem(problem, solver=name).x
     return x
 
 
 def busy(controller: CartesianController, tick: int) -> None:
-    """Changes between steps that clocks and ramps of a controller come from."""
+    """Make changes between steps that start clocks and ramps of a controller."""
     if tick == 100:
         assert controller.change({"position_gain": 4.0, "min_distance": 0.025}) is None
     if tick % 50 == 10:
@@ -55,7 +55,7 @@ def busy(controller: CartesianController, tick: int) -> None:
         controller.move_obstacle("hand", MovingObstacle(**shape, **pose))
 
 
-def test_a_run_in_which_the_problem_is_read_is_the_same_to_the_bit(robot: Robot) -> None:
+def test_reading_the_problem_does_not_change_a_run_in_any_bit(robot: Robot) -> None:
     read, unread = CartesianController(robot, KEPT), CartesianController(robot, KEPT)
     for tick in range(300):
         targets: Mapping[str, pin.SE3 | None] = crossing(robot, tick) if tick % 70 < 60 else {}
@@ -71,7 +71,7 @@ def test_a_run_in_which_the_problem_is_read_is_the_same_to_the_bit(robot: Robot)
         assert same(read.step(targets, dt), unread.step(targets, dt)), tick
 
 
-def test_the_problem_is_what_the_step_solves(robot: Robot) -> None:
+def test_the_problem_is_the_one_that_the_step_solves(robot: Robot) -> None:
     by_hand, controller = CartesianController(robot), CartesianController(robot)
     with_rows = 0
     for tick in range(300):
@@ -86,7 +86,7 @@ def test_the_problem_is_what_the_step_solves(robot: Robot) -> None:
     assert with_rows > 100
 
 
-def test_velocities_that_the_step_would_find_lead_to_the_same_reference_to_the_bit(robot: Robot) -> None:
+def test_the_velocities_of_the_step_lead_to_the_same_reference_to_the_bit(robot: Robot) -> None:
     controllers = [CartesianController(robot) for _ in range(2)]
     for tick in range(200):
         targets = crossing(robot, tick)
@@ -103,7 +103,7 @@ NO_SOLUTION: tuple[Any, ...] = (
 
 @pytest.mark.slow
 @pytest.mark.parametrize("x", NO_SOLUTION, ids=lambda x: repr(x)[:12])
-def test_what_is_no_solution_brakes_along_the_certified_stop_as_an_unsolved_step(robot: Robot, x: Any) -> None:
+def test_an_invalid_solution_brakes_along_the_certified_stop_like_an_unsolved_step(robot: Robot, x: Any) -> None:
     controller = CartesianController(robot)
     before = [controller.step(crossing(robot), DT) for _ in range(100)][-1]
     report = controller.advance(x, crossing(robot), DT).report
@@ -123,6 +123,6 @@ def test_velocities_far_beyond_the_box_break_no_promise(robot: Robot) -> None:
 
 
 @pytest.mark.parametrize("dt", [0.0, -1.0, 0.11, math.nan, None, "a"])
-def test_a_problem_of_no_possible_step_is_refused(robot: Robot, dt: Any) -> None:
+def test_an_impossible_step_has_no_problem(robot: Robot, dt: Any) -> None:
     with pytest.raises(RobotError, match=r"dt = .*: allowed: a number above 0, up to 0\.1 s"):
         CartesianController(robot).problem({}, dt)

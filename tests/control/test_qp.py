@@ -1,4 +1,4 @@
-"""DAQP finds the minimum of the soft problem, and is asked only where the cost's own minimum breaks a bound."""
+"""DAQP finds the minimum of the soft problem, and is called only if the cost's own minimum breaks a bound."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def _problem(random: np.random.Generator, rows: int, conflicting: bool = False) 
 
 
 def _assert_minimum(problem: QpProblem, v: Array) -> None:
-    """Without slack variables the soft problem is a convex, once differentiable function in a box.
+    """Assert that ``v`` is the minimum. Without slack variables, the soft problem is a convex function in a box.
 
     ``v`` is its minimum if no Newton-like step, the gradient scaled by the curvature, leads on within the box.
     """
@@ -54,7 +54,7 @@ def _solved(solver: DaqpSolver, problem: QpProblem) -> Array:
     return solution.v
 
 
-def test_the_minimum_is_found_with_any_number_of_rows_from_tick_to_tick_also_with_conflicting_ones() -> None:
+def test_the_minimum_is_found_for_any_number_of_rows_in_successive_ticks_also_with_conflicting_rows() -> None:
     random, solver = np.random.default_rng(30), DaqpSolver(NV)
     for rows, conflicting in ((0, False), (5, False), (4, True), (0, False), (17, False), (3, False), (60, False)):
         for _ in range(5):
@@ -63,7 +63,7 @@ def test_the_minimum_is_found_with_any_number_of_rows_from_tick_to_tick_also_wit
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1e3], ids="cost times {:g}".format)
-def test_a_row_alone_gives_way_by_the_same_part_however_strong_the_cost(scale: float) -> None:
+def test_a_single_row_yields_by_the_same_part_for_any_strength_of_the_cost(scale: float) -> None:
     row = np.zeros((1, NV))
     row[0, :2] = 0.6, 0.8
     wide = np.full(NV, 10.0)
@@ -83,7 +83,7 @@ def test_numbers_that_are_not_finite_raise_nothing_and_leave_no_trace(what: str)
 
 @pytest.fixture
 def data() -> KernelData:
-    """Of a cost whose minimum is 0.1 rad/s for every joint, in a box of 1 rad/s and with one row that it keeps."""
+    """Return data of a cost whose minimum is 0.1 rad/s for every joint. It keeps the box of 1 rad/s and the row."""
     data = kernel_data("dual_iiwa7", np.zeros(NV))
     root = np.random.default_rng(5).normal(size=(NV, NV))
     data.tasks.H[:] = root @ root.T + np.eye(NV)
@@ -118,7 +118,7 @@ def _flat(data: KernelData) -> None:
 
 
 @pytest.mark.parametrize("change", [_lower, _upper, _row, _not_finite, _infinite, _flat])
-def test_a_minimum_within_all_bounds_is_found_and_one_bound_in_the_way_leaves_it_to_the_solver(
+def test_a_minimum_within_all_bounds_is_found_directly_and_otherwise_the_solver_is_called(
     data: KernelData, change: Callable[[KernelData], None]
 ) -> None:
     assert find_minimum(pointer_to(data))
@@ -128,12 +128,13 @@ def test_a_minimum_within_all_bounds_is_found_and_one_bound_in_the_way_leaves_it
 
 
 class BothWays:
-    """Solves every problem in full, and notes how far the minimum that was found before is from that."""
+    """A solver that solves every problem in full, and records the difference from the direct minimum."""
 
     def __init__(self) -> None:
         self._solver = DaqpSolver(NV)
         self.deviations: list[float] = []
-        self.held_back: list[bool] = []  # problems without such a minimum: whether a bound holds the solution back
+        # For each problem without a direct minimum: True if a bound holds the solution back.
+        self.held_back: list[bool] = []
 
     def solve(self, problem: QpProblem) -> QpSolution:
         solution = self._solver.solve(replace(problem, minimum=None))
@@ -148,13 +149,13 @@ class BothWays:
 
 
 def circling(home: pin.SE3, t: float, side: float) -> pin.SE3:
-    """A tool that goes round and, farther on, into the other arm and out of it again."""
+    """Return targets of a tool that moves in circles and, farther on, into the other arm and out again."""
     by = np.array([0.08 * np.sin(4.0 * t), -side * 0.25 * (1.0 - np.cos(t)), 0.04 * np.sin(3.0 * t)])
     return pin.SE3(home.rotation, home.translation + by)
 
 
 @pytest.mark.slow
-def test_the_minimum_is_the_solution_wherever_it_is_one() -> None:
+def test_the_direct_minimum_is_the_solution_whenever_there_is_one() -> None:
     robot, solver = cell("dual_iiwa7").robot, BothWays()
     controller = CartesianController(robot, ControllerSettings(), solver=solver)
     home = {arm: controller.tool_pose(arm) for arm in robot.arms}
@@ -186,5 +187,5 @@ def test_the_factor_is_read_from_the_upper_triangle_and_solves_the_equations(n: 
 @pytest.mark.parametrize(
     "A", [np.diag([1.0, -1e-9, 2.0]), np.ones((3, 3)), np.full((3, 3), np.nan)], ids=["indefinite", "singular", "nan"]
 )
-def test_what_is_not_positive_definite_has_no_factor(A: np.ndarray) -> None:
+def test_a_matrix_that_is_not_positive_definite_has_no_factor(A: np.ndarray) -> None:
     assert not factorise(A)

@@ -1,4 +1,4 @@
-"""The suite to trust a robot by: named ways to hurt it, and the contract at every tick.
+"""The suite that checks a robot: named hostile motions, with the contract at every tick.
 
 Another robot joins by a line in ``ROBOTS`` and in the parameters of the test.
 """
@@ -24,8 +24,8 @@ from tests.control.cells import pandas
 from tests.control.scenarios import SCENARIOS, Scenario, circle, crossing
 
 DURATION = 2.0  # [s]
-FAULT_PERIOD, FAULT_SHARE = 0.2, 0.2  # a faulty solver fails at the end of every period [s]
-AGAINST_US = "against us"  # one attack after the other, a period each
+FAULT_PERIOD, FAULT_SHARE = 0.2, 0.2  # A faulty solver fails at the end of every period [s].
+AGAINST_US = "against us"  # All attacks in turn, each for one period.
 Start = Callable[[Robot], tuple[Array, Array]]
 
 
@@ -42,7 +42,10 @@ def robot_of(name: str) -> Robot:
 
 @cache
 def controller_of(name: str) -> tuple[CartesianController, FaultySolver]:
-    """Made once: reset starts it anew. The solver's times are made up, so that no outcome depends on the load."""
+    """Return the controller of a robot.
+
+    It is made once, and a reset starts it again. The solver's times are simulated.
+    """
     settings = ControllerSettings(solve_time_limit=0.05)
     solver = FaultySolver(DaqpSolver(robot_of(name).model.nv))
     return CartesianController(robot_of(name), settings, solver=untimed(solver, robot_of(name).model.nv)), solver
@@ -53,7 +56,7 @@ def at_home(robot: Robot) -> tuple[Array, Array]:
 
 
 def outside_its_limits(robot: Robot) -> tuple[Array, Array]:
-    """The last joint of every arm 0.05 rad beyond its upper limit."""
+    """Return a posture with the last joint of every arm 0.05 rad beyond its upper limit."""
     q, v = at_home(robot)
     for arm in robot.arms.values():
         q[arm.joints[-1]] = robot.position_upper[arm.joints[-1]] + 0.05
@@ -61,7 +64,7 @@ def outside_its_limits(robot: Robot) -> tuple[Array, Array]:
 
 
 def in_penetration(robot: Robot) -> tuple[Array, Array]:
-    """The arms overlap by 39 mm: turned inwards and leant forwards until they do."""
+    """Return a posture in which the arms overlap by 39 mm, because they are turned inwards and leant forwards."""
     first = [arm.joints[0] for arm in robot.arms.values()]
 
     def turned(turn: float) -> Array:
@@ -82,7 +85,7 @@ def in_penetration(robot: Robot) -> tuple[Array, Array]:
 
 
 def too_fast(robot: Robot) -> tuple[Array, Array]:
-    """Every joint 1.2 times as fast as it may be, upwards and apart, far from its position limits."""
+    """Return velocities in which every joint is 1.2 times too fast, upwards and apart, far from its position limits."""
     q, v = at_home(robot)
     for arm, sign in zip(robot.arms.values(), (1.0, -1.0), strict=True):
         v[arm.joints[0]] = 1.2 * sign * robot.velocity_limit[arm.joints[0]]
@@ -92,7 +95,7 @@ def too_fast(robot: Robot) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """Targets over time, where the robot starts, whether ticks jitter, and how the solver fails."""
+    """A case: targets over time, the start of the robot, whether ticks jitter, and how the solver fails."""
 
     scenario: Scenario
     start: Start = at_home
@@ -124,7 +127,10 @@ CASES = {
 
 
 def ticks_of(dt: float, jitter: bool) -> Iterator[float]:
-    """Lengths of the ticks of one run; jittering ones are between a fifth and five times as long."""
+    """Return the lengths of the ticks of one run.
+
+    With jitter, they are between a fifth of the tick and five times as long.
+    """
     random, t = np.random.default_rng(5), 0.0
     while t < DURATION:
         length = dt * 5.0 ** random.uniform(-1.0, 1.0) if jitter else dt
@@ -132,7 +138,7 @@ def ticks_of(dt: float, jitter: bool) -> Iterator[float]:
         yield length
 
 
-# Shorter than a substep, and five of them.
+# One tick is shorter than a substep, and one has five substeps.
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.parametrize(
     ("robot", "dt"), [("iiwa7", 0.001), ("iiwa7", 0.01), pytest.param("panda", 0.01, marks=pytest.mark.slow)]
@@ -159,7 +165,7 @@ def test_the_contract_holds_at_every_tick(name: str, robot: str, dt: float) -> N
     # Only a start in penetration has no certificate at first.
     assert (contract.uncertified > 0) == (case.start is in_penetration)
     assert failed == 0 or case.fault in STOPPING_FAULTS
-    # After an absurd solution, which was followed as far as could be certified, rows may be late by a part of a stop.
+    # After an absurd solution, which was followed as far as it was certified, rows may be late by a part of a stop.
     assert unfounded <= (0.02 if case.fault == "absurd" else 0.001) * contract.ticks
     if case.recovers:
         assert StepStatus.RECOVERING in statuses

@@ -1,4 +1,4 @@
-"""A program that knows the public names alone takes the QP into its own hands."""
+"""A program that uses only public names solves the QP by itself."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ ANY = next(name for name in ("clarabel", "quadprog", "daqp") if name in qpsolver
 
 
 class Slowly:
-    """A cost on every joint's speed."""
+    """A task: a cost on every joint's speed."""
 
     def cost(self, q: Numbers, v: Numbers) -> tuple[Numbers, Numbers]:
         return 0.01 * np.eye(len(q)), np.zeros(len(q))
 
 
 class NotBackwards:
-    """The left tool does not move against the world's x."""
+    """A constraint: the left tool does not move backwards along the world's x."""
 
     hard = True
 
@@ -46,7 +46,7 @@ class NotBackwards:
 
 
 class OwnSolver:
-    """Solves the soft problem without its rows: projected gradients, which is good enough for the certificate."""
+    """A solver of the soft problem without rows, by projected gradients. The certificate needs no better one."""
 
     def solve(self, problem: QpProblem) -> QpSolution:
         v = np.clip(np.zeros_like(problem.g), problem.lower, problem.upper)
@@ -62,7 +62,7 @@ def cell() -> Config:
 
 
 @pytest.mark.slow
-def test_a_stranger_adds_a_task_and_a_constraint_and_solves_the_qp_by_a_solver_of_choice(cell: Config) -> None:
+def test_a_user_program_adds_a_task_and_a_constraint_and_solves_the_qp_with_its_own_solver(cell: Config) -> None:
     robot = Robot.from_config(cell)
     tasks: list[Task] = [LookAt(robot, (0.7, 0.0, 0.2), arms=["right"]), Slowly()]
     forwards = NotBackwards(robot)
@@ -91,7 +91,7 @@ def test_a_stranger_adds_a_task_and_a_constraint_and_solves_the_qp_by_a_solver_o
 
 
 @pytest.mark.slow
-def test_a_solver_of_a_strangers_own_keeps_every_distance(cell: Config) -> None:
+def test_a_user_program_with_its_own_solver_keeps_every_distance(cell: Config) -> None:
     robot, solver = Robot.from_config(cell), OwnSolver()
     typed: Solver = solver
     controller = CartesianController(robot, cell.control, solver=typed)

@@ -25,11 +25,11 @@ def tracker() -> TargetTracker:
 
 
 def _taken(tracker: TargetTracker) -> TaskTargets:
-    return tracker._targets  # kernels read them through ``pointer``, Python code need not
+    return tracker._targets  # Kernels read the targets through ``pointer``. Python code need not read them.
 
 
 def _update(tracker: TargetTracker, targets: dict[str, Any], dt: float, q: Array, v: Array) -> tuple[str, ...]:
-    """The names whose target is not usable, unknown names among them."""
+    """Return the names whose target is not usable, including unknown names."""
     known = tracker.offer(targets)
     return () if update_targets(_taken(tracker), q, v, dt) and known else tracker.rejected(targets)
 
@@ -61,7 +61,7 @@ UNUSABLE: dict[str, Callable[[], Any]] = {
 
 
 @pytest.mark.parametrize("bad", UNUSABLE.values(), ids=UNUSABLE.keys())
-def test_a_target_that_is_no_pose_is_named_and_the_last_one_stays(
+def test_a_target_that_is_not_a_pose_is_named_and_the_last_one_stays(
     tracker: TargetTracker, bad: Callable[[], Any]
 ) -> None:
     good = _pose(pin.exp3(np.array([0.1, 0.2, 0.3])))
@@ -74,7 +74,7 @@ def test_a_target_that_is_no_pose_is_named_and_the_last_one_stays(
     assert np.isfinite(taken.feed_forward).all()
 
 
-def test_a_target_of_an_arm_that_is_not_there_is_named(tracker: TargetTracker) -> None:
+def test_a_target_of_an_unknown_arm_is_named(tracker: TargetTracker) -> None:
     assert _update(tracker, {"left": _pose(), "third": _pose()}, 0.001, STILL, STILL) == ("third",)
 
 
@@ -115,7 +115,7 @@ TELEPORTS = {
 
 
 @pytest.mark.parametrize("elsewhere", TELEPORTS.values(), ids=TELEPORTS.keys())
-def test_a_target_that_is_put_elsewhere_has_no_velocity(tracker: TargetTracker, elsewhere: pin.SE3) -> None:
+def test_a_target_that_jumps_has_no_velocity(tracker: TargetTracker, elsewhere: pin.SE3) -> None:
     for pose in (_pose(), elsewhere, elsewhere):
         _update(tracker, {"left": pose}, 0.001, STILL, STILL)
         np.testing.assert_array_equal(_taken(tracker).feed_forward[0], 0.0)
@@ -131,7 +131,7 @@ def test_the_first_target_after_a_hold_or_a_reset_has_no_velocity(tracker: Targe
 
 
 @pytest.mark.parametrize("dt", [0.0, -0.001], ids=["no time", "time backwards"])
-def test_without_time_passing_a_target_has_no_velocity(tracker: TargetTracker, dt: float) -> None:
+def test_a_target_has_no_velocity_if_no_time_passes(tracker: TargetTracker, dt: float) -> None:
     for x in (0.5, 0.6):
         assert _update(tracker, {"left": _pose(None, np.array([x, 0.0, 0.4]))}, dt, STILL, STILL) == ()
         assert np.isfinite(_taken(tracker).feed_forward).all()

@@ -1,4 +1,4 @@
-"""Two arms at work close together: the contract at every tick, and motion that keeps its distance is not slowed."""
+"""Two arms work close together: the contract holds at every tick, and motion that keeps its distance is not slowed."""
 
 from __future__ import annotations
 
@@ -14,8 +14,9 @@ from tests.support.driven import Driven
 pytestmark = pytest.mark.slow
 
 CONFIG = load_config("config/dual_iiwa7.yaml")
-SETTINGS = CONFIG.control.model_copy(update={"solve_time_limit": None})  # no outcome hangs on the clock
-STILL = 3.0  # longer than the motions themselves wait: arms that block each other slide for a while [s]
+SETTINGS = CONFIG.control.model_copy(update={"solve_time_limit": None})  # No result depends on the clock.
+# Time at rest [s], which is longer than that of the motions, because arms that block each other slide for a while.
+STILL = 3.0
 
 
 @cache
@@ -25,24 +26,24 @@ def robot_of(free: bool) -> Robot:
 
 @cache
 def figures_of(name: str, free: bool = False) -> MotionFigures:
-    """Our figures in a work motion, or in free air on the same path."""
+    """Return our figures in a work motion, or in free air on the same path."""
     robot = robot_of(free)
     return run_motion(OwnController(robot, CONFIG), robot, WORK_MOTIONS[name])
 
 
 def rms(name: str, free: bool = False) -> float:
-    """Of the position error of the worse tool [mm]."""
+    """Return the RMS position error of the worse tool [mm]."""
     error = figures_of(name, free).rms_error_mm
     assert error is not None
     return error
 
 
-# Of the carries the nearest at the highest speed.
+# These are the nearest carries at the highest speed.
 CHECKED = [name for name in WORK_MOTIONS if not name.startswith("carry")] + ["carry-0.16-0.50"]
 
 
 @pytest.mark.parametrize("motion", [WORK_MOTIONS[name] for name in CHECKED], ids=CHECKED)
-def test_the_contract_holds_at_every_tick_of_work_without_fallback_and_it_ends_in_rest(motion: WorkMotion) -> None:
+def test_work_keeps_the_contract_at_every_tick_without_fallback_and_ends_in_rest(motion: WorkMotion) -> None:
     run = Driven(CartesianController(robot_of(free=False), SETTINGS))
     run.drive(motion.ends + STILL, lambda t, start: motion.targets(min(t, motion.ends), start))
     contract = run.contract
@@ -51,14 +52,14 @@ def test_the_contract_holds_at_every_tick_of_work_without_fallback_and_it_ends_i
     assert contract.tail_acceleration() < 0.1
 
 
-def test_arms_that_carry_something_close_together_follow_as_they_do_in_free_air() -> None:
+def test_arms_that_carry_something_close_together_follow_as_in_free_air() -> None:
     name = "carry-0.20-0.50"
     assert rms(name) <= 1.5 * rms(name, free=True)
     assert figures_of(name).fallback_percent == 0.0
 
 
 @pytest.mark.parametrize(("name", "time"), [("pass", 2.0), ("pass-back", 2.0), ("cross", 4.5), ("reach-under", 2.0)])
-def test_arms_get_past_each_other_where_there_is_a_way(name: str, time: float) -> None:
+def test_arms_get_past_each_other_if_there_is_a_way(name: str, time: float) -> None:
     arrival = figures_of(name).arrival_s
     assert arrival is not None
     assert arrival < time

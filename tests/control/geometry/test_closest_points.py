@@ -51,7 +51,10 @@ def _to_segment(point: Array, start: Array, end: Array) -> float:
 
 
 def _least_distance(segments: Segments) -> float:
-    """A convex quadratic on a square is least at its free minimum, if that is inside, or on one of the four sides."""
+    """The function is a convex quadratic.
+
+    On a square, it is least at its free minimum if that is inside, else on a side.
+    """
     a0, a1, b0, b1 = segments
     candidates = [_to_segment(a0, b0, b1), _to_segment(a1, b0, b1), _to_segment(b0, a0, a1), _to_segment(b1, a0, a1)]
     directions = np.column_stack([a1 - a0, b0 - b1])
@@ -65,7 +68,7 @@ def _least_distance(segments: Segments) -> float:
 def test_segments_are_as_far_apart_as_their_closest_points(kind: str) -> None:
     random = np.random.default_rng(1)
     on_a, on_b = np.zeros(3), np.zeros(3)
-    # Segments that are parallel but for rounding are measured in the middle of the overlap, not at its nearer end.
+    # Segments that are parallel except for rounding are measured in the middle of the overlap, not at its nearer end.
     tolerance = 1e-7 if kind == "nearly parallel" else 1e-9
     for _ in range(SAMPLES):
         segments = _segments(kind, random)
@@ -92,12 +95,12 @@ def _to_box(a0: npt.ArrayLike, a1: npt.ArrayLike, half: Array) -> BoxAnswer:
 
 
 def _outside(points: Array, half: Array) -> Array:
-    """Distance of points (..., 3) from a box; 0 inside."""
+    """Return the distance of points (..., 3) from a box; 0 inside."""
     return np.asarray(np.linalg.norm(points - np.clip(points, -half, half), axis=-1))
 
 
 def _nearest_along(a0: Array, a1: Array, half: Array) -> float:
-    """The squared distance is convex along the segment: halve where its slope changes sign."""
+    """The squared distance is convex along the segment. Bisection finds where its slope changes sign."""
     low, high = 0.0, 1.0
     for _ in range(100):
         middle = 0.5 * (low + high)
@@ -116,7 +119,7 @@ def _boxes_and_segments(count: int, spread: float = 1.0) -> Iterator[tuple[Array
         yield a0, a1, half
 
 
-def test_a_segment_outside_a_box_is_as_far_as_its_nearest_point() -> None:
+def test_the_distance_of_a_segment_outside_a_box_is_that_of_its_nearest_point() -> None:
     outside = 0
     for a0, a1, half in _boxes_and_segments(1000):
         expected = _nearest_along(a0, a1, half)
@@ -159,7 +162,7 @@ def test_special_positions_of_a_segment_and_a_box(a0: list[float], a1: list[floa
         _assert_witnesses(answer, np.array(start), np.array(end), half)
 
 
-def test_a_segment_that_enters_a_box_leaves_it_by_the_shortest_way_of_all_directions() -> None:
+def test_the_shortest_way_of_a_segment_out_of_a_box_is_found_among_all_directions() -> None:
     directions = np.random.default_rng(8).normal(size=(400, 3))
     directions = np.vstack([directions / np.linalg.norm(directions, axis=1, keepdims=True), np.eye(3), -np.eye(3)])
     entered = across = 0
@@ -173,7 +176,7 @@ def test_a_segment_that_enters_a_box_leaves_it_by_the_shortest_way_of_all_direct
         np.testing.assert_allclose(answer.on_box - answer.on_a, answer.distance * answer.normal, atol=1e-9)
         assert np.abs(np.abs(answer.on_box) - half).min() < 1e-9, "the way out ends on the box"
         across += np.abs(answer.normal).max() < 1.0 - 1e-9
-        # Moved by t n the segment is out once its nearest end has passed the box's farthest corner.
+        # A segment that moves by t n is outside when its nearest end has passed the farthest corner of the box.
         ways = np.abs(directions) @ half - np.minimum(directions @ a0, directions @ a1)
         assert -answer.distance <= ways.min() + 1e-9
         out = answer.distance * answer.normal

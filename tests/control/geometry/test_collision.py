@@ -14,9 +14,9 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 from tests.control.cells import NAMES, CellArrays, arrays_of, cell, distances, placed, random_posture
 
-# Coal finds capsule and capsule in closed form, capsule and box by iteration.
+# Coal computes capsule and capsule in closed form, and capsule and box by iteration.
 EXACT, ITERATED = 1e-9, 1e-4
-STEP = 1e-6  # of finite differences [rad]
+STEP = 1e-6  # Step of finite differences [rad].
 
 
 def _coal_distances(robot: Robot, q: Array) -> Array:
@@ -24,7 +24,7 @@ def _coal_distances(robot: Robot, q: Array) -> Array:
 
 
 def _core_distance(cell: CellArrays) -> Array:
-    """Distance (p,) below which the closed forms stop being smooth: the segment itself touches."""
+    """Return the distance (p,) below which the closed forms are not smooth, because the segment itself touches."""
     return np.asarray(-cell.bodies.radius[cell.pairs.first] - cell.bodies.radius[cell.pairs.second])
 
 
@@ -61,18 +61,18 @@ def _row(arrays: CellArrays, q: Array, p: int) -> Array:
 
 
 def _differences(arrays: CellArrays, q: Array, step: float) -> Array:
-    """Central differences (nv, p) of all distances."""
+    """Return central differences (nv, p) of all distances."""
     steps = step * np.eye(len(q))
     return (distances(arrays, q + steps) - distances(arrays, q - steps)) / (2 * step)
 
 
 def _assert_rows_are_gradients(arrays: CellArrays, q: Array) -> tuple[int, int]:
-    """Returns the numbers of pairs compared outside and in penetration."""
+    """Return the numbers of compared pairs outside and in penetration."""
     here = distances(arrays, q[None])[0]
     slopes, coarse = _differences(arrays, q, STEP), _differences(arrays, q, 10 * STEP)
     outside = penetrating = 0
     for p, distance in enumerate(here):
-        # Where the closest points jump there is no gradient: two step sizes disagree there.
+        # Where the closest points jump, there is no gradient. Two step sizes give different results there.
         smooth = np.abs(slopes[:, p] - coarse[:, p]).max() < 1e-4
         if distance < _core_distance(arrays)[p] + 1e-3 or not smooth:
             continue
@@ -91,7 +91,7 @@ def test_rows_are_the_gradients_of_the_distances(seed: int, name: str) -> None:
 
 
 def _way_bound(arrays: CellArrays, way: Array) -> Array:
-    """S (p,) of stop_certificate.py for joint ways (nv,)."""
+    """Return S (p,) of stop_certificate.py for joint ways (nv,)."""
     padded = np.concatenate([[0.0], way])
     return np.asarray((arrays.pairs.reach * padded[arrays.pairs.joint]).sum(axis=1))
 
@@ -103,7 +103,7 @@ def test_no_distance_changes_by_more_than_the_reach_times_the_joints_ways(seed: 
     q = random_posture(arrays.robot, random)
     other = np.clip(q + random.uniform(-size, size, len(q)), arrays.robot.position_lower, arrays.robot.position_upper)
     here, there = distances(arrays, np.array([q, other]))
-    # Where a box has a segment enter it over an edge, its way out is not continuous.
+    # Where a segment enters a box over an edge, its shortest way out is not continuous.
     comparable = np.minimum(here, there) > _core_distance(arrays) + 1e-9
     excess = np.abs(here - there) - _way_bound(arrays, np.abs(other - q))
     assert excess[comparable].max() <= 1e-12
@@ -121,7 +121,7 @@ SLIDING = """<robot name="slide"><link name="base"><collision><origin xyz="0.9 0
 <limit lower="-0.3" upper="0.3" velocity="1" effort="1"/></joint></robot>"""
 
 
-def test_slides_have_rows_and_reaches_too() -> None:
+def test_prismatic_joints_have_rows_and_reaches_too() -> None:
     arrays, random = (
         arrays_of(Robot.from_urdf(SLIDING, {"left": "tip"}, unchecked_links=["carriage", "turned"])),
         np.random.default_rng(13),

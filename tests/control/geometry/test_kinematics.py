@@ -34,7 +34,7 @@ def test_every_joint_frame_is_where_pinocchio_puts_it(name: str) -> None:
 
 
 def _model(*joints: object) -> pin.Model:
-    """A chain of joints, each offset and turned against the one before."""
+    """Return a chain of joints, each with an offset and a rotation relative to the one before."""
     model, parent = pin.Model(), 0
     for number, joint in enumerate(joints):
         offset = pin.SE3(pin.rpy.rpyToMatrix(0.3, -0.4, 0.5), np.array([0.1, 0.2, -0.3]))
@@ -42,7 +42,7 @@ def _model(*joints: object) -> pin.Model:
     return model
 
 
-def test_slides_and_oblique_axes_are_where_pinocchio_puts_them() -> None:
+def test_prismatic_joints_and_oblique_axes_are_where_pinocchio_puts_them() -> None:
     oblique = np.array([1.0, -2.0, 0.5]) / np.linalg.norm([1.0, -2.0, 0.5])
     turned, slid = pin.JointModelRevoluteUnaligned(oblique), pin.JointModelPrismaticUnaligned(oblique)
     model = _model(pin.JointModelRZ(), pin.JointModelPX(), turned, slid, pin.JointModelRY())
@@ -60,6 +60,6 @@ UNSUPPORTED: dict[str, Callable[[], object]] = {
 
 
 @pytest.mark.parametrize("joint", UNSUPPORTED.values(), ids=UNSUPPORTED.keys())
-def test_a_joint_that_is_neither_hinge_nor_slide_is_refused_by_name(joint: Callable[[], object]) -> None:
+def test_a_joint_that_is_neither_revolute_nor_prismatic_is_refused_by_name(joint: Callable[[], object]) -> None:
     with pytest.raises(RobotError, match=r"joint_1.*revolute and prismatic"):
         chain_of(_model(pin.JointModelRZ(), joint()))

@@ -24,7 +24,7 @@ ROUNDED = with_rounded_boxes(MODEL, np.where(TOUCHING, DEPTH, -0.02))
 
 
 def measured(model: CollisionModel, q: Array) -> tuple[Array, Array]:
-    """Every pair's distance and lower bound at a posture."""
+    """Return every pair's distance and lower bound at a posture."""
     data = CollisionData.empty(model)
     update_placements(model, data, q)
     count = len(NAMES)
@@ -38,7 +38,7 @@ def test_only_pairs_with_a_depth_see_a_rounded_box_and_never_a_larger_one(seed: 
     (distance, _), (rounded, bound) = measured(MODEL, q), measured(ROUNDED, q)
     np.testing.assert_array_equal(rounded[~TOUCHING], distance[~TOUCHING])
     more = (rounded - distance)[TOUCHING]
-    # Corners lose sqrt(3) - 1 of the radius, and what is deep inside is nearer to the smaller core's other sides.
+    # Corners lose sqrt(3) - 1 of the radius. A point deep inside is nearer to other sides of the smaller core.
     assert (more > -1e-9).all()
     outside = distance[TOUCHING] > 0.0
     assert (more[outside] <= (np.sqrt(3.0) - 1.0) * DEPTH + 1e-9).all()
@@ -50,7 +50,7 @@ def test_above_the_face_of_a_box_nothing_changes() -> None:
     np.testing.assert_allclose(rounded[TOUCHING], distance[TOUCHING], atol=1e-12)
 
 
-def test_the_cores_of_pairs_with_a_depth_are_that_much_farther_apart() -> None:
+def test_a_depth_increases_the_distance_of_cores_by_the_same_amount() -> None:
     first, second = ((model.bodies.radius[model.pairs.second])[TOUCHING] for model in (MODEL, ROUNDED))
     np.testing.assert_allclose(second - first, DEPTH)
 
@@ -60,7 +60,7 @@ CORES_APART = 0.03  # [m]
 
 
 def _looked_at(arrays: CellArrays, q: Array, p: int, smooth: bool = True) -> tuple[float, Array]:
-    """Distance of pair ``p`` and its row."""
+    """Return the distance of pair ``p`` and its row."""
     data, row = placed(arrays, q), np.zeros(len(q))
     distance = measure_smooth(arrays.collision, data, p, SMOOTHING) if smooth else measure(arrays.collision, data, p)
     distance_row(arrays.collision, data, p, row)
@@ -73,7 +73,7 @@ def _radii(arrays: CellArrays, p: int) -> float:
 
 @pytest.fixture(scope="module")
 def seen() -> list[tuple[Array, int]]:
-    """Postures and pairs, a box in some, whose cores are apart."""
+    """Return postures and pairs, some with a box, whose cores are apart."""
     arrays, random = cell("dual_iiwa7"), np.random.default_rng(21)
     found = []
     for _ in range(300):
@@ -84,7 +84,7 @@ def seen() -> list[tuple[Array, int]]:
     return found
 
 
-def test_the_smooth_distance_is_larger_than_the_distance_by_no_more_than_stated(seen: list[tuple[Array, int]]) -> None:
+def test_the_smooth_distance_exceeds_the_distance_by_no_more_than_stated(seen: list[tuple[Array, int]]) -> None:
     arrays = cell("dual_iiwa7")
     for q, p in seen:
         exact, smooth = _looked_at(arrays, q, p, smooth=False)[0], _looked_at(arrays, q, p)[0]
@@ -117,7 +117,7 @@ FIXED = {
 
 
 @pytest.mark.parametrize("kind", FIXED)
-def test_a_bar_that_tilts_over_another_body_turns_the_row_gradually_where_the_exact_one_jumps(kind: str) -> None:
+def test_a_bar_that_tilts_over_another_body_turns_the_row_gradually_where_the_exact_row_jumps(kind: str) -> None:
     quarter, fixed, height = FIXED[kind]
     urdf = LYING.format(quarter=quarter, fixed=fixed, height=height)
     arrays = arrays_of(Robot.from_urdf(urdf, {"left": "bar"}, unchecked_links=["beam"]))

@@ -1,4 +1,4 @@
-"""A step and the stop after it, as the kernels certify it and as dense samples."""
+"""A step and the stop after it, as the kernels certify them and as dense samples."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tests.control.cells import kernel_model
 
 ACCELERATION = 10.0
 H = 0.002
-DENSE = 500  # samples of a motion
+DENSE = 500  # Number of samples of a motion.
 
 
 @dataclass(frozen=True)

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from q2r2_control.control.safety.joint_limits import JointLimits, VelocityBox, fastest_towards, next_velocity_box
 from q2r2_control.types import Array
 
-JOINTS = 60  # stepped side by side
+JOINTS = 60  # Joints that are stepped side by side.
 STEPS = 800
 RETURN_SPEED = 0.2
-# Of what the accumulated rounding of positions may cost.
+# Tolerance for the accumulated rounding of positions.
 EXACT = 1e-9
 
 
@@ -30,7 +30,7 @@ def _box(q: Array, v: Array, bounds: JointLimits, h: float) -> tuple[VelocityBox
 
 
 def _stoppable(room: Array, v: Array, bounds: JointLimits) -> npt.NDArray[np.bool_]:
-    """P of joint_limits.py towards one side, with rounding."""
+    """Return property P of joint_limits.py towards one side, with rounding."""
     return np.where(
         v <= 0.0, room >= -EXACT, v**2 / (2 * bounds.acceleration) + bounds.longest_step * v <= room + EXACT
     )
@@ -42,7 +42,7 @@ def _keeps_p(q: Array, v: Array, bounds: JointLimits) -> bool:
 
 
 def _fastest_in_p(room: Array, bounds: JointLimits) -> Array:
-    """Largest speed for which P holds with this much room."""
+    """Return the largest speed for which property P holds with this much room."""
     a, H = bounds.acceleration, bounds.longest_step
     return np.minimum(bounds.velocity, -a * H + np.sqrt((a * H) ** 2 + 2 * a * np.maximum(room, 0.0)))
 
@@ -67,7 +67,7 @@ CHOICES: dict[str, Choice] = {
 
 @pytest.mark.parametrize("longest", [0.0005, 0.02], ids="longest step {} s".format)
 @pytest.mark.parametrize("choose", CHOICES.values(), ids=CHOICES.keys())
-def test_whatever_is_chosen_from_the_box_every_limit_holds_also_between_steps(choose: Choice, longest: float) -> None:
+def test_any_velocity_from_the_box_keeps_every_limit_also_between_steps(choose: Choice, longest: float) -> None:
     random = np.random.default_rng(6)
     bounds = _bounds(random, longest)
     q, v = _start_on_the_edge_of_p(random, bounds)
@@ -90,7 +90,7 @@ def test_whatever_is_chosen_from_the_box_every_limit_holds_also_between_steps(ch
 
 
 def _turning_point(v: Array, chosen: Array) -> Array:
-    """Share of the step at which a joint that turns round is at rest; its end where none turns."""
+    """Return the share of the step at which a reversing joint is at rest, or 1 if no joint reverses."""
     turns = v * chosen < 0.0
     return np.where(turns, v / np.where(turns, v - chosen, 1.0), 1.0)
 
@@ -103,7 +103,7 @@ def _turning_point(v: Array, chosen: Array) -> Array:
     part=st.floats(1e-3, 1.0),
 )
 @settings(derandomize=True, max_examples=500, deadline=None)
-def test_the_bound_is_the_fastest_that_can_still_stop(
+def test_the_bound_is_the_largest_velocity_that_can_still_stop(
     room: float, share: float, a: float, longest: float, part: float
 ) -> None:
     h = part * longest
@@ -115,7 +115,7 @@ def test_the_bound_is_the_fastest_that_can_still_stop(
 
 
 def _recover(q: Array, v: Array, bounds: JointLimits, choose: Choice, seconds: float) -> tuple[Array, Array]:
-    """Positions and velocities (t, n) of joints that start outside P; acceleration is checked on the way."""
+    """Return positions and velocities (t, n) of joints that start outside P. The acceleration is checked on the way."""
     random, h = np.random.default_rng(7), bounds.longest_step
     positions, velocities = [q], [v]
     for _ in range(int(seconds / h)):

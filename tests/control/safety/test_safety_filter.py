@@ -17,7 +17,7 @@ H = 0.002
 
 
 def started() -> SafetyData:
-    """At home, moving slowly with a certified stop, the box of the next step known."""
+    """Return a filter at home with slow motion, a certified stop, and the box of the next step."""
     data = kernel_data("dual_iiwa7", HOME, V).safety
     data.distance[:] = distances(cell("dual_iiwa7"), HOME[None])[0]
     assert certify_start(MODEL, data)
@@ -26,12 +26,12 @@ def started() -> SafetyData:
 
 
 def moved(data: SafetyData, wish: Array, usable: bool = True) -> int:
-    """The filter's answer to a wish."""
+    """Return the filter's answer to a wish."""
     outcome, _ = apply_safety_filter(MODEL, data, wish, usable, H, 1.0)
     return int(outcome)
 
 
-def test_a_wish_within_the_box_and_far_from_everything_is_followed_as_it_is() -> None:
+def test_a_wish_within_the_box_and_far_from_everything_is_followed_unchanged() -> None:
     data, wish = started(), V + np.linspace(0.008, -0.008, 14)
     assert moved(data, wish) == FOLLOWED
     np.testing.assert_array_equal(data.state.v, wish)
@@ -52,7 +52,7 @@ def test_a_wish_beyond_the_box_is_cut_to_it_joint_by_joint_and_the_joint_is_name
 
 @pytest.mark.parametrize("number", [np.nan, np.inf])
 @pytest.mark.parametrize("joint", [0, 13])
-def test_a_single_number_that_is_not_finite_makes_the_certified_stop_go_on(number: float, joint: int) -> None:
+def test_a_single_number_that_is_not_finite_continues_the_certified_stop(number: float, joint: int) -> None:
     data, wish = started(), V.copy()
     wish[joint] = number
     assert moved(data, wish) == STOPPED
@@ -62,7 +62,7 @@ def test_a_single_number_that_is_not_finite_makes_the_certified_stop_go_on(numbe
     np.testing.assert_array_equal(data.state.v, v)
 
 
-def test_a_wish_that_is_not_usable_is_not_looked_at() -> None:
+def test_an_unusable_wish_is_not_evaluated() -> None:
     data = started()
     assert moved(data, V, usable=False) == STOPPED
     assert (np.abs(data.state.v) <= np.abs(V)).all()

@@ -38,7 +38,7 @@ def _stays_beyond(model: CollisionModel, data: CollisionData, step: QuadraticPie
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_what_is_proven_is_true_all_along_the_step_and_little_room_suffices(name: str) -> None:
+def test_a_proven_separation_is_true_during_the_whole_step_and_needs_little_room(name: str) -> None:
     random, robot = np.random.default_rng(21), cell(name).robot
     proven = 0
     for _ in range(40):
@@ -56,19 +56,19 @@ def test_what_is_proven_is_true_all_along_the_step_and_little_room_suffices(name
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_pair_without_any_room_is_proven_to_part(name: str) -> None:
-    """The distance alone proves nothing then: half of the way that the joints travel would have to be free."""
+    """The distance alone would prove nothing, because half of the joints' way would have to be free."""
     random, robot = np.random.default_rng(22), cell(name).robot
     parted = 0
     for _ in range(40):
         q, step = random_posture(robot, random), 1e-6
         here = distances(cell(name), q[None])[0]
         gradient = (distances(cell(name), q + step * np.eye(len(q))) - here) / step
-        # The height of a first link above the table, say, is nobody's to change.
+        # No joint changes some distances, such as the height of a first link above the table.
         movable = np.abs(gradient).max(axis=0) > 0.01
         for p in np.flatnonzero((here > 1e-3) & (here < 0.3) & movable)[:4].tolist():
             away = gradient[:, p] / np.abs(gradient[:, p]).max()
             if np.abs(_difference(name, q, away, p) - gradient[:, p] @ away) > 1e-3:
-                continue  # the closest points jump here: there is no gradient
+                continue  # The closest points jump here, so that there is no gradient.
             apart, closer = (_prepared(name, q, np.zeros(len(q)), sign * 0.02 * away) for sign in (1.0, -1.0))
             parted += _proven(name, apart, p, float(here[p]) - 1e-9)
             assert not _proven(name, closer, p, float(here[p]) - 1e-9)

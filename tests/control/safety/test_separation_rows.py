@@ -18,7 +18,7 @@ H = 0.001
 
 
 class Seen:
-    """The measured distances, and the rows that are written, in one state whose joints can stop together."""
+    """The measured distances and the written rows in one state, whose joints can stop together."""
 
     def __init__(self, name: str, q: Array, v: Array) -> None:
         model, data = kernel_model(name).safety, kernel_data(name, q, v).safety
@@ -50,13 +50,13 @@ def test_distances_are_exact_where_they_matter_and_never_too_large(seed: int, na
     matters = exact <= STOP_DISTANCE
     np.testing.assert_allclose(seen.distance[matters], exact[matters], rtol=0, atol=1e-12)
     assert seen.distance[seen.closest] == pytest.approx(exact.min(), abs=1e-12)
-    # The stop certificate takes a bound below the least distance for a pair that is too close.
+    # For a pair that is too close, the stop certificate uses a bound below the least distance.
     assert (seen.distance[~matters] > STOP_DISTANCE).all()
 
 
 @given(seed=SEEDS, name=st.sampled_from(NAMES), speed=st.floats(0.05, 1.0))
 @settings(derandomize=True, max_examples=80, deadline=None)
-def test_a_pair_that_closes_in_fast_is_looked_at_in_time(seed: int, name: str, speed: float) -> None:
+def test_a_pair_that_approaches_fast_is_examined_early_enough(seed: int, name: str, speed: float) -> None:
     q, v = _state(name, seed, speed)
     seen, exact = Seen(name, q, v), distances(cell(name), q[None])[0]
     before, after = distances(cell(name), q + 1e-6 * np.array([[-1.0], [1.0]]) * v)
@@ -72,7 +72,7 @@ def _gradient(name: str, q: Array, p: int) -> Array:
 
 @given(seed=SEEDS, name=st.sampled_from(NAMES))
 @settings(derandomize=True, max_examples=80, deadline=None)
-def test_every_pair_that_is_too_close_is_asked_to_part_at_bounded_speed(seed: int, name: str) -> None:
+def test_every_pair_that_is_too_close_gets_a_row_that_parts_it_at_bounded_speed(seed: int, name: str) -> None:
     q, v = _state(name, seed, 0.0)
     seen, exact = Seen(name, q, v), distances(cell(name), q[None])[0]
     for p in np.flatnonzero(exact < STOP_DISTANCE - 1e-3).tolist():
@@ -84,14 +84,14 @@ def test_every_pair_that_is_too_close_is_asked_to_part_at_bounded_speed(seed: in
 
 
 def _least_free(name: str, q: Array, v: Array, duration: float, p: int) -> float:
-    """B: the least free distance of a pair on the stop of ``duration`` from (q, v), straight on in joint space."""
+    """Return B, the least free distance of a pair on a straight stop in joint space from (q, v)."""
     way = np.linspace(0.0, 0.5 * duration, 33)[:, None] * v
     return float(distances(cell(name), q + way)[:, p].min()) - STOP_DISTANCE
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_velocities_that_keep_the_rows_use_up_what_the_stop_leaves_free_no_faster_than_the_gain(name: str) -> None:
-    """And those that break them do: the rows are neither lax nor stricter than they say."""
+    """Velocities that break the rows use it up faster, so that the rows are neither too lax nor too strict."""
     random, kept, broken = np.random.default_rng(5), 0, 0
     for seed in range(150):
         q, v = _state(name, seed, 0.4)

@@ -16,7 +16,7 @@ from tests.control.safety.motions import ACCELERATION, H, Motion, motion_of
 
 
 def prepared(name: str, motion: Motion) -> tuple[SafetyData, float]:
-    """Data as the certificate has it before it looks at pairs, and the time of the bound [s]."""
+    """Return the data of the certificate before it examines pairs, and the time of the bound [s]."""
     model, data = kernel_model(name).safety, kernel_data(name, motion.q, motion.v).safety
     data.distance[:] = distances(cell(name), motion.q[None])[0]
     data.candidate.q[:] = motion.q_next
@@ -28,7 +28,7 @@ def prepared(name: str, motion: Motion) -> tuple[SafetyData, float]:
 
 
 def bounds_of(name: str, motion: Motion) -> Array:
-    """The least distance of each pair (p,) by its speed [m]."""
+    """Return the least distance of each pair (p,) by its speed [m]."""
     data, time = prepared(name, motion)
     bounds = np.zeros_like(data.distance)
     _least_distances(kernel_model(name).safety, data, time, bounds)
@@ -37,7 +37,7 @@ def bounds_of(name: str, motion: Motion) -> Array:
 
 @kernel
 def _least_distances(model: SafetyModel, data: SafetyData, time: float, out: Array) -> None:
-    """All pairs in one call, since a call from Python hands over all arrays of the model anew."""
+    """All pairs are computed in one call, because each call from Python passes all arrays of the model again."""
     for p in range(out.shape[0]):
         out[p] = least_distance(model, data, p, time)
 
@@ -50,7 +50,7 @@ def share_no_joint(name: str) -> Array:
     return cell(name).pairs.carried == 0
 
 
-def test_bodies_are_as_fast_as_their_places_change() -> None:
+def test_the_speed_of_bodies_is_that_of_their_places() -> None:
     random, robot = np.random.default_rng(60), cell("dual_panda").robot
     q, v = random_posture(robot, random), random.uniform(-1.0, 1.0, robot.model.nv)
     later, earlier = (placed(cell("dual_panda"), q + share * v).posed for share in (1e-6, -1e-6))
@@ -60,7 +60,7 @@ def test_bodies_are_as_fast_as_their_places_change() -> None:
 
 @pytest.mark.parametrize("shape", range(SHAPES), ids=["together", "arm by arm", "own"])
 @pytest.mark.parametrize("name", NAMES)
-def test_no_pair_comes_closer_than_its_speed_says_in_a_step_and_a_stop_of_any_shape(name: str, shape: int) -> None:
+def test_no_pair_comes_closer_in_a_step_and_any_stop_than_its_speed_bound_says(name: str, shape: int) -> None:
     random, robot = np.random.default_rng(61), cell(name).robot
     apart = share_no_joint(name)
     for _ in range(40):
@@ -71,7 +71,7 @@ def test_no_pair_comes_closer_than_its_speed_says_in_a_step_and_a_stop_of_any_sh
 
 
 def still_hand(q: Array, random: np.random.Generator) -> Array:
-    """Velocities (14,) that turn the left elbow about a hand at rest; the right arm rests."""
+    """Return velocities (14,) that turn the left elbow about a hand at rest. The right arm rests."""
     robot = cell("dual_iiwa7").robot
     data = robot.model.createData()
     pin.computeJointJacobians(robot.model, data, q)
@@ -82,7 +82,7 @@ def still_hand(q: Array, random: np.random.Generator) -> Array:
 @pytest.mark.parametrize(
     ("shape", "speed"), [(TOGETHER, 2.0), (OWN, 0.2)], ids=["the ways are curved", "joints rest one after the other"]
 )
-def test_a_hand_at_rest_whose_arm_moves_may_come_closer_while_that_stops(shape: int, speed: float) -> None:
+def test_a_hand_at_rest_on_a_moving_arm_may_come_closer_while_the_arm_stops(shape: int, speed: float) -> None:
     random, robot = np.random.default_rng(62), cell("dual_iiwa7").robot
     apart, moved = share_no_joint("dual_iiwa7"), 0
     for _ in range(40):
@@ -96,7 +96,7 @@ def test_a_hand_at_rest_whose_arm_moves_may_come_closer_while_that_stops(shape: 
 
 
 @pytest.mark.parametrize("speed", [0.01, 0.1], ids=["a stop as short as the step", "a long stop"])
-def test_the_bound_holds_and_leaves_little_room_where_joints_stop_together(speed: float) -> None:
+def test_the_bound_holds_and_is_tight_where_joints_stop_together(speed: float) -> None:
     random, robot = np.random.default_rng(64), cell("dual_iiwa7").robot
     apart, used = share_no_joint("dual_iiwa7"), []
     for _ in range(40):
@@ -106,11 +106,11 @@ def test_the_bound_holds_and_leaves_little_room_where_joints_stop_together(speed
         closer, bound = now - least_along("dual_iiwa7", motion), now - bounds_of("dual_iiwa7", motion)
         assert (closer <= bound + 1e-12)[apart].all()
         used.append((closer / bound)[apart].max())
-    assert np.median(used) > 0.6  # else it would prove little
+    assert np.median(used) > 0.6  # A smaller value would show that the bound is useless.
 
 
 @pytest.mark.parametrize("shape", [TOGETHER, OWN])
-def test_the_deviation_of_a_joint_counts_those_before_it_that_carry_it(shape: int) -> None:
+def test_the_deviation_of_a_joint_includes_the_joints_before_it_that_carry_it(shape: int) -> None:
     random, robot = np.random.default_rng(65), cell("dual_iiwa7").robot
     v, dv = random.uniform(-1, 1, 14), random.uniform(-1, 1, 14) * ACCELERATION * H
     motion = motion_of("dual_iiwa7", random_posture(robot, random), v, v + dv, shape)
@@ -128,7 +128,7 @@ def test_the_deviation_of_a_joint_counts_those_before_it_that_carry_it(shape: in
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_pairs_that_a_joint_carries_together_are_told_from_those_that_share_none(name: str) -> None:
+def test_pairs_that_one_joint_carries_together_are_distinguished_from_pairs_without_a_common_joint(name: str) -> None:
     model, pairs, bodies = cell(name).robot.model, cell(name).pairs, cell(name).bodies
     movers = [set(model.supports[int(joint)]) - {0} for joint in bodies.joint]
     together = [bool(movers[first] & movers[second]) for first, second in zip(pairs.first, pairs.second, strict=True)]
@@ -137,11 +137,11 @@ def test_pairs_that_a_joint_carries_together_are_told_from_those_that_share_none
     assert not all(together)
 
 
-STEP = 1e-6  # of finite differences [s]
+STEP = 1e-6  # Step of finite differences [s].
 
 
 def bounds_at(name: str, q: Array, v: Array) -> Array:
-    """Fastest approach (p,) of every pair [m/s]."""
+    """Return the fastest approach (p,) of every pair [m/s]."""
     model, data = kernel_model(name).safety.collision, kernel_data(name, q, v).safety
     bounds = np.zeros(len(model.pairs.first))
     _fastest_approaches(data.velocities, model.pairs.first, model.pairs.second, bounds)
@@ -155,7 +155,7 @@ def _fastest_approaches(velocities: BodyVelocities, first: IntArray, second: Int
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_no_pair_closes_in_faster_than_its_bound_and_some_come_near_it(name: str) -> None:
+def test_no_pair_approaches_faster_than_its_bound_and_some_come_near_it(name: str) -> None:
     random, robot = np.random.default_rng(51), cell(name).robot
     nearest = 0.0
     for _ in range(30):

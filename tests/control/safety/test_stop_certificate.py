@@ -22,7 +22,7 @@ MIN_DISTANCE = 0.02
 
 @given(v=st.floats(-3, 3), v_next=st.floats(-3, 3), h=st.floats(1e-5, 0.02))
 @settings(derandomize=True, max_examples=200, deadline=None)
-def test_the_way_of_a_step_counts_there_and_back(v: float, v_next: float, h: float) -> None:
+def test_the_way_of_a_step_includes_motion_there_and_back(v: float, v_next: float, h: float) -> None:
     t = np.linspace(0.0, h, 2001)
     q = v * t + 0.5 * (v_next - v) / h * t**2
     way = float(np.abs(np.diff(q)).sum())
@@ -30,7 +30,7 @@ def test_the_way_of_a_step_counts_there_and_back(v: float, v_next: float, h: flo
 
 
 def _least(name: str, motion: Motion) -> Array:
-    """Least distance (p,) of each pair along the whole motion; only a bound where it is far."""
+    """Return the least distance (p,) of each pair along the whole motion; for a far pair, only a bound."""
     samples = np.concatenate([motion.step(), motion.stop()])
     return np.asarray(distances(cell(name), samples, exact_below=0.05).min(axis=0))
 
@@ -60,7 +60,7 @@ def _motions_from(
 
 
 def _starts_apart(name: str, random: np.random.Generator, near: bool, count: int) -> Iterator[Array]:
-    """Postures with every pair apart; ``near``: on the way from one into a collision, just before it."""
+    """Yield postures in which every pair is apart. With ``near``, they are just before a collision on a way into it."""
     arrays, found = cell(name), 0
     while found < count:
         q, other = random_posture(arrays.robot, random), random_posture(arrays.robot, random)
@@ -79,7 +79,7 @@ def _starts_apart(name: str, random: np.random.Generator, near: bool, count: int
 @pytest.mark.parametrize("shape", range(SHAPES), ids=["together", "arm by arm", "own"])
 @pytest.mark.parametrize("near", [False, True], ids=["anywhere", "just before contact"])
 @pytest.mark.parametrize("name", NAMES)
-def test_nothing_comes_too_close_in_a_certified_motion_and_what_is_safe_by_far_is_certified(
+def test_nothing_comes_too_close_in_a_certified_motion_and_clearly_safe_motions_are_certified(
     name: str, near: bool, shape: int
 ) -> None:
     random = np.random.default_rng(15)
@@ -98,7 +98,7 @@ def test_nothing_comes_too_close_in_a_certified_motion_and_what_is_safe_by_far_i
 
 
 def _aimed_at_the_threshold(name: str, random: np.random.Generator, count: int, shape: int) -> Iterator[Motion]:
-    """Motions whose speed is scaled so that their stop ends within a hair of the least distance."""
+    """Yield motions whose speed is scaled so that their stop ends very near the least distance."""
     found = 0
     for motion in _motions_from(name, _starts_apart(name, random, True, 10 * count), random):
         low, high = 0.0, 2.0
@@ -119,7 +119,7 @@ def _aimed_at_the_threshold(name: str, random: np.random.Generator, count: int, 
 
 @pytest.mark.parametrize("shape", range(SHAPES), ids=["together", "arm by arm", "own"])
 @pytest.mark.parametrize("name", ["dual_iiwa7", "dual_panda"])
-def test_the_certificate_tells_motions_apart_that_end_just_inside_and_well_outside(name: str, shape: int) -> None:
+def test_the_certificate_distinguishes_motions_that_end_just_inside_and_well_outside(name: str, shape: int) -> None:
     accepted = total = 0
     for number, motion in enumerate(_aimed_at_the_threshold(name, np.random.default_rng(16), 6, shape)):
         if number % 2 == 0:
@@ -131,7 +131,9 @@ def test_the_certificate_tells_motions_apart_that_end_just_inside_and_well_outsi
 
 
 def _swings(random: np.random.Generator, count: int, dip: float) -> Iterator[Motion]:
-    """Steps that bring the nearest pair closer by ``dip`` [m] and away again, and stops that keep all pairs apart."""
+    """Yield steps that bring the nearest pair closer by ``dip`` [m] and away again, with stops that keep all pairs
+    apart.
+    """
     name, found = "dual_iiwa7", 0
     for q in _starts_apart(name, random, True, 20 * count):
         apart = distances(cell(name), q[None])[0]
@@ -148,7 +150,7 @@ def _swings(random: np.random.Generator, count: int, dip: float) -> Iterator[Mot
             return
 
 
-def test_a_pair_that_comes_too_close_within_a_step_is_refused_although_both_ends_are_apart() -> None:
+def test_a_pair_that_comes_too_close_within_a_step_is_refused_even_if_it_is_apart_at_both_ends() -> None:
     swings = list(_swings(np.random.default_rng(21), 8, dip=5e-4))
     assert len(swings) == 8
     for motion in swings:
@@ -158,7 +160,7 @@ def test_a_pair_that_comes_too_close_within_a_step_is_refused_although_both_ends
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_lower_bounds_in_place_of_distances_prove_nothing_that_is_not_so(name: str) -> None:
+def test_lower_bounds_in_place_of_distances_prove_nothing_false(name: str) -> None:
     arrays, random = cell(name), np.random.default_rng(17)
     for motion in _motions_from(name, _starts_apart(name, random, True, 20), random):
         exact = distances(arrays, motion.q[None])[0]
@@ -193,29 +195,30 @@ def test_a_pair_that_starts_too_close_comes_no_closer_in_a_certified_motion(name
     assert certified > 3
 
 
-def test_a_step_that_brings_a_pair_closer_which_is_too_close_is_refused_although_they_part_at_its_end() -> None:
+def test_a_step_that_brings_a_too_close_pair_closer_is_refused_even_if_the_pair_parts_at_its_end() -> None:
     name, found = "dual_iiwa7", 0
     for q in _too_close(cell(name), np.random.default_rng(22), 200):
         apart = distances(cell(name), q[None])[0]
         if np.partition(apart, 1)[1] < MIN_DISTANCE:
-            continue  # another pair is too close, and could be the reason
+            continue  # Another pair is too close and could be the reason.
         gradient = (distances(cell(name), q + 1e-6 * np.eye(len(q)))[:, apart.argmin()] - apart.min()) / 1e-6
-        parting = 0.01 * gradient / np.linalg.norm(gradient) ** 2  # at 0.01 m/s
+        parting = 0.01 * gradient / np.linalg.norm(gradient) ** 2  # The pair parts at 0.01 m/s.
         if _certified(name, motion_of(name, q, parting, parting)):
             found += 1
             assert not _certified(name, motion_of(name, q, -4.0 * parting, parting))
     assert found >= 10
 
 
-def test_digits_that_rounding_leaves_do_not_add_up_over_many_ticks() -> None:
+def test_rounding_errors_do_not_add_up_over_many_ticks() -> None:
     name, random = "dual_iiwa7", np.random.default_rng(23)
     for q in _starts_apart(name, random, True, 3):
-        for _ in range(2):  # to a start at the pair's distance
+        for _ in range(2):  # The iteration finds a start at the pair's distance.
             apart = distances(cell(name), q[None])[0]
             pair = apart.argmin()
             gradient = (distances(cell(name), q + 1e-6 * np.eye(len(q)))[:, pair] - apart.min()) / 1e-6
             q = q - (apart.min() - MIN_DISTANCE) * gradient / np.linalg.norm(gradient) ** 2
-        closing = -5e-9 * gradient / np.linalg.norm(gradient) ** 2  # at 5e-9 m/s, thus 5e-12 m a step
+        # The pair approaches at 5e-9 m/s, which is 5e-12 m per step.
+        closing = -5e-9 * gradient / np.linalg.norm(gradient) ** 2
         for _ in range(400):
             motion = motion_of(name, q, np.zeros_like(q), closing)
             q = motion.q_next if _certified(name, motion) else q
@@ -223,7 +226,7 @@ def test_digits_that_rounding_leaves_do_not_add_up_over_many_ticks() -> None:
 
 
 def _turning_at_its_end(name: str, random: np.random.Generator, count: int) -> Iterator[Motion]:
-    """Stops of all joints together out of postures that are too close, the fastest that are certified.
+    """Yield the fastest certified stops of all joints together from postures that are too close.
 
     A faster one brings a pair closer again, at its end.
     """
@@ -248,7 +251,7 @@ def test_a_pair_that_starts_too_close_comes_no_closer_between_the_samples_of_its
         found += 1
         close = np.flatnonzero(distances(arrays, motion.q[None])[0] < MIN_DISTANCE)
         way = distances(arrays, motion.stop(20 * DENSE), exact_below=MIN_DISTANCE, pairs=close)
-        # A pair that has come free may come closer again, as far as its distance.
+        # A pair that has come free may come closer again, up to its distance.
         fall = np.where(way[1:] < MIN_DISTANCE, way[:-1] - way[1:], 0.0)
         assert fall.max() < 1e-9
     assert found == 10
@@ -272,7 +275,7 @@ def _some_stop(seed: int) -> tuple[Array, Array, Array]:
     return random.uniform(-3, 3, 14), v, 10.0 ** random.uniform(0, 1.5, 14)
 
 
-def test_every_joint_stops_after_its_own_time_and_way() -> None:
+def test_every_joint_stops_after_its_own_time_and_distance() -> None:
     q, v, a = _some_stop(14)
     end, rest = _braked(q, v, a, 100.0)
     np.testing.assert_array_equal(rest, 0.0)
@@ -287,7 +290,7 @@ def test_every_joint_stops_after_its_own_time_and_way() -> None:
 
 @given(seed=st.integers(0, 1000), parts=st.lists(st.floats(1e-6, 0.1), min_size=1, max_size=40))
 @settings(derandomize=True, max_examples=100, deadline=None)
-def test_the_stop_is_the_same_motion_however_it_is_cut_into_ticks(seed: int, parts: list[float]) -> None:
+def test_the_stop_is_the_same_motion_for_any_lengths_of_ticks(seed: int, parts: list[float]) -> None:
     q, v, a = _some_stop(seed)
     expected = _braked(q, v, a, float(np.sum(parts)))
     for t in parts:
@@ -308,7 +311,7 @@ def _random_velocities(seed: int) -> Array:
 
 @given(seed=SEEDS)
 @settings(derandomize=True, max_examples=50, deadline=None)
-def test_joints_that_stop_together_go_straight_on_in_joint_space(seed: int) -> None:
+def test_joints_that_stop_together_move_on_a_straight_line_in_joint_space(seed: int) -> None:
     v = _random_velocities(seed)
     deceleration = _decelerations(HOME, v, TOGETHER)
     duration = np.abs(v / MODEL.limits.acceleration).max()
@@ -319,7 +322,7 @@ def test_joints_that_stop_together_go_straight_on_in_joint_space(seed: int) -> N
 
 @given(seed=SEEDS)
 @settings(derandomize=True, max_examples=50, deadline=None)
-def test_arm_by_arm_each_arm_stops_in_the_time_of_its_own_slowest_joint(seed: int) -> None:
+def test_arm_by_arm_each_arm_stops_in_the_time_of_its_slowest_joint(seed: int) -> None:
     v = _random_velocities(seed)
     v[7:] *= 0.1
     times = np.abs(v) / _decelerations(HOME, v, ARM_BY_ARM)
@@ -332,13 +335,16 @@ def test_arm_by_arm_each_arm_stops_in_the_time_of_its_own_slowest_joint(seed: in
 @given(seed=SEEDS)
 @settings(derandomize=True, max_examples=200, deadline=None)
 def test_every_shape_keeps_position_limits_at_every_moment_of_the_stop(shape: int, seed: int) -> None:
-    """Every joint, near a limit or not, starts as fast as property P allows; the slow ones would drift on for long."""
+    """Every joint, near a limit or not, starts as fast as property P allows.
+
+    Slow joints would drift for a long time.
+    """
     random, limits, h = np.random.default_rng(seed), MODEL.limits, 0.001
     room = 10.0 ** random.uniform(-6, 0, 14)
     ahead = np.asarray(random.choice([-1.0, 1.0], 14), dtype=float)
     limit = np.where(ahead > 0, limits.upper, limits.lower)
     q = limit - ahead * room
-    # The largest speed that P allows: v^2 / 2a + H v = room.
+    # This is the largest speed that P allows: v^2 / 2a + H v = room.
     a, longest = limits.acceleration, limits.longest_step
     fastest = np.minimum(a * (-longest + np.sqrt(longest**2 + 2 * room / a)), limits.velocity)
     v = ahead * fastest * np.asarray(random.choice([1.0 - 1e-9, 0.5, 0.01], 14), dtype=float)

@@ -20,7 +20,7 @@ LIMIT, DT = 0.25, 0.002
 
 
 def speeds_along(name: str, motion: Motion) -> tuple[float, float]:
-    """The fastest tool at the motion's begin, and in all of its step and its stop [m/s]."""
+    """Return the speed of the fastest tool at the motion's begin, and in the whole step and stop [m/s]."""
     robot = cell(name).robot
     tools, t = MeasuredToolSpeeds(robot), np.linspace(0.0, 1.0, 30)[:, None]
     in_step = motion.v + t * (motion.v_next - motion.v)
@@ -55,7 +55,7 @@ def test_no_tool_is_faster_than_the_bound_in_a_step_and_a_stop_of_any_shape(name
 
 
 class Pushing:
-    """A solver that drives all joints as fast as the box allows, this way or that for a while."""
+    """A solver that drives all joints as fast as the box allows, for a while in one direction, then in the other."""
 
     def __init__(self) -> None:
         self._random, self._left, self._signs = np.random.default_rng(72), 0, np.ones(1)
@@ -72,7 +72,7 @@ def limited(robot: Robot, solver: Solver | None = None) -> CartesianController:
     return CartesianController(robot, settings.model_copy(update={"tool_speed_limit": LIMIT}), solver=solver)
 
 
-def test_a_solver_that_pushes_moves_no_tool_faster_at_between_and_after_any_tick(robot: Robot) -> None:
+def test_a_solver_that_pushes_makes_no_tool_too_fast_at_between_or_after_ticks(robot: Robot) -> None:
     controller = limited(robot, solver=Pushing())
     contract, fastest = Contract(controller, sample_all=True), 0.0
     for _ in range(450):
@@ -83,7 +83,7 @@ def test_a_solver_that_pushes_moves_no_tool_faster_at_between_and_after_any_tick
     assert contract.margins["tool_speed"].checked > 400
 
 
-def test_a_tool_goes_near_its_limit_to_a_far_target_arrives_and_its_report_names_no_limit(robot: Robot) -> None:
+def test_a_tool_moves_near_its_limit_to_a_far_target_and_its_report_at_rest_names_no_limit(robot: Robot) -> None:
     controller = limited(robot)
     contract, goal = Contract(controller), controller.tool_pose("left")
     goal.translation += [0.1, 0.2, 0.1]
@@ -99,14 +99,14 @@ def test_a_tool_goes_near_its_limit_to_a_far_target_arrives_and_its_report_names
 
 
 def fast_start(robot: Robot) -> Array:
-    """Joint velocities (nv,) with which the left tool moves at three times its limit [rad/s]."""
+    """Return joint velocities (nv,) with which the left tool moves at three times its limit [rad/s]."""
     data = robot.model.createData()
     pin.computeJointJacobians(robot.model, data, robot.home)
     J = pin.getFrameJacobian(robot.model, data, robot.arms["left"].frame_id, pin.LOCAL_WORLD_ALIGNED)[:3]
     return np.asarray(np.linalg.pinv(J) @ [0.0, 0.0, 3.0 * LIMIT])
 
 
-def test_a_tool_that_starts_too_fast_is_braked_until_it_is_not_and_its_report_says_why(robot: Robot) -> None:
+def test_a_tool_that_starts_too_fast_is_braked_and_its_report_says_why(robot: Robot) -> None:
     controller, v = limited(robot, solver=Pushing()), fast_start(robot)
     controller.reset(robot.home, v)
     tools, before, certified = MeasuredToolSpeeds(robot), 3.0 * LIMIT, []

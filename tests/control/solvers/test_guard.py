@@ -1,4 +1,4 @@
-"""No solver reaches the controller's arrays, and none makes a step raise."""
+"""No solver can change the controller's arrays, and no solver makes a step raise."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ NV = ROBOT.model.nv
 
 
 class Answering:
-    """Returns, or raises, what it was made with."""
+    """A solver that returns, or raises, the given answer."""
 
     def __init__(self, answer: Any) -> None:
         self.answer = answer
@@ -66,7 +66,7 @@ NO_SOLUTIONS: dict[str, Any] = {
 
 
 @pytest.mark.parametrize("answer", NO_SOLUTIONS.values(), ids=NO_SOLUTIONS)
-def test_what_is_no_solution_is_a_failed_solve_and_the_arms_stop(answer: Any) -> None:
+def test_an_answer_that_is_no_solution_is_a_failed_solve_and_the_arms_stop(answer: Any) -> None:
     controller = CartesianController(ROBOT, ControllerSettings(), solver=Answering(answer))
     reference = controller.step({arm: controller.tool_pose(arm) for arm in ROBOT.arms}, DT)
     assert reference.report.unsolved == 1
@@ -77,7 +77,7 @@ def test_what_is_no_solution_is_a_failed_solve_and_the_arms_stop(answer: Any) ->
 
 
 class Writer:
-    """Opens every limit that it is handed, and answers what those would allow."""
+    """A solver that opens every limit that it gets, and answers with what those would allow."""
 
     def solve(self, problem: QpProblem) -> QpSolution:
         problem.lower[:], problem.upper[:] = -1e6, 1e6
@@ -86,7 +86,7 @@ class Writer:
         return QpSolution(np.full(NV, 1e6), 0.0)
 
 
-def test_a_solver_that_writes_into_the_limits_moves_none_of_them() -> None:
+def test_a_solver_that_writes_into_the_limits_changes_none_of_them() -> None:
     controller = CartesianController(ROBOT, ControllerSettings(), solver=Writer())
     home = {arm: controller.tool_pose(arm) for arm in ROBOT.arms}
     v = np.zeros(NV)
@@ -119,7 +119,7 @@ class UnprintableError(Exception):
 
 
 class Panic(BaseException):
-    """As a library in Rust raises it."""
+    """An exception like that of a library in Rust."""
 
 
 @pytest.mark.parametrize("error", [UnprintableError(), Panic("at the disco")], ids=["unprintable", "panic"])
@@ -157,21 +157,21 @@ def problem_of(H: Any, g: Any) -> QpProblem:
         pytest.param(problem_of(1e-20 * np.eye(NV), ZEROS), "too flat", id="too flat"),
     ],
 )
-def test_no_solver_is_asked_about_a_problem_that_libraries_loop_at(problem: QpProblem, told: str) -> None:
+def test_no_solver_gets_a_problem_in_which_libraries_loop_for_ever(problem: QpProblem, told: str) -> None:
     guard = Guard(Raising(AssertionError("asked")), NV)
     assert guard.solve(problem).v is None
     assert re.search(told, str(guard.failure))
 
 
 class Blocking:
-    """Finds a solution too late, and says that it took no time."""
+    """A solver that finds a solution too late, and reports that it took no time."""
 
     def solve(self, problem: QpProblem) -> QpSolution:
         time.sleep(0.02)
         return QpSolution(np.zeros(NV), 0.0)
 
 
-def test_a_solver_that_blocks_is_late_whatever_it_says() -> None:
+def test_a_solver_that_blocks_counts_as_late_whatever_it_reports() -> None:
     controller = CartesianController(ROBOT, ControllerSettings().timed(realtime=True), solver=Blocking())
     report = controller.step({"left": controller.tool_pose("left")}, DT).report
     assert report.unsolved == 1

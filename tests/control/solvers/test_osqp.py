@@ -1,4 +1,4 @@
-"""OSQP, set up once, finds DAQP's solution of one problem after another, with few rows and with many."""
+"""OSQP, which is set up once, finds DAQP's solutions of successive problems, with few rows and with many."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def _problem(random: np.random.Generator, rows: int) -> QpProblem:
     return QpProblem(J.T @ J + 0.1 * np.eye(NV), random.normal(size=NV), middle - width, middle + width, matrix, lower)
 
 
-def test_osqp_finds_the_solution_of_daqp_whatever_the_number_of_rows() -> None:
+def test_osqp_finds_the_solution_of_daqp_for_any_number_of_rows() -> None:
     random, osqp, daqp = np.random.default_rng(3), OsqpSolver(NV), DaqpSolver(NV)
     for rows in (0, 5, 0, 17, 3, 60, 1):
         problem = _problem(random, rows)

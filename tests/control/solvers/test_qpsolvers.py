@@ -1,4 +1,4 @@
-"""Every solver that is installed leads the arms as DAQP does, prints nothing, and raises nothing that a step shows."""
+"""Every installed solver leads the arms as DAQP does, prints nothing, and raises nothing that a step shows."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ DT = 0.002
 ROBOT = cell("dual_iiwa7").robot
 NV = ROBOT.model.nv
 INSTALLED = [name for name in SOLVERS if name in (*OURS, *qpsolvers.available_solvers)]
-FAR_M = 2e-3  # that first-order solvers lead a tool from where DAQP does
+FAR_M = 2e-3  # Largest distance of a tool from where DAQP leads it. It allows for first-order solvers.
 
 
 @contextmanager
 def silence(capfd: pytest.CaptureFixture[str]) -> Iterator[None]:
-    """Fail if something is printed in the block, also by a library, or warned of."""
-    capfd.readouterr()  # of solvers as they are made: HiGHS says on stderr that it is there, once
+    """Fail if something is printed in the block, also by a library, or if there is a warning."""
+    capfd.readouterr()  # This output came from making the solvers: HiGHS prints a line on stderr once.
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         yield
@@ -40,7 +40,7 @@ def silence(capfd: pytest.CaptureFixture[str]) -> Iterator[None]:
 
 
 def _driven(controller: CartesianController, ticks: int) -> tuple[Array, int]:
-    """Send the tools to each other; returns the postures of the run and the number of unsolved ticks."""
+    """Send the tools to each other, and return the postures of the run and the number of unsolved ticks."""
     home = {arm: controller.tool_pose(arm) for arm in ROBOT.arms}
     contract, q, unsolved = Contract(controller), [], 0
     for tick in range(ticks):
@@ -72,7 +72,7 @@ def test_arms_go_with_each_solver_where_they_go_with_daqp(name: str, capfd: pyte
 
 
 @pytest.mark.parametrize("name", INSTALLED)
-def test_a_problem_that_nothing_solves_is_a_failed_solve_and_the_next_one_is_solved(
+def test_a_problem_without_a_solution_is_a_failed_solve_and_the_next_one_is_solved(
     name: str, capfd: pytest.CaptureFixture[str]
 ) -> None:
     solver, random = make_solver(name, NV), np.random.default_rng(2)
@@ -88,7 +88,7 @@ def test_a_problem_that_nothing_solves_is_a_failed_solve_and_the_next_one_is_sol
 
 
 @pytest.mark.parametrize("name", [name for name in INSTALLED if name not in OURS])
-def test_a_row_that_no_velocity_can_break_is_taken_without_a_word(name: str, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_row_that_no_velocity_can_break_causes_no_message(name: str, capfd: pytest.CaptureFixture[str]) -> None:
     solver = make_solver(name, NV)
     problem = _problem(np.random.default_rng(4), 5)
     problem.rows_lower[:3] = -1e11
@@ -96,7 +96,7 @@ def test_a_row_that_no_velocity_can_break_is_taken_without_a_word(name: str, cap
         assert solver.solve(problem).v is not None
 
 
-def test_what_is_printed_as_a_solver_is_made_goes_to_stderr(
+def test_the_output_of_making_a_solver_goes_to_stderr(
     capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class Loud:
@@ -110,7 +110,7 @@ def test_what_is_printed_as_a_solver_is_made_goes_to_stderr(
 
 
 @pytest.mark.skipif("highs" not in INSTALLED, reason="HiGHS is not installed")
-def test_an_iteration_limit_that_is_reached_is_a_failed_solve() -> None:
+def test_reaching_the_iteration_limit_is_a_failed_solve() -> None:
     problem = _problem(np.random.default_rng(5), 40)
     assert make_solver("highs", NV, options={"qp_iteration_limit": 1}).solve(problem).v is None
     assert make_solver("highs", NV).solve(problem).v is not None

@@ -1,4 +1,4 @@
-"""Solvers are found by their names, in settings and in Python, and one that is not there is told in one line."""
+"""Solvers are found by their names, in settings and in Python, and a missing solver gives one line."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.control.cells import cell
 ROBOT = cell("dual_iiwa7").robot
 
 
-def test_an_unknown_solver_is_one_line_with_those_that_are_there_and_the_way_to_the_rest() -> None:
+def test_an_unknown_solver_gives_one_line_with_the_installed_ones_and_the_way_to_others() -> None:
     with pytest.raises(ConfigError) as caught:
         CartesianController(ROBOT, ControllerSettings(solver="osqb"))
     line = str(caught.value)
@@ -24,7 +24,7 @@ def test_an_unknown_solver_is_one_line_with_those_that_are_there_and_the_way_to_
     assert line.endswith("pip install 'qpsolvers[open-source-solvers]'")
 
 
-def test_a_solver_that_is_known_and_not_installed_is_told_with_its_own_pip_line() -> None:
+def test_a_known_solver_that_is_not_installed_is_named_with_its_pip_line() -> None:
     missing = next(name for name in ("gurobi", "mosek", "cvxopt") if name not in qpsolvers.available_solvers)
     with pytest.raises(ConfigError, match=rf"pip install 'qpsolvers\[{missing}\]'$"):
         CartesianController(ROBOT, solver=missing)
@@ -36,17 +36,17 @@ def test_an_option_that_a_solver_does_not_have_is_refused_at_the_start(name: str
         CartesianController(ROBOT, ControllerSettings(solver=name, solver_options={"colour": 1}))
 
 
-def test_a_name_in_python_takes_the_place_of_the_settings() -> None:
+def test_a_name_in_python_replaces_that_of_the_settings() -> None:
     assert CartesianController(ROBOT, ControllerSettings(), solver="osqp").settings.solver == "osqp"
 
 
 @pytest.mark.parametrize("solver", [object(), 3, ["osqp"]], ids=["object", "number", "list"])
-def test_what_is_neither_a_name_nor_a_solver_is_refused(solver: Any) -> None:
+def test_an_argument_that_is_neither_a_name_nor_a_solver_is_refused(solver: Any) -> None:
     with pytest.raises(ConfigError, match="allowed: a solver's name, a Solver, or None"):
         CartesianController(ROBOT, ControllerSettings(), solver=solver)
 
 
-def test_options_are_for_the_solver_that_the_settings_name() -> None:
+def test_options_apply_only_to_the_solver_of_the_settings() -> None:
     settings = ControllerSettings(solver="daqp", solver_options={"iter_limit": 500})
     assert settings.with_solver(None) is settings.with_solver("daqp") is settings
     other = settings.with_solver("osqp")

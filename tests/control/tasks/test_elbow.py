@@ -1,4 +1,4 @@
-"""Tasks in NumPy: the elbow's swivel alone and in the controller, and one that another package brings."""
+"""Tasks in NumPy: the elbow's swivel alone and in the controller, and a task of another package."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.support.driven import Driven
 from tests.support.modules import blocks_of, install
 
 
-def test_the_angle_is_that_between_the_planes_through_the_line_up_and_to_the_elbow() -> None:
+def test_the_swivel_is_the_angle_between_the_vertical_plane_and_the_plane_of_the_elbow() -> None:
     robot, random = cell("dual_iiwa7").robot, np.random.default_rng(31)
     task, data = ElbowSwivel(robot, {"left": None}), robot.model.createData()
     for _ in range(50):
@@ -32,7 +32,7 @@ def test_the_angle_is_that_between_the_planes_through_the_line_up_and_to_the_elb
         assert task.angle("left", q) == pytest.approx(np.arctan2(sine, up @ out), abs=1e-9)
 
 
-def test_the_cost_pulls_along_the_angles_gradient_and_does_not_move_the_tool() -> None:
+def test_the_cost_pulls_along_the_gradient_of_the_angle_and_does_not_move_the_tool() -> None:
     robot, random = cell("dual_iiwa7").robot, np.random.default_rng(32)
     for _ in range(20):
         q = random_posture(robot, random)
@@ -48,7 +48,10 @@ def test_the_cost_pulls_along_the_angles_gradient_and_does_not_move_the_tool() -
 
 
 def run(angles: dict[str, float | None], start: Array) -> tuple[ElbowSwivel, Array, float]:
-    """Final posture and motion of the tools [m], while both keep their pose; the contract holds at every tick."""
+    """Return the final posture and the motion of the tools [m], which keep their pose.
+
+    The contract holds at every tick.
+    """
     robot = cell("dual_iiwa7").robot
     run = Driven(CartesianController(robot, ControllerSettings(tasks={"swivel": {"angles": angles}})), start)
     run.drive(4.0, run.start)
@@ -87,7 +90,7 @@ def test_a_stretched_arm_has_no_elbow_to_turn_and_rests() -> None:
         ({"angles": {"left": 0.1}, "joints": 5}, "joints = 5: allowed: three, at shoulder, elbow and wrist"),
     ],
 )
-def test_settings_that_mean_nothing_are_refused_by_name(settings: dict[str, object], told: str) -> None:
+def test_meaningless_settings_are_refused_by_name(settings: dict[str, object], told: str) -> None:
     with pytest.raises(ConfigError, match=told):
         CartesianController(cell("dual_iiwa7").robot, ControllerSettings(tasks={"swivel": settings}))
 
@@ -105,13 +108,15 @@ ENTRIES = "[q2r2_control.tasks]\nelbow = elbow_package:KeepElbowsOut\nbroken = e
 
 @pytest.fixture(autouse=True)
 def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """An installed package with two tasks, one as docs/extending.md has it."""
+    """Return an installed package with two tasks, one of which is that of docs/extending.md."""
     install(tmp_path, "elbow_package", "\n".join([*blocks_of("docs/extending.md", "python"), BROKEN]), ENTRIES)
     monkeypatch.syspath_prepend(tmp_path)
 
 
 def moved_by(settings: ControllerSettings) -> float:
-    """Final angle of the left arm's third joint while both tools keep their pose; the contract holds at every tick."""
+    """Return the final angle of the left arm's third joint while both tools keep their pose, with the contract at every
+    tick.
+    """
     robot = cell("dual_iiwa7").robot
     controller = CartesianController(robot, settings)
     reference = Driven(controller).drive(2.0, lambda _, start: start)
@@ -119,12 +124,12 @@ def moved_by(settings: ControllerSettings) -> float:
     return float(reference.q[2] - robot.home[2])
 
 
-def test_a_task_of_another_package_moves_the_arm_within_every_promise() -> None:
+def test_a_task_of_another_package_moves_the_arm_and_every_promise_holds() -> None:
     settings = {"angle": float(cell("dual_iiwa7").robot.home[2]) + 0.3, "weight": 0.1}
     assert moved_by(ControllerSettings(tasks={"elbow": settings})) > 0.1
 
 
-def test_a_cost_that_is_no_number_is_not_used() -> None:
+def test_a_cost_that_is_not_finite_is_not_used() -> None:
     assert moved_by(ControllerSettings(tasks={"broken": {}})) == pytest.approx(moved_by(ControllerSettings()), abs=1e-9)
 
 

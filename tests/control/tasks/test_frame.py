@@ -67,7 +67,7 @@ def test_a_rotation_vector_is_pinocchios_logarithm(angle: float) -> None:
 
 
 @pytest.mark.parametrize("below", [0.0, 1e-15, 1e-12, 1e-8], ids="pi less {} rad".format)
-def test_half_a_turn_has_a_rotation_vector_about_one_side_of_its_axis(below: float) -> None:
+def test_the_rotation_vector_of_half_a_turn_has_one_of_the_two_directions_of_its_axis(below: float) -> None:
     random = np.random.default_rng(22)
     for axis in [*np.eye(3), *-np.eye(3), *random.normal(size=(50, 3))]:
         R = pin.exp3((np.pi - below) * axis / np.linalg.norm(axis))
@@ -122,7 +122,7 @@ def test_a_tool_task_is_the_weighted_square_of_its_twist_error() -> None:
     np.testing.assert_allclose(g, -0.1 * J.T @ W @ twist, atol=1e-12)
 
 
-# (position and rotation weights) -> what of the pose is reached: position along x, y, z, then the tool's own z axis.
+# The keys are position and rotation weights. The values are the reached parts: x, y, z, then the tool's own z axis.
 PARTS = {
     "position only": ((1, 1, 1), (0, 0, 0), (True, True, True), False),
     "rotation only": ((0, 0, 0), (1, 1, 1), (False, False, False), True),
@@ -132,7 +132,7 @@ PARTS = {
 
 
 @pytest.mark.parametrize("name", PARTS)
-def test_a_tool_reaches_the_part_of_a_pose_that_has_weight_and_leaves_the_rest_to_the_posture(name: str) -> None:
+def test_a_tool_reaches_the_weighted_parts_of_a_pose_and_the_posture_decides_the_rest(name: str) -> None:
     along, about, reached, upright = PARTS[name]
     settings = ControllerSettings(position_weights=along, rotation_weights=about)
     controller = CartesianController(cell("dual_iiwa7").robot, settings)

@@ -1,4 +1,4 @@
-"""Each task that a YAML names is reached by the QP, comes to rest, and changes nothing about the contract."""
+"""Each task that a YAML names reaches its goal, comes to rest, and keeps the contract."""
 
 from __future__ import annotations
 
@@ -16,11 +16,13 @@ from q2r2_control.types import Array
 from tests.control.cells import cell, random_posture
 from tests.support.driven import Driven
 
-DOWN = (0.0, 0.0, -1.0)  # a tool's z at home points down, so its -z points up
+DOWN = (0.0, 0.0, -1.0)  # The z axis of a tool at home points down, so that its -z axis points up.
 
 
 def driven(tasks: dict[str, Any], moved: dict[str, pin.SE3] | None = None, **settings: Any) -> Driven:
-    """After 5 s towards the tools at the start, or those ``moved`` in the world; the contract held at every tick."""
+    """Drive for 5 s towards the tools at the start, or to those ``moved`` in the world, with the contract at every
+    tick.
+    """
     robot = cell("dual_iiwa7").robot
     run = Driven(CartesianController(robot, ControllerSettings(tasks=tasks, **settings)))
     goals = {
@@ -33,7 +35,7 @@ def driven(tasks: dict[str, Any], moved: dict[str, pin.SE3] | None = None, **set
     return run
 
 
-def test_a_joint_goes_to_its_position_and_the_tools_stay() -> None:
+def test_a_joint_moves_to_its_position_and_the_tools_stay() -> None:
     robot = cell("dual_iiwa7").robot
     run = driven({"joints": {"positions": {"left_A3": robot.home[2] + 0.3}}})
     assert run.q[2] == pytest.approx(robot.home[2] + 0.3, abs=0.02)
@@ -50,7 +52,7 @@ def test_a_tool_looks_at_a_point_and_stays_where_it_is() -> None:
     np.testing.assert_allclose(tool.translation, run.start["left"].translation, atol=1e-3)
 
 
-def test_a_tool_leans_no_farther_than_its_cone_however_far_its_target_does() -> None:
+def test_a_tool_tilts_no_farther_than_its_cone_for_any_target() -> None:
     tilted = pin.SE3(pin.exp3(np.array([0.6, 0.0, 0.0])), np.zeros(3))
     run = driven({"upright": {"angle": 0.2, "axis": DOWN, "arms": ["left"]}}, {"left": tilted, "right": tilted})
     lean = {arm: math.acos(run.controller.tool_pose(arm).rotation[:, 2] @ DOWN) for arm in run.start}
@@ -58,14 +60,14 @@ def test_a_tool_leans_no_farther_than_its_cone_however_far_its_target_does() -> 
     assert lean["right"] == pytest.approx(0.6, abs=1e-3)
 
 
-def test_within_its_cone_a_tool_pays_nothing() -> None:
+def test_a_tool_within_its_cone_has_no_cost() -> None:
     robot = cell("dual_iiwa7").robot
     H, g = Upright(robot, 0.2, axis=DOWN).cost(robot.home, robot.home)
     assert not H.any()
     assert not g.any()
 
 
-def test_two_tools_keep_their_pose_to_each_other_where_only_one_is_led() -> None:
+def test_two_tools_keep_their_relative_pose_if_only_one_has_a_target() -> None:
     led = pin.SE3(pin.exp3(np.array([0.0, 0.0, 0.1])), np.array([0.0, 0.0, 0.08]))
     run = driven({"relative": {"weight": 1000.0}}, {"left": led})
     start = run.start["left"].actInv(run.start["right"])
@@ -75,7 +77,7 @@ def test_two_tools_keep_their_pose_to_each_other_where_only_one_is_led() -> None
     assert np.linalg.norm(pin.log3(start.rotation.T @ now.rotation)) < 5e-3
 
 
-def test_the_velocity_that_a_tool_looks_with_reduces_its_error_also_while_it_passes_by() -> None:
+def test_a_tool_that_looks_at_a_point_reduces_its_error_also_while_it_passes_by() -> None:
     robot, random = cell("dual_iiwa7").robot, np.random.default_rng(5)
     point = np.array([0.5, 0.1, 0.4])
 

@@ -1,4 +1,4 @@
-"""The nullspace alone, then a posture that is given at every tick: elbows go there, promises stay."""
+"""The nullspace alone, then a posture that is given at every tick: elbows reach it, and all promises hold."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def controller(robot: Robot) -> CartesianController:
 
 
 def swung(robot: Robot, arm: str, way: float) -> Array:
-    """Home with one elbow swung by ``way`` [rad], to first order, which leaves the tool where it is."""
+    """Return home with one elbow swung by ``way`` [rad] to first order, which leaves the tool where it is."""
     q, joints = robot.home.copy(), robot.arms[arm].joints
     frame = robot.arms[arm].frame_id
     J = pin.computeFrameJacobian(robot.model, robot.model.createData(), q, frame, pin.LOCAL_WORLD_ALIGNED)
@@ -35,7 +35,7 @@ def swung(robot: Robot, arm: str, way: float) -> Array:
     return q
 
 
-def test_the_elbow_goes_to_the_given_posture_and_home_without_one_while_the_tool_stays(
+def test_the_elbow_moves_to_the_given_posture_or_home_while_the_tool_stays(
     controller: CartesianController, robot: Robot
 ) -> None:
     controller.reset(robot.home)
@@ -52,7 +52,7 @@ def test_the_elbow_goes_to_the_given_posture_and_home_without_one_while_the_tool
 
 
 @pytest.mark.parametrize("bad", [np.full(14, np.nan), np.full(14, np.inf), np.zeros(3)], ids=["nan", "inf", "short"])
-def test_a_posture_that_cannot_be_is_not_used(controller: CartesianController, robot: Robot, bad: Array) -> None:
+def test_an_impossible_posture_is_not_used(controller: CartesianController, robot: Robot, bad: Array) -> None:
     controller.reset(robot.home)
     goal = {"left": controller.tool_pose("left")}
     posture = swung(robot, "left", 0.2)
@@ -67,7 +67,7 @@ def project(J: Array, v: Array) -> None:
     project_to_nullspace(J, np.zeros((len(J), len(J))), np.zeros(len(J)), v)
 
 
-def test_what_is_left_in_the_nullspace_moves_no_tool() -> None:
+def test_motion_in_the_nullspace_moves_no_tool() -> None:
     random = np.random.default_rng(27)
     for _ in range(20):
         J = np.zeros((12, 14))
@@ -80,7 +80,7 @@ def test_what_is_left_in_the_nullspace_moves_no_tool() -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_in_a_stretched_posture_the_nullspace_stays_finite(name: str) -> None:
+def test_the_nullspace_stays_finite_in_a_stretched_posture(name: str) -> None:
     arrays = cell(name)
     tools, placements = tools_of(arrays.robot), placed(arrays, np.zeros(14)).placements
     J, rotation, translation = np.zeros((12, 14)), np.zeros((3, 3)), np.zeros(3)

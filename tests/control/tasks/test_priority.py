@@ -1,4 +1,4 @@
-"""Two arms in each other's way: who gives way, that all stays safe and quiet, and that both get free again."""
+"""Two arms in each other's way: which one gives way, and that both stay safe, come to rest and get free again."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ def controller_of(priority: str) -> CartesianController:
 
 
 def errors(run: Driven, targets: Targets) -> dict[str, float]:
-    """Distance of each tool from its target [m]."""
+    """Return the distance of each tool from its target [m]."""
     poses = {arm: pose for arm, pose in targets.items() if pose is not None}
     tools = {arm: run.controller.tool_pose(arm).translation for arm in poses}
     return {arm: float(np.linalg.norm(tools[arm] - pose.translation)) for arm, pose in poses.items()}
 
 
 @pytest.mark.parametrize(("name", "duration"), [("crossing", 10.0), ("same point", 5.0)])
-def test_arms_of_which_one_gives_way_come_to_rest(name: str, duration: float) -> None:
+def test_two_arms_with_a_priority_come_to_rest(name: str, duration: float) -> None:
     run = Driven(controller_of("left"), dt=0.005)
     run.drive(duration, SCENARIOS[name])
     assert run.contract.tail_acceleration() < 0.1
@@ -39,7 +39,7 @@ def test_arms_of_which_one_gives_way_come_to_rest(name: str, duration: float) ->
 
 
 @pytest.mark.parametrize("priority", ["left", "right"])
-def test_the_arm_with_priority_reaches_a_place_that_both_want_in_the_time_it_takes_alone(priority: str) -> None:
+def test_the_arm_with_priority_reaches_a_place_that_both_want_as_fast_as_alone(priority: str) -> None:
     times = {}
     for case in ("alone", "against the other"):
         run = Driven(controller_of(priority), dt=0.005)
@@ -63,7 +63,7 @@ def test_the_arm_with_priority_reaches_a_place_that_both_want_in_the_time_it_tak
         pytest.param("crossing", ("left", "right"), "equal", id="both of two that are equal leave"),
     ],
 )
-def test_arms_that_blocked_each_other_reach_their_targets_once_the_way_is_free(
+def test_arms_that_blocked_each_other_reach_their_targets_when_the_way_is_free(
     blocked: str, arms: tuple[str, ...], priority: str
 ) -> None:
     run = Driven(controller_of(priority), dt=0.005)
@@ -83,12 +83,12 @@ def test_an_arm_without_a_target_holds_and_does_not_give_way(priority: str) -> N
     assert errors(run, {"left": run.start["left"]})["left"] < (4e-4 if priority == "equal" else 0.02)
 
 
-def test_where_the_arms_are_far_apart_priority_changes_nothing() -> None:
+def test_priority_changes_nothing_if_the_arms_are_far_apart() -> None:
     first, *others = (Driven(controller_of(priority), dt=0.005).drive(1.0, circle).q for priority in POLICIES)
     for other in others:
         np.testing.assert_allclose(other, first, rtol=0, atol=1e-6)
 
 
-def test_a_priority_that_is_no_arm_of_the_cell_is_refused() -> None:
+def test_a_priority_of_an_unknown_arm_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"control\.priority = 'middle': allowed here: equal, left, right"):
         CartesianController(robot_of("iiwa7"), ControllerSettings(priority="middle"))
