@@ -1,4 +1,4 @@
-"""The demo: two arms that do small assembly work, from samples of hands alone."""
+"""The demo: two arms do small assembly work, driven only by samples of hands."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ from tests.support.processes import Watch, assert_torque_bounds
 
 pytestmark = pytest.mark.slow
 
-# The tasks that are shown, by mode, and in which ticks: nothing here needs 1 kHz, and the tests have to be fast.
+# The tasks that are shown, by mode, and their ticks [s]. No task needs 1 kHz, and the tests have to be fast.
 SHOWN = {CommandMode.POSITION: "meet+grasp+carry+handover+stack", CommandMode.TORQUE: "handover+stack"}
 PERIODS = {CommandMode.POSITION: 0.01, CommandMode.TORQUE: 0.005}  # [s]
 
 
 @cache
 def coarse(mode: CommandMode = CommandMode.POSITION) -> Config:
-    """The demo's cell, with the control loop slowed down."""
+    """Return the demo's cell with a slower control loop."""
     config, period = with_controls(load_config("config/dual_iiwa7.yaml")), PERIODS[mode]
     control = config.control.model_copy(update={"max_substep": period})
     return config.model_copy(update={"loop_rate_hz": 1.0 / period, "control": control})
 
 
 class Played:
-    """Tasks in simulated time, for as long as they last, with the contract checked at every tick."""
+    """Tasks in simulated time until their end, with the contract checked at every tick."""
 
     def __init__(self, names: str, mode: CommandMode) -> None:
         config, self.mode = coarse(mode), mode
@@ -52,7 +52,7 @@ def played(request: pytest.FixtureRequest) -> Played:
     return Played(SHOWN[request.param], request.param)
 
 
-def test_every_task_succeeds_without_a_touch_that_is_no_grasp(played: Played) -> None:
+def test_every_task_succeeds_and_arms_touch_only_what_they_grasp(played: Played) -> None:
     assert "+".join(played.results) == SHOWN[played.mode]
     reasons = {name: result.reason for name, result in played.results.items() if not result.succeeded}
     assert reasons == {}
@@ -75,7 +75,7 @@ def test_the_arms_follow_the_hands_within_a_millimetre_or_so_and_need_no_fallbac
     assert played.summary.at_rest
     for arm in played.summary.arms.values():
         assert arm.position_error_mm_rms is not None
-        # Of two arms that carry, the tool that is led makes up for what the other one is late by.
+        # With two arms that carry, the led tool corrects the lag of the other one.
         assert arm.position_error_mm_rms < (1.5 if "carry" in played.results else 1.0)
     if played.mode is CommandMode.TORQUE:
         assert_torque_bounds(played.pipeline, played.ticks)
@@ -87,7 +87,7 @@ def test_the_arms_follow_the_hands_within_a_millimetre_or_so_and_need_no_fallbac
 
 
 @pytest.mark.parametrize("name", ["wipe", "peg"])
-def test_arms_that_yield_press_with_what_is_asked_and_find_the_hole(name: str) -> None:
+def test_arms_that_yield_press_with_the_wanted_force_and_find_the_hole(name: str) -> None:
     result = Played(name, CommandMode.TORQUE).results[name]
     assert result.reason == ""
     if name == "wipe":
@@ -102,7 +102,7 @@ def test_arms_that_hands_lead_into_each_other_refuse_without_a_touch(mode: Comma
     assert played.results["clash"].reason == ""
     led = [[tick.targets[arm].pose for arm in ("left", "right")] for tick in played.ticks]
     ways = [left.translation[1] - right.translation[1] for left, right in led if left is not None and right is not None]
-    assert min(ways) < 1e-3  # to one place
+    assert min(ways) < 1e-3  # Both tools were asked to be at one place.
     assert played.summary.at_rest
     assert played.summary.uncertified_ticks == 0
 
@@ -116,9 +116,7 @@ def test_arms_that_hands_lead_into_each_other_refuse_without_a_touch(mode: Comma
         ),
     ],
 )
-def test_arms_that_touch_what_they_should_not_spoil_the_task_and_are_named(
-    q: list[float], expected: tuple[str, str]
-) -> None:
+def test_arms_that_touch_other_bodies_spoil_the_task_and_are_named(q: list[float], expected: tuple[str, str]) -> None:
     robot = Robot.from_config(coarse())
     plant = MujocoPlant(robot, coarse())
     touches = TouchWatch(plant, robot, ("bar",), tuple(coarse().mujoco.objects))
@@ -130,7 +128,7 @@ def test_arms_that_touch_what_they_should_not_spoil_the_task_and_are_named(
     assert set(touches.forbidden.values()) == {0.5}
 
 
-def test_tasks_come_in_the_order_in_which_they_can_follow_each_other() -> None:
+def test_tasks_come_in_an_order_in_which_they_can_follow_each_other() -> None:
     assert [task.name for task in tasks_named(["stack", "meet", "stack"])] == ["meet", "stack"]
     assert tasks_named(["all"]) == tuple(TASKS.values())
     with pytest.raises(

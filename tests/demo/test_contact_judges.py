@@ -1,4 +1,4 @@
-"""Judges of what is pressed on and what is fitted, told of parts that nobody moves."""
+"""Judges of pressing and fitting, which get simulated measurements of parts."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from q2r2_control.demo.part_judges import PartState, Toucher
 
 DT = 0.01
 LEFT, TABLE = Toucher.LEFT_FINGER, Toucher.SURROUNDINGS
-SETTLES = 0.3  # of the mean of the force [s]
+SETTLES = 0.3  # Time after which the mean of the force has settled [s].
 
 
 def wiped(strokes: Sequence[tuple[float, float]], touched: int = LEFT | TABLE) -> WipeJudge:
-    """Strokes of a length [m] at 0.1 m/s, pressed on with a force [N]."""
+    """Return a judge after strokes of a length [m] at 0.1 m/s, with a force [N]."""
     judge, y = WipeJudge("part"), 0.0
     for length, force in strokes:
         for step in range(round(SETTLES / DT) + round(length / 0.1 / DT)):
@@ -25,7 +25,7 @@ def wiped(strokes: Sequence[tuple[float, float]], touched: int = LEFT | TABLE) -
     return judge
 
 
-def test_a_way_of_300_mm_with_5_to_15_newtons_is_wiped() -> None:
+def test_300_mm_with_5_to_15_newtons_count_as_wiped() -> None:
     assert wiped([(0.16, 14.5), (0.16, 6.0)]).faults() == []
     assert wiped([(0.32, 10.0), (0.03, 3.0)]).faults() == []
 
@@ -40,7 +40,9 @@ def test_a_way_of_300_mm_with_5_to_15_newtons_is_wiped() -> None:
         pytest.param([(0.4, 0.0)], LEFT, 1, id="in the air"),
     ],
 )
-def test_what_is_not_wiped_so_fails(strokes: Sequence[tuple[float, float]], touched: int, faults: int) -> None:
+def test_other_lengths_and_forces_do_not_count_as_wiped(
+    strokes: Sequence[tuple[float, float]], touched: int, faults: int
+) -> None:
     assert len(wiped(strokes, touched).faults()) == faults
 
 
@@ -66,6 +68,6 @@ def test_a_peg_that_stands_at_the_bottom_of_the_hole_for_a_second_succeeds() -> 
         pytest.param(stands(touched=Toucher.PART | LEFT), id="still held"),
     ],
 )
-def test_a_peg_that_does_not_stand_in_it_fails(judge: PegJudge) -> None:
+def test_a_peg_that_does_not_stand_in_the_hole_fails(judge: PegJudge) -> None:
     assert len(judge.faults()) == 1
     assert judge.measured()["stood_s"] == 0.0

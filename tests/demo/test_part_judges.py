@@ -1,4 +1,4 @@
-"""Judges of assembly work, told of parts that nobody moves."""
+"""Judges of assembly work, which get simulated measurements of parts."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from q2r2_control.demo.part_judges import (
 DT = 0.1
 LEFT, RIGHT, TABLE = Toucher.LEFT_FINGER, Toucher.RIGHT_FINGER, Toucher.SURROUNDINGS
 
-# Time [s], y, z [m], and what touches the part meanwhile.
+# Time [s], y and z [m], and the bodies that touch the part.
 Phase = tuple[float, float, float, int]
 
 
@@ -44,7 +44,7 @@ def test_a_part_that_is_held_up_for_a_second_and_put_back_succeeds() -> None:
     assert judge.measured() == pytest.approx(measured)
 
 
-def test_a_part_that_lay_back_for_a_second_may_be_taken_elsewhere() -> None:
+def test_a_part_that_was_put_back_for_a_second_may_be_moved_again() -> None:
     lain = [LIES, GRIPPED, HELD, GRIPPED, BACK, BACK]
     elsewhere = (1.0, 0.3, 0.2, TABLE)
     assert play(LiftJudge("part"), [*lain, HELD, elsewhere]).faults() == []
@@ -55,9 +55,9 @@ def test_a_part_that_lay_back_for_a_second_may_be_taken_elsewhere() -> None:
     ("phases", "name", "figure"),
     [
         ([LIES], "held_s", 0.0),
-        ([LIES, GRIPPED, (1.5, 0.0, 0.29, LEFT), GRIPPED, BACK], "held_s", 0.0),  # not high enough
-        ([LIES, GRIPPED, (0.5, 0.0, 0.3, LEFT), GRIPPED, BACK], "held_s", 0.5),  # not long enough
-        ([LIES, (1.5, 0.0, 0.3, TABLE | LEFT), GRIPPED, BACK], "held_s", 0.0),  # standing on something
+        ([LIES, GRIPPED, (1.5, 0.0, 0.29, LEFT), GRIPPED, BACK], "held_s", 0.0),  # The part is not high enough.
+        ([LIES, GRIPPED, (0.5, 0.0, 0.3, LEFT), GRIPPED, BACK], "held_s", 0.5),  # The part is not up long enough.
+        ([LIES, (1.5, 0.0, 0.3, TABLE | LEFT), GRIPPED, BACK], "held_s", 0.0),  # The part stands on something.
         ([LIES, GRIPPED, HELD, (0.1, 0.0, 0.25, Toucher.NOTHING), BACK], "fall_mm", 100.0),
         ([LIES, GRIPPED, HELD, GRIPPED, (1.0, 0.02, 0.2, TABLE)], "put_back_mm", 20.0),
         ([LIES, GRIPPED, HELD], "put_back_mm", 100.0),
@@ -73,7 +73,7 @@ GIVER, BOTH, TAKER = (1.0, 0.0, 0.4, LEFT), (0.5, 0.0, 0.4, FINGERS), (0.5, 0.0,
 AWAY = (1.2, -0.12, 0.4, RIGHT)
 
 
-def test_what_both_hands_carry_may_not_be_inclined_by_5_degrees() -> None:
+def test_a_part_in_both_hands_must_not_tilt_by_5_degrees() -> None:
     level, inclined = (math.radians(angle) for angle in (4.9, 5.1))
     for tilt, faults in ((level, []), (inclined, ["part: inclined by 5.1 deg"])):
         judge = play(CarryJudge("part"), [LIES, (1.5, 0.12, 0.3, FINGERS)])
@@ -95,7 +95,7 @@ def test_a_part_is_carried_by_both_hands_100_mm_away_and_put_back(away: float, h
     assert (judge.faults() == []) == (held >= HELD_TIME)
 
 
-def test_a_part_that_both_held_and_the_taker_carries_away_succeeds() -> None:
+def test_a_part_that_both_hands_held_and_the_taker_carries_away_succeeds() -> None:
     judge = play(HandoverJudge("part", LEFT, RIGHT), [LIES, GIVER, BOTH, TAKER, AWAY])
     assert judge.faults() == []
     assert judge.measured()["carried_mm"] == pytest.approx(120.0)
@@ -112,7 +112,7 @@ def test_a_part_that_both_held_and_the_taker_carries_away_succeeds() -> None:
         pytest.param([LIES, GIVER, BOTH, (1.2, -0.12, 0.2, RIGHT | TABLE)], id="pushed over the table"),
     ],
 )
-def test_what_is_not_handed_over_fails(phases: list[Phase]) -> None:
+def test_a_part_that_is_not_handed_over_fails(phases: list[Phase]) -> None:
     judge = play(HandoverJudge("part", LEFT, RIGHT), phases)
     assert len(judge.faults()) == 1
     assert judge.measured()["held_by_taker_s"] < 1.0
@@ -148,6 +148,6 @@ def test_a_part_that_rests_on_another_one_for_a_second_succeeds() -> None:
         pytest.param(stack(touched=Toucher.PART | LEFT), id="still held"),
     ],
 )
-def test_what_does_not_stand_fails(judge: Judge) -> None:
+def test_a_part_that_does_not_stand_on_another_one_fails(judge: Judge) -> None:
     assert len(judge.faults()) == 1
     assert judge.measured()["stood_s"] == 0.0

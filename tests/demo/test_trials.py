@@ -1,4 +1,4 @@
-"""Tasks of the demo, each tried with several trembling hands."""
+"""Tasks of the demo are tried with several trembling hands."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tests.support.processes import alive, children, wait_until
 
 
 @pytest.mark.slow
-def test_every_seed_is_tried_and_those_that_fail_say_why() -> None:
+def test_every_seed_is_tried_and_failed_seeds_have_reasons() -> None:
     config = coarse()
     (report,) = try_tasks(config, tasks_named(["grasp"]), CommandMode.POSITION, 2)
     assert report == TrialReport("grasp", 2, {})
@@ -39,11 +39,11 @@ def test_shaky_hands_that_are_lost_for_a_second_move_arms_that_yield_through_a_t
 
 @pytest.fixture
 def demo() -> Iterator[subprocess.Popen[str]]:
-    """A demo that tries a task twice."""
+    """Return a demo that tries a task twice."""
     if sys.platform != "linux":
         pytest.skip("looks into /proc")
     command = (sys.executable, "-m", "q2r2_control", "demo", "grasp", "--seeds", "2")
-    # A job in the background of a shell ignores SIGINT, and its children inherit that.
+    # A background job of a shell ignores SIGINT, and its children inherit this.
     listen = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
     demo = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=listen)
     try:
@@ -54,10 +54,10 @@ def demo() -> Iterator[subprocess.Popen[str]]:
 
 
 def trials_of(demo: subprocess.Popen[str]) -> list[int]:
-    """Its processes that have begun a trial."""
+    """Return the processes of the demo that have begun a trial."""
     trials = []
     for pid, folder in ((pid, Path(f"/proc/{pid}")) for pid in children(demo.pid)):
-        with suppress(OSError):  # of one that has ended meanwhile, as a command does that a library calls
+        with suppress(OSError):  # A process may have ended meanwhile, such as a command that a library calls.
             if b"spawn_main" in (folder / "cmdline").read_bytes() and "libmujoco" in (folder / "maps").read_text():
                 trials.append(pid)
     return trials
@@ -67,7 +67,7 @@ def trials_of(demo: subprocess.Popen[str]) -> list[int]:
 def test_ctrl_c_does_not_wait_for_trials(demo: subprocess.Popen[str]) -> None:
     wait_until(lambda: trials_of(demo))
     trial = trials_of(demo)[0]
-    os.kill(trial, signal.SIGSTOP)  # it never ends
+    os.kill(trial, signal.SIGSTOP)  # The stopped trial never ends.
     demo.send_signal(signal.SIGINT)
     wait_until(lambda: not alive(trial))
     assert demo.wait() == 130
@@ -83,6 +83,6 @@ def test_trials_end_with_a_demo_that_is_killed(demo: subprocess.Popen[str]) -> N
 
 
 @pytest.mark.parametrize(("failed", "reliable"), [(0, True), (1, True), (2, False)])
-def test_nineteen_of_twenty_are_reliable(failed: int, reliable: bool) -> None:
+def test_nineteen_successes_of_twenty_are_reliable(failed: int, reliable: bool) -> None:
     report = TrialReport("stack", 20, dict.fromkeys(range(failed), "fell"))
     assert report.is_reliable is reliable
