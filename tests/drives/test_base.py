@@ -1,4 +1,4 @@
-"""Velocity commands: they lead to the reference, within limits, and never from a measurement that is not trusted."""
+"""Velocity commands lead to the reference within limits, and never use a measurement that is not trusted."""
 
 from __future__ import annotations
 
@@ -59,8 +59,8 @@ DT = 0.004
 
 
 def pulled(robot: Robot, has_servos: bool) -> tuple[TorqueDrive, Reference, RobotState]:
-    """A drive whose reference has left the arms, which stand still, so that the spring pulls."""
-    # Whether a solution is late depends on the machine.
+    """Return a drive whose reference has left the resting arms, so that the spring pulls."""
+    # The machine would decide whether a solution is late.
     controller = CartesianController(robot, cell().control.model_copy(update={"solve_time_limit": None}))
     drive = TorqueDrive(robot, cell(), has_servos)
     zero = np.zeros_like(robot.home)
@@ -75,7 +75,7 @@ def pulled(robot: Robot, has_servos: bool) -> tuple[TorqueDrive, Reference, Robo
     return drive, reference, state
 
 
-def test_without_a_state_to_trust_the_torque_is_that_of_gravity(robot: Robot) -> None:
+def test_without_a_trusted_state_the_torque_is_that_of_gravity(robot: Robot) -> None:
     drive, reference, state = pulled(robot, has_servos=False)
     gravity = pin.computeGeneralizedGravity(robot.model, robot.model.createData(), robot.home)
     command = drive.command(reference, state, {}, DT, trusted=False)
@@ -89,7 +89,7 @@ def test_without_a_state_to_trust_the_torque_is_that_of_gravity(robot: Robot) ->
     np.testing.assert_allclose(last.tau, gravity, atol=1e-9)
 
 
-def test_without_a_state_to_trust_a_plant_with_servos_follows_the_reference_by_those(robot: Robot) -> None:
+def test_without_a_trusted_state_a_plant_with_servos_follows_the_reference(robot: Robot) -> None:
     drive, reference, state = pulled(robot, has_servos=True)
     command = drive.command(reference, state, {}, DT, trusted=False)
     assert command.mode is CommandMode.POSITION
@@ -98,7 +98,7 @@ def test_without_a_state_to_trust_a_plant_with_servos_follows_the_reference_by_t
 
 def test_the_wall_between_measured_links_is_part_of_the_command(robot: Robot) -> None:
     drive, reference, state = pulled(robot, has_servos=False)
-    # Fold the left arm inwards until a measured pair is closer than allowed.
+    # The left arm folds inwards until a measured pair is closer than allowed.
     q = state.q.copy()
     rng = np.random.default_rng(3)
     kept = kept_distances(robot, cell().control).values

@@ -1,4 +1,4 @@
-"""Both modes of driving a plant, through whole runs in MuJoCo: pushed arms, yielding targets, lost measurements."""
+"""Both modes of a drive in whole runs in MuJoCo: pushed arms, yielding targets, lost measurements."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ from tests.support.processes import Watch, assert_torque_bounds, cell
 pytestmark = pytest.mark.slow
 
 BLIND = cell().supervision.unusable_time
-ENGAGED = 0.3  # hands that stay where they are have long engaged both arms [s]
+ENGAGED = 0.3  # After this time, hands that stay where they are have engaged both arms [s].
 
 
 def configured(**sections: dict[str, object]) -> Config:
-    """The shipped cell at 500 Hz, with keys of its sections changed."""
+    """Return the shipped cell at 500 Hz with changed keys in its sections."""
     changed = {name: getattr(cell(), name).model_copy(update=keys) for name, keys in sections.items()}
     return cell().model_copy(update={"loop_rate_hz": 500.0, **changed})
 
 
 def at(t: float, action: Callable[[], object]) -> Callable[[Tick], None]:
-    """A listener that acts once, at time ``t`` [s]."""
+    """Return a listener that acts once, at time ``t`` [s]."""
     done: list[Tick] = []
 
     def listener(tick: Tick) -> None:
@@ -45,7 +45,7 @@ def at(t: float, action: Callable[[], object]) -> Callable[[Tick], None]:
 
 
 def pushed(config: Config, mode: str, push: Array, start: float, duration: float) -> tuple[Pipeline, Watch]:
-    """A pipeline with still hands, whose left tool is pushed from ``start`` on for ``duration`` [s]."""
+    """Return a pipeline with resting hands, whose left tool is pushed from ``start`` on for ``duration`` [s]."""
     loop = Pipeline.from_config(config, input=HandsInput(), plant="mujoco", mode=mode)
     plant = loop.plant
     assert isinstance(plant, MujocoPlant)
@@ -54,15 +54,15 @@ def pushed(config: Config, mode: str, push: Array, start: float, duration: float
 
 
 def way(watch: Watch, arm: str) -> Array:
-    """How far (n,) [m] the arm's measured tool is from where it was when the push began."""
+    """Return the distances (n,) [m] of the arm's measured tool from its place at the begin of the push."""
     start = next(tick for tick in watch.ticks if tick.t >= ENGAGED)
     return np.array(
         [np.linalg.norm(tick.tools[arm].translation - start.tools[arm].translation) for tick in watch.ticks]
     )
 
 
-def test_an_arm_pushed_into_the_other_by_torque_presses_the_wall_never_touches_and_comes_back() -> None:
-    # A soft spring, so that the push overcomes it and the wall is what holds the rest.
+def test_in_torque_mode_an_arm_pushed_into_the_other_presses_the_wall_without_a_touch_and_comes_back() -> None:
+    # The spring is soft, so that the push overcomes it and the wall holds the rest.
     config = configured(impedance={"translational_stiffness": 300.0, "rotational_stiffness": 100.0})
     loop, watch = pushed(config, "torque", np.array([0.0, -100.0, 0.0, 0.0, 0.0, 0.0]), ENGAGED, 1.5)
     summary = loop.run(6.5, realtime=False)
@@ -98,14 +98,14 @@ def test_in_position_mode_with_the_admittance_a_push_moves_the_tool_and_it_retur
     arm = tick.admittance.arms["left"]
     np.testing.assert_allclose(arm.wrench[:3], [0.0, 30.0, 0.0], atol=0.5)
     np.testing.assert_allclose(arm.displacement[:3], [0.0, asked, 0.0], atol=1e-3)
-    # The servos give way besides, by some millimetres.
+    # The servos yield by some millimetres too.
     assert asked - 1e-3 < way(watch, "left")[settled] < asked + 6e-3
     assert way(watch, "right").max() < 1e-3
     engaged = [index for index, tick in enumerate(watch.ticks) if all(tick.engaged.values())]
     assert way(watch, "left")[engaged[-1]] < 5e-4
     targets = [pose.homogeneous for index in engaged if (pose := watch.ticks[index].targets["left"].pose) is not None]
     np.testing.assert_allclose(targets, np.broadcast_to(targets[0], (len(engaged), 4, 4)), atol=1e-9)
-    # The error is against what the operator asks for: it has the displacement in it.
+    # The error is relative to the operator's target, so that it includes the displacement.
     errors = way(watch, "left")[engaged]
     figures = summary.arms["left"]
     assert figures.position_error_mm_rms == pytest.approx(1e3 * np.sqrt(np.mean(np.square(errors))), rel=0.05)
@@ -122,7 +122,7 @@ def test_an_admittance_on_a_plant_that_measures_no_external_torque_is_refused() 
 
 
 class BlindPlant(MujocoPlant):
-    """A simulated cell whose sensors fail: ``broken`` is what one joint is said to be at."""
+    """A simulated cell whose sensors fail. ``broken`` is the wrong position of one joint."""
 
     broken: float | None = None
     what = "q"
@@ -137,7 +137,7 @@ class BlindPlant(MujocoPlant):
 
 
 def blinded(what: str, value: float, start: float, duration: float) -> tuple[Pipeline, Watch, BlindPlant]:
-    """A pipeline whose hands swing sideways, and whose measurement fails at ``start`` for ``duration`` [s]."""
+    """Return a pipeline whose hands swing sideways, and whose measurement fails at ``start`` for ``duration`` [s]."""
     config = configured()
     robot = Robot.from_config(config)
     plant = BlindPlant(robot, config)
@@ -154,7 +154,7 @@ def blinded(what: str, value: float, start: float, duration: float) -> tuple[Pip
 
 
 @pytest.mark.parametrize(("what", "value"), [("q", np.nan), ("v", np.inf)])
-def test_a_measurement_that_is_lost_for_a_moment_is_bridged_and_counted(what: str, value: float) -> None:
+def test_a_short_loss_of_measurements_is_bridged_and_counted(what: str, value: float) -> None:
     loop, watch, _ = blinded(what, value, 0.9, 0.8 * BLIND)
     summary = loop.run(1.6, realtime=False)
     assert summary.torque is not None
@@ -168,7 +168,7 @@ def test_a_measurement_that_is_lost_for_a_moment_is_bridged_and_counted(what: st
 
 
 @pytest.mark.parametrize(("what", "value", "said"), [("q", np.nan, "position"), ("v", -np.inf, "velocity")])
-def test_a_measurement_that_stays_lost_ends_the_run_and_the_plant_s_own_servos_bring_the_arms_to_rest(
+def test_a_permanent_loss_of_measurements_ends_the_run_and_the_plants_servos_bring_the_arms_to_rest(
     what: str, value: float, said: str
 ) -> None:
     loop, watch, plant = blinded(what, value, 0.9, 60.0)
