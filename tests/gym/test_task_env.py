@@ -1,4 +1,4 @@
-"""Tasks as environments: repeatable by their seed, done by the work of the demo, and with every promise."""
+"""Tasks as environments: the seed makes them repeatable, the demo's work solves them, and all promises hold."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def shared() -> TaskEnv:
     return make(space=ActionSpace.JOINTS)
 
 
-def test_every_task_is_registered_and_lasts_as_long_as_its_work_takes() -> None:
+def test_every_task_is_registered_and_lasts_as_long_as_its_work() -> None:
     assert set(gym.TASKS) == set(TASKS)
     for task in gym.TASKS:
         spec = gymnasium.spec(f"q2r2/{task.capitalize()}-v0")
@@ -60,12 +60,12 @@ def test_every_task_is_registered_and_lasts_as_long_as_its_work_takes() -> None:
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::UserWarning")
 @pytest.mark.parametrize("space", list(ActionSpace))
-def test_gymnasiums_own_checks_pass(space: ActionSpace) -> None:
+def test_the_checks_of_gymnasium_pass(space: ActionSpace) -> None:
     check_env(make(space=space), skip_render_check=True)
 
 
 def script(task: str, env: TaskEnv, step: int) -> npt.NDArray[np.float32]:
-    """The work of the demo's hands as tool poses and openings."""
+    """Return the work of the demo's hands as tool poses and openings."""
     work, t, poses, openings = WORKS[task], step / RATE, [], []
     for arm in SIDES:
         points = work.tools.get(arm, ((1.0, *HOME[arm], 0.0, 0.0),))
@@ -96,7 +96,7 @@ def test_the_work_of_the_demo_earns_the_reward_and_keeps_every_promise() -> None
     assert info["measured"]["held_s"] >= 1.0
 
 
-def test_a_seed_lays_the_parts_and_the_same_actions_then_do_the_same() -> None:
+def test_a_seed_places_the_parts_and_equal_actions_then_have_equal_results() -> None:
     env, seen = shared(), []
     for seed in (3, 3, 4):
         env.reset(seed=seed)
@@ -111,7 +111,7 @@ def test_a_seed_lays_the_parts_and_the_same_actions_then_do_the_same() -> None:
     assert 0.0 < np.abs(seen[0][0] - seen[2][0]).max() <= 0.02
 
 
-def test_an_agent_that_has_learned_nothing_moves_the_tools() -> None:
+def test_an_untrained_agent_moves_the_tools() -> None:
     env = make()
     env.reset(seed=0)
     env.action_space.seed(0)
@@ -144,7 +144,7 @@ def test_the_arms_follow_small_actions_and_say_why_they_refuse_large_ones() -> N
     assert "nan" in info["promises"]["held_back"]
 
 
-def test_a_slower_loop_takes_fewer_ticks_for_the_same_steps_and_keeps_the_promises(
+def test_a_slower_loop_needs_fewer_ticks_for_the_same_steps_and_keeps_the_promises(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     ticks, tools, tick, taken = [], [], Pipeline.tick, itertools.count()
@@ -161,12 +161,12 @@ def test_a_slower_loop_takes_fewer_ticks_for_the_same_steps_and_keeps_the_promis
         ticks.append(next(taken) - before - 1)
         tools.append(observed["observation.tool"])
     assert ticks == [333, 33]
-    np.testing.assert_allclose(tools[0], tools[1], atol=0.02)  # each is some ticks behind its targets
+    np.testing.assert_allclose(tools[0], tools[1], atol=0.02)  # Each tool is some ticks behind its targets.
     with pytest.raises(ConfigError, match=r"loop_rate = 20: allowed: 50 to 1000 Hz"):
         TaskEnv("grasp", loop_rate=20)
 
 
-def test_a_step_adds_up_no_summary_and_shakes_no_device(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_step_computes_no_summary_and_vibrates_no_device(monkeypatch: pytest.MonkeyPatch) -> None:
     env = shared()
     env.reset(seed=0)
     for owner, name in ((RunStatistics, "add"), (OperatorSide, "_inspect")):
@@ -182,7 +182,7 @@ def time_of(env: TaskEnv) -> float:
     return observation.time
 
 
-def test_steps_end_at_frames_of_a_dataset_at_the_rate() -> None:
+def test_steps_end_at_frames_of_a_dataset_at_the_given_rate() -> None:
     env = shared()
     still = env.reset(seed=0)[0]["observation.state"]
     start = time_of(env)
@@ -200,7 +200,7 @@ def test_the_example_of_the_page_runs_as_it_stands(capsys: pytest.CaptureFixture
 
 
 @pytest.mark.slow
-def test_two_environments_run_in_processes_of_their_own() -> None:
+def test_two_environments_run_in_their_own_processes() -> None:
     envs = gym.make_env(n_envs=2, use_async_envs=True, cfg=object(), task="handover", cell=coarse())
     try:
         observed, infos = envs.reset(seed=[1, 2])
