@@ -1,4 +1,4 @@
-"""Hands that are aligned, put elsewhere and engaged anew, and stances: never a motion that nobody made."""
+"""Hands are aligned, put elsewhere and engaged again, in all stances. No arm moves unless a hand moves it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ again_and_again = pytest.mark.parametrize("times", [10, pytest.param(100, marks=
 
 
 def aligned(op: Operator, shift: float, samples: int) -> Iterator[float]:
-    """By the left hand's chord, ``samples`` after which the frame moves by a share of the way to ``ANEW``."""
+    """Align by the left hand's chord. After each of ``samples``, the frame moves by a share of the way to ``ANEW``."""
     op.lower.add("left")
     op.upper.add("left")
     yield samples * op.period
@@ -48,7 +48,7 @@ def test_an_alignment_by_one_hand_moves_no_arm_and_no_gripper(
         yield 0.1
         yield from op.press(*engaged)
         yield 0.2
-        if first is not None:  # of the buttons, by 30 ms
+        if first is not None:  # One button is pressed 30 ms before the other.
             getattr(op, first).add("left")
             yield 0.03
         yield from aligned(op, shift, samples)
@@ -63,7 +63,7 @@ def test_an_alignment_by_one_hand_moves_no_arm_and_no_gripper(
 
 
 @again_and_again
-def test_an_arm_under_a_load_that_nobody_knows_of_sinks_no_farther_when_it_resumes_again_and_again(times: int) -> None:
+def test_an_arm_under_an_unknown_load_sinks_no_farther_when_it_resumes_again_and_again(times: int) -> None:
     def script(op: Operator) -> Iterator[float]:
         op.noise = 1e-9
         yield from op.engage()
@@ -72,10 +72,10 @@ def test_an_arm_under_a_load_that_nobody_knows_of_sinks_no_farther_when_it_resum
         yield from op.press(*SIDES)
         for hand, at in op.hands.items():
             op.hands[hand] = pin.SE3(ANEW.rotation @ at.rotation, at.translation + ANEW.translation)
-        yield 2.0  # until the arm rests on its spring
+        yield 2.0  # The arm comes to rest on its spring.
         marks.append(op.now)
         yield from op.press(*SIDES)
-        for _ in range(2 * times):  # a pause, and an engagement
+        for _ in range(2 * times):  # Each turn has a pause and an engagement.
             op.lower |= set(SIDES)
             yield 0.03
             op.lower -= set(SIDES)
@@ -101,7 +101,8 @@ def test_an_arm_under_a_load_that_nobody_knows_of_sinks_no_farther_when_it_resum
     ("mode", "mujoco", "load", "off"),
     [
         (CommandMode.TORQUE, {}, 42.0, 1e-3),
-        # How far soft joints let the tool hang depends on the posture: 2.6 mm more where this arm rests at last.
+        # With soft joints, the sag of the tool depends on the posture: it is 2.6 mm more where this arm rests at the
+        # end.
         (CommandMode.POSITION, {"position_stiffness": 1500.0}, 75.0, 3.5e-3),
     ],
     ids=["on the spring of torque mode", "of soft joints"],
@@ -109,8 +110,11 @@ def test_an_arm_under_a_load_that_nobody_knows_of_sinks_no_farther_when_it_resum
 def test_an_arm_that_hangs_by_2_cm_and_is_engaged_in_full_motion_again_and_again_has_no_lag_in_its_sag(
     mode: CommandMode, mujoco: dict[str, object], load: float, off: float, times: int
 ) -> None:
-    """The hand goes to and fro at up to 0.6 m/s, and lets go for one sample where the tool is fastest, either way."""
-    turns, sampled = 30, 0.014  # samples of a cycle, and their time [s]
+    """The hand moves to and fro at up to 0.6 m/s.
+
+    It lets go for one sample where the tool is fastest, in both directions.
+    """
+    turns, sampled = 30, 0.014  # Samples of a cycle, and their period [s].
 
     def script(op: Operator) -> Iterator[float]:
         op.noise, op.period = 1e-9, sampled

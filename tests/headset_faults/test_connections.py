@@ -1,4 +1,4 @@
-"""Connections that end, fall silent, or deliver late: both arms pause, and only a new press engages."""
+"""Connections that end, fall silent, or deliver late: both arms pause, and only a new press engages them."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ A_TICK = 0.002  # [s]
 
 
 def go_elsewhere(op: Operator) -> Iterator[float]:
-    """The hands move while nobody follows them."""
+    """Move the hands while no arm follows them."""
     op.hands = {hand: place * AWAY for hand, place in op.hands.items()}
     yield 0.4
 
 
 def engage_anew(op: Operator) -> Iterator[float]:
-    yield 0.6  # in which nothing may move
+    yield 0.6  # During this time, nothing may move.
     yield from op.press(*SIDES)
     yield from op.move((0.0, 0.0, 0.05), seconds=0.3)
 
@@ -77,7 +77,7 @@ def test_a_headset_that_sends_no_poses_in_mid_motion_pauses_both_arms_in_time(al
 
 
 def late_by(duration: float) -> Callable[[Operator], Iterator[float]]:
-    """A headset at uneven 30 .. 72 Hz, of whose samples 5 % are lost, on a network that stands still twice."""
+    """Return a headset at uneven 30 .. 72 Hz that loses 5 % of its samples, on a network that stands still twice."""
 
     def script(op: Operator) -> Iterator[float]:
         random = np.random.default_rng(7)
@@ -98,13 +98,13 @@ def late_by(duration: float) -> Callable[[Operator], Iterator[float]]:
     return script
 
 
-def test_bursts_that_come_within_the_timeout_are_followed_without_a_jump() -> None:
+def test_bursts_within_the_timeout_are_followed_without_a_jump() -> None:
     run = InStepRun(late_by(0.08))
     assert run.reasons("lost") == []
     assert run.states == {"engaged"}
 
 
-def test_bursts_of_200_ms_pause_both_arms_and_what_comes_late_moves_nothing() -> None:
+def test_bursts_of_200_ms_pause_both_arms_and_late_samples_move_nothing() -> None:
     run = InStepRun(late_by(0.2))
     assert "pose_silent" in run.reasons("lost")
     assert [len(run.watch.engagements(arm)) for arm in SIDES] == [1, 1]

@@ -1,4 +1,4 @@
-"""Poses that are no motion of a hand: jumps, frames that move, frozen numbers, and clocks."""
+"""Poses that are not motions of a hand: jumps, moving frames, frozen numbers, and clocks."""
 
 from __future__ import annotations
 
@@ -14,8 +14,9 @@ from tests.support.headset_in_step import InStepRun, Operator, Sender
 
 pytestmark = pytest.mark.slow
 
-AWAY = pin.SE3(pin.exp3(np.array([0.0, 0.0, 0.5 * math.pi])), np.array([0.3, -0.4, 0.0]))  # 0.5 m and 90 degrees
-STILL = 5e-4  # of a tool, whose hand trembles by the noise of its sensor [m]
+# A displacement by 0.5 m and 90 degrees.
+AWAY = pin.SE3(pin.exp3(np.array([0.0, 0.0, 0.5 * math.pi])), np.array([0.3, -0.4, 0.0]))
+STILL = 5e-4  # Largest motion of a tool whose hand has only the noise of its sensor [m].
 
 
 def assert_still(run: InStepRun) -> None:
@@ -24,7 +25,7 @@ def assert_still(run: InStepRun) -> None:
 
 
 def jumping(op: Operator, hands: tuple[str, ...], count: float) -> Sender:
-    """The next ``count`` samples of these hands are measured in a frame 0.5 m and 90 degrees away."""
+    """Measure the next ``count`` samples of these hands in a frame 0.5 m and 90 degrees away."""
     left = dict.fromkeys(SIDES, 0.0) | dict.fromkeys(hands, count)
 
     def sent(hand: str, position: Array, quaternion: Array) -> bytes:
@@ -59,7 +60,7 @@ def test_a_jump_moves_no_arm_and_pauses_both(hands: tuple[str, ...], count: floa
     assert run.states == {"engaged"}
 
 
-def test_a_frame_that_steps_by_less_than_any_gate_moves_no_arm() -> None:
+def test_a_frame_that_steps_by_less_than_all_gates_moves_no_arm() -> None:
     def script(op: Operator) -> Iterator[float]:
         yield from op.engage()
         yield 0.2
@@ -71,7 +72,7 @@ def test_a_frame_that_steps_by_less_than_any_gate_moves_no_arm() -> None:
     assert_still(run)
 
 
-def test_poses_that_freeze_while_buttons_go_on_pause_both_arms_and_engage_none() -> None:
+def test_frozen_poses_with_live_buttons_pause_both_arms_and_engage_none() -> None:
     def script(op: Operator) -> Iterator[float]:
         yield from op.engage()
         yield from op.move((0.0, 0.05, 0.0), seconds=0.3)

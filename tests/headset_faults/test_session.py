@@ -15,9 +15,9 @@ from tests.support.processes import changes, speed
 
 pytestmark = pytest.mark.slow
 
-CIRCLE, RADIUS, SWAY = 4.0, 0.1, 0.2  # of the hands [s], [m], [rad]
-TURN = pin.exp3(np.array([math.radians(120.0), 0.0, 0.0]))  # of the left hand in the pause
-shown: list[tuple[float, dict[str, pin.SE3]]] = []  # the hands, and from when on [s]
+CIRCLE, RADIUS, SWAY = 4.0, 0.1, 0.2  # Period [s], radius [m] and sideways motion [m] of the hands.
+TURN = pin.exp3(np.array([math.radians(120.0), 0.0, 0.0]))  # Rotation of the left hand in the pause.
+shown: list[tuple[float, dict[str, pin.SE3]]] = []  # The hands, each with the time from which it is shown [s].
 
 
 def circle(op: Operator) -> Iterator[float]:
@@ -95,7 +95,7 @@ def test_the_tool_follows_the_hand_within_5_mm_and_1_degree_and_the_gripper_clos
     assert run.summary.arms[arm].gripper_changes == 1
 
 
-def test_it_needs_no_fallback_and_ends_at_rest(run: InStepRun) -> None:
+def test_the_session_needs_no_fallback_and_ends_at_rest(run: InStepRun) -> None:
     summary = run.summary
     assert summary.fallback_ticks == summary.uncertified_ticks == summary.rejected_targets == 0
     assert summary.at_rest
