@@ -1,4 +1,4 @@
-"""A running headset server for tests of what comes over the network."""
+"""A running headset server for tests of network input."""
 
 from __future__ import annotations
 
@@ -17,6 +17,6 @@ def clock() -> HandClock:
 
 @pytest.fixture
 def server(clock: HandClock) -> Iterator[HeadsetServer]:
-    """A running server whose time stands still unless the test moves it, so that no slow machine makes a timeout."""
+    """Return a running server. Its time changes only in the test, so that a slow machine causes no timeout."""
     with running(HeadsetServer(port=0, clock=clock)) as server:
         yield server

@@ -1,4 +1,4 @@
-"""A computer in several networks tells people all of its addresses, and none that nobody reaches."""
+"""A computer in several networks names all of its reachable addresses."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from q2r2_control.inputs import addresses
 from q2r2_control.inputs.addresses import NO_NETWORK, reachable_addresses
 
 UP, LOOPBACK, RUNNING = 0x1, 0x8, 0x40
-# Flags and address of each network interface: a cable, Wi-Fi, a bridge without a guest, a cable that is not set up.
+# Flags and address of each network interface: a cable, Wi-Fi, an unused bridge, and an unconfigured cable.
 INTERFACES: dict[str, tuple[int, str | None]] = {
     "lo": (UP | LOOPBACK | RUNNING, "127.0.0.1"),
     "eth0": (UP | RUNNING, "192.168.1.5"),
@@ -29,7 +29,7 @@ IPV6 = """fe800000000000000000000000000001 02 40 20 80 eth0
 
 @pytest.fixture
 def networks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """A computer whose way out is Wi-Fi."""
+    """A computer that reaches other networks through Wi-Fi."""
 
     def ioctl(_: object, what: int, request: bytes) -> bytes:
         flags, address = INTERFACES[request[:16].rstrip(b"\0").decode()]
@@ -50,7 +50,7 @@ def networks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("networks")
-def test_every_connected_network_has_its_address_first_the_way_out() -> None:
+def test_every_connected_network_has_its_address_with_the_default_route_first() -> None:
     assert reachable_addresses("0.0.0.0") == ("10.0.0.7", "192.168.1.5")
     assert reachable_addresses("::") == ("10.0.0.7", "192.168.1.5", "2001:db8::5")
     assert reachable_addresses("192.168.1.5") == ("192.168.1.5",)
@@ -62,7 +62,7 @@ def test_a_computer_without_a_network_says_so(monkeypatch: pytest.MonkeyPatch) -
     assert reachable_addresses("0.0.0.0") == (NO_NETWORK,)
 
 
-def test_the_addresses_of_this_computer_can_be_listened_on() -> None:
+def test_a_server_can_listen_on_the_addresses_of_this_computer() -> None:
     for address in reachable_addresses("0.0.0.0"):
         if address != NO_NETWORK:
             socket.create_server((address, 0)).close()

@@ -1,4 +1,4 @@
-"""Who is served and who is refused over real TCP, and what strangers cannot do to the headset that drives."""
+"""Clients that are served or refused over real TCP, and the limits of strangers beside the driving headset."""
 
 from __future__ import annotations
 
@@ -28,31 +28,31 @@ from tests.support.headset_server import (
     warnings,
 )
 
-HERE, ELSEWHERE = "127.0.0.1", "127.0.0.2"  # two hosts, as a server sees them
+HERE, ELSEWHERE = "127.0.0.1", "127.0.0.2"  # Two hosts from the view of a server.
 
 
 @contextmanager
 def driving(server: HeadsetServer, source: str = HERE) -> Iterator[FakeHeadset]:
-    """A headset that has registered and sent a pose."""
+    """Return a headset that has registered and sent a pose."""
     with registered(server, source=source) as headset:
         move(headset, server)
         yield headset
 
 
 def move(headset: FakeHeadset, server: HeadsetServer, x: float = 0.0) -> None:
-    """A pose of the headset arrives where poses are used."""
+    """Send a pose of the headset until it arrives."""
     headset.send(headset.pose("left", (x, 0.0, 0.0), IDENTITY))
     assert collect(server, 1)[-1].position[0] == x
 
 
 def assert_refused(headset: FakeHeadset, because: bytes) -> None:
-    """Greeted first, or the app takes the refusal for an endpoint of another version."""
+    """Assert a refusal after a greeting. Without the greeting, the app would report an endpoint of another version."""
     assert next_topic(headset) == "__handshake"
     assert_ended(headset, because)
 
 
 def assert_ended(headset: FakeHeadset, because: bytes) -> None:
-    """The last that the app hears of the server is the reason."""
+    """Assert that the reason is the server's last message to the app."""
     last = ("", b"")
     while (frame := headset.read_frame()) is not None:
         last = frame
@@ -64,7 +64,7 @@ def drives(server: HeadsetServer, headset: FakeHeadset) -> bool:
     return server.statistics.peer == "{}:{}".format(*headset.socket.getsockname())
 
 
-def test_a_second_headset_is_refused_with_a_reason_and_of_eight_hosts_one_line_each_while_one_drives(
+def test_a_second_headset_is_refused_with_a_reason_and_eight_hosts_get_one_line_each_while_one_drives(
     server: HeadsetServer, clock: HandClock, caplog: pytest.LogCaptureFixture
 ) -> None:
     hosts = [f"127.0.0.{number}" for number in range(1, 14)]
@@ -76,12 +76,12 @@ def test_a_second_headset_is_refused_with_a_reason_and_of_eight_hosts_one_line_e
             clock.advance(A_LINE_LATER)
             move(first, server)
         assert server.connected
-        lines = warnings(caplog)  # before the driver ends its connection, perhaps by a reset
+        lines = warnings(caplog)  # The lines are read before the driver ends its connection, perhaps by a reset.
     assert [f"headset {host}:" in line for host, line in zip(hosts, lines, strict=False)] == [True] * 8
     assert "refused: 127.0.0.1:" in lines[0]
 
 
-def test_a_peer_that_comes_back_after_a_silently_lost_link_takes_its_place_at_once_and_as_a_new_connection(
+def test_a_peer_that_comes_back_after_a_silently_lost_link_takes_its_place_at_once_as_a_new_connection(
     server: HeadsetServer, clock: HandClock, caplog: pytest.LogCaptureFixture
 ) -> None:
     with driving(server) as lost:
@@ -106,7 +106,7 @@ def keep_alive(headset: FakeHeadset, server: HeadsetServer, clock: HandClock) ->
     eventually(lambda: server._client is not None and server._client.last_frame == clock.now)
 
 
-def test_a_newcomer_that_shows_nothing_is_refused_after_two_seconds(server: HeadsetServer, clock: HandClock) -> None:
+def test_a_newcomer_that_sends_nothing_is_refused_after_two_seconds(server: HeadsetServer, clock: HandClock) -> None:
     with connect(server) as idle, connect(server, source=ELSEWHERE) as second:
         clock.advance(1.5)
         keep_alive(idle, server, clock)
@@ -128,7 +128,7 @@ def test_at_most_four_hosts_wait_each_with_its_newest_connection(server: Headset
         headset.close()
 
 
-def test_what_a_waiting_newcomer_sends_reaches_nobody_and_its_faults_cost_only_itself(
+def test_messages_of_a_waiting_newcomer_reach_no_arm_and_its_faults_end_only_its_own_connection(
     server: HeadsetServer, clock: HandClock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with driving(server) as first:
@@ -144,12 +144,12 @@ def test_what_a_waiting_newcomer_sends_reaches_nobody_and_its_faults_cost_only_i
         assert server.statistics.topics["q2r_left_hand_pose"].count == 1
         with connect(server) as fourth:
             fourth.send(KEEPALIVE)
-            move(first, server, 1.0)  # the quiet one is heard again
+            move(first, server, 1.0)  # The quiet headset sends again.
             assert_ended(fourth, b"drives")
         move(first, server, 2.0)
 
 
-def test_a_server_that_stood_still_does_not_take_a_live_headset_for_silent(
+def test_a_server_that_stood_still_does_not_treat_a_live_headset_as_silent(
     server: HeadsetServer, clock: HandClock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     selector = server._connections._selector
@@ -157,7 +157,7 @@ def test_a_server_that_stood_still_does_not_take_a_live_headset_for_silent(
     frozen: list[bool] = []
 
     def look_and_stand_still(timeout: float) -> list[Any]:
-        """The process freezes when it has seen the second headset's bytes; the first one's come meanwhile."""
+        """The process freezes when it has read the second headset's bytes. Those of the first one arrive meanwhile."""
         found = look(timeout)
         if found and not frozen:
             frozen.append(True)
@@ -177,7 +177,9 @@ def test_a_server_that_stood_still_does_not_take_a_live_headset_for_silent(
         assert server.statistics.last_disconnect is None
 
 
-def test_behind_a_flood_of_connections_another_host_is_served(server: HeadsetServer, clock: HandClock) -> None:
+def test_a_flood_of_connections_does_not_keep_another_host_from_being_served(
+    server: HeadsetServer, clock: HandClock
+) -> None:
     flood = [socket.create_connection(server.address, source_address=(ELSEWHERE, 0)) for _ in range(100)]
     with FakeHeadset(server.address) as headset:
         headset.send(headset.registrations() + headset.pose("left", (1.0, 2.0, 3.0), IDENTITY))
@@ -186,7 +188,7 @@ def test_behind_a_flood_of_connections_another_host_is_served(server: HeadsetSer
         assert not drives(server, headset), "no more than 20 in 0.05 s"
 
         def has_had_its_turn() -> bool:
-            # A server's thread that did not run between two steps above took twenty once and not twice.
+            # If the server's thread did not run between two steps above, it accepted twenty connections only once.
             clock.advance(0.0501)
             time.sleep(0.02)
             return drives(server, headset)
@@ -218,7 +220,7 @@ def test_only_hosts_of_allowed_networks_are_served(clock: HandClock, caplog: pyt
 
 
 @pytest.mark.skipif(not socket.has_dualstack_ipv6(), reason="this machine has no IPv6")
-def test_an_ipv4_network_is_allowed_through_ipv6_too(clock: HandClock) -> None:
+def test_an_allowed_ipv4_network_is_allowed_through_ipv6_too(clock: HandClock) -> None:
     with running(HeadsetServer("::", 0, clock=clock, allow=(ip_network("127.0.0.0/8"),))) as server:
         with FakeHeadset(("::1", server.address[1])) as headset:
             assert_refused(headset, b"::1 is not in headset.allow")
@@ -228,15 +230,15 @@ def test_an_ipv4_network_is_allowed_through_ipv6_too(clock: HandClock) -> None:
 
 
 def test_a_headset_that_reads_again_is_sent_the_rest(server: HeadsetServer, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nothing but the network's readiness wakes the server here: it would wait for an hour."""
+    """Only the network's readiness wakes the server here, because it would otherwise wait for an hour."""
     monkeypatch.setattr(connections, "TURN", 3600.0)
     with connect(server) as headset:
         client = server._client
         assert client is not None
-        for number in range(50):  # so that answers are long
+        for number in range(50):  # Many topics make the answers long.
             headset.send(headset.command("__publish", topic=f"{number:_>200}", message_name="std_msgs/Empty"))
         asked = 0
-        while len(client.session.outgoing) < 30000:  # two answers and more are left: the network is full
+        while len(client.session.outgoing) < 30000:  # The network is full when two or more answers wait.
             headset.send(headset.command("__topic_list"))
             move(headset, server)
             asked += 1

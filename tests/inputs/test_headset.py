@@ -1,4 +1,4 @@
-"""The headset server over real TCP: what the app gets, what a fault does, and that the loop never waits."""
+"""The headset server over real TCP: its messages to the app, its faults, and that the loop never waits for it."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_a_headset_is_greeted_answered_and_its_hands_arrive(server: HeadsetServe
     assert (right.hand, right.position.tolist()) == ("right", [0.4, 0.5, 0.6])
 
 
-def test_a_pose_is_stamped_at_receipt_and_keeps_its_own_stamp(server: HeadsetServer, clock: HandClock) -> None:
+def test_a_pose_is_stamped_at_receipt_and_keeps_its_original_stamp(server: HeadsetServer, clock: HandClock) -> None:
     with connect(server) as headset:
         headset.send(headset.pose("left", (0.0, 0.0, 0.0), IDENTITY, frame_id="headset"))
         (first,) = collect(server, 1)
@@ -76,7 +76,9 @@ def test_a_pose_is_stamped_at_receipt_and_keeps_its_own_stamp(server: HeadsetSer
     assert (last.stamp, last.frame_id) == (12.0000005, "headset")
 
 
-def test_a_silent_server_sends_a_keepalive_and_all_without_delay(server: HeadsetServer, clock: HandClock) -> None:
+def test_a_silent_server_sends_a_keepalive_and_sends_everything_without_delay(
+    server: HeadsetServer, clock: HandClock
+) -> None:
     with connect(server) as headset:
         assert server._client is not None
         assert server._client.socket.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
@@ -91,7 +93,7 @@ def test_haptics_arrive_as_two_floats_clipped_to_their_range(server: HeadsetServ
         payload = headset.read_until(HAPTIC)
         assert len(payload) == (8 if dialect == "ros1" else 12)
         assert struct.unpack("<2f", payload[-8:]) == (0.5, 1.0)
-        for value in (math.nan, -math.inf):  # is not sent
+        for value in (math.nan, -math.inf):  # These values are not sent.
             server.send_haptic(HapticFeedback("left", value, 1.0))
             server.send_haptic(HapticFeedback("left", 1.0, value))
         server.send_haptic(HapticFeedback("right", 1.0, 1.0))
@@ -110,14 +112,16 @@ def test_haptics_without_a_headset_or_a_subscription_do_nothing(server: HeadsetS
     server.send_haptic(HapticFeedback("left", 1.0, 1.0))
 
 
-def test_a_headset_that_does_not_read_is_owed_the_newest_vibration_and_the_next_one_none(server: HeadsetServer) -> None:
+def test_a_headset_that_does_not_read_gets_only_the_newest_vibration_and_the_next_headset_none(
+    server: HeadsetServer,
+) -> None:
     with registered(server) as headset:
         assert server._client is not None
         network = server._client.socket = MagicMock(wraps=server._client.socket)
-        network.send.side_effect = BlockingIOError  # as while its other end does not read
+        network.send.side_effect = BlockingIOError  # The network behaves as if the other end did not read.
         for step in range(51):
             server.send_haptic(HapticFeedback("left", step / 50.0, 1.0))
-            time.sleep(0.001)  # time in which an unbounded queue would grow
+            time.sleep(0.001)  # In this time, an unbounded queue would grow.
         headset.send(headset.pose("left", (1.0, 2.0, 3.0), IDENTITY))
         assert collect(server, 1)[0].position.tolist() == [1.0, 2.0, 3.0]
         network.send.side_effect = None
@@ -135,7 +139,7 @@ def test_a_headset_that_does_not_read_is_owed_the_newest_vibration_and_the_next_
         assert next_topic(second) == "q2r_right_hand_haptic_feedback"
 
 
-def test_a_listener_gets_every_message_in_order_and_poll_none(clock: HandClock) -> None:
+def test_a_listener_gets_every_message_in_order_and_poll_gets_none(clock: HandClock) -> None:
     heard: list[Watched] = []
     with running(HeadsetServer(port=0, clock=clock, listener=heard.append)) as server, connect(server) as headset:
         for index in range(100):
@@ -150,7 +154,7 @@ def test_a_listener_gets_every_message_in_order_and_poll_none(clock: HandClock) 
         assert server.poll(0.0) == []
 
 
-def test_a_frozen_pose_has_its_fault_and_a_new_connection_none(server: HeadsetServer, clock: HandClock) -> None:
+def test_a_frozen_pose_has_its_fault_but_a_new_connection_has_none(server: HeadsetServer, clock: HandClock) -> None:
     for expected in ([None, None, HandFault.FROZEN], [None, None]):
         with connect(server) as headset:
             assert faults(server, headset, len(expected), lambda: clock.advance(0.3)) == expected
@@ -158,7 +162,7 @@ def test_a_frozen_pose_has_its_fault_and_a_new_connection_none(server: HeadsetSe
 
 
 def faults(server: HeadsetServer, headset: FakeHeadset, count: int, wait: Callable[[], None]) -> list[HandFault | None]:
-    """Of the same pose that is sent again and again."""
+    """Return the faults of the same pose, which is sent again and again."""
     found = []
     for _ in range(count):
         headset.send(headset.pose("left", (1.0, 2.0, 3.0), IDENTITY))
@@ -167,7 +171,7 @@ def faults(server: HeadsetServer, headset: FakeHeadset, count: int, wait: Callab
     return found
 
 
-def test_a_cells_settings_reach_the_server() -> None:
+def test_settings_of_a_cell_reach_the_server() -> None:
     cell = load_config("config/dual_iiwa7.yaml")
     quick = cell.headset.model_copy(update={"port": 0, "frozen_time": 0.1})
     server = make_input("headset", cell.model_copy(update={"headset": quick}))
@@ -176,7 +180,7 @@ def test_a_cells_settings_reach_the_server() -> None:
         assert faults(server, headset, 2, lambda: time.sleep(0.15)) == [None, HandFault.FROZEN]
 
 
-def test_nothing_of_a_lost_connection_reaches_the_next(server: HeadsetServer) -> None:
+def test_no_data_of_a_lost_connection_reach_the_next_one(server: HeadsetServer) -> None:
     with connect(server) as first:
         first.send(first.inputs("left", lower=True) + first.pose("left", (1.0, 2.0, 3.0), IDENTITY))
         collect(server, 1)
@@ -194,7 +198,7 @@ def test_nothing_of_a_lost_connection_reaches_the_next(server: HeadsetServer) ->
 
 
 def forged(headset: FakeHeadset) -> bytes:
-    """A pose of the other dialect."""
+    """Return a pose of the other dialect."""
     other = "ros1" if headset.dialect == "ros2" else "ros2"
     return headset.frame("q2r_left_hand_pose", pack_pose(other, (0, 0, 0), IDENTITY))
 
@@ -204,7 +208,7 @@ def cut_off(headset: FakeHeadset, clock: HandClock) -> None:
     headset.close()
 
 
-# Refusals of framing and sessions are tested there; these are one of each kind.
+# Other tests check framing and sessions. These cases are one of each kind.
 FAULTS: dict[str, tuple[Callable[[FakeHeadset, HandClock], object], str]] = {
     "silence": (lambda _, clock: clock.advance(2.1 - A_LINE_LATER), "no frame for 2 s"),
     "oversized frame": (lambda one, _: one.send(struct.pack("<I1sI", 1, b"a", 1 << 20)), "at most 1048576"),
@@ -229,7 +233,7 @@ def test_a_fault_drops_that_client_with_one_line_and_the_next_is_served(
         clock.now += A_LINE_LATER
         break_down(headset, clock)
         eventually(lambda: not server.connected)
-        if headset.socket.fileno() != -1:  # is still open
+        if headset.socket.fileno() != -1:  # The connection is still open.
             last = deque(iter(headset.read_frame, None), maxlen=1).pop()
             assert last is not None
             assert last[0] == "__error"
@@ -243,13 +247,15 @@ def test_a_fault_drops_that_client_with_one_line_and_the_next_is_served(
     assert len(warnings(caplog)) == 1
 
 
-def test_a_farewell_between_frames_is_no_fault(server: HeadsetServer, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_connection_that_ends_between_frames_is_no_fault(
+    server: HeadsetServer, caplog: pytest.LogCaptureFixture
+) -> None:
     assert_serves(server)
     assert warnings(caplog) == []
     assert server.statistics.last_disconnect == "closed by the headset"
 
 
-def test_an_unexpected_exception_is_logged_and_costs_that_client_only(
+def test_an_unexpected_exception_is_logged_and_ends_only_that_connection(
     server: HeadsetServer, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     with monkeypatch.context() as patch, connect(server) as headset:
@@ -274,7 +280,7 @@ def test_poll_and_haptics_do_not_wait_for_a_snapshot_or_for_decoding(server: Hea
         assert not asked.is_alive()
 
 
-def test_an_address_that_cannot_be_bound_is_named_and_the_default_is_this_machine(server: HeadsetServer) -> None:
+def test_an_address_that_cannot_be_bound_is_named_and_the_default_is_loopback(server: HeadsetServer) -> None:
     assert HeadsetServer().address == ("127.0.0.1", 10000)
     for host, port in (server.address, ("no such host", 0), ("127.0.0.1", 70000)):
         with pytest.raises(InputError, match=f"cannot listen on {host}:{port}"):
@@ -310,7 +316,7 @@ def test_statistics_show_peer_dialect_counts_rates_and_last_values(server: Heads
     pose = statistics.topics["q2r_left_hand_pose"]
     assert isinstance(pose.last, HandPose)
     assert (statistics.dialect, pose.count, pose.last.position[0]) == (Dialect.ROS1, 90, 89.0)
-    assert pose.rate == pytest.approx(60.0, abs=1.0)  # nothing came in the last 0.2 s of the second
+    assert pose.rate == pytest.approx(60.0, abs=1.0)  # No pose came in the last 0.2 s of the second.
     assert pose.age == pytest.approx(0.2)
     assert statistics.unknown_topics == {"q2r_head_pose": 1}
     assert set(statistics.subscribed) == {HAPTIC, "q2r_right_hand_haptic_feedback"}

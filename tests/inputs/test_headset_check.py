@@ -1,4 +1,4 @@
-"""The report of headset-check: which way a hand moves, and the advice when nothing comes."""
+"""The report of headset-check: the direction of each hand's motion, and the advice if nothing comes."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_only_the_last_half_second_counts() -> None:
 
 
 @pytest.mark.parametrize("value", [np.nan, 1e308], ids=str)
-def test_hostile_positions_neither_raise_nor_hide_the_real_ones(value: float) -> None:
+def test_hostile_positions_neither_raise_nor_hide_the_real_positions(value: float) -> None:
     movement = moved(WORLD, (0.1, 0.0, 0.0))
     movement.add(HandSample("left", np.full(3, value), np.zeros(4), 5.41))
     movement.in_words(5.42)
@@ -71,7 +71,9 @@ def test_hostile_positions_neither_raise_nor_hide_the_real_ones(value: float) ->
     ],
     ids=["this machine only", "on the network", "connected and silent", "after a lost connection"],
 )
-def test_advice_is_about_what_is_most_likely(changes: dict[str, Any], says: tuple[str, ...], not_said: str) -> None:
+def test_the_advice_is_about_the_most_likely_cause(
+    changes: dict[str, Any], says: tuple[str, ...], not_said: str
+) -> None:
     text = "\n".join(advice(replace(NOBODY, **changes)))
     assert all(words in text for words in says)
     assert not not_said or not_said not in text
@@ -98,7 +100,7 @@ def test_a_run_needs_poses_and_inputs_of_each_hand_that_leads_an_arm(cell: Confi
 
 
 def check_of(server: HeadsetServer, cell: Config, sent: str) -> HeadsetCheck:
-    """The last state once the server has what a headset ``sent``, such as "left pose, right inputs"."""
+    """Return the last state after the server has what a headset ``sent``, such as "left pose, right inputs"."""
     with FakeHeadset(server.address) as headset:
         topics = [words.split() for words in sent.split(", ")]
         for hand, kind in topics:
@@ -115,7 +117,7 @@ def check_of(server: HeadsetServer, cell: Config, sent: str) -> HeadsetCheck:
         ("left pose, left inputs, right inputs", ("right_hand_pose",), "right hand: no poses"),
     ],
 )
-def test_what_a_run_needs_and_does_not_get_is_named(
+def test_the_report_names_messages_that_a_run_needs_and_that_did_not_come(
     server: HeadsetServer, cell: Config, sent: str, missing: tuple[str, ...], says: str
 ) -> None:
     check = check_of(server, cell, sent)

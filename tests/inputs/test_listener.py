@@ -1,4 +1,4 @@
-"""The door: bounded rates, a log that loses no line uncounted, who may drive, and what people are told of addresses."""
+"""The door: bounded rates, a log that counts suppressed lines, who may drive, and messages about addresses."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from q2r2_control.inputs.listener import (
 INFO, WARNING = logging.INFO, logging.WARNING
 
 
-def test_a_rate_is_kept_in_each_period_and_its_rest_is_lost() -> None:
+def test_a_rate_limit_applies_to_each_period_and_does_not_carry_over() -> None:
     limit = RateLimit(3, 0.5)
     assert [limit.take(10.0) for _ in range(5)] == [True, True, True, False, False]
     assert not limit.is_open(10.25)
@@ -66,7 +66,7 @@ def test_the_first_line_of_a_host_is_written_at_once_and_later_ones_once_a_secon
     assert lines.lines == [*first, "WARNING line 2999 (999 more left out)"]
 
 
-def test_a_line_that_came_too_early_is_written_a_little_later_and_the_most_important_is_kept() -> None:
+def test_a_line_that_came_too_early_is_written_later_and_the_most_important_line_is_kept() -> None:
     lines = Lines()
     log = lines.log_of_hosts
     log.write("a", INFO, "connected", 10.0)
@@ -81,7 +81,7 @@ def test_a_line_that_came_too_early_is_written_a_little_later_and_the_most_impor
     assert lines.lines[2:] == ["WARNING refused (1 more left out)"]
 
 
-def test_hosts_do_not_silence_each_other_but_beyond_eight_they_share_a_line() -> None:
+def test_hosts_do_not_silence_each_other_but_more_than_eight_share_a_line() -> None:
     lines = Lines()
     for index in range(100):
         lines.log_of_hosts.write(f"host {index}", WARNING, f"line {index}", 10.0)
@@ -91,7 +91,7 @@ def test_hosts_do_not_silence_each_other_but_beyond_eight_they_share_a_line() ->
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "::", ""])
-def test_a_server_on_every_network_is_told_to_the_app_by_an_address_that_can_be_typed(host: str) -> None:
+def test_a_server_on_every_network_names_an_address_that_can_be_typed_into_the_app(host: str) -> None:
     assert written("127.0.0.1", 10007) == "127.0.0.1:10007"
     assert written("::", 10007) == "[::]:10007"
     settings = app_settings(host, 10007)
@@ -103,7 +103,7 @@ def test_a_server_on_every_network_is_told_to_the_app_by_an_address_that_can_be_
         assert not ip_address(address).is_unspecified
 
 
-def test_a_server_says_who_can_drive_and_how_to_change_that() -> None:
+def test_a_server_says_which_hosts_can_drive_and_how_to_change_that() -> None:
     enter, drivers = access_lines("192.168.1.20", 10000, None)
     assert enter == "enter in the app: address 192.168.1.20, port 10000, protocol ROS2"
     assert drivers.startswith("whoever reaches this port can drive the arms")
@@ -144,7 +144,7 @@ SILENT = replace(BACK, registrations=({}, {}))
         pytest.param(QUIET, replace(SILENT, since=NOW - 2.1), Admission.REFUSE, id="waited in vain"),
     ],
 )
-def test_the_place_belongs_to_who_sends_poses_and_a_peer_that_comes_back_takes_its_own(
+def test_a_client_that_sends_poses_drives_and_a_peer_that_comes_back_replaces_itself(
     driver: Peer | None, newcomer: Peer, verdict: Admission
 ) -> None:
     decided, reason = decide(driver, newcomer, NOW)
@@ -153,12 +153,12 @@ def test_the_place_belongs_to_who_sends_poses_and_a_peer_that_comes_back_takes_i
         assert (newcomer.peer if verdict is Admission.ADMIT else driver.peer) in reason
 
 
-def test_a_driver_that_gives_way_as_quiet_moves_no_arm_any_more() -> None:
+def test_a_driver_that_lost_its_place_because_it_was_quiet_moves_no_arm() -> None:
     assert 2 * STREAM_TIMEOUT < QUIET_ALLOWED < 0.5 * SILENCE_ALLOWED
     assert WAIT_ALLOWED < POSES_ALLOWED
 
 
-def test_a_host_is_allowed_where_one_of_the_networks_has_it() -> None:
+def test_a_host_is_allowed_if_one_of_the_networks_contains_it() -> None:
     networks = [ip_network(text) for text in ("192.168.1.0/24", "10.1.2.3", "fd00::/64", "fe80::/10")]
     for host in ("192.168.1.7", "10.1.2.3", "fd00::7", "fe80::1%eth0"):
         assert is_allowed(host, networks)

@@ -1,4 +1,4 @@
-"""Frames and messages are read from bytes written by hand, and nothing is read that only resembles one."""
+"""Frames and messages are read from bytes that were written by hand. Data that only resemble a message are refused."""
 
 from __future__ import annotations
 
@@ -27,15 +27,16 @@ from q2r2_control.types import HandInputs
 
 ROS1, ROS2 = Dialect.ROS1, Dialect.ROS2
 
-# IEEE 754 by hand: 1.0 is 3FF0..., 2.0 is 4000..., -1.0 is BFF0..., 0.5 is 3FE0..., little-endian; floats alike.
+# IEEE 754 numbers by hand, little-endian: 1.0 is 3FF0..., 2.0 is 4000..., -1.0 is BFF0..., 0.5 is 3FE0...; also floats.
 ONE, TWO, MINUS_ONE, HALF, ZERO = (
     bytes.fromhex(text)
     for text in ("000000000000f03f", "0000000000000040", "000000000000f0bf", "000000000000e03f", "0000000000000000")
 )
 ONE_F, MINUS_ONE_F, HALF_F, ZERO_F = (bytes.fromhex(text) for text in ("0000803f", "000080bf", "0000003f", "00000000"))
 CDR = bytes.fromhex("00010000")
-STAMP = bytes.fromhex("0c000000 0065cd1d")  # 12 s, 500,000,000 ns
-NUMBERS = ONE + TWO + HALF + ZERO + ZERO + ZERO + MINUS_ONE  # position 1 2 0.5, identity as Unity's connector sends it
+STAMP = bytes.fromhex("0c000000 0065cd1d")  # The stamp is 12 s and 500,000,000 ns.
+# Position 1 2 0.5, and the identity as Unity's connector sends it.
+NUMBERS = ONE + TWO + HALF + ZERO + ZERO + ZERO + MINUS_ONE
 
 POSES = {
     ROS1: bytes.fromhex("07000000") + STAMP + bytes.fromhex("00000000") + NUMBERS,
@@ -53,16 +54,17 @@ every_kind = pytest.mark.parametrize("kind", list(PAYLOADS))
 
 
 def pose_with_frame(dialect: Dialect, frame_id: bytes) -> bytes:
-    """``frame_id`` as its bytes stand on the wire, in ROS2 with NUL."""
+    """Return a pose whose ``frame_id`` has these bytes on the wire. In ROS 2 they end with NUL."""
     length = len(frame_id).to_bytes(4, "little")
     if dialect is ROS1:
-        return bytes.fromhex("00010000") + STAMP + length + frame_id + NUMBERS  # seq 256 looks like an encapsulation
+        # The number 256 of the sequence looks like an encapsulation.
+        return bytes.fromhex("00010000") + STAMP + length + frame_id + NUMBERS
     text = STAMP + length + frame_id
     return CDR + text + b"\xaa" * (-len(text) % 8) + NUMBERS
 
 
 @every_dialect
-def test_messages_are_read_as_sent_with_their_stamp_and_w_of_minus_one(dialect: Dialect) -> None:
+def test_messages_are_read_as_sent_including_their_stamp_and_w_of_minus_one(dialect: Dialect) -> None:
     pose, twist, inputs = (decode(kind, payload[dialect], dialect) for kind, payload in PAYLOADS.items())
     assert isinstance(pose, HandPose)
     assert isinstance(twist, HandTwist)
@@ -107,7 +109,7 @@ def test_a_payload_of_any_other_length_is_refused(kind: MessageType, dialect: Di
 
 @every_kind
 @pytest.mark.parametrize("encapsulation", ["00000000", "00010001"])
-def test_other_encapsulations_than_plain_little_endian_are_refused(kind: MessageType, encapsulation: str) -> None:
+def test_encapsulations_other_than_plain_little_endian_are_refused(kind: MessageType, encapsulation: str) -> None:
     with pytest.raises(ProtocolError):
         decode(kind, bytes.fromhex(encapsulation) + PAYLOADS[kind][ROS2][4:], ROS2)
 
@@ -122,7 +124,7 @@ def test_a_button_that_is_neither_0_nor_1_is_refused(dialect: Dialect, button: i
 
 
 @every_dialect
-def test_a_frame_id_whose_length_lies_or_that_is_not_utf8_is_refused(dialect: Dialect) -> None:
+def test_a_frame_id_with_a_wrong_length_or_without_utf8_is_refused(dialect: Dialect) -> None:
     lies = [POSES[dialect][:12] + struct.pack("<I", length) + POSES[dialect][16:] for length in (9, 0xFFFFFFFF)]
     for payload in (*lies, pose_with_frame(dialect, b"\xff\xfe" + (b"\0" if dialect is ROS2 else b""))):
         with pytest.raises(ProtocolError):
@@ -131,7 +133,9 @@ def test_a_frame_id_whose_length_lies_or_that_is_not_utf8_is_refused(dialect: Di
 
 @every_dialect
 @pytest.mark.parametrize("value", [math.nan, math.inf])
-def test_numbers_that_are_not_finite_pass_for_the_teleop_layer_to_reject(dialect: Dialect, value: float) -> None:
+def test_numbers_that_are_not_finite_are_read_so_that_the_teleop_layer_rejects_them(
+    dialect: Dialect, value: float
+) -> None:
     payload = POSES[dialect][:-56] + struct.pack("<7d", *[value] * 7)
     pose = decode(MessageType.POSE, payload, dialect)
     assert isinstance(pose, HandPose)
@@ -157,7 +161,7 @@ def test_random_and_mutated_bytes_raise_nothing_but_protocol_errors() -> None:
     assert 1800 < refused < 2400
 
 
-# Written by hand from the protocol: length 4, "/abc", length 3, "xyz".
+# These bytes are written by hand from the protocol: length 4, "/abc", length 3, "xyz".
 ABC = b"\x04\x00\x00\x00/abc\x03\x00\x00\x00xyz"
 ABC_NUL = b"\x05\x00\x00\x00/abc\x00\x03\x00\x00\x00xyz"
 
@@ -173,7 +177,7 @@ def frames(*chunks: bytes) -> list[WireFrame]:
     return found
 
 
-def test_a_frame_is_read_and_written_as_by_hand_and_only_one_nul_is_taken_off() -> None:
+def test_a_frame_is_read_and_written_as_by_hand_and_only_one_nul_is_removed() -> None:
     assert encode_frame("/abc", b"xyz") == ABC
     assert frames(ABC) == [WireFrame("/abc", b"xyz", terminated=False)]
     assert frames(KEEPALIVE) == [WireFrame("", b"", terminated=False)]
@@ -209,7 +213,7 @@ TOO_LONG = "bytes announced, at most 1048576 are allowed"
         (b"\x00\x00\x00\x00\x01\x00\x00\x00x", "without a destination"),
     ],
 )
-def test_what_cannot_be_a_frame_is_refused_with_its_reason(stream: bytes, reason: str) -> None:
+def test_bytes_that_cannot_be_a_frame_are_refused_with_a_reason(stream: bytes, reason: str) -> None:
     with pytest.raises(ProtocolError, match=reason):
         frames(stream)
 

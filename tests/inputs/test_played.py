@@ -1,4 +1,4 @@
-"""Errors of a headset in exact poses: noise of the size asked for, uneven times, and no others unless asked."""
+"""Headset errors added to exact poses: noise of the wanted size, uneven times, and other errors only if asked for."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ HAND = pin.SE3(pin.exp3(np.array([0.3, -0.2, 0.9])), np.array([0.4, 0.2, 1.1]))
 
 
 def measured(sampling: SampleTiming, count: int) -> tuple[Array, Array]:
-    """Times (n,) [s] of samples of a hand at rest, and what was added to each (n, 6): position [m], rotation [rad]."""
+    """Return times (n,) [s] of samples of a resting hand, and the errors (n, 6) of each: position [m], rotation [rad]."""
     times, added = [], []
     for t in islice(sampling.times(), count):
         pose = sampling.measured(HAND, t)
@@ -34,7 +34,7 @@ def test_even_samples_are_exact_and_at_once() -> None:
 
 
 @pytest.mark.parametrize("noise", [1e-4, 2e-4])
-def test_a_headset_s_noise_has_the_size_asked_for_and_no_sample_is_lost(noise: float) -> None:
+def test_headset_noise_has_the_wanted_size_and_no_sample_is_lost(noise: float) -> None:
     times, added = measured(HeadsetSampling("left", 3, position_noise=noise), 4000)
     np.testing.assert_allclose(added.std(axis=0), [noise] * 3 + [math.radians(0.03)] * 3, rtol=0.05)
     np.testing.assert_allclose(added.mean(axis=0), 0.0, atol=0.1 * math.radians(0.03))
@@ -43,7 +43,7 @@ def test_a_headset_s_noise_has_the_size_asked_for_and_no_sample_is_lost(noise: f
     assert 1.0 / 72.5 < gaps.max() <= 1.0 / 72.0
 
 
-def test_tremor_and_dropouts_come_where_they_are_asked_for() -> None:
+def test_tremor_and_dropouts_come_at_the_wanted_times() -> None:
     times, added = measured(HeadsetSampling("right", 3, tremor=True, dropout_probability=0.005), 4000)
     assert 0.3e-3 < added[:, :3].std(axis=0).max() < 1e-3
     assert 0.02 < np.diff(times).max() < 6.0 / 72.0

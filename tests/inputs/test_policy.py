@@ -1,4 +1,4 @@
-"""Actions of a policy are checked where they come in, and one line says what is wrong with them."""
+"""Actions of a policy are checked where they come in, and one line names each fault."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def sent(policy: PolicyInput, *arguments: Any) -> ActionChunk:
     return chunk
 
 
-def test_it_is_a_policy_source() -> None:
+def test_the_policy_input_is_a_policy_source() -> None:
     assert isinstance(opened(), PolicySource)
 
 
@@ -59,7 +59,7 @@ def test_joint_positions_become_tool_poses_and_the_posture() -> None:
     assert [chunk.grippers[arm][0] for arm in robot().arms] == [0.3, 1.0]
 
 
-def test_a_chunk_comes_out_of_a_recording_as_it_went_in() -> None:
+def test_a_recording_returns_a_chunk_exactly_as_it_was_given() -> None:
     chunk = sent(opened(), np.tile(robot().home / 3.0, (3, 1)), [0.1, 0.2, 0.3])
     again = ActionChunk.from_json(json.loads(json.dumps(chunk.as_json())))
     assert again.as_json() == chunk.as_json()
@@ -97,7 +97,7 @@ def with_one(value: float) -> Array:
         (np.zeros((2, 16)), [0.0, 0.1], (*JOINTS, "right_gripper", "left_gripper"), "names end with"),
     ],
 )
-def test_actions_that_cannot_be_used_are_one_line_that_names_what_is_wrong(
+def test_unusable_actions_give_one_line_that_names_the_fault(
     actions: Any, times: Any, names: tuple[str, ...], told: str
 ) -> None:
     chunk = sent(opened(), actions, times, names)
@@ -141,7 +141,7 @@ def test_a_policy_is_asked_on_its_own_thread_and_again_when_half_of_its_actions_
 
 
 def asked(policy: PolicyInput, time: float = 1.0) -> str:
-    """The sentence of the fault that comes of asking the policy in simulated time."""
+    """Return the sentence of the fault after a policy was asked in simulated time."""
     policy.observe(observed(time))
     (chunk,) = policy.chunks()
     assert chunk.fault is not None
@@ -154,7 +154,7 @@ def of_function(function: Any) -> PolicyInput:
     return policy
 
 
-def test_a_policy_that_raises_is_a_fault_of_its_actions() -> None:
+def test_an_exception_of_a_policy_is_a_fault_of_its_actions() -> None:
     def fails(observation: Observation) -> Array:
         raise RuntimeError("no weights\nwere found")
 
@@ -176,7 +176,7 @@ def test_the_traceback_of_a_policy_is_logged_once_for_each_error(caplog: pytest.
     assert "_ask" not in first, "the traceback begins in the policy"
 
 
-def test_a_policy_that_returns_nothing_is_told_so() -> None:
+def test_a_policy_that_returns_nothing_gets_a_message_about_that() -> None:
     told = asked(of_function(lambda seen: None))
     assert told.endswith("the policy returned None; allowed: an array of actions (n, size)")
 
@@ -228,6 +228,6 @@ def test_the_command_line_names_a_policy_of_this_folder(tmp_path: Path, monkeypa
 
 
 @pytest.mark.parametrize("more", [{"space": "joints"}, {"rate": 0.0}, {"rate": 1000.0}], ids=str)
-def test_a_space_or_rate_that_is_not_allowed_is_said(more: dict[str, Any]) -> None:
+def test_a_space_or_rate_that_is_not_allowed_is_named(more: dict[str, Any]) -> None:
     with pytest.raises(ConfigError, match="allowed: "):
         PolicyInput(**more)

@@ -1,4 +1,7 @@
-"""Poses that are no motion of the hands are found, human hands are not; samples join what travels apart."""
+"""Poses that are not motions of the hands are found, but human motions pass.
+
+Samples join data that arrive separately.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +42,7 @@ def test_each_sample_has_the_newest_pose_and_inputs_with_their_receipt_times_and
         tracker.update("left", HandInputs(), 10.4),
         tracker.update("left", pose(3.0), 10.5),
         tracker.update("left", HandTwist(np.zeros(3), np.zeros(3)), 10.6),
-        tracker.update("right", PRESSED, 10.7),  # waits for its first pose
+        tracker.update("right", PRESSED, 10.7),  # The right hand waits for its first pose.
         tracker.update("right", pose(4.0), 10.8),
     ]
     assert [one and (one.position[0], one.pose_stamp, one.inputs, one.inputs_stamp, one.fault) for one in made] == [
@@ -61,12 +64,12 @@ def test_a_full_queue_keeps_the_newest_samples() -> None:
     assert [one.pose_stamp for one in queue.take()] == [float(index) for index in range(1000 - SAMPLES_KEPT, 1000)]
 
 
-def test_a_cut_shows_at_one_look_per_tick_whether_before_or_after_the_take() -> None:
+def test_a_cut_is_reported_at_one_tick_whether_it_came_before_or_after_the_samples_were_taken() -> None:
     for look_first in (True, False):
         queue = SampleQueue()
         queue.put(sample(1.0))
         queue.cut()
-        queue.put(sample(5.0))  # of the next connection, already
+        queue.put(sample(5.0))  # This sample belongs to the next connection already.
         seen, stamps = [], []
         for _ in range(3):
             before = queue.is_cut
@@ -96,7 +99,7 @@ def faults(watched: Iterable[Watched]) -> set[tuple[str, HandFault]]:
 
 
 def moved(samples: Iterable[Message], by: Callable[[float, str], pin.SE3]) -> Iterator[Message]:
-    """The same in a frame that has moved."""
+    """Return the same pose in a frame that has moved."""
     for t, hand, pose in samples:
         assert isinstance(pose, HandPose)
         rotation = pin.Quaternion(pose.quaternion).matrix()
@@ -104,7 +107,7 @@ def moved(samples: Iterable[Message], by: Callable[[float, str], pin.SE3]) -> It
 
 
 def stepped(shift: float, degrees: float, hands: tuple[str, ...] = SIDES) -> Callable[[float, str], pin.SE3]:
-    """A frame that moves once, by ``shift`` [m] and about the vertical."""
+    """Return a frame that moves once, by ``shift`` [m] and about the vertical."""
     step = pin.SE3(pin.exp3(np.array([0.0, 0.0, math.radians(degrees)])), shift * np.array([0.6, 0.0, 0.8]))
     return lambda t, hand: step if t >= STEP_AT and hand in hands else pin.SE3.Identity()
 
@@ -113,7 +116,7 @@ def resting(seed: int = 0) -> list[Message]:
     return list(TwoHands(rest, seed).samples(1.2))
 
 
-def test_a_pose_that_stays_the_same_to_the_last_bit_is_frozen_whatever_its_stamp() -> None:
+def test_a_pose_that_stays_equal_to_the_last_bit_is_frozen_whatever_its_stamp() -> None:
     (_, _, pose), *_ = resting()
     assert isinstance(pose, HandPose)
     still = [(index * PERIOD, "left", replace(pose, stamp=float(index))) for index in range(60)]
@@ -150,7 +153,7 @@ def test_a_frame_that_steps_is_a_fault_of_both_hands_from_its_first_pose(
     assert len(after) > len(bad)
 
 
-def test_a_step_of_one_hand_is_handed_on_in_order_for_the_gate_to_judge() -> None:
+def test_a_step_of_one_hand_is_passed_on_in_order_so_that_the_gate_judges_it() -> None:
     for hand in SIDES:
         samples = list(moved(resting(), stepped(0.3, 0.0, (hand,))))
         watched = handed_on(samples)
@@ -161,7 +164,7 @@ def test_a_step_of_one_hand_is_handed_on_in_order_for_the_gate_to_judge() -> Non
             assert stamps == sorted(stamps)
 
 
-def test_a_hand_whose_other_one_is_not_there_does_not_wait_for_it() -> None:
+def test_a_hand_does_not_wait_for_another_hand_that_is_absent() -> None:
     alone = [message for message in moved(resting(), stepped(0.1, 0.0)) if message[1] == "right"]
     watch = HandsWatch()
     for t, hand, pose in alone:
@@ -186,7 +189,7 @@ def test_after_the_chord_is_let_go_a_step_is_a_fault_again() -> None:
 
 def test_a_frame_that_turns_with_the_head_is_a_fault_of_both_hands() -> None:
     def nodding(t: float, hand: str) -> pin.SE3:
-        """A head that turns by 35 degrees in 1.2 s."""
+        """Return poses under a head that turns by 35 degrees in 1.2 s."""
         return pin.SE3(pin.exp3(np.array([0.0, 0.0, math.radians(35.0) * minimum_jerk(t / 1.2)])), np.zeros(3))
 
     coupled = list(moved(TwoHands(rest, 3, (0.0, 0.0), tremor=False).samples(1.5), nodding))
@@ -196,7 +199,9 @@ def test_a_frame_that_turns_with_the_head_is_a_fault_of_both_hands() -> None:
 
 @pytest.mark.parametrize("tremor", [True, False], ids=["trembling", "without tremor"])
 @pytest.mark.parametrize("seed", [0, 1])
-def test_human_hands_on_a_light_box_are_no_frame(seed: int, tremor: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_human_hands_on_a_light_box_are_not_a_moving_frame(
+    seed: int, tremor: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for name in ("_CARRIED_TOLERANCE", "_STEP_TOLERANCE"):
         distance, angle = getattr(moved_frame, name)
         monkeypatch.setattr(moved_frame, name, Move(2.0 * distance, 2.0 * angle))
@@ -204,7 +209,7 @@ def test_human_hands_on_a_light_box_are_no_frame(seed: int, tremor: bool, monkey
 
 
 def snatch(t: float) -> pin.SE3:
-    """Both hands by 0.2 m, to and fro, from rest to 1.2 m/s at 18 m/s^2 and straight into a stop."""
+    """Move both hands by 0.2 m, to and fro, from rest to 1.2 m/s at 18 m/s^2 and then into a sudden stop."""
     stroke, phase = divmod(t, 0.4)
     ramp = 1.2 / 18.0
     way = min(9.0 * min(phase, ramp) ** 2 + 1.2 * max(phase - ramp, 0.0), 0.2)
@@ -212,7 +217,7 @@ def snatch(t: float) -> pin.SE3:
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_hands_that_start_as_fast_as_hands_can_with_samples_lost_and_held_up_are_no_frame(seed: int) -> None:
+def test_hands_that_start_as_fast_as_possible_with_samples_lost_and_late_are_not_a_moving_frame(seed: int) -> None:
     random = np.random.default_rng(seed)
     lost = {index for index in range(600) if random.random() < 0.05}
     samples = [
@@ -226,7 +231,7 @@ def test_hands_that_start_as_fast_as_hands_can_with_samples_lost_and_held_up_are
 
 
 def test_hands_that_start_together_while_samples_are_lost_are_no_frame() -> None:
-    """At 16 m/s^2, for 60 ms, and without anything that tells them from one rigid body."""
+    """The hands accelerate with 16 m/s^2 for 60 ms, without anything that distinguishes them from one rigid body."""
 
     def reach(t: float) -> pin.SE3:
         return pin.SE3(np.eye(3), np.array([0.0, 8.0 * min(max(t - STEP_AT, 0.0), 0.06) ** 2, 0.0]))

@@ -1,4 +1,4 @@
-"""Scripted hands: what the demo and the tracking tests rely on."""
+"""Scripted hands: the properties that the demo and the tracking tests need."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def flat(samples: list[HandSample]) -> list[tuple[object, ...]]:
     return [(s.hand, s.pose_stamp, s.inputs, *s.position.tolist(), *s.quaternion.tolist()) for s in samples]
 
 
-def test_the_same_seed_gives_the_same_samples_however_they_are_polled() -> None:
+def test_equal_seeds_give_equal_samples_for_any_times_of_polling() -> None:
     often, seldom = (play(ScriptedInput("grasp", human=True, seed=3), 6.0, dt) for dt in (0.001, 0.1))
     assert len(seldom) > 500
     assert flat(often)[: len(seldom)] == flat(seldom)
@@ -49,11 +49,12 @@ def test_stamps_are_on_the_callers_clock_and_never_in_its_future() -> None:
 @pytest.mark.slow
 @EVERY
 @pytest.mark.parametrize("hand", SIDES)
-def test_hands_move_smoothly_calmly_and_within_reach(trajectory: str, hand: str) -> None:
+def test_hands_move_smoothly_slowly_and_within_reach(trajectory: str, hand: str) -> None:
     script, dt = ScriptedInput(trajectory), 0.01
     poses = [script.hand_pose(hand, tick * dt) for tick in range(2100)]
     way = np.array([pose.translation - poses[0].translation for pose in poses])
-    lowest = -0.211 if trajectory == "peg" else -0.164 if trajectory in WORKS else 0.0  # farther than a precise tool
+    # Some hands reach farther than a precise tool.
+    lowest = -0.211 if trajectory == "peg" else -0.164 if trajectory in WORKS else 0.0
     assert way[:, 2].min() > lowest - 1e-9
     assert np.abs(way).max() <= (0.355 if trajectory == "carry" else 0.25) + 1e-9
     velocity = np.diff(way, axis=0) / dt
@@ -85,7 +86,7 @@ def test_the_right_hand_mirrors_the_left() -> None:
         np.testing.assert_allclose(reflection @ left @ reflection, right, atol=1e-12)
 
 
-def test_nothing_comes_before_start_nor_after_close_and_it_waits_while_nobody_polls() -> None:
+def test_no_sample_comes_before_start_or_after_close_and_samples_wait_while_nobody_polls() -> None:
     script = ScriptedInput("circle", hands=("left",))
     assert (script.connected, script.poll(0.0)) == (False, [])
     script.start()
@@ -125,13 +126,13 @@ def test_a_wrong_setting_is_refused_with_what_is_allowed(arguments: dict[str, ob
 
 
 @pytest.mark.parametrize("trajectory", ["circle", "meet"])
-def test_an_iiwas_motion_is_the_written_one_to_the_bit(trajectory: str) -> None:
+def test_the_motion_for_an_iiwa_equals_the_written_one_to_the_bit(trajectory: str) -> None:
     written = flat(play(ScriptedInput(trajectory), 4.0))
     for name in ("dual_iiwa7", "dual_iiwa14", "iiwa7"):
         assert flat(play(ScriptedInput.from_config(load_config(f"config/{name}.yaml"), trajectory), 4.0)) == written
 
 
-def test_shorter_arms_go_less_far_and_turn_as_far() -> None:
+def test_shorter_arms_move_shorter_distances_and_turn_by_the_same_angles() -> None:
     written, script = ScriptedInput("meet"), ScriptedInput.from_config(load_config("config/dual_xarm7.yaml"), "meet")
     for hand in SIDES:
         ways = []
@@ -143,7 +144,7 @@ def test_shorter_arms_go_less_far_and_turn_as_far() -> None:
         np.testing.assert_allclose(ways[1], 0.82 / 1.12 * ways[0], rtol=1e-3)
 
 
-def test_way_points_begin_where_the_shipped_cell_has_its_tools() -> None:
+def test_way_points_begin_at_the_tools_of_the_shipped_cell() -> None:
     robot = Robot.from_config(load_config("config/dual_iiwa7.yaml"))
     for arm, home in HOME.items():
         np.testing.assert_allclose(robot.tool_pose(robot.home, arm).translation, home, atol=1e-4)
@@ -170,7 +171,7 @@ def test_the_steps_of_works_are_told_in_order_and_by_the_name_of_the_work(name: 
     assert list(dict.fromkeys(said.partition(":")[0] for said in words[1:])) == name.split("+")
 
 
-def test_works_in_sequence_do_what_each_of_them_does_one_after_the_other() -> None:
+def test_works_in_sequence_do_the_same_as_each_work_alone() -> None:
     both, first, second = (trajectory_named(name) for name in ("handover+stack", "handover", "stack"))
     assert second.duration is not None
     shift = WORKS["handover"].duration
@@ -185,7 +186,7 @@ def test_works_in_sequence_do_what_each_of_them_does_one_after_the_other() -> No
         assert both.upper_presses[hand] == pytest.approx(presses)
 
 
-def test_a_hand_with_precision_goes_four_times_as_far_as_the_tool_and_pushes_its_stick() -> None:
+def test_a_hand_with_precision_moves_four_times_as_far_as_the_tool_and_pushes_its_stick() -> None:
     trajectory, tool = trajectory_named("peg"), WayPoints(WORKS["peg"].tools["right"])
     ((begins, ends),) = trajectory.precise
     for first, last, farther in ((3.0, begins, 1.0), (begins, ends, 4.0), (ends, 24.0, 1.0)):
@@ -215,7 +216,7 @@ def test_the_hand_is_where_its_way_points_say_and_rests_at_each() -> None:
 
 
 @pytest.mark.slow
-def test_shaky_hands_are_lost_for_a_second_engage_anew_and_do_all_of_the_work() -> None:
+def test_shaky_hands_are_lost_for_a_second_engage_again_and_complete_the_work() -> None:
     for seed in range(20):
         calm, hasty = trajectory_named("carry"), hurried(trajectory_named("carry"), seed)
         assert hasty.duration is not None
@@ -251,7 +252,7 @@ def test_shaky_hands_tremble_twice_as_far_and_slower() -> None:
     assert most == pytest.approx(2.0 * least, rel=0.2)
 
 
-def test_hands_reach_for_parts_where_the_seed_lays_them() -> None:
+def test_hands_reach_for_parts_where_the_seed_places_them() -> None:
     places = {seed: place_of(seed, 0.02) for seed in range(20)}
     assert len(set(places.values())) == 20
     assert 0.015 < np.abs(list(places.values())).max() <= 0.02
@@ -266,6 +267,6 @@ def test_hands_reach_for_parts_where_the_seed_lays_them() -> None:
     np.testing.assert_allclose(elsewhere - plain, (x, y, 0.0), atol=1e-9)
 
 
-def test_what_has_no_parts_cannot_be_spread() -> None:
+def test_work_without_parts_cannot_be_spread() -> None:
     with pytest.raises(ConfigError, match="'circle': has no parts to spread; allowed: "):
         ScriptedInput("circle", spread=0.01)

@@ -1,4 +1,4 @@
-"""A client's messages and the answers to them, byte for byte, without sockets."""
+"""The messages of a client and the answers to them, byte for byte, without sockets."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def pose(dialect: Dialect, topic: str = "q2r_left_hand_pose") -> WireFrame:
 
 
 def answers(session: HeadsetSession) -> list[tuple[str, bytes]]:
-    """Frames the session wants to send, which are taken away."""
+    """Return and remove the frames that the session wants to send."""
     decoder = FrameDecoder()
     decoder.feed(bytes(session.outgoing))
     session.outgoing.clear()
@@ -51,7 +51,7 @@ def answers(session: HeadsetSession) -> list[tuple[str, bytes]]:
 
 @pytest.fixture
 def session() -> HeadsetSession:
-    """A session whose handshake was sent."""
+    """Return a session after its handshake."""
     new = HeadsetSession()
     new.outgoing.clear()
     return new
@@ -86,7 +86,7 @@ def test_a_change_of_dialect_ends_the_session(session: HeadsetSession, dialect: 
 
 
 @every_dialect
-def test_removing_takes_a_registration_away_and_may_come_without_one(session: HeadsetSession, dialect: Dialect) -> None:
+def test_a_registration_can_be_removed_even_if_it_does_not_exist(session: HeadsetSession, dialect: Dialect) -> None:
     session.receive(command(dialect, "__publish", topic="a", message_name="std_msgs/Empty"))
     session.receive(command(dialect, "__subscribe", topic="b", message_name="std_msgs/Empty"))
     for _ in range(2):
@@ -113,14 +113,14 @@ def test_the_topic_list_has_a_type_of_two_parts_for_each_topic(session: HeadsetS
 
 @every_dialect
 @pytest.mark.parametrize("name", ["__request", "__response"])
-def test_a_service_call_and_its_body_are_survived(session: HeadsetSession, dialect: Dialect, name: str) -> None:
+def test_a_service_call_with_its_body_is_ignored(session: HeadsetSession, dialect: Dialect, name: str) -> None:
     session.receive(command(dialect, name, srv_id=3))
     assert session.receive(frame(dialect, "any_service", b"\x01\x02")) is None
     assert session.unknown_topics == {}
     assert session.receive(pose(dialect)) is not None
 
 
-def test_registering_services_is_survived_and_a_request_is_answered_with_an_error(session: HeadsetSession) -> None:
+def test_registered_services_are_ignored_and_a_request_is_answered_with_an_error(session: HeadsetSession) -> None:
     for name in ("__ros_service", "__unity_service", "__remove_ros_service", "__remove_unity_service", "__response"):
         session.receive(command(Dialect.ROS2, name, topic="reset", message_name="std_srvs/Empty"))
     session.receive(frame(Dialect.ROS2, "body"))
@@ -154,7 +154,7 @@ def test_a_registration_that_cannot_be_read_ends_the_session(session: HeadsetSes
         session.receive(frame(Dialect.ROS1, "__publish", payload))
 
 
-def test_a_command_may_have_16_kilobytes_and_no_more(session: HeadsetSession) -> None:
+def test_a_command_may_have_at_most_16_kilobytes(session: HeadsetSession) -> None:
     payload = b'{"topic":"a","message_name":"a/B"}'.ljust(1 << 14)
     session.receive(frame(Dialect.ROS1, "__publish", payload))
     assert session.published == {"a": "a/B"}
@@ -183,7 +183,7 @@ def test_a_blank_topic_or_type_is_answered_with_an_error_and_the_session_goes_on
     assert session.receive(pose(Dialect.ROS2)) is not None
 
 
-def test_a_flood_of_blank_topics_ends_the_session_though_every_answer_is_read(session: HeadsetSession) -> None:
+def test_a_flood_of_blank_topics_ends_the_session_even_if_every_answer_is_read(session: HeadsetSession) -> None:
     for _ in range(MAX_INCOMPLETE):
         session.receive(command(Dialect.ROS2, "__publish", topic=""))
         session.outgoing.clear()
@@ -191,7 +191,7 @@ def test_a_flood_of_blank_topics_ends_the_session_though_every_answer_is_read(se
         session.receive(command(Dialect.ROS2, "__publish", topic=""))
 
 
-def test_data_on_unknown_topics_is_counted_in_bounded_number_and_ignored(session: HeadsetSession) -> None:
+def test_data_on_unknown_topics_are_ignored_and_counted_for_a_bounded_number_of_topics(session: HeadsetSession) -> None:
     for index in range(10 * MAX_TOPICS):
         for name in ("/q2r_head_pose", f"topic_{index}"):
             assert session.receive(frame(Dialect.ROS2, name, b"whatever")) is None
@@ -230,7 +230,7 @@ def test_haptics_go_to_the_subscribed_spelling_in_the_dialect(session: HeadsetSe
     assert answers(session) == [("/" + HAPTIC, header + bytes.fromhex("0000003f 0000803f"))]
 
 
-def test_no_haptics_go_to_a_client_that_did_not_subscribe_or_no_longer_listens(session: HeadsetSession) -> None:
+def test_no_haptics_go_to_a_client_without_a_subscription_or_after_its_end(session: HeadsetSession) -> None:
     session.queue_haptic(HapticFeedback("left", 0.5, 1.0))
     session.receive(command(Dialect.ROS2, "__subscribe", topic=HAPTIC, message_name="a/B"))
     session.queue_haptic(HapticFeedback("right", 0.5, 1.0))

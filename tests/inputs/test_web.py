@@ -1,4 +1,4 @@
-"""A page's hands: dragging moves the tool alike, letting go pauses, silence and a page that is gone stop the arm."""
+"""A page's hands: dragging moves the tool equally, letting go pauses it, and silence or a closed page stops the arm."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from q2r2_control.types import Array
 from tests.pipeline.loops import pipeline
 from tests.support.processes import cell, changes
 
-BEGIN, END = 0.2, 0.8  # of the drag [s]
+BEGIN, END = 0.2, 0.8  # Begin and end of the drag [s].
 WAY = np.array([0.03, 0.0, 0.05])  # [m]
 
 
 class Page:
-    """Drags the left tool, 50 answers a second."""
+    """A page that drags the left tool, with 50 answers a second."""
 
     def __init__(self, silent_at: float = np.inf, gone_at: float = np.inf) -> None:
         self.now, self.next = 0.0, BEGIN
@@ -43,7 +43,7 @@ class Page:
         self.next = self.next + 0.02 if tick.t < END else np.inf
 
 
-def test_a_drag_moves_the_tool_as_far_and_letting_go_pauses_it() -> None:
+def test_a_drag_moves_the_tool_by_the_same_distance_and_letting_go_pauses_it() -> None:
     page = Page()
     summary = page.loop.run(1.5, realtime=False)
     engaged, paused = changes(list(summary.events), "left")
