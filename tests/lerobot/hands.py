@@ -1,4 +1,4 @@
-"""Hands that take over whenever they are asked to: an input that ``lerobot-rollout`` finds by its entry point."""
+"""Hands that take over whenever they are asked: an input that ``lerobot-rollout`` finds by its entry point."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from q2r2_control.types import SIDES, HandInputs, HandSample
 from tests.support.hands_input import PRESSED, RELEASED, HandsInput
 
 NAME, READY = "taking_over", "hands: have taken over"
-_ASKED_ANEW, _LATER = 0.05, 0.3  # without a poll, and after the first one [s]
+_ASKED_ANEW, _LATER = 0.05, 0.3  # Times without a poll, and after the first one [s].
 
 
 class TakingOver(HandsInput):
-    """Press as soon as they are asked, and then draw a wave; a line says when they have for a while."""
+    """Hands that press as soon as they are asked, and then draw a wave. After a while, a printed line says so."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""The commands of lerobot with a cell as the robot and hands of q2r2 as the teleoperator, in simulated time.
+"""The commands of lerobot in simulated time, with a cell as the robot and hands of q2r2 as the teleoperator.
 
 Run by ``make test-lerobot``, in an environment of its own.
 """
@@ -33,15 +33,16 @@ from tests.lerobot import hands
 from tests.recording.runs import ROOT
 from tests.support.modules import blocks_of
 
-FPS = 25  # a whole number of ticks a frame
+FPS = 25  # A frame has a whole number of ticks.
 TAKEOVERS = 100
 SPACE, TAB, ESCAPE = b" ", b"\t", b"\x1b"
 PACED = f"--fps={FPS}"
-ROLLS_OUT = Path(sys.executable).with_name("lerobot-rollout").exists()  # else lerobot-record does, without takeovers
+# Without it, lerobot-record is used, which has no takeovers.
+ROLLS_OUT = Path(sys.executable).with_name("lerobot-rollout").exists()
 
 
 def command(program: str, folder: Path, *options: str) -> list[str]:
-    """A command of lerobot whose robot is a cell, recorded in ``folder``."""
+    """Return a command of lerobot whose robot is a cell, which is recorded in ``folder``."""
     robot = {"type": "q2r2_cell", "cell": folder / "cell.yaml", "simulated_time": "true", "rate": FPS}
     robot |= {"record": folder / "recordings"}
     return [str(Path(sys.executable).with_name(program)), *(f"--robot.{key}={robot[key]}" for key in robot), *options]
@@ -56,7 +57,7 @@ HANDS = ("--teleop.type=q2r2_hands", "--teleop.input=scripted", "--teleop.option
 
 
 def environment(folder: Path) -> dict[str, str]:
-    # No sounds and no window: it is in a terminal that nobody sees.
+    # The command needs no sounds and no window, because nobody sees its terminal.
     known = {name: value for name, value in os.environ.items() if name not in ("DISPLAY", "WAYLAND_DISPLAY")}
     return known | {"PYTHONPATH": f"{folder}:{ROOT}", "MUJOCO_GL": "egl"}
 
@@ -67,12 +68,12 @@ def run(arguments: list[str], folder: Path) -> None:
 
 
 CHANGES = {
-    "loop_rate_hz: auto": "loop_rate_hz: 100.0",  # nothing here needs more
+    "loop_rate_hz: auto": "loop_rate_hz: 100.0",  # These tests need no higher rate.
     "max_substep: 0.002": "max_substep: 0.01",
 }
 
 
-# An ACT wants pictures, which are slow to make without a graphics card.
+# An ACT policy needs pictures, which are slow to make without a graphics card.
 CAMERA = "{position: [1.9, 0.0, 1.0], look_at: [0.4, 0.0, 0.3], width: 64, height: 48, rate: 25}"
 SEEN = f"{{front: {CAMERA}}}"
 
@@ -89,14 +90,14 @@ def write_cell(folder: Path, changes: dict[str, str], cameras: str = "{}") -> Pa
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A folder with a cell."""
+    """Return a folder with a cell."""
     write_cell(tmp_path, CHANGES)
     return tmp_path
 
 
 @pytest.fixture
 def seen(tmp_path: Path) -> Path:
-    """A folder with a cell that has a camera, and with hands that take over."""
+    """Return a folder with a cell that has a camera, and with hands that take over."""
     write_cell(tmp_path, CHANGES, SEEN)
     hands.installed(tmp_path)
     return tmp_path
@@ -104,7 +105,7 @@ def seen(tmp_path: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The dataset of a run in which the hands go round a circle."""
+    """Return the dataset of a run in which the hands move in circles."""
     folder = tmp_path_factory.mktemp("exported")
     q2r2, recordings = [sys.executable, "-m", "q2r2_control"], str(folder / "recordings")
     scripted = ["--input", "scripted", "--trajectory", "circle", "--fast", "--duration", "4", "--headless"]
@@ -115,7 +116,7 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def trained(exported: Path) -> Path:
-    """A small policy that was trained on it for 100 steps by lerobot-train."""
+    """Return a small policy that lerobot-train has trained on it for 100 steps."""
     given = {"dataset.repo_id": "q2r2/circle", "dataset.root": exported, "output_dir": exported.with_name("act")}
     given |= {"policy.type": "act", "policy.device": "cpu", "policy.push_to_hub": "false", "steps": 100}
     given |= {"policy.chunk_size": 10, "policy.n_action_steps": 10, "policy.dim_model": 32, "policy.n_heads": 2}
@@ -128,12 +129,12 @@ def trained(exported: Path) -> Path:
 
 
 def default_interrupt() -> None:
-    """A shell lets what it starts in the background ignore Ctrl-C, and Python then does so too."""
+    """Restore the default action of Ctrl-C. A shell lets its background jobs ignore it, and Python inherits that."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 class Terminal:
-    """A program in a terminal of its own, whose lines are read one by one and whose keys are pressed."""
+    """A program in its own terminal. Its lines are read one by one, and its keys are pressed."""
 
     def __init__(self, arguments: list[str], folder: Path) -> None:
         self._controller, terminal = pty.openpty()
@@ -200,7 +201,7 @@ def test_teleoperate_lets_the_scripted_hands_drive_the_arms(folder: Path) -> Non
     assert np.ptp(rows["q"], axis=0).max() > 0.01
 
 
-def test_a_dataset_that_record_makes_has_the_numbers_that_the_export_of_the_same_run_has(folder: Path) -> None:
+def test_a_recorded_dataset_has_the_numbers_of_the_export_of_the_same_run(folder: Path) -> None:
     more = ("--dataset.num_episodes=1", "--dataset.episode_time_s=10", "--play_sounds=false")
     run(command("lerobot-record", folder, *HANDS, *dataset_options(folder, "waved"), *more), folder)
     (made,) = folder.glob("waved*")
@@ -215,14 +216,14 @@ def test_a_dataset_that_record_makes_has_the_numbers_that_the_export_of_the_same
 
 
 def test_replay_repeats_the_motion_of_a_dataset(folder: Path, exported: Path) -> None:
-    rate = 500  # a slower loop follows a target less closely [Hz]
+    rate = 500  # A slower loop follows a target less closely [Hz].
     write_cell(folder, {"loop_rate_hz: auto": f"loop_rate_hz: {rate}.0"})
     options = ("--dataset.repo_id=q2r2/circle", f"--dataset.root={exported}", "--dataset.episode=0")
     run(command("lerobot-replay", folder, *options, "--play_sounds=false"), folder)
     dataset = LeRobotDataset("q2r2/circle", root=exported)
     robot = cell_and_robot_of(recording_of(folder))[1]
     asked, rows = column(dataset, "action"), rows_of(folder)
-    # A single action is reached a frame after the tick in which it came, which is the one after it was sent.
+    # A single action is reached a frame after the tick in which it arrived. This is the tick after it was sent.
     led = rows["reference_q"][rate // FPS + 1 :: rate // FPS]
     for arm in robot.arms:
         ways = [
@@ -290,7 +291,7 @@ def test_takeovers_of_dagger_make_no_jump_and_every_frame_says_who_acted(seen: P
 
 
 def check_tags(dataset: LeRobotDataset, rows: Rows) -> None:
-    """Frames are ticks of the recording, in order; hands drive only in those that are tagged."""
+    """Check that frames are ticks of the recording in order, and that hands drive only in tagged frames."""
     tags, states = column(dataset, "intervention").ravel(), column(dataset, "observation.state")
     by_hand = rows["arms"]["intervention"].max(axis=1) > 0.0
     measured = np.hstack((rows["q"], rows["arms"]["opening"])).astype(np.float32)

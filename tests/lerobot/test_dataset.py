@@ -1,4 +1,4 @@
-"""LeRobot's own loader reads what is exported: every number, every picture, and what is said of them.
+"""LeRobot's own loader reads exported datasets: every number, every picture, and all metadata.
 
 Run by ``make test-lerobot``, in an environment of its own.
 """
@@ -30,8 +30,8 @@ ROOT = Path(__file__).resolve().parents[2]
 FPS = 30
 KEY = video_key(CAMERA)
 SEEN = [with_pictures(episode, number) for number, episode in enumerate(EPISODES)]
-SPANS = [(0, 40), (40, 65), (65, 125)]  # frames of the episodes
-BACKEND = "pyav"  # the default, torchcodec, needs the libraries of FFmpeg, which no wheel brings
+SPANS = [(0, 40), (40, 65), (65, 125)]  # Frames of the episodes.
+BACKEND = "pyav"  # The default, torchcodec, needs the libraries of FFmpeg, which no wheel contains.
 
 
 @pytest.fixture(scope="module")
@@ -50,13 +50,13 @@ def rows_of(folder: Path) -> list[dict[str, object]]:
     return rows
 
 
-def test_info_names_every_number_and_says_what_is_in_it(dataset: Path) -> None:
+def test_info_names_every_number_and_describes_its_content(dataset: Path) -> None:
     info = json.loads((dataset / "meta" / "info.json").read_text())
     assert (info["codebase_version"], info["fps"], info["robot_type"]) == ("v3.0", FPS, "two_arms")
     assert (info["total_episodes"], info["total_frames"], info["total_tasks"]) == (3, 125, 2)
     assert info["splits"] == {"train": "0:3"}
     for name, labels in NAMES.items():
-        known = [f"{label}.pos" for label in labels]  # as lerobot's commands look for them
+        known = [f"{label}.pos" for label in labels]  # lerobot's commands look for these names.
         assert info["features"][name] == {"dtype": "float32", "shape": [len(labels)], "names": known}
     for name in ("next.done", "next.success"):
         assert info["features"][name] == {"dtype": "bool", "shape": [1], "names": None}
@@ -109,7 +109,7 @@ def test_the_loader_gives_every_frame_its_picture(film: Path) -> None:
             assert np.abs(pixels - wanted).mean() < 6, index
 
 
-def test_the_same_episodes_give_the_same_bytes_also_over_what_was_begun(film: Path, tmp_path: Path) -> None:
+def test_equal_episodes_give_equal_bytes_also_after_an_interrupted_export(film: Path, tmp_path: Path) -> None:
     (tmp_path / "again").mkdir()
     shards = [tmp_path / "again" / str(number) for number in range(len(SEEN))]
     for episode, shard in zip(SEEN, shards, strict=True):
@@ -120,7 +120,7 @@ def test_the_same_episodes_give_the_same_bytes_also_over_what_was_begun(film: Pa
     assert contents(tmp_path / "whole") == contents(film)
 
 
-def test_while_a_video_is_encoded_no_thread_goes_before_a_control_loop(tmp_path: Path) -> None:
+def test_while_a_video_is_encoded_no_thread_has_priority_over_a_control_loop(tmp_path: Path) -> None:
     seen: set[int] = set()
     over = threading.Event()
 
@@ -130,7 +130,7 @@ def test_while_a_video_is_encoded_no_thread_goes_before_a_control_loop(tmp_path:
                 try:
                     seen.add(os.sched_getscheduler(int(thread)))
                 except OSError:
-                    continue  # it has ended
+                    continue  # The thread has ended.
 
     watcher = threading.Thread(target=watch)
     watcher.start()
@@ -148,7 +148,7 @@ def test_a_dataset_has_the_features_that_the_docs_name(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "q2r2_control", "export", "lerobot", str(tmp_path / "recordings")]
     run = subprocess.run([*command, "--output", str(out), "--workers", "2"], capture_output=True, text=True)
     assert (run.returncode, run.stdout) == (0, f"{out}: 2 of 2 recordings at 30 frames per second\n")
-    assert "%|" not in run.stderr  # no bar of the package's own
+    assert "%|" not in run.stderr  # The package's own progress bar is not shown.
     info = json.loads((out / "meta/info.json").read_text())
     names = [line.split("|")[1] for line in (ROOT / "docs/recording.md").read_text().splitlines() if "| `" in line]
     documented = {name for cell in names for name in cell.replace("`", " ").replace(",", " ").split()}

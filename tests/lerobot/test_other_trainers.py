@@ -1,4 +1,4 @@
-"""The loaders of other trainers read what is exported for them: that of robomimic, and LeRobot's own of v2.1.
+"""The loaders of other trainers read exported files: that of robomimic, and LeRobot's own of v2.1.
 
 Run by ``make test-lerobot``, in an environment of its own.
 """
@@ -18,8 +18,8 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 try:
     from lerobot.scripts.convert_dataset_v21_to_v30 import convert_dataset
 
-    OF_ALL = False  # whether it wants the folder of all datasets
-except ImportError:  # of lerobot 0.4
+    OF_ALL = False  # True if the loader needs the folder of all datasets.
+except ImportError:  # This is the import of lerobot 0.4.
     from lerobot.datasets.v30.convert_dataset_v21_to_v30 import convert_dataset
 
     OF_ALL = True
@@ -55,7 +55,7 @@ def test_robomimic_loads_every_step_with_its_pictures(cache: str | None, tmp_pat
     assert loaded[64]["dones"][-1] == 1.0
 
 
-def test_lerobot_takes_v21_for_its_own_and_reads_every_number_and_picture(tmp_path: Path) -> None:
+def test_lerobot_accepts_v21_and_reads_every_number_and_picture(tmp_path: Path) -> None:
     made = export("lerobot-v2.1", SEEN, tmp_path, ["1", "2", "3"])
     convert_dataset("made", root=made.parent if OF_ALL else made, push_to_hub=False)
     loaded = LeRobotDataset("made", root=made, delta_timestamps={"action": [0.0, 1 / FPS]}, video_backend="pyav")

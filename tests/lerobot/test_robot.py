@@ -33,7 +33,8 @@ from tests.recording.runs import ROOT
 from tests.ros.processes import EXECUTABLES, as_arguments, environment_of
 
 register_third_party_plugins()
-MOVED, NEAR, TRIES = 0.02, 0.004, 1800  # [rad], [rad] or of an opening, of a thirtieth of a second each at least
+# Required motion [rad], tolerance [rad] or part of an opening, and tries of at least a thirtieth of a second.
+MOVED, NEAR, TRIES = 0.02, 0.004, 1800
 ROS_RATE = 200.0  # [Hz]
 
 
@@ -44,7 +45,7 @@ def made(folder: Path, **options: Any) -> Robot:
 
 
 def assert_follows(robot: Robot) -> None:
-    """One joint and one gripper go where actions ask for them, however long the machine takes."""
+    """Assert that one joint and one gripper reach what actions ask for, however long the machine takes."""
     start = robot.get_observation()
     moved = {"left_A1.pos": start["left_A1.pos"] + MOVED, "right_gripper.pos": 0.5}
     goal = start | moved
@@ -74,7 +75,7 @@ def test_a_cell_has_the_features_of_its_datasets_and_follows_actions(tmp_path: P
     assert not robot.is_connected
 
 
-def test_arms_behind_cabinets_follow_actions_as_simulated_ones_do(tmp_path: Path) -> None:
+def test_arms_behind_cabinets_follow_actions_like_simulated_ones(tmp_path: Path) -> None:
     data = yaml.safe_load((ROOT / "config/dual_iiwa7_fri.yaml").read_text())
     for arm, port in zip(("left", "right"), free_ports(2), strict=True):
         data["fri"][arm]["port"] = port
@@ -97,7 +98,7 @@ def test_arms_behind_ros_follow_actions_too(tmp_path: Path, monkeypatch: pytest.
 
 
 def assert_follows_behind(robot: Robot, module: str, *arguments: str) -> None:
-    """Arms that another program has, which is started here and takes its time."""
+    """Assert that arms follow in another program, which is started here and takes its time."""
     program = subprocess.Popen([sys.executable, "-m", module, *arguments], cwd=ROOT, env=os.environ)
     try:
         while not robot.is_connected:
