@@ -1,4 +1,4 @@
-"""Two arms behind drivers of their own, which do not tell how far they are: one stands still, or is silent."""
+"""Two arms behind drivers that do not report their lag: one arm stands still, or its driver falls silent."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from q2r2_control.types import SIDES, ArmTiming, Array, CommandMode, RobotState
 from tests.control.test_arm_skew import Ways, beside_each_other, swung
 from tests.support.processes import cell
 
-DT, PERIOD, LAG = 0.005, 0.005, 0.04  # of the loop, of the drivers' messages, of their arms [s]
-HAPPENS = 1.51  # when both arms go to the left at their fastest [s]
+DT, PERIOD, LAG = 0.005, 0.005, 0.04  # Periods of the loop and of the drivers' messages, and the lag of their arms [s].
+HAPPENS = 1.51  # At this time, both arms move to the left at their fastest [s].
 
 
 class TwoDrivers:
-    """Arms that swing alike, near each other, each ``LAG`` behind the reference."""
+    """Arms that swing together, near each other, each ``LAG`` behind the reference."""
 
     def __init__(self, are_watched: bool = True) -> None:
         config, robot = cell(), Robot.from_config(cell())
@@ -35,7 +35,7 @@ class TwoDrivers:
         self.path = deque([controller.step({}, 1e-9).q] * round(LAG / DT), maxlen=round(LAG / DT))
         self.q, self.now = self.path[0].copy(), 0.0
         self.standing: set[str] = set()
-        self.silent: dict[str, float] = {}  # since when [s]
+        self.silent: dict[str, float] = {}  # The times since which drivers are silent [s].
         self.margins: list[float] = []
         self.speeds: list[float] = []
         self.between = Ways(controller).between
@@ -76,7 +76,7 @@ class TwoDrivers:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("are_watched", [True, False])
-def test_an_arm_that_stands_still_is_not_met_by_the_other_one_if_both_are_watched(are_watched: bool) -> None:
+def test_an_arm_that_stands_still_is_not_hit_by_the_other_one_if_both_are_monitored(are_watched: bool) -> None:
     arms = TwoDrivers(are_watched)
     arms.run_until(HAPPENS)
     assert min(arms.margins) >= 0.0
@@ -85,7 +85,7 @@ def test_an_arm_that_stands_still_is_not_met_by_the_other_one_if_both_are_watche
     assert (min(arms.margins) >= 0.0) == are_watched
 
 
-def test_the_other_arm_brakes_at_once_when_one_has_been_silent_for_two_periods() -> None:
+def test_the_other_arm_brakes_at_once_when_one_driver_has_been_silent_for_two_periods() -> None:
     arms = TwoDrivers()
     arms.run_until(HAPPENS)
     before = arms.speeds[-1]
@@ -95,7 +95,7 @@ def test_the_other_arm_brakes_at_once_when_one_has_been_silent_for_two_periods()
     assert arms.speeds[-1] < before - 2.0 * DT
 
 
-def test_arms_that_are_behind_alike_are_not_held_up() -> None:
+def test_arms_with_equal_lags_are_not_slowed() -> None:
     arms = TwoDrivers()
     arms.run_until(HAPPENS)
     assert max(arms.speeds) > 0.3

@@ -1,4 +1,4 @@
-"""One tick of control: when the arms are commanded, which targets are refused, what grippers are granted."""
+"""One tick of control: when arms are commanded, which targets are refused, and which gripper openings are permitted."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ DT = 0.004
 
 
 class Arms:
-    """Both arms at home, as another program's plant measures them."""
+    """Both arms at home, as the plant of another program measures them."""
 
     def __init__(self, owns_plant: bool, obstacles: tuple[str, ...] = ()) -> None:
         config, robot = cell(), Robot.from_config(cell())
@@ -43,7 +43,7 @@ class Arms:
         return self.loop.step(self.state, {"left": target}, self.now, DT, {"left": 1.0}, {})
 
 
-def test_arms_of_another_program_are_commanded_once_they_were_seen_at_rest_and_not_after_a_stop() -> None:
+def test_arms_of_another_program_are_commanded_after_they_rested_and_not_after_a_stop() -> None:
     arms = Arms(owns_plant=False)
     assert arms.tick().command is None
     while arms.loop.supervisor.phase is not Phase.ACTIVE:
@@ -56,7 +56,7 @@ def test_arms_of_another_program_are_commanded_once_they_were_seen_at_rest_and_n
     assert step.command is None
 
 
-def test_a_plant_of_its_own_is_commanded_on_while_the_arms_are_stopped() -> None:
+def test_the_loops_own_plant_gets_commands_while_the_arms_are_stopped() -> None:
     arms = Arms(owns_plant=True)
     arms.loop.activate(arms.state, arms.now)
     arms.loop.supervisor.stop(Reason(ReasonKind.STOP_SERVICE))
@@ -79,7 +79,7 @@ def test_a_target_far_from_its_tool_is_refused_and_moves_nothing() -> None:
     assert arms.tick(tool).refusals == {}
 
 
-def test_a_state_that_cannot_be_believed_is_no_state_to_push_by() -> None:
+def test_an_untrusted_state_is_not_used_for_the_push() -> None:
     arms = Arms(owns_plant=True)
     arms.loop.activate(arms.state, arms.now)
     assert arms.tick().trusted
@@ -90,13 +90,13 @@ def test_a_state_that_cannot_be_believed_is_no_state_to_push_by() -> None:
     assert not step.trusted
 
 
-def test_arms_that_lost_their_session_brake_by_their_state_also_once_it_is_back() -> None:
+def test_arms_that_lost_their_session_brake_by_their_state_also_after_its_return() -> None:
     arms = Arms(owns_plant=True)
     arms.loop.activate(arms.state, arms.now)
     arms.loop.observe(arms.state, arms.now, DT, lost=Reason.of(ReasonKind.FRI_DROPPED, arm="left"))
     assert arms.tick().trusted
     assert arms.loop.supervisor.state_fault is not None
-    arms.home = arms.home + 0.5  # no arm can be there
+    arms.home = arms.home + 0.5  # No arm can be at this posture.
     assert not arms.tick().trusted
 
 
@@ -111,14 +111,14 @@ def test_arms_that_lost_their_session_brake_by_their_state_also_once_it_is_back(
         pytest.param((0.0, 0.6), 0.9, 0.9, id="less closed to that one"),
     ],
 )
-def test_while_the_arms_do_not_move_a_gripper_that_was_held_goes_back_only(
+def test_while_the_arms_do_not_move_a_held_gripper_may_only_go_back(
     before: tuple[float, float] | None, wanted: float, granted: float
 ) -> None:
     assert without_proof(wanted, before) == granted
 
 
 class ReportedHand(Arms):
-    """A hand far from the arms was reported at the first tick and never again."""
+    """A hand far from the arms that was reported at the first tick and never again."""
 
     def __init__(self, owns_plant: bool) -> None:
         super().__init__(owns_plant, ("hand",))
@@ -132,17 +132,17 @@ class ReportedHand(Arms):
 
 
 @pytest.mark.slow
-def test_a_report_of_a_hand_is_as_old_as_the_clock_says_when_the_loop_stalls() -> None:
+def test_the_age_of_a_hands_report_grows_with_the_clock_when_the_loop_stalls() -> None:
     arms = ReportedHand(owns_plant=True)
     arms.loop.activate(arms.state, arms.now)
     first = arms.now + DT
     for tick in range(200):
-        arms.now += 0.06 if tick % 40 == 39 else 0.0  # a tick goes on by DT all the same
+        arms.now += 0.06 if tick % 40 == 39 else 0.0  # The tick still lasts DT.
         arms.tick()
         assert arms.now - first - 1e-9 <= arms.age <= arms.now - first + DT + 1e-5
 
 
-def test_a_report_of_a_hand_gets_older_while_arms_of_another_program_are_not_commanded() -> None:
+def test_the_age_of_a_hands_report_grows_while_arms_of_another_program_are_not_commanded() -> None:
     arms = ReportedHand(owns_plant=False)
     first = arms.now + DT
     for _ in range(500):

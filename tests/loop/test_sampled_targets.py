@@ -13,7 +13,7 @@ from q2r2_control.types import Array
 from tests.support.processes import cell
 
 DT = 0.001  # [s]
-LIMIT = 10.0  # of a joint's acceleration [rad/s^2]
+LIMIT = 10.0  # Acceleration limit of a joint [rad/s^2].
 
 
 @pytest.fixture(scope="module")
@@ -22,13 +22,13 @@ def controller() -> CartesianController:
 
 
 def wave(start: pin.SE3, t: float) -> pin.SE3:
-    """A sine of up to 0.2 m/s, with a turn of up to 0.6 rad/s."""
+    """Return a sine of up to 0.2 m/s with a rotation of up to 0.6 rad/s."""
     turn = pin.exp3(np.array([0.0, 0.0, 0.3 * math.sin(2.0 * t)]))
     return pin.SE3(start.rotation @ turn, start.translation + np.array([0.0, 0.1 * math.sin(2.0 * t), 0.0]))
 
 
 def share_at_limit(velocities: list[Array]) -> float:
-    """The share of steps in which some joint is at its limit of acceleration, after the beginning."""
+    """Return the share of steps, after the beginning, in which some joint is at its acceleration limit."""
     accelerations = np.abs(np.diff(np.array(velocities[300:]), axis=0)).max(axis=1) / DT
     return float((accelerations > 0.99 * LIMIT).mean())
 
@@ -55,7 +55,7 @@ def test_joints_are_hardly_ever_at_their_limits_while_a_tool_follows_sampled_tar
     assert max(off[300:]) < 0.01
 
 
-def test_targets_begin_at_the_tool_and_rest_at_the_newest_sample_and_end_with_a_release(
+def test_targets_begin_at_the_tool_rest_at_the_newest_sample_and_end_with_a_release(
     controller: CartesianController,
 ) -> None:
     controller.reset(controller.robot.home)
@@ -72,7 +72,7 @@ def test_targets_begin_at_the_tool_and_rest_at_the_newest_sample_and_end_with_a_
     assert targets.at(6.0) == {}
 
 
-def test_a_sample_that_is_no_pose_is_not_used_and_other_faults_are_named(controller: CartesianController) -> None:
+def test_a_sample_that_is_not_a_pose_is_not_used_and_other_faults_are_named(controller: CartesianController) -> None:
     targets, start = SampledTargets(controller, 50.0), controller.tool_pose("left")
     assert not targets.set("left", pin.SE3(np.eye(3), np.array([math.nan, 0.0, 0.0])), 0.0)
     assert not targets.set("left", pin.SE3(2.0 * np.eye(3), np.zeros(3)), 0.0)
