@@ -1,4 +1,4 @@
-"""Loops in simulated time, and what happens to them in mid-motion."""
+"""Loops in simulated time, and events in the middle of their motion."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from tests.support.processes import cell, speed
 def pipeline(
     source: Input | None = None, plant: str = "kinematic", mode: str = "position", **changes: object
 ) -> Pipeline:
-    """At 500 Hz, the lowest rate with one substep a tick, since most of a test's time goes by ticks."""
+    """Return a pipeline at 500 Hz, the lowest rate with one substep per tick. Ticks take most of a test's time."""
     config = cell().model_copy(update={"loop_rate_hz": 500.0, **changes})
     source = source or ScriptedInput("circle", frequency_hz=0.5)
     return Pipeline.from_config(config, input=source, plant=plant, mode=mode)
 
 
 class RecordingPlant(KinematicPlant):
-    """Keeps every command, counts calls of close, and measures what ``disturb`` makes of the truth."""
+    """A plant that keeps every command and counts calls of close. ``disturb`` makes its measured states."""
 
     def __init__(self) -> None:
         super().__init__(Robot.from_config(cell()), cell())
@@ -45,7 +45,7 @@ class RecordingPlant(KinematicPlant):
 
 
 def when_moving(action: Callable[[], object]) -> Callable[[Tick], None]:
-    """A listener that acts once, in mid-motion."""
+    """Return a listener that acts once, in the middle of a motion."""
     acted: list[Tick] = []
 
     def listener(tick: Tick) -> None:
@@ -57,9 +57,9 @@ def when_moving(action: Callable[[], object]) -> Callable[[Tick], None]:
 
 
 class FreezingClock(LoopClock):
-    """Simulated time in which the loop now and then stands still."""
+    """Simulated time in which the loop sometimes stands still."""
 
-    freeze = 0.0  # before the next tick [s]
+    freeze = 0.0  # Duration of the standstill before the next tick [s].
 
     def wait(self) -> float:
         gap, self.freeze = self.period + self.freeze, 0.0

@@ -1,4 +1,4 @@
-"""Arms that are led slowly behind virtual cabinets, in simulated time."""
+"""Arms that move slowly behind virtual cabinets, in simulated time."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from q2r2_control.plants.fri.wire import CommandKind, Joints, Session
 from q2r2_control.robot.robot import Robot
 from tests.plants.fri.virtual_cabinets import VirtualCabinets
 
-_LATE = 0.0005  # messages, at most [s]
+_LATE = 0.0005  # Largest delay of messages [s].
 
 
 class WeighedArm(StillArm):
-    """Measures the torques of a robot that may carry something else than the client believes."""
+    """An arm that measures the torques of a robot with a load that the client does not know."""
 
     def __init__(self, robot: Robot, arm: str) -> None:
         self._robot, self._joints, self._data = robot, robot.arms[arm].joints, robot.model.createData()
@@ -32,18 +32,18 @@ class WeighedArm(StillArm):
 
     @tau.setter
     def tau(self, tau: Joints) -> None:
-        """Measured, not set."""
+        """The torque is measured and cannot be set."""
 
 
 class StuckArm(WeighedArm):
-    """Its brakes are closed."""
+    """An arm with closed brakes."""
 
     def advance(self, dt: float, q: Joints, tau: Joints | None) -> None:
-        """It stays."""
+        """Do not move."""
 
 
 class PendantCabinets(VirtualCabinets):
-    """Virtual cabinets whose overlays somebody starts as soon as they are ready, unless they are ``locked``."""
+    """Virtual cabinets whose overlays start as soon as they are ready, unless they are ``locked``."""
 
     locked = False
 
@@ -61,7 +61,8 @@ def slow_run(
     prepare: Callable[[PendantCabinets], None] = lambda cabinets: None,
     listener: Callable[[Moment], None] | None = None,
 ) -> SlowRun:
-    """Of ``config``; the arms are the ``truth``'s, and all ``arm``. ``prepare`` is done with the cabinets first.
+    """Return a slow run of ``config``, whose arms are those of ``truth`` and of type ``arm``. ``prepare`` gets the
+    cabinets.
 
     ``listener`` gets each tick's moment.
     """

@@ -1,4 +1,4 @@
-"""The hands' controls in the whole loop: the contract at every tick, and the arms do what was asked for."""
+"""The hands' controls in the whole loop: the contract holds at every tick, and the arms obey the controls."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.pipeline.loops import pipeline
 from tests.support.hands_input import ENGAGED, HandsInput, Path
 from tests.support.processes import Watch, cell, speed
 
-SPEED, RADIUS = 0.25, 0.08  # of the left hand's circle [m/s], [m]
+SPEED, RADIUS = 0.25, 0.08  # Speed [m/s] and radius [m] of the left hand's circle.
 
 
 def circle(t: float) -> Array:
@@ -27,7 +27,7 @@ def circle(t: float) -> Array:
 
 
 class PlayingHands(HandsInput):
-    """Engages at first; its left hand circles; then the left hand pushes controls at given times, for 0.1 s each."""
+    """Hands that engage first. Then the left hand moves in circles and uses controls at given times for 0.1 s each."""
 
     def __init__(self, *pushed: tuple[float, str], left: Path = circle) -> None:
         super().__init__(left=left)
@@ -49,7 +49,7 @@ def watched(hands: HandsInput, duration: float, plant: str = "kinematic", **bind
 
 
 def played(*pushed: tuple[float, str]) -> list[Tick]:
-    """With stop on the trigger and the way home on the grip."""
+    """Run the hands with stop on the trigger and the way home on the grip."""
     return watched(PlayingHands(*pushed), 6.0, trigger="stop", grip="home").ticks
 
 
@@ -74,7 +74,7 @@ def test_a_press_on_the_way_home_ends_it_where_the_arms_come_to_rest() -> None:
 
 
 @pytest.mark.slow
-def test_a_stop_brings_both_arms_to_rest_and_only_taking_it_back_and_a_press_move_them() -> None:
+def test_after_a_stop_both_arms_rest_until_it_is_undone_and_a_press_engages_them() -> None:
     ticks = played((1.5, "press_index"), (2.0, "button_lower"), (2.3, "press_middle"), (3.0, "press_index"))
     stopped = [tick for tick in ticks if set(tick.states.values()) == {"stopped"}]
     assert (stopped[0].t, stopped[-1].t) == (pytest.approx(1.5, abs=0.02), pytest.approx(3.0, abs=0.02))
@@ -96,7 +96,7 @@ def test_a_program_may_send_the_arms_home_too() -> None:
 
 
 def wandering(t: float) -> Array:
-    """Begins softly, goes along and turns about all axes, where no limit of a joint and no pair is near."""
+    """Return a gentle motion along and about all axes, which reaches no joint limit and no pair."""
     since = max(t - ENGAGED - 0.3, 0.0)
     soft = min(since, 1.0) ** 2 * (3.0 - 2.0 * min(since, 1.0))
     x, y, z, about_x, about_y, about_z = np.sin(np.pi * since * np.array([1.0, 0.7, 0.5, 0.8, 1.0, 0.6]))
@@ -113,7 +113,7 @@ def test_two_tools_that_carry_keep_their_relation_while_one_hand_moves_and_turns
     assert carried[-1].t > 4.9
     wanted = carried[0].tools["left"].actInv(carried[0].tools["right"])
     for tick in carried:
-        assert not tick.reference.report.binding  # free motion
+        assert not tick.reference.report.binding  # The motion meets no limit.
         relation = tick.tools["left"].actInv(tick.tools["right"])
         assert np.linalg.norm(relation.translation - wanted.translation) < 0.001
         assert np.degrees(np.linalg.norm(pin.log3(relation.rotation.T @ wanted.rotation))) < 0.5
@@ -124,7 +124,7 @@ def test_two_tools_that_carry_keep_their_relation_while_one_hand_moves_and_turns
 
 
 @pytest.mark.slow
-def test_what_a_program_changes_counts_from_the_next_tick_on_without_a_jump() -> None:
+def test_changes_of_a_program_apply_from_the_next_tick_on_without_a_jump() -> None:
     loop = pipeline(PlayingHands())
     watch = Watch(loop)
     half = loop.config.teleop.model_copy(update={"position_scale": 0.5})

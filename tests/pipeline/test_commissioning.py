@@ -1,4 +1,4 @@
-"""Measurements of arms that are led slowly, and their bounds."""
+"""Measurements of arms that move slowly, and the bounds of these measurements."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def robot(config: Config) -> Robot:
 
 
 @pytest.mark.slow
-def test_a_joint_goes_a_degree_and_back_alone(config: Config) -> None:
+def test_a_joint_moves_by_a_degree_and_back_alone(config: Config) -> None:
     with slow_run(config) as run:
         start = run.reference
         motion = measure_joint(run, 8)
@@ -69,7 +69,7 @@ def test_an_arm_that_a_hand_leads_stops_within_its_certified_stop_and_the_latenc
 
 
 def moments(robot: Robot, on: float, engaged: bool = True) -> list[Moment]:
-    """The left arm goes at 0.1 rad/s in A2 for a second, and ``on`` [s] longer than its hand asks for."""
+    """Return a motion of the left arm's A2 at 0.1 rad/s for a second, and ``on`` [s] longer than its hand asks for."""
     v = np.zeros(robot.model.nv)
     v[1] = 0.1
     none, slow = np.zeros_like(v), np.full_like(v, 5.0)
@@ -89,7 +89,7 @@ def moments(robot: Robot, on: float, engaged: bool = True) -> list[Moment]:
     ]
 
 
-def test_a_stop_that_is_later_or_longer_than_it_may_be_is_told(robot: Robot) -> None:
+def test_a_stop_that_is_too_late_or_too_long_is_reported(robot: Robot) -> None:
     let_go_report(robot, "left", moments(robot, 0.1)).check()
     with pytest.raises(PlantError, match=r"the left arm, let go, stopped after .* mm and 0\.2. s; allowed"):
         let_go_report(robot, "left", moments(robot, 0.3)).check()
@@ -98,7 +98,7 @@ def test_a_stop_that_is_later_or_longer_than_it_may_be_is_told(robot: Robot) -> 
         late.check()
 
 
-def test_an_arm_that_did_not_follow_tells_nothing(robot: Robot) -> None:
+def test_an_arm_that_did_not_follow_gives_no_measurement(robot: Robot) -> None:
     with pytest.raises(PlantError, match="the left arm did not follow the hand"):
         let_go_report(robot, "left", moments(robot, 0.0, engaged=False))
     still = replace(let_go_report(robot, "left", moments(robot, 0.1)), tool_speed_mm_s=1.0)

@@ -1,4 +1,4 @@
-"""Hands that sweep beyond the edge of reach, over a network that holds samples up, never make an arm lurch."""
+"""Hands move beyond the edge of reach, over a network that delays samples in bursts. No arm ever lurches."""
 
 from __future__ import annotations
 
@@ -17,17 +17,19 @@ from q2r2_control.types import SIDES, Array, HandInputs
 from tests.pipeline.loops import pipeline
 from tests.support.processes import Watch, cell
 
-SECONDS, RATE = 110.0, 72.0  # of the hands [s], [Hz]
-LET_THROUGH = 1.0  # by the network, between two hold-ups [s]
-HELD_UP = 0.13, 0.165  # nine are ten samples long, the tenth is longer than the gate waits [s]
-FROM, BEYOND = -0.15, 0.15  # of the edge that tools are asked to be at [m]
-STALL = 0.16  # the longest in which a target moves and its tool does not: where that turns at its farthest [s]
-SLOW, STEP = 0.05, 9.0  # of a target that moves; a faster one was put elsewhere [m/s]
-_WAITS = 0.4  # an operator whose arm does not follow presses after this time [s]
+SECONDS, RATE = 110.0, 72.0  # Duration [s], and rate of the hands [Hz].
+LET_THROUGH = 1.0  # Time between two delays of the network [s].
+# Delays of the network [s]. Nine of ten last ten samples, and the tenth is longer than the gate's timeout.
+HELD_UP = 0.13, 0.165
+FROM, BEYOND = -0.15, 0.15  # Range of the targets relative to the edge of reach [m].
+# Longest time in which a target moves and its tool does not, as where the target turns at its farthest [s].
+STALL = 0.16
+SLOW, STEP = 0.05, 9.0  # Speeds between these belong to a moving target. A faster target has jumped [m/s].
+_WAITS = 0.4  # An operator whose arm does not follow presses after this time [s].
 
 
 class Bursts(SampleTiming):
-    """Samples at an even rate; those of every hold-up arrive together at its end."""
+    """Samples at an even rate. Those of every delay arrive together at its end."""
 
     def __init__(self) -> None:
         self._t = 0.0
@@ -44,7 +46,7 @@ class Bursts(SampleTiming):
 
 
 class Sweeping(PlayedInput):
-    """Both hands ask the tools to go to and fro across the edge of reach, and press where an arm does not follow."""
+    """Both hands move the tools to and fro across the edge of reach, and press if an arm does not follow."""
 
     def __init__(self) -> None:
         self._idle_since: float | None = None
@@ -90,7 +92,7 @@ class Sweeping(PlayedInput):
 
 
 def stalls(ticks: list[Tick], arm: str) -> list[float]:
-    """How long the target moves each time while the tool does not [s]."""
+    """Return each time in which the target moves while the tool does not [s]."""
     found = [0.0]
     for before, tick in pairwise(ticks):
         target, last = tick.targets[arm].pose, before.targets[arm].pose
@@ -107,7 +109,7 @@ def stalls(ticks: list[Tick], arm: str) -> list[float]:
 
 
 @pytest.mark.slow
-def test_no_arm_stands_still_while_its_target_moves_at_the_edge_of_reach_and_behind_bursts() -> None:
+def test_at_the_edge_of_reach_and_with_bursts_no_arm_stands_still_while_its_target_moves() -> None:
     hands = Sweeping()
     loop = pipeline(hands)
     loop.listeners.append(hands.look)

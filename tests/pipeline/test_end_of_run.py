@@ -1,4 +1,4 @@
-"""Ends of a run, asked for or by a failure: the arms are at rest before it does, and nothing is left open."""
+"""A run ends by a request or a failure. The arms are at rest before, and all resources are released."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.support.processes import Watch, assert_torque_bounds, cell, speed
 @pytest.mark.slow
 class TestStop:
     @pytest.mark.parametrize("how", ["the duration", "SIGINT", "SIGTERM"])
-    def test_in_mid_motion_brakes_first(self, how: str) -> None:
+    def test_a_request_during_motion_brakes_first(self, how: str) -> None:
         loop = pipeline()
         handlers = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
         watch = Watch(loop)
@@ -53,8 +53,8 @@ class TestStop:
             loop.plant.advance(0.1)
             np.testing.assert_allclose(loop.plant.state().q, rest.q, atol=1e-3)
 
-    def test_waits_for_slow_braking(self) -> None:
-        # Braking takes longer than the second that is allowed for in addition.
+    def test_the_end_waits_for_slow_braking(self) -> None:
+        # Braking takes longer than the additional second that is allowed.
         loop = pipeline(control=cell().control.model_copy(update={"acceleration_limit": 0.05}))
         watch = Watch(loop)
         summary = loop.run(4.0, realtime=False)
@@ -63,7 +63,7 @@ class TestStop:
         assert speed(watch.ticks[-1]) < 1e-3
         assert summary.at_rest
 
-    def test_asked_for_before_the_run_ends_it_at_once_and_the_next_one_runs(self) -> None:
+    def test_a_request_before_the_run_ends_it_at_once_and_the_next_one_runs(self) -> None:
         loop = pipeline()
         loop.stop()
         assert loop.run(10.0, realtime=False).ticks == 1
@@ -71,7 +71,7 @@ class TestStop:
 
 
 def assert_braked(loop: Pipeline, watch: Watch, summary: RunSummary) -> None:
-    """The run ended at rest, without input from the stop on; the contract was checked at every tick."""
+    """Assert that the run ended at rest, without input after the stop. The contract was checked at every tick."""
     stopping = [tick for tick in watch.ticks if STOPPING in tick.states.values()]
     assert stopping[0] is watch.ticks[-len(stopping)]
     assert all(not tick.samples and not any(tick.engaged.values()) for tick in stopping)
@@ -80,14 +80,14 @@ def assert_braked(loop: Pipeline, watch: Watch, summary: RunSummary) -> None:
     assert summary.at_rest
     limit = loop.robot.capped_acceleration(loop.config.control.acceleration_limit)
     braking = float((np.abs(watch.ticks[-len(stopping) - 1].reference.v) / limit).max())
-    # Slower motion than that is the last correction of a posture that is held.
+    # Slower motion is the last correction of a held posture.
     rest = next(tick for tick in stopping if speed(tick) < 1e-3)
     assert rest.t - stopping[0].t <= 1.5 * braking + 0.05 + 3.0 * max(tick.dt for tick in stopping)
 
 
 @pytest.mark.slow
 class TestFailure:
-    def test_of_a_listener_brakes_first_and_calls_it_no_more(self) -> None:
+    def test_a_failing_listener_brakes_first_and_is_not_called_again(self) -> None:
         loop, calls = pipeline(), []
 
         def fail() -> None:
@@ -102,7 +102,7 @@ class TestFailure:
         assert speed(watch.ticks[-1]) <= 1e-6 < max(map(speed, watch.ticks))
 
     @pytest.mark.parametrize("call", ["poll", "connected"])
-    def test_of_the_input_brakes_first(self, call: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_a_failing_input_brakes_first(self, call: str, monkeypatch: pytest.MonkeyPatch) -> None:
         loop = pipeline()
         watch = Watch(loop)
 
@@ -116,7 +116,9 @@ class TestFailure:
         assert speed(watch.ticks[-1]) <= 1e-6 < max(map(speed, watch.ticks))
 
     @pytest.mark.parametrize("who", ["apply", "listener", "reset", "nobody"])
-    def test_leaves_no_thread_no_port_and_no_plant_behind(self, who: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_the_end_leaves_no_thread_no_port_and_no_plant_open(
+        self, who: str, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
         plant, server = RecordingPlant(), HeadsetServer(port=0)
         loop = Pipeline.from_config(cell(), input=server, plant=plant)
 
@@ -137,7 +139,7 @@ class TestFailure:
         with socket.create_server(server.address):
             pass
 
-    def test_to_open_the_input_closes_the_plant_and_names_the_port(self) -> None:
+    def test_an_input_that_cannot_open_closes_the_plant_and_names_the_port(self) -> None:
         plant = RecordingPlant()
         with socket.create_server(("127.0.0.1", 0)) as taken:
             loop = Pipeline.from_config(cell(), input=HeadsetServer(port=taken.getsockname()[1]), plant=plant)

@@ -1,4 +1,4 @@
-"""A plant that reports endless joints within one turn is led as one that counts their turns."""
+"""A plant that reports endless joints within one turn moves like one that counts their turns."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from q2r2_control.types import RobotState
 
 
 class WrappedPlant(KinematicPlant):
-    """Reports endless joints within the turn that ends a hundredth of a radian above home."""
+    """A plant that reports endless joints within the turn that ends a hundredth of a radian above home."""
 
     def state(self) -> RobotState:
         state, end = super().state(), self._robot.home + 0.01
@@ -25,7 +25,7 @@ class WrappedPlant(KinematicPlant):
 
 
 @pytest.mark.slow
-def test_arms_follow_hands_across_the_angle_at_which_reports_begin_anew() -> None:
+def test_arms_follow_hands_across_the_angle_where_reports_wrap_around() -> None:
     config = load_config("config/dual_kinova.yaml").model_copy(update={"loop_rate_hz": 500.0})
     robot = Robot.from_config(config)
     plant = WrappedPlant(robot, config)
@@ -42,7 +42,7 @@ def test_arms_follow_hands_across_the_angle_at_which_reports_begin_anew() -> Non
 
 
 class TurnedPlant(KinematicPlant):
-    """Reports endless joints a turn lower than at first from the second report on."""
+    """A plant that reports endless joints one turn lower from the second report on."""
 
     reports = 0
 

@@ -1,4 +1,6 @@
-"""Grippers in the whole loop: they close and open, count as wide as they are, and hold what they have closed on."""
+"""Grippers in the whole loop: they close and open, are monitored at their real width, and hold what they have closed
+on.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,7 @@ from tests.support.processes import Watch, cell
 
 
 @pytest.mark.slow
-def test_fingers_count_as_wide_as_the_grippers_are_at_every_tick() -> None:
+def test_at_every_tick_fingers_are_monitored_at_the_width_of_their_grippers() -> None:
     loop = pipeline(ScriptedInput("meet"), "mujoco")
     watch, widest = Watch(loop), list[float]()
 
@@ -45,7 +47,7 @@ def test_fingers_count_as_wide_as_the_grippers_are_at_every_tick() -> None:
 
 
 class SeldomAskedGrippers(KinematicPlant):
-    """Its grippers get the newest command, and are measured, as seldom as one on Modbus may."""
+    """A plant whose grippers get commands and are measured as seldom as Modbus grippers may be."""
 
     _measured: dict[str, float] | None = None
     _asked = 0.0
@@ -63,9 +65,9 @@ class SeldomAskedGrippers(KinematicPlant):
         return self._measured or self.openings
 
 
-def test_fingers_count_as_wide_as_they_are_also_where_the_gripper_is_seldom_asked() -> None:
+def test_fingers_are_monitored_at_their_width_also_if_the_gripper_is_seldom_read() -> None:
     config, hands = cell(), LeftUpperPresses("circle")
-    hands.again = 1.25  # it is half closed
+    hands.again = 1.25  # The gripper is half closed.
     slow = {
         side: arm.model_copy(update={"gripper": arm.gripper.model_copy(update={"speed": 0.05})})
         for side, arm in config.arms.items()
@@ -88,7 +90,7 @@ def test_fingers_count_as_wide_as_they_are_also_where_the_gripper_is_seldom_aske
 
 @pytest.mark.slow
 def test_what_is_gripped_is_part_of_the_tool_until_it_is_put_down() -> None:
-    """The flat block of the demo; the contract, objects included, is checked at every tick."""
+    """The object is the flat block of the demo. The contract, with objects, is checked at every tick."""
     flat = {"box": (0.06, 0.04, 0.015), "at": (0.0, 0.0, 0.0085), "mass": 0.1}
     config = object_cell(None, flat).model_copy(update={"loop_rate_hz": 500.0})
     loop = Pipeline.from_config(config, input=ScriptedInput("grasp"), plant="mujoco")
@@ -102,10 +104,11 @@ def test_what_is_gripped_is_part_of_the_tool_until_it_is_put_down() -> None:
     assert summary.fallback_ticks == summary.uncertified_ticks == 0
     jumps = [np.abs(second.reference.v - first.reference.v).max() for first, second in pairwise(watch.ticks)]
     gripped = next(i for i, tick in enumerate(watch.ticks) if tick.holding["right"])
-    assert max(jumps[gripped - 1 : gripped + 20]) < 5e-4  # [rad/s]; a hand that rests is averaged meanwhile
+    # Largest change of velocity [rad/s]. The position of the resting hand is averaged meanwhile.
+    assert max(jumps[gripped - 1 : gripped + 20]) < 5e-4
 
 
-def test_a_run_after_one_that_ended_while_something_was_held_bears_no_weight_that_is_not_there() -> None:
+def test_a_run_after_one_that_ended_with_a_held_object_compensates_no_weight() -> None:
     config = object_cell({"mass": 2.0})
     loop = Pipeline.from_config(config, input=ScriptedInput("circle"), plant="mujoco", mode="torque")
     drive: Any = loop.drive
@@ -119,7 +122,7 @@ def test_a_run_after_one_that_ended_while_something_was_held_bears_no_weight_tha
 
 
 class LeftUpperPresses(ScriptedInput):
-    """The left hand presses its upper button at 1.0 s and once again, and moves in between."""
+    """The left hand presses its upper button at 1.0 s and once more, and moves in between."""
 
     again = 1.6  # [s]
 
@@ -132,7 +135,7 @@ class LeftUpperPresses(ScriptedInput):
 
 
 @pytest.mark.slow
-def test_a_gripper_that_something_keeps_from_closing_holds_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_gripper_that_the_limiter_keeps_from_closing_holds_no_object(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(GripperLimiter, "limit", lambda *_: {"left": 0.5, "right": 1.0})
     loop = Pipeline.from_config(object_cell({}), input=LeftUpperPresses("circle"), plant="mujoco")
     watch = Watch(loop)

@@ -1,4 +1,4 @@
-"""A run refuses hostile values of a program by ConfigError, or keeps every promise of its ticks all the same."""
+"""A run refuses hostile values of a program by ConfigError, or keeps every promise of its ticks."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_a_run_goes_on_after_a_call_with_any_value(loop: Pipeline, call: Callabl
 
 
 @pytest.mark.parametrize("value", HOSTILE.values(), ids=list(HOSTILE))
-def test_a_run_refuses_a_duration_that_is_no_positive_number_of_seconds(loop: Pipeline, value: Any) -> None:
+def test_a_run_refuses_a_duration_that_is_not_a_positive_number(loop: Pipeline, value: Any) -> None:
     if value is None or value is True:
         return
     with pytest.raises(ConfigError, match="duration"):

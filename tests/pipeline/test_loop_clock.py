@@ -1,4 +1,4 @@
-"""The loop's clock, on a computer's clock whose sleeps are as late as a test says."""
+"""The loop's clock, with a simulated computer's clock whose sleeps are late by given times."""
 
 from __future__ import annotations
 
@@ -13,7 +13,10 @@ PERIOD = 0.01
 
 
 class LateSleeper:
-    """Stands for the module ``time``: sleeping takes longer than asked for by what ``delays`` says next."""
+    """A replacement for the module ``time``.
+
+    Each sleep takes longer than asked for, by the next value of ``delays``.
+    """
 
     def __init__(self, delays: list[float]) -> None:
         self._now, self._delays = 100.0, delays
@@ -32,7 +35,7 @@ class LateSleeper:
 
 
 def _ticks(monkeypatch: pytest.MonkeyPatch, delays: list[float], count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Times of the ticks since the start, and the dt that each was told [s]."""
+    """Return the times of the ticks since the start, and the dt of each [s]."""
     monkeypatch.setattr(loop_clock, "time", LateSleeper(delays))
     loop = LoopClock(PERIOD, realtime=True)
     steps, times = np.array([(loop.wait(), loop.now - loop.start) for _ in range(count)]).T
@@ -45,20 +48,20 @@ def test_late_wake_ups_do_not_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
     assert ((lateness >= -1e-9) & (lateness <= 0.8 * PERIOD + 1e-9)).all()
 
 
-def test_every_tick_is_told_the_time_that_really_passed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_dt_of_every_tick_is_the_time_that_really_passed(monkeypatch: pytest.MonkeyPatch) -> None:
     delays = [2.0, *np.random.default_rng(2).uniform(0.0, 3.0 * PERIOD, 99).tolist()]
     times, steps = _ticks(monkeypatch, delays, 100)
     np.testing.assert_allclose(np.diff(times, prepend=0.0), steps, atol=2e-6)
     assert steps[0] == pytest.approx(2.0 + PERIOD)
 
 
-def test_ticks_that_were_missed_are_not_made_up_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missed_ticks_are_not_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
     times, steps = _ticks(monkeypatch, [0.0, 0.07, 0.0, 0.0, 0.0], 6)
     assert steps[1] == pytest.approx(0.08)
     assert np.sum(np.diff(times) < 0.5 * PERIOD) <= 1, "one tick follows at once, then the grid goes on"
 
 
-def test_simulated_time_takes_no_time_and_is_never_late() -> None:
+def test_simulated_time_takes_no_real_time_and_is_never_late() -> None:
     loop = LoopClock(PERIOD, realtime=False)
     assert [loop.wait() for _ in range(3)] == [PERIOD] * 3
     assert loop.now == pytest.approx(3 * PERIOD)
@@ -68,7 +71,7 @@ def test_simulated_time_takes_no_time_and_is_never_late() -> None:
 
 
 def paced_run(monkeypatch: pytest.MonkeyPatch, ticks: int, busy_s: float) -> tuple[LoopClock, float]:
-    """A paced clock after its ticks, each of which keeps the computer busy, and the time they took [s]."""
+    """Return a paced clock after its ticks, each of which keeps the computer busy, and the time that they took [s]."""
     computer = LateSleeper([])
     monkeypatch.setattr(loop_clock, "time", computer)
     loop, began = LoopClock(PERIOD, realtime=False, pace=WallPace()), computer.monotonic()
@@ -105,7 +108,7 @@ def test_a_long_stall_of_the_computer_is_not_caught_up_with(monkeypatch: pytest.
     assert computer.monotonic() - began >= 100 * PERIOD - 0.1 - 2 * PERIOD
 
 
-def test_a_loop_that_is_late_in_more_than_a_tenth_of_a_second_s_ticks_falls_behind(
+def test_a_loop_that_is_late_in_more_than_a_tenth_of_a_seconds_ticks_falls_behind(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     often, seldom = ([2.5 * PERIOD if tick % every == 0 else 0.0 for tick in range(400)] for every in (5, 40))
@@ -125,7 +128,7 @@ def test_lateness_and_overruns_are_counted(monkeypatch: pytest.MonkeyPatch) -> N
     for _ in range(6):
         loop.wait()
     late = loop.lateness.percentiles(1e-3)
-    # The third tick is 25 ms late; the fourth follows at once, and on the grid that begins anew there it is not late.
+    # The third tick is 25 ms late. The fourth follows at once on a new grid, where it is not late.
     assert loop.overruns == 1
     assert (late.p50, late.max) == (pytest.approx(0.0, abs=2e-3), pytest.approx(25.0))
     assert late.p99 == pytest.approx(25.0)
@@ -135,7 +138,7 @@ def state(stamp: float) -> RobotState:
     return RobotState(np.zeros(2), np.zeros(2), np.zeros(2), None, stamp)
 
 
-def test_states_of_a_plant_whose_clock_began_elsewhere_and_goes_back_are_as_new_as_they_come() -> None:
+def test_states_of_a_plant_with_another_clock_that_jumps_back_count_as_new() -> None:
     clock = PlantClock(state(1000.0))
     for stamp, now, expected in ((1000.25, 5.25, 0.25), (1000.5, 5.5, 0.25), (1000.0, 5.75, -0.5)):
         clock.give(0.25)
@@ -143,7 +146,7 @@ def test_states_of_a_plant_whose_clock_began_elsewhere_and_goes_back_are_as_new_
         assert (seen.stamp, passed) == (now, expected)
 
 
-def test_a_state_that_is_repeated_is_as_old_as_the_time_that_the_plant_was_given() -> None:
+def test_a_repeated_state_is_as_old_as_the_time_that_the_plant_was_given() -> None:
     clock, stopped = PlantClock(state(0.0)), state(0.0)
     for tick in range(1, 4):
         clock.give(0.25)

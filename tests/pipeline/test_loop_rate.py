@@ -1,4 +1,4 @@
-"""Loops that fit the computer: simulated time that is paced by it, and a rate that it can keep."""
+"""Loops adapt to the computer: simulated time that it paces, and a rate that it can keep."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from q2r2_control.summary.tick import Tick
 from q2r2_control.verification.contract import Contract
 from tests.pipeline.loops import pipeline
 
-_MEASURED = {"compute_time", "solve_time"}  # how long the computer took, which is no result
+_MEASURED = {"compute_time", "solve_time"}  # The time that the computer took is not a result.
 
 
 def flat(value: object) -> object:
-    """All that a tick holds, as nested tuples that compare to the bit, without the times that the computer took."""
+    """Return everything in a tick as nested tuples that can be compared to the bit, without times of the computer."""
     if isinstance(value, np.ndarray):
         return value.tobytes()
     if isinstance(value, pin.SE3):
@@ -42,7 +42,7 @@ def flat(value: object) -> object:
 
 
 def ticks_of(duration: float, *, paced: bool, busy_s: float = 0.0) -> list[object]:
-    """Everything in every tick of a run in torque mode, whose listener keeps the computer busy after each of them."""
+    """Return all ticks of a run in torque mode, whose listener keeps the computer busy after each tick."""
     loop = pipeline(ScriptedInput("circle", human=True, seed=3), plant="mujoco", mode="torque")
     seen: list[object] = []
 
@@ -74,7 +74,7 @@ def test_a_paced_run_is_the_same_to_the_bit_as_a_fast_one_and_as_one_on_a_slow_c
         (0.0030, 250.0, "loop rate 250 Hz, the lowest: 99 of 100 ticks take at most 3000 us, 75 %"),
     ],
 )
-def test_the_highest_rate_whose_ticks_leave_room_is_chosen_and_said(
+def test_the_highest_rate_with_time_to_spare_is_chosen_and_printed(
     tick_s: float, rate: float, words: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(Pipeline, "_resting_ticks", lambda self: repeat(tick_s))
@@ -98,7 +98,7 @@ def test_ticks_that_measure_the_computer_move_no_arm_and_reach_no_listener() -> 
     assert len(loop.listeners) == 1
 
 
-def test_a_rate_in_the_cell_is_taken_as_it_is_and_simulated_time_asks_no_computer(
+def test_a_rate_in_the_cell_is_used_unchanged_and_simulated_time_measures_no_computer(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     def fail(self: Pipeline) -> Iterator[float]:
@@ -121,7 +121,7 @@ def test_a_loop_that_falls_behind_says_so_once_and_names_the_cure(
 
 
 def error_in_free_air(rate: float, mode: str) -> float:
-    """RMS error of the worse tool on a circle [mm], while the contract is checked at every tick."""
+    """Return the RMS error of the worse tool on a circle [mm], with the contract checked at every tick."""
     source = ScriptedInput("circle", frequency_hz=0.5)
     loop = pipeline(source, plant="mujoco" if mode == "torque" else "kinematic", mode=mode, loop_rate_hz=rate)
     contract = Contract(loop.controller)
@@ -140,7 +140,7 @@ def error_in_free_air(rate: float, mode: str) -> float:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", ["position", "torque"])
-def test_tools_are_followed_at_250_hz_as_at_1000_hz_and_the_contract_holds(mode: str) -> None:
+def test_tools_follow_at_250_hz_as_well_as_at_1000_hz_and_the_contract_holds(mode: str) -> None:
     assert error_in_free_air(250.0, mode) <= 1.5 * error_in_free_air(1000.0, mode)
 
 

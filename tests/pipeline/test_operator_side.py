@@ -1,4 +1,4 @@
-"""The vibrations that an operator's hands feel of a run."""
+"""The vibrations that the operator's hands feel during a run."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ UP = np.array([0.0, 0.0, 1.0])
 
 
 class FeltHands(HandsInput):
-    """Keeps what the hands feel, with the time of the tick."""
+    """An input that keeps what the hands feel, with the time of the tick."""
 
     def __init__(self, **paths: Path) -> None:
         super().__init__(**paths)
@@ -35,13 +35,13 @@ class FeltHands(HandsInput):
         self.felt.append((self.now, feedback))
 
     def by(self, hand: str, pulse: Pulse) -> list[float]:
-        """Amplitudes of the vibrations of a hand that have this frequency."""
+        """Return the amplitudes of a hand's vibrations that have this frequency."""
         of = [one for _, one in self.felt if one.hand == hand and one.amplitude > 0.0]
         return [one.amplitude for one in of if one.frequency == pulse.frequency]
 
 
 def straight(way: Array, duration: float = 1.5) -> Path:
-    """From rest to rest along ``way`` [m], after both arms were engaged."""
+    """Return a motion from rest to rest along ``way`` [m], after both arms were engaged."""
 
     def path(t: float) -> Array:
         share = np.clip((t - BEGIN - 0.1) / duration, 0.0, 1.0)
@@ -62,7 +62,7 @@ def test_engaging_is_felt_by_both_hands_and_every_vibration_ends_before_the_next
 
 
 @pytest.mark.slow
-def test_an_arm_that_is_driven_at_the_other_is_felt_by_both_hands_stronger_and_stronger_and_then_no_more() -> None:
+def test_both_hands_feel_more_and_more_when_an_arm_is_driven_at_the_other_and_then_nothing() -> None:
     hands = FeltHands(left=straight(0.5 * -np.eye(3)[1]))
     pipeline(hands).run(5.0, realtime=False)
     for hand in SIDES:
@@ -73,7 +73,7 @@ def test_an_arm_that_is_driven_at_the_other_is_felt_by_both_hands_stronger_and_s
 
 
 @pytest.mark.slow
-def test_a_hand_that_goes_out_of_reach_feels_its_target_slip_and_one_that_turns_too_far_a_joint_at_its_limit() -> None:
+def test_a_hand_out_of_reach_feels_its_target_slip_and_a_hand_that_turns_too_far_feels_a_joint_limit() -> None:
     def turn(t: float) -> Array:
         return np.append(np.zeros(3), 40.0 * straight(0.1 * UP, 4.0)(t)[:3])
 
@@ -85,7 +85,7 @@ def test_a_hand_that_goes_out_of_reach_feels_its_target_slip_and_one_that_turns_
 
 
 @pytest.mark.slow
-def test_a_push_at_the_tool_is_felt_by_its_hand_only() -> None:
+def test_a_push_at_the_tool_is_felt_only_by_its_hand() -> None:
     hands = FeltHands()
     loop = pipeline(hands, "mujoco")
     plant = loop.plant
@@ -99,7 +99,7 @@ def test_a_push_at_the_tool_is_felt_by_its_hand_only() -> None:
 
 
 @pytest.mark.slow
-def test_a_gripper_that_closes_on_a_block_is_felt_once_and_an_empty_one_is_not() -> None:
+def test_a_gripper_that_closes_on_a_block_is_felt_once_and_an_empty_one_is_not_felt() -> None:
     class FeltScript(ScriptedInput):
         grasps: ClassVar[dict[str, int]] = {}
 

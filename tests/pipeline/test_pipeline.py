@@ -1,4 +1,4 @@
-"""The whole loop in simulated time: limits at every tick, repeatability, and what a pipeline is made of."""
+"""The whole loop in simulated time: limits at every tick, repeatability, and the parts of a pipeline."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.support.processes import Watch, assert_torque_bounds, cell, changes, 
 
 
 class Counting:
-    """A constraint that holds left_A3, a cost of nothing and a solver, each of which counts how often it is asked."""
+    """A constraint that holds left_A3, a cost of zero and a solver, which all count their calls."""
 
     hard = True
 
@@ -46,7 +46,7 @@ class Counting:
 
 
 @pytest.mark.slow
-def test_a_loop_asks_a_program_s_own_tasks_constraints_and_solver_at_every_tick_of_each_run() -> None:
+def test_a_loop_calls_a_programs_own_tasks_constraints_and_solver_at_every_tick_of_each_run() -> None:
     own = Counting()
     config = cell().model_copy(update={"loop_rate_hz": 500.0})
     loop = Pipeline.from_config(
@@ -54,7 +54,7 @@ def test_a_loop_asks_a_program_s_own_tasks_constraints_and_solver_at_every_tick_
     )
     speeds: list[Array] = []
     loop.listeners.append(lambda tick: speeds.append(np.abs(tick.reference.v)))
-    for _ in range(2):  # a run in simulated time may have a controller of its own
+    for _ in range(2):  # A run in simulated time may have its own controller.
         own.asked = dict.fromkeys(own.asked, 0)
         loop.run(1.8, realtime=False)
         assert min(own.asked.values()) >= 900
@@ -63,7 +63,7 @@ def test_a_loop_asks_a_program_s_own_tasks_constraints_and_solver_at_every_tick_
     assert fastest[3] > 0.01
 
 
-def test_a_loop_takes_its_solver_s_name_in_place_of_the_cell_s() -> None:
+def test_a_loop_uses_its_own_solver_instead_of_the_cells() -> None:
     loop = Pipeline.from_config(cell(), input=ScriptedInput("circle"), plant="kinematic", solver="osqp")
     assert loop.controller.settings.solver == loop.config.control.solver == "osqp"
     with pytest.raises(ConfigError, match=r"control\.solver = 'nosuch'"):
@@ -107,7 +107,7 @@ def test_both_arms_follow_within_every_limit(
 
 
 def assert_begins_at_the_tool(watch: Watch, arm: str) -> None:
-    """The first target of every engagement."""
+    """Assert that the first target of every engagement is at the tool."""
     for index in watch.engagements(arm):
         tick = watch.ticks[index]
         pose = tick.targets[arm].pose
@@ -133,7 +133,7 @@ def test_two_simulated_runs_on_the_same_pipeline_are_equal_bit_for_bit() -> None
 
 
 def without_times(summary: RunSummary) -> str:
-    """A summary as JSON without the figures that depend on the machine's speed."""
+    """Return a summary as JSON without the figures that depend on the machine's speed."""
     data = summary.as_json()
     del data["tick_us"], data["loop_rate_hz"], data["real_time_factor"]
     return json.dumps(data)
@@ -152,7 +152,7 @@ def test_a_run_starts_paused_even_when_the_one_before_ended_engaged() -> None:
         loop.listeners.clear()
 
 
-def test_runs_by_the_clock_keep_the_solver_s_time_limit_and_simulated_ones_have_none() -> None:
+def test_runs_in_real_time_keep_the_solvers_time_limit_and_simulated_runs_have_none() -> None:
     loop = pipeline()
     assert loop.config.control.solve_time_limit is not None
     for realtime, expected in ((False, None), (True, loop.config.control.solve_time_limit), (False, None)):
@@ -162,7 +162,7 @@ def test_runs_by_the_clock_keep_the_solver_s_time_limit_and_simulated_ones_have_
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("mode", "may_touch"), [("position", 0), ("velocity", 0), ("torque", 1)])
-def test_pairs_may_touch_in_torque_mode_only(mode: str, may_touch: int) -> None:
+def test_pairs_may_touch_only_in_torque_mode(mode: str, may_touch: int) -> None:
     contact = (ContactPair(pair=("*_finger_*", "table")),)
     control = cell().control.model_copy(update={"contact_allowed": contact})
     running = pipeline(plant="mujoco", mode=mode, control=control)
@@ -179,7 +179,7 @@ def test_a_run_takes_as_many_ticks_as_its_duration_has_periods(rate: float) -> N
     assert summary.duration_s == pytest.approx(summary.ticks / rate)
 
 
-def test_by_the_clock_a_run_lasts_as_long_as_it_is_asked_to() -> None:
+def test_in_real_time_a_run_lasts_as_long_as_asked() -> None:
     loop = pipeline(loop_rate_hz=100.0)
     watch = Watch(loop)
     summary = loop.run(0.5)
@@ -258,7 +258,7 @@ def test_a_torque_that_is_not_renewed_in_time_does_not_throw_a_simulated_arm() -
 
 
 @pytest.mark.slow
-def test_ticks_one_by_one_are_those_of_a_run() -> None:
+def test_single_ticks_equal_those_of_a_run() -> None:
     watch, loop = Watch(whole := pipeline()), pipeline()
     whole.run(1.8, realtime=False)
     ran = [tick.reference.q for tick in watch.ticks][:900]
@@ -272,7 +272,7 @@ def test_ticks_one_by_one_are_those_of_a_run() -> None:
     np.testing.assert_array_equal(stepped, ran)
 
 
-def test_ticks_one_by_one_are_refused_with_real_arms_which_nobody_would_bring_to_rest() -> None:
+def test_single_ticks_are_refused_with_real_arms_because_nothing_would_brake_these() -> None:
     loop = Pipeline.from_config(load_config("config/dual_iiwa7_fri.yaml"))
     with pytest.raises(ConfigError, match="ticks one by one: allowed with a plant that is simulated only"):
         loop.begin()

@@ -1,4 +1,4 @@
-"""An input, a plant, a task and a preset of another package, written, declared and named as docs/extending.md says."""
+"""An input, a plant, a task and a preset of another package, which are written and declared as in docs/extending.md."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def merged(data: Any, changes: Any) -> Any:
 
 @pytest.fixture
 def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The shipped cell with what the page writes in its YAML; the page's package is installed, with a broken entry."""
+    """The shipped cell with the YAML of the page. The page's package is installed, together with a broken entry."""
     groups: dict[str, dict[str, str]] = {}
     for block in blocks_of(PAGE, "toml"):
         groups |= tomllib.loads(block)["project"]["entry-points"]
@@ -57,7 +57,7 @@ def changed(file: Path, data: Any) -> Path:
 
 
 def elbow_at_the_end(config: Config) -> float:
-    """Angle of the left arm's third joint [rad], after both arms have followed."""
+    """Return the angle of the left arm's third joint [rad], after both arms have followed."""
     loop = Pipeline.from_config(config.model_copy(update={"loop_rate_hz": 500.0}))
     angles: list[float] = []
     loop.listeners.append(lambda tick: angles.append(tick.reference.q[2]))
@@ -68,14 +68,14 @@ def elbow_at_the_end(config: Config) -> float:
 
 
 @pytest.mark.slow
-def test_an_input_a_plant_and_a_task_written_as_the_page_says_run_in_one_pipeline(file: Path) -> None:
+def test_an_input_a_plant_and_a_task_of_the_page_run_in_one_pipeline(file: Path) -> None:
     config = load_config(str(file))
     assert "elbows_out" in config.control.tasks
     without = config.model_copy(update={"control": config.control.model_copy(update={"tasks": {}})})
     assert elbow_at_the_end(config) > elbow_at_the_end(without) + 0.05
 
 
-def test_a_preset_of_the_page_is_what_a_cell_or_a_node_may_name(tmp_path: Path, file: Path) -> None:
+def test_a_cell_or_a_node_may_name_a_preset_of_the_page(tmp_path: Path, file: Path) -> None:
     data = external()
     data["external"] |= {"preset": "compliant"}
     other = load_config(str(changed(tmp_path / "other.yaml", data))).external
@@ -90,7 +90,7 @@ def test_a_preset_of_the_page_is_what_a_cell_or_a_node_may_name(tmp_path: Path, 
 
 
 @pytest.mark.slow
-def test_an_input_of_the_page_engages_by_the_clock_of_a_real_run_too(file: Path) -> None:
+def test_an_input_of_the_page_engages_in_a_real_time_run_too(file: Path) -> None:
     loop = Pipeline.from_config(load_config(str(file)), plant="kinematic")
     summary = loop.run(1.0)
     assert {event.destination for event in summary.events} >= {"engaged"}
@@ -114,7 +114,7 @@ def test_an_input_of_the_page_engages_by_the_clock_of_a_real_run_too(file: Path)
     ],
     ids=["input", "cannot be imported", "plant", "binding", "binding by name"],
 )
-def test_what_is_not_installed_or_not_on_the_device_is_one_line_of_check_and_run(
+def test_a_part_that_is_not_installed_or_not_on_the_device_gives_one_line_in_check_and_run(
     file: Path, change: dict[str, Any], told: str
 ) -> None:
     checked = q2r2("check", str(changed(file, change)))

@@ -1,4 +1,4 @@
-"""A policy in the loop: what it may not do, who takes over, and what is recorded of both."""
+"""A policy in the loop: its limits, takeovers by an operator, and the recording of both."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from tests.support.processes import Watch, changes
 
 pytestmark = pytest.mark.slow
 
-CYCLE, PRESS, GIVES_BACK = 0.6, 0.1, 0.3  # of an operator who takes over again and again [s]
+CYCLE, PRESS, GIVES_BACK = 0.6, 0.1, 0.3  # Times of an operator who takes over again and again [s].
 
 
 class Circle:
-    """Both tools go round circles of 60 mm, from where they are first seen."""
+    """Both tools move in circles of 60 mm, from where they are first seen."""
 
     space, rate = ActionSpace.TOOL, 50.0
 
@@ -44,7 +44,7 @@ class Circle:
 
 
 class Operator(HandsInput):
-    """Presses the lower buttons to take over, and once more to give back; the hands move all the time."""
+    """An operator who presses the lower buttons to take over, and again to give back. The hands always move."""
 
     def poll(self, now: float) -> list[HandSample]:
         hand = super().poll(now)
@@ -102,7 +102,7 @@ def test_a_recording_says_at_every_frame_who_acted_and_is_replayed_to_the_bit(tm
 
 
 class Jumping(Circle):
-    """After 0.3 s the left tool jumps 1 m in each chunk."""
+    """After 0.3 s, the left tool jumps by 1 m in each chunk."""
 
     def __call__(self, observation: Observation) -> Array:
         actions = super().__call__(observation)
@@ -123,14 +123,14 @@ def test_no_arm_moves_on_alone_after_a_fault_of_the_policy() -> None:
 
 
 class Leaving(HandsInput):
-    """Hands that nobody hears any more after a while."""
+    """Hands that fall silent after a while."""
 
     def poll(self, now: float) -> list[HandSample]:
         return super().poll(now) if now < 0.9 else []
 
 
 @pytest.mark.parametrize("stopped", [False, True], ids=["engaged", "after a stop that waits for a press"])
-def test_a_program_gives_the_arms_to_the_policy_which_then_waits_for_no_press(stopped: bool) -> None:
+def test_a_program_that_gives_the_arms_to_the_policy_waits_for_no_press(stopped: bool) -> None:
     policy = PolicyInput(Circle(), operator=Leaving())
     loop = pipeline(source=policy)
     watch = Watch(loop)
@@ -157,7 +157,7 @@ def test_a_program_gives_the_arms_to_the_policy_which_then_waits_for_no_press(st
 
 
 def colliding(loop: Pipeline) -> Array:
-    """Joint positions at which both arms, turned towards each other, are inside each other."""
+    """Return joint positions at which both arms, turned towards each other, penetrate each other."""
     q = loop.robot.home.copy()
     while loop.robot.distance_values(q).min() > -0.03:
         q[[0, 7]] += (-0.05, 0.05)
@@ -165,12 +165,12 @@ def colliding(loop: Pipeline) -> Array:
 
 
 def touching(plant: MujocoPlant) -> set[str]:
-    """Bodies of the arms that touch anything now."""
+    """Return the bodies of the arms that touch anything now."""
     bodies = {plant.model.geom_bodyid[geom] for pair in plant.data.contact.geom.tolist() for geom in pair}
     return {name for body in bodies if (name := plant.model.body(body).name).startswith(SIDES)}
 
 
-def test_a_policy_that_would_let_the_arms_collide_makes_no_contact_and_the_summary_names_the_pair() -> None:
+def test_a_policy_that_would_make_the_arms_collide_causes_no_contact_and_the_summary_names_the_pair() -> None:
     policy, touched = PolicyInput(), set[str]()
     loop = pipeline(source=policy, plant="mujoco")
     plant, home, goal = loop.plant, loop.robot.home, colliding(loop)

@@ -1,4 +1,4 @@
-"""A recorded motion runs again: by each kind of action that its dataset has, sent back at its time."""
+"""A recorded motion is repeated by each kind of action of its dataset, which are sent at their times."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ pytestmark = pytest.mark.slow
 
 FPS = 30
 DURATION = 5.0  # [s]
-CHUNK = 16  # actions, of which half are replaced by the next chunk
+CHUNK = 16  # Number of actions. The next chunk replaces half of them.
 
 
 def tools_of(loop: Pipeline) -> list[dict[str, pin.SE3]]:
-    """The measured tools of a run that is to come, tick by tick."""
+    """Collect the measured tools of a run, tick by tick."""
     tools: list[dict[str, pin.SE3]] = []
     loop.listeners.append(lambda tick: tools.append(tick.tools))
     return tools
 
 
 class Playback:
-    """Sends the frames of a dataset at their times, some ahead, as a policy does that knows it by heart."""
+    """A policy that sends the frames of a dataset at their times, some of them ahead."""
 
     def __init__(self, policy: PolicyInput, actions: Array) -> None:
         self._policy, self._actions, self._next = policy, actions, 0
 
     def __call__(self, tick: Tick) -> None:
-        begin, frame = tick.start.now + tick.dt, self._next  # the first frame is that of the first tick
+        begin, frame = tick.start.now + tick.dt, self._next  # The first frame belongs to the first tick.
         if tick.now >= begin + frame / FPS - 1e-9 and frame < len(self._actions):
             chunk = self._actions[frame : frame + CHUNK]
             self._policy.send(chunk, begin + np.arange(frame, frame + len(chunk)) / FPS)
@@ -44,7 +44,7 @@ class Playback:
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[dict[str, pin.SE3]], dict[str, Array]]:
-    """Tools that come together and turn in MuJoCo, led by scripted hands, and the vectors of the run's dataset."""
+    """Return the tools of a run in MuJoCo that come together and turn, and the vectors of its dataset."""
     loop = pipeline("meet", "mujoco")
     tools = tools_of(loop)
     file = file_of(record(tmp_path_factory.mktemp("recordings"), loop, DURATION))
@@ -53,7 +53,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[dict[str, p
 
 
 @pytest.mark.parametrize("space", ActionSpace)
-def test_the_actions_of_a_dataset_sent_back_at_their_times_repeat_the_recorded_motion(
+def test_the_actions_of_a_dataset_repeat_the_recorded_motion_when_sent_at_their_times(
     recorded: tuple[list[dict[str, pin.SE3]], dict[str, Array]], space: ActionSpace
 ) -> None:
     before, vectors = recorded

@@ -1,4 +1,4 @@
-"""Requests of a program to a run: each is done at the next tick."""
+"""Requests of a program to a run: each takes effect at the next tick."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def test_a_pause_holds_both_arms_until_a_new_press() -> None:
 
 
 @pytest.mark.slow
-def test_a_press_of_a_program_engages_arms_whose_hands_are_there_and_pauses_none() -> None:
+def test_a_press_of_a_program_engages_arms_with_present_hands_and_pauses_none() -> None:
     loop = pipeline()
     loop.listeners.append(when_moving(loop.pause))
     pressed: list[Tick] = []
@@ -55,7 +55,7 @@ def test_a_press_of_a_program_holds_no_dead_man() -> None:
 
 
 @pytest.mark.slow
-def test_springs_of_torque_mode_change_on_a_ramp_and_no_others() -> None:
+def test_springs_change_on_a_ramp_and_only_in_torque_mode() -> None:
     loop = pipeline(plant="mujoco", mode="torque")
     seen: list[float] = []
 
@@ -75,7 +75,7 @@ def test_springs_of_torque_mode_change_on_a_ramp_and_no_others() -> None:
         pipeline().change_control({"translational_stiffness": 500.0})
 
 
-def test_a_report_of_a_hand_gets_older_between_two_runs_of_one_pipeline() -> None:
+def test_the_age_of_a_hands_report_grows_between_two_runs_of_one_pipeline() -> None:
     loop = pipeline(control=cell().control.model_copy(update={"moving_obstacles": ("hand",)}))
     hand = MovingObstacle(shape="sphere", size=(0.1,), position=(9.0, 9.0, 9.0), speed=0.1)
     reported: list[float] = []
@@ -93,7 +93,7 @@ def test_a_report_of_a_hand_gets_older_between_two_runs_of_one_pipeline() -> Non
 
 
 @pytest.mark.slow
-def test_a_hand_that_a_program_reports_in_front_of_an_arm_is_named_once_and_brakes_it() -> None:
+def test_a_reported_hand_in_front_of_an_arm_is_named_once_and_brakes_the_arm() -> None:
     loop = pipeline(control=cell().control.model_copy(update={"moving_obstacles": ("hand",)}))
     ticks: list[Tick] = []
 
@@ -117,16 +117,15 @@ def test_a_hand_that_a_program_reports_in_front_of_an_arm_is_named_once_and_brak
 
 
 @pytest.mark.slow
-def test_in_torque_mode_the_wall_knows_a_box_that_was_put_down_until_it_is_gone() -> None:
+def test_in_torque_mode_the_wall_contains_a_new_box_until_it_is_removed() -> None:
     loop = pipeline(
         plant="mujoco", mode="torque", control=cell().control.model_copy(update={"moving_obstacles": ("box",)})
     )
     robot, box, offset = loop.robot, MovingObstacle(shape="box", size=(0.1, 0.1, 0.1), speed=0.0), 0.3
     while distances_with(robot, {"box": box})(robot.home).min() > 0.003:
         offset -= 0.001
-        place = tuple(
-            robot.tool_pose(robot.home, "left").act(np.array([offset, 0.0, -0.12])).tolist()
-        )  # beside the hand
+        # The box is beside the hand.
+        place = tuple(robot.tool_pose(robot.home, "left").act(np.array([offset, 0.0, -0.12])).tolist())
         box = box.model_copy(update={"position": place})
     moments: dict[float, MovingObstacle | None] = {0.1: box, 0.2: None}
     pressed: dict[float, bool] = {}

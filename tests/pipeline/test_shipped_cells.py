@@ -1,4 +1,4 @@
-"""Every shipped cell may start, and follows scripted hands in MuJoCo with the contract kept at every tick."""
+"""Every shipped cell can start, and follows scripted hands in MuJoCo with the contract kept at every tick."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.control.scenarios import into_the_table, overhead
 from tests.support.driven import Driven
 from tests.support.processes import Watch
 
-FIRST = ("dual_iiwa7", "dual_panda")  # the others are looked at by the slow tests
+FIRST = ("dual_iiwa7", "dual_panda")  # The slow tests examine the other cells.
 FILES = [
     pytest.param(file, id=file.stem, marks=() if file.stem in FIRST else pytest.mark.slow)
     for file in sorted(SHIPPED.glob("*.yaml"))
@@ -25,12 +25,14 @@ FILES = [
 
 @pytest.mark.slow
 @pytest.mark.parametrize("file", FILES)
-def test_its_tools_follow_the_hands_around_a_circle_and_keep_the_contract_where_they_cannot(file: Path) -> None:
-    # The lowest rate with one substep a tick, since most of a test's time goes by ticks.
+def test_the_tools_of_a_cell_follow_the_hands_around_a_circle_and_keep_the_contract_where_they_cannot(
+    file: Path,
+) -> None:
+    # This is the lowest rate with one substep per tick, because ticks take most of a test's time.
     config = load_config(file).model_copy(update={"loop_rate_hz": 500.0})
     pipeline = Pipeline.from_config(config, input=ScriptedInput.from_config(config, "circle"), plant="mujoco")
     assert preflight_faults(pipeline.robot, pipeline.controller.settings, pipeline.controller) == ()
-    watch = Watch(pipeline)  # of the contract
+    watch = Watch(pipeline)  # It watches the contract.
     summary = pipeline.run(2.8, realtime=False)
     heights = [[tool.translation[2] for tool in tick.tools.values()] for tick in watch.ticks]
     assert (np.ptp(heights, axis=0) > 0.02).all()

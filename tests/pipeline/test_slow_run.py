@@ -1,4 +1,4 @@
-"""Arms that are led slowly: how fast, how they rest, and what ends a motion."""
+"""Arms that move slowly: their speed, their rest, and the ends of a motion."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def config() -> Config:
 
 
 @pytest.mark.slow
-def test_no_joint_is_faster_than_a_twentieth_of_its_limit_and_at_the_end_all_rest(config: Config) -> None:
+def test_no_joint_is_faster_than_a_twentieth_of_its_limit_and_all_rest_at_the_end(config: Config) -> None:
     cabinets: list[PendantCabinets] = []
     with slow_run(config, prepare=cabinets.append) as run:
         goal = run.reference + 0.2 * np.tile([0, 0, 0, 1, 1, 1, -1], 2)
@@ -35,7 +35,7 @@ def test_no_joint_is_faster_than_a_twentieth_of_its_limit_and_at_the_end_all_res
     assert run.is_over
 
 
-def test_a_straight_way_that_is_not_free_is_not_gone(config: Config) -> None:
+def test_the_arms_do_not_take_a_straight_way_that_is_not_free(config: Config) -> None:
     with slow_run(config) as run:
         start = run.reference
         into_the_table = start.copy()
@@ -45,7 +45,7 @@ def test_a_straight_way_that_is_not_free_is_not_gone(config: Config) -> None:
 
 
 @pytest.mark.slow
-def test_a_session_that_ends_is_told_and_the_motion_may_be_asked_for_again(config: Config) -> None:
+def test_the_end_of_a_session_is_reported_and_the_motion_may_be_repeated(config: Config) -> None:
     cabinets: list[PendantCabinets] = []
     with slow_run(config, prepare=cabinets.append) as run:
         goal = run.reference.copy()
@@ -64,7 +64,7 @@ def test_a_session_that_ends_is_told_and_the_motion_may_be_asked_for_again(confi
 
 
 @pytest.mark.slow
-def test_cabinets_that_do_not_let_a_client_command_are_named(config: Config) -> None:
+def test_cabinets_that_do_not_allow_commands_are_named(config: Config) -> None:
     def lock(cabinets: PendantCabinets) -> None:
         cabinets.locked = True
 
@@ -73,7 +73,7 @@ def test_cabinets_that_do_not_let_a_client_command_are_named(config: Config) -> 
 
 
 @pytest.mark.slow
-def test_arms_that_do_not_follow_at_all_end_the_run_which_says_why(config: Config) -> None:
+def test_arms_that_do_not_follow_at_all_end_the_run_with_a_reason(config: Config) -> None:
     with slow_run(config, StuckArm) as run:
         with pytest.raises(PlantError, match=r"left_A7"):
             run.lead_to(run.reference + 0.4 * (np.arange(len(run.reference)) == 6))

@@ -1,4 +1,4 @@
-"""Targets ahead of a plant that is late."""
+"""Targets that lead a plant that is late."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def followed(lead: TargetLead, position: float, angle: float = 0.0) -> pin.SE3:
     return led["left"]
 
 
-def test_a_steady_motion_is_led_by_the_delay() -> None:
+def test_a_steady_motion_is_ahead_by_the_delay() -> None:
     lead = TargetLead()
     for k in range(100):
         led = followed(lead, 0.3 * k * DT, 1.5 * k * DT)
@@ -31,7 +31,7 @@ def test_a_steady_motion_is_led_by_the_delay() -> None:
     np.testing.assert_allclose(led.rotation, turned(1.5 * (99 * DT + DELAY)), atol=1e-6)
 
 
-def test_the_first_target_and_one_that_rests_are_as_they_are() -> None:
+def test_the_first_target_and_a_resting_target_are_unchanged() -> None:
     lead = TargetLead()
     assert followed(lead, 0.1).translation[0] == 0.1
     for k in range(50):
@@ -41,7 +41,7 @@ def test_the_first_target_and_one_that_rests_are_as_they_are() -> None:
     assert led.translation[0] == 0.4
 
 
-def test_a_motion_that_stops_at_once_is_overshot_for_a_moment_only() -> None:
+def test_a_motion_that_stops_suddenly_overshoots_only_for_a_moment() -> None:
     lead, end = TargetLead(), 0.3 * 99 * DT
     for k in range(100):
         followed(lead, 0.3 * k * DT)
@@ -50,13 +50,13 @@ def test_a_motion_that_stops_at_once_is_overshot_for_a_moment_only() -> None:
     assert over[15] < 0.1 * over[0]
 
 
-def test_a_step_of_the_target_is_no_motion() -> None:
+def test_a_jump_of_the_target_is_no_motion() -> None:
     lead = TargetLead()
     followed(lead, 0.0)
     assert followed(lead, 0.1).translation[0] == 0.1
 
 
-def test_an_arm_that_begins_again_is_led_by_nothing_of_before() -> None:
+def test_an_arm_that_begins_again_has_no_lead_from_before() -> None:
     lead = TargetLead()
     for k in range(50):
         followed(lead, 0.3 * k * DT)

@@ -1,4 +1,4 @@
-"""Work from hand samples through the whole stack to MuJoCo is as safe and as close as with targets alone."""
+"""Work that is led by hand samples through the whole stack in MuJoCo is as safe and as exact as with targets alone."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from work_through_stack import Stack
 
 pytestmark = pytest.mark.slow
 
-RATE = 500.0  # the lowest one with one substep a tick, since most of a test's time goes by ticks [Hz]
+RATE = 500.0  # This is the lowest rate with one substep per tick, because ticks take most of a test's time [Hz].
 CARRY = replace(carry(0.20, 0.30, shortest=1.0), rest=0.6)
 PASS = replace(WORK_MOTIONS["pass"], rest=0.6)
 SLIDE = replace(WORK_MOTIONS["slide"], rest=1.5)
 
 
 def work(motion: WorkMotion, mode: str, seed: int | None = 0) -> Any:
-    """Do ``motion`` in ``mode``, every promise checked at every tick: StackFigures, none of which are missing then."""
+    """Do ``motion`` in ``mode`` with every promise checked at every tick, and return complete StackFigures."""
     config = load_config("config/dual_iiwa7.yaml").model_copy(update={"loop_rate_hz": RATE})
     return Stack(config, mode).run(motion, seed)
 
 
 def assert_safe(done: Any) -> None:
-    """Every promise kept, no pause and no slip; measured links at their distances, motors within their torques."""
+    """Assert that every promise is kept without pause or slip, with distances and torques within limits."""
     assert (done.broken, done.pauses, done.stopped, done.slip_mm) == ({}, [], None, 0.0)
     assert done.fallback_percent == 0.0
     assert done.measured_margin_mm > 0.0
@@ -37,7 +37,7 @@ def assert_safe(done: Any) -> None:
 def test_arms_that_carry_something_follow_the_hands_closely(mode: str) -> None:
     done = work(CARRY, mode)
     assert_safe(done)
-    # All but the filter's delay, of which 0.3 m/s makes 13.5 mm.
+    # Only the filter's delay remains, which causes 13.5 mm at 0.3 m/s.
     assert done.path_error_mm < 7.0
     assert done.rms_error_mm < 20.0
 
