@@ -16,7 +16,7 @@ HAND = pin.SE3(pin.exp3(np.array([0.3, -0.2, 0.9])), np.array([0.4, 0.2, 1.1]))
 
 
 def measured(sampling: SampleTiming, count: int) -> tuple[Array, Array]:
-    """Return times (n,) [s] of samples of a resting hand, and the errors (n, 6) of each: position [m], rotation [rad]."""
+    """Return times (n,) [s] of a resting hand's samples and their errors (n, 6): position [m], rotation [rad]."""
     times, added = [], []
     for t in islice(sampling.times(), count):
         pose = sampling.measured(HAND, t)
