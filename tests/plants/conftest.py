@@ -1,4 +1,4 @@
-"""A cell with one block on a post between the left fingers, and motions to drive it with."""
+"""A cell with one block on a post between the left fingers, and motions that drive it."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def plant(shared_plant: MujocoPlant) -> MujocoPlant:
 
 @pytest.fixture(scope="session")
 def grasping_config(config: Config, robot: Robot) -> Config:
-    """The cell with a block where the left fingers are at home, carried by a post that ends below them."""
+    """Return the cell with a block between the left fingers at home, on a post that ends below them."""
     x, y, z = robot.tool_pose(robot.home, "left").translation
     height = z - 0.03
     return config.model_copy(
@@ -56,12 +56,12 @@ def grasping_plant(grasping_robot: Robot, grasping_config: Config) -> MujocoPlan
 
 
 def hold(q: Array, **grippers: float) -> Command:
-    """A command to rest at ``q``."""
+    """Return a command to rest at ``q``."""
     return Command(CommandMode.POSITION, q, np.zeros_like(q), np.zeros_like(q), grippers)
 
 
 def tool_motion(robot: Robot, arm: str, velocity: Array, duration: float, dt: float, q: Array) -> Iterator[Command]:
-    """Commands that move one tool straight, without turning it, with a gentle start and end at rest."""
+    """Return commands that move one tool straight, without rotation, with a gentle start and end at rest."""
     data, chain = robot.model.createData(), robot.arms[arm]
     q = q.copy()
     ticks = round(duration / dt)

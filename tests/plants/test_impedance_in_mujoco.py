@@ -1,4 +1,4 @@
-"""The impedance controller closed over MuJoCo: stiffness, damping, contact, wrong masses; every bound at every step."""
+"""The impedance controller in a loop with MuJoCo: stiffness, damping, contact, wrong masses, and all bounds."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ POSTURES = {
     "high": [0.4, 0.3, -0.3, -1.0, 0.5, -0.6, 0.2],
     "elbow out": [0.6, 0.5, -1.2, -1.5, 0.9, 1.2, -0.3],
 }
-# Links 0..7 of an iiwa 7 as Drake's description has them [kg]; those of the other public description are in the URDF.
+# Masses of links 0..7 of an iiwa 7 in Drake's description [kg]. The URDF has those of the other public description.
 OTHER_MASSES = (3.863, 2.7025, 2.7258, 3.175, 2.73, 1.69, 1.8, 0.4)
 SETTINGS = ImpedanceSettings()
 FORCE = 20.0  # [N]
-SLOW = 0.002  # a tick for what takes long and is no matter of milliseconds [s]
+SLOW = 0.002  # A longer tick for slow motions, in which milliseconds do not matter [s].
 
 
 @pytest.fixture(scope="module")
 def bare_config(config: Config) -> Config:
-    """The cell without blocks: the tool may go down to the table."""
+    """Return the cell without blocks, so that the tool can move down to the table."""
     return config.model_copy(update={"mujoco": config.mujoco.model_copy(update={"objects": {}})})
 
 
@@ -43,7 +43,7 @@ def bare(robot: Robot, bare_config: Config) -> MujocoPlant:
 
 @pytest.fixture(scope="module")
 def reweighed(robot: Robot, bare_config: Config) -> MujocoPlant:
-    """Arms whose links weigh something else than the controller thinks."""
+    """Return arms whose links have other masses than the controller expects."""
     plant = MujocoPlant(robot, bare_config)
     for arm in robot.arms:
         for link, mass in enumerate(OTHER_MASSES):
@@ -82,7 +82,7 @@ def test_a_push_moves_the_tool_by_force_over_stiffness(bare: MujocoPlant, robot:
 
 
 def modes(robot: Robot, settings: ImpedanceSettings) -> tuple[Array, Array]:
-    """Frequencies (6,) [rad/s] and shapes V (6, 6) of the left tool on its spring at home, V' Lambda V = 1."""
+    """Return frequencies (6,) [rad/s] and shapes V (6, 6) of the left tool on its spring, with V' Lambda V = 1."""
     J, M = left_arm(robot, robot.home)
     inertia = np.linalg.inv(J @ np.linalg.solve(M, J.T))
     stiffness = np.diag([settings.translational_stiffness] * 3 + [settings.rotational_stiffness] * 3)
@@ -91,7 +91,7 @@ def modes(robot: Robot, settings: ImpedanceSettings) -> tuple[Array, Array]:
 
 
 def fitted_ratio(z: Array) -> float:
-    """Damping ratio of z'' + 2 xi w z' + w^2 z = 0 that fits a release from rest best, for any xi.
+    """Return the damping ratio of z'' + 2 xi w z' + w^2 z = 0 that fits a release from rest best, for any xi.
 
     Integrated twice, z - z_0 = -2 xi w S(z - z_0) - w^2 SS z, which is linear in 2 xi w and w^2 and takes no derivative
     of a measurement. Nothing is assumed about xi, other than by a logarithmic decrement, which needs oscillation.
@@ -104,12 +104,14 @@ def fitted_ratio(z: Array) -> float:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("ratio", [0.7, 1.0])
-def test_released_every_mode_returns_with_its_damping_ratio(bare: MujocoPlant, robot: Robot, ratio: float) -> None:
+def test_every_mode_that_is_released_returns_with_its_damping_ratio(
+    bare: MujocoPlant, robot: Robot, ratio: float
+) -> None:
     settings = SETTINGS.model_copy(update={"damping_ratio": ratio})
     frequencies, V = modes(robot, settings)
     stiffness = np.repeat([settings.translational_stiffness, settings.rotational_stiffness], 3)
     for frequency, shape in zip(frequencies, V.T, strict=True):
-        # Each mode by itself, since a fast one would drown in what is left of a slow one.
+        # Each mode is tested alone, because a fast mode would be hidden by the rest of a slow one.
         wrench = stiffness * shape
         wrench *= min(15.0 / np.linalg.norm(wrench[:3]), 4.0 / np.linalg.norm(wrench[3:]))
         loop = TorqueLoop(bare, robot, settings, robot.home)
@@ -129,7 +131,7 @@ def test_released_every_mode_returns_with_its_damping_ratio(bare: MujocoPlant, r
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["home", "reaching far", "elbow out"])
-def test_arms_of_other_masses_stay_stable_and_within_2_cm(reweighed: MujocoPlant, robot: Robot, name: str) -> None:
+def test_arms_with_other_masses_stay_stable_and_within_2_cm(reweighed: MujocoPlant, robot: Robot, name: str) -> None:
     loop = TorqueLoop(reweighed, robot, SETTINGS, posture(robot, name), SLOW)
     largest = 0.0
     for _ in loop.ticks(2.5):
@@ -142,7 +144,7 @@ def test_arms_of_other_masses_stay_stable_and_within_2_cm(reweighed: MujocoPlant
 
 
 @pytest.mark.slow
-def test_it_meets_the_table_at_0_1_m_s_and_bounces_at_most_twice(bare: MujocoPlant, robot: Robot) -> None:
+def test_a_tool_hits_the_table_at_0_1_m_s_and_bounces_at_most_twice(bare: MujocoPlant, robot: Robot) -> None:
     loop = TorqueLoop(bare, robot, SETTINGS.model_copy(update={"damping_ratio": 0.7}), robot.home)
     way = list(tool_motion(robot, "left", np.array([0.0, 0.0, -0.1]), 2.5, DT, robot.home))
     touching = []
@@ -160,7 +162,7 @@ def test_it_meets_the_table_at_0_1_m_s_and_bounces_at_most_twice(bare: MujocoPla
     assert not touching[0]
     assert all(touching[-1000:])
     assert np.abs(loop.state.v).max() < 2e-3
-    # The table bears the force that presses the spring together.
+    # The table bears the force that compresses the spring.
     depth = robot.tool_pose(loop.state.q, "left").translation - robot.tool_pose(way[-1].q, "left").translation
     assert 0.03 < depth[2] < 0.1
     external = loop.state.tau_external
@@ -176,7 +178,7 @@ def touches_table(plant: MujocoPlant) -> bool:
 
 
 @pytest.mark.parametrize("wrench", [along(0), along(2, -FORCE)], ids=["sideways", "down"])
-def test_stretched_out_it_stays_stable(bare: MujocoPlant, robot: Robot, wrench: Array) -> None:
+def test_a_stretched_arm_stays_stable(bare: MujocoPlant, robot: Robot, wrench: Array) -> None:
     loop = TorqueLoop(bare, robot, SETTINGS, np.zeros(14), SLOW)
     bare.push("left", wrench, 0.5)
     for _ in loop.ticks(0.5):
@@ -185,7 +187,7 @@ def test_stretched_out_it_stays_stable(bare: MujocoPlant, robot: Robot, wrench: 
     assert np.linalg.norm(loop.displacement()[:3]) < 1e-3
 
 
-def test_thrown_by_a_blow_it_keeps_every_bound_and_comes_back(bare: MujocoPlant, robot: Robot) -> None:
+def test_an_arm_after_a_blow_keeps_every_bound_and_comes_back(bare: MujocoPlant, robot: Robot) -> None:
     settings = SETTINGS.model_copy(update={"torque_rate_limit": 1000.0})
     loop = TorqueLoop(bare, robot, settings, robot.home, SLOW)
     bare.push("left", np.array([0.0, 300.0, 300.0, 0, 0, 0]), 0.15)
@@ -200,7 +202,9 @@ def test_thrown_by_a_blow_it_keeps_every_bound_and_comes_back(bare: MujocoPlant,
 
 
 def test_what_a_gripper_holds_hangs_on_no_spring_and_makes_no_torque_jump(bare_config: Config) -> None:
-    """2 kg at the tool's point, by 2000 N/m: 9.8 mm of sag while nobody knows of them."""
+    """A mass of 2 kg at the tool's point causes a sag of 9.8 mm at 2000 N/m, as long as the controller does not know
+    it.
+    """
     data = bare_config.model_dump()
     data["arms"]["left"]["gripper"]["object"] = {"mass": 2.0}
     config = Config.model_validate(data)

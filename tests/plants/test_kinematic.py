@@ -18,7 +18,9 @@ def plant(robot: Robot, config: Config) -> KinematicPlant:
     return KinematicPlant(robot, config)
 
 
-def test_it_stands_at_home_with_open_grippers_until_told_otherwise(plant: KinematicPlant, robot: Robot) -> None:
+def test_the_plant_stands_at_home_with_open_grippers_until_the_first_command(
+    plant: KinematicPlant, robot: Robot
+) -> None:
     plant.advance(0.5)
     state = plant.state()
     np.testing.assert_array_equal(state.q, robot.home)
@@ -26,10 +28,10 @@ def test_it_stands_at_home_with_open_grippers_until_told_otherwise(plant: Kinema
     assert plant.gripper_openings() == {"left": 1.0, "right": 1.0}
 
 
-def test_it_is_exactly_where_the_command_says_at_the_end_of_the_tick(plant: KinematicPlant, robot: Robot) -> None:
+def test_the_plant_is_exactly_at_the_command_at_the_end_of_the_tick(plant: KinematicPlant, robot: Robot) -> None:
     command = replace(hold(robot.home + 0.1), v=np.full(14, 0.3))
     plant.apply(command)
-    command.q[:], command.v[:] = 99, 99  # others may write into their arrays
+    command.q[:], command.v[:] = 99, 99  # Other code may change its arrays.
     np.testing.assert_array_equal(plant.state().q, robot.home)
     for v in (0.3, 0.0):
         plant.advance(0.001)
@@ -38,11 +40,11 @@ def test_it_is_exactly_where_the_command_says_at_the_end_of_the_tick(plant: Kine
 
 
 @pytest.mark.parametrize("dt", [0.001, 0.0037, 0.02])
-def test_a_gripper_closes_at_its_speed_whatever_the_tick(plant: KinematicPlant, robot: Robot, dt: float) -> None:
+def test_a_gripper_closes_at_its_speed_for_any_tick(plant: KinematicPlant, robot: Robot, dt: float) -> None:
     plant.apply(hold(robot.home, left=0.0))
     while plant.state().stamp < 0.1:
         plant.advance(dt)
-    # 0.1 m/s over a stroke of 0.025 m.
+    # The speed is 0.1 m/s over a stroke of 0.025 m.
     assert plant.gripper_openings()["left"] == pytest.approx(1 - 4 * plant.state().stamp, abs=1e-9)
     for _ in range(100):
         plant.advance(dt)

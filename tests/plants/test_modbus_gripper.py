@@ -1,4 +1,4 @@
-"""A gripper on Modbus against a simulated one, which moves by a step each time that it is read."""
+"""A gripper on Modbus against a simulated one, which moves by a step whenever it is read."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def simulated() -> Iterator[SimulatedGripper]:
 
 @pytest.fixture
 def connect(simulated: SimulatedGripper, monkeypatch: pytest.MonkeyPatch) -> Iterator[Connect]:
-    """A gripper under test, which a busy machine does not make lose its connection."""
+    """Return a gripper under test that does not lose its connection on a busy machine."""
     monkeypatch.setattr(f"{MODULE}._TIMEOUT", 30.0)
     monkeypatch.setattr(f"{MODULE}._AGAIN", 0.01)
     started: list[ModbusGripper] = []
@@ -47,13 +47,13 @@ def connect(simulated: SimulatedGripper, monkeypatch: pytest.MonkeyPatch) -> Ite
         return started[-1]
 
     yield start
-    simulated.stop()  # or one that waits for an answer would go on to
+    simulated.stop()  # Otherwise, a gripper that waits for an answer would go on waiting.
     for gripper in started:
         gripper.close()
 
 
 def read_on(simulated: SimulatedGripper, times: int = 10) -> None:
-    """Wait until the gripper was read some more times."""
+    """Wait until the gripper was read several more times."""
     enough = simulated.reads + times
     eventually(lambda: simulated.reads >= enough, "the gripper is read")
 
@@ -62,7 +62,7 @@ def measures(gripper: ModbusGripper, opening: float) -> None:
     eventually(lambda: gripper.opening == pytest.approx(opening, abs=0.003), f"opening {opening}")
 
 
-def test_it_is_only_read_before_the_first_command(connect: Connect, simulated: SimulatedGripper) -> None:
+def test_the_gripper_is_only_read_before_the_first_command(connect: Connect, simulated: SimulatedGripper) -> None:
     gripper = connect()
     read_on(simulated)
     assert simulated.written == []
@@ -72,7 +72,7 @@ def test_it_is_only_read_before_the_first_command(connect: Connect, simulated: S
     )
 
 
-def test_the_first_command_activates_it_and_it_goes_on_to_the_newest_opening(
+def test_the_first_command_activates_the_gripper_which_then_moves_to_the_newest_opening(
     connect: Connect, simulated: SimulatedGripper, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level("INFO")
@@ -85,7 +85,7 @@ def test_the_first_command_activates_it_and_it_goes_on_to_the_newest_opening(
     assert "left gripper: is activated, its fingers open and close" in caplog.messages
 
 
-def test_one_that_is_active_is_not_activated_so_that_it_keeps_what_it_holds(
+def test_an_active_gripper_is_not_activated_again_so_that_it_keeps_its_object(
     connect: Connect, simulated: SimulatedGripper
 ) -> None:
     simulated.activate()
@@ -96,7 +96,7 @@ def test_one_that_is_active_is_not_activated_so_that_it_keeps_what_it_holds(
     assert simulated.written == [(9, 0, 0, 0, 255, 128)]
 
 
-def test_one_that_loses_its_power_while_it_is_activated_is_activated_again(
+def test_a_gripper_that_loses_power_during_activation_is_activated_again(
     connect: Connect, simulated: SimulatedGripper
 ) -> None:
     simulated.activation = 10**9
@@ -118,7 +118,7 @@ def test_one_that_loses_its_power_while_it_is_activated_is_activated_again(
         pytest.param(0x09, [], id="nobody has spoken to it for a second"),
     ],
 )
-def test_a_fault_is_reset_where_only_a_reset_ends_it(
+def test_a_fault_that_only_a_reset_ends_is_reset(
     connect: Connect, simulated: SimulatedGripper, fault: int, begins: list[tuple[int, ...]]
 ) -> None:
     simulated.activate()
@@ -131,7 +131,9 @@ def test_a_fault_is_reset_where_only_a_reset_ends_it(
     assert simulated.written == [*begins, (9, 0, 0, 255, 255, 128)]
 
 
-def test_fingers_that_an_object_stops_are_measured_there(connect: Connect, simulated: SimulatedGripper) -> None:
+def test_fingers_that_an_object_stops_are_measured_at_that_opening(
+    connect: Connect, simulated: SimulatedGripper
+) -> None:
     simulated.object_at = 204
     gripper = connect()
     gripper.command(0.0)
@@ -140,7 +142,7 @@ def test_fingers_that_an_object_stops_are_measured_there(connect: Connect, simul
     assert gripper.in_words().endswith("unit 9: active, position 204 of 255, holds something")
 
 
-def test_the_ends_of_its_counts_are_closed_and_open_and_are_gone_beyond(
+def test_the_ends_of_the_counts_are_closed_and_open_and_values_beyond_are_clipped(
     connect: Connect, simulated: SimulatedGripper
 ) -> None:
     simulated.activate()
@@ -152,7 +154,7 @@ def test_the_ends_of_its_counts_are_closed_and_open_and_are_gone_beyond(
         assert simulated.position == position
 
 
-def test_a_lost_connection_is_said_once_and_comes_back_with_the_newest_opening(
+def test_a_lost_connection_is_reported_once_and_returns_with_the_newest_opening(
     connect: Connect, simulated: SimulatedGripper, caplog: pytest.LogCaptureFixture
 ) -> None:
     gripper = connect()
@@ -173,7 +175,7 @@ def test_a_lost_connection_is_said_once_and_comes_back_with_the_newest_opening(
     assert warnings(caplog) == [f"left gripper: {lost}"]
 
 
-def test_an_opening_is_not_known_any_more_before_the_gripper_counts_as_lost(
+def test_an_opening_becomes_unknown_before_the_gripper_counts_as_lost(
     connect: Connect, simulated: SimulatedGripper, caplog: pytest.LogCaptureFixture
 ) -> None:
     gripper = connect()
@@ -185,7 +187,7 @@ def test_an_opening_is_not_known_any_more_before_the_gripper_counts_as_lost(
     assert warnings(caplog) == []
 
 
-def test_one_that_was_switched_off_in_mid_run_is_not_activated_before_the_next(
+def test_a_gripper_that_was_switched_off_during_a_run_is_activated_only_in_the_next_run(
     connect: Connect, simulated: SimulatedGripper, caplog: pytest.LogCaptureFixture
 ) -> None:
     gripper = connect()
@@ -199,7 +201,7 @@ def test_one_that_was_switched_off_in_mid_run_is_not_activated_before_the_next(
     assert warnings(caplog) == ["left gripper: is not active any more; the next run activates it"]
 
 
-def test_a_fault_in_mid_run_is_said_once_in_words(
+def test_a_fault_during_a_run_is_reported_once_in_words(
     connect: Connect, simulated: SimulatedGripper, caplog: pytest.LogCaptureFixture
 ) -> None:
     gripper = connect()
@@ -214,7 +216,7 @@ def test_a_fault_in_mid_run_is_said_once_in_words(
 
 @contextmanager
 def serial_line(port: int) -> Iterator[str]:
-    """A serial device whose other end is a TCP port."""
+    """Return a serial device whose other end is a TCP port."""
     end, device = os.openpty()
     done = threading.Event()
 
@@ -233,7 +235,7 @@ def serial_line(port: int) -> Iterator[str]:
     os.close(device)
 
 
-def test_on_a_serial_device_it_speaks_modbus_rtu() -> None:
+def test_a_gripper_on_a_serial_device_speaks_modbus_rtu() -> None:
     with SimulatedGripper(FramerType.RTU) as simulated, serial_line(simulated.port) as device:
         gripper = ModbusGripper("left", ModbusGripperConfig(modbus=device))
         gripper.start()

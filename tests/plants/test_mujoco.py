@@ -46,7 +46,7 @@ def _same(first: RobotState, second: RobotState) -> bool:
 
 
 class TestPositionMode:
-    def test_it_holds_home_against_gravity_before_any_command(self, plant: MujocoPlant, robot: Robot) -> None:
+    def test_the_arms_hold_home_against_gravity_before_any_command(self, plant: MujocoPlant, robot: Robot) -> None:
         for _ in range(1000):
             np.testing.assert_allclose(plant.state().tau, _gravity(robot, robot.home), atol=0.01)
             plant.advance(DT)
@@ -61,7 +61,7 @@ class TestPositionMode:
             reached, due = (robot.tool_pose(q, "left").translation for q in (plant.state().q, command.q))
             assert np.linalg.norm(reached - due) < 1e-3
 
-    def test_torque_stays_inside_the_limits_of_a_leaping_reference(self, plant: MujocoPlant, robot: Robot) -> None:
+    def test_torque_stays_inside_the_limits_if_the_reference_jumps(self, plant: MujocoPlant, robot: Robot) -> None:
         rng = np.random.default_rng(3)
         saturated = np.zeros(14, dtype=bool)
         for _ in range(60):
@@ -75,7 +75,7 @@ class TestPositionMode:
                 saturated |= np.abs(state.tau) >= robot.torque_limit * (1 - 1e-12)
         assert saturated.all()
 
-    def test_a_velocity_ends_with_its_tick_when_no_newer_command_comes(self, plant: MujocoPlant, robot: Robot) -> None:
+    def test_a_velocity_ends_with_its_tick_if_no_newer_command_comes(self, plant: MujocoPlant, robot: Robot) -> None:
         commands = list(tool_motion(robot, "left", np.array([0.0, 0.0, 0.2]), 0.8, DT, robot.home))[:400]
         for command in commands:
             plant.apply(command)
@@ -109,7 +109,7 @@ class TestPush:
         plant.advance(0.4)
         np.testing.assert_allclose(_external(plant.state()), 0, atol=1e-9)
 
-    def test_it_lasts_as_long_as_asked_to_the_step(self, plant: MujocoPlant) -> None:
+    def test_a_push_lasts_for_its_duration_exact_to_a_step(self, plant: MujocoPlant) -> None:
         plant.push("left", np.array([50.0, 0, 0, 0, 0, 0]), 0.003)
         felt = []
         for _ in range(5):
@@ -144,7 +144,9 @@ class TestGripper:
         assert plant.gripper_openings()["left"] == pytest.approx(0, abs=0.01)
         assert plant.gripper_openings()["right"] == pytest.approx(1, abs=0.01)
 
-    def test_it_grasps_as_configured_lifts_and_drops_a_block(self, grasping_plant: MujocoPlant, robot: Robot) -> None:
+    def test_the_gripper_grasps_lifts_and_drops_a_block_as_configured(
+        self, grasping_plant: MujocoPlant, robot: Robot
+    ) -> None:
         plant = grasping_plant
         plant.apply(hold(robot.home, left=0.0))
         for _ in range(500):
@@ -170,13 +172,13 @@ class TestGripper:
 class TestTime:
     @pytest.mark.slow
     @pytest.mark.parametrize("dt", [0.0001, 0.00037, 0.001, 0.0013, 1 / 60, 1 / 72])
-    def test_the_stamp_never_strays_from_the_sum_of_ticks_by_a_step(self, plant: MujocoPlant, dt: float) -> None:
+    def test_the_stamp_differs_from_the_sum_of_ticks_by_less_than_a_step(self, plant: MujocoPlant, dt: float) -> None:
         for tick in range(1, 301):
             plant.advance(dt)
             assert -1e-8 < tick * dt - plant.state().stamp < DT
 
     @pytest.mark.parametrize("dt", [float("nan"), float("inf"), -DT, 3600.0])
-    def test_no_time_or_an_impossible_one_moves_nothing(self, plant: MujocoPlant, robot: Robot, dt: float) -> None:
+    def test_an_impossible_dt_moves_nothing(self, plant: MujocoPlant, robot: Robot, dt: float) -> None:
         before = plant.state()
         plant.apply(hold(robot.home + 0.1))
         plant.advance(0.0)
@@ -198,7 +200,7 @@ class TestRepeatability:
             states.append(plant.state())
         return states
 
-    def test_reset_restores_all_and_ends_pushes(self, plant: MujocoPlant, robot: Robot, config: Config) -> None:
+    def test_reset_restores_everything_and_ends_pushes(self, plant: MujocoPlant, robot: Robot, config: Config) -> None:
         plant.apply(_torque_command(np.zeros(14)))
         plant.push("left", np.array([50.0, 0, 0, 0, 0, 0]), 10.0)
         plant.advance(0.7)
@@ -216,14 +218,14 @@ class TestRepeatability:
         np.testing.assert_allclose(plant.state().q, posture, atol=1e-4)
 
 
-def test_a_state_that_was_handed_out_does_not_change_later(plant: MujocoPlant, robot: Robot) -> None:
+def test_a_returned_state_does_not_change_later(plant: MujocoPlant, robot: Robot) -> None:
     state = plant.state()
     plant.apply(hold(robot.home + 0.05))
     plant.advance(0.2)
     np.testing.assert_array_equal(state.q, robot.home)
 
 
-def test_a_block_that_has_lain_still_moves_when_an_arm_pushes_it(grasping_plant: MujocoPlant, robot: Robot) -> None:
+def test_a_block_at_rest_moves_when_an_arm_pushes_it(grasping_plant: MujocoPlant, robot: Robot) -> None:
     plant = grasping_plant
     plant.advance(1.0)
     before = float(plant.data.body("block").xpos[1])

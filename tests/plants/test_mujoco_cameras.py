@@ -1,4 +1,4 @@
-"""Cameras stand where the cell says and look where it says. None of it needs OpenGL."""
+"""Cameras stand and look as the cell says. No test here needs OpenGL."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.support.processes import cell
 
 
 def axes(**camera: object) -> tuple[Array, Array]:
-    """Where a camera is, and in columns what is to the right in its picture, up, and away from what it sees."""
+    """Return the camera's position and, in columns, the picture's right and up and the direction away from the scene."""
     config = cell().model_copy(update={"cameras": {"one": CameraConfig.model_validate(camera)}})
     plant = MujocoPlant(Robot.from_config(config), config)
     mujoco.mj_camlight(plant.model, plant.data)
@@ -41,7 +41,7 @@ def test_a_camera_without_rotation_looks_along_x_with_z_up_and_one_that_looks_do
     np.testing.assert_allclose(down, ((0, -1, 0), (1, 0, 0), (0, 0, 1)), atol=1e-12)
 
 
-def test_a_camera_on_a_link_that_there_is_not_is_refused_with_those_that_there_are() -> None:
+def test_a_camera_on_a_missing_link_is_refused_with_the_existing_links() -> None:
     with pytest.raises(PlantError, match=r"cameras\.one\.link = 'hand': no such link; allowed: left_link_0, "):
         axes(link="hand", position=(0, 0, 1), rpy=(0, 0, 0))
 
@@ -55,7 +55,7 @@ def test_a_window_without_a_display_is_refused(plant: MujocoPlant, monkeypatch: 
     assert plant.viewer_sync() is False
 
 
-def test_the_window_draws_moving_obstacles_where_they_are_and_no_longer_than_they_are_there(plant: MujocoPlant) -> None:
+def test_the_window_draws_moving_obstacles_at_their_places_while_they_exist(plant: MujocoPlant) -> None:
     scene = mujoco.MjvScene(plant.model, maxgeom=8)
     shapes = [("sphere", (0.1,)), ("capsule", (0.1, 0.4)), ("box", (0.1, 0.2, 0.4))]
     turned = {"position": (0.6, 0.4, 0.3), "rpy": (0.0, np.pi / 2, 0.0), "speed": 0.2}

@@ -35,7 +35,7 @@ def test_joint_space_inertia_and_gravity_equal_the_controllers_model(plant: Mujo
     np.testing.assert_allclose(plant.data.qfrc_bias[index], gravity, atol=1e-5)
 
 
-def test_joints_feel_the_share_of_their_rotors_that_the_cell_says(config: Config, robot: Robot) -> None:
+def test_joints_feel_the_share_of_rotor_inertia_that_the_cell_says(config: Config, robot: Robot) -> None:
     share = config.mujoco.model_copy(update={"rotor_share": 0.25})
     lighter = MujocoPlant(robot, config.model_copy(update={"mujoco": share}))
     for name, armature in zip(robot.joint_names, robot.model.armature, strict=True):
@@ -43,7 +43,7 @@ def test_joints_feel_the_share_of_their_rotors_that_the_cell_says(config: Config
     lighter.close()
 
 
-def test_joint_and_torque_limits_are_the_robots(plant: MujocoPlant, robot: Robot) -> None:
+def test_joint_and_torque_limits_are_those_of_the_robot(plant: MujocoPlant, robot: Robot) -> None:
     for index, name in enumerate(robot.joint_names):
         np.testing.assert_allclose(
             plant.model.joint(name).range, (robot.position_lower[index], robot.position_upper[index])
@@ -53,7 +53,7 @@ def test_joint_and_torque_limits_are_the_robots(plant: MujocoPlant, robot: Robot
         )
 
 
-def test_drawings_and_envelopes_touch_nothing_and_fingers_do(plant: MujocoPlant) -> None:
+def test_drawings_and_envelopes_touch_nothing_but_fingers_do(plant: MujocoPlant) -> None:
     names = {plant.model.geom(index).name for index in range(plant.model.ngeom)}
     assert {"left_link_3_ring", "left_hand_e_finger_1_tip_1_envelope", "right_hand_e_finger_2_contact"} <= names
     for name in names:
@@ -81,7 +81,7 @@ def test_only_the_blocks_on_the_table_are_in_contact_at_home(plant: MujocoPlant,
         pytest.param([0, -1.2, 0, 2.0, 0, -1.5, 0] + [0] * 7, {"left"}, id="an arm and itself"),
     ],
 )
-def test_what_really_can_meet_collides(plant: MujocoPlant, q: list[float], prefixes: set[str]) -> None:
+def test_bodies_that_can_really_meet_collide(plant: MujocoPlant, q: list[float], prefixes: set[str]) -> None:
     plant.reset(np.array(q, dtype=float))
     assert prefixes in [{name.split("_")[0] for name in pair} for pair in _pairs_in_contact(plant)]
 
@@ -112,7 +112,7 @@ def test_a_finger_meets_the_floor(config: Config) -> None:
 
 
 def _with_a_falling_block(config: Config, floor: float | None) -> MujocoPlant:
-    """The cell without its table, and a block 6 cm high, half a metre up behind the arms."""
+    """Return the cell without its table, with a block of 6 cm, half a metre above the floor behind the arms."""
     block = ObjectConfig(size=(0.04, 0.04, 0.06), position=(-0.6, 0.0, 0.5))
     obstacles = {name: thing for name, thing in config.obstacles.items() if name != "table"}
     cell = config.model_copy(
@@ -121,7 +121,7 @@ def _with_a_falling_block(config: Config, floor: float | None) -> MujocoPlant:
     return MujocoPlant(Robot.from_config(cell), cell)
 
 
-def test_neighbours_never_touch_anywhere_in_the_joint_range(plant: MujocoPlant, robot: Robot) -> None:
+def test_neighbours_never_touch_in_the_whole_joint_range(plant: MujocoPlant, robot: Robot) -> None:
     rng = np.random.default_rng(7)
     for _ in range(200):
         plant.reset(rng.uniform(robot.position_lower, robot.position_upper))
@@ -139,7 +139,7 @@ def test_an_object_named_like_a_part_of_the_robot_is_refused(robot: Robot, confi
         build_model(robot, clashing)
 
 
-# A wedge in a node that turns it about z by a quarter, which a reader could overlook.
+# The mesh has a wedge in a node that turns it about z by a quarter, which a reader could ignore.
 DAE = """<?xml version="1.0"?>
 <COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
   <asset><unit name="meter" meter="1"/><up_axis>Z_UP</up_axis></asset>
@@ -156,7 +156,7 @@ DAE = """<?xml version="1.0"?>
 </COLLADA>
 """
 
-# Its inertia is one that MuJoCo refuses as it is.
+# MuJoCo refuses the inertia as it is.
 URDF = """<robot name="rod"><link name="base"/><link name="rod">
 <inertial><mass value="1"/><inertia ixx="1e-4" iyy="1e-4" izz="0" ixy="0" ixz="0" iyz="0"/></inertial>
 <collision><geometry><mesh filename="wedge.dae" scale="2 2 2"/></geometry></collision></link>
@@ -175,7 +175,7 @@ def _cell(folder: Path) -> Config:
     return load_config(folder / "cell.yaml")
 
 
-def test_mujocos_mesh_is_the_one_that_the_controller_encloses(tmp_path: Path) -> None:
+def test_the_mesh_in_mujoco_is_the_one_that_the_controller_encloses(tmp_path: Path) -> None:
     config = _cell(tmp_path)
     robot = Robot.from_config(config)
     model = build_model(robot, config)
@@ -193,7 +193,7 @@ def test_mujocos_mesh_is_the_one_that_the_controller_encloses(tmp_path: Path) ->
     assert (across <= capsule.geometry.radius + 1e-6).all()
 
 
-def test_a_mesh_that_nobody_can_read_is_named_in_one_line(tmp_path: Path) -> None:
+def test_an_unreadable_mesh_is_named_in_one_line(tmp_path: Path) -> None:
     config = _cell(tmp_path)
     robot = Robot.from_config(config)
     (tmp_path / "wedge.dae").write_text("no mesh")

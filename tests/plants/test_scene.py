@@ -1,4 +1,4 @@
-"""The feel of obstacles in MuJoCo: which contacts are named, and how deep a finger is that slides."""
+"""Contacts of obstacles in MuJoCo: the named pairs, and the depth of a sliding finger."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
 LOAD = 20.0  # [N]
-MASS = 0.1  # of the pad; MuJoCo scales stiffness with what moves most easily, as a finger in its gripper does [kg]
+# Mass of the pad [kg]. MuJoCo scales stiffness with the lightest moving part, such as a finger in its gripper.
+MASS = 0.1
 
 
-def test_every_pad_and_the_table_are_named_with_the_cells_friction(robot: Robot, config: Config) -> None:
+def test_every_pad_is_paired_with_the_table_at_the_cells_friction(robot: Robot, config: Config) -> None:
     slippery = config.mujoco.model_copy(update={"obstacle_friction": 0.3})
     model = MujocoPlant(robot, config.model_copy(update={"mujoco": slippery})).model
     table = model.geom("table_collision").id
@@ -30,7 +31,7 @@ def test_every_pad_and_the_table_are_named_with_the_cells_friction(robot: Robot,
     assert named == {frozenset((shape, table)) for shape in (*pads, sponge)}
     np.testing.assert_array_equal(model.pair_friction[:, :2], 0.3)
     assert model.geom_friction[table, 0] == 0.3
-    # How the table bears a finger is what it is for everything else.
+    # The table bears a finger like any other body.
     of_pads = model.pair_solref[(model.pair_geom1 != sponge) & (model.pair_geom2 != sponge)]
     np.testing.assert_array_equal(of_pads, np.tile(model.geom_solref[table], (len(pads), 1)))
 
@@ -48,7 +49,9 @@ def test_a_soft_object_yields_by_its_stiffness_where_it_stands(robot: Robot, con
 
 
 def depths(config: Config, speed: float, named: bool) -> Array:
-    """How deep in the table a pad is, at each millisecond, that :data:`LOAD` presses and that is led along it [m]."""
+    """Return the depth in the table at each millisecond of a pad that :data:`LOAD` presses and that slides along it
+    [m].
+    """
     spec = mujoco.MjSpec()
     spec.option.cone, spec.option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, 100.0
     spec.option.gravity = (0.0, 0.0, -LOAD / MASS)
@@ -73,7 +76,7 @@ def depths(config: Config, speed: float, named: bool) -> Array:
 
 
 def test_a_finger_stays_in_contact_and_about_as_deep_when_it_slides(config: Config) -> None:
-    """Were friction as quick as what bears the finger, it would rise by all of its depth, and hop."""
+    """If friction acted as fast as the contact force, the finger would rise by its whole depth, and hop."""
     still = depths(config, 0.0, named=True)
     np.testing.assert_allclose(still, depths(config, 0.0, named=False), rtol=0.01)
     sliding = depths(config, 0.1, named=True)

@@ -1,4 +1,4 @@
-"""The simulated cell behind a topic: what acts on it between two commands, by a made-up clock."""
+"""The simulated cell behind a topic: what acts on it between two commands, with a simulated clock."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def cell(robot: Robot, config: Config) -> SimulatedCell:
 
 
 def push(cell: SimulatedCell, now: float) -> None:
-    """A torque that bears the arms and turns one joint."""
+    """Return a torque that bears the arms and turns one joint."""
     robot = cell.robot
     tau = pin.computeGeneralizedGravity(robot.model, robot.model.createData(), cell.plant.state().q)
     tau[5] += 5.0
@@ -40,14 +40,14 @@ def test_a_torque_that_is_not_renewed_acts_for_some_milliseconds(cell: Simulated
     assert cell.dropped == pytest.approx(late - 0.012, abs=0.005)
 
 
-def test_a_simulation_that_is_called_late_lets_no_old_torque_act_for_all_that_time(cell: SimulatedCell) -> None:
+def test_if_the_simulation_is_called_late_an_old_torque_does_not_act_for_all_that_time(cell: SimulatedCell) -> None:
     cell.advance(0.0)
     push(cell, 0.0)
     cell.advance(0.05)
     assert cell.plant.data.time <= 0.012 + 1e-9
 
 
-def test_after_a_time_without_torques_the_arms_stand_on_their_servos(cell: SimulatedCell) -> None:
+def test_without_torques_for_a_while_the_arms_stand_on_their_servos(cell: SimulatedCell) -> None:
     cell.advance(0.0)
     push(cell, 0.0)
     for now in np.arange(0.004, 1.0, 0.004):
@@ -62,13 +62,13 @@ JOINTS, DT = np.array([0, 1]), 0.001
 
 
 def motion(t: float) -> tuple[np.ndarray, np.ndarray]:
-    """Posture and velocity of a smooth motion from rest."""
+    """Return posture and velocity of a smooth motion from rest."""
     return np.array([0.5 * (1 - np.cos(t)), t**2 / 10]), np.array([0.5 * np.sin(t), t / 5])
 
 
 @pytest.mark.parametrize("with_velocity", [True, False])
 @pytest.mark.parametrize("period", [0.002, 0.004, 0.02])
-def test_it_keeps_to_a_motion_whose_commands_come_unevenly(with_velocity: bool, period: float) -> None:
+def test_the_cell_follows_a_motion_whose_commands_come_unevenly(with_velocity: bool, period: float) -> None:
     random = np.random.default_rng(3)
     follower = JointFollower(np.zeros(2), ACCELERATION, LIMIT)
     due = np.arange(0.0, 2.0, period) + random.uniform(0.0, 0.3 * period, len(np.arange(0.0, 2.0, period)))
@@ -86,7 +86,7 @@ def test_it_keeps_to_a_motion_whose_commands_come_unevenly(with_velocity: bool, 
             assert np.abs(follower.q - motion(now)[0]).max() < (0.001 if with_velocity else 0.4 * period + 0.001)
 
 
-def test_without_commands_it_coasts_shortly_and_brakes() -> None:
+def test_without_commands_the_cell_coasts_briefly_and_brakes() -> None:
     follower = JointFollower(np.zeros(2), ACCELERATION, LIMIT)
     v = np.array([1.0, -2.0])
     for tick in range(100):
@@ -106,7 +106,7 @@ def test_without_commands_it_coasts_shortly_and_brakes() -> None:
     assert not follower.v.any()
 
 
-def test_a_command_names_some_joints_and_the_others_stay() -> None:
+def test_a_command_may_name_some_joints_and_the_others_stay() -> None:
     follower = JointFollower(np.array([0.1, 0.2]), ACCELERATION, LIMIT)
     for tick in range(100):
         follower.command(np.array([1]), np.array([0.25]), np.zeros(1), tick * DT)

@@ -1,4 +1,4 @@
-"""A cabinet that asks one session, message by message."""
+"""A cabinet that sends messages to one session, one by one."""
 
 from __future__ import annotations
 
@@ -23,18 +23,21 @@ ACTIVE = replace(WAITING, session=Session.COMMANDING_ACTIVE)
 
 
 class Cabinet:
-    """Sends messages 5 ms apart to a session, and reads the answers."""
+    """A cabinet that sends messages 5 ms apart to a session, and reads the answers."""
 
     def __init__(self, session: ArmSession | None = None) -> None:
         self.session, self.sent, self.heard = session or ArmSession("left", "cabinet"), 0, 0
-        self.silence = 0.0  # so far [s]
+        self.silence = 0.0  # Duration of the silence so far [s].
 
     @property
     def now(self) -> float:
         return 0.005 * self.sent + self.silence
 
     def ask(self, message: Monitoring, lost: bool = False, doubled: bool = False) -> FriCommand | None:
-        """``lost``: the answer, which the cabinet does not hear. ``doubled``: the message, of which it hears both."""
+        """Send a message and read the answer.
+
+        If ``lost``, the answer is lost. If ``doubled``, the message comes twice.
+        """
         self.sent += 1
         datagram = write_monitoring(replace(message, counter=self.sent, reflected=self.heard))
         for late in (0.0, 0.002)[: 1 + doubled]:

@@ -1,4 +1,4 @@
-"""A cell whose cabinets send to ports of this computer that nothing else uses."""
+"""A cell whose cabinets send to free ports of this computer."""
 
 from __future__ import annotations
 

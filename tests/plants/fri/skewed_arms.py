@@ -25,25 +25,25 @@ from tests.pipeline.loops import FreezingLoop
 from tests.plants.fri.virtual_cabinets import VirtualCabinets
 
 CASES = ("nothing", "answers 0.25 s apart", "cable pulled", "pendant stopped")
-_AMPLITUDE = 0.12  # of the tools' common motion to and fro, sidewards [m]
-_HEIGHT = 0.45  # of the tools [m]
+_AMPLITUDE = 0.12  # Amplitude of the tools' common sideways motion [m].
+_HEIGHT = 0.45  # Height of the tools [m].
 
 
 @dataclass
 class Outcome:
-    """Distances are between bodies of different arms [m], the least in the whole run."""
+    """The result of a run. Distances are the least ones between bodies of different arms [m]."""
 
-    speed: float  # the fastest that both tools moved before the case [m/s]
+    speed: float  # Largest speed of both tools before the case [m/s].
     reference: float
     measured: float
-    rest: float  # from the case until both measured arms rested [s]
-    margin: float  # of the measured arms: distance less what the pair keeps
-    error: float  # of the measured tools, before the case [m RMS]
+    rest: float  # Time from the case until both measured arms rested [s].
+    margin: float  # Margin of the measured arms: distance minus the kept distance.
+    error: float  # Error of the measured tools before the case [m RMS].
     events: list[str]
 
 
 def side_by_side(config: Config, robot: Robot, apart: float) -> Array:
-    """A posture (nv,) [rad] in which both tools point down, at a distance ``apart`` [m] along the world's y."""
+    """Return a posture (nv,) [rad] in which both tools point down, ``apart`` [m] along the world's y."""
     controller = CartesianController(robot, config.control.timed(False))
     targets = {}
     for arm, y in zip(SIDES, (0.5 * apart, -0.5 * apart), strict=True):
@@ -55,7 +55,7 @@ def side_by_side(config: Config, robot: Robot, apart: float) -> Array:
 
 
 class Case:
-    """One run: both hands swing sidewards, and at their fastest something happens to one arm."""
+    """A run in which both hands swing sideways. At their fastest, one arm has an incident."""
 
     def __init__(
         self,
@@ -65,7 +65,7 @@ class Case:
         period: float = 0.005,
         apart: float = 0.2,
     ) -> None:
-        """The ``speed`` [m/s] of the tools is asked for in mid-swing; to the left, where the left arm goes in front."""
+        """The tools have ``speed`` [m/s] in the middle of the swing to the left, where the left arm is in front."""
         config = config or load_config("config/dual_iiwa7_fri.yaml")
         robot = Robot.from_config(config)
         start = side_by_side(config, robot, apart)
@@ -87,7 +87,7 @@ class Case:
         self._last: Array | None = None
 
     def run(self, duration: float = 0.8) -> Outcome:
-        """Until ``duration`` [s] after the case."""
+        """Run until ``duration`` [s] after the incident."""
         for cabinet in self.plant.cabinets.values():
             cabinet.start_overlay()
         summary = self.loop.run(self._happens + duration, realtime=False)
@@ -131,7 +131,7 @@ class Case:
             self.plant.unplugged.add(self._arm)
 
     def _measure(self, t: float) -> None:
-        """The arms as their cabinets have them."""
+        """Measure the arms as their cabinets know them."""
         if t < self._happens - 0.1:
             return
         q = np.zeros(self.robot.model.nv)
@@ -147,7 +147,7 @@ class Case:
 
 
 def _moves_both(robot: Robot, pair: int) -> bool:
-    """Whether the bodies of a pair are parts of different arms."""
+    """Return whether the bodies of a pair are parts of different arms."""
     geometry, model = robot.collision_model, robot.model
     bodies = geometry.collisionPairs[pair].first, geometry.collisionPairs[pair].second
     owners = []
@@ -158,7 +158,9 @@ def _moves_both(robot: Robot, pair: int) -> bool:
 
 
 def _swing(t: float, frequency: float) -> tuple[Array, Array]:
-    """Offset of both tools at ``t`` [s]: a swing along the world's y whose amplitude grows in its first second."""
+    """Return the offset of both tools at ``t`` [s]: a swing along the world's y whose amplitude grows in the first
+    second.
+    """
     phase = 2.0 * math.pi * frequency * max(t - START, 0.0)
     share = min(max(t - START, 0.0), 1.0)
     return np.array([0.0, share * _AMPLITUDE * math.sin(phase), 0.0]), np.zeros(3)

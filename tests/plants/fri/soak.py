@@ -1,4 +1,4 @@
-"""Sessions that end in every way there is, one after the other: ``python -m tests.plants.fri.soak --sessions 1000``."""
+"""Sessions that end in every possible way, one after the other: ``python -m tests.plants.fri.soak --sessions 1000``."""
 
 from __future__ import annotations
 
@@ -23,12 +23,15 @@ from q2r2_control.types import SIDES, Array, CommandMode, HandInputs, HandSample
 from tests.pipeline.loops import FreezingLoop
 from tests.plants.fri.virtual_cabinets import VirtualCabinets
 
-ACCELERATION = 4.0  # of the reference [rad/s^2]
-_ALLOWANCE, _STILL = 0.05, 1e-3  # after the braking time the reference rests [s], [rad/s]
+ACCELERATION = 4.0  # Acceleration of the reference [rad/s^2].
+# Time after the braking time of the reference [s], and speed of resting joints [rad/s].
+_ALLOWANCE, _STILL = 0.05, 1e-3
 
 
 class Rest(NamedTuple):
-    """The promise for measured arms. Times are after the reference rests [s], speeds of the fastest joint [rad/s]."""
+    """The promise for measured arms: times after the rest of the reference [s], and speeds of the fastest joint
+    [rad/s].
+    """
 
     slow_after: float
     slow: float
@@ -36,16 +39,16 @@ class Rest(NamedTuple):
     settled: float
 
 
-# Torques settle arms on their springs. The slowest has a time constant of 0.4 s; a held joint may creep.
+# With torques, arms settle on their springs. The slowest time constant is 0.4 s, and a held joint may creep.
 _RESTS = {CommandMode.POSITION: Rest(0.0, _STILL, 0.0, _STILL), CommandMode.TORQUE: Rest(0.35, 0.2, 1.95, 0.02)}
 _ENDS = ("pendant", "back at once", "safety stop", "loop freezes", "computer freezes", "cabinet freezes", "garbage")
 _ASKED = {Trip.STOPPED, Trip.SAFETY}
-_SILENT = 0.1  # until a cabinet that says nothing is missed [s]
-_MUTATED = 250  # datagrams with wrong bytes before a session ends so
+_SILENT = 0.1  # Time after which a silent cabinet is noticed [s].
+_MUTATED = 250  # Number of datagrams with wrong bytes before a session ends by them.
 
 
 class PressingHands(ScriptedInput):
-    """Hands that go round circles, whose operator presses again a moment after an arm was paused."""
+    """Hands that move in circles. Their operator presses again shortly after an arm was paused."""
 
     def __init__(self) -> None:
         super().__init__("circle", frequency_hz=0.5)
@@ -69,7 +72,7 @@ def make_loop(
     mode: CommandMode = CommandMode.POSITION,
     **network: Any,
 ) -> FreezingLoop:
-    """A loop whose reference leaves the cabinets' limits room for catching up; the arms ``start`` at home.
+    """Return a loop whose reference leaves the cabinets' limits room for catching up. The arms ``start`` at home.
 
     For torques they are simulated.
     """
@@ -99,13 +102,13 @@ def make_loop(
 
 @dataclass
 class Soak:
-    """Starts both overlays, lets the arms move for a while, and ends the session in some way."""
+    """A soak that starts both overlays, lets the arms move for a while, and ends the session in some way."""
 
     pipeline: FreezingLoop
     sessions: int
     seed: int = 0
     ended: int = 0
-    moved: float = 0.0  # the fastest joint [rad/s]
+    moved: float = 0.0  # Speed of the fastest joint [rad/s].
     faults: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -113,15 +116,15 @@ class Soak:
         self.plant, self.random = self.pipeline.plant, np.random.default_rng(self.seed)
         self._late, self._ends = {"computer freezes"}, list(_ENDS)
         if self.pipeline.drive.mode is CommandMode.TORQUE:
-            self._late.add("loop freezes")  # torques end the session by themselves then
-            # The stand-in's arm gets its last torque for as long as its cabinet stands still.
+            self._late.add("loop freezes")  # With torques, the session ends by itself then.
+            # The simulated arm keeps its last torque while its cabinet stands still.
             self._ends.remove("cabinet freezes")
         self._returns = False
         self._moving_since: float | None = None
         self._lasts = 0.3
         self._rest = _RESTS[self.pipeline.drive.mode]
         self._braked_by, self._slow_by, self._start_at = math.inf, math.inf, 0.0
-        # Of the last 50 ms [s]: an arm is behind the reference, and brakes from there where its cabinet is silent.
+        # Speeds of the last 50 ms [s]. An arm is late, and brakes from that speed if its cabinet is silent.
         self._braking: deque[float] = deque(maxlen=25)
         self._seen, self._end = dict.fromkeys(SIDES, 0), "start"
         self.pipeline.listeners.append(self.look)
@@ -131,7 +134,7 @@ class Soak:
         return self
 
     def look(self, tick: Tick) -> None:
-        """Of each tick of the loop."""
+        """Check each tick of the loop."""
         cabinets, now = self.plant.cabinets, tick.now
         for arm, cabinet in cabinets.items():
             for trip in cabinet.trips[self._seen[arm] :]:
@@ -142,7 +145,7 @@ class Soak:
         self._braking.append(float((np.abs(tick.reference.v) / self.pipeline.controller.stop_deceleration).max()))
         self.moved = max(self.moved, speed)
         held = not any(tick.engaged.values())
-        # Springs, or one arm that stopped sooner, may leave them beyond a limit. The reference returns, to rest then.
+        # Springs, or an arm that stopped sooner, may leave joints beyond a limit. The reference returns and then rests.
         returns = tick.reference.report.status is StepStatus.RECOVERING
         self._returns = held and (returns or (self._returns and speed > _STILL))
         still = self.pipeline.controller.settings.recovery_velocity if self._returns else _STILL
@@ -164,7 +167,7 @@ class Soak:
             self._end_session(now)
 
     def _look_at_rest(self, now: float, held: bool, still: float) -> None:
-        """Wait until the arms have settled, or move faster than they may by now."""
+        """Wait until the arms have settled, or until they move faster than they may."""
         rest, passed = self._rest, now - self._slow_by + self._rest.slow_after
         settled = passed >= rest.settled_after
         allowed = max(rest.settled if settled else rest.slow, still)
@@ -178,7 +181,7 @@ class Soak:
             self._start_at = now + float(self.random.uniform(0.05, 0.3))
 
     def _fastest(self, arm: str) -> float:
-        """Of the joints [rad/s], in the newest period of a cabinet that is commanded."""
+        """Return the speed of the fastest joint [rad/s] in the newest period of a cabinet that is commanded."""
         way = np.diff(self.plant.heard[arm][-2:], axis=0)
         return float(np.abs(way[np.isfinite(way)]).max(initial=0.0)) / self.plant.cabinets[arm].settings.period
 
@@ -192,7 +195,7 @@ class Soak:
         pause = float(self.random.uniform(0.02, 0.5))
         if self._end in ("pendant", "back at once"):
             cabinet.stop()
-            if self._end == "back at once":  # before the arms rest
+            if self._end == "back at once":  # The session is back before the arms rest.
                 cabinet.start_overlay()
         elif self._end == "safety stop":
             cabinet.safety_stop(Safety.STOP_1_ON_PATH)
@@ -203,7 +206,7 @@ class Soak:
             self.pipeline.freeze(pause)
             self.plant.asleep_until = now + pause
             now += pause
-        elif self._end == "cabinet freezes":  # its session lasts, and its arm goes on to rest then
+        elif self._end == "cabinet freezes":  # The session lasts, and its arm goes on to rest.
             self.plant.stands_until[arm] = now = now + _SILENT + 4.0 * pause
         else:
             self._send_garbage()
@@ -213,7 +216,7 @@ class Soak:
         self._slow_by = self._braked_by + self._rest.slow_after
 
     def _send_garbage(self) -> None:
-        """Some bytes of each datagram are wrong, or missing."""
+        """Send datagrams with wrong or missing bytes."""
         for arm, cabinet in self.plant.cabinets.items():
             whole = write_monitoring(cabinet.message)
             for _ in range(_MUTATED):
@@ -225,7 +228,7 @@ class Soak:
 
 
 def steady(pipeline: FreezingLoop, duration: float) -> bool:
-    """Sessions that nobody ends, for ``duration`` [s]; whether none ended."""
+    """Run sessions that nobody ends for ``duration`` [s], and return whether none ended."""
     assert isinstance(pipeline.plant, VirtualCabinets)
     cabinets = pipeline.plant.cabinets
     for cabinet in cabinets.values():

@@ -1,4 +1,4 @@
-"""The process that answers the cabinets goes by the loop's commands, and each of the two knows of the other's end."""
+"""The process that answers the cabinets obeys the loop's commands. Each of the two notices the end of the other."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ MONITORING = Monitoring(2, 1, 0, Session.MONITORING_READY, Quality.EXCELLENT, 0.
 
 
 class LongMotion(ArmSession):
-    """It is over after ``answers`` of them."""
+    """A motion that is over after ``answers`` answers."""
 
     def __init__(self, answers: int) -> None:
         super().__init__("left", "cabinet")
@@ -41,7 +41,7 @@ class LongMotion(ArmSession):
 
 
 class BrokenOnTheWay(ArmSession):
-    """The process cannot read it."""
+    """A motion that the process cannot read."""
 
     def __setstate__(self, state: object) -> None:
         raise ValueError("it came broken")
@@ -87,16 +87,16 @@ def between() -> Iterator[Between]:
         yield made
 
 
-def test_it_has_begun_as_soon_as_the_loop_has_it(between: Between) -> None:
+def test_the_process_has_begun_as_soon_as_the_loop_has_it(between: Between) -> None:
     assert between.ask().reflected == 1, "messages that came before it had begun would be dropped"
 
 
-def test_a_process_that_cannot_begin_says_why() -> None:
+def test_a_process_that_cannot_begin_gives_the_reason() -> None:
     with open_socket("127.0.0.1", 0) as ours, pytest.raises(PlantError, match="answered no more: it came broken"):
         AnsweringProcess([Line(BrokenOnTheWay("left", "cabinet"), "127.0.0.1", ours.fileno())])
 
 
-def test_the_loop_gets_the_state_after_each_message_and_an_answer_goes_by_what_was_sent_before_it(
+def test_the_loop_gets_the_state_after_each_message_and_answers_use_only_earlier_commands(
     between: Between,
 ) -> None:
     between.ask()
@@ -108,7 +108,7 @@ def test_the_loop_gets_the_state_after_each_message_and_an_answer_goes_by_what_w
 
 
 @pytest.mark.slow
-def test_messages_from_elsewhere_are_not_answered(between: Between) -> None:
+def test_messages_from_other_addresses_are_not_answered(between: Between) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("127.0.0.2", 0))
         other.settimeout(0.2)
@@ -118,16 +118,16 @@ def test_messages_from_elsewhere_are_not_answered(between: Between) -> None:
             other.recv(2000)
 
 
-def test_it_ends_with_the_loop(between: Between) -> None:
+def test_the_process_ends_with_the_loop(between: Between) -> None:
     between.process.close()
     with pytest.raises(ProcessLookupError):
         os.kill(between.process.pid, 0)
 
 
 @pytest.mark.slow
-def test_it_outlives_the_loop_until_the_arms_rest() -> None:
+def test_the_process_outlives_the_loop_until_the_arms_rest() -> None:
     with between_of(LongMotion(ANSWERS)) as between:
-        between.process._commands.close()  # as the end of the loop's process does
+        between.process._commands.close()  # The end of the loop's process closes it too.
         while between.sent < ANSWERS:
             assert between.ask().reflected == between.sent
         between.process.close()
@@ -135,7 +135,7 @@ def test_it_outlives_the_loop_until_the_arms_rest() -> None:
         os.kill(between.process.pid, 0)
 
 
-def test_a_loop_whose_process_was_killed_is_told(between: Between) -> None:
+def test_a_loop_whose_process_was_killed_gets_a_fault(between: Between) -> None:
     os.kill(between.process.pid, signal.SIGKILL)
 
     def is_told() -> bool:
@@ -150,6 +150,6 @@ def test_a_loop_whose_process_was_killed_is_told(between: Between) -> None:
         between.process.send({})
 
 
-def test_a_process_that_fails_says_why(between: Between) -> None:
+def test_a_process_that_fails_gives_the_reason(between: Between) -> None:
     with pytest.raises(PlantError, match="the cabinets are answered no more: 'middle'"):
         between.process.send({"middle": ArmCommand(0.0, 0.0, 0.001, STILL, STILL, ONES)})

@@ -8,18 +8,18 @@ import pytest
 from q2r2_control.plants.fri.answers import CATCH_UP, CATCH_UP_RAMP, AnswerTimes, MessageClock, ReferencePath
 from q2r2_control.types import Array
 
-SPEED, ACCELERATION = 1.5, 9.0  # greatest of the reference
+SPEED, ACCELERATION = 1.5, 9.0  # Largest speed and acceleration of the reference.
 DELAY, TICK = 0.008, 0.001
 
 
 def swing(t: float) -> tuple[Array, Array]:
-    """A joint that swings with the greatest speed and acceleration."""
+    """Return a swinging joint that reaches the largest speed and acceleration."""
     w = ACCELERATION / SPEED
     return np.array([SPEED / w * (1.0 - np.cos(w * t))]), np.array([SPEED * np.sin(w * t)])
 
 
 def answered(period: float, drift: float, jitter: float, loss: float, seed: int, duration: float = 30.0) -> Array:
-    """Positions that the cabinet hears, one after the other."""
+    """Return the positions that the cabinet hears, one after the other."""
     random = np.random.default_rng(seed)
     path, times = ReferencePath(0.0, swing(0.0)[0]), AnswerTimes(period, DELAY)
     heard_positions, heard, ticks, clock, before = [], -1, 0, MessageClock(0.0), 0
@@ -30,13 +30,13 @@ def answered(period: float, drift: float, jitter: float, loss: float, seed: int,
             ticks += 1
             path.extend(ticks * TICK, *swing(ticks * TICK), np.array([ACCELERATION]))
         if random.random() < loss:
-            continue  # the question
+            continue  # The question is lost.
         clock.update(arrival, (question + 1 - before) * period)
         before = question + 1
         time = times.at(question, clock.expected, question, heard)
         assert time <= path.end, "nothing is extrapolated while our loop is on time"
         if random.random() < loss:
-            continue  # the answer
+            continue  # The answer is lost.
         heard = question
         heard_positions.append(path.at(time)[0])
     return np.array(heard_positions)
@@ -55,7 +55,7 @@ CASES = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", list(CASES))
-def test_the_cabinet_sees_no_more_speed_and_acceleration_than_stated(case: str) -> None:
+def test_the_cabinet_sees_no_larger_speed_and_acceleration_than_stated(case: str) -> None:
     period = CASES[case][0]
     q = answered(*CASES[case], seed=3)
     v = np.diff(q) / period
@@ -80,7 +80,7 @@ def test_the_arm_is_not_late_by_more_than_the_delay_and_a_few_periods() -> None:
     assert max(late[500:]) <= DELAY + 4 * period
 
 
-def test_a_question_that_comes_twice_moves_nothing() -> None:
+def test_a_repeated_question_moves_nothing() -> None:
     times = AnswerTimes(0.005, DELAY)
     for question in range(100):
         first = times.at(question, 0.005 * question, 2 * question, 2 * question - 1)
@@ -98,11 +98,11 @@ def test_a_loop_that_stands_still_leads_into_the_certified_stop_and_to_rest() ->
     assert np.abs(a).max() <= 10.0 + 1e-6
 
 
-def test_a_path_that_brakes_amid_a_move_rests_where_and_when_was_certified_from_the_moves_end() -> None:
+def test_a_path_that_brakes_during_a_move_rests_as_certified_from_the_end_of_the_move() -> None:
     path, certified = ReferencePath(0.0, np.zeros(2)), ReferencePath(0.0, np.zeros(2))
     for each in (path, certified):
         each.extend(0.01, np.array([0.0, 0.0]), np.array([1.0, 0.02]), np.array([5.0, 0.1]))
-        # All joints stop together, so the one that nearly stands brakes hardly.
+        # All joints stop together, so that the joint that almost rests hardly brakes.
         each.extend(0.02, np.array([0.01, 1e-4]), np.array([1.0, 1e-4]), np.array([5.0, 5e-4]))
     path.extend(0.03, np.array([0.02, 0.0]), np.array([1.0, -0.02]), np.array([5.0, 0.1]))
     path.brake(0.015)
@@ -122,7 +122,7 @@ def test_between_two_ticks_the_posture_is_on_the_parabola_of_the_reference() -> 
 
 
 @pytest.mark.parametrize("lost", [10, 65, 300, 2000])
-def test_a_cabinet_that_heard_no_answer_for_long_gets_the_next_one_after_the_last_that_it_heard(lost: int) -> None:
+def test_a_cabinet_that_heard_no_answer_for_long_gets_the_answer_that_follows_the_last_one_it_heard(lost: int) -> None:
     period = 0.001
     times, heard = AnswerTimes(period, 0.004), -1
     for question in range(100):

@@ -1,4 +1,4 @@
-"""The stand-in for a cabinet, with a client that is written out here."""
+"""The simulated cabinet, with a client that is written in this file."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ Answer = Callable[[Monitoring], FriCommand | None]
 
 
 class Client:
-    """Mirrors the cabinet's position, as a client has to before it may command."""
+    """A client that mirrors the cabinet's position, as it must do before it may command."""
 
     def __init__(self, version: int = 2) -> None:
         self.version, self.counter = version, -1
@@ -43,7 +43,7 @@ class Client:
 
 
 def run(cabinet: Cabinet, periods: int, answer: Answer, version: int = 2) -> Monitoring:
-    """The message after ``periods`` of them, each of which was answered."""
+    """Return the message after ``periods`` periods, in each of which the client answered."""
     for period in range(periods):
         message = cabinet.send(period * cabinet.settings.period)
         if (command := answer(message)) is not None:
@@ -52,7 +52,7 @@ def run(cabinet: Cabinet, periods: int, answer: Answer, version: int = 2) -> Mon
 
 
 def commanding(settings: CabinetSettings = SETTINGS) -> tuple[Cabinet, Client]:
-    """A cabinet that has given its command to a client."""
+    """Return a cabinet that a client commands."""
     cabinet, client = Cabinet(settings, StillArm(HOME)), Client(settings.version)
     cabinet.start_overlay()
     run(cabinet, 60 * settings.multiplier, client.answer, settings.version)
@@ -60,7 +60,7 @@ def commanding(settings: CabinetSettings = SETTINGS) -> tuple[Cabinet, Client]:
     return cabinet, client
 
 
-def test_a_client_that_answers_in_time_comes_from_waiting_to_monitoring_and_by_the_overlay_to_commanding() -> None:
+def test_a_client_that_answers_in_time_goes_from_waiting_to_monitoring_and_with_the_overlay_to_commanding() -> None:
     cabinet, client = Cabinet(SETTINGS, StillArm(HOME)), Client()
     seen: list[Session] = []
     for period in range(200):
@@ -75,7 +75,7 @@ def test_a_client_that_answers_in_time_comes_from_waiting_to_monitoring_and_by_t
     assert cabinet.quality is Quality.EXCELLENT
 
 
-def test_with_load_data_that_do_not_fit_no_client_is_let_command() -> None:
+def test_with_wrong_load_data_no_client_may_command() -> None:
     cabinet, client = Cabinet(SETTINGS, StillArm(HOME)), Client()
     cabinet.load_fits = False
     cabinet.start_overlay()
@@ -85,7 +85,7 @@ def test_with_load_data_that_do_not_fit_no_client_is_let_command() -> None:
 
 
 @pytest.mark.parametrize(("speed", "trips"), [(0.24, []), (0.26, [Trip.T1])])
-def test_in_t1_a_tool_that_is_commanded_faster_than_250_mm_s_ends_the_command(speed: float, trips: list[Trip]) -> None:
+def test_in_t1_a_command_of_more_than_250_mm_s_at_the_tool_ends_the_session(speed: float, trips: list[Trip]) -> None:
     cabinet, client = commanding(replace(SETTINGS, acceleration=(1e3,) * 7))
     cabinet.operation = Operation.T1
 
@@ -99,7 +99,7 @@ def test_in_t1_a_tool_that_is_commanded_faster_than_250_mm_s_ends_the_command(sp
     assert cabinet.trips[:1] == trips
 
 
-def test_a_client_that_answers_every_other_message_is_not_let_command() -> None:
+def test_a_client_that_answers_only_every_other_message_may_not_command() -> None:
     cabinet, client = Cabinet(SETTINGS, StillArm(HOME)), Client()
     cabinet.start_overlay()
     message = run(cabinet, 300, lambda message: client.answer(message) if message.counter % 2 else None)
@@ -108,7 +108,7 @@ def test_a_client_that_answers_every_other_message_is_not_let_command() -> None:
 
 @pytest.mark.parametrize("version", [1, 2])
 @pytest.mark.parametrize("multiplier", [1, 3])
-def test_the_arm_goes_where_the_client_commands(version: int, multiplier: int) -> None:
+def test_the_arm_moves_as_the_client_commands(version: int, multiplier: int) -> None:
     settings = replace(SETTINGS, version=version, multiplier=multiplier, period=0.002)
     cabinet, client = commanding(settings)
     period = settings.answer_period
@@ -154,7 +154,7 @@ GUARDS: dict[Trip, tuple[CabinetSettings, Callable[[Client, Monitoring], FriComm
 
 
 @pytest.mark.parametrize("trip", list(GUARDS), ids=lambda trip: trip.name)
-def test_an_answer_that_no_cabinet_would_follow_ends_the_command_and_the_arm_holds(trip: Trip) -> None:
+def test_an_answer_that_no_cabinet_would_follow_ends_the_session_and_the_arm_holds(trip: Trip) -> None:
     settings, answer = GUARDS[trip]
     kept = replace(settings, command=CommandKind.POSITION)
     cabinet, client = commanding(kept)
@@ -165,11 +165,12 @@ def test_an_answer_that_no_cabinet_would_follow_ends_the_command_and_the_arm_hol
     assert message.q == HOME
 
 
-def test_what_is_no_answer_and_another_version_end_the_command_and_a_late_answer_counts_as_none() -> None:
+def test_invalid_answers_and_other_versions_end_the_session_and_a_late_answer_does_not_count() -> None:
     endless, nowhere = (math.inf,) * 7, (math.nan, *HOME[1:])
     for datagram, trip in (
         (b"hello", Trip.MALFORMED),
-        (write_monitoring(Cabinet(SETTINGS, StillArm(HOME)).send(0.0)), Trip.MALFORMED),  # another identifier
+        # The message has another identifier.
+        (write_monitoring(Cabinet(SETTINGS, StillArm(HOME)).send(0.0)), Trip.MALFORMED),
         (write_command(FriCommand(1, 1, q=nowhere), 2), Trip.MALFORMED),
         (write_command(FriCommand(1, 1, q=HOME, tau=endless), 2), Trip.MALFORMED),
         (write_command(FriCommand(1, 1, q=HOME), 1), Trip.VERSION),
@@ -182,10 +183,10 @@ def test_what_is_no_answer_and_another_version_end_the_command_and_a_late_answer
     assert cabinet.trips == [Trip.LATE]
 
 
-def test_answers_that_did_not_come_count_as_missed_where_the_client_goes_on_and_not_where_it_has_ended() -> None:
+def test_missing_answers_are_counted_if_the_client_goes_on_and_not_after_its_end() -> None:
     cabinet, client = commanding()
     run(cabinet, 100, lambda message: client.answer(message) if message.counter % 20 else None)
-    assert cabinet.missed == 6  # with the last message of commanding()
+    assert cabinet.missed == 6  # The last message of commanding() is one of them.
     run(cabinet, 20, lambda message: None)
     assert (cabinet.missed, cabinet.trips) == (6, [Trip.LATE])
 
@@ -223,12 +224,12 @@ def test_an_answer_may_write_only_outputs_that_the_cabinet_lists(
     assert (message.io, message.outputs) == ({"measured": 1.0, **outputs}, {"opening"})
 
 
-def test_torques_have_to_come_as_often_as_sunrise_asks_for() -> None:
+def test_torques_have_to_come_as_often_as_sunrise_requires() -> None:
     with pytest.raises(ConfigError, match="answered every 6 ms: allowed with torques: 5 ms or less"):
         replace(TORQUE, period=0.003, multiplier=2)
 
 
-def test_torques_are_not_overlaid_before_the_load_data_explain_what_the_arm_bears() -> None:
+def test_torques_are_not_allowed_before_the_load_data_explain_the_load_of_the_arm() -> None:
     arm, client = StillArm(HOME), Client()
     arm.external_tau = (0.0, 2.1, *(0.0,) * 5)
     cabinet = Cabinet(TORQUE, arm)
@@ -241,7 +242,7 @@ def test_torques_are_not_overlaid_before_the_load_data_explain_what_the_arm_bear
     assert (message.session, message.commanded_tau) == (Session.COMMANDING_ACTIVE, tau)
 
 
-def test_after_a_stop_the_overlay_has_to_be_started_again_and_the_safety_stop_be_over() -> None:
+def test_after_a_stop_the_overlay_has_to_start_again_and_the_safety_stop_has_to_be_over() -> None:
     cabinet, client = commanding()
     cabinet.safety_stop(Safety.STOP_2)
     cabinet.start_overlay()

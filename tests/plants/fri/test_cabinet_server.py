@@ -1,4 +1,4 @@
-"""The cell behind the cabinets that stand in: it moves as they are commanded."""
+"""The cell behind the simulated cabinets moves as they are commanded."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ PERFECT = Network()
 
 
 @pytest.mark.parametrize("overlay", [None, (0.0,) * 7], ids=["position", "torque"])
-def test_an_arm_goes_where_its_cabinet_commands_and_the_other_one_stays(
+def test_an_arm_moves_as_its_cabinet_commands_and_the_other_one_stays(
     config: Config, robot: Robot, overlay: tuple[float, ...] | None
 ) -> None:
     cell = SimulatedArms(robot, config)
@@ -41,9 +41,7 @@ def test_an_arm_goes_where_its_cabinet_commands_and_the_other_one_stays(
 
 
 @pytest.mark.parametrize("stiffness", [0.0, 100.0])
-def test_an_overlay_of_torque_comes_on_top_of_the_joint_impedance(
-    config: Config, robot: Robot, stiffness: float
-) -> None:
+def test_torque_commands_are_added_to_the_joint_impedance(config: Config, robot: Robot, stiffness: float) -> None:
     cell = SimulatedArms(robot, config, stiffness)
     joints = robot.arms["left"].joints
     start, tau = robot.home[joints], np.array([5.0, *np.zeros(6)])
@@ -64,7 +62,7 @@ def test_the_guards_leave_the_reference_room_for_catching_up(robot: Robot) -> No
     assert settings.velocity == tuple(robot.velocity_limit[joints])
 
 
-def test_an_arm_moves_on_at_the_end_of_its_way_where_the_next_command_comes(config: Config, robot: Robot) -> None:
+def test_an_arm_moves_on_at_the_end_of_its_way_when_the_next_command_comes(config: Config, robot: Robot) -> None:
     cell = SimulatedArms(robot, config)
     cell.arms["left"].advance(PERIOD, tuple(np.array(cell.arms["left"].q) + 0.01), None)
     for t, speed in ((0.5 * PERIOD, 0.01 / PERIOD), (PERIOD, 0.01 / PERIOD), (1.5 * PERIOD, 0.0)):
@@ -72,12 +70,12 @@ def test_an_arm_moves_on_at_the_end_of_its_way_where_the_next_command_comes(conf
 
 
 class Answered:
-    """A cabinet, started, and its client in the same thread, so that a busy computer changes nothing."""
+    """A started cabinet and its client in the same thread, so that a busy computer changes nothing."""
 
     def __init__(self, config: Config, robot: Robot, network: Network = PERFECT) -> None:
         settings = {"left": settings_of(robot, "left", CommandKind.POSITION, 2, PERIOD)}
         self._session, self.answers = ArmSession("left", "cabinet"), 0
-        self.counters: list[int] = []  # of the messages that came
+        self.counters: list[int] = []  # Counters of the messages that came.
         self._client = socket.socket(type=socket.SOCK_DGRAM)
         self._client.bind(("127.0.0.1", 0))
         self._client.setblocking(False)
@@ -92,7 +90,7 @@ class Answered:
         return self._session.state
 
     def answer(self, now: float) -> bool:
-        """Whether a message had come, and was answered."""
+        """Answer the next message. Return False if none had come."""
         try:
             datagram, source = self._client.recvfrom(LONGEST)
         except BlockingIOError:
@@ -110,14 +108,14 @@ class Answered:
             self.server.run(lambda now: until(now) or now > PATIENCE)
 
 
-def test_a_cabinet_that_was_late_catches_up_as_fast_as_it_is_answered(config: Config, robot: Robot) -> None:
+def test_a_late_cabinet_catches_up_as_fast_as_it_gets_answers(config: Config, robot: Robot) -> None:
     one, sent = Answered(config, robot), [0.0]
 
     def until(now: float) -> bool:
         if one.answer(now):
             sent.append(now)
             if one.answers == 100:
-                time.sleep(0.2)  # this process stands still for a moment
+                time.sleep(0.2)  # This process stands still for a moment.
         return one.answers > 120
 
     one.run(until)
@@ -125,12 +123,12 @@ def test_a_cabinet_that_was_late_catches_up_as_fast_as_it_is_answered(config: Co
     assert np.diff(sent[102:]).min() < 0.8 * PERIOD
 
 
-def test_an_answer_that_came_while_the_cabinet_stood_still_is_heard(config: Config, robot: Robot) -> None:
+def test_an_answer_that_came_while_the_cabinet_stood_still_is_used(config: Config, robot: Robot) -> None:
     one = Answered(config, robot)
 
     def until(now: float) -> bool:
         if one.answer(now):
-            time.sleep(1.5 * PERIOD)  # until the next message is due
+            time.sleep(1.5 * PERIOD)  # Wait until the next message is due.
         return one.answers > 150
 
     one.run(until)
@@ -147,25 +145,25 @@ def test_an_answer_that_came_while_the_cabinet_stood_still_is_heard(config: Conf
         pytest.param(Network(jitter=1.5 * PERIOD), (False, False, True), id="jitter"),
     ],
 )
-def test_messages_are_lost_come_twice_and_overtake_others_as_the_network_is_asked_to(
+def test_messages_are_lost_doubled_and_reordered_as_the_network_options_say(
     config: Config, robot: Robot, network: Network, faults: tuple[bool, bool, bool]
 ) -> None:
     one = Answered(config, robot, network)
     one.run(lambda now: one.answer(now) and len(one.counters) > 200)
     counters, came = one.counters, set(one.counters)
-    is_lost = not came.issuperset(range(1, max(came) - 5))  # the last ones may be under way
+    is_lost = not came.issuperset(range(1, max(came) - 5))  # The last ones may still be on their way.
     assert (is_lost, len(came) < len(counters), counters != sorted(counters)) == faults
     if network.loss:
         assert one.cabinet.missed > 0, "answers are lost too"
 
 
-def test_a_message_that_was_cut_is_not_answered_and_an_answer_that_was_cut_ends_the_session(
+def test_a_truncated_message_is_not_answered_and_a_truncated_answer_ends_the_session(
     config: Config, robot: Robot
 ) -> None:
     one = Answered(config, robot, Network(cut=0.02))
 
     def until(now: float) -> bool:
-        one.cabinet.start_overlay()  # which an answer that was cut ends in monitoring, too
+        one.cabinet.start_overlay()  # A truncated answer ends an overlay in monitoring, too.
         return one.answer(now) and bool(one.cabinet.trips) and one.state.unreadable > 0
 
     one.run(until)

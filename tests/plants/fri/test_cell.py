@@ -1,4 +1,4 @@
-"""The whole loop against two cabinets in virtual time: what each cabinet hears, whatever happens."""
+"""The whole loop against two cabinets in virtual time: the messages that each cabinet gets in all circumstances."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ from tests.plants.fri.virtual_cabinets import VirtualCabinets
 
 @pytest.fixture(scope="session")
 def config(config: Config) -> Config:
-    """At the rate of the shipped cell of cabinets."""
+    """Return the cell at the rate of the shipped cell of cabinets."""
     return config.model_copy(update={"loop_rate_hz": 500.0})
 
 
 def started(pipeline: FreezingLoop) -> VirtualCabinets:
-    """The operator has started the overlay on both pendants."""
+    """Return a cell in which the operator has started the overlay on both pendants."""
     assert isinstance(pipeline.plant, VirtualCabinets)
     for cabinet in pipeline.plant.cabinets.values():
         cabinet.start_overlay()
@@ -47,7 +47,7 @@ def trips(plant: VirtualCabinets) -> list[Trip]:
 
 
 def error(summary: RunSummary, arm: str) -> float:
-    """From target to measured tool [mm RMS]."""
+    """Return the error from target to measured tool [mm RMS]."""
     found = summary.arms[arm].position_error_mm_rms
     assert found is not None
     return found
@@ -67,7 +67,7 @@ def test_a_run_waits_for_the_cabinets_and_refuses_presses_until_then(config: Con
 
 
 @pytest.mark.slow
-def test_an_activation_is_told_and_is_no_warning(config: Config, caplog: pytest.LogCaptureFixture) -> None:
+def test_an_activation_is_reported_without_a_warning(config: Config, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO")
     pipeline = make_loop(config)
     started(pipeline)
@@ -77,7 +77,7 @@ def test_an_activation_is_told_and_is_no_warning(config: Config, caplog: pytest.
 
 
 @pytest.mark.slow
-def test_missing_messages_are_said_once_a_run_for_each_cabinet(
+def test_missing_messages_are_reported_once_a_run_for_each_cabinet(
     config: Config, caplog: pytest.LogCaptureFixture
 ) -> None:
     pipeline = make_loop(config)
@@ -115,7 +115,7 @@ def test_a_cabinet_without_the_grippers_output_is_named_once_and_gets_no_write(
         pytest.param({"drift": -200e-6, "jitter": 0.0005, "loss": 0.005}, id="loss"),
     ],
 )
-def test_no_guard_trips_through_a_bad_network(config: Config, network: dict[str, Any]) -> None:
+def test_a_bad_network_trips_no_guard(config: Config, network: dict[str, Any]) -> None:
     pipeline = make_loop(config, (0.005, 0.002), **network)
     plant = started(pipeline)
     summary = pipeline.run(2.5, realtime=False)
@@ -124,7 +124,7 @@ def test_no_guard_trips_through_a_bad_network(config: Config, network: dict[str,
 
 
 @pytest.mark.slow
-def test_a_loop_that_is_late_brakes_on_the_stop_that_the_cabinets_get(config: Config) -> None:
+def test_a_late_loop_brakes_on_the_stop_that_the_cabinets_get(config: Config) -> None:
     pipeline = make_loop(config)
     plant = started(pipeline)
 
@@ -142,7 +142,7 @@ def test_a_loop_that_is_late_brakes_on_the_stop_that_the_cabinets_get(config: Co
 def test_a_loop_whose_ticks_are_all_late_follows_as_one_in_time(
     config: Config, latest: float, thinks: bool, bound: float
 ) -> None:
-    """Of ticks each 2 ms; ``thinks``: commands are as late as the ticks."""
+    """Each tick lasts 2 ms. With ``thinks``, its command is as late as the tick."""
 
     def run(most: float) -> float:
         pipeline = make_loop(config, (0.002, 0.002), jitter=0.0004)
@@ -164,13 +164,13 @@ def test_a_loop_whose_ticks_are_all_late_follows_as_one_in_time(
 def test_before_a_session_is_known_to_follow_each_tick_moves_the_reference_by_its_period(config: Config) -> None:
     plant = started(make_loop(config))
     plant.reset()
-    for tick in range(100):  # of a loop whose commands came too late in the session before
+    for tick in range(100):  # The loop's commands came too late in the session before.
         plant.cell.sent(taken=False)
         assert plant.due(0.002 * tick) == pytest.approx((0.0, 0.002))
 
 
 @pytest.mark.slow
-def test_a_command_that_answers_have_passed_is_withdrawn_and_the_arms_go_on(config: Config) -> None:
+def test_a_command_that_came_after_its_answers_is_withdrawn_and_the_arms_go_on(config: Config) -> None:
     pipeline = make_loop(config, jitter=0.0005)
     plant, random, period = started(pipeline), np.random.default_rng(0), 1.0 / config.nominal_rate_hz
     withdrawn: list[bool] = []
@@ -195,7 +195,7 @@ def test_a_command_that_answers_have_passed_is_withdrawn_and_the_arms_go_on(conf
 
 
 @pytest.mark.slow
-def test_arms_go_on_although_each_tick_takes_longer_than_the_loop_allows_for(config: Config) -> None:
+def test_arms_go_on_even_if_each_tick_takes_longer_than_the_loop_expects(config: Config) -> None:
     pipeline = make_loop(config)
     plant = started(pipeline)
 
@@ -218,7 +218,7 @@ def test_arms_rest_on_their_certified_stop_while_a_solver_blocks_and_go_on_after
     plant = started(pipeline)
     sent: dict[str, list[tuple[float, Joints]]] = {arm: [] for arm in SIDES}
     plant.on_message = lambda arm, t: sent[arm].append((t, plant.cabinets[arm].commanded))
-    newest: list[Tick] = []  # before the tick that blocks
+    newest: list[Tick] = []  # The ticks before the one that blocks.
     decelerations: list[np.ndarray] = []
 
     def block(tick: Tick) -> None:
@@ -248,7 +248,7 @@ def test_arms_rest_on_their_certified_stop_while_a_solver_blocks_and_go_on_after
 
 
 @pytest.mark.slow
-def test_a_loop_that_is_always_too_late_says_so(config: Config) -> None:
+def test_a_loop_that_is_always_too_late_gets_a_message(config: Config) -> None:
     pipeline = make_loop(config)
     plant = started(pipeline)
 
@@ -280,7 +280,7 @@ def test_arms_follow_as_well_as_without_cabinets(config: Config, mode: CommandMo
 
 
 class ShiftedArm(SimulatedArm):
-    """Its joints are measured ``shift`` [rad] away from where they are."""
+    """An arm whose joints are measured ``shift`` [rad] away from their true positions."""
 
     shift = 0.0
 
@@ -290,7 +290,7 @@ class ShiftedArm(SimulatedArm):
 
 
 @pytest.mark.slow
-def test_arms_with_a_state_that_is_not_believed_are_braked_at_every_tick(config: Config, robot: Robot) -> None:
+def test_arms_with_an_untrusted_state_are_braked_at_every_tick(config: Config, robot: Robot) -> None:
     arms = SimulatedArms(robot, config)
     arms.arms["left"] = left = ShiftedArm(arms, "left")
     pipeline = make_loop(config, mode=CommandMode.TORQUE, jitter=0.0004, arms=arms)
@@ -311,12 +311,13 @@ def test_arms_with_a_state_that_is_not_believed_are_braked_at_every_tick(config:
     assert len(brakings) > 4
     for speeds in brakings[:-1]:
         assert max(speeds) < speeds[0] + 0.2, "a jump of what is measured is hardly a push"
-        later = np.array(speeds[20:])  # after periods of both cabinets, and of the filter of the jump
+        # These come after the periods of both cabinets, and after the filter of the jump.
+        later = np.array(speeds[20:])
         assert (np.diff(later) < 0.01 * later[:-1] + 1.0 / config.nominal_rate_hz).all(), "no arm gets faster"
         assert later[-1] < 0.02, "and both rest before they are believed again"
 
 
-def test_the_reference_brakes_as_the_path_does(robot: Robot) -> None:
+def test_the_reference_brakes_like_the_path(robot: Robot) -> None:
     controller = CartesianController(robot)
     target = controller.tool_pose("left")
     target.translation = target.translation + np.array([0.1, 0.1, 0.1])
@@ -350,7 +351,7 @@ def test_the_first_command_of_a_session_is_where_the_cabinet_holds_its_arm(confi
         np.testing.assert_allclose(plant.heard[arm][0], home, atol=1e-6)
 
 
-def test_an_arm_that_stands_beyond_its_margin_is_led_back(config: Config, robot: Robot) -> None:
+def test_an_arm_beyond_its_margin_is_led_back(config: Config, robot: Robot) -> None:
     margin, start = config.control.position_margin, robot.home.copy()
     joint = int(robot.arms["left"].joints[6])
     start[joint] = robot.position_upper[joint] - 0.3 * margin

@@ -1,4 +1,4 @@
-"""The demo through two cabinets in virtual time: its tasks, as the cabinets' simulation measured them."""
+"""The demo with two cabinets in virtual time. The cabinets' simulation measures the tasks."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.plants.fri.virtual_cabinets import VirtualCabinets
 
 @pytest.mark.slow
 @pytest.mark.parametrize("period", [0.005, 0.002], ids=["every 5 ms", "every 2 ms"])
-def test_both_tasks_succeed_through_cabinets_whose_network_jitters(period: float) -> None:
+def test_both_tasks_succeed_through_cabinets_with_a_jittering_network(period: float) -> None:
     config = load_config("config/dual_iiwa7_fri.yaml")
     robot = Robot.from_config(config)
     arms = SimulatedArms(robot, config)

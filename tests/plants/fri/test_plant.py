@@ -1,4 +1,4 @@
-"""The plant on real sockets, with a cabinet that sends its next message when the answer to the last one has come."""
+"""The plant on real sockets, with a cabinet that sends its next message after the answer to the last one."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from tests.support.robotiq_gripper import SimulatedGripper
 
 @pytest.mark.slow
 @pytest.mark.parametrize("version", [1, 2])
-def test_the_sessions_of_both_cabinets_come_to_commanding_where_the_arms_are_held(
+def test_the_sessions_of_both_cabinets_reach_commanding_while_the_arms_are_held(
     robot: Robot, fri_config: Config, version: int
 ) -> None:
     plant = FriPlant.from_config(robot, fri_config)
@@ -63,7 +63,7 @@ def test_a_gripper_by_modbus_gets_its_openings_and_is_measured(robot: Robot, fri
         assert simulated.activations == 1
 
 
-def test_without_a_cabinet_the_run_says_which_one_and_where(robot: Robot, fri_config: Config) -> None:
+def test_without_a_cabinet_the_run_names_the_cabinet_and_its_address(robot: Robot, fri_config: Config) -> None:
     plant = FriPlant.from_config(robot, fri_config)
     plant.longest_wait = 0.1
     port = fri_config.fri["left"].port
@@ -72,7 +72,7 @@ def test_without_a_cabinet_the_run_says_which_one_and_where(robot: Robot, fri_co
     assert plant.is_released()
 
 
-def test_a_wait_for_a_cabinet_that_is_stopped_says_so_and_releases_the_ports(robot: Robot, fri_config: Config) -> None:
+def test_a_stopped_wait_for_a_cabinet_says_so_and_releases_the_ports(robot: Robot, fri_config: Config) -> None:
     plant = FriPlant.from_config(robot, fri_config)
     plant.longest_wait, stopped = math.inf, iter((False, False, True))
     plant.begin(CommandMode.POSITION, lambda: next(stopped, True))
@@ -81,7 +81,7 @@ def test_a_wait_for_a_cabinet_that_is_stopped_says_so_and_releases_the_ports(rob
     assert plant.is_released()
 
 
-def test_a_port_that_is_taken_is_named(robot: Robot, fri_config: Config) -> None:
+def test_a_port_that_another_program_uses_is_named(robot: Robot, fri_config: Config) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("127.0.0.1", fri_config.fri["right"].port))
         with pytest.raises(PlantError, match=r"fri\.right\.port = \d+: cannot be bound"):

@@ -1,4 +1,4 @@
-"""One cabinet's session: what is answered, and what is not believed."""
+"""One cabinet's session: the messages that are answered, and those that are refused."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from q2r2_control.plants.fri.wire import CommandKind, FriCommand, Joints, Monito
 from q2r2_control.wording import sentence
 from tests.plants.fri.asking_cabinet import ACTIVE, IPO, MONITORING, WAITING, Cabinet, Q
 
-FAR = (0.3, 0.5, 0.0, -1.2, 0.0, 1.0, 0.0)  # where a client has led the arm
+FAR = (0.3, 0.5, 0.0, -1.2, 0.0, 1.0, 0.0)  # A client has led the arm to this posture.
 
 
-def test_an_idle_cabinet_gets_no_answer_and_one_that_monitors_gets_no_position() -> None:
+def test_an_idle_cabinet_gets_no_answer_and_a_monitoring_one_gets_no_position() -> None:
     cabinet = Cabinet()
     assert cabinet.ask(replace(MONITORING, session=Session.IDLE)) is None
     assert cabinet.ask(MONITORING) == FriCommand(0, 2)
@@ -40,7 +40,7 @@ def test_fri_1_gets_the_commanded_position_mirrored() -> None:
         pytest.param(replace(ACTIVE, version=1, commanded_q=FAR), FAR, id="already active, FRI 1"),
     ],
 )
-def test_the_first_command_is_where_the_cabinet_holds_the_arm_or_where_another_client_has_left_it(
+def test_the_first_command_is_the_posture_that_the_cabinet_holds_or_that_another_client_has_left(
     message: Monitoring, q: Joints
 ) -> None:
     cabinet = Cabinet()
@@ -51,7 +51,7 @@ def test_the_first_command_is_where_the_cabinet_holds_the_arm_or_where_another_c
 
 
 @pytest.mark.parametrize("message", [MONITORING, ACTIVE], ids=["monitoring", "active"])
-def test_only_outputs_that_the_cabinet_has_are_written_as_it_takes_them(message: Monitoring) -> None:
+def test_only_outputs_that_the_cabinet_has_are_written_in_its_own_type(message: Monitoring) -> None:
     cabinet, ones = Cabinet(), (1.0,) * 7
     wanted = {"opening": 0.25, "open": True, "light": False, "elsewhere": 0.5, "measured": 0.5, "digital": 0.5}
     cabinet.ask(WAITING)
@@ -75,7 +75,7 @@ def torque_cabinet(limit: float = 100.0, rate: float = math.inf) -> Cabinet:
 
 
 def begin_torques(cabinet: Cabinet) -> Monitoring:
-    """A session of torques is in commanding wait, and a command came; returns the message of an active one."""
+    """Begin a session of torques in commanding wait with a command, and return the message of an active one."""
     active = replace(ACTIVE, command=CommandKind.TORQUE)
     cabinet.ask(replace(WAITING, command=CommandKind.TORQUE))
     cabinet.ask(active)
@@ -92,16 +92,16 @@ def test_torques_go_with_the_cabinets_own_position() -> None:
     assert (answer.q, answer.tau) == (IPO, (1.0,) * 7)
 
 
-def test_a_torque_without_a_newer_one_becomes_one_that_brakes_and_ends_with_the_answers() -> None:
+def test_a_torque_that_is_not_replaced_becomes_a_braking_one_and_ends_with_the_answers() -> None:
     cabinet = torque_cabinet()
     active = begin_torques(cabinet)
-    q = iter(np.linspace(Q, np.add(Q, 0.025), 26)[1:])  # at 0.2 rad/s
+    q = iter(np.linspace(Q, np.add(Q, 0.025), 26)[1:])  # The joints move at 0.2 rad/s.
     answers = [cabinet.ask(replace(active, q=tuple(next(q).tolist()))) for _ in range(25)]
     torques = [answer and answer.tau and round(answer.tau[0], 3) for answer in answers]
     assert torques == [1.0] * 4 + [-4.0] * 16 + [None] * 5
 
 
-def test_a_torque_that_brakes_keeps_the_rate_limit_down_to_one_at_which_it_still_brakes() -> None:
+def test_a_braking_torque_keeps_the_rate_limit_as_long_as_it_still_brakes() -> None:
     for rate, change in ((6000.0, 30.0), (100.0, 25.0)):
         cabinet = torque_cabinet(rate=rate)
         active, still, ones = begin_torques(cabinet), (0.0,) * 7, (1.0,) * 7
@@ -113,10 +113,10 @@ def test_a_torque_that_brakes_keeps_the_rate_limit_down_to_one_at_which_it_still
         assert torques[-1] == pytest.approx(-80.0)
 
 
-def test_commands_without_an_overlay_brake_as_long_as_they_come() -> None:
+def test_commands_without_an_overlay_brake_for_as_long_as_they_come() -> None:
     cabinet = torque_cabinet()
     active = begin_torques(cabinet)
-    for q in np.linspace(Q, np.add(Q, 0.1), 101)[1:]:  # at 0.2 rad/s
+    for q in np.linspace(Q, np.add(Q, 0.1), 101)[1:]:  # The joints move at 0.2 rad/s.
         now, still = cabinet.now, (0.0,) * 7
         cabinet.session.follow(ArmCommand(now, now, now + 0.005, Q, still, (1.0,) * 7, {}, None, (20.0,) * 7))
         answer = cabinet.ask(replace(active, q=tuple(q.tolist())))
@@ -140,7 +140,7 @@ def test_no_torque_is_beyond_the_limit() -> None:
     assert answer.tau == (0.5,) * 7
 
 
-def test_torques_are_refused_to_a_cabinet_that_asks_too_seldom() -> None:
+def test_torques_are_refused_for_a_cabinet_with_too_long_a_period() -> None:
     cabinet = torque_cabinet()
     begin_torques(cabinet)
     assert cabinet.ask(replace(WAITING, command=CommandKind.TORQUE, multiplier=2)) is None
@@ -149,7 +149,7 @@ def test_torques_are_refused_to_a_cabinet_that_asks_too_seldom() -> None:
     assert sentence(fault) == "left: the cabinet asks every 10 ms; allowed for torques: 5 at most"
 
 
-def test_a_drop_is_told_and_the_arm_follows_no_more() -> None:
+def test_a_dropped_session_is_reported_and_the_arm_follows_no_more() -> None:
     cabinet = Cabinet()
     cabinet.ask(WAITING)
     cabinet.ask(ACTIVE)
@@ -164,11 +164,11 @@ def test_a_drop_is_told_and_the_arm_follows_no_more() -> None:
     assert fault.detail["session"] == "monitoring ready"
 
 
-def test_commands_for_a_time_that_was_answered_are_refused_for_both_arms_which_stop_as_was_certified() -> None:
+def test_late_commands_are_refused_for_both_arms_which_stop_as_certified() -> None:
     cabinet, still, ones = Cabinet(), (0.0,) * 7, (1.0,) * 7
     cabinet.ask(WAITING)
     cabinet.ask(ACTIVE)
-    for _ in range(10):  # a reference that leaves IPO at 1 rad/s^2, for 50 ms
+    for _ in range(10):  # The reference leaves IPO at 1 rad/s^2 for 50 ms.
         end = cabinet.now + 0.003
         passed = end - 0.013
         way, speed = 0.5 * passed**2, passed
@@ -186,7 +186,7 @@ def test_commands_for_a_time_that_was_answered_are_refused_for_both_arms_which_s
     stop = np.array([answer.q for answer in answers if answer and answer.q])
     assert np.diff(stop, axis=0).min() >= 0.0, "it goes on, slower and slower"
     np.testing.assert_allclose(stop[-1], state.rest, atol=1e-9)
-    # From there a reference is followed again.
+    # From there on, a reference is followed again.
     now = cabinet.now
     assert follow({"left": cabinet.session}, {"left": ArmCommand(now, now, now + 0.002, state.rest, still, ones)})
     assert cabinet.session.path.end == now + 0.002
@@ -210,19 +210,19 @@ def test_an_arm_that_rests_before_lost_messages_are_caught_up_begins_to_move_aga
         assert not cabinet.session.has_passed(ArmCommand(cabinet.now, start, end, there, (speed,) * 7, fives))
         cabinet.session.follow(ArmCommand(cabinet.now, start, end, there, (speed,) * 7, fives))
 
-    for tick in range(1, 21):  # 50 ms of acceleration, 50 ms of braking
+    for tick in range(1, 21):  # The motion has 50 ms of acceleration and 50 ms of braking.
         t, end = 0.005 * tick, cabinet.now + 0.003
         way, speed = (0.5 * a * t**2, a * t) if tick <= 10 else (0.0125 - 0.5 * a * (0.1 - t) ** 2, a * (0.1 - t))
         command(end - 0.005, end, way, speed)
         if 8 <= tick <= 13:
-            cabinet.sent += 1  # lost
+            cabinet.sent += 1  # This message is lost.
         else:
             ask()
     while np.abs(np.subtract(followed[-1], state.rest)).max() > 1e-12:
         ask()
         assert cabinet.now < begun + 1.0
     start = state.answered + 1e-4
-    for t in (0.0, 0.002, 0.004):  # ticks of the loop before the next message
+    for t in (0.0, 0.002, 0.004):  # These are ticks of the loop before the next message.
         command(start + t, start + t + 0.002, 0.0125 + 0.5 * a * (t + 0.002) ** 2, a * (t + 0.002))
     for _ in range(10):
         ask()
@@ -230,7 +230,7 @@ def test_an_arm_that_rests_before_lost_messages_are_caught_up_begins_to_move_aga
     assert np.abs(accelerations).max() <= (1.0 + CATCH_UP) ** 2 * a + CATCH_UP_RAMP * a * 0.05
 
 
-def test_an_arm_that_begins_to_move_while_no_answer_is_heard_begins_from_rest() -> None:
+def test_an_arm_that_begins_to_move_while_answers_are_lost_begins_from_rest() -> None:
     cabinet, fives, a = Cabinet(), (5.0,) * 7, 5.0
     cabinet.ask(WAITING)
     cabinet.ask(ACTIVE)
@@ -240,7 +240,7 @@ def test_an_arm_that_begins_to_move_while_no_answer_is_heard_begins_from_rest() 
         t, end = max(0.005 * (tick - 4), 0.0), cabinet.now + 0.003
         there = tuple(q + 0.5 * a * t**2 for q in IPO)
         cabinet.session.follow(ArmCommand(cabinet.now, end - 0.005, end, there, (a * t,) * 7, fives))
-        lost = tick <= 10  # the first ones at rest, where the time of an answer may jump
+        lost = tick <= 10  # The first answers are lost at rest, where their time may jump.
         answer = cabinet.ask(ACTIVE, lost)
         assert answer is not None
         assert answer.q is not None
@@ -288,13 +288,13 @@ def test_an_older_message_is_not_answered_and_lost_ones_are_counted() -> None:
     assert cabinet.session.state.lost == 3
 
 
-def test_a_message_that_comes_twice_gets_the_same_answer_and_moves_nothing() -> None:
+def test_a_repeated_message_gets_the_same_answer_and_moves_nothing() -> None:
     cabinets, ones = {doubled: Cabinet() for doubled in (False, True)}, (1.0,) * 7
     heard: dict[bool, list[object]] = {False: [], True: []}
     for doubled, cabinet in cabinets.items():
         cabinet.ask(WAITING)
         cabinet.ask(ACTIVE)
-        for t in np.linspace(0.005, 0.1, 20):  # a reference that leaves IPO at 1 rad/s^2
+        for t in np.linspace(0.005, 0.1, 20):  # The reference leaves IPO at 1 rad/s^2.
             end, there = cabinet.now + 0.003, tuple(q + 0.5 * t**2 for q in IPO)
             cabinet.session.follow(ArmCommand(cabinet.now, end - 0.005, end, there, (t,) * 7, ones))
             answer = cabinet.ask(replace(ACTIVE, q=there), doubled=doubled)
@@ -304,7 +304,7 @@ def test_a_message_that_comes_twice_gets_the_same_answer_and_moves_nothing() -> 
     assert heard[True] == heard[False]
 
 
-def test_a_cabinet_of_another_version_than_the_yamls_is_not_answered_and_said() -> None:
+def test_a_cabinet_of_another_version_than_in_the_yaml_is_not_answered_and_is_reported() -> None:
     cabinet = Cabinet(ArmSession("left", "cabinet", version=1))
     assert cabinet.ask(MONITORING) is None
     fault = cabinet.session.state.fault(cabinet.now)
@@ -322,7 +322,7 @@ def test_a_cabinet_of_another_version_than_the_yamls_is_not_answered_and_said() 
         pytest.param(b"", id="empty"),
     ],
 )
-def test_a_message_that_cannot_be_the_cabinets_changes_nothing(wrong: bytes) -> None:
+def test_a_message_that_cannot_come_from_the_cabinet_changes_nothing(wrong: bytes) -> None:
     cabinet = Cabinet()
     cabinet.ask(MONITORING)
     before = cabinet.session.state.newest

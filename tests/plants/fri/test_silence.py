@@ -1,4 +1,4 @@
-"""A cabinet that says nothing for a while, or asks for nothing any more, in mid-motion."""
+"""A cabinet is silent for a while, or becomes idle, in the middle of a motion."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.plants.fri.asking_cabinet import ACTIVE, IPO, MONITORING, WAITING, Ca
 
 @pytest.mark.parametrize("silence", [0.15, 6.0])
 @pytest.mark.parametrize("loop", ["goes on", "stands still"])
-def test_an_arm_whose_cabinet_was_silent_in_mid_motion_brakes_as_was_certified_and_follows_from_rest_only(
+def test_an_arm_whose_cabinet_was_silent_during_motion_brakes_as_certified_and_follows_only_from_rest(
     silence: float, loop: str
 ) -> None:
     cabinet, ones, still = Cabinet(), (1.0,) * 7, (0.0,) * 7
@@ -36,19 +36,19 @@ def test_an_arm_whose_cabinet_was_silent_in_mid_motion_brakes_as_was_certified_a
 
     cabinet.ask(WAITING)
     cabinet.ask(ACTIVE)
-    for t in np.linspace(0.005, 0.1, 20):  # a reference that leaves IPO at 1 rad/s^2
+    for t in np.linspace(0.005, 0.1, 20):  # The reference leaves IPO at 1 rad/s^2.
         command(0.5 * t**2, t)
         ask()
     assert follows()
     if loop == "stands still":
         cabinet.silence = silence
-    while cabinet.silence < silence:  # on at that speed, of which nothing is heard
+    while cabinet.silence < silence:  # The arm goes on at that speed, and no message about it comes.
         cabinet.silence += 0.005
         command(0.005 + 0.1 * cabinet.silence, 0.1)
     ask()
     assert not follows()
     assert not session.is_still(cabinet.now)
-    for _ in range(100):  # another reference begins where this one is going to rest
+    for _ in range(100):  # Another reference begins where this one will rest.
         now, rest = cabinet.now, session.state.rest
         session.follow(ArmCommand(now, now - 0.002, now + 0.003, rest, still, ones))
         ask()
@@ -67,7 +67,7 @@ def test_an_arm_whose_cabinet_was_silent_in_mid_motion_brakes_as_was_certified_a
         pytest.param(replace(ACTIVE, ipo_q=Q), id="counter began anew"),
     ],
 )
-def test_a_session_that_began_anew_in_a_silence_gets_the_cabinets_own_position(after: Monitoring) -> None:
+def test_a_session_that_restarted_during_a_silence_gets_the_cabinets_own_position(after: Monitoring) -> None:
     cabinet = Cabinet()
     cabinet.sent = 10
     cabinet.ask(WAITING)
@@ -80,7 +80,7 @@ def test_a_session_that_began_anew_in_a_silence_gets_the_cabinets_own_position(a
     assert answer.q == pytest.approx(Q, abs=1e-15)
 
 
-def test_an_arm_whose_cabinet_becomes_idle_in_mid_motion_is_moved_by_nothing_any_more() -> None:
+def test_an_arm_whose_cabinet_becomes_idle_during_motion_is_not_moved_any_more() -> None:
     cabinet = Cabinet()
     cabinet.ask(WAITING)
     cabinet.ask(ACTIVE)

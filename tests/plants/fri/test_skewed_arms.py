@@ -1,4 +1,4 @@
-"""Two arms that swing alike near each other, each behind its cabinet: one lags, or it stops alone."""
+"""Two arms swing together near each other, each behind its cabinet. One of them lags or stops alone."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_measured_arms_keep_their_distance_whatever_happens_to_one_of_them(case: str) -> None:
+def test_measured_arms_keep_their_distance_in_every_case_of_one_of_them(case: str) -> None:
     found = Case(case, 0.5).run()
     assert found.speed > 0.35
     assert found.margin >= 0.0
@@ -18,5 +18,5 @@ def test_measured_arms_keep_their_distance_whatever_happens_to_one_of_them(case:
 
 
 @pytest.mark.parametrize("case", ["cable pulled", "pendant stopped"])
-def test_the_other_arm_rests_in_the_time_of_two_messages_and_its_stop(case: str) -> None:
+def test_the_other_arm_rests_within_the_time_of_two_messages_and_its_stop(case: str) -> None:
     assert Case(case, 0.5).run().rest < 0.2

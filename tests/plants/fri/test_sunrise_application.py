@@ -1,4 +1,4 @@
-"""The application for Sunrise: what can be read off its text, since KUKA's libraries are not at hand to compile it."""
+"""The application for Sunrise. Only its text is tested, because KUKA's libraries are not available here."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ TEXT = FILE.read_text(encoding="utf-8")
 
 
 def choices(name: str) -> list[str]:
-    """The answers that an operator may choose from at the smartPAD."""
+    """Return the answers that an operator may choose at the smartPAD."""
     found = re.search(rf"{name} = {{(.*?)}};", TEXT)
     assert found is not None
     return re.findall(r'"(.*?)"', found[1])
 
 
-def test_the_application_has_no_motion_but_a_hold() -> None:
+def test_the_application_has_no_motion_except_a_hold() -> None:
     code = re.sub(r"/\*.*?\*/|//[^\n]*", "", TEXT, flags=re.DOTALL)
     assert len(re.findall(r"\.move(?:Async)?\(", code)) == 1
     assert ".move(positionHold(" in code
     assert not re.search(r"\b(?:ptp|lin|circ|spl|batch|ptpHome|handGuiding)\w*\(", code)
 
 
-def test_its_ports_are_those_of_the_shipped_cell_and_its_periods_those_that_a_client_may_command_at() -> None:
+def test_its_ports_are_those_of_the_shipped_cell_and_its_periods_allow_commands() -> None:
     cell = yaml.safe_load((CHECKOUT / "config/dual_iiwa7_fri.yaml").read_text(encoding="utf-8"))
     assert choices("PORTS") == [str(cell["fri"][arm]["port"]) for arm in ("left", "right")]
     assert all(1 <= int(period) <= 10 for period in choices("POSITION_PERIODS_MS"))

@@ -1,4 +1,4 @@
-"""A wait for cabinets, by a clock of the test's own."""
+"""A wait for cabinets, with a simulated clock."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SILENT = SessionState("left", "cabinet 192.0.2.1 on port 30200")
 
 
 class Clock:
-    """Every look at it takes a second."""
+    """A clock that advances by a second each time it is read."""
 
     now = -1.0
 
@@ -36,13 +36,13 @@ def waited(longest: float, ready_after: float = math.inf, stopped_after: float =
     return waiting.until(lambda: clock.now >= ready_after, lambda: [SILENT], longest), clock.now
 
 
-def test_a_wait_lasts_until_cabinets_are_ready_or_time_is_over_or_somebody_stops_it() -> None:
+def test_a_wait_lasts_until_cabinets_are_ready_or_its_time_is_over_or_it_is_stopped() -> None:
     assert waited(math.inf, ready_after=70.0) == (True, 70.0)
     assert waited(60.0) == (False, 60.0)
     assert waited(math.inf, stopped_after=5.0) == (False, 5.0)
 
 
-def test_a_wait_says_for_what_and_every_ten_seconds_for_how_long(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_wait_names_its_cabinets_and_every_ten_seconds_its_duration(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO")
     waited(34.0)
     lines = [entry.getMessage() for entry in caplog.records]
@@ -50,7 +50,7 @@ def test_a_wait_says_for_what_and_every_ten_seconds_for_how_long(caplog: pytest.
     assert "left: no FRI message from cabinet 192.0.2.1 on port 30200 of this computer; start its FRI" in lines[0]
 
 
-def test_cabinets_that_are_there_soon_need_no_line(caplog: pytest.LogCaptureFixture) -> None:
+def test_cabinets_that_are_ready_soon_need_no_line(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO")
     waited(math.inf, ready_after=2.0)
     assert caplog.records == []
@@ -67,12 +67,12 @@ def test_cabinets_that_are_there_soon_need_no_line(caplog: pytest.LogCaptureFixt
         (Session.COMMANDING_WAIT, "whether the load data are those of the tool"),
     ],
 )
-def test_what_a_person_has_to_do_goes_by_the_session(session: Session, told: str) -> None:
+def test_the_instruction_for_the_operator_depends_on_the_session(session: Session, told: str) -> None:
     state = replace(SILENT, newest=replace(MONITORING, session=session), arrival=10.0)
     assert told in what_is_missing(state, 10.0)
     assert "no FRI message" in what_is_missing(state, 11.0)
 
 
-def test_a_message_that_cannot_be_read_is_told_as_it_is() -> None:
+def test_a_message_that_cannot_be_read_is_reported_unchanged() -> None:
     state = replace(SILENT, newest=ACTIVE, arrival=10.0, problem="FRI 2 datagram whose checksum is wrong")
     assert what_is_missing(state, 11.0).endswith("30200: FRI 2 datagram whose checksum is wrong")

@@ -64,7 +64,7 @@ def _double(value: float) -> bytes:
     return struct.pack("<d", value)
 
 
-# Written by hand from the published field numbers: header, joints one by one, session 4, quality 3, 5 ms.
+# The bytes are written by hand from the published field numbers: header, joints one by one, session 4, quality 3, 5 ms.
 HEADER = _inner(1, b"\x08\xc2\xa2\x91\x01" + b"\x10\x07" + b"\x18\x05")
 JOINTS = b"".join(_field(1, 1, _double(value)) for value in Q)
 CONNECTION = _inner(4, b"\x08\x04\x10\x03\x18\x05\x20\x02")
@@ -84,7 +84,7 @@ def test_packed_joints_are_understood_too() -> None:
 
 
 @pytest.mark.parametrize("version", [1, 2])
-def test_what_is_written_is_read_again(version: int) -> None:
+def test_a_written_message_can_be_read_again(version: int) -> None:
     sent = dataclasses.replace(MONITORING, version=version)
     datagram = write_monitoring(sent)
     assert version_of(datagram) == version
@@ -97,7 +97,7 @@ def test_what_is_written_is_read_again(version: int) -> None:
     ("command", "control", "overlay"),
     [(CommandKind.NONE, 0, 0), (CommandKind.POSITION, 0, 1), (CommandKind.WRENCH, 1, 1), (CommandKind.TORQUE, 2, 1)],
 )
-def test_a_cabinet_says_in_which_control_mode_it_lets_a_client_overlay(
+def test_a_cabinet_names_the_control_mode_that_it_allows_for_commands(
     command: CommandKind, control: int, overlay: int
 ) -> None:
     message = MonitoringMessage.FromString(
@@ -141,7 +141,7 @@ def test_other_bytes_are_refused_with_what_is_allowed(case: str) -> None:
         read_monitoring(datagram)
 
 
-def test_a_name_that_is_no_text_is_read_all_the_same() -> None:
+def test_a_name_that_is_not_text_is_read_too() -> None:
     datagram = write_monitoring(dataclasses.replace(MONITORING, version=1, io={"valve": True}))
     assert read_monitoring(datagram.replace(b"valve", b"val\xff\xfe")).io == {"val\ufffd\ufffd": True}
 
@@ -157,7 +157,7 @@ def test_changed_bytes_are_read_or_refused_and_never_raise_anything_else(
         for place, value in edits:
             datagram[place % len(datagram)] = value
         body = bytes(datagram[: max(end, 1)])
-        if version == 2:  # beyond its checksum
+        if version == 2:  # The bytes are those after the checksum.
             body = struct.pack("<I", len(body)) + body + struct.pack("<I", zlib.crc32(body))
         with contextlib.suppress(ProtocolError):
             read_monitoring(body)

@@ -1,4 +1,4 @@
-"""Cabinets that stand in for KUKA's, in the virtual time of a loop: drift, jitter, loss, and a pendant."""
+"""Simulated KUKA cabinets in the virtual time of a loop: drift, jitter, loss, and a pendant."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from q2r2_control.plants.fri.wire import CommandKind, Session, write_monitoring
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import ArmTiming, Array, Command, CommandMode, RobotState
 
-_BEGIN = -0.1  # of the cabinets [s]
+_BEGIN = -0.1  # Time at which the cabinets begin [s].
 _KINDS = {CommandMode.POSITION: CommandKind.POSITION, CommandMode.TORQUE: CommandKind.TORQUE}
 
 
 class VirtualCabinets:
-    """A plant. Every message and every answer takes its time, and some are lost."""
+    """A plant in which every message and every answer takes time, and some are lost."""
 
     modes: tuple[CommandMode, ...] = (CommandMode.POSITION, CommandMode.TORQUE)
     realtime_only = False
@@ -44,8 +44,9 @@ class VirtualCabinets:
         arms: SimulatedArms | None = None,
         grippers: dict[str, GripperIoConfig] | None = None,
     ) -> None:
-        """``period`` of the loop, its ``longest`` step, cabinets' clocks ``drift`` apart, up to ``jitter`` late [s].
+        """Make cabinets for a loop with this ``period`` and ``longest`` step [s].
 
+        The clocks of the cabinets ``drift`` apart, and messages are up to ``jitter`` [s] late.
         Without ``arms`` they are where they are commanded to be, and torques do not move them.
         """
         self._robot, self._period, self._longest, self._random = robot, period, longest, np.random.default_rng(seed)
@@ -62,10 +63,10 @@ class VirtualCabinets:
         rates = np.linspace(1.0 - 0.5 * drift, 1.0 + 0.5 * drift, len(settings))
         self._rates = dict(zip(settings, rates, strict=True))
         self.on_message: Callable[[str, float], None] = lambda arm, t: None
-        self.asleep_until = -1.0  # nothing of this computer's is done before [s]
-        self.stands_until = dict.fromkeys(self.cabinets, -1.0)  # a cabinet does nothing before [s]
-        self.unplugged: set[str] = set()  # cabinets whose cable is pulled: nothing goes either way
-        self.thinking = 0.0  # time that passes between the beginning of a tick and its command [s]
+        self.asleep_until = -1.0  # This computer does nothing before this time [s].
+        self.stands_until = dict.fromkeys(self.cabinets, -1.0)  # A cabinet does nothing before this time [s].
+        self.unplugged: set[str] = set()  # Cabinets whose cable is unplugged, so that nothing passes.
+        self.thinking = 0.0  # Time between the beginning of a tick and its command [s].
         self._mode = CommandMode.POSITION
 
     def begin(self, mode: CommandMode, stopped: Callable[[], bool]) -> None:
@@ -79,11 +80,11 @@ class VirtualCabinets:
             self.lines[arm] = ArmSession(arm, "cabinet", None, _KINDS[self._mode], *limits)
         states = [copy(session.state) for session in self.lines.values()]
         self.cell = FriCell(self._robot, states, self._period, self._longest, self._grippers)
-        self.now, self._serial = _BEGIN, 0  # the loop begins at 0
+        self.now, self._serial = _BEGIN, 0  # The loop begins at 0.
         self._events: list[tuple[float, int, Callable[..., None], tuple[object, ...]]] = []
         self.heard: dict[str, list[Array]] = {
             arm: [] for arm in self.cabinets
-        }  # positions that a cabinet follows, with torques measured ones
+        }  # Positions that a cabinet follows. With torques, they are the measured ones.
         for arm in self.cabinets:
             self._at(self.now, self._send, arm)
         self.due(0.0)
@@ -116,7 +117,7 @@ class VirtualCabinets:
         self.cell.sent(follow(self.lines, self.cell.apply(command)))
 
     def advance(self, dt: float) -> None:
-        """Time passes by itself, until the next tick."""
+        """Let time pass until the next tick."""
 
     def state(self) -> RobotState:
         return self.cell.state()
@@ -128,7 +129,7 @@ class VirtualCabinets:
         pass
 
     def _pass(self, now: float) -> None:
-        """Let happen what does until ``now`` [s]."""
+        """Process everything that happens until ``now`` [s]."""
         while self._events and self._events[0][0] <= now:
             self.now, _, act, arguments = heapq.heappop(self._events)
             act(*arguments)
@@ -166,7 +167,7 @@ class VirtualCabinets:
             self._at(self.now + self._late(), self.cabinets[arm].receive, answer)
 
     def answer(self, arm: str, datagram: bytes) -> bytes | None:
-        """A datagram as the process that answers takes it."""
+        """Answer a datagram like the process that answers cabinets."""
         reply = answer(self.lines, arm, datagram, self.now)
         self.cell.update(copy(self.lines[arm].state))
         return reply

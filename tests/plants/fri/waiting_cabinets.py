@@ -1,4 +1,4 @@
-"""Cabinets on real sockets, which wait for each answer: a client on a busy machine is never late."""
+"""Cabinets on real sockets that wait for each answer, so that a client on a busy machine is never late."""
 
 from __future__ import annotations
 
@@ -16,16 +16,19 @@ from q2r2_control.process.scheduling import schedule_thread_first
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import SIDES
 
-_PRIORITY = 41  # above the loop's: a real cabinet does not wait for the computer
-_LOOKS = 0.02  # between two messages to a client that is not there, and two looks at the end [s]
-_GONE = 1.0  # without an answer: the client has ended before it read the message [s]
+_PRIORITY = 41  # The priority is above that of the loop, because a real cabinet does not wait for the computer.
+_LOOKS = 0.02  # Time between two messages to an absent client, and between two checks for the end [s].
+_GONE = 1.0  # Time without an answer after which the client has ended before it read the message [s].
 
 
 @contextmanager
 def waiting_cabinets(
     robot: Robot, config: Config, version: int = 2, period: float = 0.005
 ) -> Iterator[dict[str, Cabinet]]:
-    """One for each arm, in a thread; each sends every ``period`` [s], and starts its overlay whenever it may."""
+    """Run a cabinet for each arm in a thread.
+
+    Each sends every ``period`` [s], and starts its overlay whenever it may.
+    """
     made, done = {}, threading.Event()
     for arm in SIDES:
         settings = settings_of(robot, arm, CommandKind.POSITION, version, period)
@@ -38,13 +41,13 @@ def waiting_cabinets(
                 return opened.recv(2000)
             except TimeoutError:
                 continue
-            except OSError:  # nobody listens there
+            except OSError:  # No program listens there.
                 done.wait(_LOOKS)
                 break
         return None
 
     def serve(cabinet: Cabinet, address: str, port: int) -> None:
-        schedule_thread_first(_PRIORITY)  # where that is permitted
+        schedule_thread_first(_PRIORITY)  # The system permits this priority.
         due = time.monotonic()
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
             opened.bind((address, 0))
@@ -53,7 +56,7 @@ def waiting_cabinets(
             while not done.wait(max(due - time.monotonic(), 0.0)):
                 due += period
                 cabinet.start_overlay()
-                with suppress(OSError):  # of the message before, which nobody listened to
+                with suppress(OSError):  # The error belongs to the last message, which no program received.
                     opened.send(write_monitoring(cabinet.send(0.0)))
                 if (answer := answer_to(opened)) is not None:
                     cabinet.receive(answer)
