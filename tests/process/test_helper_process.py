@@ -1,4 +1,4 @@
-"""A process beside the loop never keeps the run from ending, nor does one that it has started."""
+"""A process beside the loop, or one that it has started, never keeps the run from ending."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from tests.support.processes import alive, wait_until
 
 
 @pytest.mark.parametrize(("busy", "fault"), [(False, "did nothing for 0.5 s"), (True, "did not end within 0.5 s")])
-def test_a_process_that_does_not_end_is_killed_with_those_that_it_started(busy: bool, fault: str) -> None:
+def test_a_process_that_does_not_end_is_killed_with_its_children(busy: bool, fault: str) -> None:
     started: list[int] = []
     process = HelperProcess("lasts", "tests.support.lasting_helper", started.append)
     process.send(busy)

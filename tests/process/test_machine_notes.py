@@ -1,4 +1,4 @@
-"""Hints about the kernel, and about a network card of what ``ip`` and ``ethtool`` print."""
+"""Notes about the kernel, and about a network card from the output of ``ip`` and ``ethtool``."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ RING = "Pre-set maximums:\nRX:\t\t4096\nTX:\t\t4096\nCurrent hardware settings:\
 
 @pytest.fixture
 def prints(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """Puts an ``ethtool`` that prints ``gathers`` and ``rings`` in the place of a computer's."""
+    """Replace the computer's ``ethtool`` by one that prints ``gathers`` and ``rings``."""
 
     def put(gathers: str = QUIET, rings: str = RING.format(4096)) -> None:
         (tmp_path / "-c").write_text(gathers)
@@ -27,7 +27,7 @@ def prints(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Non
     return put
 
 
-def test_a_card_that_sends_every_message_on_at_once_needs_nothing(prints: Callable[..., None]) -> None:
+def test_a_card_that_forwards_every_message_at_once_needs_no_note(prints: Callable[..., None]) -> None:
     prints()
     assert card_notes("lo") == []
 
@@ -44,12 +44,12 @@ def test_a_card_with_a_short_ring_buffer_is_named_with_the_command(prints: Calla
     assert card_notes("lo") == ["lo: a ring buffer of 256 messages; ethtool -G lo rx 4096"]
 
 
-def test_a_card_that_tells_nothing_gives_no_note(prints: Callable[..., None]) -> None:
+def test_a_card_without_information_gives_no_note(prints: Callable[..., None]) -> None:
     prints("rx-usecs: n/a\n", "RX:\t\tn/a\nRX:\t\tn/a\n")
     assert card_notes("no_such_card") == []
 
 
-def test_this_computers_own_addresses_need_no_card() -> None:
+def test_addresses_of_this_computer_need_no_card() -> None:
     assert network_notes(["127.0.0.1", "::1"]) == []
 
 
@@ -57,12 +57,12 @@ def test_this_computers_own_addresses_need_no_card() -> None:
     ("release", "shares", "is_noted"),
     [
         ("6.12.0-rt5", "50000000", True),
-        ("6.12.0", None, True),  # may not be read
+        ("6.12.0", None, True),  # The file may not be read.
         ("6.18.44", "0", False),
         ("6.8.0-48-generic", None, False),
     ],
 )
-def test_a_kernel_that_halts_real_time_threads_for_other_programs_is_named(
+def test_a_kernel_that_throttles_real_time_threads_for_other_programs_is_named(
     tmp_path: Path, release: str, shares: str | None, is_noted: bool
 ) -> None:
     for cpu in ("cpu0", "cpu1") if shares is not None else ():

@@ -1,4 +1,4 @@
-"""Real-time scheduling is asked for as far as the system permits, and given back."""
+"""Real-time scheduling is requested as far as the system permits, and undone afterwards."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="only asked for 
 
 
 class FakeSystem:
-    """Stands for Linux: grants what it is told to, and keeps what it was asked for."""
+    """A replacement for Linux that grants what it is told to, and keeps all requests."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, grants_memory: bool, grants_scheduler: bool) -> None:
         self.calls: list[tuple[object, ...]] = []
@@ -49,7 +49,9 @@ class FakeSystem:
             raise PermissionError(errno.EPERM, os.strerror(errno.EPERM))
 
 
-def test_where_all_is_permitted_nothing_is_said_and_all_is_given_back(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_if_everything_is_permitted_no_line_is_printed_and_everything_is_undone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     system = FakeSystem(monkeypatch, grants_memory=True, grants_scheduler=True)
     with real_time() as refused:
         assert refused is None
@@ -60,7 +62,7 @@ def test_where_all_is_permitted_nothing_is_said_and_all_is_given_back(monkeypatc
     assert system.calls[-1] == ("sched", 0, os.SCHED_OTHER, 0)
 
 
-def test_what_is_refused_is_one_line_with_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_refusal_gives_one_line_with_the_cure(monkeypatch: pytest.MonkeyPatch) -> None:
     FakeSystem(monkeypatch, grants_memory=False, grants_scheduler=False)
     with real_time() as refused:
         assert refused is not None
@@ -77,7 +79,7 @@ def test_what_is_refused_is_one_line_with_what_to_do(monkeypatch: pytest.MonkeyP
         pytest.param(0, 8 << 20, 3, id="root"),
     ],
 )
-def test_memory_to_come_is_locked_only_where_no_limit_could_refuse_it_in_mid_run(
+def test_future_memory_is_locked_only_if_no_limit_could_refuse_it_during_the_run(
     monkeypatch: pytest.MonkeyPatch, user: int, limit: int, flags: int
 ) -> None:
     system = FakeSystem(monkeypatch, grants_memory=True, grants_scheduler=True)
@@ -87,7 +89,7 @@ def test_memory_to_come_is_locked_only_where_no_limit_could_refuse_it_in_mid_run
         assert system.calls[0] == ("mlockall", flags)
 
 
-def test_the_real_system_is_left_as_it_was_and_other_threads_are_not_put_first() -> None:
+def test_the_real_system_is_restored_and_other_threads_get_no_priority() -> None:
     before = os.sched_getscheduler(0)
     policies = []
     with real_time() as refused:
@@ -101,7 +103,7 @@ def test_the_real_system_is_left_as_it_was_and_other_threads_are_not_put_first()
 
 
 @pytest.mark.parametrize(("machine", "granted", "number"), [("x86_64", True, 314), ("aarch64", False, 274)])
-def test_a_reservation_is_asked_for_in_nanoseconds_and_a_refusal_is_told(
+def test_a_reservation_is_requested_in_nanoseconds_and_a_refusal_is_reported(
     monkeypatch: pytest.MonkeyPatch, machine: str, granted: bool, number: int
 ) -> None:
     asked: list[tuple[int, int, bytes, int]] = []
@@ -124,7 +126,7 @@ def test_a_machine_without_a_known_call_has_no_reservations(monkeypatch: pytest.
     assert not reserve(0.001, 0.002)
 
 
-def test_only_the_thread_that_asks_is_scheduled_first_and_as_others_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_the_calling_thread_is_scheduled_first_and_normally_again(monkeypatch: pytest.MonkeyPatch) -> None:
     system = FakeSystem(monkeypatch, grants_memory=True, grants_scheduler=True)
     ended = threading.Event()
     thread = threading.Thread(target=ended.wait)
@@ -140,7 +142,7 @@ def test_only_the_thread_that_asks_is_scheduled_first_and_as_others_again(monkey
     assert (schedule_thread_first(38) or "").startswith("no SCHED_FIFO: Operation not permitted; to permit it")
 
 
-# Sends a signal at every line that the first signal's handler runs, so each of them is interrupted by another handler.
+# A signal is sent at every line of the first signal's handler, so that another handler interrupts each of them.
 SCRIPT = """
 import os, signal, sys
 from q2r2_control.process.scheduling import StopRequest
@@ -158,21 +160,21 @@ print(stop.asked, len(sent) > 0)
 """
 
 
-def test_a_signal_in_the_middle_of_another_one_s_handler_does_not_wait_for_it() -> None:
+def test_a_signal_during_another_ones_handler_does_not_wait_for_it() -> None:
     done = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, timeout=60)
     assert done.stdout.split() == ["True", "True"], done.stderr
 
 
 @pytest.fixture
 def _nothing_frozen() -> Iterator[None]:
-    """The tests themselves freeze what they import."""
+    """Undo the freezing of imported objects by the tests."""
     gc.unfreeze()
     yield
     gc.freeze()
 
 
 @pytest.mark.usefixtures("_nothing_frozen")
-def test_garbage_collection_leaves_existing_objects_alone_until_the_block_ends_or_fails() -> None:
+def test_garbage_collection_ignores_existing_objects_until_the_block_ends_or_fails() -> None:
     frozen = []
 
     def fail() -> None:
