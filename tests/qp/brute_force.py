@@ -23,7 +23,7 @@ _ROUNDING = 1e-9
 
 
 def cost_of(problem: QpProblem, v: Array) -> float:
-    """f at velocities ``v`` (nv,) [rad/s], in which a hard row costs nothing."""
+    """Return f at velocities ``v`` (nv,) [rad/s], in which a hard row has no cost."""
     soft = len(problem.rows_lower) - problem.hard
     slack = np.maximum(problem.rows_lower - problem.rows @ v, 0.0)[:soft]
     softness = row_softness(problem.H, problem.rows)[:soft]
@@ -31,7 +31,7 @@ def cost_of(problem: QpProblem, v: Array) -> float:
 
 
 def is_feasible(problem: QpProblem, v: Array, tolerance: float = _ROUNDING) -> bool:
-    """Whether ``v`` (nv,) [rad/s] is within the box and satisfies the hard rows, to a ``tolerance`` [rad/s]."""
+    """Return whether ``v`` (nv,) [rad/s] is within the box and satisfies the hard rows, to a ``tolerance`` [rad/s]."""
     soft = len(problem.rows_lower) - problem.hard
     outside = np.maximum(problem.lower - v, v - problem.upper).max()
     lacking = (problem.rows_lower - problem.rows @ v)[soft:].max(initial=0.0)
@@ -39,7 +39,7 @@ def is_feasible(problem: QpProblem, v: Array, tolerance: float = _ROUNDING) -> b
 
 
 def solve_by_brute_force(problem: QpProblem) -> Array:
-    """The solution (nv,) [rad/s] of a problem that has one; the time is 3^nv 2^m."""
+    """Return the solution (nv,) [rad/s] of a problem that has one. The time grows as 3^nv 2^m."""
     best, least = None, np.inf
     for sides in product((-1, 0, 1), repeat=len(problem.g)):
         for active in product((False, True), repeat=len(problem.rows_lower)):
@@ -51,7 +51,7 @@ def solve_by_brute_force(problem: QpProblem) -> Array:
 
 
 def _least_point(problem: QpProblem, sides: npt.NDArray[np.int64], active: npt.NDArray[np.bool_]) -> Array | None:
-    """Least point of f with joints at the bounds that ``sides`` say, soft rows giving way and hard ones met."""
+    """Return the least point of f with joints at the bounds in ``sides``, and with these rows violated or met."""
     soft = np.arange(len(active)) < len(active) - problem.hard
     giving, met = problem.rows[active & soft], problem.rows[active & ~soft]
     stiffness = 1.0 / row_softness(problem.H, problem.rows)[active & soft]
@@ -66,6 +66,6 @@ def _least_point(problem: QpProblem, sides: npt.NDArray[np.int64], active: npt.N
         return v
     try:
         v[free] = np.linalg.solve(system, right)[: free.sum()]
-    except np.linalg.LinAlgError:  # more hard rows than free joints
+    except np.linalg.LinAlgError:  # There are more hard rows than free joints.
         return None
     return v

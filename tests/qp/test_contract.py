@@ -1,4 +1,4 @@
-"""The contract's motions at reduced length: with every solver each limit and each distance is kept at every tick."""
+"""Shorter motions of the contract: every solver keeps each limit and each distance at every tick."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ from tests.qp.solvers import NAMES, ROBOT, controller_with, each_solver
 from tests.support.driven import Driven
 
 DT, MOVING, RESTING = 0.002, 0.16, 2.5  # [s]
-SLOWLY_OUT = "start in penetration"  # arms part at 50 mm/s, and a tick has up to 80 rows
-REST, RESTED = 1e-3, 0.02  # a speed of every joint [rad/s], for so long [s]
-TRACKING = 1.05  # times DAQP's error that another solver's may be
+SLOWLY_OUT = "start in penetration"  # Arms part at 50 mm/s, and a tick has up to 80 rows.
+REST, RESTED = 1e-3, 0.02  # A speed of every joint [rad/s], and the time for which it has to last [s].
+TRACKING = 1.05  # Largest error of another solver, as a multiple of DAQP's.
 ROUNDING = 1e-9
 MOTIONS = {name: case for name, case in CASES.items() if case.fault is None}
-SHORTEST = ("crossing", "circle", SLOWLY_OUT)  # what runs with the other short tests
+SHORTEST = ("crossing", "circle", SLOWLY_OUT)  # These motions run with the other short tests.
 
 
 @dataclass(frozen=True, slots=True)
 class Motion:
     """One run, in which the tools follow their targets and then hold."""
 
-    references: list[Reference]  # while there were targets
-    error: float  # of the tool that is farther from its target, root mean square [m]
-    unsolved: int  # ticks
-    rested: bool | None  # None: not waited for
+    references: list[Reference]  # References of the time with targets.
+    error: float  # RMS error of the tool that is farther from its target [m].
+    unsolved: int  # Number of ticks without a solution.
+    rested: bool | None  # None if the test does not wait for rest.
 
 
 def _error(controller: CartesianController, targets: Targets) -> float:
@@ -44,7 +44,7 @@ def _error(controller: CartesianController, targets: Targets) -> float:
 
 @cache
 def motion(solver: str, name: str) -> Motion:
-    """Drive a motion of ``MOTIONS``; the contract is checked at every tick."""
+    """Drive a motion of ``MOTIONS`` with the contract checked at every tick."""
     case, controller = MOTIONS[name], controller_with(solver)
     driven = Driven(controller, *case.start(ROBOT), dt=DT, random=np.random.default_rng(3))
     references, errors, t = [], [], 0.0
@@ -65,7 +65,7 @@ def motion(solver: str, name: str) -> Motion:
 
 
 def _comes_to_rest(driven: Driven) -> bool:
-    """Whether the arms rest in time after their targets are gone; the contract is checked on the way too."""
+    """Return whether the arms rest in time after their targets ended. The contract is checked meanwhile too."""
     driven.dt, slow = DT, 0.0
     for _ in range(round(RESTING / DT)):
         slow = slow + DT if np.abs(driven.drive(DT, {}).v).max() < REST else 0.0
@@ -89,13 +89,13 @@ def test_arms_keep_the_contract_and_come_to_rest(solver: str, name: str) -> None
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Limits of a run as the robot and the settings have them, without the controller's own bookkeeping."""
+    """Limits of a run from the robot and the settings, without the controller's own data."""
 
     lower: Array  # (nv,) [rad]
     upper: Array  # (nv,) [rad]
     velocity: Array  # (nv,) [rad/s]
     acceleration: Array  # (nv,) [rad/s^2]
-    distances: Array  # of each pair (p,) [m]
+    distances: Array  # Distances of each pair (p,) [m].
 
 
 def limits_of(controller: CartesianController) -> Limits:
@@ -114,7 +114,7 @@ def from_rest(case: Case) -> bool:
 
 
 def assert_within(limits: Limits, references: list[Reference]) -> None:
-    """Check ticks of ``DT`` from rest on. A tick moves along a parabola, so positions tell the same velocities."""
+    """Check ticks of ``DT`` from rest on. A tick follows a parabola, so that positions determine the velocities."""
     q = np.array([reference.q for reference in references])
     v = np.array([reference.v for reference in references])
     assert (q >= limits.lower - ROUNDING).all()
@@ -130,12 +130,12 @@ def assert_within(limits: Limits, references: list[Reference]) -> None:
 @pytest.mark.parametrize(
     ("solver", "name"), [_every(solver, name) for solver in NAMES for name in MOTIONS if from_rest(MOTIONS[name])]
 )
-def test_limits_and_distances_hold_at_every_tick_by_plain_arithmetic_and_coal(solver: str, name: str) -> None:
+def test_limits_and_distances_hold_at_every_tick_by_simple_arithmetic_and_coal(solver: str, name: str) -> None:
     assert_within(limits_of(controller_with(solver)), motion(solver, name).references)
 
 
 @pytest.mark.parametrize("solver", each_solver())
-def test_joints_that_are_driven_beyond_their_limits_meet_each_limit_and_break_none(solver: str) -> None:
+def test_joints_that_are_driven_beyond_their_limits_reach_each_limit_and_break_none(solver: str) -> None:
     controller, last = controller_with(solver), [arm.joints[-1] for arm in ROBOT.arms.values()]
     limits, q = limits_of(controller), ROBOT.home.copy()
     q[last] = limits.upper[last] - 1.2
@@ -152,13 +152,13 @@ def test_joints_that_are_driven_beyond_their_limits_meet_each_limit_and_break_no
     np.testing.assert_allclose(references[-1].q[last], limits.upper[last], atol=2e-3)
 
 
-def test_a_motion_that_can_be_followed_is_followed_to_millimetres() -> None:
+def test_a_reachable_motion_is_followed_within_millimetres() -> None:
     assert MOTIONS["circle"].scenario is circle
     assert 1e-3 < motion("daqp", "circle").error < 5e-3
 
 
 def test_targets_that_meet_bring_the_arms_within_millimetres_of_the_distance_they_keep() -> None:
-    """The motions of this file do press pairs against their distances, so that a solver's rows are needed."""
+    """The motions of this file really press pairs against their distances, so that a solver needs the rows."""
     controller = controller_with("daqp")
     controller.reset(ROBOT.home)
     left, right = controller.tool_pose("left"), controller.tool_pose("right")

@@ -1,4 +1,4 @@
-"""Where limits leave hardly any room the QP still has a solution, and every solver's answer keeps the contract."""
+"""Where limits leave hardly any room, the QP still has a solution, and every solver's answer keeps the contract."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from tests.support.driven import Driven
 
 DT, DRIVEN = 0.002, 0.04  # [s]
 TICKS = 6
-Corner = tuple[Array, Array, pin.Motion]  # q, v, and how the targets move away from the tools [m], [rad]
+Corner = tuple[Array, Array, pin.Motion]  # q and v, and the motion of the targets away from the tools [m], [rad].
 OUT = pin.Motion(np.array([0.3, 0.0, 0.3]), np.zeros(3))
 DOWN = pin.Motion(np.array([0.0, 0.0, -0.5]), np.array([0.0, 1.0, 0.0]))
 IN = pin.Motion(np.array([-0.4, 0.0, -0.2]), np.array([0.5, 0.0, 0.5]))
 
 
 def _posture(robot: Robot, *joints: float) -> Array:
-    """Every arm at the same joint positions (7,) [rad]."""
+    """Return a posture with every arm at the same joint positions (7,) [rad]."""
     q = robot.home.copy()
     for arm in robot.arms.values():
         q[arm.joints] = joints
@@ -76,7 +76,7 @@ CORNERS: dict[str, Callable[[Robot], Corner]] = {
 
 
 def moved(controller: CartesianController, way: pin.Motion) -> dict[str, pin.SE3]:
-    """Targets that are a ``way`` (3,) [m] away from the tools' poses."""
+    """Return targets that are ``way`` (3,) [m] away from the tools' poses."""
     poses = {arm: controller.tool_pose(arm) for arm in ROBOT.arms}
     turn = pin.exp3(way.angular)
     return {arm: pin.SE3(turn @ pose.rotation, pose.translation + way.linear) for arm, pose in poses.items()}
@@ -109,7 +109,7 @@ def test_every_tick_from_a_corner_is_solved_and_keeps_the_contract(solver: str, 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0], ids=["upper", "lower"])
 @pytest.mark.parametrize("solver", each_solver())
-def test_a_joint_at_its_limit_that_still_runs_towards_it_brakes_as_hard_as_it_can(solver: str, sign: float) -> None:
+def test_a_joint_at_its_limit_that_still_moves_towards_it_brakes_as_hard_as_possible(solver: str, sign: float) -> None:
     controller = controller_with(solver)
     settings = controller.settings
     braking = ROBOT.capped_acceleration(settings.acceleration_limit)
@@ -128,12 +128,12 @@ def test_a_joint_at_its_limit_that_still_runs_towards_it_brakes_as_hard_as_it_ca
             unsolved += reference.report.unsolved
         assert sign * reference.v[joint] == pytest.approx(abs(v[joint]) - TICKS * braking[joint] * DT, abs=1e-6)
     # OSQP finds no solution in some ticks in which an elbow is folded into its own arm and 48 rows contradict each
-    # other. The arm then brakes, as it does with a solution.
+    # other. The arm then brakes, as with a solution.
     assert unsolved <= (0.15 if solver == "osqp" else 0.0) * TICKS * len(joints)
 
 
 @pytest.mark.parametrize("solver", each_solver())
-def test_arms_in_penetration_part_at_the_speed_that_they_may(solver: str) -> None:
+def test_arms_in_penetration_part_at_the_permitted_speed(solver: str) -> None:
     q, v = in_penetration(ROBOT)
     driven = Driven(controller_with(solver), q, v, DT)
     before = driven.drive(0.05, {}).report.margin

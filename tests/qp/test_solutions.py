@@ -1,4 +1,4 @@
-"""The QP has one solution: every solver finds what brute force finds on a small one, and DAQP on those of motions."""
+"""The QP has one solution. Every solver finds that of brute force for small problems, and that of DAQP in motions."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def solver_of(name: str, nv: int) -> Solver:
 
 
 def small(random: np.random.Generator, rows: list[list[float]], lower: list[float], hard: int = 0) -> QpProblem:
-    """A problem of four joints, whose box some of them meet, with these rows."""
+    """Return a problem of four joints, some of which meet the box, with these rows."""
     J = random.normal(size=(3, NV))
     matrix = np.array(rows, dtype=float).reshape(-1, NV)
     matrix /= np.linalg.norm(matrix, axis=1, keepdims=True)
@@ -52,7 +52,7 @@ def _at_hardly_any_cost(random: np.random.Generator) -> QpProblem:
 
 
 def corners() -> dict[str, QpProblem]:
-    """Problems in which something that is usually there is missing, contradicts itself or leaves no choice."""
+    """Return problems in which a usual part is missing, is contradictory, or leaves no choice."""
     random = np.random.default_rng(11)
     return {
         "no rows": small(random, [], []),
@@ -106,7 +106,7 @@ def test_a_solver_finds_the_solution_of_brute_force(name: str, corner: str) -> N
 
 @cache
 def random_problems() -> list[tuple[QpProblem, Array]]:
-    """Problems with none to three rows, with the solution of each."""
+    """Return problems with zero to three rows, with the solution of each."""
     random, found = np.random.default_rng(5), []
     for rows in (0, 1, 2, 3, 3, 3):
         lower = random.uniform(-0.5, 1.0, rows).tolist()
@@ -116,20 +116,20 @@ def random_problems() -> list[tuple[QpProblem, Array]]:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_solver_finds_the_solution_of_brute_force_of_random_problems(name: str) -> None:
+def test_a_solver_finds_the_brute_force_solutions_of_random_problems(name: str) -> None:
     for problem, expected in random_problems():
         _assert_solved(solver_of(name, NV).solve(problem), problem, expected, accuracy_of(name))
 
 
 class Noting:
-    """DAQP, which keeps a copy of every problem that needs a solver."""
+    """DAQP that keeps a copy of every problem that needs a solver."""
 
     def __init__(self) -> None:
         self._solver, self.problems = DaqpSolver(ROBOT.model.nv), list[QpProblem]()
 
     def solve(self, problem: QpProblem) -> QpSolution:
         if problem.minimum is None:
-            self.problems.append(problem)  # a copy already: of a solver's own object nothing is shared
+            self.problems.append(problem)  # The problem is a copy already, because it shares no data with a solver.
         return self._solver.solve(problem)
 
 
@@ -146,7 +146,7 @@ MOTIONS = {
 
 @cache
 def problems_of(motion: str) -> list[QpProblem]:
-    """Ten problems of 0.6 s, evenly spread among those that need a solver."""
+    """Return ten problems of 0.6 s, evenly spread among those that need a solver."""
     scenario, start = MOTIONS[motion]
     noting = Noting()
     controller = CartesianController(ROBOT, ControllerSettings(), solver=noting)
@@ -169,13 +169,14 @@ def test_a_solver_finds_daqps_solution_of_each_problem_of_a_motion(name: str, mo
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_solver_finds_a_solution_where_the_box_hardly_lets_similar_rows_be_kept(name: str) -> None:
+def test_a_solver_finds_a_solution_where_the_box_hardly_allows_similar_rows(name: str) -> None:
     nv, up, unsolved = 7, np.full(7, 0.1), 0
     for seed in range(20):
         random = np.random.default_rng(seed)
         rows = random.normal(size=nv) + 0.1 * random.normal(size=(3, nv))
         rows /= np.linalg.norm(rows, axis=1)[:, None]
-        lower = 0.1 * np.abs(rows).sum(axis=1) * random.uniform(0.95, 1.05, 3)  # of what the box allows
+        # The rows demand about what the box allows.
+        lower = 0.1 * np.abs(rows).sum(axis=1) * random.uniform(0.95, 1.05, 3)
         problem = QpProblem(300.0 * np.eye(nv), np.zeros(nv), -up, up, rows, lower)
         v = solver_of(name, nv).solve(problem).v
         unsolved += v is None
@@ -184,7 +185,7 @@ def test_a_solver_finds_a_solution_where_the_box_hardly_lets_similar_rows_be_kep
     assert unsolved <= (2 if name == "osqp" else 0)
 
 
-def test_daqp_through_qpsolvers_finds_what_daqp_finds_directly() -> None:
+def test_daqp_through_qpsolvers_equals_daqp_called_directly() -> None:
     through, directly = QpSolversSolver("daqp"), solver_of("daqp", ROBOT.model.nv)
     for motion in MOTIONS:
         for problem in problems_of(motion):
@@ -194,7 +195,7 @@ def test_daqp_through_qpsolvers_finds_what_daqp_finds_directly() -> None:
 
 
 def test_slacks_of_the_public_problem_are_what_the_rows_give_way_by_and_cost_what_they_should() -> None:
-    """x = [v; s] of ``CartesianController.problem`` costs, at its solution, what f costs at v."""
+    """At its solution, x = [v; s] of ``CartesianController.problem`` has the same cost as f at v."""
     for motion in ("targets that cross", "recovery from penetration"):
         for problem in problems_of(motion):
             nv, public = len(problem.g), slack_problem(problem)
@@ -207,7 +208,7 @@ def test_slacks_of_the_public_problem_are_what_the_rows_give_way_by_and_cost_wha
 
 
 def test_motions_press_many_rows_at_once_and_some_give_way() -> None:
-    """Without this the agreement of solvers would be one about boxes."""
+    """Otherwise, the agreement of solvers would be only about boxes."""
     pressed, gave_way = 0, 0
     for motion in ("targets that cross", "recovery from penetration"):
         for problem in problems_of(motion):
