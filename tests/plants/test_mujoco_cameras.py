@@ -17,7 +17,7 @@ from tests.support.processes import cell
 
 
 def axes(**camera: object) -> tuple[Array, Array]:
-    """Return the camera's position and, in columns, the picture's right and up and the direction away from the scene."""
+    """Return the camera's position, and the right, upward and backward directions of its picture as columns."""
     config = cell().model_copy(update={"cameras": {"one": CameraConfig.model_validate(camera)}})
     plant = MujocoPlant(Robot.from_config(config), config)
     mujoco.mj_camlight(plant.model, plant.data)
