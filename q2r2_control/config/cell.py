@@ -87,7 +87,7 @@ class HeadsetConfig(StrictModel):
     """The TCP server that the Quest2ROS app connects to."""
 
     host: str = Field("127.0.0.1", description="address to bind; 0.0.0.0 admits the network, :: also that of IPv6")
-    port: int = Field(10000, ge=0, le=65535, description="0 takes any free port")
+    port: int = Field(10000, ge=0, le=65535, description="port of the server; 0: any free port")
     allow: tuple[str, ...] | None = Field(
         None, min_length=1, description="addresses and networks that may connect; null: all that reach the port"
     )
@@ -118,19 +118,23 @@ class BoxConfig(StrictModel):
     """A further box of a loose object."""
 
     size: tuple[Extent, Extent, Extent] = Field(description="x y z [m]")
-    at: Metres3 = Field(description="its centre, from that of the first box [m]")
+    at: Metres3 = Field(description="centre, relative to that of the first box [m]")
 
 
 class ObjectConfig(StrictModel):
-    """A loose box in the simulated cell, to be grasped. The controller does not know of it."""
+    """A loose box in the simulated cell, to be grasped. The controller does not know it."""
 
     size: tuple[Extent, Extent, Extent] = Field(description="x y z [m]")
-    position: Metres3 = Field(description="of the centre at the start [m]")
-    mass: float = Field(0.2, gt=0, le=100, description="of all of it [kg]")
-    boxes: tuple[BoxConfig, ...] = Field((), description="further boxes fixed to it, as the walls of a hole")
-    friction: float = Field(1.0, ge=0, le=1.5, description="against other objects; pads and obstacles have theirs")
+    position: Metres3 = Field(description="position of the centre at the start [m]")
+    mass: float = Field(0.2, gt=0, le=100, description="mass of the whole object [kg]")
+    boxes: tuple[BoxConfig, ...] = Field(
+        (), description="further boxes that are fixed to the object, such as the walls of a hole"
+    )
+    friction: float = Field(
+        1.0, ge=0, le=1.5, description="friction against other objects; pads and obstacles have their own"
+    )
     stiffness: float | None = Field(
-        None, ge=100, le=1e5, description="of a soft one where it stands on an obstacle; none: as hard as wood [N/m]"
+        None, ge=100, le=1e5, description="stiffness of a soft object on an obstacle [N/m]; null: as hard as wood"
     )
     colour: Colour = (0.2, 0.45, 0.8, 1.0)
 
@@ -176,8 +180,8 @@ class Config(StrictModel):
     )
     capsules: dict[str, Annotated[int, Field(ge=1, le=4)]] = Field(
         default_factory=dict,
-        description="links of whose meshes each becomes so many capsules at most, or of whose drawings where a link "
-        "has no collision shape; others: one",
+        description="largest number of capsules that enclose each collision mesh of a link, or each drawing of a link "
+        "without a collision shape; other links: one",
     )
     unchecked_links: tuple[str, ...] = Field(
         (), description="links without a collision shape that are not monitored at all"

@@ -53,7 +53,7 @@ class NamedPairDistance(StrictModel):
     pair: tuple[LinkPattern, LinkPattern] = Field(
         description="two links in any order; * stands for any characters and ? for one"
     )
-    distance: Distance = Field(description="[m]")
+    distance: Distance = Field(description="distance that the pairs keep [m]")
 
 
 class ContactPair(StrictModel):
@@ -142,8 +142,8 @@ class ControllerSettings(StrictModel):
     priority: str = Field(EQUAL, description="equal, or the arm that the other one gives way to")
     yield_weight: LiveFloat = Field(0.01, gt=0, le=1, description="factor of the costs of the arm that gives way")
 
-    position_gain: LiveFloat = Field(8.0, gt=0, le=50, description="[1/s]")
-    rotation_gain: LiveFloat = Field(8.0, gt=0, le=50, description="[1/s]")
+    position_gain: LiveFloat = Field(8.0, gt=0, le=50, description="gain of the position error [1/s]")
+    rotation_gain: LiveFloat = Field(8.0, gt=0, le=50, description="gain of the rotation error [1/s]")
     position_weights: Weights = Field(
         (1.0, 1.0, 1.0), description="weights of the position error along the world's x, y, z"
     )
@@ -151,8 +151,8 @@ class ControllerSettings(StrictModel):
         (1.0, 1.0, 1.0),
         description="weights of the rotation error about the tool's own x, y, z; 0 leaves that rotation free",
     )
-    max_linear_speed: LiveFloat = Field(1.0, gt=0, le=3, description="tool speed [m/s]")
-    max_angular_speed: LiveFloat = Field(2.5, gt=0, le=10, description="tool speed [rad/s]")
+    max_linear_speed: LiveFloat = Field(1.0, gt=0, le=3, description="largest linear speed of a tool task [m/s]")
+    max_angular_speed: LiveFloat = Field(2.5, gt=0, le=10, description="largest angular speed of a tool task [rad/s]")
     linear_deceleration: LiveFloat = Field(
         2.0, gt=0, le=50, description="deceleration with which a tool approaches its target [m/s^2]"
     )
@@ -277,10 +277,12 @@ class ImpedanceSettings(StrictModel):
 class AdmittanceSettings(StrictModel):
     """The impedance that a tool shows in position mode, on plants that report external torque."""
 
-    enabled: bool = Field(False, description="needs a plant that measures external torque")
-    stiffness: float = Field(1000.0, ge=10, le=20000, description="[N/m]")
-    rotation_stiffness: float = Field(30.0, ge=0.5, le=1000, description="[Nm/rad]")
-    damping_ratio: float = Field(1.0, ge=0.1, le=5, description="1 returns fastest without overshoot")
+    enabled: bool = Field(False, description="the admittance is on; it needs a plant that measures external torque")
+    stiffness: float = Field(1000.0, ge=10, le=20000, description="stiffness in all directions [N/m]")
+    rotation_stiffness: float = Field(30.0, ge=0.5, le=1000, description="stiffness about all axes [Nm/rad]")
+    damping_ratio: float = Field(
+        1.0, ge=0.1, le=5, description="damping ratio of the tool; 1: the fastest return without overshoot"
+    )
     mass: float = Field(10.0, ge=0.5, le=200, description="virtual mass of the tool [kg]")
     inertia: float = Field(0.3, ge=0.01, le=20, description="virtual inertia of the tool [kg m^2]")
     # The tool's model may be wrong by the weight of 0.2 kg. The torque is that of this weight, 0.15 m from the tool
@@ -288,8 +290,8 @@ class AdmittanceSettings(StrictModel):
     force_dead_band: float = Field(2.0, ge=0, le=50, description="a smaller force moves nothing [N]")
     torque_dead_band: float = Field(0.3, ge=0, le=10, description="a smaller torque moves nothing [Nm]")
     filter_time: float = Field(0.01, ge=0, le=0.5, description="time constant of the wrench's low-pass [s]")
-    max_displacement: float = Field(0.1, gt=0, le=0.5, description="[m]")
-    max_rotation: float = Field(0.5, gt=0, le=1.5, description="[rad]")
+    max_displacement: float = Field(0.1, gt=0, le=0.5, description="largest displacement from the target [m]")
+    max_rotation: float = Field(0.5, gt=0, le=1.5, description="largest rotation from the target [rad]")
 
 
 def _live_fields(settings: type[StrictModel]) -> tuple[str, ...]:

@@ -120,7 +120,7 @@ _EXTERNAL = tuple(name for name in PRESETS if name != BUILTIN.name)
 class ExternalConfig(StrictModel):
     """The controller that drives the arms instead of the built-in one, and the messages that it gets."""
 
-    preset: str = Field(description=f"its terms: {', '.join(_EXTERNAL)}, or one that is installed")
+    preset: str = Field(description=f"kind of the controller: {', '.join(_EXTERNAL)}, or an installed preset")
     mode: Mode = Field(
         Mode.FILTERED,
         description="filtered: what the built-in controller makes of the hand's target; raw: that target itself",

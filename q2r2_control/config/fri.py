@@ -14,9 +14,13 @@ from q2r2_control.config.strict import StrictModel
 class GripperIoConfig(StrictModel):
     """A gripper on named inputs and outputs of the cabinet, as they are called in the Sunrise project."""
 
-    output: str = Field(min_length=1, description="that gets the opening: 0 closed .. 1 open, or on for open")
-    input: str | None = Field(None, description="that has the measured opening, 0 closed .. 1 open; none: not measured")
-    digital: bool = Field(False, description="the output is on or off, and not analog")
+    output: str = Field(
+        min_length=1, description="name of the output for the opening: 0 closed .. 1 open, or on for open"
+    )
+    input: str | None = Field(
+        None, description="name of the input with the measured opening, 0 closed .. 1 open; null: no measurement"
+    )
+    digital: bool = Field(False, description="true if the output is digital, which is on or off")
 
 
 # A gripper on Modbus gets its newest command and measures its opening within this time. Otherwise the opening counts as
@@ -30,11 +34,12 @@ class ModbusGripperConfig(StrictModel):
     """A Robotiq Hand-E, 2F-85 or 2F-140 by Modbus TCP, or by Modbus RTU on a serial device: 115200 baud, 8N1."""
 
     modbus: str = Field(description="host:port or host, or a serial device such as /dev/ttyUSB0")
-    unit: int = Field(9, ge=1, le=247, description="the gripper's slave number")
-    speed: float = Field(1.0, ge=0, le=1, description="of the fingers, 0 slowest .. 1 fastest")
-    force: float = Field(0.5, ge=0, le=1, description="of a grasp, 0 least .. 1 greatest")
+    unit: int = Field(9, ge=1, le=247, description="slave number of the gripper")
+    speed: float = Field(1.0, ge=0, le=1, description="speed of the fingers, 0 slowest .. 1 fastest")
+    force: float = Field(0.5, ge=0, le=1, description="force of a grasp, 0 least .. 1 greatest")
     counts: tuple[_Count, _Count] = Field(
-        (0, 255), description="its position, open and closed, as q2r2 fri-check says; 2F-85 and 2F-140: about [3, 230]"
+        (0, 255),
+        description="counts when open and closed, as q2r2 fri-check prints; 2F-85, 2F-140: about [3, 230]",
     )
 
     @field_validator("modbus")
@@ -73,11 +78,11 @@ _AnyGripper = Annotated[
 class CabinetConfig(StrictModel):
     """The cabinet of one arm, which sends to a port of this computer."""
 
-    address: str = Field("127.0.0.1", description="of the cabinet; nothing else is heard")
-    port: int = Field(30200, ge=0, le=65535, description="of this computer, as the Sunrise project names it")
-    version: Literal[1, 2] | None = Field(None, description="of FRI; none: as the cabinet's messages are")
+    address: str = Field("127.0.0.1", description="address of the cabinet; messages from others are ignored")
+    port: int = Field(30200, ge=0, le=65535, description="port of this computer, as in the Sunrise project")
+    version: Literal[1, 2] | None = Field(None, description="version of FRI; null: that of the cabinet's messages")
     gripper: _AnyGripper | None = Field(
-        None, description="on inputs and outputs of the cabinet, or by Modbus; none: not commanded"
+        None, description="gripper on inputs and outputs of the cabinet, or by Modbus; null: no gripper is commanded"
     )
 
     @field_validator("address")

@@ -15,15 +15,17 @@ class MovingObstacle(ObstacleConfig):
     """The shape and pose of an obstacle in the world, and the greatest speed of any of its points from then on."""
 
     shape: Literal["box", "sphere", "capsule"]
-    speed: float = Field(ge=0, le=10, description="no point of it ever gets faster; 0: it stays [m/s]")
+    speed: float = Field(ge=0, le=10, description="largest speed of any of its points; 0: the obstacle stays [m/s]")
     acceleration: float | None = Field(
         None,
         gt=0,
         le=1000,
-        description="no point of it gains speed faster; none: it may be at its speed at once [m/s^2]",
+        description="largest acceleration of any of its points [m/s^2]; null: no limit",
     )
-    speed_now: float | None = Field(None, ge=0, description="of its fastest point now; none: its speed [m/s]")
-    age: float = Field(0.0, ge=0, le=10, description="of the pose when it is handed over [s]")
+    speed_now: float | None = Field(
+        None, ge=0, description="present speed of its fastest point [m/s]; null: the largest speed"
+    )
+    age: float = Field(0.0, ge=0, le=10, description="age of the pose when it is passed on [s]")
 
     @property
     def slower(self) -> float:

@@ -15,67 +15,93 @@ Radians = Annotated[float, Field(ge=0, le=3.15)]
 
 
 class JudgeSettings(StrictModel):
-    """Thresholds of ``q2r2 judge``: an episode beyond any of them is discarded. None: that number is not judged.
+    """Thresholds of ``q2r2 judge``: an episode beyond any of them is discarded. With null, the number is not judged.
 
     Shares are fractions of the time for which an arm is engaged, unless a description says otherwise. No threshold thus
     depends on the length of an episode. The package ``q2r2_control.judging`` computes the numbers.
     """
 
     min_pose_rate: Annotated[float, Field(ge=0, le=1000)] | None = Field(
-        30.0, description="poses received of a hand that leads an engaged arm [Hz]"
+        30.0, description="smallest rate of poses from a hand that leads an engaged arm [Hz]"
     )
     dropout: float = Field(0.06, ge=0.005, le=1, description="a longer time between two poses is a dropout [s]")
-    max_dropout_share: Share | None = Field(0.05, description="within dropouts")
+    max_dropout_share: Share | None = Field(0.05, description="largest share of time within dropouts")
     max_pose_gap: Seconds | None = Field(0.12, description="longest time without a pose [s]")
-    max_sample_age: Seconds | None = Field(0.04, description="p99 of receipt to tick, of poses [s]")
-    max_delay: Seconds | None = Field(0.12, description="from the motion of a hand to that of its tool [s]")
-    max_faults: Annotated[int, Field(ge=0, le=1000)] | None = Field(
-        0, description="pauses that no operator asked for: jumps, lost hands, refused targets"
+    max_sample_age: Seconds | None = Field(0.04, description="largest age of poses when a tick uses them, p99 [s]")
+    max_delay: Seconds | None = Field(
+        0.12, description="largest delay from the motion of a hand to that of its tool [s]"
     )
-    max_rejected_share: Share | None = Field(0.01, description="targets that the controller could not use")
-    max_leashed_share: Share | None = Field(0.05, description="the leash drags the target along with the tool")
-    max_position_error_rms: Metres | None = Field(0.025, description="target to measured tool [m]")
-    max_position_error_p99: Metres | None = Field(0.07, description="target to measured tool [m]")
-    max_rotation_error_rms: Radians | None = Field(0.15, description="target to measured tool [rad]")
-    max_rotation_error_p99: Radians | None = Field(0.4, description="target to measured tool [rad]")
+    max_faults: Annotated[int, Field(ge=0, le=1000)] | None = Field(
+        0, description="largest number of pauses by faults: jumps, lost hands, refused targets"
+    )
+    max_rejected_share: Share | None = Field(
+        0.01, description="largest share of targets that the controller could not use"
+    )
+    max_leashed_share: Share | None = Field(
+        0.05, description="largest share of time in which the leash drags the target along with the tool"
+    )
+    max_position_error_rms: Metres | None = Field(
+        0.025, description="largest RMS distance from target to measured tool [m]"
+    )
+    max_position_error_p99: Metres | None = Field(
+        0.07, description="largest p99 distance from target to measured tool [m]"
+    )
+    max_rotation_error_rms: Radians | None = Field(
+        0.15, description="largest RMS angle from target to measured tool [rad]"
+    )
+    max_rotation_error_p99: Radians | None = Field(
+        0.4, description="largest p99 angle from target to measured tool [rad]"
+    )
     max_unmeasured_ticks: Annotated[int, Field(ge=0, le=10**9)] | None = Field(
-        0, description="ticks whose measured joints, openings or references are no finite numbers"
+        0, description="largest number of ticks in which joints, openings or references are not finite"
     )
     max_joint_speed: Annotated[float, Field(gt=0, le=100)] | None = Field(
-        1.2, description="fastest measured joint, by its limit of speed"
+        1.2, description="largest measured speed of a joint, divided by the joint's limit"
     )
     max_velocity_mismatch: Annotated[float, Field(ge=0, le=100)] | None = Field(
-        0.5, description="measured velocities less the slope of the positions, by that slope"
+        0.5, description="largest difference of measured velocities from the slope of positions, divided by that slope"
     )
     max_reference_lag: Seconds | None = Field(
-        0.12, description="measured joints behind the reference, or before it [s]"
+        0.12, description="largest delay or lead of measured joints relative to the reference [s]"
     )
-    min_picture_rate_share: Share | None = Field(0.8, description="of a camera: pictures by those that were due")
+    min_picture_rate_share: Share | None = Field(
+        0.8, description="smallest share of a camera's pictures that were recorded"
+    )
     max_picture_gap: Annotated[float, Field(ge=1, le=1000)] | None = Field(
-        2.5, description="of a camera: longest time without a picture, in its periods"
+        2.5, description="longest time without a picture of a camera, in its periods"
     )
-    max_frozen_share: Share | None = Field(0.2, description="of a camera: the picture stays while the arms move")
-    max_black_share: Share | None = Field(0.05, description="of the pictures: those that are black or of one colour")
+    max_frozen_share: Share | None = Field(
+        0.2, description="largest share of time in which a camera's picture stays equal while the arms move"
+    )
+    max_black_share: Share | None = Field(0.05, description="largest share of pictures that are black or of one colour")
     max_bad_pictures: Annotated[int, Field(ge=0, le=10**6)] | None = Field(
-        0, description="pictures of a camera that are damaged, or not of its size"
+        0, description="largest number of pictures that are damaged or have a wrong size"
     )
-    max_picture_lag: Seconds | None = Field(0.12, description="motion in the pictures behind that of the joints [s]")
-    max_idle_share: Share | None = Field(0.5, description="of the whole run: no arm engaged, or none of those moves")
+    max_picture_lag: Seconds | None = Field(
+        0.12, description="largest delay of the motion in pictures behind that of the joints [s]"
+    )
+    max_idle_share: Share | None = Field(
+        0.5, description="largest share of the whole run in which no engaged arm moves"
+    )
     min_ldlj: Annotated[float, Field(ge=-100, le=0)] | None = Field(
-        -11.0, description="smoothness of the tool: log dimensionless jerk, the nearer to 0 the smoother"
+        -11.0, description="smallest smoothness of the tool: log dimensionless jerk; nearer to 0 is smoother"
     )
-    max_fallback_share: Share | None = Field(0.05, description="of the ticks: the certified stop was executed")
-    max_uncertified_share: Share | None = Field(0.0, description="of the ticks: no certified stop was known")
+    max_fallback_share: Share | None = Field(
+        0.05, description="largest share of ticks that executed the certified stop"
+    )
+    max_uncertified_share: Share | None = Field(0.0, description="largest share of ticks without a certified stop")
     min_margin: Annotated[float, Field(ge=-1, le=1)] | None = Field(
-        -0.001, description="least distance of a pair less the one that it keeps [m]"
+        -0.001, description="smallest margin of a pair: its distance minus the kept distance [m]"
     )
-    max_lost_share: Share | None = Field(0.01, description="of the ticks: not in the file")
-    max_lost_gap: Seconds | None = Field(0.03, description="longest time of which no tick is in the file [s]")
-    max_missed_share: Share | None = Field(0.5, description="of the ticks that were due: the loop was late")
+    max_lost_share: Share | None = Field(0.01, description="largest share of ticks that are missing in the file")
+    max_lost_gap: Seconds | None = Field(0.03, description="longest time without a tick in the file [s]")
+    max_missed_share: Share | None = Field(
+        0.5, description="largest share of ticks that the loop missed because it was late"
+    )
     max_tick_gap: Seconds | None = Field(0.1, description="longest time between two ticks of the loop [s]")
-    keep_failed: bool = Field(False, description="one that failed, as its operator or task says, is kept")
-    needs_task: bool = Field(False, description="one that has no task in words is discarded")
-    needs_end: bool = Field(True, description="a file that was not ended, by a killed process say, is discarded")
+    keep_failed: bool = Field(False, description="episodes that failed, by their operator or task, are kept")
+    needs_task: bool = Field(False, description="episodes without a task in words are discarded")
+    needs_end: bool = Field(True, description="files without an end, as after a killed process, are discarded")
 
 
 TOPIC_RATE = 100.0  # [Hz]
@@ -86,7 +112,7 @@ class RecordingSettings(StrictModel):
 
     topic_rate: Annotated[float, Field(gt=0, le=1000)] | None = Field(
         TOPIC_RATE,
-        description="of the standard topics, which repeat numbers of the tick [Hz]; null: at every tick",
+        description="rate of the standard topics, which repeat numbers of the tick [Hz]; null: every tick",
     )
 
 
@@ -108,15 +134,23 @@ class CameraConfig(StrictModel):
         max_length=200,
         description="ROS topic of a real camera: CompressedImage if it ends with /compressed, else Image",
     )
-    link: str | None = Field(None, description="link that carries it, as left_hand_e_base; none: the world")
-    position: Metres3 | None = Field(None, description="in the link's frame [m]; not of one with a topic")
+    link: str | None = Field(
+        None, description="link that carries the camera, such as left_hand_e_base; null: the world"
+    )
+    position: Metres3 | None = Field(
+        None, description="position in the link's frame [m]; not for a camera with a topic"
+    )
     look_at: Metres3 | None = Field(None, description="point in the middle of the picture, in the link's frame [m]")
-    rpy: Radians3 | None = Field(None, description="instead of look_at: of the camera's frame in the link's [rad]")
-    field_of_view: float = Field(0.9, ge=0.05, le=2.8, description="from the lower to the upper edge [rad]")
+    rpy: Radians3 | None = Field(
+        None, description="rotation of the camera in the link's frame, instead of look_at [rad]"
+    )
+    field_of_view: float = Field(
+        0.9, ge=0.05, le=2.8, description="angle from the lower to the upper edge of the picture [rad]"
+    )
     # Width and height are even, because video formats need even numbers.
-    width: int = Field(640, ge=16, le=3840, multiple_of=2, description="[pixels]")
-    height: int = Field(480, ge=16, le=2160, multiple_of=2, description="[pixels]")
-    rate: float = Field(30.0, gt=0, le=240, description="[pictures/s]")
+    width: int = Field(640, ge=16, le=3840, multiple_of=2, description="width of the pictures [pixels]")
+    height: int = Field(480, ge=16, le=2160, multiple_of=2, description="height of the pictures [pixels]")
+    rate: float = Field(30.0, gt=0, le=240, description="rate of the pictures [pictures/s]")
 
     @model_validator(mode="after")
     def _looks_one_way(self) -> CameraConfig:
