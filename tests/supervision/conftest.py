@@ -1,4 +1,4 @@
-"""The shipped cell for tests of what stops its arms."""
+"""The shipped cell for tests of the reasons that stop its arms."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ STRICT = watch_settings(SupervisionSettings(unusable_time=0.0), yields=False)
 
 
 def unhurried(config: Config) -> ControllerSettings:
-    """Settings with which no solution is late, which depends on the machine."""
+    """Return settings in which no solution is late, because lateness depends on the machine."""
     return config.control.model_copy(update={"solve_time_limit": None})
 
 

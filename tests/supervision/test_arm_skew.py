@@ -1,4 +1,4 @@
-"""Arms that are not at the same place of the one reference brake together, whichever loop moves them."""
+"""Arms at different places of their common reference brake together, whichever loop moves them."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from q2r2_control.supervision.arm_skew import SkewWatch, allowed_skew, skew_wind
 from q2r2_control.types import ArmTiming
 from tests.supervision.test_supervisor import DT, World, raised
 
-PERIOD = 0.005  # of the arms' messages [s]
+PERIOD = 0.005  # Period of the arms' messages [s].
 
 
 def timings(left: float = 0.0, right: float = 0.0, silent: tuple[float, float] = (0.0, 0.0)) -> dict[str, ArmTiming]:
-    """Of two arms that are so far behind, and ``silent``, in periods."""
+    """Return the timing of two arms with these lags, and with ``silent`` in periods."""
     behind = {"left": left, "right": right}
     return {
         arm: ArmTiming(PERIOD * lag, PERIOD * quiet, PERIOD)
@@ -38,19 +38,19 @@ def timings(left: float = 0.0, right: float = 0.0, silent: tuple[float, float] =
         pytest.param({}, False, id="arms that move as one"),
     ],
 )
-def test_arms_are_held_up_while_they_are_apart_in_time(found: dict[str, ArmTiming], holds: bool) -> None:
+def test_arms_are_slowed_while_their_lags_differ(found: dict[str, ArmTiming], holds: bool) -> None:
     watch = SkewWatch()
     watch.observe(found, 0.0)
     assert watch.holds == holds
 
 
-def test_the_window_holds_the_allowed_skew_and_two_messages_more() -> None:
+def test_the_window_contains_the_allowed_skew_and_two_more_messages() -> None:
     found = timings()
     assert skew_window(found, 0.004) == pytest.approx(allowed_skew(found) + 2.0 * PERIOD + 0.004)
     assert skew_window({"left": found["left"]}, 0.004) == 0.0
 
 
-def test_arms_that_are_apart_for_long_name_the_one_that_is_behind() -> None:
+def test_after_a_long_difference_of_lags_the_arm_that_is_behind_is_named() -> None:
     watch = SkewWatch()
     watch.observe(timings(), 0.0)
     watch.observe(timings(right=4.0), 0.05)
@@ -68,7 +68,7 @@ def test_both_arms_brake_while_one_is_behind_and_go_on_when_it_is_not(
     left, right = world.engage_both()
 
     def go(seconds: float, skew: float) -> float:
-        """Lead both tools to 50 mm above their start; returns the speed of the fastest joint at the end [rad/s]."""
+        """Lead both tools to 50 mm above their start, and return the speed of the fastest joint at the end [rad/s]."""
         for _ in range(round(seconds / DT)):
             world.supervisor.skew.observe(timings(left=skew), world.now)
             world.run(DT, raised(left, 0.05), right=raised(right, 0.05))
@@ -85,7 +85,7 @@ def test_both_arms_brake_while_one_is_behind_and_go_on_when_it_is_not(
     assert controller.tool_pose("left").translation[2] == pytest.approx(left.translation[2] + 0.05, abs=1e-3)
 
 
-def test_arms_that_stay_apart_are_activated_anew_from_rest(robot: Robot, controller: CartesianController) -> None:
+def test_arms_that_stay_apart_are_activated_again_from_rest(robot: Robot, controller: CartesianController) -> None:
     world = World(robot, controller)
     left, right = world.engage_both()
     for _ in range(60):

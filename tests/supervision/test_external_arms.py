@@ -1,4 +1,4 @@
-"""Arms that another controller moves: their elbows go where they like, and what is measured may not come too close."""
+"""Arms that another controller moves. Their elbows are free, and the measured arms must not come too close."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ from tests.supervision.conftest import CONFIG, unhurried
 from tests.support.reasons import kinds
 
 DT = 0.005  # [s]
-SPEED = 0.3  # of the elbow's swing, in the norm of the joints' velocities [rad/s]
-POST, RADIUS = 2.6, 0.04  # where a post is on the elbow's way, and its own radius [rad], [m]
-LAG, PACE = 0.6, 0.3  # of a soft controller [s], of a tool or a joint that it moves [m/s], [rad/s]
+SPEED = 0.3  # Speed of the elbow's swing, as the norm of the joint velocities [rad/s].
+POST, RADIUS = 2.6, 0.04  # Angle of the swing at which a post is in the way [rad], and radius of the post [m].
+LAG, PACE = 0.6, 0.3  # Lag of a soft controller [s], and speed of a tool [m/s] or joint [rad/s] that it moves.
 MIN_DISTANCE, TOLERANCE = 0.02, 0.01  # [m]
 
 
 def swing(robot: Robot, angle: float) -> list[Array]:
-    """Postures from home on, with the left elbow swinging inwards by ``angle`` [rad] while no tool moves."""
+    """Return postures from home on, in which the left elbow swings inwards by ``angle`` [rad] while no tool moves."""
     data, arm, q = robot.model.createData(), robot.arms["left"], robot.home.copy()
     tool, step = robot.tool_pose(q, "left"), SPEED * DT
     postures, last = [q.copy()], np.eye(7)[2]
@@ -50,7 +50,7 @@ def swing(robot: Robot, angle: float) -> list[Array]:
 
 @pytest.fixture(scope="module")
 def config(robot: Robot, tmp_path_factory: pytest.TempPathFactory) -> Config:
-    """The cell with a post that the left elbow meets on its way, but not the reference's elbow."""
+    """Return the cell with a post that the left elbow meets on its way, but the reference's elbow does not."""
     data = robot.model.createData()
     pin.forwardKinematics(robot.model, data, swing(robot, POST)[-1])
     elbow = data.oMi[robot.model.getJointId("left_A4")].translation
@@ -62,7 +62,7 @@ def config(robot: Robot, tmp_path_factory: pytest.TempPathFactory) -> Config:
 
 
 class World:
-    """A supervisor of arms that another controller moves; its references are not commanded."""
+    """A supervisor of arms that another controller moves. Its references are not commanded."""
 
     def __init__(self, config: Config) -> None:
         self.robot = Robot.from_config(config)
@@ -74,7 +74,7 @@ class World:
         self.now = 0.0
 
     def show(self, postures: list[Array]) -> Reference | None:
-        """One measured posture and one tick after another; the reference of the last."""
+        """Show one measured posture after another, one per tick, and return the last reference."""
         zero, reference = np.zeros_like(self.robot.home), None
         for q in postures:
             self.now += DT
@@ -92,10 +92,11 @@ def world(config: Config) -> World:
     return made
 
 
-def test_elbows_may_swing_while_the_tools_stay_but_not_too_close_to_what_is_near(world: World) -> None:
+def test_elbows_may_swing_while_the_tools_rest_but_not_too_close_to_other_bodies(world: World) -> None:
     postures, far = swing(world.robot, 1.5), round(0.7 / (SPEED * DT))
     home = world.controller.tool_pose("left").translation
-    world.show(postures[:far] + postures[far : far + 1] * round(1.0 / DT))  # longer than a deviation may last
+    # The time is longer than a deviation may last.
+    world.show(postures[:far] + postures[far : far + 1] * round(1.0 / DT))
     assert np.abs(postures[far] - world.robot.home).max() > 0.5
     assert world.supervisor.phase is Phase.ACTIVE
     assert world.supervisor.events == []
@@ -106,13 +107,14 @@ def test_elbows_may_swing_while_the_tools_stay_but_not_too_close_to_what_is_near
     assert event.kind is ReasonKind.TOO_CLOSE
     assert event.detail["pair"].startswith("left_link_")
     assert event.detail["pair"].endswith("|post_0")
-    # The first state that is too close counts: the next one is nearer by no more than the elbow moves meanwhile.
+    # The first state that is too close counts. The next one is nearer only by the elbow's motion in between.
     assert MIN_DISTANCE - TOLERANCE - 1e-3 < event.detail["distance"] <= MIN_DISTANCE - TOLERANCE
 
 
-def test_a_tool_that_is_not_where_its_reference_is_starts_over(world: World) -> None:
+def test_a_tool_that_is_away_from_its_reference_starts_over(world: World) -> None:
     moved = world.robot.home.copy()
-    moved[0] += 0.1  # farther than a stream may begin, nearer than a joint may deviate
+    # The distance is larger than a stream's beginning allows, but smaller than a joint's deviation allows.
+    moved[0] += 0.1
     steps = [world.robot.home + share * (moved - world.robot.home) for share in np.linspace(0.0, 1.0, 40)]
     world.show(steps + [moved] * round(0.4 / DT))
     assert world.supervisor.events == []
@@ -140,7 +142,7 @@ def test_a_soft_controller_that_lags_is_followed_and_an_arm_that_runs_away_start
         q += DT / LAG * (reference.q - q)
     assert world.supervisor.arm_state("left") == "following"
     assert world.supervisor.events == []
-    assert min(lags[-round(0.6 / DT) :]) > 0.2  # longer than a deviation may last
+    assert min(lags[-round(0.6 / DT) :]) > 0.2  # The time is longer than a deviation may last.
     ran = 0.0
     while not world.supervisor.events:
         q[0] += PACE * DT
@@ -151,7 +153,7 @@ def test_a_soft_controller_that_lags_is_followed_and_an_arm_that_runs_away_start
     assert world.supervisor.phase is Phase.BRAKING
 
 
-def test_the_way_home_leads_the_tools_until_they_are_there_and_takes_no_targets(config: Config) -> None:
+def test_the_way_home_leads_the_tools_until_they_arrive_and_accepts_no_targets(config: Config) -> None:
     world = World(config)
     q = world.robot.home.copy()
     q[[1, 8]] += 0.2
@@ -163,7 +165,7 @@ def test_the_way_home_leads_the_tools_until_they_are_there_and_takes_no_targets(
         reference = world.show([q])
         assert reference is not None
         assert world.now < 6.0
-        q = reference.q  # the other controller follows at once
+        q = reference.q  # The other controller follows at once.
     assert list(map(kinds, world.supervisor.events)) == ["homing_outcome: homing_arrived"]
     assert kinds(world.supervisor.homing.outcome) == "homing_arrived"
     for arm in world.robot.arms:

@@ -1,4 +1,7 @@
-"""A gripper goes no farther than the controller has proven, which knows where it may be and when it holds something."""
+"""A gripper moves only as far as the controller has proven.
+
+The controller knows its opening and whether it holds an object.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +33,7 @@ def controller() -> CartesianController:
 
 
 class Cell:
-    """The arms at their reference, and grippers that move at their speed to what is commanded."""
+    """The arms at their reference, with grippers that move at their speed to their commands."""
 
     def __init__(self, controller: CartesianController) -> None:
         controller.reset(controller.robot.home)
@@ -48,7 +51,7 @@ class Cell:
             self.motion.advance(DT)
             least, greatest = self.controller.openings["left"]
             for opening in (self.granted["left"], self.motion.openings["left"]):
-                # A gripper does not leap: half of the tolerance is there always.
+                # A gripper does not jump: half of the tolerance is always there.
                 assert least <= max(opening - 0.5 * TOLERANCE / STROKE, 0.0)
                 assert greatest >= min(opening + 0.5 * TOLERANCE / STROKE, 1.0)
             assert self.controller.openings["right"][1] == 1.0
@@ -64,7 +67,7 @@ def gripper(controller: CartesianController) -> Cell:
     return Cell(controller)
 
 
-def test_a_closed_gripper_takes_up_less_room_and_asks_nothing_at_rest(gripper: Cell) -> None:
+def test_a_closed_gripper_needs_less_room_and_asks_for_nothing_at_rest(gripper: Cell) -> None:
     gripper.run(0.0, 0.5)
     assert gripper.granted["left"] == gripper.motion.openings["left"] == 0.0
     assert gripper.controller.openings["left"][0] == 0.0
@@ -74,7 +77,7 @@ def test_a_closed_gripper_takes_up_less_room_and_asks_nothing_at_rest(gripper: C
     assert gripper.asked == asked < 12
 
 
-def test_it_opens_as_far_as_is_proven_asking_once_in_5_ms_and_to_the_end_where_there_is_room(gripper: Cell) -> None:
+def test_a_gripper_opens_as_far_as_proven_asks_once_in_5_ms_and_opens_fully_if_there_is_room(gripper: Cell) -> None:
     gripper.run(0.0, 1.6, BESIDE)
     assert not gripper.limiter.held
     gripper.run(1.0, 0.4, BESIDE)
@@ -93,7 +96,7 @@ def test_it_opens_as_far_as_is_proven_asking_once_in_5_ms_and_to_the_end_where_t
     assert not gripper.limiter.held
 
 
-def test_what_is_not_measured_is_passed_through_with_its_fingers_all_way(gripper: Cell) -> None:
+def test_without_a_measurement_commands_pass_and_fingers_count_at_all_openings(gripper: Cell) -> None:
     for wanted in (1.0, 0.0, 0.5):
         gripper.tick(wanted, {})
         assert gripper.granted == {"left": wanted, "right": 1.0}
@@ -101,9 +104,7 @@ def test_what_is_not_measured_is_passed_through_with_its_fingers_all_way(gripper
 
 
 @pytest.mark.parametrize("measured", [{}, {"left": math.nan}, {"left": 7.0}], ids=["none", "no number", "absurd"])
-def test_without_a_measurement_that_can_be_believed_a_gripper_stays_commanded_as_it_was(
-    gripper: Cell, measured: dict[str, float]
-) -> None:
+def test_without_a_trusted_measurement_a_gripper_keeps_its_command(gripper: Cell, measured: dict[str, float]) -> None:
     gripper.run(0.0, 0.5)
     openings = gripper.controller.openings
     for _ in range(100):
@@ -112,7 +113,7 @@ def test_without_a_measurement_that_can_be_believed_a_gripper_stays_commanded_as
     assert gripper.controller.openings == openings
 
 
-def test_one_that_is_forced_into_what_is_near_is_named_and_may_close(gripper: Cell) -> None:
+def test_a_gripper_that_is_forced_into_another_body_is_named_and_may_close(gripper: Cell) -> None:
     gripper.run(0.0, 1.6, BESIDE)
     openings = gripper.controller.openings["left"]
     for _ in range(20):
@@ -125,7 +126,7 @@ def test_one_that_is_forced_into_what_is_near_is_named_and_may_close(gripper: Ce
         assert gripper.granted["left"] == wanted
 
 
-def test_one_that_was_commanded_before_takes_up_what_it_does_at_once(controller: CartesianController) -> None:
+def test_a_gripper_with_an_earlier_command_counts_with_that_opening_at_once(controller: CartesianController) -> None:
     controller.reset(controller.robot.home)
     limiter = GripperLimiter(controller)
     limiter.resume({"left": 0.0, "right": 0.3}, {"left": 0.2, "right": math.nan}, 1.0)
@@ -149,7 +150,7 @@ def test_an_opening_counts_for_as_long_as_the_gripper_may_take(controller: Carte
     assert 0.3 <= least[0.3] < 0.7
 
 
-def test_fingers_that_turn_wait_above_the_table_with_closing_and_go_on_by_themselves(tmp_path: Path) -> None:
+def test_turning_fingers_wait_above_the_table_before_they_close_and_go_on_by_themselves(tmp_path: Path) -> None:
     config = turning_cell(tmp_path)
     robot = Robot.from_config(config)
     real = RealHands(robot)
@@ -178,12 +179,12 @@ def test_fingers_that_turn_wait_above_the_table_with_closing_and_go_on_by_themse
     run(0.0, above_table(0.06), 1.5)
     assert motion.openings["left"] == 0.0
     assert not limiter.held
-    # Down with closed fingers, which reach farther: it is the arm that waits.
+    # The arm moves down with closed fingers, which reach farther. Therefore the arm waits.
     run(0.0, above_table(0.006), 1.0)
     assert controller.tool_pose("left").translation[2] > above_table(0.006).translation[2] + 0.005
 
 
-def test_one_whose_bodies_may_not_get_smaller_yet_is_not_held(gripper: Cell) -> None:
+def test_a_gripper_whose_bodies_may_not_shrink_yet_is_not_held(gripper: Cell) -> None:
     controller = gripper.controller
     gripper.run(0.0, 0.05)
     with patch.object(controller, "set_opening", return_value=("finger", "table")):
@@ -204,7 +205,7 @@ def holder() -> CartesianController:
 
 
 class Hand:
-    """A left gripper that closes at its speed, but no farther than to what is between its fingers."""
+    """A left gripper that closes at its speed, but no farther than the object between its fingers allows."""
 
     def __init__(self, holder: CartesianController) -> None:
         self.holder, self.watch = holder, GraspWatch(holder)
@@ -225,7 +226,7 @@ def hand(holder: CartesianController) -> Hand:
     return Hand(holder)
 
 
-def test_closed_on_a_block_it_holds_once_its_fingers_stand_still_until_the_block_slips_out(hand: Hand) -> None:
+def test_a_gripper_that_closed_on_a_block_holds_it_from_standstill_until_the_block_slips_out(hand: Hand) -> None:
     assert not hand.run(0.0, 0.2, least=0.8)
     assert hand.run(0.0, 0.2, least=0.8)
     assert hand.run(0.0, 1.0, least=0.8)
@@ -234,16 +235,16 @@ def test_closed_on_a_block_it_holds_once_its_fingers_stand_still_until_the_block
 
 
 @pytest.mark.parametrize("least", [0.0, 0.06], ids=["nothing", "1.5 mm"])
-def test_a_gripper_that_closes_fully_or_nearly_holds_nothing(hand: Hand, least: float) -> None:
+def test_a_gripper_that_closes_fully_or_nearly_holds_no_object(hand: Hand, least: float) -> None:
     assert not hand.run(0.0, 1.5, least=least)
 
 
-def test_one_that_closes_slowly_holds_nothing_on_the_way(hand: Hand) -> None:
+def test_a_slowly_closing_gripper_holds_no_object_on_the_way(hand: Hand) -> None:
     for step in range(100):
         assert not hand.run(0.0, TICK, least=1.0 - 0.01 * step)
 
 
-def test_while_nothing_is_measured_what_was_known_stays(hand: Hand) -> None:
+def test_without_measurements_the_last_known_state_stays(hand: Hand) -> None:
     assert not hand.run(0.0, 0.5, measured=math.nan)
     hand.run(0.0, 0.5, least=0.8)
     assert hand.run(0.0, 0.5, measured=math.nan)
@@ -251,7 +252,7 @@ def test_while_nothing_is_measured_what_was_known_stays(hand: Hand) -> None:
 
 
 def test_where_no_opening_is_measured_a_closed_gripper_holds() -> None:
-    """A gripper of which the cell has no joints."""
+    """The cell has no joints of this gripper."""
     data = BLOCK_CELL.model_dump()
     data["arms"]["left"]["gripper"]["joints"] = ()
     bare = type(BLOCK_CELL).model_validate(data)
@@ -263,14 +264,14 @@ def test_where_no_opening_is_measured_a_closed_gripper_holds() -> None:
     assert held == [False, True, True, False]
 
 
-def test_a_gripper_that_may_begin_late_is_given_that_time() -> None:
+def test_a_gripper_that_may_begin_late_gets_that_time() -> None:
     for stall in (0.2, 0.5):
         grip = Grip(0.025, stall)
         held = [at for at in np.arange(0.0, 1.0, 0.01) if grip.look(0.0, 1.0, float(at))]
         assert stall <= held[0] < stall + 0.03
 
 
-def test_a_controller_that_was_reset_is_told_at_once_of_what_is_held(hand: Hand) -> None:
+def test_a_controller_that_was_reset_learns_at_once_which_objects_are_held(hand: Hand) -> None:
     assert hand.run(0.0, 0.5, least=0.8)
     hand.holder.reset(hand.holder.robot.home)
     assert not hand.holder.holding["left"]

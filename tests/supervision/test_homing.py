@@ -1,4 +1,4 @@
-"""Home from anywhere: all joints; every promise kept at every tick; interruptible; and it says why it ends."""
+"""The way home from any posture: all joints move, every promise holds, and it can be interrupted."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ LONGEST = 60.0  # [s]
 
 
 class World:
-    """A supervisor whose arms are where its references are; the contract is checked at every tick."""
+    """A supervisor whose arms are at its references. The contract is checked at every tick."""
 
     def __init__(self, robot: Robot, controller: CartesianController, q: Array) -> None:
         self.controller = controller
@@ -39,7 +39,7 @@ class World:
         self.supervisor.activate(self.state, 0.0)
         self.contract = Contract(controller, q)
         self.now = 0.0
-        self.fastest = 0.0  # of any joint [rad/s]
+        self.fastest = 0.0  # Speed of the fastest joint [rad/s].
 
     def tick(self) -> Reference:
         self.now += DT
@@ -58,7 +58,7 @@ class World:
             self.tick()
 
     def go_home(self) -> str:
-        """How it ended."""
+        """Go home, and return the result."""
         assert self.supervisor.go_home() is None
         while self.now < LONGEST and self.supervisor.homing.active:
             self.tick()
@@ -67,7 +67,7 @@ class World:
 
 
 def postures(robot: Robot, controller: CartesianController, count: int, seed: int) -> list[Array]:
-    """Random ones at which a stop is certified and every pair has 5 mm to spare."""
+    """Return random postures with a certified stop and a margin of 5 mm for every pair."""
     random = np.random.default_rng(seed)
     found: list[Array] = []
     while len(found) < count:
@@ -81,7 +81,7 @@ def postures(robot: Robot, controller: CartesianController, count: int, seed: in
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("reached", "count"), [(6, 6), pytest.param(48, 50, marks=pytest.mark.soak)])
-def test_from_nearly_all_random_postures_all_joints_come_home_and_keep_the_contract(
+def test_from_nearly_all_random_postures_all_joints_reach_home_and_keep_the_contract(
     robot: Robot, controller: CartesianController, reached: int, count: int
 ) -> None:
     ends = []
@@ -112,7 +112,7 @@ def test_a_motion_is_braked_before_the_way_home_begins(robot: Robot, controller:
 @pytest.mark.parametrize(
     ("how", "arguments"), [("pause", (True,)), ("stop", (Reason(ReasonKind.STOP_SERVICE),)), ("reset", ())]
 )
-def test_it_can_be_interrupted_and_the_arms_come_to_rest_where_they_are(
+def test_the_way_home_can_be_interrupted_and_the_arms_come_to_rest_where_they_are(
     robot: Robot, controller: CartesianController, how: str, arguments: tuple[object, ...]
 ) -> None:
     (q,) = postures(robot, controller, 1, seed=6)
@@ -131,8 +131,8 @@ def test_it_can_be_interrupted_and_the_arms_come_to_rest_where_they_are(
     assert np.abs(world.state.q - at).max() < 0.04
 
 
-def test_while_no_way_is_known_the_arms_stand_still_and_a_tick_looks_at_two_samples_at_most(robot: Robot) -> None:
-    distances = Mock(side_effect=chain([np.ones(3)], repeat(np.zeros(3))))  # only the start is free
+def test_while_no_way_is_known_the_arms_rest_and_a_tick_examines_at_most_two_samples(robot: Robot) -> None:
+    distances = Mock(side_effect=chain([np.ones(3)], repeat(np.zeros(3))))  # Only the start is free.
     bounds = {"position_lower": robot.position_lower, "position_upper": robot.position_upper}
     searched: Any = SimpleNamespace(arms=robot.arms, **bounds)
     homing, q, ticks = JointHoming(searched, lambda: (distances, np.full(3, 0.02)), robot.home), robot.home + 0.5, 0
@@ -141,13 +141,13 @@ def test_while_no_way_is_known_the_arms_stand_still_and_a_tick_looks_at_two_samp
         at = homing.step(q, np.zeros_like(q), DT).joints
         assert at is not None
         assert np.array_equal(at, q)
-        assert distances.call_count - before <= 3  # with the room where the way begins, once
+        assert distances.call_count - before <= 3  # One more call computes the margin at the begin of the way.
         ticks += 1
     assert homing.outcome is ReasonKind.HOMING_NO_WAY
     assert ticks > 100
 
 
-def test_where_only_the_straight_way_is_asked_for_no_other_one_is_gone(robot: Robot) -> None:
+def test_if_only_the_straight_way_is_allowed_no_other_way_is_taken(robot: Robot) -> None:
     free = Mock(side_effect=chain([np.ones(3)], repeat(np.zeros(3))))
     bounds = {"position_lower": robot.position_lower, "position_upper": robot.position_upper}
     searched: Any = SimpleNamespace(arms=robot.arms, **bounds)
@@ -157,24 +157,24 @@ def test_where_only_the_straight_way_is_asked_for_no_other_one_is_gone(robot: Ro
     assert homing.outcome is ReasonKind.HOMING_NO_WAY
 
 
-def test_an_arm_that_is_held_up_is_waited_for_and_then_it_says_so(robot: Robot) -> None:
+def test_the_way_home_waits_for_an_arm_that_is_held_up_and_then_reports_it(robot: Robot) -> None:
     settings = load_config(CONFIG).control
     homing = JointHoming(robot, lambda: (robot.distance_values, kept_distances(robot, settings).values), robot.home)
     q = robot.home.copy()
     q[0] += 0.8
     farthest = 0.0
     for _ in range(round(10.0 / DT)):
-        at = homing.step(q, np.zeros_like(q), DT).joints  # the reference does not move
+        at = homing.step(q, np.zeros_like(q), DT).joints  # The reference does not move.
         assert at is not None
         farthest = max(farthest, float(np.abs(at - q).max()))
         if homing.outcome is not None:
             break
     assert homing.outcome is ReasonKind.HOMING_HELD_UP
-    assert 0.05 < farthest < 0.13  # or it would set off fast when it is free again
+    assert 0.05 < farthest < 0.13  # Otherwise, the arm would start fast when it is free again.
 
 
 class Beside(World):
-    """With a thing that is reported 30 times a second from ``begin`` [s] on; no body comes nearer than it has to be."""
+    """A world with a body that is reported 30 times a second from ``begin`` [s] on. No link comes too near."""
 
     def __init__(self, controller: CartesianController, q: Array, thing: MovingObstacle, begin: float = 0.0) -> None:
         super().__init__(controller.robot, controller, q)
@@ -197,7 +197,7 @@ class Beside(World):
 
 @pytest.fixture
 def in_the_way(robot: Robot) -> tuple[CartesianController, Array, Array]:
-    """A controller, the left arm turned outwards, and where its tool comes by on the straight way home."""
+    """Return a controller, a posture with the left arm turned outwards, and a place on its straight way home."""
     settings = unhurried(load_config(CONFIG)).model_copy(update={"moving_obstacles": ("thing",)})
     turned = robot.home.copy()
     turned[robot.arms["left"].joints[0]] += 1.0
@@ -212,18 +212,18 @@ def in_the_way(robot: Robot) -> tuple[CartesianController, Array, Array]:
         pytest.param({"shape": "sphere", "size": (0.1,), "speed": 0.25}, id="a hand that may move"),
     ],
 )
-def test_a_way_home_leads_past_a_moving_obstacle_where_it_was_reported(
+def test_a_way_home_avoids_a_moving_obstacle_where_it_was_reported(
     in_the_way: tuple[CartesianController, Array, Array], thing: dict[str, Any]
 ) -> None:
     controller, turned, middle = in_the_way
     world = Beside(controller, turned, MovingObstacle(position=tuple(middle.tolist()), **thing))
     with pytest.raises(AssertionError):
-        world.check(0.5 * (turned + controller.robot.home))  # the straight way is not free
+        world.check(0.5 * (turned + controller.robot.home))  # The straight way is not free.
     assert world.go_home() == "homing_arrived"
     assert np.abs(world.state.q - controller.robot.home).max() < 0.004
 
 
-def test_a_moving_obstacle_that_comes_into_the_way_home_later_holds_the_arms_up_until_that_ends(
+def test_a_moving_obstacle_that_enters_the_way_home_holds_the_arms_up_until_the_way_ends(
     in_the_way: tuple[CartesianController, Array, Array],
 ) -> None:
     controller, turned, middle = in_the_way
@@ -248,7 +248,7 @@ def test_a_home_that_a_joint_cannot_hold_against_gravity_is_a_fault(
     assert fault.startswith(f"home: left_A2 needs {gravity[1]:.1f} Nm against gravity alone; allowed: its torque limit")
 
 
-def test_every_pair_closer_than_min_distance_is_named_once_and_nearest_first(robot: Robot) -> None:
+def test_every_pair_closer_than_min_distance_is_named_once_with_the_nearest_first(robot: Robot) -> None:
     nearest = sorted(pair.distance for pair in robot.distances(robot.home))
     between = ControllerSettings(min_distance=float(np.mean(nearest[1:3])))
     faults = preflight_faults(robot, between, CartesianController(robot, between))

@@ -1,4 +1,4 @@
-"""Measured joint states that are late, old, no numbers, or jump; and the rules for arms of another controller."""
+"""Measured joint states that are late, old, not finite, or that jump; and the rules for arms of another controller."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from q2r2_control.supervision.joint_watch import JointWatch, settings_for_extern
 from q2r2_control.types import RobotState
 from tests.supervision.conftest import CONFIG
 
-NAMES, LIMIT = ("shoulder", "elbow"), np.array([1.0, 2.0])  # velocity limits [rad/s]
+NAMES, LIMIT = ("shoulder", "elbow"), np.array([1.0, 2.0])  # Names of joints, and their velocity limits [rad/s].
 SETTINGS = SupervisionSettings()
-PERIOD = 0.01  # of the states [s]
+PERIOD = 0.01  # Period of the states [s].
 
 
 def state(q: float, stamp: float, v: float = 0.0, external: float | None = None) -> RobotState:
@@ -54,7 +54,7 @@ def test_no_fault_is_found_while_states_come_and_the_arms_rest(joints: Joints) -
     assert joints.watch.believed
 
 
-def test_states_that_cease_are_a_fault_after_the_timeout(joints: Joints) -> None:
+def test_the_end_of_states_is_a_fault_after_the_timeout(joints: Joints) -> None:
     joints.now += SETTINGS.state_timeout - 1e-6
     assert joints.fault() is None
     joints.now += 2e-6
@@ -81,7 +81,7 @@ def test_the_first_fault_stays_until_states_are_accepted_again(joints: Joints) -
 
 
 @pytest.mark.parametrize("what", ["position", "velocity", "external torque"])
-def test_a_number_that_is_not_finite_is_bridged_for_a_while_and_named_then(joints: Joints, what: str) -> None:
+def test_a_number_that_is_not_finite_is_bridged_for_a_while_and_then_named(joints: Joints, what: str) -> None:
     bad = {
         "position": lambda stamp: state(np.nan, stamp),
         "velocity": lambda stamp: state(0.0, stamp, v=np.inf),
@@ -103,7 +103,7 @@ def test_a_number_that_is_not_finite_is_bridged_for_a_while_and_named_then(joint
 
 @pytest.mark.parametrize("gap", [PERIOD, 0.05])
 def test_a_joint_that_moves_farther_than_its_speed_allows_is_a_fault(gap: float) -> None:
-    """The elbow may move at 2 rad/s for the gap and 20 ms more, and 50 mrad."""
+    """The elbow may move at 2 rad/s during the gap and for 20 ms more, plus 50 mrad."""
     allowed = 2.0 * (gap + 0.02) + 0.05
     for distance, expected in ((allowed - 1e-6, None), (allowed + 1e-6, ReasonKind.STATE_JUMPED)):
         joints = Joints()
@@ -112,13 +112,13 @@ def test_a_joint_that_moves_farther_than_its_speed_allows_is_a_fault(gap: float)
         assert joints.fault() is expected
 
 
-def test_simulated_time_that_passed_counts_where_it_is_longer_than_the_loop_s(joints: Joints) -> None:
+def test_simulated_time_since_the_last_state_counts_if_it_is_longer_than_the_loops_time(joints: Joints) -> None:
     joints.now += PERIOD
     joints.watch.observe(state(0.4, joints.now), joints.now, passed=0.2)
     assert joints.fault() is None
 
 
-def test_arms_that_creep_are_not_settled_and_arms_at_rest_are_after_the_settle_time() -> None:
+def test_arms_that_creep_are_not_settled_and_resting_arms_are_after_the_settle_time() -> None:
     watch, now = JointWatch(NAMES, LIMIT, watch_settings(SETTINGS, yields=False)), 0.0
     while now < 3.0 * SETTINGS.settle_time:
         now += PERIOD
@@ -162,7 +162,7 @@ def test_a_joint_away_from_its_reference_is_named_after_the_deviation_time(joint
     assert joints.watch.deviates(far, began + 1.0 + SETTINGS.deviation_time) is None
 
 
-def test_compliant_arms_may_be_pushed_farther_away() -> None:
+def test_compliant_arms_may_deviate_farther_from_their_reference() -> None:
     assert watch_settings(SETTINGS, yields=True).deviation == SETTINGS.max_deviation_torque
     assert watch_settings(SETTINGS, yields=False).deviation == SETTINGS.max_deviation
 

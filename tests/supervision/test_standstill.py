@@ -1,4 +1,4 @@
-"""A controller that stands still while joint states go on, against arms that only lag, turn round, or are not heard."""
+"""A controller that stands still while joint states go on, compared with arms that lag, reverse, or are not heard."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ from q2r2_control.types import Array, RobotState
 from tests.supervision.conftest import STRICT
 
 DT = 0.004
-WITHIN = 0.1  # after the controller has stopped [s]
+WITHIN = 0.1  # Longest time until the standstill is found [s].
 FROZEN_AT = 0.6  # [s]
 
 
 def swinging(speed: float, hertz: float) -> Callable[[float], Array]:
-    """Joints that begin at rest and go to and fro; ``speed`` is the greatest one [rad/s]."""
+    """Return joints that begin at rest and move to and fro; ``speed`` is the largest one [rad/s]."""
     turn = 2.0 * np.pi * hertz
     return lambda t: np.array([0.0, 1.0, -0.4]) * speed / turn * (1.0 - np.cos(turn * max(t, 0.0)))
 
 
 def ramp(speed: float, acceleration: float) -> Callable[[float], Array]:
-    """Joints that accelerate to a speed, and keep it."""
+    """Return joints that accelerate to a speed and keep it."""
     rise = speed / acceleration
 
     def at(t: float) -> Array:
@@ -58,7 +58,7 @@ def findings(
     ticks: Callable[[float], bool] = lambda t: True,
     state_period: float = DT,
 ) -> Iterator[float]:
-    """Times of findings about an arm that follows after ``delay`` and a first-order ``lag`` [s], until it is frozen.
+    """Return times of findings about an arm with a ``delay`` and a first-order ``lag`` [s], until it is frozen.
 
     Its controller keeps the command of when it was frozen. ``heard``: whether a state comes; ``ticks``: whether the
     loop ticks, without which the arm gets no command either.
@@ -67,7 +67,7 @@ def findings(
     seen, next_state = measured, 0.0
     for t in np.arange(0.0, seconds, DT):
         measured = measured + (command - measured) * (DT / lag)
-        if t < frozen_at and ticks(t):  # what is sent at a tick moves the arm until the next one
+        if t < frozen_at and ticks(t):  # A command of one tick moves the arm until the next one.
             command = asked(t - delay)
         if t >= next_state and heard(t):
             seen, stamp, next_state = measured, t, next_state + state_period
@@ -77,7 +77,7 @@ def findings(
 
 @pytest.mark.parametrize("speed", [0.4, 1.2, 2.0])
 @pytest.mark.parametrize("motion", [lambda speed: ramp(speed, 8.0), lambda speed: swinging(speed, 0.2)])
-def test_a_driver_that_stops_in_mid_motion_is_found_within_a_tenth_of_a_second(
+def test_a_driver_that_stops_during_motion_is_found_within_a_tenth_of_a_second(
     speed: float, motion: Callable[[float], Callable[[float], Array]]
 ) -> None:
     found = next(findings(JOINTS, motion(speed), lag=0.008, frozen_at=FROZEN_AT))
@@ -91,7 +91,7 @@ def test_a_driver_that_never_began_is_found_before_its_arm_is_far_behind() -> No
 
 
 @pytest.mark.parametrize(("limits", "allowed"), [(LAGGING_JOINTS, 0.3), (LAGGING_TOOL, 0.3)])
-def test_a_controller_that_may_lag_is_found_when_it_has_followed_and_stops(
+def test_a_controller_that_may_lag_is_found_if_it_has_followed_and_then_stops(
     limits: StandstillLimits, allowed: float
 ) -> None:
     found = next(findings(limits, ramp(0.6, 8.0), lag=0.03, frozen_at=FROZEN_AT))
@@ -110,14 +110,14 @@ LAGS = {
 @pytest.mark.parametrize(("limits", "delay", "lag"), LAGS.values(), ids=LAGS)
 @pytest.mark.parametrize("hertz", [0.1, 0.4, 1.0, 2.0])
 @pytest.mark.parametrize("speed", [0.3, 1.5])
-def test_an_arm_that_lags_is_not_taken_for_one_that_stands_where_it_begins_and_turns_round(
+def test_an_arm_that_lags_is_not_reported_as_standing_when_it_starts_or_reverses(
     limits: StandstillLimits, delay: float, lag: float, hertz: float, speed: float
 ) -> None:
     assert list(findings(limits, swinging(speed, hertz), seconds=6.0, delay=delay, lag=lag)) == []
 
 
 def test_nothing_is_judged_where_the_loop_or_the_states_have_a_gap() -> None:
-    """A loop that stood still sent nothing to follow; of an arm that is not heard nothing is known."""
+    """A loop that stood still sent no commands to follow. Nothing is known about an arm that is not heard."""
 
     def gap(t: float) -> bool:
         return not FROZEN_AT < t < FROZEN_AT + 0.08
@@ -130,7 +130,7 @@ def test_nothing_is_judged_where_the_loop_or_the_states_have_a_gap() -> None:
 
 
 def test_nothing_is_judged_before_a_whole_window_was_seen() -> None:
-    """The command runs away at once, and the arm is measured where it was."""
+    """The command moves away at once, while the measured arm stays."""
     watch, still = StandstillWatch(JOINTS), np.zeros(3)
     for step in range(40):
         t = step * DT
@@ -139,14 +139,14 @@ def test_nothing_is_judged_before_a_whole_window_was_seen() -> None:
     assert found is not None
 
 
-def test_states_that_come_fifty_times_a_second_are_enough() -> None:
+def test_fifty_states_a_second_are_enough() -> None:
     asked = ramp(1.2, 8.0)
     assert list(findings(JOINTS, asked, state_period=0.02)) == []
     assert next(findings(JOINTS, asked, state_period=0.02, lag=0.008, frozen_at=FROZEN_AT)) <= FROZEN_AT + 0.12
 
 
 class Cell:
-    """A supervisor of arms that another process moves, which is named ``/jtc``."""
+    """A supervisor of arms that another process named ``/jtc`` moves."""
 
     def __init__(self, robot: Robot, controller: CartesianController) -> None:
         self.tool = controller.tool_pose
@@ -169,9 +169,7 @@ class Cell:
             self.q = self.q + self.v * DT
 
 
-def test_both_arms_are_stopped_when_the_driver_of_one_stands_still(
-    robot: Robot, controller: CartesianController
-) -> None:
+def test_both_arms_are_stopped_if_the_driver_of_one_stands_still(robot: Robot, controller: CartesianController) -> None:
     cell = Cell(robot, controller)
     up = np.array([0.0, 0.0, 0.25])
     cell.run(0.2, up)

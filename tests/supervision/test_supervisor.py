@@ -1,4 +1,4 @@
-"""The rules by which the controller moves arms, with the real controller and without ROS or a clock."""
+"""The rules by which the controller moves arms, with the real controller but without ROS and without a clock."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ TOOL = pin.SE3(np.eye(3), np.array([0.5, 0.2, 0.4]))
 
 
 class World:
-    """A supervisor and arms that are where its references are, as long as they are not blocked."""
+    """A supervisor and arms that are at its references, unless they are blocked."""
 
     def __init__(self, robot: Robot, controller: CartesianController) -> None:
         self.streams = StreamSettings()
         self.supervisor, self.tool = Supervisor(robot, controller, self.streams, STRICT), controller.tool_pose
         self.q, self.now, self.blocked = robot.home.copy(), 0.0, False
-        self.v, self.lag = np.zeros_like(self.q), DT  # [s]
+        self.v, self.lag = np.zeros_like(self.q), DT  # Lag of the arms [s].
         self.commanded: list[Array | None] = []
 
     @property
     def states(self) -> list[str]:
-        """The activities of the left arm and the right one."""
+        """Return the activities of the left arm and the right one."""
         return [self.supervisor.arm_state(arm) for arm in ("left", "right")]
 
     def engage(self, by: float = 0.0, seconds: float = 0.3) -> pin.SE3:
-        """The left arm follows, and goes up ``by`` so much [m]; returns where it begins."""
+        """Let the left arm follow and move up ``by`` [m]. Return where it begins."""
         self.run(0.2)
         tool = self.tool("left")
         self.run(0.02, tool)
@@ -46,7 +46,7 @@ class World:
         return tool
 
     def engage_both(self) -> tuple[pin.SE3, pin.SE3]:
-        """Both arms follow; returns where their targets begin."""
+        """Let both arms follow. Return where their targets begin."""
         self.run(0.2)
         left, right = self.tool("left"), self.tool("right")
         self.run(0.1, left, right=right)
@@ -56,7 +56,7 @@ class World:
     def run(
         self, seconds: float, target: pin.SE3 | None = None, sees: bool = True, right: pin.SE3 | None = None
     ) -> None:
-        """Let time pass, with a steady target of the left arm and the ``right`` one, and with joint states or not."""
+        """Let time pass with a steady target of the left arm and the ``right`` one, with or without joint states."""
         zero = np.zeros_like(self.q)
         for _ in range(round(seconds / DT)):
             self.now += DT
@@ -81,10 +81,10 @@ def raised(pose: pin.SE3, by: float) -> pin.SE3:
     return pin.SE3(pose.rotation, pose.translation + np.array([0.0, 0.0, by]))
 
 
-def test_nothing_is_commanded_before_joint_states_are_good_and_at_rest(world: World, robot: Robot) -> None:
+def test_nothing_is_commanded_before_joint_states_are_valid_and_at_rest(world: World, robot: Robot) -> None:
     world.run(0.5, sees=False)
     assert world.commanded == [None] * len(world.commanded)
-    for step in range(50):  # pushed by somebody
+    for step in range(50):  # A person pushes the arm.
         world.q = robot.home + 0.005 * step
         world.run(0.008)
     assert world.states == ["inactive"] * 2
@@ -94,13 +94,13 @@ def test_nothing_is_commanded_before_joint_states_are_good_and_at_rest(world: Wo
     assert np.allclose(first, world.q, atol=1e-9)
 
 
-def test_where_targets_of_one_linked_arm_cease_both_hold_until_a_stream_of_each_begins_anew(world: World) -> None:
+def test_if_targets_of_one_linked_arm_end_both_hold_until_a_new_stream_of_each_begins(world: World) -> None:
     _, right = world.engage_both()
     world.run(0.3, right=raised(right, 0.01))
     assert not world.supervisor.follows("right")
     assert [reason.root.kind for reason in world.supervisor.targets.ended.values()] == ["targets_ceased"] * 2
     rest = world.tool("right")
-    world.run(1.0, right=raised(right, 0.02))  # the stream that goes on
+    world.run(1.0, right=raised(right, 0.02))  # The other stream goes on.
     assert np.allclose(world.tool("right").translation, rest.translation, atol=1e-6)
     world.run(0.2)
     world.run(0.1, world.tool("left"), right=world.tool("right"))
@@ -108,7 +108,7 @@ def test_where_targets_of_one_linked_arm_cease_both_hold_until_a_stream_of_each_
     assert world.supervisor.targets.ended == {}
 
 
-def test_a_target_that_comes_just_after_the_timeout_does_not_hide_that_targets_ceased(world: World) -> None:
+def test_a_target_just_after_the_timeout_does_not_hide_that_targets_had_ended(world: World) -> None:
     left, right = world.engage_both()
     for _ in range(3):
         world.now += 0.07
@@ -117,7 +117,7 @@ def test_a_target_that_comes_just_after_the_timeout_does_not_hide_that_targets_c
     assert world.states == ["following", "holding"]
 
 
-def test_two_publishers_of_one_linked_arm_hold_both(world: World) -> None:
+def test_two_publishers_for_one_linked_arm_stop_both_arms(world: World) -> None:
     left, _ = world.engage_both()
     for number in (100, 5):
         world.supervisor.update_target("left", left, world.now, number)
@@ -125,7 +125,7 @@ def test_two_publishers_of_one_linked_arm_hold_both(world: World) -> None:
 
 
 @pytest.mark.parametrize("linked", [True, False], ids=["that its sender ends", "of an arm that is not linked"])
-def test_a_stream_stops_its_own_arm_only(world: World, linked: bool) -> None:
+def test_a_stream_can_stop_only_its_own_arm(world: World, linked: bool) -> None:
     world.streams.linked = linked
     _, right = world.engage_both()
     if linked:
@@ -134,9 +134,9 @@ def test_a_stream_stops_its_own_arm_only(world: World, linked: bool) -> None:
     assert world.states == ["holding", "following"]
 
 
-def test_a_loop_that_stood_still_commands_nothing_and_follows_no_target_that_waited(world: World) -> None:
+def test_a_loop_that_stood_still_commands_nothing_and_follows_no_old_target(world: World) -> None:
     world.engage(by=0.1)
-    rest, before = world.q, len(world.commanded)  # where the robot has come to rest by itself, as far as it is known
+    rest, before = world.q, len(world.commanded)  # As far as is known, the robot has come to rest here by itself.
     waited = world.tool("left")
     world.now += 1.0
     world.supervisor.stalled(1.0, world.now)
@@ -201,7 +201,7 @@ def test_homing_ends_at_home_and_takes_no_targets(world: World) -> None:
     assert world.supervisor.arm_state("left") == "holding"
 
 
-def test_a_stream_that_was_followed_goes_on_anywhere_and_after_a_silence_only_from_the_tool() -> None:
+def test_a_stream_goes_on_anywhere_but_after_a_silence_only_from_the_tool() -> None:
     stream = TargetStream(StreamSettings())
     assert stream.offer(TOOL, [TOOL], 0.0) is None
     assert stream.offer(raised(TOOL, 0.2), [], 0.1) is None
@@ -212,14 +212,14 @@ def test_a_stream_that_was_followed_goes_on_anywhere_and_after_a_silence_only_fr
     assert not stream.following
 
 
-def test_targets_are_followed_no_longer_than_nothing_forbids_it(world: World) -> None:
+def test_targets_are_not_followed_any_more_when_a_reason_forbids_it(world: World) -> None:
     tool = world.engage()
     world.supervisor.paused = True
     assert kinds(world.supervisor.update_target("left", tool, world.now)) == "controller_paused"
     assert not world.supervisor.follows("left")
 
 
-def test_targets_that_begin_elsewhere_are_followed_once_they_jump_to_the_tool_or_after_a_silence() -> None:
+def test_targets_that_begin_elsewhere_are_followed_after_they_jump_to_the_tool_or_after_a_silence() -> None:
     passing, jumping, silent = (TargetStream(StreamSettings()) for _ in range(3))
     for step in range(100):
         assert passing.offer(raised(TOOL, 0.5 - 0.01 * step), [TOOL], 0.01 * step) is not None
@@ -228,11 +228,11 @@ def test_targets_that_begin_elsewhere_are_followed_once_they_jump_to_the_tool_or
         assert stream.offer(raised(TOOL, 0.2), [TOOL], 0.0) is not None
     assert jumping.offer(TOOL, [TOOL], 0.01) is None
     assert silent.offer(raised(TOOL, 0.04), [TOOL], 0.01) is not None
-    assert silent.offer(TOOL, [TOOL], 0.02) is not None  # came by within a hand's speed
+    assert silent.offer(TOOL, [TOOL], 0.02) is not None  # The target reached the tool at a hand's speed.
     assert silent.offer(TOOL, [TOOL], 0.2) is None
 
 
-def test_a_stream_that_was_dropped_is_not_taken_up_again_where_it_stands() -> None:
+def test_a_stream_that_was_dropped_does_not_continue_where_it_stands() -> None:
     stream = TargetStream(StreamSettings())
     assert stream.offer(TOOL, [TOOL], 0.0) is None
     stream.drop()
@@ -243,7 +243,7 @@ def test_a_stream_that_was_dropped_is_not_taken_up_again_where_it_stands() -> No
 
 def test_arms_that_nothing_moves_are_noticed_and_a_new_receiver_gets_no_jump(world: World) -> None:
     tool = world.engage()
-    world.blocked = True  # what moved the arms is gone
+    world.blocked = True  # The program that moved the arms is gone.
     world.run(0.3, raised(tool, 0.06))
     last = world.commanded[-1]
     assert last is not None
@@ -257,7 +257,7 @@ def test_arms_that_nothing_moves_are_noticed_and_a_new_receiver_gets_no_jump(wor
     assert all(np.abs(q - world.q).max() < 1e-6 for q in world.commanded[began:] if q is not None)
 
 
-def test_arms_that_brake_go_on_braking_when_their_receiver_is_gone(world: World) -> None:
+def test_braking_arms_go_on_braking_when_their_receiver_is_gone(world: World) -> None:
     world.engage(by=0.1)
     world.supervisor.stop(Reason(ReasonKind.OTHER))
     world.supervisor.let_go(Reason(ReasonKind.OTHER), world.now)
@@ -270,7 +270,7 @@ def test_arms_that_brake_go_on_braking_when_their_receiver_is_gone(world: World)
     assert kinds(world.supervisor.fault) == "other"
 
 
-def test_arms_that_lag_behind_the_commands_are_not_off_their_reference(world: World) -> None:
+def test_arms_that_lag_behind_the_commands_do_not_deviate_from_their_reference(world: World) -> None:
     tool = world.engage()
     world.lag = 0.06
     deviation = 0.0
@@ -283,7 +283,7 @@ def test_arms_that_lag_behind_the_commands_are_not_off_their_reference(world: Wo
     assert world.supervisor.follows("left")
 
 
-def test_arms_that_brake_near_each_other_rest_when_their_stop_ends_and_make_no_room_by_themselves(
+def test_arms_that_brake_near_each_other_rest_at_the_end_of_their_stop_and_do_not_move_apart_by_themselves(
     world: World, controller: CartesianController
 ) -> None:
     world.q = np.array([-0.8, 0.42, -0.69, -1.49, 0.43, 1.12, -0.28, 0.52, 0.47, 0.18, -1.31, -0.02, 1.32, 0.36])

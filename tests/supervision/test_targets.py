@@ -1,4 +1,4 @@
-"""Messages of frozen senders and of two publishers are found, and even motion stays even in a loop of other times."""
+"""Messages of frozen senders and of two publishers are found. Even motion stays even in a loop with other ticks."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ ALLOWED, PERIOD, USUAL = 0.15, 0.01, 0.0004  # [s]
 
 
 class Stream:
-    """Messages of a sender whose clock is ahead by ``offset`` [s] and gains ``drift`` seconds a second."""
+    """Messages of a sender whose clock is ahead by ``offset`` [s] and gains ``drift`` seconds per second."""
 
     def __init__(self, offset: float, drift: float = 0.0) -> None:
         self._watch, self.offset, self._drift = DelayWatch(ALLOWED), offset, drift
@@ -31,14 +31,14 @@ class Stream:
 
 
 @pytest.mark.parametrize("offset", [0.0, 3600.0, -3600.0])
-def test_only_the_message_that_a_frozen_sender_finishes_is_late(offset: float) -> None:
+def test_only_the_message_that_a_frozen_sender_completes_is_late(offset: float) -> None:
     stream = Stream(offset)
     assert not any(stream.take() for _ in range(100))
     assert stream.take(extra=1.0, after=1.0) == pytest.approx(1.0, abs=2e-3)
     assert not any(stream.take() for _ in range(100))
 
 
-def test_a_message_that_waits_on_the_network_for_less_than_is_allowed_is_used() -> None:
+def test_a_message_that_waits_on_the_network_for_less_than_allowed_is_used() -> None:
     stream, random = Stream(0.0), np.random.default_rng(3)
     assert not any(stream.take(extra=extra) for extra in random.uniform(0.0, 0.9 * ALLOWED, 1000))
 
@@ -50,7 +50,7 @@ def test_clocks_that_drift_apart_for_a_day_make_no_message_late(drift: float) ->
 
 
 @pytest.mark.parametrize("by", [-5.0, 5.0])
-def test_after_a_clock_was_set_messages_are_used_again_within_little_more_than_a_second(by: float) -> None:
+def test_after_a_change_of_a_clock_messages_are_used_again_within_little_more_than_a_second(by: float) -> None:
     stream = Stream(0.0)
     assert not any(stream.take() for _ in range(100))
     stream.offset += by
@@ -59,7 +59,7 @@ def test_after_a_clock_was_set_messages_are_used_again_within_little_more_than_a
     assert not any(late[105:])
 
 
-def test_where_the_middleware_knows_no_delay_no_message_is_late_and_none_that_is_known_becomes_so() -> None:
+def test_if_the_middleware_knows_no_delay_no_message_becomes_late() -> None:
     watch = DelayWatch(ALLOWED)
     assert [watch.take(delay, now) for now, delay in enumerate((-math.inf, USUAL, math.nan, USUAL))] == [0.0] * 4
 
@@ -70,13 +70,13 @@ def breaks(numbers: list[int]) -> list[int]:
 
 
 @pytest.mark.parametrize("other", [1, 205, 90_000], ids=["younger", "almost in step", "older"])
-def test_two_publishers_that_take_turns_break_the_numbers_at_the_third_message_and_the_fifth(other: int) -> None:
+def test_two_publishers_that_alternate_break_the_numbers_at_the_third_and_fifth_message(other: int) -> None:
     found = breaks([number for step in range(20) for number in (200 + step, other + step)])
     assert found[2] >= 1
     assert all(count >= 2 for count in found[4:])
 
 
-def test_one_publisher_may_lose_numbers_and_one_that_takes_over_is_one_break_and_forgotten_after_a_while() -> None:
+def test_one_publisher_may_lose_numbers_and_a_new_publisher_is_one_break_that_is_forgotten() -> None:
     assert not any(breaks([7, 8, 9, 20, 21, 60, 61]))
     found = breaks([*range(500, 520), *range(1, 150)])
     assert found[19:21] == [0, 1]
@@ -84,21 +84,21 @@ def test_one_publisher_may_lose_numbers_and_one_that_takes_over_is_one_break_and
     assert found[-1] == 0
 
 
-def test_a_break_counts_for_one_second_and_a_message_that_comes_twice_is_one() -> None:
+def test_a_break_counts_for_one_second_and_a_repeated_message_is_one_break() -> None:
     watch = SequenceWatch()
     found = [watch.take(number, now, STREAM_TIMEOUT) for number, now in ((5, 0.0), (5, 0.1), (6, 0.2), (6, 0.3))]
     assert found == [0, 1, 1, 2]
     assert [watch.take(7 + k, 0.35 + 0.1 * k, STREAM_TIMEOUT) for k in range(12)] == [2] * 8 + [1, 1, 0, 0]
 
 
-def test_numbers_begin_anew_after_a_silence_for_who_was_started_again() -> None:
+def test_numbers_of_a_restarted_publisher_begin_again_after_a_silence() -> None:
     watch = SequenceWatch()
     for number in range(100):
         watch.take(number, PERIOD * number, STREAM_TIMEOUT)
     assert watch.take(1, PERIOD * 99 + STREAM_TIMEOUT + 0.01, STREAM_TIMEOUT) == 0
 
 
-SENDER, LOOP = 0.005, 0.004  # periods [s]
+SENDER, LOOP = 0.005, 0.004  # Periods of the sender and of the loop [s].
 SPEED, RADIUS = 0.3, 0.1  # [m/s], [m]
 
 
@@ -109,7 +109,7 @@ def circling(t: float) -> pin.SE3:
 
 
 def played(pose: Callable[[float], pin.SE3], until: float, *, lines: bool, jitter: float = 4e-4) -> list[pin.SE3]:
-    """The loop's target at each tick, where both tick late by up to ``jitter`` [s] and messages take as long."""
+    """Return the loop's target at each tick. Both tick late by up to ``jitter`` [s], and messages take as long."""
     random, line, clock = np.random.default_rng(0), TargetExtrapolator(), TickClock(LOOP)
     sent = [SENDER * k + random.uniform(0.0, jitter) for k in range(int(until / SENDER))]
     received = [t + 5e-4 + random.uniform(0.0, jitter) for t in sent]
@@ -125,17 +125,17 @@ def played(pose: Callable[[float], pin.SE3], until: float, *, lines: bool, jitte
 
 
 def ripple(targets: list[pin.SE3]) -> float:
-    """RMS of the speed about its mean, as a share of it, once it goes on evenly."""
+    """Return the RMS deviation of the speed from its mean, divided by the mean, after the start."""
     speeds = np.linalg.norm(np.diff([target.translation for target in targets[20:]], axis=0), axis=1)
     return float(np.std(speeds) / np.mean(speeds))
 
 
-def test_an_even_motion_leaves_evenly_and_without_lines_it_does_not() -> None:
+def test_an_even_motion_stays_even_which_it_does_not_without_interpolation() -> None:
     assert ripple(played(circling, 3.0, lines=True)) < 0.02
     assert ripple(played(circling, 3.0, lines=False)) > 0.3
 
 
-def test_the_way_is_the_targets_own() -> None:
+def test_the_path_is_that_of_the_targets() -> None:
     for found in played(circling, 3.0, lines=True)[10:]:
         middle = found.translation - np.array([0.5, 0.0, 0.4])
         assert np.linalg.norm(middle) == pytest.approx(RADIUS, abs=2e-4)
@@ -146,7 +146,7 @@ def test_the_way_is_the_targets_own() -> None:
         assert abs(turned) < 2e-3
 
 
-def test_a_step_is_no_motion_that_goes_on() -> None:
+def test_a_jump_is_not_continued_as_a_motion() -> None:
     line, low = TargetExtrapolator(), pin.SE3.Identity()
     high = pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.002]))
     for k in range(20):
@@ -157,7 +157,7 @@ def test_a_step_is_no_motion_that_goes_on() -> None:
         assert found.translation[2] in (0.0, 0.002)
 
 
-def test_a_motion_goes_on_for_no_longer_than_its_targets_may_be_late() -> None:
+def test_a_motion_continues_only_as_long_as_its_targets_may_be_late() -> None:
     line, velocity = TargetExtrapolator(), np.array([0.3, 0.0, 0.0])
     for k in range(10):
         line.put(pin.SE3(np.eye(3), velocity * k * SENDER), k * SENDER)
@@ -167,7 +167,7 @@ def test_a_motion_goes_on_for_no_longer_than_its_targets_may_be_late() -> None:
 
 
 @pytest.mark.parametrize("stamps", [[0.0] * 10, [5e-6 * k for k in range(10)], [0.1 * k for k in range(10)]])
-def test_stamps_that_say_nothing_let_targets_be_taken_as_they_are(stamps: list[float]) -> None:
+def test_with_useless_stamps_targets_are_used_as_they_come(stamps: list[float]) -> None:
     line = TargetExtrapolator()
     for k, stamp in enumerate(stamps):
         target = circling(k * SENDER)
@@ -175,7 +175,7 @@ def test_stamps_that_say_nothing_let_targets_be_taken_as_they_are(stamps: list[f
         assert line.at(stamp + 0.004) is target
 
 
-def test_a_target_that_is_due_before_the_last_one_is_taken_as_it_is() -> None:
+def test_a_target_that_is_due_before_the_last_one_is_used_as_it_is() -> None:
     line = TargetExtrapolator()
     for k in range(10):
         line.put(circling(k * SENDER), k * SENDER)
@@ -185,7 +185,7 @@ def test_a_target_that_is_due_before_the_last_one_is_taken_as_it_is() -> None:
     assert line.at(5 * SENDER) is older
 
 
-def test_a_new_stream_owes_nothing_to_the_one_before() -> None:
+def test_a_new_stream_does_not_depend_on_the_one_before() -> None:
     line = TargetExtrapolator()
     for k in range(5):
         line.put(circling(k * SENDER), k * SENDER)

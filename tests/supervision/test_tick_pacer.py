@@ -1,4 +1,4 @@
-"""Late ticks move nothing farther than its limits allow, and targets become motion that keeps limits at every step."""
+"""Late ticks move nothing beyond its limits, and targets become motion that keeps its limits at every step."""
 
 from __future__ import annotations
 
@@ -20,7 +20,9 @@ LIMIT = np.array([1.7, 3.1])
 
 
 @given(gap=st.floats(1e-6, 10.0), shares=st.tuples(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0)))
-def test_no_joint_can_go_farther_than_in_one_period_at_its_limit(gap: float, shares: tuple[float, float]) -> None:
+def test_no_joint_can_move_farther_in_a_tick_than_in_one_period_at_its_limit(
+    gap: float, shares: tuple[float, float]
+) -> None:
     v = LIMIT * np.array(shares)
     step = TickPacer(PERIOD, LIMIT, ACCELERATION).step(gap, v)
     assert min(gap, PERIOD) <= step * (1.0 + 1e-9)
@@ -30,7 +32,7 @@ def test_no_joint_can_go_farther_than_in_one_period_at_its_limit(gap: float, sha
         assert (farthest <= LIMIT * PERIOD * (1.0 + 1e-9)).all()
 
 
-def test_a_tick_in_time_passes_to_the_bit_and_a_clock_that_stands_or_goes_back_moves_nothing() -> None:
+def test_a_punctual_tick_passes_unchanged_and_a_clock_that_stands_or_goes_back_moves_nothing() -> None:
     pacer = TickPacer(PERIOD, LIMIT, ACCELERATION)
     assert [pacer.step(gap, LIMIT) for gap in (PERIOD, 0.3 * PERIOD, 0.0, -1.0)] == [PERIOD, 0.3 * PERIOD, 0.0, 0.0]
     assert pacer.missed_ticks == 0
@@ -47,7 +49,7 @@ def test_slow_motion_catches_up_and_fast_motion_is_stretched_and_counted() -> No
     assert fast.missed_ticks == 24
 
 
-def test_a_busy_machines_ticks_are_even_and_on_time() -> None:
+def test_the_ticks_of_a_busy_machine_are_even_and_on_time() -> None:
     clock, random = TickClock(PERIOD), np.random.default_rng(1)
     ran = PERIOD * np.arange(2000) + random.uniform(0.0, 6e-4, 2000)
     counted = np.array([clock.at(t) for t in ran])
@@ -63,7 +65,7 @@ def ten_ticks() -> TickClock:
 
 
 @pytest.mark.parametrize("late", [0.4, 1.7, 20.3])
-def test_a_late_tick_counts_for_all_that_were_due_and_those_that_hurry_after_it_for_nothing(late: float) -> None:
+def test_a_late_tick_counts_for_all_due_ticks_and_those_that_follow_quickly_for_none(late: float) -> None:
     clock = ten_ticks()
     due = 10 + round(late)
     assert clock.at((10 + late) * PERIOD) == pytest.approx(due * PERIOD, abs=0.02 * PERIOD)
@@ -73,7 +75,7 @@ def test_a_late_tick_counts_for_all_that_were_due_and_those_that_hurry_after_it_
 
 
 @pytest.mark.parametrize("gap", [0.2, -0.02])
-def test_time_begins_anew_after_a_long_gap_and_where_it_was_set_back(gap: float) -> None:
+def test_time_begins_again_after_a_long_gap_and_after_the_clock_was_set_back(gap: float) -> None:
     clock = ten_ticks()
     now = 9 * PERIOD + gap
     assert clock.at(now) == now
@@ -108,14 +110,14 @@ class Watched:
         return self.guard.pose
 
     def step(self, target: pin.SE3 | None, dt: float = DT) -> pin.SE3:
-        if self.now + dt - self.now > LONGEST_DT:  # what follows it has come to rest
+        if self.now + dt - self.now > LONGEST_DT:  # The target has come to rest in this time.
             self.velocity = np.zeros(3), np.zeros(3)
         before, last = self.pose, self.velocity
         self.now += dt
         after = self.guard.step(target, self.now)
         assert after is not None
         ways = after.translation - before.translation, pin.log3(after.rotation @ before.rotation.T)
-        if dt > self._period:  # late: a step moves it by no more than a period allows
+        if dt > self._period:  # A late step moves the target by no more than a period allows.
             for way, fastest in zip(ways, FASTEST, strict=True):
                 assert math.hypot(*way) <= fastest * self._period * (1 + 1e-6) + 1e-9
             speeds = np.array([math.hypot(*velocity) for velocity in last])
@@ -129,7 +131,7 @@ class Watched:
 
 
 def moving() -> Watched:
-    """A guard that follows a target at 0.4 m/s."""
+    """Return a guard that follows a target at 0.4 m/s."""
     watched = Watched()
     for step in range(1, 101):
         watched.step(pose(0.4 * DT * step))
@@ -138,12 +140,12 @@ def moving() -> Watched:
 
 
 def circle(t: float, radius: float, period: float) -> pin.SE3:
-    """A circle through the origin that sets off within half a second, turning on its way."""
+    """Return a circle through the origin that starts within half a second, with rotation on its way."""
     phase = 2 * math.pi / period * (t * t if t < 0.5 else t - 0.25)
     return pose(radius * (math.cos(phase) - 1), radius * math.sin(phase), 0.0, (0.0, 0.0, 0.5 * math.sin(phase)))
 
 
-def test_what_was_left_to_brake_on_is_not_moved_after_a_gap_in_which_all_came_to_rest() -> None:
+def test_the_remaining_braking_motion_is_dropped_after_a_gap_in_which_everything_came_to_rest() -> None:
     watched = moving()
     held = watched.pose
     assert watched.step(None, 1.01 * LONGEST_DT).isApprox(held, 1e-12)
@@ -151,7 +153,7 @@ def test_what_was_left_to_brake_on_is_not_moved_after_a_gap_in_which_all_came_to
     assert watched.step(None).isApprox(held, 1e-12)
 
 
-def test_the_first_pose_is_that_of_the_reset_exactly_and_stays_while_the_clock_does_not_advance() -> None:
+def test_the_first_pose_is_exactly_that_of_the_reset_and_stays_while_the_clock_does_not_advance() -> None:
     start = pose(0.3, -0.2, 0.7, (0.1, 2.0, -0.4))
     watched = Watched(start)
     first = watched.step(start)
@@ -170,7 +172,7 @@ def test_a_motion_within_the_limits_is_followed_without_lag() -> None:
 
 
 @pytest.mark.parametrize("dt", [0.002, 0.02])
-def test_a_step_is_reached_without_overshoot_in_the_time_that_the_limits_take(dt: float) -> None:
+def test_a_jump_is_followed_without_overshoot_in_the_time_that_the_limits_require(dt: float) -> None:
     watched, goal = Watched(period=dt), pose(0.4, 0.0, 0.0, (0.0, 0.0, 1.0))
     fastest = 0.4 / LIMITS.max_velocity + LIMITS.max_velocity / LIMITS.max_acceleration
     for _ in range(math.ceil(fastest / dt) + 4):
@@ -181,7 +183,7 @@ def test_a_step_is_reached_without_overshoot_in_the_time_that_the_limits_take(dt
     assert watched.guard.clipped > 0
 
 
-def test_without_a_target_it_brakes_and_rests() -> None:
+def test_without_a_target_the_guard_brakes_and_rests() -> None:
     watched = moving()
     for _ in range(math.ceil(0.4 / LIMITS.max_acceleration / DT) + 1):
         watched.step(None)
@@ -192,7 +194,7 @@ def test_without_a_target_it_brakes_and_rests() -> None:
 
 
 @pytest.mark.parametrize("entry", [(0, 3), (2, 1)], ids=["of its position", "of its rotation"])
-def test_a_target_with_one_number_that_is_not_finite_is_held_off(entry: tuple[int, int]) -> None:
+def test_a_target_with_one_number_that_is_not_finite_is_refused(entry: tuple[int, int]) -> None:
     watched, matrix = moving(), pose(0.1, 0.0, 0.0, (0.3, -2.0, 1.0)).homogeneous
     matrix[entry] = math.nan
     for _ in range(50):
@@ -219,7 +221,7 @@ def test_no_sequence_of_targets_breaks_a_limit(
     assert watched.guard.at_rest
 
 
-def test_limits_that_are_lowered_in_motion_brake_the_pose_at_the_acceleration_and_count_from_then_on() -> None:
+def test_lower_limits_during_motion_brake_the_pose_at_the_acceleration_and_hold_from_then_on() -> None:
     watched, velocities = Watched(), []
     for tick in range(1, 121):
         if tick == 41:
