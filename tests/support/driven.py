@@ -1,4 +1,4 @@
-"""A controller that is driven from a start on, with its contract checked at every tick."""
+"""A controller in a run from a start on, with its contract checked at every tick."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from q2r2_control.types import Array, Reference
 from q2r2_control.verification.contract import Contract
 
 Targets = Mapping[str, pin.SE3 | None]
-# Of the time since the start [s] and the tools there.
+# The arguments are the time since the start [s] and the tools at the start.
 Scenario = Callable[[float, Mapping[str, pin.SE3]], Targets]
 
 
 class Driven:
-    """One run, which starts at home or at ``q`` and ``v``; ``options`` are those of the contract."""
+    """A run that starts at home or at ``q`` and ``v``; ``options`` are those of the contract."""
 
     def __init__(
         self,
@@ -37,7 +37,7 @@ class Driven:
         self.q, self.v, self.a = q, np.zeros_like(q) if v is None else v, np.zeros_like(q)
 
     def drive(self, seconds: float, towards: Scenario | Targets | None = None) -> Reference:
-        """The reference after ``seconds`` towards targets that stay or move."""
+        """Return the reference after ``seconds`` towards targets that stay or move."""
         for _ in range(max(round(seconds / self.dt), 1)):
             targets = towards(self.ticks * self.dt, self.start) if callable(towards) else towards or {}
             reference = self.controller.step(targets, self.dt)
@@ -47,7 +47,7 @@ class Driven:
         return reference
 
     def set_opening(self, arm: str, least: float, greatest: float) -> tuple[str, str] | None:
-        """As the controller's; the contract knows of it too."""
+        """Call the method of the controller, and tell the contract."""
         refused = self.controller.set_opening(arm, least, greatest)
         self.contract.set_openings(self.controller.openings)
         return refused

@@ -1,4 +1,4 @@
-"""The shipped cell with a commented block in force, as its own comment says how."""
+"""The shipped cell with a commented block switched on, as the block's own comment describes."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ CELL = Path(__file__).resolve().parents[2] / "config" / "dual_iiwa7.yaml"
 
 
 def external_text() -> str:
-    """The YAML with its block ``external``, and with all its other comments."""
+    """Return the YAML with its block ``external`` and all other comments."""
     text = _uncommented("external", CELL.read_text(encoding="utf-8"))
     assert "controller: builtin " in text
     return text.replace("controller: builtin ", "controller: external ")
 
 
 def robot_text() -> str:
-    """The YAML with its block ``robot``, and with all its other comments."""
+    """Return the YAML with its block ``robot`` and all other comments."""
     return _uncommented("robot", CELL.read_text(encoding="utf-8").replace("robot: null ", "# "))
 
 
@@ -29,6 +29,6 @@ def _uncommented(key: str, text: str) -> str:
 
 
 def external() -> dict[str, Any]:
-    """Its text."""
+    """Return the text of the cell."""
     data: dict[str, Any] = yaml.safe_load(external_text())
     return data

@@ -25,11 +25,11 @@ RATE_HZ = 75.0
 DIALECTS = ("ros1", "ros2")
 KEEPALIVE = b"\0\0\0\0\0\0\0\0"
 TOPICS = {"pose": "geometry_msgs/PoseStamped", "twist": "geometry_msgs/Twist", "inputs": "quest2ros/OVR2ROSInputs"}
-NOISE = 1e-6  # of a position, too little for anything but telling a hand at rest from a frozen pose [m]
+NOISE = 1e-6  # Noise of a position [m]. It is so small that it only distinguishes a hand at rest from a frozen pose.
 
 
 class FakeHeadset:
-    """One connection of a headset. ``slash`` writes topics with a leading slash; ``source`` is its own address."""
+    """A connection of a headset. With ``slash``, topics have a leading slash; ``source`` is the headset's address."""
 
     def __init__(
         self,
@@ -43,7 +43,7 @@ class FakeHeadset:
         self._slash = "/" if slash else ""
         self._received = bytearray()
         deadline, here = time.monotonic() + connect_timeout, (source, 0) if source else None
-        while True:  # tries again while nobody listens, as the app does
+        while True:  # Like the app, this tries again while no server listens.
             try:
                 self.socket = socket.create_connection(address, timeout=None, source_address=here)
                 break
@@ -54,12 +54,12 @@ class FakeHeadset:
         self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def frame(self, destination: str, payload: bytes) -> bytes:
-        """A frame as this dialect's client writes it."""
+        """Return a frame as this dialect's client writes it."""
         name = destination.encode() + (b"\0" if self.dialect == "ros2" else b"")
         return struct.pack(f"<I{len(name)}sI", len(name), name, len(payload)) + payload
 
     def command(self, name: str, **parameters: object) -> bytes:
-        """A system command; JSON ends with NUL in the ROS2 dialect."""
+        """Return a system command. In the ROS 2 dialect, its JSON ends with NUL."""
         text = json.dumps(parameters, separators=(",", ":")).encode()
         return self.frame(name, text + (b"\0" if self.dialect == "ros2" else b""))
 
@@ -67,7 +67,9 @@ class FakeHeadset:
         return f"{self._slash}q2r_{hand}_hand_{suffix}"
 
     def registrations(self) -> bytes:
-        """The app's first messages after connecting: a keepalive, its topics, and a question for the server's."""
+        """Return the app's first messages after connecting: a keepalive, its topics, and a request for the server's
+        topics.
+        """
         parts = [KEEPALIVE]
         for hand in SIDES:
             for suffix, kind in TOPICS.items():
@@ -92,7 +94,7 @@ class FakeHeadset:
         self.socket.sendall(data)
 
     def read_frame(self, timeout: float = 5.0) -> tuple[str, bytes] | None:
-        """Next frame from the server that is no keepalive, None at the end. Raises TimeoutError."""
+        """Return the next frame from the server that is no keepalive, or None at the end. Raises TimeoutError."""
         deadline = time.monotonic() + timeout
         while True:
             frame = self._cut_frame()
@@ -112,7 +114,7 @@ class FakeHeadset:
             self._received += data
 
     def read_until(self, destination: str, timeout: float = 5.0) -> bytes:
-        """Payload of the next frame with ``destination``, skipping others. Raises TimeoutError or ConnectionError."""
+        """Return the payload of the next frame with ``destination``. Raises TimeoutError or ConnectionError."""
         deadline = time.monotonic() + timeout
         while (frame := self.read_frame(max(deadline - time.monotonic(), 0.001))) is not None:
             if frame[0] == destination:
@@ -120,7 +122,7 @@ class FakeHeadset:
         raise ConnectionError(f"the server closed before it sent {destination}")
 
     def discard_received(self) -> None:
-        """Throw away what the server has sent so far."""
+        """Discard what the server has sent so far."""
         self._received.clear()
         with suppress(BlockingIOError):
             while self.socket.recv(1 << 16, socket.MSG_DONTWAIT):
@@ -157,7 +159,7 @@ class FakeHeadset:
 def pack_pose(
     dialect: str, position: Vector, quaternion: Quaternion, frame_id: str = "", stamp: tuple[int, int] = (12, 500)
 ) -> bytes:
-    """``stamp``: of the headset's own clock [s], [ns]."""
+    """Return the bytes of a pose; ``stamp`` is that of the headset's own clock [s], [ns]."""
     numbers = struct.pack("<7d", *position, *quaternion)
     name = frame_id.encode()
     if dialect == "ros1":
@@ -179,7 +181,7 @@ def pack_inputs(
 
 
 def main() -> int:
-    """Play scripted hands at RATE_HZ in real time, to a server which may close first."""
+    """Play scripted hands at RATE_HZ in real time to a server, which may close first."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--port", type=int, required=True)
     parser.add_argument("--duration", type=float, default=20.0, help="[s]")

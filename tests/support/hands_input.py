@@ -1,4 +1,4 @@
-"""An input whose hands follow given paths: engaged by a press early on, 75 samples a second."""
+"""An input whose hands follow given paths. An early press engages both arms, and 75 samples come in a second."""
 
 from __future__ import annotations
 
@@ -11,13 +11,14 @@ from q2r2_control.types import QUEST_CONTROLS, SIDES, Array, HandInputs, HandSam
 
 PERIOD = 1.0 / 75.0  # [s]
 PRESSED, RELEASED = 0.1, 0.2  # [s]
-ENGAGED = 0.3  # both arms follow their hands from here on [s]
+ENGAGED = 0.3  # From this time on, both arms follow their hands [s].
 
-Path = Callable[[float], Array]  # time [s] -> (6,) position [m] and rotation vector [rad] of a hand
+# A function of time [s] that returns position [m] and rotation vector [rad] of a hand (6,).
+Path = Callable[[float], Array]
 
 
 class HandsInput:
-    """Both hands along paths of position and rotation vector; a hand without one stays where it is."""
+    """Hands along paths of position and rotation vector. A hand without a path stays where it is."""
 
     controls = QUEST_CONTROLS
 

@@ -1,4 +1,5 @@
-"""An operator whose headset sends over TCP in simulated time: what was sent by a tick has arrived when it polls.
+"""An operator whose headset sends over TCP in simulated time. Everything that was sent by a tick has arrived at its
+poll.
 
 Outcomes then do not depend on how fast the machine is. A script is a generator that changes the operator and yields the
 times to wait [s]; the run ends with it.
@@ -24,21 +25,21 @@ from tests.support.headset_server import eventually
 from tests.support.processes import Watch, cell
 from tests.support.reasons import kinds
 
-START = {"left": (0.3, 0.2, 1.1), "right": (0.3, -0.2, 1.1)}  # of the hands [m]
-PERIOD = 1.0 / 72.0  # of samples [s]
-PRESS = 0.12  # longer than a chord's window [s]
-NOISE = 2e-5  # of a position [m]
-_PATIENCE = 60.0  # of the machine's time [s]
-_AT_REST = 0.5  # after an arm was let go, it has braked [s]
-_CREEP = 1e-5  # of an arm that is held where it stopped [m]
-_FASTEST, _FASTEST_TURN = 2.0, 8.0  # of a target [m/s], [rad/s]
+START = {"left": (0.3, 0.2, 1.1), "right": (0.3, -0.2, 1.1)}  # Positions of the hands [m].
+PERIOD = 1.0 / 72.0  # Period of samples [s].
+PRESS = 0.12  # Duration of a press, which is longer than a chord's window [s].
+NOISE = 2e-5  # Noise of a position [m].
+_PATIENCE = 60.0  # Longest wait in real time [s].
+_AT_REST = 0.5  # Time after which an arm that was released has braked [s].
+_CREEP = 1e-5  # Largest motion of an arm that is held where it stopped [m].
+_FASTEST, _FASTEST_TURN = 2.0, 8.0  # Largest speed [m/s] and angular speed [rad/s] of a target.
 
 Script = Callable[["Operator"], Iterator[float]]
-Sender = Callable[[str, Array, Array], bytes | None]  # of hand, position and quaternion
+Sender = Callable[[str, Array, Array], bytes | None]  # The arguments are hand, position and quaternion.
 
 
 class Operator:
-    """The changes of the script. Hands are where ``hands`` says, in a frame that is at ``frame``."""
+    """The operator whom the script changes. Hands are at ``hands`` in a frame that is at ``frame``."""
 
     def __init__(self, server: HeadsetServer, plant: MujocoPlant) -> None:
         self.plant = plant
@@ -49,7 +50,7 @@ class Operator:
         self.grip: set[str] = set()
         self.period = PERIOD
         self.silent = False
-        self.held_up = False  # by the network, which delivers in order and all at once later
+        self.held_up = False  # If True, the network holds messages, and later delivers all of them at once in order.
         self.send_pose: Sender = self.pose
         self.noise = NOISE
         self.headset: FakeHeadset | None = None
@@ -64,14 +65,14 @@ class Operator:
         self.headset.read_until("__topic_list", _PATIENCE)
 
     def pose(self, hand: str, position: Array, quaternion: Array, stamp: tuple[int, int] = (12, 500)) -> bytes:
-        """The bytes of a pose."""
+        """Return the bytes of a pose."""
         assert self.headset is not None
         x, y, z = position.tolist()
         qx, qy, qz, qw = quaternion.tolist()
         return self.headset.pose(hand, (x, y, z), (qx, qy, qz, qw), stamp=stamp)
 
     def send(self) -> None:
-        """Both hands' poses and buttons; returns when the server has read them."""
+        """Send both hands' poses and buttons, and return when the server has read them."""
         if self.headset is None or self.silent:
             return
         frames = []
@@ -88,20 +89,20 @@ class Operator:
             self.wait_until_read()
 
     def lose(self, end: Callable[[FakeHeadset], None]) -> None:
-        """End the connection, which the server has noticed behind this."""
+        """End the connection. After that, the server has noticed it."""
         assert self.headset is not None
         end(self.headset)
         self.headset = None
         eventually(lambda: self._server.statistics.peer is None)
 
     def wait_until_read(self) -> None:
-        """The server answers in the order in which it was asked."""
+        """Wait until the server has read all messages, which it answers in their order."""
         assert self.headset is not None
         self.headset.send(self.headset.command("__topic_list"))
         self.headset.read_until("__topic_list", _PATIENCE)
 
     def press(self, *hands: str) -> Iterator[float]:
-        """The lower buttons, which engage and pause."""
+        """Press the lower buttons, which engage and pause."""
         self.lower |= set(hands)
         yield PRESS
         self.lower -= set(hands)
@@ -114,7 +115,10 @@ class Operator:
     def move(
         self, way: Iterable[float], turn: Iterable[float] = (0.0, 0.0, 0.0), seconds: float = 0.6
     ) -> Iterator[float]:
-        """Both hands, as people reach; the right one goes by 0.9 of the way, as human hands never move as one."""
+        """Move both hands as people reach.
+
+        The right hand moves by 0.9 of the way, because human hands are never rigid.
+        """
         steps, starts = max(round(seconds / PERIOD), 1), dict(self.hands)
         whole = pin.Motion(np.array(list(way)), np.array(list(turn)))
         for index in range(1, steps + 1):
@@ -126,7 +130,7 @@ class Operator:
 
 
 class HeadsetInStep:
-    """The input of a run: the server, and the operator that the script plays."""
+    """The input of a run: the server, and the operator whom the script controls."""
 
     controls = QUEST_CONTROLS
 
@@ -174,7 +178,7 @@ class HeadsetInStep:
 
 
 class InStepRun:
-    """A whole run of a script: its ticks and events. The contract held at every one, and no arm caught up."""
+    """A whole run of a script with its ticks and events. The contract held at every tick, and no arm caught up."""
 
     def __init__(
         self,
@@ -199,16 +203,16 @@ class InStepRun:
 
     @property
     def ticks(self) -> list[Tick]:
-        """Of the script, without the way to rest behind it."""
+        """Return the ticks of the script, without the way to rest after it."""
         return [tick for tick in self.watch.ticks if tick.following]
 
     def tool(self, arm: str) -> Array:
-        """Measured positions of a tool at every tick (n, 3) [m]."""
+        """Return the measured positions of a tool at every tick (n, 3) [m]."""
         return np.array([tick.tools[arm].translation for tick in self.ticks])
 
     @property
     def states(self) -> set[str]:
-        """Of both arms at the end."""
+        """Return the states of both arms at the end."""
         return set(self.ticks[-1].states.values())
 
     @property
@@ -216,12 +220,12 @@ class InStepRun:
         return [event for tick in self.ticks for event in tick.events]
 
     def reasons(self, destination: str) -> list[str]:
-        """The kinds of why arms came to a state, or what they were refused in it."""
+        """Return the kinds of the reasons for a state of an arm, or for refusals in that state."""
         return [kinds(event.reason) for event in self.events if event.destination == destination]
 
 
 class NoCatchUp:
-    """Fails a run in which an arm moves that nobody engaged, or a target that jumps."""
+    """A check that fails a run in which an arm moves without engagement, or a target jumps."""
 
     def __init__(self, loop: Pipeline) -> None:
         self._robot = loop.robot

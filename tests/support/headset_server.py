@@ -1,4 +1,4 @@
-"""A headset server under test, whose time only the test moves, and what tests do with it from outside."""
+"""A headset server under test with a simulated clock, and helpers that use it from outside."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from q2r2_control.types import HandSample
 from tests.support.fake_headset import FakeHeadset
 
 IDENTITY = (0.0, 0.0, 0.0, -1.0)
-A_LINE_LATER = 1.0  # [s]: a host gets one line a second in the log
+A_LINE_LATER = 1.0  # Time after which a host gets another line in the log [s].
 
 
 class HandClock:
-    """A clock that only the test moves."""
+    """A clock that only the test advances."""
 
     def __init__(self) -> None:
         self.now = 100.0
@@ -29,7 +29,7 @@ class HandClock:
         return self.now
 
     def advance(self, seconds: float) -> None:
-        """Move on, and return when the server's thread has begun to wait for the network at the new time.
+        """Advance, and return when the server's thread has begun to wait for the network at the new time.
 
         It reads the clock before it waits and behind that, so that one of three readings is the first of these.
         """
@@ -48,7 +48,7 @@ def running(server: HeadsetServer) -> Iterator[HeadsetServer]:
 
 
 def eventually(condition: Callable[[], object], what: str = "") -> None:
-    """Wait for the other thread, far longer than it needs."""
+    """Wait for the other thread, with a timeout far longer than it needs."""
     deadline = time.monotonic() + 30.0
     while not condition():
         assert time.monotonic() < deadline, f"never happened: {what or condition}"
@@ -56,7 +56,7 @@ def eventually(condition: Callable[[], object], what: str = "") -> None:
 
 
 def collect(server: HeadsetServer, count: int) -> list[HandSample]:
-    """Poll as the loop does until ``count`` samples have come."""
+    """Poll like the loop until ``count`` samples have come."""
     samples: list[HandSample] = []
 
     def enough() -> bool:
@@ -68,7 +68,7 @@ def collect(server: HeadsetServer, count: int) -> list[HandSample]:
 
 
 def assert_serves(server: HeadsetServer, dialect: str = "ros2") -> None:
-    """A new headset is accepted and its motion arrives."""
+    """Assert that a new headset is accepted and that its motion arrives."""
     with connect(server, dialect) as headset:
         headset.send(headset.registrations() + headset.pose("right", (7.0, 8.0, 9.0), IDENTITY))
         headset.read_until("__topic_list")
@@ -78,14 +78,14 @@ def assert_serves(server: HeadsetServer, dialect: str = "ros2") -> None:
 
 
 def connect(server: HeadsetServer, dialect: str = "ros2", source: str = "") -> FakeHeadset:
-    """Connect and wait until the server has the connection, so that tests can go on in order."""
+    """Connect, and wait until the server has the connection, so that the order of events is fixed."""
     headset = FakeHeadset(server.address, dialect, source=source)
     headset.read_until("__handshake")
     return headset
 
 
 def registered(server: HeadsetServer, dialect: str = "ros2", source: str = "") -> FakeHeadset:
-    """The same, of a headset that has registered its topics."""
+    """Connect a headset that has registered its topics."""
     headset = connect(server, dialect, source)
     headset.send(headset.registrations())
     headset.read_until("__topic_list")
@@ -93,14 +93,14 @@ def registered(server: HeadsetServer, dialect: str = "ros2", source: str = "") -
 
 
 def next_topic(headset: FakeHeadset) -> str:
-    """The topic of the next frame from the server."""
+    """Return the topic of the next frame from the server."""
     frame = headset.read_frame()
     assert frame is not None
     return frame[0]
 
 
 def warnings(caplog: pytest.LogCaptureFixture) -> list[str]:
-    """The product's own warnings and errors: a library's log is not printed, and depends on when it tries again."""
+    """Return warnings and errors of this package. Those of libraries depend on timing and are left out."""
     own = (record for record in caplog.records if record.name.startswith("q2r2_control"))
     return [record.getMessage() for record in own if record.levelno >= logging.WARNING]
 

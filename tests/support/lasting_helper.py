@@ -1,4 +1,4 @@
-"""Helper processes that do not end: one waits for ever beside a process that it has started, one is always busy."""
+"""Helper processes that do not end: one waits for ever beside its child, and one is always busy."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from typing import Any
 
 
 def main(requests: Iterator[Any], answer: Callable[[Any], None]) -> None:
-    """The first request says whether it is to be busy; the answer is the process that it has started."""
+    """Run the helper. The first request says whether it is busy, and the answer is the id of its child."""
     busy = next(requests)
-    # As a fork does, it keeps the pipe of the answers open.
+    # Like a fork, the child keeps the pipe of the answers open.
     started = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(1000)"], stdout=1)
     answer(started.pid)
     while busy:

@@ -1,4 +1,4 @@
-"""Scripts outside the package, as modules."""
+"""Scripts outside the package, loaded as modules."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def install(folder: Path, package: str, source: str, entries: str) -> None:
-    """A package of one module with its entry points, as pip writes them; found where ``folder`` is on the path."""
+    """Install a package of one module with its entry points, as pip does. It is found if ``folder`` is on the path."""
     (folder / f"{package}.py").write_text(source)
     (folder / f"{package}-1.0.dist-info").mkdir()
     (folder / f"{package}-1.0.dist-info/entry_points.txt").write_text(entries)
 
 
 def blocks_of(page: str, language: str) -> list[str]:
-    """The blocks of code in a page, as they stand."""
+    """Return the blocks of code in a page, unchanged."""
     return re.findall(rf"```{language}\n(.*?)```", (ROOT / page).read_text(encoding="utf-8"), re.DOTALL)
 
 
 def load_script(path: str) -> ModuleType:
-    """The script at ``path`` in the repository."""
+    """Return the script at ``path`` in the repository as a module."""
     file = ROOT / path
     spec = importlib.util.spec_from_file_location(file.stem, file)
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # where dataclasses look for the types of their fields
+    sys.modules[spec.name] = module  # Dataclasses look here for the types of their fields.
     spec.loader.exec_module(module)
     return module

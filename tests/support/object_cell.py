@@ -12,15 +12,15 @@ import pinocchio as pin
 
 from q2r2_control.config.cell import Config, load_config
 
-TABLE = 0.2  # height of its top [m]
-# A block of the demo, gripped 13 mm above its middle.
+TABLE = 0.2  # Height of the table's top [m].
+# This is a block of the demo, gripped 13 mm above its middle.
 BLOCK: dict[str, Any] = {"box": (0.04, 0.04, 0.06), "at": (0.0, 0.0, 0.013), "mass": 0.1}
-GRIP = TABLE + 0.03 + 0.013  # height of a tool that has gripped it on the table [m]
-_DOWN = pin.rpy.rpyToMatrix(np.pi, 0.0, np.pi)  # as at home
+GRIP = TABLE + 0.03 + 0.013  # Height of a tool that has gripped the block on the table [m].
+_DOWN = pin.rpy.rpyToMatrix(np.pi, 0.0, np.pi)  # The tools point down as at home.
 
 
 def cell(left: dict[str, Any] | None, right: dict[str, Any] | None = None) -> Config:
-    """With these objects, and nothing that hangs on the clock."""
+    """Return the cell with these objects, in which nothing depends on the clock."""
     data = load_config("config/dual_iiwa7.yaml").model_dump()
     data["arms"]["left"]["gripper"]["object"], data["arms"]["right"]["gripper"]["object"] = left, right
     data["control"]["solve_time_limit"] = None
@@ -28,22 +28,22 @@ def cell(left: dict[str, Any] | None, right: dict[str, Any] | None = None) -> Co
 
 
 def at(z: float, y: float = 0.25, x: float = 0.5) -> pin.SE3:
-    """A tool that points down."""
+    """Return a pose of a tool that points down."""
     return pin.SE3(_DOWN, np.array([x, y, z]))
 
 
 _FRAME_TO_TIPS = 0.013  # [m]
 
-# The face nearest to the tool is 35 mm from its middle; a finger's outside is at 22 mm when closed and 47 mm when open.
+# The nearest face is 35 mm from the tool's middle. A finger's outer side is at 22 mm when closed and 47 mm when open.
 _BLOCK = {"shape": "box", "size": (0.1, 0.04, 0.015), "position": (0.5, 0.25 + 0.055, TABLE + 0.0075)}
 _DATA = load_config("config/dual_iiwa7.yaml").model_dump()
 _DATA["obstacles"]["block"] = _BLOCK
 CELL = Config.model_validate(_DATA)
-SETTINGS = CELL.control.model_copy(update={"solve_time_limit": None})  # no outcome hangs on the clock
+SETTINGS = CELL.control.model_copy(update={"solve_time_limit": None})  # No result depends on the clock.
 
 
 def tips_at(y: float, tips: float) -> pin.SE3:
-    """The left tool pointing down with its tips this far above the table [m]."""
+    """Return a pose of the left tool, which points down with its tips this far above the table [m]."""
     return at(TABLE + _FRAME_TO_TIPS + tips, y)
 
 

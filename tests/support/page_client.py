@@ -1,4 +1,4 @@
-"""A page without a browser: hears what the server of a page draws, and presses its buttons."""
+"""A page without a browser: it receives what the page's server draws, and presses buttons."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ _CAMERA = {
     **{"position": (0.0, 0.0, 0.0), "look_at": (1.0, 0.0, 0.0), "up_direction": (0.0, 0.0, 1.0)},
     **{"wxyz": (1.0, 0.0, 0.0, 0.0), "fov": 1.0, "near": 0.1, "far": 9.0, "image_height": 100, "image_width": 100},
 }
-_PATIENCE = 120.0  # far longer than anything takes [s]
+_PATIENCE = 120.0  # Timeout far above any usual duration [s].
 
 
 class PageClient:
-    """A context. It speaks viser's protocol: lengths, packed messages, and arrays, which are not read."""
+    """A context manager for viser's protocol: lengths, packed messages, and arrays, which are not read."""
 
     def __init__(self, url: str) -> None:
         host = urlsplit(url).netloc
         protocol = [Subprotocol(f"viser-v{viser.__version__}")]
         self._socket = connect(f"ws://{host}", origin=Origin(f"http://{host}"), subprotocols=protocol, max_size=None)
-        self._contents: dict[str, str] = {}  # of the panel's pieces of HTML
-        self.buttons: dict[str, str] = {}  # by label
-        self.drawn: set[str] = set()  # names of meshes
-        self.pictures: list[bytes] = []  # of cameras, as they came
-        # The page counts no press of a browser that has sent no camera yet.
+        self._contents: dict[str, str] = {}  # Contents of the panel's pieces of HTML.
+        self.buttons: dict[str, str] = {}  # Identifiers of buttons by label.
+        self.drawn: set[str] = set()  # Names of drawn meshes.
+        self.pictures: list[bytes] = []  # Pictures of cameras as they came.
+        # The page ignores presses of a browser that has not sent its camera.
         self.send("ViewerCameraMessage", **_CAMERA)
 
     def __enter__(self) -> Self:
@@ -52,19 +52,19 @@ class PageClient:
 
     @property
     def words(self) -> str:
-        """The panel without its markup; cells of a table are apart by |."""
+        """The text of the panel without markup. Cells of a table are separated by |."""
         return re.sub(r"<[^>]*>", "", self.html.replace("</td>", "|"))
 
     def says(self, text: str) -> bool:
         return text in self.words
 
     def row(self, name: str) -> list[str]:
-        """A row of the panel's table, arm by arm."""
+        """Return a row of the panel's table, arm by arm."""
         found = re.search(rf">{re.escape(name)}</td>(.*?)</tr>", self.html)
         return [] if found is None else re.sub(r"<[^>]*>", "", found[1].replace("</td>", "|")).split("|")[:-1]
 
     def wait_until(self, condition: Callable[[], object]) -> None:
-        """Hear what is drawn until ``condition`` holds; otherwise the failure says what is seen."""
+        """Receive until ``condition`` holds. Otherwise, the failure says what the page shows."""
         deadline = time.monotonic() + _PATIENCE
         while not condition():
             assert time.monotonic() < deadline, f"the page says: {self.words}"
@@ -72,17 +72,17 @@ class PageClient:
                 self._hear(self._socket.recv(timeout=1.0))
 
     def press(self, label: str) -> None:
-        """Click the button whose label begins so."""
+        """Click the button whose label begins with this text."""
         self.send("GuiUpdateMessage", uuid=self.button(label), updates={"value": True})
 
     def button(self, label: str) -> str:
-        """The identifier of the button whose label begins so."""
+        """Return the identifier of the button whose label begins with this text."""
         self.wait_until(lambda: any(one.startswith(label) for one in self.buttons))
         (uuid,) = (uuid for one, uuid in self.buttons.items() if one.startswith(label))
         return uuid
 
     def send(self, kind: str, **fields: Any) -> None:
-        """Send a message of viser's protocol, also one that no browser sends."""
+        """Send a message of viser's protocol, even one that no browser sends."""
         self._socket.send(msgspec.msgpack.encode({"type": kind, **fields}))
 
     def _hear(self, data: bytes | str) -> None:

@@ -1,4 +1,4 @@
-"""Whether this machine can take pictures without a window."""
+"""Checks whether this machine can take pictures without a window."""
 
 from __future__ import annotations
 
@@ -19,6 +19,6 @@ def _can_draw() -> bool:
 
 
 def needs_opengl() -> None:
-    """Skips a test where there is no OpenGL without a window."""
+    """Skips a test if there is no OpenGL without a window."""
     if not _can_draw():
         pytest.skip("no OpenGL without a window: libegl1 and libgl1-mesa-dri are not installed")

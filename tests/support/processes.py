@@ -1,4 +1,4 @@
-"""Processes by their numbers, those too that are not this one's own children."""
+"""Processes by their ids, including those that are not children of this process."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from q2r2_control.summary.tick import Tick
 from q2r2_control.verification.contract import Contract
 from tests.support.reasons import kinds
 
-_PATIENCE = 120.0  # [s], far longer than anything takes
+_PATIENCE = 120.0  # Timeout far above any usual duration [s].
 
 
 def children(pid: int) -> list[int]:
@@ -24,7 +24,7 @@ def children(pid: int) -> list[int]:
 
 
 def alive(pid: int) -> bool:
-    """Whether it runs; a process that has ended may remain as a zombie."""
+    """Return whether the process runs. A process that has ended may remain as a zombie."""
     try:
         with open(f"/proc/{pid}/stat") as file:
             return file.read().rpartition(")")[2].split()[0] != "Z"
@@ -45,12 +45,12 @@ CELL = "config/dual_iiwa7.yaml"
 
 @cache
 def cell() -> Config:
-    """The shipped cell of two iiwa 7."""
+    """Return the shipped cell of two iiwa 7."""
     return load_config(CELL)
 
 
 class Watch:
-    """A listener that keeps every tick, and fails the run at the first one that breaks the contract."""
+    """A listener that keeps every tick, and fails the run at the first tick that breaks the contract."""
 
     def __init__(self, pipeline: Pipeline) -> None:
         self.ticks: list[Tick] = []
@@ -69,13 +69,13 @@ class Watch:
         self.ticks.append(tick)
 
     def engagements(self, arm: str) -> list[int]:
-        """Indices of the ticks in which ``arm`` became engaged."""
+        """Return the indices of the ticks in which ``arm`` became engaged."""
         engaged = [tick.engaged[arm] for tick in self.ticks]
         return [i for i, now in enumerate(engaged) if now and not (i and engaged[i - 1])]
 
 
 def assert_torque_bounds(pipeline: Pipeline, ticks: list[Tick]) -> None:
-    """The torque at every tick is within its limits, and so is its change between ticks."""
+    """Assert that torques and their changes between ticks are within their limits at every tick."""
     settings = pipeline.config.impedance
     tau = np.array([tick.state.tau for tick in ticks])
     dt = np.array([tick.dt for tick in ticks])
@@ -85,10 +85,10 @@ def assert_torque_bounds(pipeline: Pipeline, ticks: list[Tick]) -> None:
 
 
 def speed(tick: Tick) -> float:
-    """Of the fastest joint's reference [rad/s]."""
+    """Return the speed of the fastest joint of the reference [rad/s]."""
     return float(np.abs(tick.reference.v).max())
 
 
 def changes(events: list[Event], arm: str) -> list[tuple[str, str, str]]:
-    """State changes of ``arm``: from, to, and the kinds of the reason."""
+    """Return the state changes of ``arm``: from, to, and the kinds of the reason."""
     return [(str(event.source), str(event.destination), kinds(event.reason)) for event in events if event.arm == arm]

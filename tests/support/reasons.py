@@ -1,4 +1,4 @@
-"""Reasons of events, for assertions: kinds instead of sentences."""
+"""Reasons of events for assertions, as kinds instead of sentences."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from q2r2_control.events import Reason
 
 
 def kinds(reason: Reason | None) -> str:
-    """Of a reason and what it follows from: ``not_engaged: pose_silent``; empty for None."""
+    """Return the kinds of a reason and of its causes, such as ``not_engaged: pose_silent``; empty for None."""
     if reason is None:
         return ""
     return str(reason.kind) if reason.cause is None else f"{reason.kind}: {kinds(reason.cause)}"

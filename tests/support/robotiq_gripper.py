@@ -1,4 +1,4 @@
-"""A gripper on Modbus that is simulated behind pymodbus' own server. It moves by a step each time that it is read."""
+"""A simulated gripper on Modbus behind the server of pymodbus. It moves by a step whenever it is read."""
 
 from __future__ import annotations
 
@@ -13,31 +13,31 @@ from pymodbus.server import ModbusTcpServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 
 UNIT = 9
-_STEP = 25  # of its position
+_STEP = 25  # Step of its position.
 
 
 class SimulatedGripper:
-    """A context, in which a thread serves it; ``stop`` drops the connection, ``start`` brings it back on its port."""
+    """A context manager with a thread that serves the gripper. ``stop`` drops the connection, ``start`` restores it."""
 
     def __init__(self, framer: FramerType = FramerType.SOCKET) -> None:
         self._framer, self.port = framer, 0
-        self.silent = False  # it takes what comes and answers nothing
-        self.reads, self.activation = 0, 3  # how often it was read, and is until it is active
+        self.silent = False  # If True, requests get no answer.
+        self.reads, self.activation = 0, 3  # Number of reads, and number of reads until the gripper is active.
         self.power_off()
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, daemon=True)
         self._server: Any = None
 
     def power_off(self) -> None:
-        """Forget everything but where the fingers are."""
-        self.written: list[tuple[int, ...]] = []  # the six bytes of each request
+        """Forget everything except the position of the fingers."""
+        self.written: list[tuple[int, ...]] = []  # The six bytes of each request.
         self.position, self.fault = getattr(self, "position", 120), 0
-        self.object_at = 255  # which the fingers cannot close beyond
+        self.object_at = 255  # Position beyond which the fingers cannot close.
         self.request: tuple[int, ...] = (0,) * 6
         self._waits = self.activation
 
     def activate(self) -> None:
-        """Be active from an earlier run."""
+        """Become active, as from an earlier run."""
         self.request, self._waits = (1, *self.request[1:]), 0
 
     @property
@@ -94,7 +94,7 @@ class SimulatedGripper:
         self.request = request
 
     def _move(self) -> tuple[int, ...]:
-        """The six bytes of what is read."""
+        """Move a step, and return the six bytes that are read."""
         asked, goes, state, detected = self.request[0] & 1, self.request[0] >> 3 & 1, 0, 0
         if asked:
             self._waits = max(self._waits - 1, 0)

@@ -1,4 +1,4 @@
-"""An impedance controller that drives a plant by torque, with the bounds of every single step asserted."""
+"""An impedance controller that drives a plant by torque, with bounds asserted at every step."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from q2r2_control.types import Array, Command, CommandMode, Reference, StepRepor
 
 
 def pose_error(wanted: pin.SE3, pose: pin.SE3) -> Array:
-    """Way from ``pose`` to ``wanted`` (6,): difference of positions [m], rotation vector [rad], in world axes."""
+    """Return the way (6,) from ``pose`` to ``wanted``: position [m] and rotation vector [rad], in world axes."""
     return np.concatenate([wanted.translation - pose.translation, pin.log3(wanted.rotation @ pose.rotation.T)])
 
 
@@ -25,13 +25,13 @@ _NO_REPORT = StepReport(StepStatus.OK, (), (), ("", ""), np.inf, True, False, 0.
 
 
 def reference(q: Array, v: Array | None = None, a: Array | None = None) -> Reference:
-    """A reference without a controller; at rest where ``v`` and ``a`` are left out."""
+    """Return a reference without a controller. It rests if ``v`` and ``a`` are left out."""
     zero = np.zeros_like(q)
     return Reference(q, zero if v is None else v, zero if a is None else a, _NO_REPORT)
 
 
 class TorqueLoop:
-    """One run with a tick of ``dt`` [s], which starts at rest at the posture ``q`` (nv,) that the reference holds."""
+    """A run with a tick of ``dt`` [s]. It starts at rest at the posture ``q`` (nv,) of the reference."""
 
     def __init__(self, plant: MujocoPlant, robot: Robot, settings: ImpedanceSettings, q: Array, dt: float = DT) -> None:
         self.dt = dt
@@ -47,7 +47,7 @@ class TorqueLoop:
         self._last: Array = pin.computeGeneralizedGravity(robot.model, robot.model.createData(), q)
 
     def tick(self) -> TorqueCommand:
-        """One tick, with every bound asserted."""
+        """Do one tick, and assert every bound."""
         command = self.controller.step(self.reference, self.state, self.dt)
         # A number that is not finite fails these as well.
         assert (np.abs(command.tau) <= self._limit).all()
@@ -61,7 +61,7 @@ class TorqueLoop:
         return command
 
     def ticks(self, duration: float) -> Iterator[TorqueCommand]:
-        """Ticks for ``duration`` [s]."""
+        """Yield ticks for ``duration`` [s]."""
         for _ in range(round(duration / self.dt)):
             yield self.tick()
 
@@ -78,12 +78,12 @@ class TorqueLoop:
         raise AssertionError(f"still {np.abs(self.state.v).max():.2e} rad/s after {timeout:g} s")
 
     def displacement(self, arm: str = "left") -> Array:
-        """Way (6,) [m, rad] that the tool is away from where the run started, world axes."""
+        """Return the displacement (6,) [m, rad] of the tool from the start of the run, in world axes."""
         return pose_error(self.robot.tool_pose(self.state.q, arm), self.start[arm])
 
 
 def left_arm(robot: Robot, q: Array) -> tuple[Array, Array]:
-    """Jacobian (6, 7) and inertia (7, 7) of the left arm."""
+    """Return the Jacobian (6, 7) and inertia (7, 7) of the left arm."""
     data, arm = robot.model.createData(), robot.arms["left"]
     pin.computeJointJacobians(robot.model, data, q)
     J = pin.getFrameJacobian(robot.model, data, arm.frame_id, pin.LOCAL_WORLD_ALIGNED)[:, arm.joints]

@@ -1,4 +1,4 @@
-"""A hand whose fingers turn, as those of a Robotiq 2F-85 do, on both arms of the shipped cell; and where it really is.
+"""A hand with turning fingers like those of a Robotiq 2F-85, on both arms of the shipped cell, and its real position.
 
 Each finger hangs on a knuckle that the gripper turns by 0.8 rad. Its tip turns back by as much, so that it stays
 parallel, and a second knuckle follows. The tips are 14 mm farther out when the hand is closed. Axes are where the
@@ -20,9 +20,9 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
 CLOSED, OPEN = 0.8, 0.0  # [rad]
-_TABLE = 0.2  # height of its top [m]
-_FRAME_TO_OPEN_TIPS = 0.0107  # [m]; closed ones are 14 mm farther
-# By which part of the drive's turn the other joints turn.
+_TABLE = 0.2  # Height of the table's top [m].
+_FRAME_TO_OPEN_TIPS = 0.0107  # Distance from the frame to the open tips [m]. Closed tips are 14 mm farther.
+# The turn of each other joint as a multiple of the drive's turn.
 _FOLLOWERS = {"one_tip": -1.0, "one_inner": 1.0, "two_knuckle": 1.0, "two_tip": -1.0, "two_inner": 1.0}
 
 
@@ -54,7 +54,7 @@ def _finger(side: str, y: float, yaw: float, drive: str) -> str:
 
 
 def hand_urdf() -> str:
-    """The hand as a model of a tool, with its frame between the tips."""
+    """Return the hand as a model of a tool, with its frame between the tips."""
     return (
         f'<robot name="turning_hand"><link name="palm">{_shape("0 0 0.045", "0 0 0", 0.035, 0.05)}</link>'
         + _finger("one", -1.0, np.pi, "drive")
@@ -65,7 +65,7 @@ def hand_urdf() -> str:
 
 
 def turning_cell(folder: Path, **obstacles: object) -> Config:
-    """The shipped cell with this hand on both arms; its model is written to ``folder``."""
+    """Return the shipped cell with this hand on both arms. The hand's model is written to ``folder``."""
     model = folder / "turning_hand.urdf"
     model.write_text(hand_urdf(), encoding="utf-8")
     data = load_config("config/dual_iiwa7.yaml").model_dump()
@@ -77,12 +77,12 @@ def turning_cell(folder: Path, **obstacles: object) -> Config:
 
 
 def above_table(tips: float) -> pin.SE3:
-    """The left tool pointing down with the tips of its open fingers this far above the table [m]."""
+    """Return a pose of the left tool, which points down with its open tips this far above the table [m]."""
     return pin.SE3(pin.rpy.rpyToMatrix(np.pi, 0.0, np.pi), np.array([0.5, 0.25, _TABLE + _FRAME_TO_OPEN_TIPS + tips]))
 
 
 class RealHands:
-    """Shapes as drawn, enclosed but not swept, with fingers where the joints of the URDF put them."""
+    """Drawn shapes, enclosed but not swept, with fingers where the joints of the URDF put them."""
 
     def __init__(self, robot: Robot) -> None:
         self._robot, self._model = robot, pin.buildModelFromXML(robot.urdf)
@@ -106,13 +106,13 @@ class RealHands:
         return full
 
     def distances(self, q: Array, openings: Mapping[str, float]) -> Array:
-        """Of every monitored pair as Coal measures them (pairs,) [m]."""
+        """Return the distances of all monitored pairs as Coal measures them (pairs,) [m]."""
         full = self._posture(q, openings)
         pin.computeDistances(self._model, self._data, self.geometry, self._geometry_data, full)
         return np.array([result.min_distance for result in self._geometry_data.distanceResults])
 
     def ends(self, arm: str, name: str, opening: float) -> tuple[Array, float]:
-        """Both ends (2, 3) of a capsule in the frame of the arm's last joint, and its radius [m]."""
+        """Return both ends (2, 3) of a capsule in the frame of the arm's last joint, and its radius [m]."""
         full = self._posture(self._robot.home, {arm: opening})
         pin.forwardKinematics(self._model, self._data, full)
         pin.updateGeometryPlacements(self._model, self._data, self.geometry, self._geometry_data)
@@ -125,6 +125,6 @@ class RealHands:
 
     @property
     def fingers(self) -> list[str]:
-        """Geometry names of the left hand's fingers."""
+        """Return the geometry names of the left hand's fingers."""
         found = [item.name for item in self.geometry.geometryObjects]
         return [name for name in found if link_of(name).startswith(("left_one_", "left_two_"))]

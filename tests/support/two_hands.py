@@ -1,4 +1,4 @@
-"""Two human hands as a headset sees them: what they mean to do, and what each of them adds to it."""
+"""Two human hands as a headset measures them: a common motion, and the deviation of each hand."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from q2r2_control.types import SIDES, Array
 START = {"left": np.array([0.35, 0.2, 1.1]), "right": np.array([0.35, -0.2, 1.1])}
 PERIOD = 1.0 / 72.0  # [s]
 
-Motion = Callable[[float], pin.SE3]  # of what both hands hold, from where it was at 0 [s]
+Motion = Callable[[float], pin.SE3]  # The common motion as a function of time, relative to its pose at 0 [s].
 
 
 class TwoHands:
-    """Both hands on one thing that moves. Each sways on its own, trembles, and is measured with noise.
+    """Both hands on one moving object. Each sways on its own, trembles, and is measured with noise.
 
     ``sway``: RMS of what each hand does on its own at 0.4 .. 2 Hz, along each axis [m] and about it [rad]. Hands on a
     box of cardboard, in which grips give way, do some millimetres and degrees.
@@ -41,7 +41,7 @@ class TwoHands:
         self._phases = {hand: random.uniform(0.0, 2.0 * math.pi, (6, 3)) for hand in SIDES}
 
     def pose(self, hand: str, t: float) -> pin.SE3:
-        """The measurement of a hand at ``t`` [s]."""
+        """Return the measured pose of a hand at ``t`` [s]."""
         tones = np.sin(2.0 * math.pi * self._frequencies[hand] * t + self._phases[hand]).sum(axis=1) / math.sqrt(1.5)
         held = self._motion(t)
         position = held.act(START[hand]) + self._sway[0] * tones[:3]
@@ -49,19 +49,19 @@ class TwoHands:
         return self._sampling[hand].measured(pin.SE3(rotation, position), t)
 
     def samples(self, duration: float) -> Iterator[tuple[float, str, HandPose]]:
-        """Receipt time, hand and pose of each sample, left before right."""
+        """Return receipt time, hand and pose of each sample, left before right."""
         for index in range(int(duration / PERIOD)):
             for place, hand in enumerate(SIDES):
                 yield index * PERIOD + 2e-4 * place, hand, hand_pose(self.pose(hand, index * PERIOD))
 
 
 def hand_pose(pose: pin.SE3) -> HandPose:
-    """As the app sends it."""
+    """Return the pose as the app sends it."""
     return HandPose(pose.translation.copy(), pin.Quaternion(pose.rotation).coeffs(), 12.0, "")
 
 
 def carry(t: float) -> pin.SE3:
-    """To and fro by 0.35 m and 20 degrees, 1.2 s each way, with rests of 0.4 s."""
+    """Return a motion to and fro by 0.35 m and 20 degrees, with 1.2 s in each direction and rests of 0.4 s."""
     stroke, phase = divmod(t, 1.6)
     share = minimum_jerk(phase / 1.2)
     share = share if stroke % 2 == 0 else 1.0 - share
@@ -70,5 +70,5 @@ def carry(t: float) -> pin.SE3:
 
 
 def rest(t: float) -> pin.SE3:
-    """Nothing moves but the hands by themselves."""
+    """Return a common motion that rests, so that only the hands' own deviations remain."""
     return pin.SE3.Identity()
