@@ -18,7 +18,7 @@ from q2r2_control.types import SIDES, ArmTarget, Array, HandInputs, HandSample
 from tests.support.reasons import kinds
 
 TICK = 0.001
-PERIOD = 0.013  # of the hands' samples [s]
+PERIOD = 0.013  # Period of the hands' samples [s].
 
 
 def pose(x: float = 0.0, y: float = 0.0, z: float = 0.0, turn: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> pin.SE3:
@@ -35,7 +35,9 @@ def sample(
 
 @dataclass
 class Operator:
-    """Feeds a :class:`Teleop` at 1 kHz with both hands' samples at about 77 Hz; keeps events and the last targets."""
+    """An operator who feeds a :class:`Teleop` at 1 kHz with samples of both hands at about 77 Hz, and keeps its
+    results.
+    """
 
     settings: TeleopSettings = field(default_factory=TeleopSettings)
     arms: tuple[str, ...] = SIDES
@@ -52,11 +54,12 @@ class Operator:
     commanded: dict[str, pin.SE3] | None = None
     in_step: bool = True
     obstacles: dict[str, Reason] = field(default_factory=dict)
-    lower: set[str] = field(default_factory=set)  # hands that hold the button
+    lower: set[str] = field(default_factory=set)  # Hands that hold the button.
     upper: set[str] = field(default_factory=set)
-    held: dict[str, float] = field(default_factory=dict)  # how far other controls are pushed, by their bindings' names
-    only: str | None = None  # the hand that pushes them; None: both
-    silent: set[str] = field(default_factory=set)  # hands that send nothing
+    # Displacements of other controls, by the names of their bindings.
+    held: dict[str, float] = field(default_factory=dict)
+    only: str | None = None  # The hand that pushes them; None if both do.
+    silent: set[str] = field(default_factory=set)  # Hands that send nothing.
     alter: Callable[[HandSample], HandSample] = lambda received: received
     events: list[Event] = field(default_factory=list)
     targets: dict[str, ArmTarget] = field(default_factory=dict)
@@ -66,7 +69,7 @@ class Operator:
         self._next_sample = self.now
 
     def samples(self) -> list[HandSample]:
-        """The data that both hands send now."""
+        """Return the data that both hands send now."""
         found = [
             sample(hand, self.hands[hand], self.now, lower=hand in self.lower, upper=hand in self.upper)
             for hand in SIDES
@@ -94,7 +97,7 @@ class Operator:
     def run(
         self, duration: float, move: Callable[[float], dict[str, pin.SE3]] | None = None
     ) -> list[dict[str, ArmTarget]]:
-        """Ticks for ``duration``; ``move`` gives the hands' poses over the time since the call."""
+        """Tick for ``duration``; ``move`` gives the hands' poses over the time since the call."""
         start, history = self.now, []
         while self.now < start + duration - TICK / 2:
             if move is not None:
@@ -103,7 +106,7 @@ class Operator:
         return history
 
     def press(self, *hands: str, button: str = "lower") -> None:
-        """A press of 0.15 s, after which the button rests for 0.1 s."""
+        """Press a button for 0.15 s, after which it rests for 0.1 s."""
         held = self.lower if button == "lower" else self.upper
         held.update(hands)
         self.run(0.15)
@@ -111,20 +114,20 @@ class Operator:
         self.run(0.1)
 
     def push(self, control: str, hand: str = "left") -> None:
-        """Push a control for 0.1 s, after which it rests for as long."""
+        """Push a control for 0.1 s, after which it rests for 0.1 s."""
         self.only, self.held = hand, {control: 1.0}
         self.run(0.1)
         self.held = {}
         self.run(0.1)
 
     def place(self, arm: str = "left") -> pin.SE3:
-        """The target of an arm that has one."""
+        """Return the target of an arm that has one."""
         target = self.targets[arm].pose
         assert target is not None
         return target
 
     def assert_holds(self, duration: float = 0.4) -> None:
-        """Both arms hold at every tick, although the hands go on waving."""
+        """Assert that both arms hold at every tick, although the hands still move."""
         for targets in self.run(duration, waving(self)):
             assert all(target.pose is None for target in targets.values())
 
@@ -141,7 +144,7 @@ class Operator:
 
 
 def spoilt(received: HandSample, **changes: object) -> HandSample:
-    """The sample with some of its fields replaced by what they should never hold."""
+    """Return the sample with some of its fields replaced by invalid values."""
     return replace(received, **changes)  # type: ignore[arg-type]
 
 
@@ -163,7 +166,7 @@ def engaged(**changes: object) -> Operator:
 
 
 def waving(driver: Operator, speed: float = 0.2) -> Callable[[float], dict[str, pin.SE3]]:
-    """Both hands going sidewards and turning from where they are."""
+    """Return a motion of both hands sideways with rotation, from where they are."""
     start = dict(driver.hands)
     return lambda t: {
         hand: pin.SE3(pin.exp3(np.array([0.0, 0.0, speed * t])) @ at.rotation, at.translation + sidewards(speed * t))
@@ -180,7 +183,7 @@ def first_target(history: History, arm: str) -> pin.SE3:
 
 
 def assert_smooth(history: History, largest: float = 0.002) -> None:
-    """Between two ticks of one engagement a target moves by less than ``largest`` metres and 3 ``largest`` radians."""
+    """Assert that a target moves by less than ``largest`` [m] and 3 ``largest`` [rad] between two ticks."""
     for before, after in pairwise(history):
         for arm in SIDES:
             a, b = before[arm].pose, after[arm].pose

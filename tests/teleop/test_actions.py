@@ -22,7 +22,7 @@ def engaged(**bindings: str) -> Operator:
 
 
 class TestAStop:
-    def test_stops_both_arms_in_the_sample_that_it_comes_with(self) -> None:
+    def test_a_stop_stops_both_arms_in_its_own_sample(self) -> None:
         driver = engaged()
         driver.run(0.3, waving(driver))
         driver.only, driver.held = "right", {"grip": 1.0}
@@ -31,7 +31,7 @@ class TestAStop:
         assert all(target.pose is None for target in driver.targets.values())
         assert not any(map(is_fault, driver.events))
 
-    def test_lets_nothing_move_until_it_is_taken_back_and_then_a_press_engages(self) -> None:
+    def test_after_a_stop_nothing_moves_until_it_is_undone_and_a_press_engages(self) -> None:
         driver = engaged()
         driver.push("grip")
         driver.push("stick_down")
@@ -48,7 +48,7 @@ class TestAStop:
         driver.press(*SIDES)
         assert driver.states == ENGAGED
 
-    def test_comes_before_all_else_that_is_pressed_at_once(self) -> None:
+    def test_a_stop_comes_before_all_other_simultaneous_presses(self) -> None:
         driver = engaged()
         driver.lower, driver.upper = {"left"}, {"left"}
         driver.held, driver.only = {"grip": 1.0, "stick_down": 1.0}, "right"
@@ -59,13 +59,13 @@ class TestAStop:
         driver.run(0.3)
         assert driver.states == STOPPED
 
-    def test_is_over_for_both_arms_when_one_is_reset(self) -> None:
+    def test_a_stop_is_over_for_both_arms_when_one_is_reset(self) -> None:
         driver = engaged()
         driver.push("grip")
         driver.teleop.reset(driver.now, "left", Reason(ReasonKind.RESET_SERVICE))
         assert driver.states == PAUSED
 
-    def test_that_a_button_is_held_for_is_not_lost_by_a_fault_in_between(self) -> None:
+    def test_a_stop_for_which_a_button_is_held_is_not_lost_by_a_fault(self) -> None:
         driver = engaged(upper_hold="stop")
         driver.upper = {"left"}
         driver.run(0.3)
@@ -77,12 +77,12 @@ class TestAStop:
 
 
 class TestTheWayHome:
-    def test_of_both_arms_is_asked_for_by_either_hand_and_ends_where_the_caller_says(self) -> None:
+    def test_either_hand_can_send_both_arms_home_and_the_caller_says_where_the_way_ends(self) -> None:
         driver = engaged()
         driver.push("stick_down", "right")
         assert driver.states == HOMING
         assert driver.teleop.homing
-        driver.assert_holds()  # the hands lead nothing
+        driver.assert_holds()  # The hands lead no arm.
         driver.teleop.end_homing(driver.now, Reason(ReasonKind.HOMING_ARRIVED))
         driver.run(0.1)
         assert driver.states == PAUSED
@@ -91,7 +91,7 @@ class TestTheWayHome:
         driver.press(*SIDES)
         assert driver.states == ENGAGED
 
-    def test_is_refused_only_for_what_is_in_the_way_of_the_arm_whose_hand_asks(self) -> None:
+    def test_the_way_home_is_refused_only_for_obstacles_of_the_arm_whose_hand_asks(self) -> None:
         for blocked, states in (("left", PAUSED), ("right", HOMING)):
             driver = engaged()
             driver.press(*SIDES)
@@ -101,7 +101,7 @@ class TestTheWayHome:
 
     @pytest.mark.parametrize("hand", SIDES)
     @pytest.mark.parametrize("control", ["lower", "upper", "stick_down"])
-    def test_is_ended_by_any_press_which_does_nothing_else(self, control: str, hand: str) -> None:
+    def test_any_press_ends_the_way_home_and_has_no_other_effect(self, control: str, hand: str) -> None:
         driver = engaged()
         driver.push("stick_down")
         if control in ("lower", "upper"):
@@ -111,7 +111,7 @@ class TestTheWayHome:
         assert driver.states == PAUSED
         assert [driver.targets[arm].gripper for arm in SIDES] == [1.0, 1.0]
 
-    def test_ends_as_a_fault_when_the_hand_that_asked_is_lost_and_not_for_the_other(self) -> None:
+    def test_the_way_home_ends_as_a_fault_if_the_hand_that_asked_is_lost_but_not_with_the_other_hand(self) -> None:
         driver = engaged()
         driver.push("stick_down")
         driver.silent = {"right"}
@@ -122,7 +122,7 @@ class TestTheWayHome:
         assert driver.states == LOST
         assert {kinds(event.reason) for event in driver.events[-2:]} == {"homing_fault: pose_silent"}
 
-    def test_that_no_hand_asked_for_needs_none(self) -> None:
+    def test_a_way_home_that_no_hand_asked_for_needs_no_hand(self) -> None:
         driver = hands.operator(bindings=BINDINGS)
         driver.silent = set(SIDES)
         driver.run(0.3)
@@ -136,7 +136,7 @@ class TestTheWayHome:
         driver.press("left")
         assert driver.states == PAUSED
 
-    def test_is_refused_while_something_is_in_the_way(self) -> None:
+    def test_the_way_home_is_refused_while_something_is_in_the_way(self) -> None:
         driver = hands.operator(bindings=BINDINGS)
         driver.alter = lambda received: spoilt(received, pose_stamp=-math.inf)
         driver.run(0.3)
@@ -152,7 +152,7 @@ class TestAGripperThatFollowsATrigger:
         driver.run(0.1)
         return driver
 
-    def test_closes_as_far_as_it_is_pressed_and_opens_again_no_faster_than_the_setting(self) -> None:
+    def test_a_gripper_closes_as_far_as_the_trigger_and_opens_no_faster_than_the_setting(self) -> None:
         driver = self.driver(gripper_speed=2.0)
         for pressed, opening in ((0.5, 0.5), (1.0, 0.0), (0.275, 0.75), (0.0, 1.0)):
             driver.held = {"trigger": pressed}
@@ -161,7 +161,7 @@ class TestAGripperThatFollowsATrigger:
             assert openings[-1] == pytest.approx(opening, abs=1e-9)
             assert driver.targets["right"].gripper == 1.0
 
-    def test_does_not_tremble_with_the_trigger(self) -> None:
+    def test_a_gripper_does_not_tremble_with_the_trigger(self) -> None:
         driver = self.driver()
         random, seen = np.random.default_rng(0), set()
         driver.held = {"trigger": 0.5}
@@ -172,7 +172,7 @@ class TestAGripperThatFollowsATrigger:
             seen.add(driver.targets["left"].gripper)
         assert len(seen) == 1
 
-    def test_keeps_what_it_holds_when_the_connection_comes_back_until_the_trigger_has_reached_it(self) -> None:
+    def test_after_a_reconnection_a_gripper_keeps_its_opening_until_the_trigger_has_reached_it(self) -> None:
         driver = self.driver()
         driver.held = {"trigger": 0.725}
         driver.run(0.4)
@@ -187,7 +187,7 @@ class TestAGripperThatFollowsATrigger:
         driver.run(0.4)
         assert driver.targets["left"].gripper == pytest.approx(1.0 - 0.85 / 0.9)
 
-    def test_is_left_as_it_is_by_a_reading_that_is_no_number(self) -> None:
+    def test_a_reading_that_is_not_finite_leaves_a_gripper_unchanged(self) -> None:
         driver = self.driver()
         driver.held = {"trigger": 0.5}
         driver.run(0.4)

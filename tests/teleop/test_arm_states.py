@@ -1,4 +1,4 @@
-"""The table of states: what the docs say, and that nothing but an engagement lets an arm follow its hand."""
+"""The table of states: it agrees with the docs, and only an engagement lets an arm follow its hand."""
 
 from __future__ import annotations
 
@@ -13,31 +13,31 @@ RESTS = set(ArmState) - {ArmState.ENGAGED, ArmState.CARRIED, ArmState.POLICY, Ar
 
 
 def documented(sources: str, cause: str, destination: str, who: str) -> Transition:
-    """The transition of a row of the table in the docs."""
+    """Return the transition of a row of the table in the docs."""
     named = frozenset(map(ArmState, re.findall(r"`(\w+)`", sources)))
     states = set(ArmState) - named if "any but" in sources else named
     return Transition(frozenset(states), Cause(cause), ArmState(destination.strip("`")), Who(who))
 
 
-def test_the_table_in_the_docs_is_the_one_of_the_code() -> None:
+def test_the_table_in_the_docs_equals_the_one_in_the_code() -> None:
     rows = table_rows("operator.md")
     assert {documented(*row) for row in rows if row[-1] in list(Who)} == set(TRANSITIONS)
 
 
-def test_no_state_has_two_ways_for_one_cause() -> None:
+def test_no_state_has_two_transitions_for_one_cause() -> None:
     ways = [(source, line.cause) for line in TRANSITIONS for source in line.sources]
     assert len(ways) == len(set(ways))
     assert {line.cause for line in TRANSITIONS} == set(Cause)
     assert {line.destination for line in TRANSITIONS} | {ArmState.IDLE} == set(ArmState)
 
 
-def test_an_arm_is_set_in_motion_by_its_operator_or_a_policy_alone() -> None:
+def test_only_an_operator_or_a_policy_can_start_the_motion_of_an_arm() -> None:
     begins = {line.cause for line in TRANSITIONS if line.destination not in RESTS and line.sources & RESTS}
     assert begins == {Cause.ENGAGE, Cause.ALIGNED, Cause.CARRY, Cause.POLICY_ACTS, Cause.HOME}
 
 
 @pytest.mark.parametrize("state", ArmState)
-def test_a_stop_stops_in_every_state_and_ends_by_itself_alone(state: ArmState) -> None:
+def test_a_stop_works_in_every_state_and_ends_only_by_itself(state: ArmState) -> None:
     assert next_state(state, Cause.STOP) is ArmState.STOPPED
     ends = [cause for cause in Cause if next_state(ArmState.STOPPED, cause) is not ArmState.STOPPED]
     assert ends == [Cause.GO_ON]
@@ -45,6 +45,6 @@ def test_a_stop_stops_in_every_state_and_ends_by_itself_alone(state: ArmState) -
 
 @pytest.mark.parametrize("state", sorted(set(ArmState) - RESTS))
 @pytest.mark.parametrize("cause", [Cause.FAULT, Cause.STOP])
-def test_what_moves_is_stopped_by_a_fault_and_by_a_stop(state: ArmState, cause: Cause) -> None:
+def test_every_moving_state_is_stopped_by_a_fault_and_by_a_stop(state: ArmState, cause: Cause) -> None:
     assert next_state(state, cause) in RESTS
     assert next(line.who for line in TRANSITIONS if state in line.sources and line.cause is cause) is not Who.ARM

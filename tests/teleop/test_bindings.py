@@ -1,4 +1,4 @@
-"""The actions of triggers, sticks and buttons, none of which makes a target jump."""
+"""The actions of triggers, sticks and buttons. None of them makes a target jump."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def engaged(**bindings: str) -> Operator:
 
 
 def shift(driver: Operator, way: np.ndarray, turn: np.ndarray, duration: float = 1.0) -> list:
-    """Both hands by ``way`` [m] and ``turn`` [rad], and then at rest."""
+    """Return a motion of both hands by ``way`` [m] and ``turn`` [rad], and then rest."""
     start = dict(driver.hands)
 
     def move(t: float) -> dict[str, pin.SE3]:
@@ -44,7 +44,7 @@ WAY, TURN = np.array([0.1, -0.05, 0.08]), np.array([0.1, 0.3, -0.2])
     [("precision", 0.25, 0.25), ("rotation_lock", 1.0, 0.0), ("translation_lock", 0.0, 1.0)],
 )
 @pytest.mark.parametrize("control", ["trigger", "stick_left"])
-def test_what_is_held_scales_the_motion_for_as_long_as_it_is_held_and_nothing_jumps(
+def test_a_held_control_scales_the_motion_while_it_is_held_and_nothing_jumps(
     control: str, action: str, position: float, rotation: float
 ) -> None:
     driver = engaged(**{control: action})
@@ -60,7 +60,7 @@ def test_what_is_held_scales_the_motion_for_as_long_as_it_is_held_and_nothing_ju
     assert_smooth(history)
 
 
-def test_pressing_and_letting_go_in_mid_motion_does_not_jump_either() -> None:
+def test_pressing_and_releasing_during_motion_does_not_cause_a_jump_either() -> None:
     driver = engaged(grip="precision", trigger="rotation_lock", stick_up="translation_lock")
     wave = waving(driver, 0.2)
     history, random = [], np.random.default_rng(2)
@@ -90,7 +90,7 @@ class TestADeadMan:
         assert driver.states == IDLE
         return driver
 
-    def test_engages_while_it_is_held_and_pauses_at_once_when_it_is_let_go(self) -> None:
+    def test_a_dead_man_engages_while_it_is_held_and_pauses_at_once_when_released(self) -> None:
         driver = self.driver()
         driver.held = {"grip": 1.0}
         driver.run(0.05)
@@ -103,7 +103,7 @@ class TestADeadMan:
         assert {event.kind for event in driver.events} == {"dead_man_held", "dead_man_released"}
         assert not any(map(is_fault, driver.events))
 
-    def test_that_stays_held_through_a_fault_has_to_be_let_go_first(self) -> None:
+    def test_a_dead_man_that_is_held_through_a_fault_has_to_be_released_first(self) -> None:
         driver = self.driver()
         driver.held = {"grip": 1.0}
         driver.run(0.05)
@@ -120,7 +120,7 @@ class TestADeadMan:
         assert driver.states == ENGAGED
 
     @pytest.mark.parametrize("lost", [False, True])
-    def test_that_is_held_while_the_connection_comes_up_does_nothing(self, lost: bool) -> None:
+    def test_a_dead_man_that_is_held_while_the_connection_starts_does_nothing(self, lost: bool) -> None:
         driver = hands.operator(bindings=self.BINDINGS)
         driver.held = {"grip": 1.0}
         driver.run(0.2)
@@ -136,7 +136,7 @@ class TestADeadMan:
             assert driver.states == LOST
 
     @pytest.mark.parametrize("let_go", [False, True])
-    def test_is_aligned_anew_only_if_it_is_still_held(self, let_go: bool) -> None:
+    def test_after_an_alignment_a_dead_man_goes_on_only_if_it_is_still_held(self, let_go: bool) -> None:
         driver = self.driver()
         driver.held = {"grip": 1.0}
         driver.run(0.05)
@@ -149,7 +149,7 @@ class TestADeadMan:
         driver.run(0.2)
         assert driver.states == (PAUSED if let_go else ENGAGED)
 
-    def test_is_let_go_by_a_reading_that_is_no_number(self) -> None:
+    def test_a_reading_that_is_not_finite_releases_a_dead_man(self) -> None:
         driver = self.driver()
         driver.held = {"grip": 1.0}
         driver.run(0.05)
@@ -158,7 +158,7 @@ class TestADeadMan:
         assert driver.states == PAUSED
 
 
-def test_a_pedal_that_only_the_device_has_engages_while_it_is_held_and_another_one_taps() -> None:
+def test_a_pedal_of_the_device_engages_while_it_is_held_and_another_one_can_be_tapped() -> None:
     driver = hands.operator(bindings={"lower": "none", "device": {"pedal": "dead_man", "knob_hold": "stop"}})
     driver.run(0.1)
     for more, expected in (({"pedal": 1.0}, ENGAGED), ({}, PAUSED), ({"knob": 0.9}, PAUSED), ({"knob": 0.9}, STOPPED)):
@@ -167,7 +167,7 @@ def test_a_pedal_that_only_the_device_has_engages_while_it_is_held_and_another_o
         assert driver.states == expected
 
 
-def test_a_control_that_trembles_about_its_threshold_is_held_and_let_go_once() -> None:
+def test_a_control_that_trembles_about_its_threshold_is_pressed_and_released_once() -> None:
     controls = HeldControls(BindingSettings(grip=Action.PRECISION))
     seen = []
     for value in (0.0, 0.55, 0.61, 0.45, 0.59, 0.41, 0.39, 0.55, 0.5, 0.59, 0.7):
@@ -177,7 +177,7 @@ def test_a_control_that_trembles_about_its_threshold_is_held_and_let_go_once() -
 
 
 @pytest.mark.parametrize("control", HELD)
-def test_every_control_moves_from_0_to_1_and_no_other_with_it(control: str) -> None:
+def test_every_control_moves_from_0_to_1_without_any_other(control: str) -> None:
     inputs = HandInputs(**PUSHED[control])
     assert travel(control, inputs) == 1.0
     assert all(travel(other, inputs) <= 0.0 for other in HELD if other != control)
@@ -202,7 +202,7 @@ def test_every_control_moves_from_0_to_1_and_no_other_with_it(control: str) -> N
         ({"grip": "gripper_analog"}, "upper is gripper_toggle and grip is gripper_analog; allowed: one of them"),
     ],
 )
-def test_bindings_that_mean_two_things_or_nothing_are_refused(given: dict[str, str], said: str) -> None:
+def test_ambiguous_and_empty_bindings_are_refused(given: dict[str, str], said: str) -> None:
     with pytest.raises(ConfigError) as error:
         BindingSettings.model_validate(given)
     assert said in str(error.value)

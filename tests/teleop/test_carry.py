@@ -1,4 +1,4 @@
-"""Two tools that one hand moves as one body: their relation, what begins and ends it, and that nothing jumps."""
+"""Two tools that one hand moves as one body: their relation, the begin and the end, and that nothing jumps."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ CARRYING = {"left": "engaged", "right": "carried"}
 
 
 def carrying(*hands: str, **changes: object) -> Operator:
-    """The left hand carries, after ``hands`` were engaged."""
+    """Return a driver whose left hand carries, after ``hands`` were engaged."""
     driver = operator(bindings=BINDINGS, **changes)
     driver.engage(*hands)
     driver.push("grip")
@@ -34,7 +34,7 @@ def relation(targets: dict[str, ArmTarget]) -> pin.SE3:
 
 
 def turning(driver: Operator, way: float = 0.2, angle: float = 0.6) -> Callable[[float], dict[str, pin.SE3]]:
-    """The left hand goes along and turns within a second; the right one wanders about as it likes."""
+    """Return a motion in which the left hand moves and turns within a second, and the right one moves freely."""
     left, right = (driver.hands[hand] for hand in SIDES)
 
     def move(t: float) -> dict[str, pin.SE3]:
@@ -50,7 +50,7 @@ def turning(driver: Operator, way: float = 0.2, angle: float = 0.6) -> Callable[
 
 
 class TestBothTools:
-    def test_keep_their_relation_at_every_tick_and_turn_about_the_point_between_them(self) -> None:
+    def test_carried_tools_keep_their_relation_at_every_tick_and_turn_about_the_point_between_them(self) -> None:
         driver = carrying()
         before, start = relation(driver.targets), {arm: driver.place(arm) for arm in SIDES}
         for targets in driver.run(1.5, turning(driver)):
@@ -60,7 +60,7 @@ class TestBothTools:
         turned = driver.place("right").rotation @ start["right"].rotation.T
         np.testing.assert_allclose(pin.log3(turned), (0.0, 0.18, 0.6), atol=5e-3)
 
-    def test_do_not_jump_when_it_begins_in_mid_motion(self) -> None:
+    def test_carried_tools_do_not_jump_if_carrying_begins_during_motion(self) -> None:
         driver = engaged(bindings=BINDINGS)
         move = turning(driver)
         history = driver.run(0.4, move)
@@ -70,23 +70,23 @@ class TestBothTools:
         assert_smooth(history)
 
     @pytest.mark.parametrize("hand", SIDES)
-    def test_are_led_by_the_hand_that_asked(self, hand: str) -> None:
+    def test_carried_tools_follow_the_hand_that_asked(self, hand: str) -> None:
         driver = engaged(bindings=BINDINGS)
         driver.push("grip", hand)
         assert driver.states == {hand: "engaged", ("right" if hand == "left" else "left"): "carried"}
         assert [arm for arm, target in driver.targets.items() if target.hand is not None] == [hand]
 
-    def test_need_only_the_arm_of_that_hand_engaged_and_the_other_one_does_not_move_when_it_begins(self) -> None:
+    def test_carrying_needs_only_the_arm_of_its_hand_engaged_and_moves_no_arm_at_its_begin(self) -> None:
         driver = carrying("left")
         assert driver.place("right").isApprox(driver.tools["right"], 1e-6)
 
-    def test_are_held_back_together_where_one_arm_cannot_follow(self) -> None:
+    def test_both_tools_are_held_back_if_one_arm_cannot_follow(self) -> None:
         driver = carrying()
         poses = {arm: driver.place(arm) for arm in SIDES}
         move = turning(driver, angle=0.0)
         for tick in range(1500):
             driver.hands |= move(0.001 * tick)
-            driver.commanded = {"left": driver.place(), "right": poses["right"]}  # which is stuck
+            driver.commanded = {"left": driver.place(), "right": poses["right"]}  # The other arm is stuck.
             driver.tick()
             for arm in SIDES:
                 away = driver.place(arm).translation - poses[arm].translation
@@ -98,7 +98,9 @@ class TestBothTools:
         [(True, 0.5, 0.003, 0.011), (False, 0.5, -1e-9, 1e-9), (True, 0.401, 0.0009, 0.001 + 1e-9)],
         ids=["by poses of one moment", "not by those of two", "no farther than the box"],
     )
-    def test_keep_their_relation(self, in_step: bool, top: float, least: float, greatest: float) -> None:
+    def test_both_tools_keep_their_relation_at_the_leash(
+        self, in_step: bool, top: float, least: float, greatest: float
+    ) -> None:
         driver = carrying(workspace={"right": {"x": [0.3, 0.7], "y": [-0.7, 0.7], "z": [0.3, top]}})
         driver.in_step = in_step
         right = driver.place("right")
@@ -108,7 +110,7 @@ class TestBothTools:
         raised = driver.place("right").translation[2] - right.translation[2]
         assert least < raised < greatest
 
-    def test_both_stay_in_their_boxes(self) -> None:
+    def test_both_tools_stay_in_their_boxes(self) -> None:
         box = {"x": [0.4, 0.6], "y": [-0.7, 0.7], "z": [0.35, 0.6]}
         driver = carrying(workspace={"right": box})
         history = driver.run(2.0, turning(driver))
@@ -131,7 +133,9 @@ class TestItEnds:
             pytest.param(lambda driver: driver.press("right"), id="by a pause of the other hand"),
         ],
     )
-    def test_for_both_arms_which_hold_until_they_are_engaged_anew(self, end: Callable[[Operator], Any]) -> None:
+    def test_carrying_ends_for_both_arms_which_hold_until_they_are_engaged_again(
+        self, end: Callable[[Operator], Any]
+    ) -> None:
         driver = carrying()
         end(driver)
         assert driver.states == PAUSED
@@ -140,20 +144,20 @@ class TestItEnds:
         driver.press(*SIDES)
         assert driver.states == ENGAGED
 
-    def test_and_then_each_arm_is_on_its_own_leash_and_in_its_own_box(self) -> None:
+    def test_after_carrying_each_arm_has_its_own_leash_and_its_own_box(self) -> None:
         box = {"x": [0.3, 0.9], "y": [-0.7, 0.7], "z": [0.1, 0.8]}
         driver = carrying(workspace={"left": box, "right": box | {"x": [0.3, 0.51]}})
         driver.press("left")
         driver.press("left")
         assert driver.states == {"left": "engaged", "right": "paused"}
         held = driver.place()
-        driver.commanded = {"left": held}  # which is stuck
+        driver.commanded = {"left": held}  # The arm is stuck.
         driver.run(1.5, turning(driver, angle=0.0))
         away = driver.place().translation - held.translation
-        assert 0.09 < np.linalg.norm(away) < 0.1 + 1e-6  # of which less where the hand has come back a little
+        assert 0.09 < np.linalg.norm(away) < 0.1 + 1e-6  # The distance is smaller if the hand has come back a little.
 
     @pytest.mark.parametrize("hand", SIDES)
-    def test_with_an_alignment_after_which_neither_goes_on_by_itself(self, hand: str) -> None:
+    def test_carrying_ends_with_an_alignment_after_which_neither_arm_goes_on_by_itself(self, hand: str) -> None:
         driver = carrying()
         driver.lower, driver.upper = {hand}, {hand}
         driver.run(0.3)
@@ -163,21 +167,21 @@ class TestItEnds:
         driver.assert_holds()
 
     @pytest.mark.parametrize("linked", [True, False])
-    def test_with_a_fault_of_the_hand_that_leads(self, linked: bool) -> None:
+    def test_carrying_ends_with_a_fault_of_the_hand_that_leads(self, linked: bool) -> None:
         driver = carrying(linked=linked)
         driver.silent = {"left"}
         driver.run(0.3)
         assert driver.states == {"left": "lost", "right": "lost" if linked else "paused"}
         driver.assert_holds()
 
-    def test_not_with_a_fault_of_the_other_hand_which_may_be_put_down(self) -> None:
+    def test_carrying_does_not_end_with_a_fault_of_the_other_hand_which_may_be_put_down(self) -> None:
         driver = carrying()
         driver.silent = {"right"}
         history = driver.run(1.0, turning(driver))
         assert driver.states == CARRYING
         assert all(targets["right"].pose is not None for targets in history)
 
-    def test_with_a_stop_and_with_a_lost_connection(self) -> None:
+    def test_carrying_ends_with_a_stop_and_with_a_lost_connection(self) -> None:
         driver = carrying()
         driver.push("stick_left", "right")
         assert driver.states == {"left": "stopped", "right": "stopped"}
@@ -188,14 +192,14 @@ class TestItEnds:
 
 
 class TestItDoesNotBegin:
-    def test_for_an_arm_that_is_not_engaged(self) -> None:
+    def test_carrying_is_refused_for_an_arm_that_is_not_engaged(self) -> None:
         driver = operator(bindings=BINDINGS)
         driver.engage("right")
         driver.push("grip")
         assert driver.states == {"left": "idle", "right": "engaged"}
         assert driver.refusals() == {"not_carried: engage_first"}
 
-    def test_where_a_tool_is_held_up(self) -> None:
+    def test_carrying_is_refused_if_a_tool_is_held_up(self) -> None:
         driver = engaged(bindings=BINDINGS)
         driver.commanded = {arm: driver.place(arm) for arm in SIDES}
         driver.run(1.0, turning(driver))
@@ -203,7 +207,7 @@ class TestItDoesNotBegin:
         assert driver.states == ENGAGED
         assert driver.refusals() == {"not_carried: tool_held_up"}
 
-    def test_and_while_it_lasts_the_arms_do_not_go_home(self) -> None:
+    def test_the_way_home_is_refused_while_the_arms_carry(self) -> None:
         driver = carrying()
         driver.push("stick_down")
         assert driver.states == CARRYING

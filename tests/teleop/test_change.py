@@ -1,4 +1,4 @@
-"""Settings that change while the arms move: no jump, what counts from then on, and what is refused."""
+"""Settings that change while the arms move: nothing jumps, the new values hold, and some changes are refused."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def settings(driver: Operator, **changes: object) -> TeleopSettings:
 
 
 @pytest.mark.parametrize("changes", CHANGES.values(), ids=CHANGES)
-def test_an_arm_that_moves_goes_on_without_a_jump(changes: dict[str, object]) -> None:
+def test_a_moving_arm_goes_on_without_a_jump(changes: dict[str, object]) -> None:
     driver = engaged()
     move = waving(driver)
     history = driver.run(0.4, move)
@@ -39,7 +39,7 @@ def test_an_arm_that_moves_goes_on_without_a_jump(changes: dict[str, object]) ->
     [{"stance": "mirror"}, {"axes": ("+y", "-x", "+z")}, {"bindings": {"grip": "home"}}, {"hold_time": 1.0}],
     ids=["stance", "axes", "bindings", "hold_time"],
 )
-def test_what_turns_the_hands_or_their_controls_round_waits_until_both_arms_hold(changes: dict[str, object]) -> None:
+def test_a_change_of_stance_axes_or_controls_waits_until_both_arms_hold(changes: dict[str, object]) -> None:
     driver = engaged()
     refusal = driver.teleop.change(settings(driver, **changes), driver.now)
     assert kinds(refusal) == "arms_must_hold"
@@ -51,7 +51,7 @@ def test_what_turns_the_hands_or_their_controls_round_waits_until_both_arms_hold
     assert driver.states == ENGAGED
 
 
-def test_a_stance_that_is_changed_gives_each_hand_the_other_arm() -> None:
+def test_a_changed_stance_gives_each_hand_the_other_arm() -> None:
     driver = engaged()
     driver.press(*SIDES)
     assert driver.teleop.change(settings(driver, stance="mirror"), driver.now) is None
@@ -61,7 +61,7 @@ def test_a_stance_that_is_changed_gives_each_hand_the_other_arm() -> None:
     assert driver.states == {"left": "paused", "right": "engaged"}
 
 
-def test_a_press_that_began_before_the_hands_were_turned_round_engages_nothing() -> None:
+def test_a_press_that_began_before_the_change_of_hands_engages_nothing() -> None:
     driver = engaged()
     driver.press(*SIDES)
     driver.lower = {"left"}

@@ -1,4 +1,4 @@
-"""Faults and hostile input: every arm stops, stays, and engages anew only by a new press."""
+"""Faults and hostile input: every arm stops, stays, and engages again only with a new press."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_a_fault_of_the_left_hand_disengages(reason: str, linked: bool) -> None:
 
 
 @pytest.mark.parametrize("linked", [True, False], ids=["linked", "each for itself"])
-def test_what_stops_one_arm_outside_of_this_layer_stops_the_linked_one_once(linked: bool) -> None:
+def test_a_stop_of_one_arm_by_other_code_stops_the_linked_one_once(linked: bool) -> None:
     driver = engaged(linked=linked)
     driver.teleop.pause(driver.now, Reason(ReasonKind.TOOL_UNKNOWN), "left")
     assert driver.states == (LOST if linked else {"left": "lost", "right": "engaged"})
@@ -68,13 +68,14 @@ def test_what_stops_one_arm_outside_of_this_layer_stops_the_linked_one_once(link
         assert driver.states == {"left": "lost", "right": "engaged"}
 
 
-def test_a_reset_arm_holds_until_a_press_after_its_hand_was_seen_anew() -> None:
+def test_a_reset_arm_holds_until_a_press_after_a_new_sample_of_its_hand() -> None:
     driver = engaged(linked=False)
     driver.teleop.reset(driver.now, "left", Reason(ReasonKind.RESET_SERVICE))
     assert driver.states == {"left": "lost", "right": "engaged"}
     driver.teleop.take_events()
     driver.teleop.reset(driver.now, "left", Reason(ReasonKind.RESET_SERVICE))
-    assert [event.kind for event in driver.teleop.take_events()] == ["reset_service"]  # told, though it holds already
+    # The event is reported although the arm already holds.
+    assert [event.kind for event in driver.teleop.take_events()] == ["reset_service"]
     driver.silent = {"left"}
     driver.run(0.1)
     driver.press("left")
@@ -94,7 +95,7 @@ def test_silence_disengages_within_the_timeout_and_a_tick() -> None:
     assert 148 <= following <= 151
 
 
-def test_a_reading_of_the_buttons_that_was_overtaken_presses_nothing() -> None:
+def test_a_reading_of_the_buttons_that_arrives_after_a_newer_one_presses_nothing() -> None:
     driver = engaged()
     driver.tick(driver.samples())
     late = replace(sample("left", driver.hands["left"], driver.now, lower=True), inputs_stamp=driver.now - 0.005)
@@ -103,7 +104,7 @@ def test_a_reading_of_the_buttons_that_was_overtaken_presses_nothing() -> None:
     assert driver.states == ENGAGED
 
 
-def test_a_lost_connection_pauses_every_arm_and_wants_fresh_poses_and_a_new_press() -> None:
+def test_a_lost_connection_pauses_every_arm_and_requires_new_poses_and_a_new_press() -> None:
     driver = engaged()
     driver.run(0.2, waving(driver))
     driver.teleop.connection_lost(driver.now)
@@ -126,7 +127,7 @@ def test_a_lost_connection_pauses_every_arm_and_wants_fresh_poses_and_a_new_pres
     ],
     ids=["stale", "never received", "not usable"],
 )
-def test_engaging_is_refused_when_poses_are(alter: Callable[[HandSample], HandSample], reason: str) -> None:
+def test_engaging_is_refused_if_poses_are_refused(alter: Callable[[HandSample], HandSample], reason: str) -> None:
     driver = operator()
     driver.alter = alter
     driver.run(0.3)
@@ -136,7 +137,7 @@ def test_engaging_is_refused_when_poses_are(alter: Callable[[HandSample], HandSa
 
 
 @pytest.mark.parametrize("tools", [{}, dict.fromkeys(SIDES, pose(math.nan))], ids=["missing", "not finite"])
-def test_engaging_is_refused_when_the_tools_pose_is(tools: dict[str, pin.SE3]) -> None:
+def test_engaging_is_refused_if_the_tools_pose_is_refused(tools: dict[str, pin.SE3]) -> None:
     driver = operator()
     driver.tools = tools
     driver.engage()
@@ -154,7 +155,7 @@ def test_a_stalled_loop_disengages_instead_of_catching_up() -> None:
 
 
 @pytest.mark.parametrize("back", [0.001, 0.1], ids=["a millisecond", "a tenth of a second"])
-def test_a_clock_that_goes_back_a_little_holds_the_target_still(back: float) -> None:
+def test_a_clock_that_goes_back_a_little_holds_the_target(back: float) -> None:
     driver = engaged()
     driver.run(0.2, waving(driver))
     before = driver.targets
@@ -164,7 +165,7 @@ def test_a_clock_that_goes_back_a_little_holds_the_target_still(back: float) -> 
 
 
 @pytest.mark.parametrize("now", [math.nan, math.inf, -math.inf, -1e9, 0.0, 1e12], ids=str)
-def test_a_clock_that_cannot_be_followed_disengages_and_a_press_on_the_new_one_engages(now: float) -> None:
+def test_a_clock_that_cannot_be_followed_disengages_and_a_press_on_the_new_clock_engages(now: float) -> None:
     driver = engaged()
     driver.run(0.2, waving(driver))
     targets = driver.teleop.update(driver.samples(), driver.tools, now)

@@ -1,4 +1,4 @@
-"""Filters: the stated delay, the tremor, and what a hostile stream may not do."""
+"""Filters: the stated delay, the tremor, and the limits of a hostile stream's effect."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ STILL = pose(0.1, 0.2, 0.3, (0.4, 0.5, 0.6))
 
 
 def follow(path: Path, duration: float = 3.0, dt: float = 0.002, period: float = 1 / 75) -> tuple[float, list[pin.SE3]]:
-    """The filter's delay and its output at every tick."""
+    """Return the filter's delay and its output at every tick."""
     pose_filter = PoseFilter(FilterSettings())
     pose_filter.reset(floats_of(path(0.0)), 0.0)
     due, outputs = period, []
@@ -34,7 +34,9 @@ def follow(path: Path, duration: float = 3.0, dt: float = 0.002, period: float =
 
 @pytest.mark.parametrize("dt", [0.001, 0.02], ids="loop of {} s".format)
 @pytest.mark.parametrize("speed", [0.02, 2.0], ids="{} per second".format)
-def test_a_steady_motion_comes_out_late_by_exactly_the_stated_delay_at_any_speed(speed: float, dt: float) -> None:
+def test_the_output_of_a_steady_motion_is_late_by_exactly_the_stated_delay_at_any_speed(
+    speed: float, dt: float
+) -> None:
     def path(t: float) -> pin.SE3:
         return pose(speed * t, 0.7 * speed * t, -0.5 * speed * t, (0.0, 0.0, speed * t))
 
@@ -57,7 +59,7 @@ def test_tremor_of_a_resting_hand_is_reduced_to_less_than_two_fifths(frequency: 
     assert max(abs(pin.log3(output.rotation)[1]) for output in rest) < math.radians(0.4 * 0.3)
 
 
-def test_a_hand_that_stops_dead_is_overshot_by_less_than_the_lead_can_be() -> None:
+def test_the_overshoot_of_a_hand_that_stops_suddenly_is_smaller_than_its_lead() -> None:
     def path(t: float) -> pin.SE3:
         return pose(0.3 * min(t, 1.0))
 
@@ -67,7 +69,7 @@ def test_a_hand_that_stops_dead_is_overshot_by_less_than_the_lead_can_be() -> No
 
 
 def largest_step(arrivals: list[tuple[float, list[tuple[float, float]]]]) -> float:
-    """Largest step of the output in 1 ms, for samples (stamp, x) that arrive at given times."""
+    """Return the largest step of the output in 1 ms, for samples (stamp, x) that arrive at given times."""
     pose_filter = PoseFilter(FilterSettings())
     pose_filter.reset(floats_of(pose()), 0.0)
     outputs: list[float] = []
@@ -93,12 +95,14 @@ def largest_step(arrivals: list[tuple[float, list[tuple[float, float]]]]) -> flo
     ],
     ids=["a step", "a burst of 51", "doubled stamps", "a late stamp", "samples a millisecond apart", "long gaps"],
 )
-def test_the_output_is_continuous_when_the_stream_has(arrivals: list[tuple[float, list[tuple[float, float]]]]) -> None:
+def test_the_output_is_continuous_after_gaps_and_bursts_of_the_stream(
+    arrivals: list[tuple[float, list[tuple[float, float]]]],
+) -> None:
     assert largest_step(arrivals) < 0.006
 
 
 def speeds(arrivals: list[tuple[float, float]], velocity: float, since: float) -> np.ndarray:
-    """Of the output after a time, for samples of a steady hand, each with when it is measured and received [s]."""
+    """Return the output speeds after a time, for a steady hand's samples with times of measurement and receipt [s]."""
     pose_filter = PoseFilter(FilterSettings())
     pose_filter.reset(floats_of(pose()), 0.0)
     outputs, queue = [], list(arrivals)
@@ -111,18 +115,18 @@ def speeds(arrivals: list[tuple[float, float]], velocity: float, since: float) -
     return np.diff(outputs)[round(since / 0.001) :] / 0.001
 
 
-def test_jitter_of_receipt_hardly_looks_like_speed() -> None:
+def test_jitter_of_receipt_hardly_changes_the_speed() -> None:
     late = np.random.default_rng(5).exponential(0.0015, 300).clip(max=0.01)
     arrivals = [(n / 75, n / 75 + late[n]) for n in range(300)]
     assert np.std(speeds(arrivals, 0.5, 1.0)) < 0.04 * 0.5
 
 
-def test_what_was_missed_in_a_gap_is_made_up_for_at_no_more_than_some_times_the_speed() -> None:
+def test_motion_that_was_missed_in_a_gap_is_caught_up_at_a_bounded_speed() -> None:
     arrivals = [(n / 75, n / 75) for n in range(300) if not 1.5 < n / 75 < 1.6]
     assert speeds(arrivals, 0.5, 1.0).max() < 3.5 * 0.5
 
 
-def test_a_rotation_that_is_filtered_for_long_stays_one() -> None:
+def test_a_rotation_stays_a_rotation_after_long_filtering() -> None:
     pose_filter = PoseFilter(FilterSettings())
     pose_filter.reset(floats_of(STILL), 0.0)
     for tick in range(20_000):

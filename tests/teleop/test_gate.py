@@ -1,4 +1,4 @@
-"""The gate: which poses may move an arm."""
+"""The gate decides which poses may move an arm."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def test_a_quaternion_of_either_sign_and_any_length_is_the_same_rotation(factor:
     ],
     ids=["a fast move passes", "a jump is a fault", "a fast turn passes", "a jump of the rotation is a fault"],
 )
-def test_between_two_samples(moved: object, fault: str | None) -> None:
+def test_limits_between_two_samples(moved: object, fault: str | None) -> None:
     usable, found = gate().receive(sample("left", moved, 1.013), 1.013)
     assert usable
     assert kinds(found) == (fault or "")
@@ -79,25 +79,25 @@ def test_the_watchdog_counts_receipt_time_and_only_new_poses() -> None:
     assert passed.stale(1.1501)
 
 
-def test_a_stamp_in_the_future_does_not_hold_the_watchdog_off() -> None:
+def test_a_stamp_in_the_future_does_not_delay_the_watchdog() -> None:
     passed = gate()
     passed.receive(replace(GOOD, pose_stamp=1e6), 1.01)
     assert passed.stale(1.17)
     assert passed.receive(replace(GOOD, pose_stamp=1.02), 1.02) == (True, None)
 
 
-def test_an_overtaken_pose_is_passed_over() -> None:
+def test_a_pose_that_arrives_after_a_newer_one_is_ignored() -> None:
     passed = gate()
     assert passed.receive(sample("left", pose(9.0), 0.99), 1.01) == (False, None)
     assert passed.pose is not None
     assert passed.pose[0][0] == 0.1
 
 
-def test_poses_too_far_apart_in_time_are_a_fault_even_when_they_arrive_together() -> None:
+def test_poses_too_far_apart_in_time_are_a_fault_even_if_they_arrive_together() -> None:
     assert kinds(gate().receive(replace(GOOD, pose_stamp=1.2), 1.2)[1]) == "pose_gap"
 
 
-def test_before_any_pose_inputs_alone_are_no_fault_and_a_stamp_that_is_no_number_is() -> None:
+def test_before_any_pose_inputs_alone_are_no_fault_but_a_stamp_that_is_not_finite_is() -> None:
     fresh = PoseGate(GateSettings())
     assert fresh.receive(replace(GOOD, pose_stamp=-math.inf, quaternion=np.zeros(4)), 1.0) == (False, None)
     assert fresh.receive(replace(GOOD, pose_stamp=math.nan), 1.0)[1] is not None
@@ -106,7 +106,7 @@ def test_before_any_pose_inputs_alone_are_no_fault_and_a_stamp_that_is_no_number
 
 
 def faults_of_a_motion(speed: float, receipts: list[float], turning: bool = False) -> list[str]:
-    """Faults of a hand at a constant speed [m/s or rad/s], sampled at 75 Hz and received at these times [s]."""
+    """Return faults of a hand at constant speed [m/s or rad/s], sampled at 75 Hz and received at these times [s]."""
     passed = PoseGate(GateSettings())
     found = []
     for index, stamp in enumerate(receipts):
@@ -130,13 +130,13 @@ def test_a_hand_that_moves_faster_than_any_operator_is_a_fault(speed: float, tur
 
 @pytest.mark.parametrize("stall", [0.04, 0.08, 0.13])
 def test_samples_that_a_network_held_up_and_delivers_at_once_are_no_speed(stall: float) -> None:
-    """A hand at 2 m/s whose samples of ``stall`` come within a millisecond: 26 mm in 0.1 ms."""
+    """The hand moves at 2 m/s. Samples of ``stall`` arrive within a millisecond: 26 mm in 0.1 ms."""
     end = EVEN[20] + stall
     receipts = [max(t, end + 1e-4 * (index - 20)) if t > EVEN[20] else t for index, t in enumerate(EVEN)]
     assert faults_of_a_motion(2.0, sorted(receipts)) == [""] * len(EVEN)
 
 
-def test_no_speed_is_taken_across_a_jump_which_is_a_fault_of_its_own() -> None:
+def test_a_jump_is_a_fault_of_its_own_and_gives_no_speed() -> None:
     passed = PoseGate(GateSettings(max_speed=1.0))
     for stamp in EVEN[:10]:
         passed.receive(sample("left", pose(), stamp), stamp)
@@ -146,7 +146,7 @@ def test_no_speed_is_taken_across_a_jump_which_is_a_fault_of_its_own() -> None:
 
 
 @pytest.mark.parametrize("fault", sorted(HandFault))
-def test_a_fault_that_the_input_found_is_handed_on_and_leaves_no_pose(fault: HandFault) -> None:
+def test_a_fault_that_the_input_found_is_passed_on_and_leaves_no_pose(fault: HandFault) -> None:
     passed = gate()
     assert passed.problem is None
     assert passed.receive(replace(GOOD, pose_stamp=1.01, fault=fault), 1.01) == (False, Reason(ReasonKind(fault)))

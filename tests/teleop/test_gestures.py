@@ -1,4 +1,4 @@
-"""Gestures: each once, told from the alignment chord."""
+"""Each gesture is reported once, and is distinguished from the alignment chord."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from q2r2_control.teleop.gestures import GestureRecognizer, Press
 from q2r2_control.types import HandInputs
 from tests.teleop.hands import PUSHED
 
-WINDOW = 0.075  # between two readings, so that rounding does not matter
+WINDOW = 0.075  # The window ends between two readings, so that rounding does not matter.
 LOWER_DOWN, LOWER = Press("lower", Gesture.DOWN), Press("lower", Gesture.TAP)
 UPPER_DOWN, UPPER = Press("upper", Gesture.DOWN), Press("upper", Gesture.TAP)
 
@@ -24,7 +24,10 @@ def recognizer(**bindings: str) -> GestureRecognizer:
 def play(
     script: str, bindings: dict[str, str] | None = None, period: float = 0.01, start_released: bool = True
 ) -> list[tuple[Press, float]]:
-    """Presses and when they were reported; ``script`` has one letter a reading: . none, u upper, l lower, b both."""
+    """Return presses and their times of report.
+
+    Each letter of ``script`` is a reading: . none, u upper, l lower, b both.
+    """
     gestures = recognizer(**(bindings or {}))
     found, t = [], 0.0
     for letter in ("." if start_released else "") + script:
@@ -58,7 +61,9 @@ SCRIPTS: dict[str, tuple[dict[str, str], str, list[tuple[Press, float]]]] = {
 
 
 @pytest.mark.parametrize(("bindings", "script", "expected"), SCRIPTS.values(), ids=SCRIPTS)
-def test_one_gesture_is_one(bindings: dict[str, str], script: str, expected: list[tuple[Press, float]]) -> None:
+def test_one_gesture_is_reported_once(
+    bindings: dict[str, str], script: str, expected: list[tuple[Press, float]]
+) -> None:
     assert play(script, bindings) == expected
 
 
@@ -66,7 +71,7 @@ def test_a_button_held_from_the_first_reading_does_not_count_until_released() ->
     assert play("l" * 20 + "." + "l" * 10, start_released=False)[0] == (LOWER_DOWN, 0.21)
 
 
-def test_controls_that_are_held_from_the_first_reading_on_are_told_once_after_a_second() -> None:
+def test_controls_that_are_held_from_the_first_reading_on_are_reported_once_after_a_second() -> None:
     found = recognizer()
     for step in range(30):
         now = 0.1 * step
@@ -79,7 +84,7 @@ def test_controls_that_are_held_from_the_first_reading_on_are_told_once_after_a_
     assert found.take_stuck(9.0) is None, "it was pressed"
 
 
-def test_cancelling_drops_everything_but_a_stop_that_has_begun() -> None:
+def test_cancelling_drops_everything_except_a_stop_that_has_begun() -> None:
     gestures = recognizer(upper_hold="stop", lower_hold="home")
     gestures.receive(HandInputs(), 0.0)
     gestures.receive(HandInputs(button_upper=True), 0.01)
@@ -89,13 +94,13 @@ def test_cancelling_drops_everything_but_a_stop_that_has_begun() -> None:
     gestures.receive(HandInputs(), 1.0)
     gestures.receive(HandInputs(button_upper=True), 1.1)
     gestures.cancel()
-    assert gestures.receive(HandInputs(), 1.2) == []  # no stop, so nothing
+    assert gestures.receive(HandInputs(), 1.2) == []  # There is no stop, so that nothing is reported.
     gestures.receive(HandInputs(button_lower=True), 1.3)
     gestures.cancel()
     assert gestures.due(3.0) == gestures.receive(HandInputs(button_lower=True), 3.1) == []
 
 
-def test_readings_that_come_late_and_at_once_are_told_by_their_own_times() -> None:
+def test_readings_that_arrive_late_and_together_count_at_their_own_times() -> None:
     gestures = recognizer(lower_hold="home")
     found = []
     for stamp, inputs in ((0.0, HandInputs()), (0.1, HandInputs(button_lower=True)), (0.8, HandInputs())):
@@ -104,16 +109,17 @@ def test_readings_that_come_late_and_at_once_are_told_by_their_own_times() -> No
 
 
 @pytest.mark.parametrize("control", HELD)
-def test_triggers_and_stick_are_tapped_at_once_since_no_chord_is_made_of_them(control: str) -> None:
+def test_taps_of_triggers_and_sticks_are_reported_at_once_because_they_are_part_of_no_chord(control: str) -> None:
     gestures = recognizer(**{control: "home"})
-    assert gestures.receive(HandInputs(**PUSHED[control]), 0.0) + gestures.due(1.0) == []  # as held from before
+    # The control counts as held from before.
+    assert gestures.receive(HandInputs(**PUSHED[control]), 0.0) + gestures.due(1.0) == []
     gestures.receive(HandInputs(), 1.1)
     assert gestures.receive(HandInputs(**PUSHED[control]), 1.2) == [Press(control, Gesture.DOWN)]
     assert gestures.due(1.2) == [Press(control, Gesture.TAP)]
     assert gestures.receive(HandInputs(), 1.3) + gestures.due(2.0) == []
 
 
-def test_what_is_not_bound_or_lasts_makes_no_gesture() -> None:
+def test_an_unbound_control_and_a_lasting_action_make_no_gesture() -> None:
     gestures = recognizer(grip="precision")
     gestures.receive(HandInputs(), 0.0)
     pressed = HandInputs(press_index=1.0, press_middle=1.0, thumb_stick_vertical=1.0)

@@ -1,4 +1,4 @@
-"""Arms that hang lower than they are commanded to: engaging them moves neither the tool nor the command."""
+"""Arms that hang lower than their commands: engaging them moves neither the tool nor the command."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ SAG = np.array([0.005, 0.0, -0.02])
 
 
 def hanging(driver: Operator, by: Array = SAG) -> Operator:
-    """All tools hang ``by`` off their commands."""
+    """Let all tools hang ``by`` away from their commands."""
     driver.commanded = {arm: pin.SE3(tool.rotation, tool.translation - by) for arm, tool in driver.tools.items()}
     return driver
 
 
 def command(driver: Operator, arm: str = "left") -> Array:
-    """The position that the controller is asked for."""
+    """Return the position that the controller gets."""
     asked = driver.targets[arm].command
     assert asked is not None
     return asked.translation
@@ -39,13 +39,13 @@ def test_the_target_begins_at_the_tool_and_the_command_where_it_was() -> None:
     np.testing.assert_allclose(target(driver) - command(driver), SAG, atol=1e-12)
 
 
-def test_a_tool_that_is_farther_from_its_command_was_pushed_there_and_the_command_begins_at_it() -> None:
+def test_a_tool_far_from_its_command_was_pushed_and_the_command_begins_at_the_tool() -> None:
     driver = hanging(operator(), np.array([0.0, 1.01 * MAX_OFFSET[0], 0.0]))
     driver.engage()
     np.testing.assert_allclose(command(driver), driver.tools["left"].translation, atol=1e-9)
 
 
-def test_each_engagement_goes_by_the_sag_that_there_is_then_and_changed_settings_do_not() -> None:
+def test_each_engagement_uses_the_present_sag_and_changed_settings_do_not_alter_it() -> None:
     driver = hanging(engaged())
     assert driver.targets["left"].offset is None
     changed = driver.settings.model_copy(update={"position_scale": 0.5})
@@ -57,7 +57,7 @@ def test_each_engagement_goes_by_the_sag_that_there_is_then_and_changed_settings
     np.testing.assert_allclose(command(driver) - target(driver), -SAG, atol=1e-12)
 
 
-def test_the_leash_is_measured_from_where_the_tool_hangs() -> None:
+def test_the_leash_is_measured_from_the_hanging_tool() -> None:
     for way in (0.2, -0.2):
         driver = hanging(operator(leash={"distance": 0.03}))
         driver.engage()

@@ -1,4 +1,4 @@
-"""The vibrations of a hand, each of which ends."""
+"""The vibrations of a hand. Each of them ends."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_a_pause_that_is_complete_is_not_felt_again() -> None:
     assert haptics.at(1.0, "left") is None
 
 
-def test_slipping_is_felt_at_every_stretch_of_it_and_anew_after_engaging() -> None:
+def test_slipping_is_felt_at_every_further_distance_and_again_after_engaging() -> None:
     haptics = HapticPulses()
     felt = []
     for tick in range(100):
@@ -76,7 +76,7 @@ def test_slipping_is_felt_at_every_stretch_of_it_and_anew_after_engaging() -> No
     assert haptics.at(20.0, "left") == feedback(pulses.SLIP)
 
 
-def test_a_weaker_vibration_does_not_cut_a_stronger_one_short() -> None:
+def test_a_weaker_vibration_does_not_interrupt_a_stronger_one() -> None:
     haptics = HapticPulses()
     haptics.start_pulse(JUMPED)
     assert haptics.at(1.0, "left") == feedback(pulses.FAULT)
@@ -86,7 +86,7 @@ def test_a_weaker_vibration_does_not_cut_a_stronger_one_short() -> None:
 
 
 def felt(haptics: HapticPulses, since: float, until: float) -> list[HapticFeedback]:
-    """All that is sent in that time [s], at 1000 ticks a second."""
+    """Return everything that is sent in that time [s], at 1000 ticks a second."""
     ticks = range(round((until - since) * 1000))
     return [sent for tick in ticks if (sent := haptics.at(since + 0.001 * tick, "left")) is not None]
 
@@ -95,10 +95,10 @@ def condition(spare: float = 1.0, limits: tuple[str, ...] = (), force: float | N
     return ArmCondition(spare, frozenset(limits), force)
 
 
-def test_coming_near_is_felt_at_every_5_mm_and_stronger_the_nearer_and_leaving_is_not() -> None:
+def test_approach_is_felt_at_every_5_mm_and_stronger_when_nearer_and_retreat_is_not_felt() -> None:
     haptics = HapticPulses()
     felt_at: list[float] = []
-    for tick in range(200):  # from 60 mm to spare to 0, where the distance trembles, and back
+    for tick in range(200):  # The margin falls from 60 mm to 0, where it trembles, and rises again.
         haptics.notice(condition(abs(0.06 - 0.0006 * tick) + (0.004 * (tick % 2) if tick < 100 else 0.0)))
         felt_at += [sent.amplitude for sent in felt(haptics, tick, tick + 1.0) if sent.amplitude > 0.0]
         if tick == 100:
@@ -108,7 +108,7 @@ def test_coming_near_is_felt_at_every_5_mm_and_stronger_the_nearer_and_leaving_i
     assert pulses.NEAR.amplitude < felt_at[0] < felt_at[-1] == pytest.approx(0.6)
 
 
-def test_a_contact_is_felt_at_every_5_newtons_and_stronger_the_harder() -> None:
+def test_a_contact_is_felt_at_every_5_newtons_and_stronger_at_larger_forces() -> None:
     haptics = HapticPulses()
     felt_at = []
     for tick in range(80):
@@ -118,7 +118,7 @@ def test_a_contact_is_felt_at_every_5_newtons_and_stronger_the_harder() -> None:
     assert pulses.CONTACT.amplitude < felt_at[0] < felt_at[5] < felt_at[-1] == pytest.approx(0.8)
 
 
-def test_a_joint_at_its_limit_and_a_grasp_are_each_felt_once_for_as_long_as_they_last() -> None:
+def test_a_joint_limit_and_a_grasp_are_each_felt_once_while_they_last() -> None:
     haptics = HapticPulses()
     sent = []
     for tick in range(10):
@@ -131,7 +131,7 @@ def test_a_joint_at_its_limit_and_a_grasp_are_each_felt_once_for_as_long_as_they
     assert [one for one in sent if one.amplitude][2:] == [feedback(pulses.GRASP)] * 2
 
 
-def test_two_vibrations_are_felt_as_two_and_a_fault_waits_for_none() -> None:
+def test_two_vibrations_are_felt_as_two_and_a_fault_does_not_wait() -> None:
     haptics = HapticPulses()
     haptics.start_pulse(event("paused", "engaged", K.PRESSED))
     first = felt(haptics, 1.0, 1.0 + pulses.ENGAGED.duration + 0.002)
@@ -144,13 +144,15 @@ def test_two_vibrations_are_felt_as_two_and_a_fault_waits_for_none() -> None:
 
 
 @pytest.mark.parametrize(("strength", "expected"), [(0.5, [0.5 * pulses.FAULT.amplitude, 0.0]), (0.0, [])])
-def test_the_strength_of_all_is_a_setting_and_0_sends_nothing(strength: float, expected: list[float]) -> None:
+def test_the_strength_of_all_vibrations_is_a_setting_and_0_sends_nothing(
+    strength: float, expected: list[float]
+) -> None:
     haptics = HapticPulses(HapticSettings(strength=strength))
     haptics.start_pulse(JUMPED)
     assert [sent.amplitude for sent in felt(haptics, 1.0, 2.0)] == expected
 
 
-def test_of_two_at_once_the_one_that_stands_later_in_the_vocabulary_is_felt() -> None:
+def test_of_two_simultaneous_vibrations_the_later_one_in_the_vocabulary_is_felt() -> None:
     amplitudes = [pulse.amplitude for pulse in VOCABULARY]
     assert amplitudes == sorted(amplitudes)
     haptics = HapticPulses()
@@ -159,7 +161,7 @@ def test_of_two_at_once_the_one_that_stands_later_in_the_vocabulary_is_felt() ->
     assert haptics.at(0.0, "left") == feedback(pulses.GRASP)
 
 
-def test_the_table_in_the_docs_is_the_vocabulary() -> None:
+def test_the_table_in_the_docs_equals_the_vocabulary() -> None:
     rows = [row for row in table_rows("operator.md") if row[-1].isdigit()]
     numbers = {meaning: [float(n) for n in re.findall(r"[\d.]+", " ".join(cells))] for meaning, *cells in rows}
     assert numbers.keys() == {pulse.meaning for pulse in VOCABULARY}

@@ -1,4 +1,4 @@
-"""The leash: alone on an arm that does not move, then in the closed loop with one that is stretched out or blocked."""
+"""The leash: alone on an arm that does not move, then in the closed loop with a stretched or blocked arm."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ MOTIONS = {
 
 
 class Tied:
-    """A hand, a motion and a leash to a tool; every tick is 1 ms."""
+    """A hand, a motion and a leash to a tool. Every tick is 1 ms."""
 
     def __init__(self, motion: RelativeMotion, **settings: float | None) -> None:
         self.motion, self.leash = motion, Leash(LeashSettings.model_validate(settings))
@@ -80,7 +80,7 @@ def test_a_target_within_the_leash_is_the_relative_motion_bit_for_bit(motion: Re
 
 
 @pytest.mark.parametrize("motion", MOTIONS.values(), ids=MOTIONS.keys())
-def test_a_taut_leash_holds_the_target_at_its_length_and_counts_what_slipped(motion: RelativeMotion) -> None:
+def test_a_taut_leash_holds_the_target_at_its_length_and_counts_the_slip(motion: RelativeMotion) -> None:
     tied = Tied(motion, distance=0.1, angle=0.5)
     way, turn = 0.6, 0.9
     for target in tied.go(along(way / 600, 0, 0, 0, 0, turn / 600), 600):
@@ -98,7 +98,7 @@ def test_a_taut_leash_holds_the_target_at_its_length_and_counts_what_slipped(mot
 
 @pytest.mark.parametrize("sign", [1.0, -1.0], ids=["a quaternion", "the other one of the same rotation"])
 @pytest.mark.parametrize("turning", [False, True], ids=["position", "rotation"])
-def test_a_target_is_held_from_the_end_of_the_leash_on_and_not_before(turning: bool, sign: float) -> None:
+def test_a_target_is_held_at_the_end_of_the_leash_and_not_before(turning: bool, sign: float) -> None:
     leash, length = Leash(LeashSettings(distance=0.1, angle=0.5)), 0.5 if turning else 0.1
     position, (a, b, c, w) = floats_of(TOOL)
     tool = position, (sign * a, sign * b, sign * c, sign * w)
@@ -113,19 +113,19 @@ def test_a_target_is_held_from_the_end_of_the_leash_on_and_not_before(turning: b
 
 
 @pytest.mark.parametrize("settings", [{"distance": None}, {"angle": None}, {"distance": None, "angle": None}], ids=str)
-def test_a_leash_that_is_none_lets_the_target_go_anywhere(settings: dict[str, None]) -> None:
+def test_without_a_leash_the_target_may_be_anywhere(settings: dict[str, None]) -> None:
     tied = Tied(RelativeMotion(), **settings)
     tied.go(along(0.001, 0, 0, 0.002, 0, 0), 1000)
     assert tied.distance == pytest.approx(1.0 if "distance" in settings else 0.1)
     assert tied.angle == pytest.approx(2.0 if "angle" in settings else 0.5)
 
 
-def test_a_taut_target_goes_along_with_its_tool_without_a_step() -> None:
+def test_a_taut_target_moves_with_its_tool_without_a_step() -> None:
     tied = Tied(RelativeMotion(), distance=0.1, angle=0.5)
     tied.go(along(0.001), 300)
     before = tied.target
     for _ in range(300):
-        tied.tool = moved(tied.tool, along(-0.0005, 0.0001))  # pushed back by something
+        tied.tool = moved(tied.tool, along(-0.0005, 0.0001))  # Something pushed the tool back.
         target = tied.tick(tied.hand)
         assert np.linalg.norm(target.translation - before.translation) < 0.0006
         assert tied.distance <= 0.1 + 1e-12
@@ -141,7 +141,7 @@ def test_a_hand_that_comes_back_takes_the_target_from_the_tool_at_once(motion: R
     tied.go(out, 900)
     farthest, held = tied.hand, tied.target
     tied.go(-0.1 * out, 200)
-    # As if the hand had been at the tool when it was farthest, but for the part that could have been tremor.
+    # The effect is as if the hand had been at the tool when it was farthest, except for a part that may be tremor.
     motion.anchor(farthest, TOOL)
     expected = motion.target(tied.hand)
     missing = expected.actInv(tied.target)
@@ -152,7 +152,7 @@ def test_a_hand_that_comes_back_takes_the_target_from_the_tool_at_once(motion: R
     assert (tied.leash.rotation.slip if turning else tied.leash.position.slip) > 0.1
 
 
-def test_a_headset_s_noise_on_a_resting_hand_drops_no_slack() -> None:
+def test_headset_noise_of_a_resting_hand_drops_no_slack() -> None:
     tied, random = Tied(RelativeMotion(), distance=0.1, angle=0.5), np.random.default_rng(4)
     tied.go(along(0.001), 300)
     start, noise = tied.hand, np.zeros(6)
@@ -164,16 +164,16 @@ def test_a_headset_s_noise_on_a_resting_hand_drops_no_slack() -> None:
         assert tied.distance > 0.098
 
 
-def test_a_tool_that_comes_after_is_not_held_up() -> None:
+def test_a_tool_that_follows_is_not_slowed() -> None:
     tied = Tied(RelativeMotion(), distance=0.1, angle=0.5)
     tied.go(along(0.001), 300)
     for _ in range(150):
-        tied.tool = moved(tied.tool, along(0.0004))  # 0.4 m/s
+        tied.tool = moved(tied.tool, along(0.0004))  # The speed is 0.4 m/s.
         target = tied.go(along(-0.0001), 1)[0]
-        assert target.translation[0] - tied.tool.translation[0] > 0.02  # never put at the tool
+        assert target.translation[0] - tied.tool.translation[0] > 0.02  # The target was never put at the tool.
 
 
-def test_slack_is_dropped_only_in_a_tick_so_short_that_no_controller_takes_it_for_motion() -> None:
+def test_slack_is_dropped_only_in_a_tick_that_is_too_short_to_count_as_motion() -> None:
     tied = Tied(RelativeMotion(), distance=0.1, angle=0.5)
     tied.go(along(0.001), 300)
     for _ in range(4):
@@ -183,7 +183,7 @@ def test_slack_is_dropped_only_in_a_tick_so_short_that_no_controller_takes_it_fo
     assert tied.distance < 1e-12
 
 
-def test_a_new_engagement_starts_slack_at_the_tool() -> None:
+def test_a_new_engagement_starts_with_slack_at_the_tool() -> None:
     driver = engaged()
     driver.commanded = dict(driver.tools)
     start = dict(driver.hands)
@@ -201,20 +201,20 @@ def test_a_new_engagement_starts_slack_at_the_tool() -> None:
         assert first.slip == first.slip_angle == 0.0
 
 
-# Directions of a hand's way out, in the world, of which the arm can follow a part [m].
+# Directions of a hand's motion in the world, in which the arm can follow only a part of the way [m].
 OUT = {
     "stretched out forwards": np.array([1.0, 0.0, 0.0]),
     "blocked by the table": np.array([0.0, 0.0, -0.65]),
     "blocked by the other arm": np.array([0.0, -1.2, 0.0]),
 }
-HELD, BACK = 6.0, 0.002  # the hand goes back after so long, by so much [s, m]
+HELD, BACK = 6.0, 0.002  # Time after which the hand goes back [s], and distance [m].
 RATE = 500.0
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("out", OUT.values(), ids=OUT)
 def test_an_arm_held_up_rests_and_follows_the_first_millimetres_back_at_once_and_without_a_lurch(out: Array) -> None:
-    """The left hand goes out smoothly within 2.5 s, trembles there, and comes back at ``HELD``."""
+    """The left hand moves out smoothly within 2.5 s, trembles there, and comes back at ``HELD``."""
     farthest = float(np.linalg.norm(out))
 
     def hand(t: float) -> Array:
@@ -231,14 +231,14 @@ def test_an_arm_held_up_rests_and_follows_the_first_millimetres_back_at_once_and
     way = places @ out / farthest
     speed = np.linalg.norm(np.diff(places, axis=0, prepend=places[:1]), axis=1) * RATE
     start, held, soon, later = np.searchsorted(t, np.array([0.4, HELD, HELD + 0.25, HELD + 0.45]) - 1e-9)
-    assert way[held] - way[start] < farthest - 0.45  # the arm was held up for half a metre
+    assert way[held] - way[start] < farthest - 0.45  # The arm was held up for half a metre.
     resting = (t > HELD - 0.5) & (t < HELD)
     acceleration = np.array([np.linalg.norm(tick.reference.a) for tick in ticks])[resting]
-    assert np.sqrt(np.mean(acceleration**2)) < 0.2  # an arm that is free has 0.39
+    assert np.sqrt(np.mean(acceleration**2)) < 0.2  # An arm in free motion has 0.39 here.
     assert speed[resting].max() < 0.01
-    # Almost straight, an arm takes a while for the second one; and an arm that was pushed aside comes back as well.
+    # An almost straight arm needs a while for the second one. An arm that was pushed aside comes back as well.
     assert -2.0 * BACK < way[soon] - way[held] < -0.5 * BACK
     assert way[later] - way[held] > -2.0 * BACK
-    assert speed[t >= HELD].max() < 0.05  # the hand comes back at 0.04 m/s
+    assert speed[t >= HELD].max() < 0.05  # The hand comes back at 0.04 m/s.
     assert summary.arms["left"].slip_mm_max > 350.0
     assert summary.fallback_ticks == summary.uncertified_ticks == 0

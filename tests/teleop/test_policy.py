@@ -1,4 +1,4 @@
-"""Actions of a policy become targets: interpolated, replaced without a jump, and over when they cease or break."""
+"""Actions of a policy become targets. They are interpolated, replaced without a jump, and end with the stream."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from tests.teleop.hands import pose, sample
 
 TICK = 0.001
 TOOLS = {"left": pose(0.5, 0.4, 0.4), "right": pose(0.5, -0.4, 0.4, (0.0, 0.0, 0.3))}
-PERIOD = 0.05  # of actions [s]
+PERIOD = 0.05  # Period of actions [s].
 
 
 def chunk(times: npt.ArrayLike, ways: Array, arms: tuple[str, ...] = SIDES, **more: object) -> ActionChunk:
-    """Actions at ``times`` that put the tools ``ways`` (n,) [m] along x from :data:`TOOLS`."""
+    """Return actions at ``times`` that move the tools ``ways`` (n,) [m] along x from :data:`TOOLS`."""
     tools = {arm: np.array([floats_of_moved(TOOLS[arm], way) for way in ways]) for arm in arms}
     return ActionChunk(np.array(times), PERIOD, tools=tools, **more)  # type: ignore[arg-type]
 
@@ -33,7 +33,7 @@ def floats_of_moved(tool: pin.SE3, way: float) -> tuple[float, ...]:
 
 
 class Run:
-    """A teleop layer whose arms are where their last targets are."""
+    """A teleop layer whose arms are at their last targets."""
 
     def __init__(self, settings: TeleopSettings | None = None) -> None:
         self.teleop = Teleop(settings or TeleopSettings(), SIDES)
@@ -49,7 +49,7 @@ class Run:
             self.tools |= {arm: target.pose for arm, target in self.targets.items() if target.pose is not None}
 
     def ways(self, seconds: float, *chunks: ActionChunk) -> Array:
-        """Of the left tool along x, after each tick [m]."""
+        """Return the positions of the left tool along x after each tick [m]."""
         found = []
         for _ in range(round(seconds / TICK)):
             self.tick(*chunks)
@@ -76,7 +76,7 @@ def test_the_first_target_is_the_tool_and_actions_are_reached_at_their_times() -
     assert np.abs(np.diff(ways)).max() < 0.1 * TICK
 
 
-def test_a_newer_chunk_counts_from_its_first_time_on_and_the_difference_fades_without_a_jump() -> None:
+def test_a_newer_chunk_is_used_from_its_first_time_on_and_the_difference_fades_without_a_jump() -> None:
     run = Run()
     start = run.now + TICK
     old = chunk(start + PERIOD * np.arange(20), np.zeros(20))
@@ -87,14 +87,14 @@ def test_a_newer_chunk_counts_from_its_first_time_on_and_the_difference_fades_wi
     assert np.abs(np.diff(ways)).max() <= 0.6 * TICK + 1e-9
 
 
-def test_a_newer_chunk_replaces_those_too_whose_time_has_not_come() -> None:
+def test_a_newer_chunk_also_replaces_actions_whose_time_has_not_come() -> None:
     run = Run()
     later = chunk(run.now + 0.3 + PERIOD * np.arange(10), np.full(10, 0.03))
     newer = chunk(run.now + PERIOD * np.arange(20), np.zeros(20))
     assert np.abs(run.ways(0.6, later, newer)).max() < 1e-12
 
 
-def test_a_late_chunk_is_followed_from_where_it_still_counts_and_one_of_the_past_is_left_out() -> None:
+def test_a_late_chunk_is_followed_from_its_present_part_on_and_a_past_one_is_left_out() -> None:
     run = Run()
     past = chunk(run.now - 2.0 + PERIOD * np.arange(10), np.full(10, 0.05))
     run.ways(0.1, past)
@@ -104,7 +104,7 @@ def test_a_late_chunk_is_followed_from_where_it_still_counts_and_one_of_the_past
     assert ways[-1] == pytest.approx(0.08, abs=1e-3)
 
 
-def test_motions_lead_on_from_the_target_and_a_single_late_one_is_made_as_a_whole() -> None:
+def test_relative_motions_continue_from_the_target_and_a_single_late_one_is_made_in_full() -> None:
     run = Run()
     motion = np.tile([0.01, 0.0, 0.0, 0.0, 0.0, 0.2], (1, 1))
     for index in range(5):
@@ -142,11 +142,12 @@ def test_an_action_that_jumps_stops_both_arms_and_is_not_followed(way: Array, re
     assert run.reasons("right") == []
 
 
-STAYS, JUMPS, JUMPS_LATER = np.zeros(4), np.full(4, 1.0), np.array([0.0, 0.0, 1.0, 1.0])  # of the left tool [m]
+# Positions of the left tool [m].
+STAYS, JUMPS, JUMPS_LATER = np.zeros(4), np.full(4, 1.0), np.array([0.0, 0.0, 1.0, 1.0])
 
 
 def for_both(run: Run, left: Array) -> ActionChunk:
-    """One chunk for both arms, of which the right one stays."""
+    """Return one chunk for both arms, in which the right arm stays."""
     times = np.array(run.now + PERIOD * np.arange(4), dtype=np.float64)
     ways = zip(SIDES, (left, STAYS), strict=True)
     tools = {arm: chunk(times, its, (arm,)).tools[arm] for arm, its in ways}
@@ -181,7 +182,7 @@ def test_an_arm_that_is_not_linked_goes_on_alone() -> None:
     assert {arm: str(state) for arm, state in run.teleop.states.items()} == {"left": "lost", "right": "policy"}
 
 
-def test_what_cannot_be_used_is_told_once_while_nothing_moves() -> None:
+def test_an_unusable_action_is_reported_once_while_nothing_moves() -> None:
     run = Run()
     fault = ActionChunk(np.zeros(0), PERIOD, fault=Reason.of(ReasonKind.POLICY_UNUSABLE, text="no numbers"))
     for _ in range(10):
@@ -206,7 +207,7 @@ def test_grippers_change_at_the_time_of_the_action() -> None:
     assert run.targets["right"].gripper == 1.0
 
 
-def test_the_leash_holds_the_target_near_a_tool_that_something_blocks() -> None:
+def test_the_leash_holds_the_target_near_a_blocked_tool() -> None:
     run = Run()
     run.blocked = True
     times = run.now + PERIOD * np.arange(20)
@@ -222,7 +223,7 @@ def test_targets_stay_in_the_workspace() -> None:
     assert run.ways(0.9, chunk(run.now + PERIOD * np.arange(20), 0.004 * np.arange(20.0))).max() == pytest.approx(0.02)
 
 
-def test_an_operator_whose_data_ceased_is_asked_before_the_policy_goes_on() -> None:
+def test_an_operator_whose_data_ended_has_to_press_before_the_policy_goes_on() -> None:
     run = Run()
 
     def hands(lower: bool) -> tuple[HandSample, ...]:

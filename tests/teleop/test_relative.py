@@ -1,4 +1,4 @@
-"""Relative motion: what the tool does when the hand moves."""
+"""Relative motion: the tool's motion when the hand moves."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def anchored(hand: pin.SE3, tool: pin.SE3, **settings: object) -> RelativeMotion
     scale=st.floats(0.1, 5.0),
     axes=st.sampled_from([("+x", "+y", "+z"), ("+z", "-x", "+y")]),
 )
-def test_a_hand_can_be_put_where_the_target_is_any_pose_that_is_wanted(
+def test_a_hand_can_be_put_where_the_target_has_any_wanted_pose(
     hand: pin.SE3, tool: pin.SE3, wanted: pin.SE3, stance: str, frame: str, scale: float, axes: tuple[str, ...]
 ) -> None:
     settings: dict[str, object] = {"stance": stance, "rotation_frame": frame, "scale": scale, "axes": axes}
@@ -57,7 +57,7 @@ def test_a_hand_can_be_put_where_the_target_is_any_pose_that_is_wanted(
 
 @quick
 @given(hand=poses, tool=poses, moved=poses)
-def test_the_tool_moves_as_the_hand_does_in_the_world_about_its_own_axes_or_reflected(
+def test_the_tool_moves_like_the_hand_in_the_world_about_its_own_axes_or_reflected(
     hand: pin.SE3, tool: pin.SE3, moved: pin.SE3
 ) -> None:
     way, turn = moved.translation - hand.translation, moved.rotation @ hand.rotation.T
@@ -103,7 +103,7 @@ AXES = [
 
 @pytest.mark.parametrize("axes", AXES, ids=" ".join)
 def test_every_axis_convention_gives_the_world_what_the_hand_did_in_the_world(axes: tuple[str, str, str]) -> None:
-    """The same physical motion, written down in the input's frame, moves the tool as it does written in the world's."""
+    """The same physical motion, written in the input's frame, moves the tool as it does when written in the world's."""
     to_world = np.array([[float(axis[0] + "1") * (name == axis[1]) for name in "xyz"] for axis in axes])
 
     def as_sent(physical: pin.SE3) -> pin.SE3:
@@ -127,7 +127,9 @@ def test_every_axis_convention_gives_the_world_what_the_hand_did_in_the_world(ax
     ],
     ids=lambda value: str(value) if isinstance(value, dict) else "",
 )
-def test_a_setting_that_is_not_allowed_is_named_with_what_is(arguments: dict[str, object], message: str) -> None:
+def test_a_setting_that_is_not_allowed_is_named_with_the_allowed_values(
+    arguments: dict[str, object], message: str
+) -> None:
     with pytest.raises(ConfigError, match=message) as caught:
         RelativeMotion(**arguments)  # type: ignore[arg-type]
     assert "\n" not in str(caught.value)

@@ -1,4 +1,7 @@
-"""A resting hand is known better than its samples; one that moves is followed as without; and nothing jumps."""
+"""The mean of a resting hand is more exact than its samples.
+
+A moving hand is followed as without it, and nothing jumps.
+"""
 
 from __future__ import annotations
 
@@ -14,13 +17,13 @@ from q2r2_control.teleop.filters import PoseFilter, RestingPose
 from q2r2_control.types import SIDES, HandSample, Pose
 from tests.teleop.hands import PAUSED, Operator, pose
 
-TICK, PERIOD = 0.004, 1.0 / 75.0  # of the loop and of the samples [s]
-NOISE, TURN_NOISE = 2e-4, 5e-4  # of a headset, standard deviation of each axis [m], [rad]
-AXIS = np.array([0.6, 0.0, 0.8])  # that the hand turns about
+TICK, PERIOD = 0.004, 1.0 / 75.0  # Periods of the loop and of the samples [s].
+NOISE, TURN_NOISE = 2e-4, 5e-4  # Standard deviation of a headset's noise along [m] and about [rad] each axis.
+AXIS = np.array([0.6, 0.0, 0.8])  # Axis about which the hand turns.
 
 
 class Filtered:
-    """A filter with and without the mean at rest, fed with a hand that goes along x and turns."""
+    """A filter with and without the mean at rest, which gets a hand that moves along x and turns."""
 
     def __init__(self, noise: float = NOISE) -> None:
         self._random, self._noise = np.random.default_rng(4), noise / NOISE
@@ -41,7 +44,7 @@ class Filtered:
         return floats_of(self.hand * pin.SE3(pin.exp3(noise[3:]), noise[:3]))
 
     def run(self, seconds: float, speed: float = 0.0, turning: float = 0.0) -> None:
-        """``speed`` [m/s] and ``turning`` [rad/s] of the hand."""
+        """Run with the ``speed`` [m/s] and ``turning`` [rad/s] of the hand."""
         for _ in range(round(seconds / TICK)):
             self.t += TICK
             self.x += speed * TICK
@@ -63,7 +66,7 @@ def angle(one: pin.SE3, other: pin.SE3) -> float:
     return float(np.linalg.norm(pin.log3(one.rotation.T @ other.rotation)))
 
 
-def test_noise_of_a_resting_hand_is_a_third_of_what_the_filter_leaves_of_it_or_less() -> None:
+def test_with_the_mean_the_noise_of_a_resting_hand_is_at_most_a_third() -> None:
     filtered = Filtered()
     filtered.run(23.0)
     rested = slice(round(3.0 / TICK), None)
@@ -76,7 +79,7 @@ def test_noise_of_a_resting_hand_is_a_third_of_what_the_filter_leaves_of_it_or_l
 
 @pytest.mark.parametrize("noise", [0.0, NOISE])
 @pytest.mark.parametrize("speed", [0.002, 0.03, 1.0])
-def test_a_hand_that_sets_off_is_followed_without_a_jump_and_at_once(speed: float, noise: float) -> None:
+def test_a_hand_that_starts_to_move_is_followed_at_once_without_a_jump(speed: float, noise: float) -> None:
     filtered = Filtered(noise)
     filtered.run(2.0)
     filtered.run(1.0, speed)
@@ -85,7 +88,7 @@ def test_a_hand_that_sets_off_is_followed_without_a_jump_and_at_once(speed: floa
     assert np.linalg.norm(drawn - plain, axis=1).max() < max(0.45e-3, 2e-3 * speed)
     steps = np.linalg.norm(np.diff(drawn[round(0.5 / TICK) :], axis=0), axis=1) / TICK
     assert steps.max() < 1.2 * speed + 0.025
-    # Once it moves, and faster than the noise, it is the filter's alone.
+    # When it moves faster than the noise, only the filter's output is used.
     if speed >= 0.03:
         moving = slice(round(2.3 / TICK), round(2.95 / TICK))
         assert np.array_equal(drawn[moving], plain[moving])
@@ -94,7 +97,7 @@ def test_a_hand_that_sets_off_is_followed_without_a_jump_and_at_once(speed: floa
 
 @dataclass
 class NoisyOperator(Operator):
-    """Its headset is noisy; its tools are where their targets are."""
+    """An operator with a noisy headset, whose tools are at their targets."""
 
     noise: float = NOISE
 
@@ -135,7 +138,7 @@ def test_a_hundred_pauses_of_a_resting_hand_with_noise_hardly_displace_the_tool(
 
 
 @pytest.mark.parametrize("turning", [0.1, 6.0])
-def test_a_hand_that_has_turned_however_far_is_known_as_well_as_any_when_it_rests(turning: float) -> None:
+def test_the_rest_of_a_hand_is_exact_after_rotations_of_any_size(turning: float) -> None:
     filtered = Filtered()
     filtered.run(2.0, turning=turning)
     filtered.run(4.0)

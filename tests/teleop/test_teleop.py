@@ -17,7 +17,7 @@ from q2r2_control.types import SIDES
 from tests.teleop.hands import ENGAGED, assert_smooth, engaged, first_target, operator, pose, sample, waving
 
 
-def test_it_starts_idle_and_the_first_press_of_the_lower_button_engages_that_arm_alone() -> None:
+def test_all_arms_start_idle_and_the_first_press_of_a_lower_button_engages_only_that_arm() -> None:
     driver = operator()
     driver.assert_holds()
     driver.engage("left")
@@ -26,7 +26,7 @@ def test_it_starts_idle_and_the_first_press_of_the_lower_button_engages_that_arm
     assert [(e.arm, e.source, e.destination, e.kind) for e in driver.events] == [("left", "idle", "engaged", "pressed")]
 
 
-def test_a_target_tells_the_hand_that_it_is_made_of_and_none_while_the_arm_holds() -> None:
+def test_a_target_names_its_hand_and_there_is_none_while_the_arm_holds() -> None:
     driver = engaged()
     driver.run(0.3, waving(driver))
     driver.run(1.5)
@@ -40,7 +40,7 @@ def test_a_target_tells_the_hand_that_it_is_made_of_and_none_while_the_arm_holds
 
 @settings(derandomize=True, max_examples=25, deadline=None)
 @given(st.lists(st.floats(-3.0, 3.0), min_size=12, max_size=12), st.sampled_from([1.0, -1.0]))
-def test_the_first_target_is_the_measured_tool_pose_whatever_the_hand(n: list[float], sign: float) -> None:
+def test_the_first_target_is_the_measured_tool_pose_for_any_hand_pose(n: list[float], sign: float) -> None:
     teleop = Teleop(TeleopSettings(), ("left",))
     hand, tool = pose(n[0], n[1], n[2], (n[3], n[4], n[5])), pose(n[6], n[7], n[8], (n[9], n[10], n[11]))
     for stamp, lower in ((1.0, False), (1.01, True), (1.02, False)):
@@ -53,7 +53,7 @@ def test_the_first_target_is_the_measured_tool_pose_whatever_the_hand(n: list[fl
     ("stance", "right_goes"),
     [("side_by_side", (0.1, 0.2, 0.3)), ("mirror", (-0.3, 0.1, 0.1)), ("mirror_reflected", (-0.3, -0.1, 0.1))],
 )
-def test_the_right_arm_goes_as_the_stance_says(stance: str, right_goes: tuple[float, float, float]) -> None:
+def test_the_right_arm_moves_as_the_stance_says(stance: str, right_goes: tuple[float, float, float]) -> None:
     driver = engaged(stance=stance)
     hands, ways = driver.hands, {"left": np.array([-0.3, 0.1, 0.1]), "right": np.array([0.1, 0.2, 0.3])}
     history = driver.run(
@@ -77,7 +77,7 @@ def test_pausing_stops_at_the_first_reading_of_the_button() -> None:
     assert driver.states == {"left": "paused", "right": "engaged"}
 
 
-def test_resuming_anchors_hand_and_tool_anew_and_carries_the_orientation_on() -> None:
+def test_resuming_sets_new_anchors_and_keeps_the_orientation() -> None:
     driver = engaged()
     history = driver.run(0.5, waving(driver))
     driver.lower = set(SIDES)
@@ -112,7 +112,7 @@ def test_a_thousand_pauses_with_the_hand_turning_in_between_do_not_drift() -> No
     np.testing.assert_allclose(firsts, np.broadcast_to(tool.homogeneous, (1001, 4, 4)), atol=1e-9)
 
 
-def test_the_upper_button_toggles_its_own_gripper_once_a_press() -> None:
+def test_each_press_of_the_upper_button_toggles_its_own_gripper() -> None:
     driver = engaged()
     openings = []
     for _ in range(4):
@@ -123,7 +123,7 @@ def test_the_upper_button_toggles_its_own_gripper_once_a_press() -> None:
 
 
 @pytest.mark.parametrize(("first", "delay"), [("lower", 0.0), ("lower", 0.06), ("upper", 0.03)])
-def test_a_chord_moves_no_gripper_stops_both_arms_and_anchors_anew_when_released(first: str, delay: float) -> None:
+def test_a_chord_moves_no_gripper_stops_both_arms_and_sets_new_anchors_when_released(first: str, delay: float) -> None:
     driver = engaged()
     driver.run(0.2, waving(driver))
     (driver.lower if first == "lower" else driver.upper).add("left")
@@ -150,7 +150,7 @@ DT = 0.002
 
 
 def tracking_error(script: ScriptedInput, duration: float) -> tuple[float, float]:
-    """RMS distance [mm] and angle [deg] of the left target from the ideal hand's path, over all engaged ticks."""
+    """Return RMS distance [mm] and angle [deg] of the left target from the ideal path, over all engaged ticks."""
     teleop = Teleop(TeleopSettings(), SIDES)
     tools = {"left": pose(0.5, 0.4, 0.5, (3.0, 0.1, 0.2)), "right": pose(0.5, -0.4, 0.5)}
     script.start()

@@ -1,4 +1,4 @@
-"""The box that targets stay in: never left, left inwards at once; and scales of axes."""
+"""The box of targets: they never leave it, and go back inwards at once. Axes have scales."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from q2r2_control.teleop.leash import Workspace
 from q2r2_control.types import SIDES
 from tests.teleop.hands import TICK, Operator, assert_smooth, engaged, operator
 
-# About the left tool of the operator's tests, at (0.5, 0.4, 0.4).
+# The box is around the left tool of the operator's tests, which is at (0.5, 0.4, 0.4).
 BOX = {"x": [0.4, 0.65], "y": [0.3, 0.6], "z": [0.3, 0.5]}
 
 
 def shift(driver: Operator, way: tuple[float, float, float], duration: float) -> list[np.ndarray]:
-    """The left target's positions while both hands move evenly by ``way`` and then rest a while."""
+    """Return the left target's positions while both hands move evenly by ``way`` and then rest."""
     start = dict(driver.hands)
 
     def move(t: float) -> dict[str, pin.SE3]:
@@ -33,25 +33,25 @@ def test_a_target_never_leaves_its_box_and_comes_back_with_the_hand_at_once() ->
     driver = engaged(workspace={"left": BOX})
     out = shift(driver, (0.3, 0.0, 0.0), 1.0)
     assert max(position[0] for position in out) <= 0.65
-    assert out[-1][0] > 0.64  # at the side, but for what the filter swings back when the hand stops
+    assert out[-1][0] > 0.64  # The target is at the side, except for the overshoot of the filter when the hand stops.
     assert driver.targets["left"].slip > 0.1
     assert driver.targets["right"].slip == 0.0
     back = shift(driver, (-0.1, 0.05, -0.05), 0.5)
     np.testing.assert_allclose(back[-1] - out[-1], (-0.1, 0.05, -0.05), atol=1e-3)
 
 
-def test_an_arm_that_is_engaged_outside_does_not_jump_and_may_only_come_in() -> None:
+def test_an_arm_that_is_engaged_outside_does_not_jump_and_may_only_move_inwards() -> None:
     driver = operator(workspace={"left": BOX | {"x": [0.6, 0.8]}})
     driver.engage()
     np.testing.assert_allclose(driver.place().translation, driver.tools["left"].translation, atol=1e-6)
     out = shift(driver, (-0.1, 0.0, 0.0), 0.5)
     assert min(position[0] for position in out) > 0.5 - 1e-6
-    assert out[-1][0] < 0.504  # what the filter swings back when the hand stops
+    assert out[-1][0] < 0.504  # The tolerance is the overshoot of the filter when the hand stops.
     assert shift(driver, (0.2, 0.0, 0.0), 0.5)[-1][0] == pytest.approx(0.7, abs=5e-3)
 
 
 @pytest.mark.parametrize("at", [0.6499, 0.66])
-def test_a_hand_that_trembles_at_a_side_does_not_creep_away_from_it(at: float) -> None:
+def test_a_hand_that_trembles_at_a_side_does_not_drift_away_from_it(at: float) -> None:
     workspace = Workspace(WorkspaceSettings.model_validate(BOX))
     position, way = (at, 0.4, 0.4), 0.0
     assert workspace.hold((position, IDENTITY)) is None
@@ -64,7 +64,7 @@ def test_a_hand_that_trembles_at_a_side_does_not_creep_away_from_it(at: float) -
         assert abs(position[0] - at) < 1.5e-3
 
 
-def test_axes_have_scales_of_their_own_and_a_scale_of_0_locks_one() -> None:
+def test_axes_have_their_own_scales_and_a_scale_of_0_locks_an_axis() -> None:
     driver = engaged(position_scale=0.5, axis_scales=(1.0, 2.0, 0.0))
     before = driver.tools["left"].translation
     after = shift(driver, (0.1, -0.05, 0.08), 1.0)[-1]
