@@ -1,4 +1,4 @@
-"""The contract checker finds what breaks a promise by little, and says which one and by how much."""
+"""The contract checker finds small breaches of a promise, and names the promise and the excess."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from tests.control.test_scenarios import in_penetration
 SETTINGS = ControllerSettings()
 DT = 0.001
 JOINT = 2
-FASTEST = 5.69 * DT  # change of velocity of A3 of an iiwa 7 in a tick [rad/s]; others may do more
+FASTEST = 5.69 * DT  # Largest change of velocity of A3 of an iiwa 7 in a tick [rad/s]. Other joints may do more.
 
 
 @pytest.fixture(scope="module")
 def apart(robot: Robot) -> StepReport:
-    """A report that tells of nothing but what is measured at home."""
+    """Return a report in which only the distances at home are set."""
     nearest = min(robot.distances(robot.home), key=lambda pair: pair.distance)
     pair, margin = (nearest.name_a, nearest.name_b), nearest.distance - SETTINGS.min_distance
     return StepReport(StepStatus.OK, (), (), pair, nearest.distance, True, False, 0.0, 0.0, pair, margin)
 
 
 def contract_of(robot: Robot, q: Array | None = None, v: Array | None = None, **options: Any) -> Contract:
-    """Of a controller whose stop takes every joint's limit."""
+    """Return the contract of a controller whose stop uses every joint's limit."""
     limit = robot.capped_acceleration(SETTINGS.acceleration_limit)
     kept = kept_distances(robot, SETTINGS).values
     controller: Any = SimpleNamespace(
@@ -42,14 +42,14 @@ def contract_of(robot: Robot, q: Array | None = None, v: Array | None = None, **
 
 
 def one(value: float) -> Array:
-    """For one joint, and 0 for the others."""
+    """Return an array with this value for one joint, and 0 for the others."""
     values = np.zeros(14)
     values[JOINT] = value
     return values
 
 
 def moved(q: Array, v: Array, change: float, report: StepReport) -> Reference:
-    """The tick after ``q``, ``v``, in which the velocity of one joint changes."""
+    """Return the tick after ``q`` and ``v``, in which the velocity of one joint changes."""
     after = v + one(change)
     return Reference(q + 0.5 * DT * (v + after), after, one(change / DT), report)
 
@@ -92,13 +92,13 @@ def test_each_promise_is_checked(
     assert promise in broken
 
 
-def test_a_solver_failure_that_is_not_followed_by_the_stop_breaks_two_promises(robot: Robot, apart: StepReport) -> None:
+def test_a_solver_failure_without_the_certified_stop_breaks_two_promises(robot: Robot, apart: StepReport) -> None:
     contract = contract_of(robot)
     broken = contract.observe(moved(robot.home, np.zeros(14), FASTEST, apart), DT, failed=True)
     assert list(broken) == ["not_stopped", "unsaid"]
 
 
-def test_a_joint_that_started_too_fast_may_not_become_faster_and_not_return_above_its_limit(
+def test_a_joint_that_started_too_fast_must_not_become_faster_or_exceed_its_limit_again(
     robot: Robot, apart: StepReport
 ) -> None:
     limit = float(robot.velocity_limit[JOINT])
@@ -111,7 +111,7 @@ def test_a_joint_that_started_too_fast_may_not_become_faster_and_not_return_abov
     assert list(contract.observe(moved(slower.q, slower.v, FASTEST, apart), DT)) == ["velocity"]
 
 
-def test_a_joint_that_started_outside_its_limits_may_not_go_further_out(robot: Robot, apart: StepReport) -> None:
+def test_a_joint_that_started_outside_its_limits_must_not_go_further_out(robot: Robot, apart: StepReport) -> None:
     q = robot.home.copy()
     q[JOINT] = robot.position_upper[JOINT] + 0.05
     assert list(contract_of(robot, q).observe(moved(q, np.zeros(14), 1e-6, apart), DT)) == ["outward"]
@@ -128,7 +128,7 @@ def test_a_joint_that_has_returned_into_its_limits_stays_there(robot: Robot, apa
     assert "position" in contract.observe(moved(inside.q + one(2e-5), np.zeros(14), 0.0, apart), DT)
 
 
-def test_a_tick_of_no_time_moves_nothing(robot: Robot, apart: StepReport) -> None:
+def test_a_tick_without_duration_moves_nothing(robot: Robot, apart: StepReport) -> None:
     moves = Reference(robot.home + one(1e-12), one(0.0), one(0.0), apart)
     assert list(contract_of(robot).observe(moves, 0.0)) == ["idle"]
 
@@ -140,7 +140,7 @@ def test_a_joint_that_cannot_stop_before_its_limit_is_found(robot: Robot, apart:
     assert "stop_position" in contract.observe(moved(q, np.zeros(14), FASTEST, apart), DT)
 
 
-def test_recovering_pairs_never_come_closer_again_and_once_apart_keep_their_distance(
+def test_recovering_pairs_never_come_closer_again_and_keep_their_distance_once_apart(
     robot: Robot, apart: StepReport
 ) -> None:
     q, v = in_penetration(robot)
@@ -176,7 +176,7 @@ def test_a_wrong_distance_is_found_by_coal(robot: Robot, apart: StepReport, repo
     assert list(contract.observe(moved(robot.home, np.zeros(14), 0.0, report), DT)) == ["coal"]
 
 
-def test_a_margin_keeps_the_worst_and_counts_what_is_no_number_as_broken() -> None:
+def test_a_margin_keeps_the_worst_value_and_counts_nan_as_broken() -> None:
     margin = Margin("distance", "m", ">=", 0.0)
     assert all(margin.note(value, tick) for tick, value in enumerate((0.3, 0.1, 0.2), 1))
     assert (margin.worst, margin.tick, margin.violations) == (0.1, 2, 0)

@@ -1,4 +1,4 @@
-"""A hostile policy breaks no promise, and a door that is left open is found."""
+"""A hostile policy breaks no promise, and a missing check is found."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def test_a_policy_whose_last_action_is_repeated_for_ever_is_found(monkeypatch: p
     assert not report.passed
 
 
-def test_the_command_prints_every_promise_and_what_was_sent() -> None:
+def test_the_command_prints_every_promise_and_the_number_of_actions() -> None:
     result = q2r2("soak", "--policy", "--ticks", "300")
     assert result.exit_code == 0
     assert "speed after a stall of the policy" in result.stdout

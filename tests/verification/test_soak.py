@@ -1,4 +1,4 @@
-"""The soak finds nothing where there is nothing, and finds each kind of broken promise, at its tick."""
+"""The soak finds no fault in the real controller, and finds each kind of broken promise at its tick."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def controller_and_solver() -> tuple[CartesianController, FaultySolver]:
 
 
 class Sabotaged:
-    """The real controller, but for what it returns at one tick and after."""
+    """The real controller with a changed result at one tick and after."""
 
     def __init__(self, change: Callable[[Reference], Reference], first: int, settings: ControllerSettings) -> None:
         self.settings, self.kept_distances = settings, kept_distances(robot(), settings).values
@@ -115,7 +115,7 @@ def test_hostile_ticks_move_no_tool_faster_than_its_limit() -> None:
 
 
 class Garbage:
-    """Of each kind of answer one, in turns, from no answer at all to numbers that look like one."""
+    """A solver whose answers are invalid in turns: no answer, wrong types, and numbers that resemble an answer."""
 
     def __init__(self) -> None:
         self.random, self.asked = np.random.default_rng(1), 0
@@ -156,7 +156,7 @@ def test_hostile_ticks_with_a_solver_that_returns_garbage_break_no_promise() -> 
 
 
 class Impossible:
-    """Asks for joint speeds that no acceleration limit allows."""
+    """A task that asks for joint speeds that no acceleration limit allows."""
 
     hard = True
 
@@ -165,7 +165,7 @@ class Impossible:
 
 
 class Flipping:
-    """Each tick asks for the opposite: the first joint is to turn this way, then that way."""
+    """A task that reverses its request at each tick: the first joint is to turn in one direction, then in the other."""
 
     hard = True
 
@@ -178,7 +178,7 @@ class Flipping:
 
 
 class Moody:
-    """Mostly harmless rows, and at random no rows at all: NaN, another shape, an exception."""
+    """A constraint with mostly harmless rows, and at random invalid ones: NaN, another shape, an exception."""
 
     hard = True
 
@@ -187,7 +187,7 @@ class Moody:
 
     def rows(self, q: Array, v: Array) -> Any:
         self.asked += 1
-        usual = (-np.sign(v + 1e-300)[None, :], np.array([-3.0]))  # joints may not all be fast
+        usual = (-np.sign(v + 1e-300)[None, :], np.array([-3.0]))  # The joints may not all be fast.
         if self.asked < 50 or self.random.random() < 0.7:
             return usual
         kind = int(self.random.integers(5))
@@ -229,7 +229,7 @@ def test_fingers_that_open_without_a_proof_are_found(monkeypatch: pytest.MonkeyP
     assert "distance - kept distance, at ticks" in {found.promise for found in report.broken}
 
 
-def test_the_same_seed_gives_the_same_run() -> None:
+def test_equal_seeds_give_equal_runs() -> None:
     first, second, other = (run_soak(CONFIG, 150, seed) for seed in (5, 5, 6))
     assert first.margins == second.margins
     assert first.margins != other.margins
@@ -281,14 +281,14 @@ def test_a_wrong_reported_distance_is_found_by_coal() -> None:
 
 
 def test_arms_that_come_too_close_are_found_at_ticks_between_them_and_in_stops() -> None:
-    """The controller keeps 20 mm where 150 mm are asked for."""
+    """The controller keeps 20 mm, but 150 mm are asked for."""
     report = soak(lambda reference: reference, 0, 1000, settings=SETTINGS.model_copy(update={"min_distance": 0.15}))
     promises = {found.promise for found in report.broken}
     assert {f"distance - kept distance, {when}" for when in ("at ticks", "between ticks", "full stops")} <= promises
 
 
 def test_a_stop_that_is_due_and_not_executed_is_found() -> None:
-    """The faults go to a solver that the controller does not have."""
+    """The faults go to a solver that the controller does not use."""
     elsewhere = FaultySolver(DaqpSolver(14), np.random.default_rng(0))
     controller_and_solver()[1].fault = None
     report = soak(lambda reference: reference, 0, 300, solver=elsewhere)
@@ -299,7 +299,7 @@ def test_a_stop_that_is_due_and_not_executed_is_found() -> None:
 
 
 def test_leaving_penetration_the_separation_never_decreases() -> None:
-    """Found by the soak: the wrist, 16 mm in the table, opens to 0.5 mm, and the stop then takes 0.3 mm of it back."""
+    """The soak found this: the wrist, 16 mm in the table, opens to 0.5 mm, and the stop takes 0.3 mm back."""
     left = [-0.21607004362824325, 1.5400883486752313, 1.949636558861823, 0.6047422668811306]
     left += [0.8080053095448911, 1.4352829330812347, 1.9429994776891732]
     right = [-2.159257201510056, -1.1332045586738233, -0.5307167749313296, -1.634581274414817]
@@ -323,7 +323,7 @@ def test_leaving_penetration_the_separation_never_decreases() -> None:
     [((100.0, 103.0, 106.0, 109.0), 9.0), ((142.0, 145.0, 147.5, 147.1), -1.2), ((100.0, None, 100.0, 100.0), None)],
     ids=["a leak", "a heap that settles", "unknown"],
 )
-def test_memory_that_grows_on_counts_and_a_heap_that_settles_does_not(
+def test_growing_memory_counts_and_a_heap_that_settles_does_not(
     memory: tuple[float | None, ...], growth: float | None
 ) -> None:
     found = steady_growth(memory)
