@@ -1,4 +1,4 @@
-"""The cell whose runs are viewed, and ticks of it."""
+"""The cell of the viewed runs, and ticks of it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,10 @@ from q2r2_control.types import ArmTarget, Reference, RobotState, StepReport, Ste
 
 
 def tick_at(robot: Robot, t: float, distance: float = 0.1, engaged: bool = True) -> Tick:
-    """A tick whose tools are 3 mm and 0.1 rad from their targets; the tightest pair keeps 20 mm, the nearest one 0."""
+    """Return a tick with tools 3 mm and 0.1 rad from their targets.
+
+    The tightest pair keeps 20 mm, and the nearest one 0.
+    """
     zero = np.zeros(len(robot.joint_names))
     hand, arms = ("left_hand_0", "table_0"), ("left_link_5_0", "right_link_5_0")
     report = StepReport(StepStatus.OK, (), (), hand, distance, True, False, 0.0, 0.0, arms, distance - 0.018)

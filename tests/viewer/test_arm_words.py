@@ -1,4 +1,4 @@
-"""Sentences on an arm: why it is where it is, and what its operator can do, in the words of the device in hand."""
+"""Sentences about an arm: the reason for its state, and the operator's next steps in the words of the device."""
 
 from __future__ import annotations
 
@@ -44,13 +44,13 @@ def words(tick: Tick, *binding: ActiveLimit, told: tuple[Event, ...] = ()) -> st
         ((NEAR_TABLE, NEAR_ARM), "held by left_link_5_0 | right_link_5_0, 82 mm to spare"),
     ],
 )
-def test_an_arm_that_is_away_from_its_target_is_held_by_what_is_at_work_on_it(
+def test_an_arm_away_from_its_target_is_held_by_a_limit_at_work(
     robot: Robot, binding: tuple[ActiveLimit, ...], expected: str
 ) -> None:
     assert words(tick_at(robot, 1.0), *binding) == expected
 
 
-def test_an_arm_that_is_at_its_target_follows_whatever_is_at_work(robot: Robot) -> None:
+def test_an_arm_at_its_target_follows_whatever_limits_are_at_work(robot: Robot) -> None:
     tick = tick_at(robot, 1.0)
     targets = {arm: ArmTarget(pose, 1.0) for arm, pose in tick.tools.items()}
     assert words(replace(tick, targets=targets), FAST) == "follows the hand"
@@ -64,14 +64,14 @@ def test_an_arm_that_is_at_its_target_follows_whatever_is_at_work(robot: Robot) 
         ("paused", "paused", ReasonKind.NO_RECORDING, ReasonKind.NO_RECORDING.template),
     ],
 )
-def test_an_arm_that_is_not_engaged_says_what_stopped_it(
+def test_an_arm_that_is_not_engaged_names_the_reason_of_its_stop(
     robot: Robot, source: str, destination: str, kind: ReasonKind, expected: str
 ) -> None:
     paused = replace(tick_at(robot, 1.0, engaged=False), states={"left": destination, "right": "idle"})
     assert words(paused, told=(Event(0.5, "left", source, destination, Reason(kind)),)) == expected
 
 
-def test_before_its_first_event_and_while_aligning_it_says_so_too(robot: Robot) -> None:
+def test_the_sentence_before_the_first_event_and_while_aligning_says_so(robot: Robot) -> None:
     paused = tick_at(robot, 1.0, engaged=False)
     assert words(paused) == "not engaged yet"
     aligning = replace(paused, states={"left": "aligning", "right": "aligning"})
@@ -81,7 +81,7 @@ def test_before_its_first_event_and_while_aligning_it_says_so_too(robot: Robot) 
     assert press(aligning) == "release both buttons to go on"
 
 
-def test_a_reason_stays_until_the_state_changes_and_a_refusal_stands_beside_it(robot: Robot) -> None:
+def test_a_reason_stays_until_the_state_changes_with_a_refusal_beside_it(robot: Robot) -> None:
     lost = replace(tick_at(robot, 1.0, engaged=False), states={"left": "lost", "right": "lost"})
     silent = Event(0.5, "left", "engaged", "lost", Reason.of(ReasonKind.POSE_SILENT, timeout=0.15))
     changed = Event(0.6, "left", "lost", "lost", Reason(ReasonKind.CONTROL_CHANGED))
@@ -93,7 +93,7 @@ def test_a_reason_stays_until_the_state_changes_and_a_refusal_stands_beside_it(r
     assert words(lost, told=(silent, refused, paused)) == "a program asks for a pause"
 
 
-def test_a_reason_calls_a_control_as_its_operator_does(robot: Robot) -> None:
+def test_a_reason_uses_the_operators_name_of_a_control(robot: Robot) -> None:
     paused = tick_at(robot, 1.0, engaged=False)
     pressed = Event(0.5, "left", "pausing", "paused", Reason.of(ReasonKind.PRESSED, control="lower button"))
     assert words(paused, told=(pressed,)) == "A or X"
@@ -103,7 +103,7 @@ def press(tick: Tick, bindings: Mapping[str, str] = {}, device: DeviceWords = QU
     return ArmWords(JOINTS, BindingSettings.model_validate(bindings), device).next_press(tick, "left")
 
 
-def test_the_next_press_is_told_by_state_and_gripper(robot: Robot) -> None:
+def test_the_next_press_depends_on_state_and_gripper(robot: Robot) -> None:
     engaged, paused = tick_at(robot, 1.0), tick_at(robot, 1.0, engaged=False)
     assert press(engaged) == "press A or X to pause, press B or Y to close the gripper"
     closed = {arm: ArmTarget(None, 0.0) for arm in paused.targets}
@@ -111,7 +111,7 @@ def test_the_next_press_is_told_by_state_and_gripper(robot: Robot) -> None:
     assert press(replace(paused, connected=False)) == "nothing: no headset is connected"
 
 
-def test_the_next_press_is_that_of_the_control_that_is_bound(robot: Robot) -> None:
+def test_the_next_press_is_that_of_the_bound_control(robot: Robot) -> None:
     engaged, paused = tick_at(robot, 1.0), tick_at(robot, 1.0, engaged=False)
     swapped = {"lower": "gripper_toggle", "upper": "pause_toggle"}
     assert press(paused, swapped) == "press B or Y to engage, press A or X to close the gripper"
@@ -120,7 +120,7 @@ def test_the_next_press_is_that_of_the_control_that_is_bound(robot: Robot) -> No
     assert press(engaged, dead_man) == "let go of the grip to pause"
 
 
-def test_the_handles_of_a_page_are_its_device_also_before_anybody_drags_them(robot: Robot) -> None:
+def test_the_handles_of_a_page_are_its_device_even_before_they_are_dragged(robot: Robot) -> None:
     waits = replace(tick_at(robot, 1.0, engaged=False), connected=False)
     made = ArmWords(JOINTS, web_cell(cell()).teleop.bindings, WebInput.controls.words)
     assert made.next_press(waits, "left").startswith("drag a tool's arrows or rings to engage")
@@ -130,6 +130,6 @@ def test_the_handles_of_a_page_are_its_device_also_before_anybody_drags_them(rob
     assert "lower" not in str(made.controls())
 
 
-def test_nobody_is_asked_to_press_what_a_script_presses(robot: Robot) -> None:
+def test_no_operator_is_asked_to_press_what_a_script_presses(robot: Robot) -> None:
     scripted = replace(QUEST_WORDS, nobody="a script moves the hands")
     assert press(tick_at(robot, 1.0), {}, scripted) == "nothing: a script moves the hands"

@@ -1,4 +1,4 @@
-"""The messages of a run to the page that headsets open, in the shapes for which its scripts are checked."""
+"""The messages of a run to the page in headsets, in the shapes for which the page's scripts are checked."""
 
 from __future__ import annotations
 
@@ -43,16 +43,16 @@ def display(plant: MujocoPlant) -> RunDisplay:
     return RunDisplay(ShownRobot.of(robot, config), robot.model, robot.collision_model, parts)
 
 
-def test_the_scene_has_the_parts_of_the_task_and_what_goes_with_each_tool(display: RunDisplay) -> None:
+def test_the_scene_contains_the_parts_of_the_task_and_the_links_that_move_with_each_tool(display: RunDisplay) -> None:
     scene = TypeAdapter(ShownScene).validate_python(display.scene())
     assert scene["name"] == cell().name
     assert set(scene["parts"]) == set(cell().mujoco.objects)
     for joints in scene["hands"].values():
-        assert len(joints) >= 3  # the last joint, and the fingers that it carries
+        assert len(joints) >= 3  # The tool carries the last joint and the fingers.
     assert not set(scene["hands"]["left"]) & set(scene["hands"]["right"])
 
 
-def test_a_moment_has_parts_where_they_lie_leashes_and_the_tightest_pair(
+def test_a_moment_has_parts_at_their_places_leashes_and_the_tightest_pair(
     display: RunDisplay, plant: MujocoPlant, robot: Robot
 ) -> None:
     display.scene()
@@ -66,7 +66,7 @@ def test_a_moment_has_parts_where_they_lie_leashes_and_the_tightest_pair(
     assert state["pair"] is not None
     ends = np.array(state["pair"]["ends"])
     assert np.linalg.norm(ends[0] - ends[1]) > 0.0
-    # The page puts the words of the device in hand in.
+    # The page fills in the words of the device.
     assert state["arms"]["left"]["why"] == "{lower}"
     assert "{lower} to engage" in state["arms"]["left"]["next"]
 

@@ -1,4 +1,4 @@
-"""The live table: what it shows, and how it is drawn on a real terminal, one end of a pseudo-terminal."""
+"""The live table: its content, and its drawing on a real terminal, which is one end of a pseudo-terminal."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_it_shows_states_errors_distances_and_grippers_of_the_newest_tick(robot:
     assert "paused" not in text
 
 
-def test_names_and_progress_are_whole_in_80_columns(robot: Robot) -> None:
+def test_names_and_progress_are_complete_in_80_columns(robot: Robot) -> None:
     table = LiveTable("demo", ArmWords(JOINTS, BindingSettings()), ((0.0, "meet: both grasp"),), 10.0)
     tick = tick_at(robot, 2.5)
     pair = ("right_hand_e_finger_1_envelope_0", "left_hand_e_finger_1_envelope_0")
@@ -64,7 +64,7 @@ def test_it_shows_the_step_of_the_work_and_how_much_of_it_is_done(robot: Robot) 
     assert "━" * 5 + "·" * 15 + " 25%" in text
 
 
-def test_it_shows_every_limit_that_was_at_work_since_it_was_drawn_last(robot: Robot) -> None:
+def test_it_shows_every_limit_that_was_at_work_since_the_last_drawing(robot: Robot) -> None:
     table = LiveTable("demo", ArmWords(JOINTS, BindingSettings()))
     tick = tick_at(robot, 0.0)
     report = replace(tick.reference.report, binding=(ActiveLimit(LimitKind.VELOCITY, ("left_A2",)),))
@@ -75,7 +75,7 @@ def test_it_shows_every_limit_that_was_at_work_since_it_was_drawn_last(robot: Ro
 
 
 class Terminal:
-    """A terminal, and what has come out of it, which a thread reads."""
+    """A terminal and its output, which a thread reads."""
 
     def __init__(self) -> None:
         self._reads, writes = pty.openpty()
@@ -83,18 +83,18 @@ class Terminal:
         threading.Thread(target=self._read, daemon=True).start()
 
     def wait_for(self, expected: str) -> None:
-        end = time.monotonic() + 60.0  # a machine may be slow
+        end = time.monotonic() + 60.0  # A machine may be slow.
         while expected not in self.text:
             assert time.monotonic() < end, f"{expected!r} did not come; {self.text!r} did"
             time.sleep(0.01)
 
     def _read(self) -> None:
-        with suppress(OSError):  # when the test is over
+        with suppress(OSError):  # The terminal closes when the test is over.
             while data := os.read(self._reads, 4096):
                 self.text += data.decode(errors="replace")
 
 
-def test_it_is_drawn_again_and_again_below_what_is_printed_and_wiped_away_at_the_end(
+def test_the_table_is_redrawn_below_printed_lines_and_removed_at_the_end(
     monkeypatch: pytest.MonkeyPatch, robot: Robot
 ) -> None:
     monkeypatch.setenv("TERM", "xterm")

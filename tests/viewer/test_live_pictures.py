@@ -1,4 +1,4 @@
-"""Pictures to look at come from a process of their own, and a fault of it is one line."""
+"""Live pictures come from a separate process, and its fault gives one line."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.support.processes import cell, wait_until
 
 
 @pytest.mark.slow
-def test_a_picture_of_the_cell_comes_and_a_lost_process_is_one_line(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_picture_of_the_cell_comes_and_a_lost_process_gives_one_line(caplog: pytest.LogCaptureFixture) -> None:
     camera = CameraConfig(position=(1.5, 0.0, 1.0), look_at=(0.4, 0.0, 0.3), width=64, height=48)
     loop = Pipeline.from_config(cell().model_copy(update={"cameras": {"front": camera}}), plant="mujoco")
     assert isinstance(loop.plant, MujocoPlant)

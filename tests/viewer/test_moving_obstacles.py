@@ -1,4 +1,4 @@
-"""Moving obstacles on the page: where a run knows them, in a colour that tells of reports that have ceased."""
+"""Moving obstacles on the page: at their reported places, in a colour that shows whether reports have ended."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_each_tick_of_a_run_has_the_obstacles_as_reported_and_their_age() -> Non
                         assert obstacle_colour(shown) == (RED if old else AMBER)
 
 
-def test_the_page_draws_an_obstacle_anew_where_it_is_looks_otherwise_and_until_it_is_gone(
+def test_the_page_redraws_an_obstacle_when_it_moves_or_changes_until_it_is_gone(
     server: viser.ViserServer,
 ) -> None:
     figure = ObstacleFigure(server.scene, "/obstacles")
