@@ -1,4 +1,4 @@
-"""A run with its page, in a process of its own, and Chromium that looks at it."""
+"""A run with its page in its own process, and Chromium that opens the page."""
 
 from __future__ import annotations
 
@@ -31,9 +31,10 @@ ARGUMENTS = [
     *("--no-sandbox", "--disable-gpu", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
     *("--disable-background-networking", "--disable-component-update", "--disable-sync", "--no-first-run"),
 ]
-HIDDEN = "[class*=mantine-Notification] {display: none !important}"  # a warning of slow drawing, which covers an arm
+# This hides a warning of slow drawing, which covers an arm.
+HIDDEN = "[class*=mantine-Notification] {display: none !important}"
 VIEW = {"width": 680, "height": 360}
-PATIENCE = 600.0  # far longer than a page takes that a processor draws beside ten other programs [s]
+PATIENCE = 600.0  # Timeout far above what a page takes when a processor draws it beside ten other programs [s].
 
 
 _URL = r"(?:page:|webxr: open) (http\S+)\n"
@@ -50,7 +51,8 @@ class WebRun:
                 stdout=subprocess.PIPE,
                 stderr=file,
                 text=True,
-                preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a shell's background job ignores it
+                # A background job of a shell ignores this signal.
+                preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
             )
         wait_until(lambda: re.search(_URL, self.errors) or self._process.poll() is not None)
         found = re.search(_URL, self.errors)
@@ -62,25 +64,25 @@ class WebRun:
         return self._errors.read_text()
 
     def end(self) -> dict[str, Any]:
-        """The summary of a run that ends by itself."""
+        """Wait for a run that ends by itself, and return its summary."""
         output, _ = self._process.communicate(timeout=PATIENCE)
         assert self._process.returncode == 0, self.errors
         summary: dict[str, Any] = json.loads(output)
         return summary
 
     def interrupt(self) -> None:
-        """As Ctrl-C does."""
+        """End the run like Ctrl-C."""
         self._process.send_signal(signal.SIGINT)
 
     def kill(self) -> None:
-        """End a run that a failed test has left, which would keep a processor from the next test."""
+        """End a run that a failed test has left, which would occupy a processor during the next test."""
         self._process.kill()
         self._process.communicate()
 
 
 @contextmanager
 def one_processor() -> Iterator[None]:
-    """For browsers, which draw by the processor here and take all that there are; what starts later gets all."""
+    """Confine browsers to one processor, because they draw by software and use all of them. Later processes get all."""
     processors = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {max(processors)})
     yield
@@ -88,7 +90,7 @@ def one_processor() -> Iterator[None]:
 
 
 def table(page: Page) -> dict[str, list[str]]:
-    """Rows of the panel's table: what is said of the left and of the right arm."""
+    """Return rows of the panel's table with the cells of the left and of the right arm."""
     rows = page.locator("table tr").evaluate_all("rows => rows.map(row => [...row.cells].map(cell => cell.innerText))")
     return {row[0]: row[1:] for row in rows}
 
@@ -102,7 +104,7 @@ def wait_until(condition: Callable[[], object]) -> None:
 
 
 def wait_for_row(page: Page, name: str, arm: int, text: str) -> None:
-    """Wait until a row of the table has ``text`` for an arm; otherwise the table is in the failure."""
+    """Wait until a row of the table has ``text`` for an arm. Otherwise, the failure contains the table."""
     seen: dict[str, list[str]] = {}
 
     def says() -> bool:
@@ -121,12 +123,12 @@ def wait_for(page: Page, text: str) -> None:
 
 
 def tool(page: Page, arm: int = 0) -> Array:
-    """Position (3,) of a tool, as the panel says [m]."""
+    """Return the position (3,) of a tool from the panel [m]."""
     return np.array([float(number) for number in table(page)["tool [m]"][arm].split()])
 
 
 def pixels(page: Page) -> Array:
-    """(height, width, 3) of the scene."""
+    """Return the pixels (height, width, 3) of the scene."""
     picture = Image.open(io.BytesIO(page.screenshot())).convert("RGB")
     box = page.locator("canvas").first.bounding_box()
     assert box is not None
@@ -135,7 +137,7 @@ def pixels(page: Page) -> Array:
 
 
 def on_screen(page: Page, point: Array) -> tuple[float, float]:
-    """Where the first view shows a point (3,) of the world [m], in the page's pixels."""
+    """Return where the first view shows a point (3,) of the world [m], in the page's pixels."""
     robot = Robot.from_config(cell())
     eye, middle = first_view(robot.model, robot.home)
     forward = (middle - eye) / np.linalg.norm(middle - eye)
@@ -149,12 +151,12 @@ def on_screen(page: Page, point: Array) -> tuple[float, float]:
 
 
 def count(picture: Array, colour: tuple[float, float, float]) -> int:
-    """Pixels of about this colour."""
+    """Count pixels of about this colour."""
     return int((np.abs(picture - colour).max(axis=2) < 70.0).sum())
 
 
-_TOUCHED = (255.0, 255.0, 64.0)  # of a gizmo under the mouse
-_HANDLE, _PULLED = 0.13, 0.07  # of a gizmo's arrow, along the tool's z axis [m]
+_TOUCHED = (255.0, 255.0, 64.0)  # Colour of a gizmo under the mouse.
+_HANDLE, _PULLED = 0.13, 0.07  # Place of a gizmo's arrow along the tool's z axis [m].
 
 
 def grab(page: Page, arm: str) -> None:
@@ -170,11 +172,11 @@ def grab(page: Page, arm: str) -> None:
 
 
 def drag(page: Page, arm: str, to: float) -> None:
-    """Move the mouse to where the arrow of a tool at home is at ``to`` [m]."""
+    """Move the mouse to the place where the arrow of a tool at home would be at ``to`` [m]."""
     page.mouse.move(*on_arrow(page, arm, to), steps=6)
 
 
 def on_arrow(page: Page, arm: str, along: float) -> tuple[float, float]:
-    """Pixel of a point on the arrow of a tool at home, ``along`` its z axis [m]."""
+    """Return the pixel of a point on the arrow of a tool at home, ``along`` its z axis [m]."""
     robot = Robot.from_config(cell())
     return on_screen(page, robot.tool_pose(robot.home, arm).act(np.array([0.0, 0.0, along])))

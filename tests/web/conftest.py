@@ -17,14 +17,14 @@ from q2r2_control.inputs.webxr.webxr import WebXrInput
 from tests.web.browser import ARGUMENTS, CHROMIUM, HIDDEN, PATIENCE, VIEW, WebRun, one_processor
 from tests.web.headset_page import Listen
 
-_COARSE = 0.5  # of a pixel's width, since a processor draws them
+_COARSE = 0.5  # Ratio of pixels, which is coarse because a processor draws them.
 Open = Callable[..., Page]
 Start = Callable[..., WebRun]
 
 
 @pytest.fixture(scope="session")
 def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[BrowserContext]:
-    """One browser for all tests. Its own requests, to update itself, are off."""
+    """Start one browser for all tests. Its own requests for updates are off."""
     folder = tmp_path_factory.mktemp("profile")
     with ExitStack() as stack:
         with one_processor():
@@ -46,7 +46,7 @@ def open_page(browser: BrowserContext) -> Iterator[Open]:
     pages: list[Page] = []
 
     def open_one(url: str, script: str | None = None) -> Page:
-        """``script`` runs before those of a page that is not viser's."""
+        """Open a page. A page that is not viser's runs ``script`` before its own scripts."""
         pages.append(browser.new_page())
         if script is not None:
             pages[-1].add_init_script(script)

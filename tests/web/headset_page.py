@@ -1,4 +1,4 @@
-"""A headset's page without a headset: what it sends to a run, and what the run's server answers."""
+"""A headset's page without a headset: its messages to a run, and the answers of the run's server."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Page:
         self.socket.close()
 
     def ended(self) -> str:
-        """Why the run has ended it."""
+        """Return the reason why the run has ended it."""
         with suppress(ConnectionClosed):
             for _ in self.socket:
                 pass
@@ -63,8 +63,8 @@ def samples(source: WebXrInput, until: Callable[[list[HandSample]], object]) -> 
 
 
 def refused(source: WebXrInput, origin: str | None = None, query: str | None = None) -> bool:
-    """Whether the server refuses the socket."""
-    # websockets' client reads and writes from two threads, which an SSL connection does not allow.
+    """Return whether the server refuses the socket."""
+    # The client of websockets reads and writes from two threads, which an SSL connection does not allow.
     assert source.url is not None
     scheme, host, _, token, _ = urlsplit(source.url)
     connection = HTTPConnection(host, timeout=60.0)

@@ -16,12 +16,12 @@ from q2r2_control.inputs.webxr.page_messages import PageMessage
 from q2r2_control.inputs.webxr.shown import FromRun
 
 _PLAIN = {"string": "string", "number": "number", "integer": "number", "boolean": "boolean", "null": "null"}
-# Tuples without a class of their own, which a schema does not name.
+# These tuples have no class of their own, so that a schema does not name them.
 _NAMED = f"type Point = [{', '.join(['number'] * 3)}];\ntype Seven = [{', '.join(['number'] * 7)}];\n"
 
 
 def types() -> str:
-    """Declarations for all scripts of the page."""
+    """Return declarations for all scripts of the page."""
     found: dict[str, Any] = {}
     for shape in (PageMessage, FromRun):
         schema = TypeAdapter(shape).json_schema(mode="validation")
@@ -30,7 +30,7 @@ def types() -> str:
 
 
 def _type_of(schema: dict[str, Any]) -> str:
-    """The TypeScript type of a JSON schema. Raises KeyError for one that no message needs yet."""
+    """Return the TypeScript type of a JSON schema. Raises KeyError for a type that no message needs yet."""
     if "$ref" in schema:
         return str(schema["$ref"]).rpartition("/")[2]
     if "anyOf" in schema:
@@ -54,7 +54,7 @@ def _type_of(schema: dict[str, Any]) -> str:
 
 
 def main() -> None:
-    """Write the file that is named."""
+    """Write the given file."""
     file = Path(sys.argv[1])
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text(types(), encoding="utf-8")

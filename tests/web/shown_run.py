@@ -1,4 +1,4 @@
-"""A run for the headset's page without robot and loop: what it shows is given, and what its buttons ask for is kept."""
+"""A run for the headset's page without robot and loop. Its display is given, and requests of buttons are kept."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ STATE: ShownState = {
 
 
 class GivenDisplay:
-    """Shows states as they are."""
+    """A display that shows states unchanged."""
 
     def scene(self) -> ShownScene:
         return {
@@ -49,7 +49,7 @@ class GivenDisplay:
 
 
 class ShownRun:
-    """An input that shows :data:`STATE` once it is started."""
+    """An input that shows :data:`STATE` after its start."""
 
     def __init__(self, source: WebXrInput) -> None:
         self.asked: list[str] = []

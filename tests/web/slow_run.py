@@ -17,11 +17,11 @@ from q2r2_control.summary.tick import Tick
 from q2r2_control.viewer.web import view
 from tests.support.processes import cell
 
-_SILENT, _STANDS = 0.5, 1.0  # an engaged hand without samples for longer lets each tick take so long [s]
+_SILENT, _STANDS = 0.5, 1.0  # Longest silence of an engaged hand [s], and the duration of each later tick [s].
 
 
 class SlowTime:
-    """The loop's time, of which a tick of 1 ms takes ``pause`` [s] and more.
+    """The loop's time, in which a tick of 1 ms takes at least ``pause`` [s].
 
     It all but stands still while an engaged arm waits for a page that is busy drawing.
     """
@@ -40,7 +40,7 @@ class SlowTime:
 
 
 def patient(config: Config) -> Config:
-    """The cell with a gate that waits long for a browser."""
+    """Return the cell with a gate that waits long for a browser."""
     gate = config.teleop.gate.model_copy(update={"timeout": 2.0})
     return config.model_copy(update={"teleop": config.teleop.model_copy(update={"gate": gate})})
 
@@ -53,7 +53,7 @@ def main(source: str, port: int, pause: float) -> None:
     hands = WebInput(slow) if is_web else make_input("scripted", config, trajectory=source)
     pipeline = Pipeline.from_config(config, input=hands, plant="kinematic")
     pipeline.listeners.append(slow.pass_by)
-    view._PERIOD = 0.2  # a processor draws the page, which takes long
+    view._PERIOD = 0.2  # A processor draws the page, which takes long.
     with view.PageView("127.0.0.1", port) as page:
         print(f"page: {page.begin(pipeline, 'slow', False)}", file=sys.stderr, flush=True)
         print(json.dumps(pipeline.run(realtime=False).as_json()))

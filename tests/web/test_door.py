@@ -1,4 +1,4 @@
-"""Who is let in: browsers of this machine's own page, and beyond it those with the token."""
+"""Access control: pages of this machine itself, and from other machines only with the token."""
 
 from __future__ import annotations
 
@@ -35,25 +35,25 @@ def door(request: pytest.FixtureRequest) -> Iterator[Door]:
 
 
 def status(door: Door, path: str = "/", **headers: str) -> int:
-    """Of a page that is asked for."""
+    """Return the status of a requested page."""
     connection = HTTPConnection("127.0.0.1", door.port)
     connection.request("GET", path, headers=headers)
     return connection.getresponse().status
 
 
 def token_of(door: Door) -> str:
-    """Empty on loopback."""
+    """Return the token, which is empty on loopback."""
     return urlsplit(door.urls[0]).path.strip("/")
 
 
 def connected(door: Door, origin: str, token: str) -> ClientConnection:
-    """As viser's page connects, to the path that it came from."""
+    """Connect like viser's page, to the path that it came from."""
     protocol = [Subprotocol(f"viser-v{viser.__version__}")]
     return connect(f"ws://127.0.0.1:{door.port}/{token}", origin=Origin(origin), subprotocols=protocol)
 
 
 def admitted(door: Door, origin: str, token: str) -> bool:
-    """Whether a page of ``origin`` may connect."""
+    """Return whether a page of ``origin`` may connect."""
     try:
         connected(door, origin, token).close()
     except InvalidStatus as error:
@@ -61,7 +61,7 @@ def admitted(door: Door, origin: str, token: str) -> bool:
     return True
 
 
-def test_only_the_own_page_connects(door: Door) -> None:
+def test_only_our_own_page_connects(door: Door) -> None:
     own = f"http://127.0.0.1:{door.port}"
     token = token_of(door)
     assert admitted(door, own, token)
@@ -73,20 +73,20 @@ def test_only_the_own_page_connects(door: Door) -> None:
         assert (status(door), status(door, f"/{token}")) == (403, 200)
     else:
         assert status(door) == 200
-        assert status(door, Host=f"example.org:{door.port}") == 403  # a name that was made to lead here
+        assert status(door, Host=f"example.org:{door.port}") == 403  # An attacker may have made this name lead here.
         assert status(door, Host="example.org:9000") == 403
 
 
-def test_a_forwarded_port_is_let_in_and_another_name_is_told_what_is_allowed(door: Door) -> None:
+def test_a_forwarded_port_is_admitted_and_another_name_is_told_what_is_allowed(door: Door) -> None:
     if door.token is not None:
         pytest.skip("beyond loopback the token decides")
-    assert status(door, Host="localhost:9000") == 200  # after ssh -L 9000:localhost:PORT
+    assert status(door, Host="localhost:9000") == 200  # This address is that after ssh -L 9000:localhost:PORT.
     request = Request("/", Headers({"Host": "example.org:9000"}))
     assert door.refusal(request) == (
         "unknown Host 'example.org:9000'; allowed: 127.0.0.1, [::1], localhost, at any port, "
         f"such as localhost:9000 after ssh -L 9000:localhost:{door.port}"
     )
-    # A page of another server of this computer is another site still.
+    # A page of another server on this computer is still another site.
     stranger = Headers({"Host": f"localhost:{door.port}", "Origin": "http://localhost:5000", "Upgrade": "websocket"})
     assert str(door.refusal(Request("/", stranger))).startswith("unknown Origin")
     own = Headers({"Host": "localhost:9000", "Origin": "http://localhost:9000", "Upgrade": "websocket"})
@@ -105,7 +105,7 @@ def test_the_tab_of_the_page_has_the_name_of_the_cell(encoding: str) -> None:
     assert response.headers["Content-Length"] == str(len(response.body))
 
 
-def test_no_more_pages_than_a_few_connect(door: Door) -> None:
+def test_only_a_few_pages_can_connect(door: Door) -> None:
     origin, token = f"http://127.0.0.1:{door.port}", token_of(door)
     pages = [connected(door, origin, token) for _ in range(12)]
     assert not admitted(door, origin, token)
@@ -113,7 +113,7 @@ def test_no_more_pages_than_a_few_connect(door: Door) -> None:
         page.close()
 
 
-def test_beyond_this_machine_the_page_comes_by_tls_and_is_neither_kept_nor_framed(tmp_path: Path) -> None:
+def test_from_other_machines_the_page_comes_by_tls_and_is_neither_cached_nor_framed(tmp_path: Path) -> None:
     certificate, _ = own_certificate(tmp_path, ["192.168.1.5", "10.0.0.7"], datetime.now(UTC))
     far = Door("0.0.0.0", 0, str(certificate), ["192.168.1.5", "10.0.0.7"])
     token = token_of(far)
@@ -132,17 +132,17 @@ def test_beyond_this_machine_the_page_comes_by_tls_and_is_neither_kept_nor_frame
     assert "'unsafe-eval'" not in policy
     connection.close()
     with pytest.raises((RemoteDisconnected, ConnectionError)):
-        status(far, f"/{token}")  # without TLS
+        status(far, f"/{token}")  # This request has no TLS.
     server.stop()
 
 
-def test_a_port_that_is_taken_is_one_clear_line() -> None:
+def test_a_port_that_another_program_uses_gives_one_clear_line() -> None:
     door = Door("127.0.0.1", 0)
     with pytest.raises(ConfigError, match=f"cannot listen on 127.0.0.1 port {door.port}: .*allowed: a free port"):
         Door("127.0.0.1", door.port)
     door.socket.close()
 
 
-def test_loopback_is_told_from_the_rest() -> None:
+def test_loopback_is_distinguished_from_other_addresses() -> None:
     assert [is_loopback(host) for host in ("127.0.0.1", "::1", "localhost")] == [True] * 3
     assert not any(map(is_loopback, ("0.0.0.0", "::", "192.168.1.5", "example.org")))

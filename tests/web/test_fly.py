@@ -1,4 +1,4 @@
-"""Keys and a gamepad fly a hand on the page that headsets open, through the same gate, anchor and leash."""
+"""Keys and a gamepad move a hand on the page for headsets, through the same gate, anchor and leash."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ def let_go(page: Page, code: str) -> None:
 
 
 def targets_of_left(page: Page) -> Array:
-    """(3,) of the target's position [m]."""
+    """Return the target's position (3,) [m]."""
     return np.array(arms(page, "target")[0][:3])
 
 
-def test_keys_and_a_gamepad_engage_an_arm_move_it_and_leave_it_when_the_page_is_left(
+def test_keys_and_a_gamepad_engage_an_arm_move_it_and_pause_it_when_the_page_is_left(
     open_page: Open, start: Start
 ) -> None:
     run = start(*RUN)
@@ -70,7 +70,7 @@ def test_keys_and_a_gamepad_engage_an_arm_move_it_and_leave_it_when_the_page_is_
     assert run.end()["at_rest"]
 
 
-# The page's own flying hand, in time that the test lets pass: 20 ms a look.
+# The page's own flying hand, in simulated time of 20 ms per reading.
 LOOKS = """async ([events, looks, unsent = 0]) => {
     const { Flying } = await import("/fly.js");
     let now = performance.now();
@@ -92,11 +92,13 @@ LOOKS = """async ([events, looks, unsent = 0]) => {
 
 
 def flown(page: Page, *events: tuple[str, Mapping[str, object]]) -> float:
-    """How far a hand has gone forward within 4 s of events of the keyboard [m]."""
+    """Return how far a hand has moved forward within 4 s of events of the keyboard [m]."""
     return float(page.evaluate(LOOKS, [events, 200])["moved"])
 
 
-def test_a_key_whose_release_is_never_heard_moves_a_hand_for_a_short_time_only(open_page: Open, listen: Listen) -> None:
+def test_a_key_whose_release_is_never_reported_moves_a_hand_only_for_a_short_time(
+    open_page: Open, listen: Listen
+) -> None:
     page = open_page(str(listen().url), "")
     forward, ctrl = {"code": "KeyW"}, {"code": "ControlLeft", "key": "Control", "ctrlKey": True}
     down, repeated = ("keydown", forward), ("keydown", forward | {"repeat": True})
@@ -110,7 +112,7 @@ def test_a_key_whose_release_is_never_heard_moves_a_hand_for_a_short_time_only(o
     assert flown(page, down, ("keyup", ctrl | {"ctrlKey": False})) == 0.0
 
 
-def test_a_button_is_held_while_another_key_repeats_and_only_a_press_begins_it_anew(
+def test_a_button_stays_held_while_another_key_repeats_and_only_a_new_press_starts_it_again(
     open_page: Open, listen: Listen
 ) -> None:
     page = open_page(str(listen().url), "")
@@ -120,20 +122,21 @@ def test_a_button_is_held_while_another_key_repeats_and_only_a_press_begins_it_a
     assert held[-10:] == [False] * 10
 
 
-def test_a_tap_between_two_messages_is_in_the_next_one_that_is_sent_soon_and_only_for_its_own_hand(
+def test_a_tap_between_two_messages_is_in_the_next_one_which_comes_soon_and_only_for_its_own_hand(
     open_page: Open, listen: Listen
 ) -> None:
     page = open_page(str(listen().url), "")
     down, up = ("keydown", {"code": "Space"}), ("keyup", {"code": "Space"})
 
     def held(*events: tuple[str, Mapping[str, object]], unsent: int = 0) -> int:
-        """How many messages say that the button is down."""
+        """Return how many messages say that the button is down."""
         return sum(page.evaluate(LOOKS, [events, 200, unsent])["held"])
 
     assert held(down, up) == 1
-    assert held(down, up, unsent=3) == 4  # the first three messages are left out
-    assert held(down, up, unsent=200) == 6  # for less than 150 ms, after which the arm stops for want of messages
+    assert held(down, up, unsent=3) == 4  # The first three messages are left out.
+    # The button is held for less than 150 ms. After that, the arm stops because messages are missing.
+    assert held(down, up, unsent=200) == 6
     assert held(down, up, ("blur", {})) == 0
     assert held(down, up, ("keydown", {"code": "Digit2"})) == 0
-    assert held(down, ("keydown", {"code": "Digit2"})) == 0  # also while it is held
+    assert held(down, ("keydown", {"code": "Digit2"})) == 0  # The same holds while it is held.
     assert held(down, up, ("keydown", {"code": "KeyW", "ctrlKey": True})) == 0

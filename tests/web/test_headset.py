@@ -1,4 +1,4 @@
-"""The page in a headset that is emulated, from entering VR to the arms of the simulated cell."""
+"""The page in an emulated headset, from entering VR to the arms of the simulated cell."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ EMULATOR = Path(os.environ.get("Q2R2_IWER", ".venv/iwer/package")) / "build" / "
 RUN = ("tests.web.headset_run", "0.004")
 LOWER = {"left": "x-button", "right": "a-button"}
 UPPER = {"left": "y-button", "right": "b-button"}
-# One browser opens both pages, and a page of the driver's browser would be its own, loaded anew.
+# One browser opens both pages. A page in the driver's browser would count as the driver's own page, loaded again.
 ANOTHER_BROWSER = "Storage.prototype.getItem = () => null"
-ORANGE = (255.0, 107.0, 13.0)  # of the arms' rings
+ORANGE = (255.0, 107.0, 13.0)  # Colour of the arms' rings.
 
 
 def emulated() -> str:
-    """The script of a headset that is not there, and of what the tests ask it."""
+    """The script of an emulated headset, and of the tests' requests to it."""
     assert EMULATOR.exists(), f"{EMULATOR} is missing: make test-web fetches it with npm"
     return f"{EMULATOR.read_text()};{Path(__file__).with_name('emulator.js').read_text()}"
 
@@ -44,7 +44,7 @@ def enter(open_page: Open) -> Any:
 
 
 def begin(page: Page, mode: str = "vr") -> None:
-    """Enter from the page, as after it was reloaded."""
+    """Enter from the page, as after a reload."""
     wait_until(lambda: said(page) is not None)
     page.click(f"#immersive-{mode}")
     wait_until(lambda: page.evaluate("Boolean(headset.activeSession)"))
@@ -52,13 +52,13 @@ def begin(page: Page, mode: str = "vr") -> None:
 
 
 def frames(page: Page, count: int) -> None:
-    """Let the emulator draw so many."""
+    """Let the emulator draw this many frames."""
     drawn = page.evaluate("frames")
     wait_until(lambda: page.evaluate("frames") >= drawn + count)
 
 
 def said(page: Page) -> dict[str, Any] | None:
-    """The newest state that the run has told the page."""
+    """Return the newest state that the page got from the run."""
     state: dict[str, Any] | None = page.evaluate("said")
     return state
 
@@ -77,7 +77,7 @@ def wait_for(page: Page, states: str, why: str = "") -> None:
 
 
 def wait_until_said(page: Page, condition: Callable[[], object]) -> None:
-    """Wait until the page was told so; otherwise the last it was told is in the failure."""
+    """Wait until the page got this. Otherwise, the failure contains the last message."""
     try:
         wait_until(condition)
     except AssertionError as error:
@@ -91,7 +91,7 @@ def press(page: Page, *buttons: dict[str, str]) -> None:
 
 
 def targets(page: Page) -> Array:
-    """(2, 3) positions of both targets [m]."""
+    """Return the positions (2, 3) of both targets [m]."""
     return np.array(arms(page, "target"))[:, :3]
 
 
@@ -102,12 +102,12 @@ def test_hands_engage_the_arms_move_them_by_the_rooms_axes_and_feel_it(enter: An
     press(page, LOWER)
     wait_for(page, "engaged")
     before = targets(page)
-    page.evaluate("carry([-0.05, 0.06, -0.07], 60)")  # left, up, forward
+    page.evaluate("carry([-0.05, 0.06, -0.07], 60)")  # The motion is to the left, up and forward.
     wait_until_said(page, lambda: np.allclose(targets(page)[0] - before[0], [0.07, 0.05, 0.06], atol=2e-3))
     assert np.allclose(targets(page)[1] - before[1], 0.5 * np.array([0.07, 0.05, 0.06]), atol=2e-3)
     wait_for(page, "engaged", "follows the hand")
-    wait_until(lambda: count(pixels(page), ORANGE) > 5)  # the robot, not only its board
-    # The chord of the app stops both, and a pause after it is one.
+    wait_until(lambda: count(pixels(page), ORANGE) > 5)  # The robot is visible, not only its board.
+    # The chord of the app stops both arms, and a pause after it counts as one.
     page.evaluate("hold(['x-button', 'y-button'], 'left', 1)")
     wait_for(page, "aligning")
     page.evaluate("hold(['x-button', 'y-button'], 'left', 0)")
@@ -117,13 +117,13 @@ def test_hands_engage_the_arms_move_them_by_the_rooms_axes_and_feel_it(enter: An
     felt = page.evaluate("vibrations.filter(one => one.amplitude > 0).map(one => one.hand)")
     assert {"left", "right"} <= set(felt)
     assert page.evaluate("pulses") > 3
-    page.evaluate("document.getElementById('leave').click()")  # behind what the emulator draws
+    page.evaluate("document.getElementById('leave').click()")  # The button is behind what the emulator draws.
     wait_until(lambda: not page.evaluate("Boolean(headset.activeSession)"))
     run.interrupt()
     assert run.end()["at_rest"]
 
 
-def test_whatever_takes_the_hands_away_stops_the_arms_until_a_new_press(enter: Any, start: Start) -> None:
+def test_if_the_hands_are_lost_in_any_way_the_arms_stop_until_a_new_press(enter: Any, start: Start) -> None:
     run = start(*RUN)
     page = enter(run.url)
 
@@ -132,13 +132,13 @@ def test_whatever_takes_the_hands_away_stops_the_arms_until_a_new_press(enter: A
         wait_for(page, "engaged")
 
     engage()
-    page.evaluate("guessed = true")  # controllers out of the headset's sight
+    page.evaluate("guessed = true")  # The controllers are out of the headset's sight.
     wait_for(page, "lost", "does not see the hand")
     page.evaluate("guessed = false")
     frames(page, 20)
     wait_for(page, "lost")
     engage()
-    # Hidden by the headset's menu, or taken off, at a moment when the socket takes nothing.
+    # The headset's menu hides the page, or the headset is taken off, while the socket accepts nothing.
     page.evaluate("full = true, headset.updateVisibilityState('hidden')")
     frames(page, 5)
     page.evaluate("full = false")
@@ -149,7 +149,7 @@ def test_whatever_takes_the_hands_away_stops_the_arms_until_a_new_press(enter: A
     engage()
     page.evaluate("void carry([0.0, 0.3, 0.0], 400)")
     frames(page, 30)
-    page.reload()  # in the middle of a motion
+    page.reload()  # The reload comes in the middle of a motion.
     begin(page)
     frames(page, 20)
     wait_for(page, "lost", "connection lost")
@@ -160,7 +160,7 @@ def test_whatever_takes_the_hands_away_stops_the_arms_until_a_new_press(enter: A
     assert run.end()["at_rest"]
 
 
-def test_fingers_found_beside_a_controller_that_was_laid_down_move_no_arm(enter: Any, start: Start) -> None:
+def test_fingers_beside_a_controller_that_was_laid_down_move_no_arm(enter: Any, start: Start) -> None:
     run = start(*RUN)
     page = enter(run.url)
     press(page, LOWER)
@@ -180,7 +180,7 @@ def test_fingers_found_beside_a_controller_that_was_laid_down_move_no_arm(enter:
     assert run.end()["at_rest"]
 
 
-def test_the_first_headset_drives_and_another_is_told_so(enter: Any, start: Start, open_page: Open) -> None:
+def test_the_first_headset_drives_and_another_one_gets_a_message(enter: Any, start: Start, open_page: Open) -> None:
     run = start(*RUN)
     page = enter(run.url, "ar")
     other = open_page(run.url, ANOTHER_BROWSER)

@@ -1,4 +1,4 @@
-"""Who is served a headset's page: hosts, tokens, certificates and cables."""
+"""Access to a headset's page: hosts, tokens, certificates and cables."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tests.support.processes import cell
 from tests.web.headset_page import Listen, refused
 
 
-def test_only_the_own_page_connects_and_beyond_this_machine_only_with_the_token(
+def test_only_our_own_page_connects_and_from_other_machines_only_with_the_token(
     listen: Listen,
 ) -> None:
     lines: list[str] = []
@@ -39,7 +39,7 @@ def test_only_the_own_page_connects_and_beyond_this_machine_only_with_the_token(
     assert far.url.startswith("https://")
     assert any("new certificate, first use" in line for line in lines)
     assert any("▀" in line or "█" in line for line in lines), "a code for a camera"
-    # The same URL in the next run, without a new certificate.
+    # The next run has the same URL and needs no new certificate.
     lines.clear()
     token = urlsplit(far.url).query
     again = listen(host="0.0.0.0", say=lines.append)
@@ -70,7 +70,7 @@ def test_a_certificate_is_renewed_before_it_expires_and_for_another_address(tmp_
     assert "cannot be read" in str(made("10.0.0.7")[1])
 
 
-def test_each_network_of_this_computer_has_its_url_its_code_and_its_name_in_the_certificate(
+def test_each_network_of_this_computer_has_a_url_a_code_and_a_name_in_the_certificate(
     listen: Listen, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     networks = ("192.168.1.5", "10.0.0.7")
@@ -89,7 +89,7 @@ def test_each_network_of_this_computer_has_its_url_its_code_and_its_name_in_the_
     assert set(networks) <= {str(name.value) for name in names}
 
 
-def test_a_cable_needs_adb_which_says_what_is_missing(
+def test_a_cable_needs_adb_and_its_message_says_what_is_missing(
     listen: Listen, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
@@ -131,7 +131,7 @@ def test_hosts_outside_the_allowed_networks_get_nothing(listen: Listen) -> None:
 
 
 @pytest.mark.parametrize(("package", "shows"), [("websockets", False), ("trimesh", True)])
-def test_a_package_that_is_missing_is_named_with_the_extra_that_has_it(
+def test_a_missing_package_is_named_with_the_extra_that_has_it(
     package: str, shows: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     found = {name: find_spec(name) for name in ("websockets", "trimesh") if name != package}
@@ -143,7 +143,7 @@ def test_a_package_that_is_missing_is_named_with_the_extra_that_has_it(
         source.start()
 
 
-def test_a_port_that_is_taken_and_a_cable_to_another_address_are_one_clear_line(
+def test_a_used_port_and_a_cable_to_another_address_give_one_clear_line(
     listen: Listen,
 ) -> None:
     source = listen()

@@ -1,4 +1,4 @@
-"""The page's server: who drives, and what of a page's messages becomes samples."""
+"""The page's server: the driver, and the samples that are made of a page's messages."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_a_hand_arrives_as_the_page_sent_it_with_all_its_controls(listen: Listen
         pytest.param({"fault": "hand_frame_moved"}, HandFault.FRAME_MOVED, id="a recentred room"),
     ],
 )
-def test_a_pose_that_the_headset_does_not_vouch_for_is_a_fault(
+def test_a_pose_that_the_headset_only_guesses_is_a_fault(
     listen: Listen, told: dict[str, Any], fault: HandFault
 ) -> None:
     source = listen()
@@ -57,13 +57,13 @@ def test_a_pose_that_the_headset_does_not_vouch_for_is_a_fault(
         assert samples(source, len)[0].fault is fault
 
 
-def test_of_messages_that_come_together_the_newest_counts_and_every_button(listen: Listen) -> None:
+def test_of_simultaneous_messages_the_newest_pose_counts_and_every_button(listen: Listen) -> None:
     source = listen()
     with closing(Page(source)) as page:
         page.send(left=hand(0.0))
         samples(source, len)
         burst = [hand(x, False, x == 4.0) for x in (1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0)]
-        # All in one piece of the stream, as after a silence of the Wi-Fi.
+        # All messages come in one piece of the stream, as after a silence of the Wi-Fi.
         frames = []
         with page.socket.protocol_mutex:
             for index, one in enumerate(burst):
@@ -91,7 +91,7 @@ def test_of_messages_that_come_together_the_newest_counts_and_every_button(liste
         pytest.param("x" * (LONGEST + 1), id="too long"),
     ],
 )
-def test_garbage_ends_its_own_page_only(listen: Listen, content: str | bytes) -> None:
+def test_garbage_ends_only_its_own_page(listen: Listen, content: str | bytes) -> None:
     source = listen()
     with closing(Page(source)) as page:
         page.socket.send(content)
@@ -101,7 +101,7 @@ def test_garbage_ends_its_own_page_only(listen: Listen, content: str | bytes) ->
         assert samples(source, len)[0].position[0] == 5.0
 
 
-def test_numbers_that_are_none_arrive_for_the_gate_to_judge_as_of_every_headset(
+def test_numbers_that_are_not_finite_arrive_so_that_the_gate_judges_them(
     listen: Listen,
 ) -> None:
     source = listen()
@@ -130,9 +130,9 @@ def test_the_first_page_drives_and_one_that_comes_back_takes_its_place(listen: L
         samples(source, len)
         peer = source.statistics.peer
         with closing(Page(source, "2")) as second:
-            # The second words are those of a machine so busy that the first page has been silent for a while.
+            # The second words come from a machine so busy that the first page has been silent for a while.
             assert second.ended() in (f"4001 {peer} drives", f"4001 {peer} is connected")
-        # Only after a silence of the first connection, which has been lost without a word. The page tries again.
+        # The page tries again after a silence of the first connection, which was lost without a message.
         with ExitStack() as tries:
 
             def comes_back() -> bool:
@@ -177,7 +177,7 @@ def test_the_newest_picture_reaches_the_page_that_drives(listen: Listen) -> None
         received: list[str | bytes] = []
 
         def has_the_newest() -> bool:
-            page.send(left=hand(1.0))  # a page goes on sending; a picture goes out after one of its messages
+            page.send(left=hand(1.0))  # A page goes on sending. A picture follows one of its messages.
             with suppress(TimeoutError):
                 received.append(page.socket.recv(timeout=0.05))
             return received[-1:] == [b"newest"]
@@ -185,7 +185,7 @@ def test_the_newest_picture_reaches_the_page_that_drives(listen: Listen) -> None
         wait_until(has_the_newest)
 
 
-def test_headset_check_shows_what_the_page_sends_and_where_to_open_it(listen: Listen) -> None:
+def test_headset_check_shows_messages_of_the_page_and_its_address(listen: Listen) -> None:
     source, config = listen(silence=PATIENCE), WebXrInput.cell(cell())
     alone = watch_headset(source, config, 0.0, lambda check: None, lambda: False)
     assert f"open {source.url} in the headset's browser" in alone.advice

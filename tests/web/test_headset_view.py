@@ -1,4 +1,4 @@
-"""Words and buttons of the page that headsets open, on a screen, and the board that it shows in VR."""
+"""Words and buttons of the page for headsets on a screen, and the board that it shows in VR."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[ShownRun]:
 
 
 def shows(run: ShownRun, page: Page, condition: Callable[[], object]) -> None:
-    """Show the state again and again until the page says so."""
+    """Show the state again and again until the page shows it."""
 
     def look() -> object:
         run.show()
@@ -51,7 +51,7 @@ def test_stop_and_home_are_buttons_and_reach_the_run(run: ShownRun, open_page: O
     wait_until(lambda: run.asked == ["home"])
     page.click("#stop")
     wait_until(lambda: run.asked == ["home", "stop"])
-    # Space, which engages a flown hand, presses neither again.
+    # The space key, which engages a flown hand, presses neither button again.
     page.click("#fly")
     page.keyboard.press("Space")
     page.wait_for_timeout(500)
@@ -63,10 +63,10 @@ def test_a_state_has_its_colour_and_the_tab_the_name_of_the_cell(run: ShownRun, 
     colour = page.evaluate("getComputedStyle(document.querySelector('.state')).backgroundColor")
     assert colour == f"rgb{RED}"
     assert page.title() == "two_arms: drive the arms"
-    assert page.inner_text("#arms").count("lost") == 2  # each arm's state once
+    assert page.inner_text("#arms").count("lost") == 2  # Each arm's state is shown once.
 
 
-def test_words_are_those_of_the_device_in_hand(run: ShownRun, open_page: Open) -> None:
+def test_words_are_those_of_the_used_device(run: ShownRun, open_page: Open) -> None:
     page = opened(run, open_page)
 
     def next_of(row: int) -> str:
@@ -83,7 +83,7 @@ def test_words_are_those_of_the_device_in_hand(run: ShownRun, open_page: Open) -
 
 
 @pytest.mark.parametrize("flies", [False, True], ids=["looking on", "flying"])
-def test_nothing_lies_over_anything_else_on_a_phone(run: ShownRun, open_page: Open, flies: bool) -> None:
+def test_no_element_covers_another_one_on_a_phone(run: ShownRun, open_page: Open, flies: bool) -> None:
     page = opened(run, open_page)
     page.set_viewport_size({"width": 390, "height": 800})
     if flies:
@@ -107,10 +107,10 @@ def test_nothing_lies_over_anything_else_on_a_phone(run: ShownRun, open_page: Op
     view = boxes["#view"]
     assert view is not None
     assert view["height"] > 250.0
-    assert count(pixels(page), (230.0, 40.0, 40.0)) > 20  # the block, beside the words
+    assert count(pixels(page), (230.0, 40.0, 40.0)) > 20  # The block is visible beside the words.
 
 
-def test_a_page_that_watches_sees_who_drives_and_the_state_and_may_only_stop(run: ShownRun, open_page: Open) -> None:
+def test_a_watching_page_sees_the_driver_and_the_state_and_may_only_stop(run: ShownRun, open_page: Open) -> None:
     driver = opened(run, open_page)
     other = opened(run, open_page, ANOTHER_BROWSER)
     assert f"{run.source.statistics.peer} drives" in other.inner_text("#link")
@@ -122,14 +122,14 @@ def test_a_page_that_watches_sees_who_drives_and_the_state_and_may_only_stop(run
     }""")
     wait_until(lambda: run.asked == ["stop"])
     driver.close()
-    wait_until(lambda: "connected" in other.inner_text("#link"))  # it may drive now
+    wait_until(lambda: "connected" in other.inner_text("#link"))  # The other page may drive now.
 
 
 def test_a_run_that_is_over_says_so_on_its_page(run: ShownRun, open_page: Open) -> None:
     page = opened(run, open_page)
     run.source.close()
     wait_until(lambda: "The run is over" in page.inner_text("#link"))
-    page.wait_for_timeout(2500)  # in which it tries to connect again
+    page.wait_for_timeout(2500)  # In this time, the page tries to connect again.
     assert "The run is over" in page.inner_text("#link")
     assert page.locator("#stop").is_disabled()
     assert page.inner_text("#arms") == ""
@@ -160,13 +160,11 @@ BOARD = """async (state) => {
 }"""
 
 
-def test_the_board_has_letters_that_can_be_read_and_goes_where_the_operator_looks(
-    run: ShownRun, open_page: Open
-) -> None:
+def test_the_board_has_readable_letters_and_moves_to_where_the_operator_looks(run: ShownRun, open_page: Open) -> None:
     state = STATE | {"arms": {"left": arm("left", why="paused by {lower}")}}
     board = opened(run, open_page).evaluate(BOARD, state)
     assert min(board["degrees"]) >= 1.5
-    assert board["still"]  # it does not swim while the head moves a little
+    assert board["still"]  # The board does not move when the head moves a little.
     assert board["yaw"] == pytest.approx(0.9, abs=0.05)
     x, y, z = board["centre"]
     assert (x, board["up"]) == (0.0, True)

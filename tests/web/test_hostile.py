@@ -1,4 +1,4 @@
-"""Pages that are many, slow, dead or hostile change nothing of a run, and cannot make its loop wait."""
+"""Many, slow, dead or hostile pages do not change a run, and cannot make its loop wait."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from q2r2_control.viewer.web.server import LimitedAnswers
 from q2r2_control.viewer.web.view import PageView
 from tests.pipeline.loops import pipeline
 
-SECONDS = 1.5  # of each run
+SECONDS = 1.5  # Duration of each run.
 NOISE = np.random.default_rng(7)
 
 
@@ -45,7 +45,7 @@ def joined(url: str) -> ClientConnection:
 
 
 def played(loop: Pipeline, acts: Mapping[float, Callable[[], object]]) -> Array:
-    """Joint positions (ticks, nv) of a run in simulated time, with what is done at some of its times."""
+    """Return joint positions (ticks, nv) of a run in simulated time, with actions at some of its times."""
     positions, due = [], sorted(acts)
 
     def follow(tick: Tick) -> None:
@@ -66,14 +66,14 @@ def circling() -> Pipeline:
 def test_watchers_garbage_and_a_page_that_stands_still_change_nothing(
     view: PageView, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(view_module, "_PERIOD", 0.0)  # more frames than a pipe has room for
+    monkeypatch.setattr(view_module, "_PERIOD", 0.0)  # There are more frames than a pipe has room for.
     loop = circling()
     url = view.begin(loop, "hostile", False)
     page = view._process.pid
     with ExitStack() as stack:
 
         def crowd() -> None:
-            for _ in range(10):  # which read nothing
+            for _ in range(10):  # These pages read nothing.
                 stack.callback(joined(url).close)
 
         def garbage() -> None:
@@ -101,7 +101,7 @@ def test_watchers_garbage_and_a_page_that_stands_still_change_nothing(
     assert np.array_equal(watched, played(circling(), {}))
 
 
-def test_a_slider_gives_no_speed_above_the_cells_and_no_nonsense(view: PageView) -> None:
+def test_a_slider_allows_no_speed_above_the_cells_and_no_invalid_value(view: PageView) -> None:
     loop = circling()
     view.begin(loop, "sliders", False)
     usual = loop.config.control.max_linear_speed
@@ -117,7 +117,7 @@ def test_a_slider_gives_no_speed_above_the_cells_and_no_nonsense(view: PageView)
     assert seen == [(1.0, 1.0), *[(0.5, 0.5)] * 5, (1.0, 0.5), (0.5, 0.5), (1.0, 0.5)]
 
 
-def test_a_flood_of_requests_is_thinned_out_but_for_a_stop() -> None:
+def test_a_flood_of_requests_is_reduced_except_for_stops() -> None:
     passed: list[object] = []
     answer = LimitedAnswers(passed.append, clock=lambda: 0.0)
     for _ in range(1000):

@@ -1,4 +1,4 @@
-"""A stranger's look at a run, and its buttons, in a real browser."""
+"""A visitor's view of a run, and the buttons of the page, in a real browser."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.support.processes import CELL
 from tests.web.browser import count, drag, grab, on_arrow, pixels, table, tool, wait_for, wait_for_row, wait_until
 from tests.web.conftest import Open, Start
 
-ORANGE = (255.0, 107.0, 13.0)  # of the arms' rings
+ORANGE = (255.0, 107.0, 13.0)  # Colour of the arms' rings.
 SLOW = "tests.web.slow_run"
 
 
@@ -25,12 +25,12 @@ def test_the_page_shows_both_arms_and_its_buttons_end_the_run_in_rest(open_page:
     wait_for(page, "certified")
     for arm in (0, 1):
         wait_for_row(page, "state", arm, "engaged")
-    # Rings of both arms, left and right of the middle, which no empty scene has.
+    # The rings of both arms, left and right of the middle, are missing in an empty scene.
     wait_until(lambda: all(count(half, ORANGE) > 5 for half in np.array_split(pixels(page), 2, axis=1)))
     page.get_by_text("Pause both arms").click()
     wait_for_row(page, "why", 1, "a program asks for a pause")
     assert table(page)["next"] == ["nothing: a script moves the hands"] * 2
-    # News that change no state, as those of a slider, do not hide the reason.
+    # News without a change of state, such as those of a slider, do not hide the reason.
     page.get_by_text("Settings", exact=True).click()
     page.locator("input:visible").first.fill("50")
     page.locator("input:visible").first.press("Enter")
@@ -44,7 +44,7 @@ def test_the_page_shows_both_arms_and_its_buttons_end_the_run_in_rest(open_page:
     assert summary["at_rest"]
     kinds = [event["kind"] for event in summary["events"]]
     assert kinds.index("control_changed") < kinds.index("homing_arrived")
-    # The page that stays on the screen says so, and offers nothing that would not be done.
+    # The page that stays on the screen says so, and offers no button without effect.
     wait_for(page, "The run is over after")
     assert not page.get_by_text("certified").is_visible()
     assert not page.get_by_text("Bring both arms home").is_visible()
@@ -56,7 +56,7 @@ def test_the_page_shows_both_arms_and_its_buttons_end_the_run_in_rest(open_page:
     assert again.end()["at_rest"]
 
 
-def test_a_page_drags_a_tool_as_a_hand_does_and_no_other_page_can_meanwhile(open_page: Open, start: Start) -> None:
+def test_a_page_drags_a_tool_like_a_hand_and_no_other_page_can_at_the_same_time(open_page: Open, start: Start) -> None:
     run = start(SLOW, "web", "0", "0.01")
     page, other = open_page(run.url), open_page(run.url)
     for one in (page, other):
@@ -74,7 +74,7 @@ def test_a_page_drags_a_tool_as_a_hand_does_and_no_other_page_can_meanwhile(open
     other.mouse.down()
     drag(other, "right", 0.02)
     other.mouse.up()
-    # The first goes on meanwhile, and a driver that is gone stops the arm.
+    # The first page goes on meanwhile, and a driver that is gone stops the arm.
     moved = tool(page)
     drag(page, "left", 0.02)
     wait_until(lambda: np.linalg.norm(tool(other) - moved) > 0.02)
@@ -100,10 +100,10 @@ def test_the_scene_and_the_panel_share_the_screen_of_a_phone(open_page: Open, st
     assert (scene["width"], panel["width"]) == (390.0, 390.0)
 
 
-def test_a_replay_has_a_time_line_and_a_page_with_a_token_comes_back_when_it_is_loaded_anew(
+def test_a_replay_has_a_time_line_and_a_page_with_a_token_returns_after_a_reload(
     open_page: Open, start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))  # where its certificate is made
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))  # The certificate is made here.
     loop = pipeline()
     with Recorder(tmp_path, "circle", waits=True) as recorder:
         recorder.begin(About.of(loop, False, {}), loop.robot)
@@ -115,7 +115,7 @@ def test_a_replay_has_a_time_line_and_a_page_with_a_token_comes_back_when_it_is_
     url = urlsplit(run.url)
     assert url.scheme == "https"
     page = open_page(url._replace(netloc=f"127.0.0.1:{url.port}").geturl())
-    wait_for(page, "3.0 s")  # the end, where it stands still
+    wait_for(page, "3.0 s")  # The replay stands still at its end.
     page.reload()
     wait_for(page, "3.0 s")
     number = page.locator("input:visible").first
