@@ -16,7 +16,7 @@ LIMIT = 2.0  # [rad/s]
 
 
 def an_arm(name: str, x: float) -> str:
-    """Two hinges, and a hand with a finger that slides."""
+    """Return a model of two hinges, and a hand with a sliding finger."""
     return f"""
     <body name="{name}_base" pos="{x} 0.1 0.2" euler="0 0 0.3"><geom type="cylinder" size="0.05 0.05"/>
       <body name="{name}_upper" pos="0 0 0.1"><joint name="{name}_1" axis="0 0 1" range="-1 2"/>
@@ -52,7 +52,7 @@ def placed(model: mujoco.MjModel, **positions: float) -> mujoco.MjData:
     return data
 
 
-def test_our_robot_of_a_model_moves_as_it_does_and_encloses_all_that_a_finger_sweeps(
+def test_our_robot_of_a_model_moves_like_it_and_encloses_all_that_a_finger_sweeps(
     model: mujoco.MjModel, arms: dict[str, ArmModel]
 ) -> None:
     closing = [placed(model, left_slide=way, right_slide=way).qpos.copy() for way in (0.1, 0.04, 0.0)]
@@ -79,7 +79,7 @@ def test_our_robot_of_a_model_moves_as_it_does_and_encloses_all_that_a_finger_sw
                 assert inside.all(), (side, geom, way)
 
 
-def test_the_judge_counts_what_mujoco_did(model: mujoco.MjModel, arms: dict[str, ArmModel]) -> None:
+def test_the_judge_counts_the_contacts_of_mujoco(model: mujoco.MjModel, arms: dict[str, ArmModel]) -> None:
     judge = Judge(model, arms)
     judge.look(placed(model))
     assert (judge.contacts, judge.breaks_position, judge.breaks_velocity) == (0, False, False)
@@ -92,13 +92,13 @@ def test_the_judge_counts_what_mujoco_did(model: mujoco.MjModel, arms: dict[str,
         f"<mujoco><worldbody>{an_arm('left', 0.0)}{an_arm('right', 0.05)}</worldbody></mujoco>"
     )
     judge = Judge(nearer, arms)
-    for _ in range(2):  # one contact that lasts
+    for _ in range(2):  # The contact lasts, and counts once.
         judge.look(placed(nearer))
     assert judge.contacts == 1
     assert judge.nearest < 0.0
 
 
-def test_hands_go_straight_and_wait_for_their_tools_before_they_ask_for_more() -> None:
+def test_hands_move_straight_and_wait_for_their_tools_before_they_go_on() -> None:
     asked: list[str] = []
 
     def asks() -> Iterator[Ask]:
@@ -112,7 +112,7 @@ def test_hands_go_straight_and_wait_for_their_tools_before_they_ask_for_more() -
     for step in range(1, 11):
         hands.advance(start, 0.1)
         assert hands.targets["left"].translation == pytest.approx([SPEED * step / 10, 0.0, 0.0])
-    for _ in range(4):  # the tool has not come
+    for _ in range(4):  # The tool has not arrived.
         hands.advance(start, 0.1)
     assert asked == ["first"]
     while len(asked) == 1:
@@ -122,7 +122,7 @@ def test_hands_go_straight_and_wait_for_their_tools_before_they_ask_for_more() -
     assert hands.done
 
 
-def test_a_hand_that_looks_down_closes_where_it_is_told_and_leans_about_that() -> None:
+def test_a_hand_that_looks_down_closes_where_it_is_told_and_leans_about_that_point() -> None:
     rotation = looking_down(np.array([0.0, 2.0]))
     assert rotation[:, 0] == pytest.approx([0.0, 1.0, 0.0])
     assert rotation[:, 2] == pytest.approx([0.0, 0.0, -1.0])

@@ -1,4 +1,4 @@
-"""The benchmarks outside the package start, and the one that reaches into the loop finds all its stages."""
+"""The benchmarks outside the package start, and the one that measures the loop finds all its stages."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ NEEDED = {
     "ros": ("rclpy", "quest2ros"),
     "page": ("viser", "websockets"),
     "qp": ("qpbenchmark",),
-}  # by what a script's name begins with
+}  # The keys are the beginnings of the scripts' names.
 
 
 def run(script: str, *options: str) -> str:
@@ -33,7 +33,7 @@ def run(script: str, *options: str) -> str:
 
 
 @pytest.mark.parametrize("script", SCRIPTS)
-def test_every_benchmark_says_what_it_asks(script: str) -> None:
+def test_every_benchmark_says_which_question_it_answers(script: str) -> None:
     needed = NEEDED.get(script.split("_")[0], ())
     if absent := [name for name in needed if find_spec(name) is None]:
         pytest.skip(f"not installed: {', '.join(absent)}")
@@ -44,7 +44,7 @@ def test_every_benchmark_says_what_it_asks(script: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.soak
-def test_answers_are_told_apart_by_whether_a_processor_stood_still_meanwhile() -> None:
+def test_answers_during_a_standstill_of_a_processor_are_separated_from_others() -> None:
     bench = load_script("benchmarks/fri.py")
     answers, stills = [(0.0, 0.001), (0.010, 0.013), (0.020, 0.028)], [(0.012, 0.014), (0.030, 0.031)]
     assert bench.undisturbed(answers, stills) == pytest.approx([0.001, 0.008])
@@ -52,7 +52,7 @@ def test_answers_are_told_apart_by_whether_a_processor_stood_still_meanwhile() -
 
 
 @pytest.mark.slow
-def test_the_loop_s_benchmark_times_every_stage() -> None:
+def test_the_benchmark_of_the_loop_times_every_stage() -> None:
     cases = json.loads(run("loop_times.py", "--ticks", "100", "--rounds", "1", "--record", "--json"))["cases"]
     assert set(cases) == {"kinematic position", "mujoco position", "mujoco torque"}
     for stage in ("inputs", "measured state", "teleop", "supervision", "control", "drive", "apply", "physics"):
@@ -68,7 +68,7 @@ def test_qps_of_motions_are_a_test_set_that_qpbenchmark_loads_and_daqp_solves(
     told = json.loads(run("qp_problems.py", "--ticks", "40", "--solved", "8", "--file", str(file), "--json"))
     assert (told["ticks"], told["solved"]) == (40, 8)
     assert set(told["success_percent"]["daqp"].values()) == {100.0}
-    monkeypatch.chdir(tmp_path)  # where the set looks for its file
+    monkeypatch.chdir(tmp_path)  # The test set looks for its file here.
     monkeypatch.setattr(sys, "path", [*sys.path])
     names = [problem.name for problem in benchmark.load_test_set(str(FOLDER / "qp_problems.py"))]
     assert [name.split("_")[0] for name in names] == [
@@ -77,7 +77,7 @@ def test_qps_of_motions_are_a_test_set_that_qpbenchmark_loads_and_daqp_solves(
     assert len(set(names)) == 40
 
 
-def test_every_line_of_the_table_stands_once_in_its_file() -> None:
+def test_every_line_of_the_table_occurs_once_in_its_file() -> None:
     for mutation in load_script("benchmarks/safety_mutations.py").MUTATIONS:
         text = (ROOT / mutation.path).read_text(encoding="utf-8")
         assert text.count(mutation.old) == 1, mutation.claim

@@ -1,4 +1,4 @@
-"""The README's way from episodes to a dataset, its own lines, with one episode."""
+"""The lines of the README that lead from episodes to a dataset, with one episode."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ import pytest
 pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).resolve().parents[1]
-# These lines install and use the package lerobot, which has tests of its own.
+# These lines install and use the package lerobot, which has its own tests.
 _ELSEWHERE = ("make ", ".venv-lerobot/")
 _SEEDS = "1 2 3 4 5 6 7 8 9 10"
 
 
-def test_each_line_of_the_readme_does_what_is_said_beside_it(tmp_path: Path) -> None:
+def test_each_line_of_the_readme_does_what_its_comment_says(tmp_path: Path) -> None:
     section = (ROOT / "README.md").read_text().split("## From ten episodes to a dataset")[1]
     found = re.search(r"```sh\n(.*?)```", section, re.DOTALL)
     assert found is not None

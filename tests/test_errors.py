@@ -1,4 +1,4 @@
-"""Every public name answers a wrong argument with one line of the package's own family of errors."""
+"""Every public name answers a wrong argument with one line of the package's own errors."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from q2r2_control.plants.base import Plant, make_plant
 from q2r2_control.types import QUEST_CONTROLS
 
 CONFIG = load_config("config/dual_iiwa7.yaml")
-WRONG: Any = None  # kinds that a type checker would not let pass
+WRONG: Any = None  # A type checker would not allow these kinds.
 FIVE: Any = 5
 NO_SETTINGS: Any = {}
 A_CELL: Any = CONFIG
@@ -65,7 +65,7 @@ def one_line(kind: type[Q2R2Error], call: Callable[[], object]) -> str:
 
 
 @pytest.mark.parametrize("path", [None, {}, [], 5, b"cell.yaml"])
-def test_a_cell_is_loaded_from_a_path_only(path: Any) -> None:
+def test_a_cell_is_loaded_only_from_a_path(path: Any) -> None:
     assert one_line(ConfigError, lambda: load_config(path)).endswith(
         "allowed: the path of a file, as text or pathlib.Path"
     )
@@ -110,7 +110,7 @@ def test_arms_of_a_urdf_are_a_mapping_of_names(robot: Robot, arms: Any) -> None:
 
 
 @pytest.mark.parametrize("q", [None, "abc", 5, [0.0] * 3, [math.nan] * 14, [[0.0]] * 14, [object()]])
-def test_joints_of_a_wrong_kind_or_shape_are_refused_wherever_they_go(
+def test_joints_of_a_wrong_kind_or_shape_are_refused_everywhere(
     robot: Robot, controller: CartesianController, q: Any
 ) -> None:
     pair = (robot.distances(robot.home)[0].name_a, robot.distances(robot.home)[0].name_b)
@@ -126,7 +126,7 @@ def test_joints_of_a_wrong_kind_or_shape_are_refused_wherever_they_go(
     assert np.isfinite(controller.step({}, 0.001, q).q).all(), "a posture that is not usable is not used"
 
 
-def test_lists_of_numbers_are_joints_too(robot: Robot) -> None:
+def test_lists_of_numbers_are_accepted_as_joints(robot: Robot) -> None:
     assert robot.tool_pose(robot.home.tolist(), "left") == robot.tool_pose(robot.home, "left")
 
 
@@ -176,14 +176,14 @@ def test_a_pipeline_refuses_a_wrong_duration_and_wrong_settings(pipeline: Pipeli
 
 
 @pytest.mark.parametrize("dt", [math.nan, math.inf, -1.0, 0.0, None, "a"])
-def test_a_time_that_is_none_brakes_nothing(controller: CartesianController, dt: Any) -> None:
+def test_an_invalid_time_brakes_nothing(controller: CartesianController, dt: Any) -> None:
     controller.reset(controller.robot.home)
     controller.brake(dt)
     np.testing.assert_allclose(controller.step({}, 0.001).q, controller.robot.home, atol=1e-9)
 
 
 @pytest.mark.parametrize("pose", [None, 5, np.eye(4), NO_NUMBER, pin.SE3(np.zeros((3, 3)), np.zeros(3))])
-def test_relative_motion_takes_finite_poses_only(pose: Any) -> None:
+def test_relative_motion_takes_only_finite_poses(pose: Any) -> None:
     unanchored, motion, identity = RelativeMotion(), RelativeMotion(), pin.SE3.Identity()
     motion.anchor(identity, identity)
     allowed = "allowed: finite numbers" if pose is NO_NUMBER else POSE
@@ -215,7 +215,7 @@ MEASURED = ("q", "v", "tau_external", "stamp")
 
 
 class Device:
-    """An input and a plant of a program's own, which may return what they should not."""
+    """An input and a plant of a user's program, which may return invalid values."""
 
     def __init__(self, plant: Plant) -> None:
         self.controls, self.connected, self.modes = QUEST_CONTROLS, True, plant.modes
@@ -250,7 +250,7 @@ Call = Callable[[Program, Any], object]
 
 
 def each(what: str, names: Iterable[str], call: Callable[[Program, str, Any], object]) -> dict[str, Call]:
-    """Calls with one of these keywords each."""
+    """Return calls, each with one of these keywords."""
 
     def of(name: str) -> Call:
         return lambda own, x: call(own, name, x)
@@ -327,7 +327,7 @@ def program(robot: Robot, controller: CartesianController) -> Program:
 
 
 @pytest.mark.parametrize("name", CALLS)
-def test_an_argument_of_a_wrong_kind_gets_one_line_of_the_family(program: Program, name: str) -> None:
+def test_an_argument_of_a_wrong_kind_gives_one_line_of_our_errors(program: Program, name: str) -> None:
     refused = []
     for value in KINDS:
         try:

@@ -1,4 +1,4 @@
-"""Examples run as they stand: each script in examples/, the code and commands of the README, and code of docs/."""
+"""Examples run unchanged: each script in examples/, the code and commands of the README, and code of docs/."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.support.modules import ROOT
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 SCRIPTS = sorted((ROOT / "examples").glob("*.py"))
-ROS = "external_controller.py"  # tests/ros runs it
+ROS = "external_controller.py"  # tests/ros runs this example.
 
 
 Done = subprocess.CompletedProcess[Any]
@@ -26,7 +26,7 @@ START_PROCESS: Callable[..., Done] = subprocess.run
 
 
 def run_command(command: list[str], *arguments: Any, **options: Any) -> Done:
-    """The command of this package that an example starts, in this process; any other program is started."""
+    """Run the package's command that an example starts in this process. Any other program is started."""
     if command[:3] != [sys.executable, "-m", "q2r2_control"]:
         return START_PROCESS(command, *arguments, **options)
     result = CliRunner().invoke(app, command[3:])
@@ -36,7 +36,7 @@ def run_command(command: list[str], *arguments: Any, **options: Any) -> Done:
 
 @pytest.fixture
 def as_main(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
-    """Runs code as the module ``__main__`` of this process, whose imports are done, and returns its output."""
+    """Run code as the module ``__main__`` of this process, whose imports are done, and return its output."""
     monkeypatch.chdir(ROOT)
     monkeypatch.setattr(sys, "path", list(sys.path))
     monkeypatch.setattr(subprocess, "run", run_command)
@@ -54,7 +54,7 @@ def as_main(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
 
 @pytest.mark.slow
 @pytest.mark.parametrize("script", [script for script in SCRIPTS if script.name != ROS], ids=lambda script: script.stem)
-def test_an_example_runs_and_prints_what_came_of_it(script: Path, tmp_path: Path, as_main: Callable[..., str]) -> None:
+def test_an_example_runs_and_prints_its_result(script: Path, tmp_path: Path, as_main: Callable[..., str]) -> None:
     code = script.read_text(encoding="utf-8")
     pictures = [tmp_path / "picture.png"] if "PICTURE" in code else []
     assert as_main(code, str(script), *pictures).strip()

@@ -13,7 +13,7 @@ from q2r2_control.extras import install_line
 ROOT = Path(__file__).resolve().parents[1]
 
 
-def test_in_a_checkout_the_line_names_its_folder_so_that_it_works_from_anywhere() -> None:
+def test_in_a_checkout_the_line_names_its_folder_so_that_it_works_from_any_folder() -> None:
     assert install_line("web") == f"pip install -e '{ROOT}[web]'"
 
 
@@ -22,7 +22,7 @@ def test_elsewhere_the_line_names_the_package(monkeypatch: pytest.MonkeyPatch, t
     assert install_line("web") == "pip install 'q2r2_control[web]'"
 
 
-def test_every_extra_that_a_message_names_is_one_of_the_package() -> None:
+def test_every_extra_in_a_message_exists_in_the_package() -> None:
     known = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
     named = {
         text.split(quote)[1]

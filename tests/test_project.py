@@ -1,4 +1,4 @@
-"""Imports are those of the project's rules and dependencies, and the documentation is current.
+"""Imports follow the rules and dependencies of the project, and the documentation is current.
 
 Beyond the rules of ``lint-imports``: modules import each other in no circle, and light ones stay light.
 """
@@ -26,13 +26,13 @@ from tests.support.modules import ROOT, load_script
 PACKAGE = "q2r2_control"
 HEAVY = (f"{PACKAGE}.control.controller", "mujoco", "numba", "matplotlib")
 ROS = ROOT / PACKAGE / "ros"
-# Distributions whose import has another name.
+# Some distributions have another name than their import.
 IMPORTS = {
     **{"pin": "pinocchio", "example-robot-data-loaders": "example_robot_data", "PyYAML": "yaml", "pin-pink": "pink"},
     "pillow": "PIL",
     "protobuf": "google",
 }
-# These come with pin, mujoco, lerobot, pydantic, matplotlib and viser.
+# These packages come with pin, mujoco, lerobot, pydantic, matplotlib and viser.
 WITH_OTHERS = {"coal", "glfw", "datasets", "pydantic_core", "packaging", "trimesh", "msgspec", "websockets"}
 NODES = set(ROS.rglob("*.py"))
 OTHERS = set((ROOT / PACKAGE).rglob("*.py")) - NODES
@@ -41,7 +41,7 @@ PROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text())["
 
 
 def modules(*extras: str) -> set[str]:
-    """The packages that the dependencies, or these extras, bring."""
+    """Return the packages that the dependencies, or these extras, install."""
     optional = PROJECT["optional-dependencies"]
     entries = [entry for extra in extras for entry in optional[extra]] if extras else PROJECT["dependencies"]
     names = [re.split(r"[\[<>=]", entry)[0].removeprefix("ros-jazzy-") for entry in entries]
@@ -49,7 +49,7 @@ def modules(*extras: str) -> set[str]:
 
 
 def names_imported(node: ast.AST) -> Iterator[str]:
-    """Names that are imported when a module runs, inside functions too, not for type checkers only."""
+    """Return names that are imported when a module runs, inside functions too, but not only for type checkers."""
     if isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING":
         return
     if isinstance(node, ast.Import):
@@ -69,12 +69,12 @@ def imported_by(file: Path) -> frozenset[str]:
 
 
 def imported(files: Iterable[Path]) -> set[str]:
-    """Top-level packages, without the standard library and this package."""
+    """Return top-level packages, without the standard library and this package."""
     names = {name.partition(".")[0] for file in files for name in imported_by(file)}
     return names - set(sys.stdlib_module_names) - {PACKAGE}
 
 
-def test_every_dependency_is_imported_by_the_package_and_everything_that_is_imported_is_one() -> None:
+def test_every_dependency_is_imported_and_every_import_is_a_dependency() -> None:
     optional = modules("bench", "xacro", "export", "gym", "lerobot", "modbus", "web")
     assert modules() <= imported(OTHERS)
     assert imported(OTHERS) - modules() - optional - WITH_OTHERS == set()
@@ -82,7 +82,7 @@ def test_every_dependency_is_imported_by_the_package_and_everything_that_is_impo
     assert imported(NODES) - modules() - modules("ros") - built - WITH_OTHERS == set()
 
 
-def test_peers_are_imported_by_their_own_modules_only() -> None:
+def test_peers_are_imported_only_by_their_own_modules() -> None:
     for file in OTHERS:
         if found := modules("bench") & imported([file]):
             assert (file.parent.name, found) == ("peers", {file.stem})
@@ -97,10 +97,10 @@ def test_the_ros_manifest_has_the_name_and_version_of_the_python_package() -> No
 def test_no_modules_import_each_other_in_a_circle() -> None:
     files = [
         file for file in OTHERS | NODES if file.name != "__init__.py"
-    ]  # an import of a module is its package's too
+    ]  # An import of a module is also one of its package.
     known = {".".join(file.relative_to(ROOT).with_suffix("").parts): file for file in files}
     graph = {name: imported_by(file) & known.keys() for name, file in known.items()}
-    TopologicalSorter(graph).prepare()  # raises CycleError
+    TopologicalSorter(graph).prepare()  # A circle would raise CycleError.
 
 
 @pytest.mark.parametrize(
@@ -142,7 +142,7 @@ def test_every_public_name_exists(package: str) -> None:
         assert hasattr(found, name), name
 
 
-def test_the_configuration_reference_is_made_from_the_settings_of_now() -> None:
+def test_the_configuration_reference_agrees_with_the_settings() -> None:
     made = load_script("docs/make_reference.py")
     assert made.FILE.read_text(encoding="utf-8") == made.reference(), "python docs/make_reference.py"
 
@@ -154,7 +154,7 @@ def test_no_two_public_classes_share_a_name() -> None:
 
 @cache
 def anchors(page: Path) -> set[str]:
-    """Those of its headings."""
+    """Return the anchors of a page's headings."""
     text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
     titles = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
     return {re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in titles}
@@ -169,7 +169,7 @@ def test_every_link_of_a_page_leads_to_a_file_and_a_heading(page: Path) -> None:
         assert not anchor or anchor in anchors(target), link
 
 
-def test_the_page_of_ros_names_every_parameter_that_a_node_declares() -> None:
+def test_the_page_about_ros_names_every_parameter_that_a_node_declares() -> None:
     page = (ROOT / "docs" / "ros.md").read_text(encoding="utf-8")
     sources = [file.read_text(encoding="utf-8") for file in (ROOT / PACKAGE / "ros").rglob("*.py")]
     declared = {name for text in sources for name in re.findall(r'(?:parameter|declare)\(\s*"([a-z_.]+)"', text)}

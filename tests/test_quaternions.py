@@ -1,4 +1,4 @@
-"""Rotations of four floats are those of Pinocchio."""
+"""Rotations of four floats equal those of Pinocchio."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def random_vectors(count: int = 200) -> list[tuple[float, float, float]]:
     return list(zip(x, y, z, strict=True))
 
 
-def test_a_rotation_vector_and_its_rotation_lead_to_each_other() -> None:
+def test_rotation_vector_and_rotation_are_inverse_functions() -> None:
     for vector in random_vectors():
         q = rotation_of(vector)
         assert matrix(q) == pytest.approx(pin.exp3(np.array(vector)), abs=1e-14)
@@ -42,7 +42,7 @@ def test_a_rotation_vector_and_its_rotation_lead_to_each_other() -> None:
         assert rotation_vector((-a, -b, -c, -w)) == pytest.approx(vector, abs=1e-14)
 
 
-def test_products_and_inverses_are_those_of_matrices() -> None:
+def test_products_and_inverses_equal_those_of_matrices() -> None:
     for one, other in zip(random_vectors(), reversed(random_vectors()), strict=True):
         p, q = rotation_of(one), rotation_of(other)
         assert matrix(product(p, q)) == pytest.approx(matrix(p) @ matrix(q), abs=1e-14)
@@ -52,5 +52,5 @@ def test_products_and_inverses_are_those_of_matrices() -> None:
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-300, 1e-12, 1e-6, math.pi - 1e-6, math.pi - 1e-12], ids="{:g} rad".format)
-def test_the_shortest_turns_and_those_of_almost_half_a_turn_are_exact(angle: float) -> None:
+def test_very_small_turns_and_almost_half_turns_are_exact(angle: float) -> None:
     assert rotation_vector(rotation_of((0.0, angle, 0.0))) == pytest.approx((0.0, angle, 0.0), rel=1e-14, abs=0.0)

@@ -1,4 +1,4 @@
-"""Loops that stand still for a while, and plants that do not do what they are told, in the in-process loop."""
+"""In-process loops that stand still for a while, and plants that do not obey their commands."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ RATE = 250.0  # [Hz]
 
 
 def swing(t: float) -> Array:
-    """A hand that swings as fast as the arms can just follow."""
+    """Return a hand that swings as fast as the arms can just follow."""
     return np.array([0.0, 0.12 * np.sin(6.0 * max(t - 0.5, 0.0)), 0.0, 0.0, 0.0, 0.0])
 
 
 def reach(t: float) -> Array:
-    """A hand that moves far and slowly."""
+    """Return a hand that moves far and slowly."""
     return np.array([0.0, 0.0, 0.2 * (1.0 - np.cos(1.5 * max(t - 0.5, 0.0))), 0.0, 0.0, 0.0])
 
 
@@ -41,13 +41,13 @@ def swinging(plant: Plant | str, mode: str = "position", path: Callable[[float],
 
 
 def largest_step(plant: RecordingPlant, limit: Array) -> float:
-    """Of any joint between two commands, as a share of what its limit allows in one period."""
+    """Return the largest step of any joint between two commands, as a share of its limit in one period."""
     ways = np.abs(np.diff(np.array([command.q for command in plant.commands]), axis=0))
     return float((ways / (limit / RATE)).max())
 
 
 class StallingClock:
-    """Stands for the module ``time``: every 0.37 s the computer stands still for ``stall`` [s]."""
+    """A replacement for the module ``time``: every 0.37 s, the computer stands still for ``stall`` [s]."""
 
     def __init__(self, stall: float, first: float = 0.9) -> None:
         self._now, self._stall, self._next = 0.0, stall, first
@@ -66,7 +66,7 @@ class StallingClock:
 
 
 @pytest.mark.parametrize("stall", [0.05, 0.7])
-def test_after_a_stall_no_joint_goes_farther_than_in_a_period(stall: float, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_after_a_stall_no_joint_moves_farther_than_in_a_period(stall: float, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(loop_clock, "time", StallingClock(stall))
     plant = RecordingPlant()
     loop = swinging(plant)
@@ -78,7 +78,7 @@ def test_after_a_stall_no_joint_goes_farther_than_in_a_period(stall: float, monk
     assert largest_step(plant, loop.robot.velocity_limit) <= 1.0 + 1e-9
     paused = [event for event in summary.events if event.destination == "lost"]
     assert bool(paused) == (stall > loop.config.teleop.gate.timeout), "a long stall pauses, a short one does not"
-    expected = ("loop_stalled", "pose_silent", "pose_gap", "inputs_silent")  # none of which comes in a stall
+    expected = ("loop_stalled", "pose_silent", "pose_gap", "inputs_silent")  # None of these events comes in a stall.
     assert all(event.reason.root.kind in expected for event in paused)
 
 
@@ -91,14 +91,16 @@ def test_a_stall_before_the_first_tick_is_no_fault_of_the_plant(monkeypatch: pyt
 
 
 @pytest.mark.parametrize("mode", ["position", "velocity", "torque"])
-def test_a_plant_that_makes_up_for_a_stall_is_no_plant_that_jumps(mode: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_plant_that_catches_up_after_a_stall_is_not_a_plant_that_jumps(
+    mode: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(loop_clock, "time", StallingClock(0.09))
     loop = swinging("mujoco", mode)
     watch = Watch(loop)
     summary = loop.run(3.0)
     assert summary.missed_ticks >= 5
     assert max(map(speed, watch.ticks)) > 0.5
-    # Velocities go on acting during a stall, torques for 5 ms; the arms are brought back to the reference afterwards.
+    # Velocities act during a stall, torques only for 5 ms. The arms are led back to the reference afterwards.
     deviation = [np.abs(after.state.q - tick.reference.q).max() for tick, after in pairwise(watch.ticks)]
     assert max(deviation) < {"position": 0.15, "velocity": 0.3, "torque": 0.05}[mode]
     assert summary.at_rest
@@ -106,14 +108,14 @@ def test_a_plant_that_makes_up_for_a_stall_is_no_plant_that_jumps(mode: str, mon
 
 
 @pytest.mark.parametrize(("mode", "plant"), [("velocity", "kinematic"), ("torque", "mujoco")])
-def test_states_that_are_lost_while_the_arms_brake_drive_them_no_more(mode: str, plant: str) -> None:
+def test_states_that_are_lost_while_the_arms_brake_are_not_used_any_more(mode: str, plant: str) -> None:
     loop = swinging(plant, mode)
     watch = Watch(loop)
     measure = loop.plant.state
     loop.plant.apply = Mock(wraps=loop.plant.apply)  # type: ignore[method-assign]
 
     def lose_and_stop(tick: Tick) -> None:
-        # Velocities brake within 0.1 s from less, which is as long as states may be missing.
+        # Slower motion is braked within 0.1 s, which is as long as states may be missing.
         if speed(tick) > (0.8 if mode == "torque" else 1.1) and tick.following:
             last = measure()
             loop.plant.state = lambda: last  # type: ignore[method-assign]
@@ -149,19 +151,19 @@ def test_a_plant_that_gives_no_more_states_gets_a_last_command_that_holds_the_ar
 
 
 def blocked(plant: RecordingPlant) -> Callable[[RobotState], RobotState]:
-    """From now on the arms stay where they are, and say so."""
+    """From now on, the arms stay where they are, and report that."""
     q = plant.state().q
     return lambda state: replace(state, q=q, v=np.zeros_like(q))
 
 
 def frozen(plant: RecordingPlant) -> Callable[[RobotState], RobotState]:
-    """From now on the last measurement is repeated."""
+    """From now on, repeat the last measurement."""
     last = plant.state()
     return lambda state: last
 
 
 def shifted(by: float) -> Callable[[RecordingPlant], Callable[[RobotState], RobotState]]:
-    """From now on one joint of the fourteen is elsewhere."""
+    """From now on, one joint of the fourteen is measured elsewhere."""
     way = np.zeros(14)
     way[3] = by
     return lambda plant: lambda state: replace(state, q=state.q + way)
@@ -177,7 +179,7 @@ def shifted(by: float) -> Callable[[RecordingPlant], Callable[[RobotState], Robo
     ],
     ids=["blocked", "teleporting", "frozen", "not a number"],
 )
-def test_a_plant_that_does_not_do_what_it_is_told_ends_the_run_and_the_arms_brake_first(
+def test_a_plant_that_does_not_obey_ends_the_run_and_the_arms_brake_first(
     fault: Callable[[RecordingPlant], Callable[[RobotState], RobotState]], message: str
 ) -> None:
     plant = RecordingPlant()
