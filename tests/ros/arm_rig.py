@@ -1,4 +1,4 @@
-"""Test rig of arm controllers: it sends hand data and tool poses, and records what comes back."""
+"""Test rig of arm controllers: it sends hand data and tool poses, and records the outputs."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from q2r2_control.ros.base_node import COMMAND_QOS, LATCHED_QOS, STREAM_QOS
 from q2r2_control.ros.bridge.messages import pose_of, stamped_pose
 from tests.ros.processes import Processes, RosProcess, wait_until
 
-PERIOD = 1.0 / 72.0  # of the hand's messages, as a Quest sends them, and of /tf [s]
-ANSWER_PERIOD = 0.2  # of what the built-in controller says [s]
+PERIOD = 1.0 / 72.0  # Period of the hand's messages, as a Quest sends them, and of /tf [s].
+ANSWER_PERIOD = 0.2  # Period of the built-in controller's reports [s].
 HAND = pin.SE3(pin.exp3(np.array([0.2, -0.4, 0.6])), np.array([0.3, 0.1, 1.0]))
 TOOL = pin.SE3(pin.exp3(np.array([3.0, 0.2, 0.1])), np.array([0.5, 0.25, 0.38]))
-# Longer than by default, so that other load on the machine does not look like a fault.
+# The timeout is longer than the default, so that other load on the machine does not look like a fault.
 PATIENT = {"teleop.gate.timeout": 2.0, "tool_timeout": 2.0, "listener_timeout": 3.0}
 
 
@@ -34,11 +34,11 @@ def patient(parameters: Mapping[str, Any]) -> list[str]:
     return [f"{name}:={value}" for name, value in (PATIENT | dict(parameters)).items()]
 
 
-HOLDING = ("paused", "lost")  # states of an arm that was engaged
+HOLDING = ("paused", "lost")  # States of an arm that was engaged.
 
 
 class ArmRig:
-    """The hand and the robot of an arm. While ``follows`` the tool is at the newest target; ``sends_tool``: on /tf."""
+    """The hand and the robot of an arm. With ``follows``, the tool is at the newest target. ``sends_tool``: on /tf."""
 
     def __init__(
         self,
@@ -49,16 +49,19 @@ class ArmRig:
         robot: str = "q2r2",
         answers: bool | None = None,
     ) -> None:
-        """``answers``: as the built-in controller does, by default where the rig takes its targets."""
+        """With ``answers``, the rig reports like the built-in controller.
+
+        By default, it does so if it takes its targets.
+        """
         self.arm, self.node = arm, node
         self.hand, self.tool = HAND, TOOL
         self.lower = self.upper = False
         self.grip = self.trigger = 0.0
         self.sends_hand = self.sends_tool = self.follows = True
-        self.sent = 0  # messages of the hand, since a button was pressed or let go
+        self.sent = 0  # Messages of the hand since a button was pressed or released.
         self.targets: list[PoseStamped] = []
         self.state: dict[str, Any] = {}
-        self.ready_states = 0  # in a row
+        self.ready_states = 0  # Number of ready states in a row.
         self.pulses: list[tuple[float, float]] = []
         self._frame = tool_frame or f"{arm}_tool_frame"
         self._made = [
@@ -78,7 +81,8 @@ class ArmRig:
                 OVR2ROSHapticFeedback,
                 f"q2r_{arm}_hand_haptic_feedback",
                 lambda message: self.pulses.append((round(message.frequency, 3), round(message.amplitude, 3))),
-                QoSProfile(depth=100, reliability=COMMAND_QOS.reliability),  # none lost while this process stalls
+                # No message is lost while this process stalls.
+                QoSProfile(depth=100, reliability=COMMAND_QOS.reliability),
             ),
         ]
         self._timer = node.create_timer(PERIOD, self._send)
@@ -111,7 +115,7 @@ class ArmRig:
             time.sleep(PERIOD / 2)
 
     def let_the_hand_rest(self) -> None:
-        """Send a hand that stands still until the controller's filter, slowest at rest, has come to it."""
+        """Send a hand at rest until the controller's filter, which is slowest at rest, has reached it."""
         self.sent = 0
         self.wait(lambda: self.sent > 2.0 / PERIOD, "the hand rests")
 
@@ -119,7 +123,7 @@ class ArmRig:
         return target_of(self, -1)
 
     def wait_for_rest(self) -> pin.SE3:
-        """Wait until the target stands still, or no more comes; the target."""
+        """Wait until the target rests or no more targets come, and return the target."""
 
         def rests() -> bool:
             before = self.newest()
@@ -156,7 +160,7 @@ class ArmRig:
 
 
 class ArmRigs:
-    """Several rigs whose hands do the same at the same time."""
+    """Several rigs whose hands make the same motion at the same time."""
 
     def __init__(self, rigs: list[ArmRig]) -> None:
         self.rigs = rigs
@@ -170,7 +174,7 @@ class ArmRigs:
         self.press_until(lambda rig: rig.state.get("engaged"), "the arm is engaged")
 
     def wait_until_ready(self, states: int) -> None:
-        """Wait until all have said so in that many states in a row, from now on."""
+        """Wait until all rigs have been ready in that many states in a row, from now on."""
         for rig in self.rigs:
             rig.ready_states = 0
         self.wait(lambda rig: rig.ready_states >= states, "nothing keeps the arm from being engaged")
@@ -189,7 +193,7 @@ class ArmRigs:
             thread.join()
 
     def interrupt_hand_data(self) -> None:
-        """Send no hand data until all arms are paused; then send them from elsewhere."""
+        """Send no hand data until all arms are paused, and then send them from another place."""
         for rig in self.rigs:
             rig.sends_hand = False
         self.wait_for_pause()
@@ -198,13 +202,13 @@ class ArmRigs:
             rig.sends_hand = True
 
     def press_until(self, condition: Callable[[ArmRig], Any], what: str) -> None:
-        """Press the lower buttons of those for which ``condition`` does not hold yet, and wait until it does."""
+        """Press the lower buttons of the rigs for which ``condition`` does not hold yet, and wait until it holds."""
         rigs = [rig for rig in self.rigs if not condition(rig)]
         ArmRigs(rigs).press()
         self.wait(condition, what)
 
     def press(self, button: str = "lower") -> None:
-        """A press that is no chord, of all hands: it is held, and let go, for some messages at least."""
+        """Press a button of all hands, which is no chord: it is held, and then released, for several messages."""
         for held in (True, False):
             for rig in self.rigs:
                 setattr(rig, button, held)
@@ -215,7 +219,7 @@ class ArmRigs:
 
 
 def stamped_transform(parent: str, child: str, pose: pin.SE3) -> TransformStamped:
-    """Where a frame is in another, as on /tf; the stamp is not set."""
+    """Return the transform of a frame in another one, as on /tf, without a stamp."""
     message = TransformStamped(child_frame_id=child)
     message.header.frame_id = parent
     message.transform.rotation, to = stamped_pose(pose, "", 0.0).pose.orientation, message.transform.translation
@@ -238,7 +242,7 @@ def assert_same(pose: pin.SE3 | None, other: pin.SE3, tolerance: float) -> None:
 
 
 def target_of(rig: ArmRig, number: int = 0) -> pin.SE3:
-    """The first target that came, or another one."""
+    """Return the first target that came, or another one."""
     pose = pose_of(rig.targets[number].pose)
     assert pose is not None
     return pose

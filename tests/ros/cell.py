@@ -1,4 +1,4 @@
-"""A cell of ROS nodes as tests see and move it: joint states, transforms, states in; targets and services out."""
+"""A cell of ROS nodes from the view of tests, which read joint states, transforms and states, and send targets."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ from q2r2_control.ros.bridge.messages import stamped_pose
 from q2r2_control.types import Array
 from tests.ros.processes import CONFIG, ROOT, Processes, RosProcess, call, wait_until
 
-RATE = 100.0  # of targets [Hz]
-NODE_RATE = 125.0  # half of the nodes' default, since many processes share a test machine [Hz]
-STILL = 2e-3  # how far joints at rest may move [rad]
-# Longer than by default, so that other load on the machine does not look like a fault.
+RATE = 100.0  # Rate of targets [Hz].
+NODE_RATE = 125.0  # The rate is half of the nodes' default, because many processes share a test machine [Hz].
+STILL = 2e-3  # Largest motion of joints at rest [rad].
+# The timeout is longer than the default, so that other load on the machine does not look like a fault.
 PATIENT = ("joint_state_timeout:=0.5", "target_timeout:=0.5", "listener_timeout:=1.0")
 
 
@@ -43,7 +43,7 @@ class Cell:
         self.node, self.robot, self.processes = node, robot, processes
         self.joints = JointRecorder(node, robot)
         self.frames = FrameTree()
-        self.parents: dict[str, str] = {}  # of each frame on /tf and /tf_static
+        self.parents: dict[str, str] = {}  # The parent of each frame on /tf and /tf_static.
         self.states: dict[str, dict[str, Any]] = {}
         self.streams: list[Stream] = []
         self.call = partial(call, node)
@@ -82,7 +82,7 @@ class Cell:
         return tool
 
     def find_tool(self, arm: str) -> pin.SE3 | None:
-        """From /tf; None as long as it is not known."""
+        """Return the tool's pose from /tf, or None while it is not known."""
         placement = self.frames.find(self.robot.arms[arm].tool_frame, WORLD)
         return None if placement is None else placement.pose
 
@@ -106,18 +106,18 @@ class Cell:
         return stream
 
     def stop_and_reset(self, at_home: bool = False) -> None:
-        """Of the controller; ``at_home``: the simulation puts the arms there meanwhile."""
+        """Stop and reset the controller. With ``at_home``, the simulation puts the arms there meanwhile."""
         assert self.call("/cartesian_controller/stop").success
         wait_until(lambda: self.state("phase") == "stopped", "the controller is stopped")
         if at_home:
             self.call("/mujoco_robot/reset")
-            # The controller begins where the newest joint state says that the arms are: it may be of before the reset.
+            # The controller begins at the posture of the newest joint state, which may be older than the reset.
             for arm in self.robot.arms:
                 self.wait_until_there(arm, self.robot.tool_pose(self.robot.home, arm), 2e-3)
         assert self.call("/cartesian_controller/reset").success
 
     def wait_until_there(self, arm: str, goal: pin.SE3, within: float) -> None:
-        """Wait until a tool is this near to a pose [m]."""
+        """Wait until a tool is within this distance of a pose [m]."""
 
         def there() -> bool:
             tool = self.find_tool(arm)
@@ -131,7 +131,7 @@ class Cell:
 
 
 class Stream:
-    """Sends the targets of some arms steadily until it is ended; ``poses`` may be replaced."""
+    """A thread that sends the targets of some arms steadily until its end; ``poses`` may be replaced."""
 
     def __init__(self, cell: Cell, poses: dict[str, pin.SE3]) -> None:
         self.poses = dict(poses)
@@ -141,7 +141,7 @@ class Stream:
         self._thread.start()
 
     def move(self, arm: str, by: tuple[float, float, float], speed: float = 0.25) -> None:
-        """Move an arm's target on a straight line [m], [m/s]; returns when it has arrived."""
+        """Move an arm's target on a straight line [m], [m/s], and return when it has arrived."""
         start, way = self.poses[arm], np.array(by)
         steps = max(int(np.linalg.norm(way) / speed * RATE), 1)
         for step in range(1, steps + 1):
@@ -176,8 +176,8 @@ def changed_cell(folder: Path, **sections: dict[str, Any]) -> str:
     return str(file)
 
 
-# Torques through ROS arrive some periods late on a machine with other load. Springs of the default stiffness bear 8 ms
-# of delay, which is one period here; these bear several.
+# On a machine with other load, torques through ROS arrive some periods late. Springs of the default stiffness bear 8 ms
+# of delay, which is one period here. These springs bear several periods.
 SOFT = {"translational_stiffness": 300.0, "rotational_stiffness": 20.0, "nullspace_stiffness": 10.0}
 
 
@@ -185,17 +185,18 @@ def shifted(pose: pin.SE3, *by: float) -> pin.SE3:
     return pin.SE3(pose.rotation, pose.translation + np.array(by))
 
 
-SLOW = 0.05  # 3 % of a joint's limit: the arm still settles, but no longer follows [rad/s]
+SLOW = 0.05  # This is 3 % of a joint's limit: the arm still settles, but no longer follows [rad/s].
 REST = 0.01  # [rad/s]
-REST_TIME = 0.3  # that joints have to be slower than that [s]
-SPEED_WINDOW = 0.2  # longer than a robot without processor time catches up with, shorter than a jump takes [s]
+REST_TIME = 0.3  # Time for which joints have to be slower than that [s].
+# The window is longer than the time in which a starved robot catches up, and shorter than a jump takes [s].
+SPEED_WINDOW = 0.2
 
 
 class Joints(NamedTuple):
-    t: float  # of its receipt, on this machine's steady clock [s]
+    t: float  # Time of its receipt, on this machine's steady clock [s].
     q: Array
     v: Array
-    stamp: float  # of the message [s]
+    stamp: float  # Stamp of the message [s].
 
 
 class JointRecorder:
@@ -205,7 +206,7 @@ class JointRecorder:
         node.create_subscription(JointState, "/joint_states", self._on_joint_state, 100)
 
     def _on_joint_state(self, message: Any) -> None:
-        """A state without all joints of the arms is ignored."""
+        """Ignore a state without all joints of the arms."""
         if set(message.name) >= set(self._robot.joint_names):
             order = [message.name.index(name) for name in self._robot.joint_names]
             stamp = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
@@ -220,17 +221,17 @@ class JointRecorder:
         return self._robot.tool_pose(self.q, arm)
 
     def since(self, t: float) -> list[Joints]:
-        states = self.states[:]  # another thread appends
+        states = self.states[:]  # The other thread appends to the list.
         return states[bisect_right(states, t, key=lambda state: state.t) :]
 
     def speeds(self, duration: float) -> Array:
-        """Greatest speed of each joint in the last ``duration`` [s]."""
+        """Return the largest speed of each joint in the last ``duration`` [s]."""
         recent = self.since(time.monotonic() - duration)
         speeds = np.abs([state.v for state in recent] or [np.zeros(self._robot.model.nv)])
         return np.asarray(speeds.max(axis=0), dtype=float)
 
     def fastest(self, since: float) -> float:
-        """Greatest speed of any joint since [s], as a mean over a window [rad/s]."""
+        """Return the largest speed of any joint since a time [s], as a mean over a window [rad/s]."""
         states, first, fastest = self.since(since), 0, 0.0
         for state in states:
             while state.stamp - states[first].stamp > SPEED_WINDOW:
@@ -246,7 +247,7 @@ class JointRecorder:
         return max(self._tool_motion(arm, posture, self.since(since)) for arm in self._robot.arms)
 
     def wait_for_rest(self) -> Array:
-        """Wait until no joint has moved for a while; the positions [rad]."""
+        """Wait until no joint has moved for a while, and return the positions [rad]."""
 
         def rests() -> bool:
             recent = [state.q for state in self.since(time.monotonic() - 0.4)]
@@ -256,10 +257,13 @@ class JointRecorder:
         return self.q
 
     def stop_after(self, fault: float) -> tuple[float, float]:
-        """Wait for rest after a fault [s]: its greatest joint speed [rad/s], and the time until all are slow [s]."""
+        """Wait for rest after a fault [s].
+
+        Return the largest joint speed [rad/s], and the time until all joints are slow [s].
+        """
 
         def last(speed: float) -> float:
-            """When any joint was last faster than that [s]."""
+            """Return the last time when a joint was faster than this."""
             return max((state.t for state in self.since(fault) if np.abs(state.v).max() > speed), default=fault)
 
         wait_until(lambda: self.states[-1].t - last(REST) > REST_TIME, "all joints rest")
@@ -268,7 +272,7 @@ class JointRecorder:
 
     @contextmanager
     def tools_rest(self, within: float, what: str) -> Iterator[None]:
-        """Asserts that no tool is farther than ``within`` [m] from where it was, at any joint state meanwhile."""
+        """Assert that no tool is farther than ``within`` [m] from where it was, at any joint state meanwhile."""
         first = self.states[-1]
         yield
         for arm in self._robot.arms:

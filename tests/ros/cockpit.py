@@ -1,4 +1,4 @@
-"""Two hands that drive the simulated arms through all their nodes, which tests kill, freeze and start again."""
+"""Two hands that drive the simulated arms through all their nodes. Tests kill, freeze and restart these nodes."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ ROBOT, CONTROLLER, ARMS = "mujoco_robot", "cartesian_controller", "arm_controlle
 class Cockpit:
     def __init__(self, node: Any, robot: Robot, processes: Processes, parameters: Mapping[str, Any]) -> None:
         self._starts: dict[str, Callable[[], RosProcess]] = {
-            ROBOT: lambda: start_robot(processes, "max_jump:=1.0"),  # a jump is to be seen
+            ROBOT: lambda: start_robot(processes, "max_jump:=1.0"),  # A jump has to be visible.
             CONTROLLER: lambda: start_controller(processes, *PATIENT),
             ARMS: lambda: processes.start_node(ARMS, *patient(parameters)),
         }
         self.running = {name: start() for name, start in self._starts.items()}
-        self.cell = Cell(node, robot, targets="/not_used/{arm}")  # the arms' nodes publish targets
+        self.cell = Cell(node, robot, targets="/not_used/{arm}")  # The targets come from the nodes of the arms.
         self.left, self.right = (ArmRig(node, arm, answers=False) for arm in ("left", "right"))
         self.rigs = ArmRigs([self.left, self.right])
         for rig in self.rigs.rigs:
@@ -43,12 +43,12 @@ class Cockpit:
         return sent
 
     def restart(self, name: str) -> None:
-        """Start the robot or controller, which was killed; what it said before does not count any more."""
+        """Restart the robot or controller after a kill. Its earlier states do not count any more."""
         self.cell.states.pop(name, None)
         self.running[name] = self._starts[name]()
 
     def go_home(self) -> None:
-        """Put the arms at home by the simulation, at rest and not engaged."""
+        """Let the simulation put the arms at home, at rest and not engaged."""
         self.cell.stop_and_reset(at_home=True)
         self.wait_until_up()
         self.rigs.wait(lambda rig: not rig.state["engaged"], "no arm is engaged")

@@ -27,7 +27,7 @@ _PROCESSES = pytest.StashKey[Processes]()
 
 
 def need_ros() -> None:
-    """On top of a module: skip it without ROS; fail where only ``q2r2 ros build-interfaces`` has not been run."""
+    """Skip a module without ROS, and fail if only ``q2r2 ros build-interfaces`` has not been run."""
     pytest.importorskip("rclpy", reason=NEEDS_ROS)
     if absent := [package.name for package in interface_packages() if importlib.util.find_spec(package.name) is None]:
         if missing := missing_tools(Path(sys.prefix)):
@@ -37,7 +37,7 @@ def need_ros() -> None:
 
 @pytest.fixture(scope="session")
 def domain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
-    """A ROS_DOMAIN_ID that no other test session or worker on this machine has; set for this process too."""
+    """Return a ROS_DOMAIN_ID that no other test session or worker on this machine has, and set it for this process."""
     pytest.importorskip("rclpy", reason=NEEDS_ROS)
     coordinator = pytest.importorskip("domain_coordinator", reason=NEEDS_ROS)
     with coordinator.domain_id() as number, pytest.MonkeyPatch.context() as patch:
@@ -48,17 +48,17 @@ def domain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
 
 @pytest.fixture(scope="session", autouse=True)
 def precedence() -> None:
-    """This process and those that it starts go before all others, where that is permitted."""
-    # No process of a test goes before another, so a test sees what it would see on a machine without other load.
+    """Give this process and its children priority over all others, if that is permitted."""
+    # No process of a test has priority over another one, as on a machine without other load.
     with suppress(OSError):
         os.setpriority(os.PRIO_PROCESS, 0, _NICE)
     with suppress(OSError):
-        Path("/proc/self/autogroup").write_text(str(_NICE))  # on Linux nice levels count within a session only
+        Path("/proc/self/autogroup").write_text(str(_NICE))  # On Linux, nice levels count only within a session.
 
 
 @pytest.fixture(scope="session", autouse=True)
 def kernels(robot: Robot) -> None:
-    """Compiled before any process is waited for: the first time that takes a minute or two."""
+    """Compile the kernels before any process is waited for, because the first time takes a minute or two."""
     config = load_config(CONFIG)
     CartesianController(robot, config.control).step({}, 0.001)
     ImpedanceController(robot, config.impedance)
@@ -79,7 +79,7 @@ def module_node(domain: int) -> Iterator[Any]:
 
 @pytest.fixture
 def processes(domain: int, tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Processes]:
-    """Starts processes in the private domain; what they printed is part of a failed test's report."""
+    """Start processes in the private domain. Their output is part of a failed test's report."""
     started = Processes(tmp_path, os.environ)
     request.node.stash[_PROCESSES] = started
     yield started
@@ -101,7 +101,7 @@ def rig(node: Any) -> Any:
 
 @pytest.fixture
 def context(domain: int) -> Iterator[Any]:
-    """Where nodes are made that never spin."""
+    """Return a context for nodes that never spin."""
     import rclpy
 
     made = rclpy.Context()
@@ -112,7 +112,7 @@ def context(domain: int) -> Iterator[Any]:
 
 @contextmanager
 def spun_node(domain: int, name: str = "test") -> Iterator[Any]:
-    """The same for fixtures that outlive one test."""
+    """Return a context manager that makes a spinning node, for fixtures that outlive one test."""
     import rclpy
     from rclpy.action import ActionServer
     from rclpy.exceptions import InvalidHandle
@@ -126,7 +126,7 @@ def spun_node(domain: int, name: str = "test") -> Iterator[Any]:
     ended = Event()
 
     def spin() -> None:
-        # A test may destroy an entity that the executor is about to wait for; go on with the other entities.
+        # A test may destroy an entity that the executor is about to wait for. The other entities continue.
         while not ended.is_set():
             with suppress(InvalidHandle):
                 executor.spin()
@@ -140,7 +140,7 @@ def spun_node(domain: int, name: str = "test") -> Iterator[Any]:
         executor.shutdown()
         thread.join()
         for server in [one for one in made.waitables if isinstance(one, ActionServer)]:
-            server.destroy()  # which outlives its node, and would serve the next test on this domain
+            server.destroy()  # The server outlives its node, and would serve the next test on this domain.
         made.destroy_node()
         context.try_shutdown()
 

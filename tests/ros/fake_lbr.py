@@ -1,4 +1,4 @@
-"""One arm behind lbr_fri_ros2_stack: its sessions, its filter, and the guards that shut the connection."""
+"""One arm behind lbr_fri_ros2_stack: its sessions, its filter, and the guards that end the connection."""
 
 from __future__ import annotations
 
@@ -13,37 +13,41 @@ from q2r2_control import Robot
 from q2r2_control.plants.fri.wire import CommandKind, Drives, Operation, Quality, Safety, Session
 from q2r2_control.types import Array
 
-PERIOD = 0.005  # of the driver [s]
-TAU = 0.04  # of its filter of positions, by default [s]
-NARROWER = math.radians(1.0)  # than the model's limits are the driver's [rad]
-SAME = 3e-4  # of a first command and the cabinet's own position: a step from rest, where it is outside a limit [rad]
-SAG = 2e-3  # of the measured joints below what is commanded [rad]
-BRAKES = 10.0  # a cabinet whose client is gone [rad/s^2]
+PERIOD = 0.005  # Period of the driver [s].
+TAU = 0.04  # Default time constant of its filter of positions [s].
+NARROWER = math.radians(1.0)  # The driver's limits are narrower than the model's by this angle [rad].
+SAME = 3e-4  # Largest distance of a first command from the cabinet's own position, outside a limit [rad].
+SAG = 2e-3  # The measured joints hang this far below their commands [rad].
+BRAKES = 10.0  # Deceleration of a cabinet whose client is gone [rad/s^2].
 TOPICS = {"for Jazzy": ("lbr_joint_position_command", "lbr_state"), "of 2024": ("joint_position", "state")}
-_ROUNDING = 1e-6  # relative, of the limits
-_ORDER = [2, 0, 1, 3, 4, 6, 5]  # of the joints in its joint states
+_ROUNDING = 1e-6  # Relative tolerance of the limits.
+_ORDER = [2, 0, 1, 3, 4, 6, 5]  # Order of the joints in its joint states.
 
 
 class FakeLbr:
-    """Follows commands in commanding active only. Everything that would shut the connection is in ``trips``."""
+    """A driver that follows commands only in commanding active.
+
+    Everything that would end the connection is in ``trips``.
+    """
 
     def __init__(self, robot: Robot, arm: str, tau: float = TAU) -> None:
-        """``tau``: of the filter of positions [s]."""
+        """The time constant of the filter of positions is ``tau`` [s]."""
         joints = robot.arms[arm].joints
-        self._share = 1.0 if tau == 0.0 else 1.0 - math.exp(-PERIOD / tau)  # of the way, in one period
-        self.q, self.v = robot.home[joints].copy(), np.zeros(len(joints))  # as commanded to the cabinet [rad], [rad/s]
+        self._share = 1.0 if tau == 0.0 else 1.0 - math.exp(-PERIOD / tau)  # Share of the way in one period.
+        # Positions and velocities as commanded to the cabinet [rad], [rad/s].
+        self.q, self.v = robot.home[joints].copy(), np.zeros(len(joints))
         self.session, self.quality, self.safety = Session.MONITORING_READY, Quality.EXCELLENT, Safety.NORMAL
         self.drives, self.operation = Drives.ACTIVE, Operation.AUTOMATIC
-        self.silent = False  # its process has ended
+        self.silent = False  # If True, the driver's process has ended.
         self.begun, self.trips = 0, list[str]()
-        self.target: Array | None = None  # the newest command of this session
-        self.ipo = self.q  # of the cabinet's own motion, which stays where the session began: commands overlay it
+        self.target: Array | None = None  # The newest command of this session.
+        self.ipo = self.q  # The cabinet's own motion stays where the session began. Commands are added to it.
         self._fastest = robot.velocity_limit[joints] * (1.0 + _ROUNDING)
-        away = NARROWER + self._fastest * PERIOD  # of its guard safe_stop, the narrower one
+        away = NARROWER + self._fastest * PERIOD  # The limit is that of its guard safe_stop, the narrower one.
         self._lower, self._upper = robot.position_lower[joints] + away, robot.position_upper[joints] - away
 
     def begin(self) -> None:
-        """Commanding active, as after a press on the pendant; the driver was started anew."""
+        """Enter commanding active, as after a press on the pendant. The driver was restarted."""
         self.quality, self.safety, self.drives = Quality.EXCELLENT, Safety.NORMAL, Drives.ACTIVE
         self.target, self.v, self.ipo = None, np.zeros_like(self.q), self.q
         self.session, self.silent = Session.COMMANDING_ACTIVE, False
@@ -53,7 +57,7 @@ class FakeLbr:
         self.session, self.target = session, None
 
     def take(self, message: Any) -> None:
-        """A command."""
+        """Take a command."""
         q = np.array(message.joint_position)
         if self.session is not Session.COMMANDING_ACTIVE:
             return
@@ -62,7 +66,7 @@ class FakeLbr:
         self.target = q
 
     def advance(self) -> None:
-        """One period: towards the newest command, or to rest by the cabinet's own brakes."""
+        """Advance by one period, towards the newest command or to rest by the cabinet's own brakes."""
         if self.session is not Session.COMMANDING_ACTIVE:
             self.v = np.sign(self.v) * np.maximum(np.abs(self.v) - BRAKES * PERIOD, 0.0)
         elif self.target is not None:

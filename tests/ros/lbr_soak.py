@@ -1,4 +1,4 @@
-"""Sessions of two KUKA drivers that end in every way there is."""
+"""Sessions of two KUKA drivers that end in every possible way."""
 
 from __future__ import annotations
 
@@ -16,35 +16,35 @@ from q2r2_control.types import SIDES, Array
 from tests.ros.fake_lbr import SAME, TOPICS
 from tests.ros.virtual_lbrs import Operator, VirtualLbrs
 
-_NEAR = 1e-9  # relative, of limits
-_UNEVEN = 0.004  # relative, of the times between ticks, which follow their clock
-_NOTICED = 0.15  # a session's end, by states that may be late, or by a silence of 0.1 s [s]
-_RESTARTED = 1.0  # a driver's process, at the earliest [s]
-_ALLOWANCE = 0.2  # after the braking time of the certified stop, which braking may be a little slower than [s]
-_LONGEST_STOP = 1.0  # from a session's end on [s]
-_CREEPS = 1e-3  # slower than this is at rest [rad/s]
-_STUCK = 20.0  # a session that does not begin to move in this time never will [s]
+_NEAR = 1e-9  # Relative tolerance of limits.
+_UNEVEN = 0.004  # Relative tolerance of the times between ticks, which follow their clock.
+_NOTICED = 0.15  # Time until the end of a session is noticed, by late states or by a silence of 0.1 s [s].
+_RESTARTED = 1.0  # Shortest time until a driver's process is restarted [s].
+_ALLOWANCE = 0.2  # Time after that of the certified stop, because real braking may be a little slower [s].
+_LONGEST_STOP = 1.0  # Longest time from the end of a session to rest [s].
+_CREEPS = 1e-3  # A slower joint counts as resting [rad/s].
+_STUCK = 20.0  # A session in which nothing moves for this time will never move [s].
 
 
 @dataclass
 class LbrSoak:
-    """Begins both sessions, lets the arms move for a while, and ends them in some way."""
+    """A soak that begins both sessions, lets the arms move for a while, and ends them in some way."""
 
     virtual: VirtualLbrs
     sessions: int
     ended: int = 0
     activations: int = 0
-    moved: float = 0.0  # the fastest joint of a driver [rad/s]
+    moved: float = 0.0  # Speed of the fastest joint of a driver [rad/s].
     faults: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.operator, self.random = Operator(self.virtual), self.virtual.random
         self._how, self._ends_at, self._progress = "start", math.inf, self.virtual.now
         self._phase, self._seen = Phase.INACTIVE, dict.fromkeys(SIDES, 0)
-        self._commands: dict[str, tuple[int, int, Array, Array]] = {}  # the newest: session, tick, q, v
-        self._late = 0  # the last tick that was late
-        self._brakings = 0  # so far
-        self._disturbed = 0.0  # until when an end may not be noticed yet [s]
+        self._commands: dict[str, tuple[int, int, Array, Array]] = {}  # The newest command: session, tick, q, v.
+        self._late = 0  # The last tick that was late.
+        self._brakings = 0  # Number of brakings so far.
+        self._disturbed = 0.0  # Time until which an end may not be noticed yet [s].
         self.virtual.on_command = self._on_command
         robot, node = self.virtual.robot, self.virtual.node
         self._fastest = robot.velocity_limit * node._controller.settings.velocity_scale * (1.0 + _NEAR)
@@ -62,7 +62,7 @@ class LbrSoak:
         self.faults.append(f"{self.virtual.now:.3f} s, session {self.ended}, {self._how}: {what}")
 
     def _on_command(self, arm: str, q: Array) -> None:
-        """As it is sent: one period after the other within the limits of the reference, and without a jump."""
+        """Check a command when it is sent: each period is within the limits of the reference and without a jump."""
         node, joints, session = self.virtual.node, self.virtual.robot.arms[arm].joints, self.virtual.drivers[arm].begun
         tick, v = node._advances, np.full(len(q), math.nan)
         if arm in self._commands:
@@ -82,7 +82,7 @@ class LbrSoak:
         self._commands[arm] = session, tick, q, v
 
     def _look(self) -> None:
-        """A hundred times a second."""
+        """Check the arms a hundred times a second."""
         virtual, now = self.virtual, self.virtual.now
         virtual.at(now + 0.01, self._look)
         for arm, driver in virtual.drivers.items():
@@ -150,7 +150,7 @@ class LbrSoak:
             virtual.at(virtual.now + (_RESTARTED if self._how == "a driver ends" else 0.0), partial(self._rearm, *arms))
 
     def _move(self, by: Array, times: int) -> None:
-        """Hand guiding, by so much again and again, within what the controller may command."""
+        """Move an arm as by hand guiding, within what the controller may command."""
         margin, robot = self.virtual.node._controller.settings.position_margin, self.virtual.robot
         for (arm, driver), step in zip(self.virtual.drivers.items(), by, strict=True):
             joints = robot.arms[arm].joints
@@ -161,7 +161,7 @@ class LbrSoak:
             self.virtual.at(self.virtual.now + 0.01, partial(self._move, by, times - 1))
 
     def _rearm(self, *arms: str) -> None:
-        """One before the other; a cabinet begins when its arm is at rest."""
+        """Start one session before the other. A cabinet begins when its arm is at rest."""
         for arm in arms:
             self.virtual.at(self.virtual.now + float(self.random.uniform(0.05, 0.6)), partial(self._begin, arm))
 
@@ -180,7 +180,10 @@ class LbrSoak:
             self._fault(f"the controller is active {_NOTICED:g} s after that")
 
     def _check_rest(self, braking: int) -> None:
-        """After the time to brake: the controller may be active, brake anew, or let a joint creep to its goal."""
+        """Check the arms after the braking time.
+
+        The controller may be active, brake again, or let a joint creep to its goal.
+        """
         node = self.virtual.node
         fastest = float(np.abs(node._loop._velocity).max())
         if node._supervisor.phase is Phase.BRAKING and braking == self._brakings and fastest > _CREEPS:

@@ -26,13 +26,13 @@ from q2r2_control.ros.launch.middleware import set_up_middleware
 ROOT = Path(__file__).resolve().parents[2]
 EXECUTABLES = "q2r2_control.ros.launch.executables"
 CONFIG = "config/dual_iiwa7.yaml"
-PATIENCE = 30.0  # for starting Python and discovery on an overloaded machine [s]
+PATIENCE = 30.0  # Timeout for the start of Python and for discovery on an overloaded machine [s].
 _NODES = ("cartesian_controller", "mujoco_robot", "arm_controllers", "tcp_endpoint", "simulation_input")
 multiprocessing.get_context("forkserver").set_forkserver_preload([f"q2r2_control.ros.nodes.{name}" for name in _NODES])
 
 
 class WarmProcess(ForkServerProcess):
-    """With what :class:`subprocess.Popen` offers."""
+    """A forked process with the methods of :class:`subprocess.Popen`."""
 
     def poll(self) -> int | None:
         return self.exitcode
@@ -49,7 +49,7 @@ class WarmProcess(ForkServerProcess):
 
 
 def _run(command: list[str], environment: dict[str, str], log: str) -> None:
-    """In the new process: as if an interpreter had been started with this environment and this output."""
+    """Run in the new process, as if an interpreter had been started with this environment and this output."""
     output = os.open(log, os.O_WRONLY | os.O_APPEND)
     os.dup2(output, 1)
     os.dup2(output, 2)
@@ -59,7 +59,7 @@ def _run(command: list[str], environment: dict[str, str], log: str) -> None:
     os.environ.update(environment)
     signal.signal(signal.SIGINT, signal.default_int_handler)
     sys.argv = list(command)
-    sys.modules.pop(command[0], None)  # it runs as __main__
+    sys.modules.pop(command[0], None)  # The module runs as __main__.
     runpy.run_module(command[0], run_name="__main__", alter_sys=True)
 
 
@@ -77,10 +77,10 @@ class RosProcess:
         return self._process.poll() is None
 
     def wait_for(self, text: str, timeout: float = PATIENCE) -> str:
-        """The first whole line of output that contains ``text``; fails when the process ends or time runs out."""
+        """Return the first whole line of output that contains ``text``. Fails if the process ends or time runs out."""
         deadline = time.monotonic() + timeout
         while True:
-            ended = not self.running  # asked before reading, so that all of its output is read
+            ended = not self.running  # This is asked before reading, so that all of the output is read.
             for line in self.output.splitlines(keepends=True):
                 if text in line and line.endswith("\n"):
                     return line.rstrip("\n")
@@ -89,7 +89,7 @@ class RosProcess:
             time.sleep(0.02)
 
     def wait(self, timeout: float = PATIENCE) -> int:
-        """Its exit code; fails when time runs out."""
+        """Return the exit code. Fails if time runs out."""
         try:
             return self._process.wait(timeout)
         except subprocess.TimeoutExpired:
@@ -108,14 +108,14 @@ class RosProcess:
 
 
 class Processes:
-    """Starts processes in one environment, and ends those that are left."""
+    """Starts processes in one environment, and ends those that remain."""
 
     def __init__(self, folder: Path, environment: Mapping[str, str]) -> None:
         self._folder, self._environment = folder, dict(environment)
         self.started: list[RosProcess] = []
 
     def start(self, *command: str, name: str = "", **environment: str) -> RosProcess:
-        """Start a program; ``environment`` is added to the private domain's."""
+        """Start a program; ``environment`` is added to that of the private domain."""
         log = self._folder / f"{len(self.started)}-{name or Path(command[0]).name}.log"
         given = {"cwd": ROOT, "env": self._environment | environment, "stdin": subprocess.DEVNULL}
         with log.open("w") as output:
@@ -133,7 +133,9 @@ class Processes:
         return self.started[-1]
 
     def start_node(self, name: str, *parameters: str, node: str = "") -> RosProcess:
-        """Start an executable with ``parameters``, each as ``name:=value``; ``node``: another name for its node."""
+        """Start an executable with ``parameters``, each as ``name:=value``, and optionally another name for its
+        ``node``.
+        """
         remapping = ["-r", f"__node:={node}"] if node else []
         return self.start_module(EXECUTABLES, name, *as_arguments(*parameters), *remapping)
 
@@ -143,12 +145,12 @@ class Processes:
 
 
 def as_arguments(*parameters: str) -> list[str]:
-    """Of a node's command line."""
+    """Return the parameters as arguments of a node's command line."""
     return ["--ros-args", *(part for parameter in parameters for part in ("-p", parameter))]
 
 
 def environment_of(domain: int, folder: Path) -> dict[str, str]:
-    """This process's, with ROS confined to ``domain`` on this machine, set up as for nodes, and logs in ``folder``."""
+    """Return an environment for nodes with ROS confined to ``domain`` on this machine, and with logs in ``folder``."""
     environment = dict(os.environ) | {
         "ROS_DOMAIN_ID": str(domain),
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
@@ -162,7 +164,7 @@ def environment_of(domain: int, folder: Path) -> dict[str, str]:
 def wait_until(
     condition: Callable[[], object], what: str, details: Callable[[], object] | None = None, patience: float = PATIENCE
 ) -> None:
-    """Wait until ``condition`` holds; fails with ``what`` and ``details`` after a time far longer than it takes."""
+    """Wait until ``condition`` holds. Fails with ``what`` and ``details`` after a time far longer than it takes."""
     deadline = time.monotonic() + patience
     while not condition():
         if time.monotonic() > deadline:
@@ -171,7 +173,10 @@ def wait_until(
 
 
 def call(node: Any, service: str, request: Any = None) -> Any:
-    """The response of a Trigger service, or of a SetBool one for its ``request``; another thread spins ``node``."""
+    """Return the response of a Trigger service, or of a SetBool service for ``request``.
+
+    Another thread spins ``node``.
+    """
     from std_srvs.srv import SetBool, Trigger
 
     client = node.create_client(Trigger if request is None else SetBool, service)
@@ -189,7 +194,7 @@ def drained(queue: Queue[Any]) -> list[Any]:
 
 
 def subscribed(node: Any, kind: type, topic: str, qos: Any = 100) -> Queue[Any]:
-    """Messages that come on a topic from now on."""
+    """Collect the messages that come on a topic from now on."""
     messages: Queue[Any] = Queue()
     node.create_subscription(kind, topic, messages.put, qos)
     return messages
@@ -204,7 +209,7 @@ class States:
         self._states = subscribed(node, String, f"/{name}/state")
 
     def wait_for(self, **values: Any) -> dict[str, Any]:
-        """The first state from now on that has these values."""
+        """Return the first state from now on that has these values."""
         drained(self._states)
         deadline = time.monotonic() + PATIENCE
         while True:

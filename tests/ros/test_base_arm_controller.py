@@ -34,7 +34,9 @@ from tests.ros.arm_rig import TOOL, ArmRig, assert_same, offset, patient, steps,
 from tests.ros.programs.stalling_arm import STALL
 
 
-def test_an_arm_engages_where_it_is_follows_pauses_and_resumes_without_jump(rig: ArmRig, processes: Processes) -> None:
+def test_an_arm_engages_where_it_is_follows_pauses_and_resumes_without_a_jump(
+    rig: ArmRig, processes: Processes
+) -> None:
     process = rig.start(processes)
     rig.move((0.2, 0.0, 0.0), 0.1)
     time.sleep(0.3)
@@ -60,7 +62,7 @@ def test_an_arm_engages_where_it_is_follows_pauses_and_resumes_without_jump(rig:
     assert max(steps(rig.targets)) < 0.02
     assert all(abs(np.linalg.norm(_quaternion(target)) - 1.0) < 1e-12 for target in rig.targets)
     assert (0.0, 0.0) in rig.pulses
-    assert len(rig.pulses) >= 6  # two engagements and a pause, each with its end
+    assert len(rig.pulses) >= 6  # There are two engagements and a pause, each with its end.
     assert process.interrupt() == 0
 
 
@@ -70,7 +72,7 @@ def _quaternion(target: Any) -> list[float]:
 
 
 def test_an_arm_that_hangs_below_its_target_resumes_with_that_target(rig: ArmRig, processes: Processes) -> None:
-    """The controller is another one, which tells of no command: the last target is what it holds."""
+    """Another controller moves the arm and reports no command, so that the last target is what it holds."""
     rig.start(processes)
     rig.engage()
     rig.wait(lambda: rig.targets, "targets come")
@@ -109,7 +111,7 @@ def test_a_silent_hand_pauses_the_arm_and_its_return_moves_nothing(rig: ArmRig, 
 
 
 def test_a_node_that_stood_still_in_a_tick_sends_no_target_of_the_past(rig: ArmRig, processes: Processes) -> None:
-    """Neither the one that it had decided on, nor the way that its last motion had left to brake on."""
+    """It sends neither the target that it had computed, nor the rest of its last motion."""
     process = processes.start_module("tests.ros.programs.stalling_arm", *as_arguments(*patient({})))
     rig.wait_until_connected()
     rig.engage()
@@ -119,7 +121,7 @@ def test_a_node_that_stood_still_in_a_tick_sends_no_target_of_the_past(rig: ArmR
     os.kill(process.pid, signal.SIGUSR1)
     time.sleep(0.5 * STALL)
     before, held = len(rig.targets), rig.newest()
-    assert held.translation[0] > TOOL.translation[0] + 0.05  # it was moving
+    assert held.translation[0] > TOOL.translation[0] + 0.05  # The arm was moving.
     rig.wait(lambda: rig.state["last_event_kind"] == ReasonKind.NODE_STALLED, "it has gone on")
     mover.join()
     assert len(rig.targets) == before
@@ -128,7 +130,7 @@ def test_a_node_that_stood_still_in_a_tick_sends_no_target_of_the_past(rig: ArmR
     assert_same(rig.wait_for_rest(), offset(held, (0.0, 0.05, 0.0)), 1e-3)
 
 
-def test_an_arm_needs_its_tools_pose_and_a_gripper_its_server(rig: ArmRig, processes: Processes) -> None:
+def test_an_arm_needs_the_pose_of_its_tool_and_a_gripper_needs_its_server(rig: ArmRig, processes: Processes) -> None:
     rig.sends_tool = False
     rig.start(processes)
     rig.press()
@@ -186,7 +188,7 @@ def test_a_second_publisher_of_the_same_hand_pauses_the_arm_and_is_named(
     rig.engage()
 
 
-def test_a_hand_feels_what_the_controller_says_of_its_arm(rig: ArmRig, node: Any, processes: Processes) -> None:
+def test_a_hand_feels_the_controllers_reports_about_its_arm(rig: ArmRig, node: Any, processes: Processes) -> None:
     publisher = node.create_publisher(String, "/cartesian_controller/condition/left", 10)
     rig.start(processes)
     rig.wait(publisher.get_subscription_count, "the node listens")
@@ -204,14 +206,14 @@ def test_a_gripper_is_closed_when_its_result_says_so(kind: str, rig: ArmRig, pro
 
     def execute(goal: Any) -> Any:
         goals.put(goal.request.command)
-        goal.abort()  # as grippers do that are held up
+        goal.abort()  # Real grippers abort a goal if they are held up.
         return action.Result(stalled=stalls)
 
     with spun_node(domain, "gripper") as other:
         ActionServer(other, action, "/q2r2/left_gripper/gripper_cmd", execute)
         joint = {"gripper.joint_name": "finger"} if kind == "ParallelGripperCommand" else {}
         rig.start(processes, {"gripper.action_type": kind, "gripper.open_position": 0.04, **joint})
-        while goals.empty():  # a press before the server is discovered has no effect
+        while goals.empty():  # A press has no effect before the server is discovered.
             rig.press("upper")
             rig.wait(lambda: not goals.empty() or "kind" in rig.state, "an answer to the press")
         command = goals.get()
@@ -244,7 +246,7 @@ def test_a_bad_parameter_is_refused_with_one_line(given: str, context: Any) -> N
     assert len(str(error.value).splitlines()) == 1
 
 
-def test_an_arm_without_time_is_not_engaged_or_paused(rig: ArmRig, node: Any, processes: Processes) -> None:
+def test_without_time_an_arm_is_neither_engaged_nor_paused(rig: ArmRig, node: Any, processes: Processes) -> None:
     diagnostics: list[DiagnosticStatus] = []
     node.create_subscription(DiagnosticArray, "/diagnostics", lambda message: diagnostics.extend(message.status), 10)
     rig.start(processes, {"use_sim_time": True})
@@ -258,10 +260,10 @@ def test_an_arm_without_time_is_not_engaged_or_paused(rig: ArmRig, node: Any, pr
     send_time = lambda: publisher.publish(Clock(clock=time_message(1.0 + time.monotonic() - began)))  # noqa: E731
     timer = node.create_timer(0.01, send_time)
     rig.wait(lambda: rig.state["ready"], "it is ready when time comes")
-    assert (rig.state["engaged"], rig.targets) == (False, [])  # by the press before
+    assert (rig.state["engaged"], rig.targets) == (False, [])  # The press before has not engaged it.
     rig.engage()
     node.destroy_timer(timer)
-    # On a machine with other load something else may have paused it before, so the reason is asked of what it says now.
+    # On a machine with other load, another fault may have paused it before. Therefore its present reason is asked for.
     rig.wait(lambda: rig.state.get("clock_problem") == {"kind": ReasonKind.CLOCK_STANDS}, "it says that time stops")
     rig.wait(lambda: not rig.state["engaged"] and not rig.state["ready"], "it is paused")
     rig.press()

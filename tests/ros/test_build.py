@@ -40,13 +40,13 @@ def test_the_shipped_packages_define_what_the_app_and_grippers_use() -> None:
 
 
 @pytest.mark.slow
-def test_a_sourced_install_stays_and_a_package_built_beside_it_is_used_once_it_is_sourced_too(tmp_path: Path) -> None:
+def test_a_sourced_install_stays_and_a_package_built_beside_it_is_used_after_it_is_sourced_too(tmp_path: Path) -> None:
     if missing := missing_tools(Path(sys.prefix)):
         pytest.skip(f"nothing can be built here: missing {'; '.join(missing)}")
     venv.create(bare_environment := tmp_path / "bare", symlinks=True, with_pip=False)
     python, prefix = bare_environment / "bin" / "python", Path(sys.prefix)
     libraries = [prefix / "lib", *(prefix / SITE_PACKAGES).glob("ros_*.libs")]
-    sourced = {  # as sourcing a ROS install does
+    sourced = {  # These variables are those of a sourced ROS install.
         "AMENT_PREFIX_PATH": str(prefix),
         "PYTHONPATH": os.pathsep.join(map(str, [ROOT, *filter(None, sys.path)])),
         "LD_LIBRARY_PATH": os.pathsep.join(map(str, libraries)),
@@ -75,7 +75,7 @@ def test_a_sourced_install_stays_and_a_package_built_beside_it_is_used_once_it_i
 
 @pytest.mark.slow
 def test_without_a_compiler_one_line_says_so(tmp_path: Path) -> None:
-    """With a PATH that has make and nothing else; CMake comes with the environment."""
+    """The PATH contains only make. CMake comes with the environment."""
     if (make := shutil.which("make")) is None:
         pytest.skip("needs make")
     (tmp_path / "make").symlink_to(make)
@@ -87,7 +87,7 @@ def test_without_a_compiler_one_line_says_so(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_folder_that_no_python_looks_into_is_refused(tmp_path: Path) -> None:
+def test_a_folder_that_is_not_on_pythons_path_is_refused(tmp_path: Path) -> None:
     assert f"a virtual environment that can be written to, since {tmp_path} is none" in missing_tools(tmp_path)
 
 
@@ -103,8 +103,8 @@ def test_a_build_that_fails_names_its_log(tmp_path: Path) -> None:
     assert "broken" in log.read_text()
 
 
-# The list of docs.ros.org/en/jazzy/p/control_msgs, in its order; a type hash depends on names and types of fields
-# alone.
+# The list is that of docs.ros.org/en/jazzy/p/control_msgs in its order. A type hash depends only on names and types of
+# fields.
 GRIPPER_STATE = "float64 position\nfloat64 effort\nbool stalled\nbool reached_goal"
 PUBLISHED_FIELDS = {
     "tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms",
@@ -122,14 +122,14 @@ PUBLISHED_FIELDS = {
 
 def built_hash(kind: str) -> str:
     package, folder, name = kind.split("/")
-    module = Path(import_module(package).__path__[0])  # prefix/lib/python3.x/site-packages/package
+    module = Path(import_module(package).__path__[0])  # The path is prefix/lib/python3.x/site-packages/package.
     file = module.parents[3] / "share" / package / folder / f"{name.split('_')[0]}.json"
     hashes = json.loads(file.read_text())["type_hashes"]
     return next(entry["hash_string"] for entry in hashes if entry["type_name"] == kind)
 
 
 def published_hash(kind: str) -> str:
-    """The type hash of the published fields, computed by rosbags from its own definitions of what they contain."""
+    """Return the type hash of the published fields, which rosbags computes from its own definitions of their types."""
     store = get_typestore(Stores.ROS2_JAZZY)
     for name, fields in PUBLISHED_FIELDS.items():
         store.register(get_types_from_msg(fields, name))
@@ -146,7 +146,7 @@ FOLDERS = ("config", "launch", "q2r2_control", "resource", "robots", "views")
 
 
 def printed(folder: Path, *command: str, **environment: str) -> str:
-    """The output of a command that runs in ``folder``, without the PYTHONPATH of these tests."""
+    """Return the output of a command that runs in ``folder``, without the PYTHONPATH of these tests."""
     inherited = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
     given = {"cwd": folder, "env": inherited | environment, "capture_output": True, "text": True, "timeout": 120}
     run: subprocess.CompletedProcess[str] = subprocess.run(command, **given)  # type: ignore[call-overload]

@@ -1,4 +1,4 @@
-"""The controller as a process that moves the simulated robot: targets followed, faults survived, nothing jumps."""
+"""The controller as a process that moves the simulated robot: it follows targets, survives faults, and never jumps."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def started(module_node: Any, module_processes: Processes, robot: Robot) -> Cell
 
 @pytest.fixture
 def cell(started: Cell) -> Iterator[Cell]:
-    """At home, active, without targets."""
+    """Return a cell at home that is active and has no targets."""
     started.stop_and_reset(at_home=True)
     started.wait_until_active()
     started.forget()
@@ -64,7 +64,7 @@ def test_an_arm_follows_its_target_and_the_other_one_holds(cell: Cell, robot: Ro
     assert all(np.abs((q - start_q)[right]).max() < STILL for q in cell.postures)
 
 
-def test_pause_stop_and_home(cell: Cell, robot: Robot) -> None:
+def test_pause_stop_and_home_work(cell: Cell, robot: Robot) -> None:
     stream = cell.engage("left")
     stream.move("left", (0.0, 0.0, 0.06))
     assert cell.call("/cartesian_controller/pause", SetBool.Request(data=True)).success
@@ -84,7 +84,7 @@ def test_pause_stop_and_home(cell: Cell, robot: Robot) -> None:
 
 
 def test_a_controller_that_stood_still_in_motion_publishes_no_jump(cell: Cell, robot: Robot) -> None:
-    commands: list[tuple[int, Any]] = []  # their numbers, and the positions
+    commands: list[tuple[int, Any]] = []  # Numbers and positions of the commands.
 
     def take(message: JointTrajectory, info: Any) -> None:
         order = [message.joint_names.index(name) for name in robot.joint_names]
@@ -96,7 +96,7 @@ def test_a_controller_that_stood_still_in_motion_publishes_no_jump(cell: Cell, r
         stream.poses["left"] = shifted(stream.poses["left"], 0.0, 0.0, way)
         wait_until(lambda: cell.joints.speeds(0.05).max() > 0.5, "the arm is fast")
         os.kill(cell.processes[1].pid, signal.SIGSTOP)
-        time.sleep(0.05)  # less than what would start over
+        time.sleep(0.05)  # The time is too short for a new start.
         os.kill(cell.processes[1].pid, signal.SIGCONT)
         time.sleep(0.7)
     for (before, start), (number, end) in pairwise(commands):
@@ -104,7 +104,7 @@ def test_a_controller_that_stood_still_in_motion_publishes_no_jump(cell: Cell, r
     cell.node.destroy_subscription(subscription)
 
 
-def test_a_second_publisher_of_targets_in_mid_motion_stops_the_arm_and_is_named(cell: Cell, domain: int) -> None:
+def test_a_second_publisher_of_targets_during_motion_stops_the_arm_and_is_named(cell: Cell, domain: int) -> None:
     stream = cell.engage("left")
     begin, elsewhere = stream.poses["left"], shifted(cell.tool("left"), 0.0, 0.0, 0.2)
     both = "/sender and /test"
@@ -125,14 +125,15 @@ def test_a_second_publisher_of_targets_in_mid_motion_stops_the_arm_and_is_named(
         assert np.abs(cell.q - rest).max() < STILL
         other.destroy_timer(timer)
     tools = [cell.robot.tool_pose(q, "left").translation for q in cell.postures]
-    assert max(np.linalg.norm(tool - begin.translation) for tool in tools) < 0.03  # nothing but its own 1 cm
+    # Only its own motion of 1 cm is allowed.
+    assert max(np.linalg.norm(tool - begin.translation) for tool in tools) < 0.03
     stream.poses["left"] = shifted(begin, 0.0, 0.0, 0.2)
-    time.sleep(1.5)  # longer than two publishers count
+    time.sleep(1.5)  # The time is longer than two publishers count.
     stream.poses["left"] = cell.tool("left")
     wait_until(lambda: cell.state("left_state") == "following", "the stream that is left begins anew")
 
 
-def test_it_follows_in_another_layout_and_frame_and_on_simulated_time(
+def test_the_controller_follows_in_another_layout_and_frame_and_in_simulated_time(
     cell: Cell, robot: Robot, processes: Processes
 ) -> None:
     cell.call("/cartesian_controller/stop")

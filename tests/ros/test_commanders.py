@@ -1,4 +1,4 @@
-"""Others that command the driven arms, and a receiver that stands still, are named and stop both arms."""
+"""Other programs that command the driven arms, and a receiver that stands still, are named and stop both arms."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tests.ros.processes import wait_until
 pytestmark = pytest.mark.alone
 
 TOPIC = "/joint_trajectory"
-# A busy machine may take long to find that an arm stands still, which is no deviation until then.
+# A busy machine may need long to find that an arm stands still. Until then, there is no deviation.
 LONG = "deviation_time:=8.0", "max_deviation:=1.0"
 
 
@@ -35,7 +35,7 @@ class Driven(Cell):
         self.wait_until_active()
 
     def wait_for_fault(self, kind: ReasonKind) -> str:
-        """Until the controller tells this fault and commands nothing; its sentence."""
+        """Wait until the controller reports this fault and commands nothing. Return its sentence."""
         wait_until(lambda: self.state("kind") == kind, f"it tells {kind}", lambda: self.states)
         wait_until(lambda: self.state("phase") in ("stopped", "inactive"), "the arms rest", lambda: self.states)
         return str(self.state("message"))
@@ -49,21 +49,21 @@ def driven(node: Any, processes: Processes, robot: Robot) -> Iterator[Driven]:
 
 
 def here(cell: Cell) -> JointTrajectory:
-    """A command that moves nothing."""
+    """Return a command that moves nothing."""
     point = JointTrajectoryPoint(positions=cell.q.tolist())
     return JointTrajectory(joint_names=list(cell.robot.joint_names), points=[point])
 
 
 def test_a_second_publisher_of_commands_stops_both_arms_and_is_named(driven: Driven) -> None:
     driven.engage("left", "right")
-    long = 3.0 * NODE_RATE  # commands: whoever was there before is discovered
+    long = 3.0 * NODE_RATE  # This is a number of commands. After it, earlier publishers are discovered.
     wait_until(lambda: driven.state("sent")[TOPIC] > long, "it has driven for some seconds")
     second = driven.node.create_publisher(JointTrajectory, TOPIC, 1)
     assert "/test commands the arms on /joint_trajectory" in driven.wait_for_fault(ReasonKind.OTHER_COMMANDER)
     assert {driven.state(f"{arm}_state") for arm in driven.robot.arms} == {"stopped"}
     driven.end_streams()
 
-    # It says nothing: after a reset the controller drives beside it, and listens.
+    # The second publisher is silent: after a reset, the controller drives beside it and listens.
     assert driven.call("/cartesian_controller/reset").success
     wait_until(lambda: driven.state("phase") == "active", "it is active again", lambda: driven.states)
     driven.engage("left", "right")
@@ -80,7 +80,7 @@ def test_a_second_publisher_of_commands_stops_both_arms_and_is_named(driven: Dri
 def test_a_receiver_that_stands_still_while_joint_states_go_on_stops_both_arms_and_is_named(
     node: Any, processes: Processes, robot: Robot
 ) -> None:
-    """This test is the receiver: it acknowledges all commands, and passes them on until it stands still."""
+    """This test is the receiver. It acknowledges all commands, and passes them on until it stands still."""
     passes, onward = [True], node.create_publisher(JointTrajectory, TOPIC, COMMAND_QOS)
     node.create_subscription(
         JointTrajectory, "/asked", lambda message: onward.publish(message) if passes[0] else None, COMMAND_QOS

@@ -22,13 +22,14 @@ from tests.ros.cell import JointRecorder
 from tests.ros.cockpit import ARMS, CONTROLLER, Cockpit
 from tests.ros.processes import wait_until
 
-MOVING = 0.2  # an arm that moves has a joint this fast [rad/s]
-STILL = 0.005  # a joint that stands moves no farther [rad]
-ANCHORED = 0.005  # a tool whose hand rests moves no farther [m]
-FAST = 1.7  # hands turn the fastest joint at about 0.9: a jump to an old target would be faster [rad/s]
-AWHILE = 0.5  # in which something would have moved if anything did [s]
-WAY = (0.3, 0.0, 0.12)  # of the hands [m]
-FROZEN = 2.0  # longer than any timeout [s]
+MOVING = 0.2  # A moving arm has a joint with at least this speed [rad/s].
+STILL = 0.005  # A resting joint moves less than this [rad].
+ANCHORED = 0.005  # A tool whose hand rests moves less than this [m].
+# Hands turn the fastest joint at about 0.9 rad/s. A jump to an old target would be faster than this [rad/s].
+FAST = 1.7
+AWHILE = 0.5  # Time in which any motion would be seen [s].
+WAY = (0.3, 0.0, 0.12)  # Motion of the hands [m].
+FROZEN = 2.0  # The time is longer than any timeout [s].
 
 
 @pytest.fixture(scope="module")
@@ -38,20 +39,20 @@ def started(module_node: Any, module_processes: Processes, robot: Robot) -> Cock
 
 @pytest.fixture
 def moving(started: Cockpit) -> Iterator[Cockpit]:
-    """Both arms follow their hands from home, and go on to."""
+    """Let both arms follow their hands from home during the test."""
     started.go_home()
     started.rigs.engage()
     mover = threading.Thread(target=started.rigs.move, args=(WAY, 1.2))
     mover.start()
     joints, arms = started.cell.joints, started.cell.robot.arms.values()
     wait_until(lambda: all(joints.speeds(0.05)[arm.joints].max() > MOVING for arm in arms), "both arms move")
-    time.sleep(0.2)  # until they are fast
+    time.sleep(0.2)  # The arms become fast in this time.
     yield started
     mover.join()
 
 
 def stopped(moving: Cockpit, what: str, fault: float) -> JointRecorder:
-    """Both arms have come to rest after a fault at that time [s], and have not jumped; tells how soon."""
+    """Assert that both arms rest after a fault at that time [s] without a jump, and return how soon."""
     joints = moving.cell.joints
     speed, slow = joints.stop_after(fault)
     print(f"\n{what}: from {speed:.2f} rad/s slow within {1e3 * slow:.0f} ms")
@@ -61,7 +62,7 @@ def stopped(moving: Cockpit, what: str, fault: float) -> JointRecorder:
 
 
 def assert_only_a_press_moves(moving: Cockpit, joints: JointRecorder) -> None:
-    """Nothing moves but by a press, which moves nothing itself: from then on the arms follow."""
+    """Assert that nothing moves before a press, that the press moves nothing, and that the arms then follow."""
     posture, began = joints.q, time.monotonic()
     time.sleep(AWHILE)
     moving.wait_until_up()
@@ -70,7 +71,7 @@ def assert_only_a_press_moves(moving: Cockpit, joints: JointRecorder) -> None:
     began = time.monotonic()
     moving.rigs.engage()
     time.sleep(AWHILE)
-    assert joints.tool_farthest_from(posture, began) < ANCHORED  # elbows may move, towards their posture
+    assert joints.tool_farthest_from(posture, began) < ANCHORED  # Elbows may move towards their posture.
     moving.rigs.move((0.0, 0.0, -0.06), 0.5)
     wait_until(lambda: joints.tool_farthest_from(posture, began) > 0.03, "the arms follow")
     assert joints.fastest(began) < FAST
@@ -91,7 +92,7 @@ def test_a_frozen_node_stops_both_arms_and_moves_none_when_it_continues(moving: 
     assert_only_a_press_moves(moving, joints)
 
 
-def test_a_wrong_parameter_of_one_arm_ends_both_in_one_line(processes: Processes) -> None:
+def test_a_wrong_parameter_of_one_arm_ends_both_with_one_line(processes: Processes) -> None:
     process = processes.start_node("arm_controllers", "right_q2r2_arm_controller:rate:=-1.0")
     assert process.wait() == 2
     line = process.output.splitlines()[-1]

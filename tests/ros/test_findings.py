@@ -60,7 +60,7 @@ def found(seen: SetView) -> list[Finding]:
     return examine_set(seen, EXPECTED)
 
 
-def test_nothing_is_found_in_a_good_set_nor_where_none_runs() -> None:
+def test_there_are_no_findings_in_a_good_set_or_without_a_set() -> None:
     assert found(view()) == []
     assert found(SetView((), (), ("/stranger",), arm_views((), CELL))) == []
 
@@ -105,17 +105,17 @@ STOPPING = {
 
 
 @pytest.mark.parametrize(("seen", "what", "cure"), STOPPING.values(), ids=STOPPING)
-def test_what_stops_the_arms_is_found_with_its_cure(seen: SetView, what: str, cure: str) -> None:
+def test_every_fault_that_stops_the_arms_is_found_with_its_cure(seen: SetView, what: str, cure: str) -> None:
     assert [one for one in found(seen) if one.stops_arms and what in one.what and cure in one.cure], found(seen)
 
 
-def test_controllers_of_an_arm_each_may_share_a_topic_of_commands() -> None:
+def test_controllers_of_single_arms_may_share_a_topic_of_commands() -> None:
     left = node("/controller", phase="active", left_state="holding", sent={"/commands": 1})
     right = node("/other", phase="active", right_state="holding", sent={"/commands": 1})
     assert found(view(left, right, topic("/commands", ("/controller", "/other"), ("/robot",)))) == []
 
 
-def test_a_second_taker_of_commands_is_a_warning() -> None:
+def test_a_second_receiver_of_commands_is_a_warning() -> None:
     (finding,) = found(view(topic("/commands", ("/controller",), ("/robot", "/echo"))))
     assert "2 takers: /robot, /echo" in finding.what
     assert not finding.stops_arms
@@ -126,7 +126,7 @@ ROS = ROOT / "q2r2_control" / "ros"
 INTERFACES = {file.parent.name for file in ROS.glob("interfaces/*/package.xml")}
 
 
-def test_every_package_that_the_nodes_import_is_looked_for() -> None:
+def test_every_package_that_the_nodes_import_is_checked() -> None:
     imported = {
         name.split(".")[0]
         for file in ROS.rglob("*.py")
@@ -145,14 +145,14 @@ def test_every_package_that_the_nodes_import_is_looked_for() -> None:
         ({"ROS_LOCALHOST_ONLY": "1"}, "this machine only"),
     ],
 )
-def test_it_says_whom_nodes_find(variables: dict[str, str], reaches: str) -> None:
-    facts, findings = examine_environment(variables | {"ROS_DOMAIN_ID": "-1"})  # so that no node is tried
+def test_the_report_says_which_computers_nodes_can_find(variables: dict[str, str], reaches: str) -> None:
+    facts, findings = examine_environment(variables | {"ROS_DOMAIN_ID": "-1"})  # With this domain, no node is tried.
     assert facts["reaches"].startswith(reaches)
     assert any("ROS_DOMAIN_ID is '-1'" in finding.what and finding.stops_arms for finding in findings)
 
 
 @pytest.mark.parametrize(("name", "told"), [("rmw_zenoh_cpp", True), ("rmw_fastrtps_cpp", False)])
-def test_it_says_of_a_middleware_without_acknowledgements_that_a_receiver_that_hangs_is_not_noticed(
+def test_a_middleware_without_acknowledgements_gets_a_note_that_a_hanging_receiver_is_not_noticed(
     name: str, told: bool
 ) -> None:
     _, findings = examine_environment({"RMW_IMPLEMENTATION": name, "ROS_DOMAIN_ID": "-1"})

@@ -17,7 +17,7 @@ from q2r2_control.ros.launch.processes import UpError, run_together
 
 @pytest.fixture
 def built(monkeypatch: pytest.MonkeyPatch) -> MagicMock:
-    """Stands in for the build, which takes minutes."""
+    """A replacement for the build, which takes minutes."""
     monkeypatch.setattr(build, "build_interfaces", made := MagicMock())
     return made
 
@@ -35,9 +35,7 @@ def test_nodes_without_rclpy_are_refused_in_one_line_that_says_how_to_install_it
     assert not built.called
 
 
-def test_message_packages_are_built_where_one_is_missing_and_else_not(
-    monkeypatch: pytest.MonkeyPatch, built: MagicMock
-) -> None:
+def test_message_packages_are_built_only_if_one_is_missing(monkeypatch: pytest.MonkeyPatch, built: MagicMock) -> None:
     needs(monkeypatch, "json")
     build_missing(said := MagicMock())
     assert not built.called
@@ -48,9 +46,7 @@ def test_message_packages_are_built_where_one_is_missing_and_else_not(
     said.assert_called_once_with("building message packages, once for this environment")
 
 
-def test_no_node_starts_where_message_packages_cannot_be_built(
-    monkeypatch: pytest.MonkeyPatch, built: MagicMock
-) -> None:
+def test_no_node_starts_if_message_packages_cannot_be_built(monkeypatch: pytest.MonkeyPatch, built: MagicMock) -> None:
     needs(monkeypatch, "no_such_messages")
     monkeypatch.setattr(processes, "check_rclpy", lambda: None)
     built.side_effect = BuildError("quest2ros not built: missing a C++ compiler")

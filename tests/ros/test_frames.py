@@ -1,4 +1,4 @@
-"""Where one frame is in another, from transforms as they come."""
+"""Poses of frames in other frames, from transforms as they come."""
 
 from __future__ import annotations
 
@@ -60,14 +60,14 @@ def test_a_frame_is_found(frame: str, within: str, pose: pin.SE3, received: floa
     assert placement.received == received
 
 
-def test_frames_that_nothing_joins_are_not_found_even_in_a_ring(tree: FrameTree) -> None:
+def test_unconnected_frames_are_not_found_even_in_a_ring(tree: FrameTree) -> None:
     assert tree.find("tool", "elsewhere") is None
     tree.set(read(stamped_transform("tool", "world", A)), 4.0)
     assert tree.find("tool", "elsewhere") is None
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, 0.0])
-def test_a_transform_that_is_none_is_passed_over(bad: float, tree: FrameTree) -> None:
+def test_an_invalid_transform_is_ignored(bad: float, tree: FrameTree) -> None:
     message = stamped_transform("mount", "tool", C)
     rotation = message.transform.rotation
     rotation.x = rotation.y = rotation.z = rotation.w = bad
@@ -77,9 +77,9 @@ def test_a_transform_that_is_none_is_passed_over(bad: float, tree: FrameTree) ->
     np.testing.assert_allclose(placement.pose.homogeneous, B.homogeneous, atol=1e-12)
 
 
-def test_a_name_that_is_no_text_is_another_node_s_fault_and_ends_nothing(node: Any) -> None:
+def test_a_name_that_is_not_text_is_the_fault_of_another_node_and_ends_nothing(node: Any) -> None:
     dropped: list[str] = []
-    node.drop = lambda topic, text: dropped.append(topic)  # as nodes of the package do
+    node.drop = lambda topic, text: dropped.append(topic)  # Nodes of the package have this method.
     listener = FrameListener(node)
     publisher = node.create_publisher(TFMessage, "/tf_static", LATCHED_QOS)
     good = serialize_message(TFMessage(transforms=[stamped_transform("mount", "tool", C)]))
@@ -102,7 +102,7 @@ def send_from(node: Any, name: str, pose: pin.SE3, counted: int) -> Any:
 def test_two_publishers_of_a_frame_block_it_if_they_disagree(
     second: pin.SE3, disagree: bool, domain: int, node: Any
 ) -> None:
-    node.now = 0.0  # which nodes of the package have
+    node.now = 0.0  # Nodes of the package have this attribute.
     listener = FrameListener(node)
     disputed = Reason.of(ReasonKind.FRAME_DISPUTED, frame="mount", publishers="/another and /test")
     timers = [send_from(node, "mount", A, 300), send_from(node, "elsewhere", B, 0)]
@@ -121,7 +121,7 @@ def test_two_publishers_of_a_frame_block_it_if_they_disagree(
         node.destroy_timer(timer)
 
 
-def test_a_listener_keeps_only_the_frames_on_a_way_that_is_asked_for_and_follows_it_elsewhere(node: Any) -> None:
+def test_a_listener_keeps_only_the_frames_on_requested_ways_and_follows_changes_of_these(node: Any) -> None:
     node.now = 0.0
     listener = FrameListener(node)
     publisher = node.create_publisher(TFMessage, "/tf", 10)

@@ -1,4 +1,4 @@
-"""A gripper's client that asks before it commands: it goes where it is granted, and no farther whatever fails."""
+"""A gripper's client asks before it commands. It moves only as far as it is permitted, whatever fails."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ _CLOSED = 0.05  # [m]
 
 
 class Bench:
-    """A client, a gripper that reaches or refuses every goal, and who grants: the test."""
+    """A client, a gripper that reaches or refuses every goal, and the test, which gives permissions."""
 
     def __init__(self, domain: int, kind: GripperType = GripperType.GRIPPER_COMMAND, topic: str = "/gripper") -> None:
         self._nodes = ExitStack()
         self.close = self._nodes.close
         near, self.far = (self._nodes.enter_context(spun_node(domain, name)) for name in ("near", "far"))
-        self.goals: Queue[float] = Queue()  # openings
-        self.asked: list[list[float]] = []  # wanted, commanded
+        self.goals: Queue[float] = Queue()  # Commanded openings.
+        self.asked: list[list[float]] = []  # Pairs of wanted and commanded openings.
         self.refuses = False
         self.answers = self.far.create_publisher(Float64MultiArray, "/controller/opening/left", LATCHED_QOS)
         self.far.create_subscription(
@@ -87,10 +87,10 @@ def bench(domain: int) -> Iterator[Bench]:
         yield bench
 
 
-def test_it_goes_on_as_more_is_granted_and_has_opened_only_at_the_end(bench: Bench) -> None:
+def test_a_gripper_moves_on_as_more_is_permitted_and_reports_its_opening_only_at_the_end(bench: Bench) -> None:
     bench.command(close=True)
     bench.pass_time(0.3)
-    assert bench.openings() == []  # nothing is granted yet
+    assert bench.openings() == []  # Nothing is permitted yet.
     bench.grant(0.0, 0.0)
     bench.wait(lambda: bench.client.closed, "it is closed")
     bench.command(close=False)
@@ -105,8 +105,8 @@ def test_it_goes_on_as_more_is_granted_and_has_opened_only_at_the_end(bench: Ben
     wait_until(lambda: bench.asked and bench.asked[-1] == [1.0, 1.0], "it says what it was commanded to")
 
 
-def test_a_wish_without_an_answer_is_dropped_and_says_so(bench: Bench) -> None:
-    bench.grant(1.0, 1.0)  # of an earlier wish
+def test_a_wish_without_an_answer_is_dropped_and_reported(bench: Bench) -> None:
+    bench.grant(1.0, 1.0)  # The permission belongs to an earlier wish.
     bench.command(close=True)
     bench.wait(lambda: bench.client.problem, "it gives up")
     assert bench.client.problem == "/gripper goes no farther: the controller that grants openings does not answer"
@@ -119,7 +119,8 @@ def test_a_press_without_a_server_ends_the_wish_before_it(bench: Bench) -> None:
     bench.command(close=False)
     bench.grant(1.0, 0.4)
     bench.wait(lambda: bench.asked and bench.asked[-1] == [1.0, 0.4], "it opens a part of the way")
-    # In the executor's thread: rclpy fails if an action server goes while its executor is about to wait for it.
+    # This runs in the executor's thread. rclpy fails if an action server ends while its executor is about to wait for
+    # it.
     bench.far.executor.create_task(bench.server.destroy)
     wait_until(lambda: not bench.client._has_server(), "the server is gone")
     bench.command(close=True)
@@ -130,17 +131,17 @@ def test_a_press_without_a_server_ends_the_wish_before_it(bench: Bench) -> None:
     assert bench.asked[-1] == [0.4, 0.4]
 
 
-def test_a_gripper_follows_a_trigger_ten_times_a_second_at_most(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_gripper_follows_a_trigger_at_most_ten_times_a_second(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[float] = []
     monkeypatch.setattr(bench.grants, "ask", asked.append)
     for step in range(21):
         bench.client.move(1.0 - 0.04 * step, 0.01 * step)
     bench.client.move(0.0, 0.3)
-    bench.client.move(0.005, 0.5)  # too little to follow
+    bench.client.move(0.005, 0.5)  # The change is too small to follow.
     assert asked == pytest.approx([0.96, 0.56, 0.0])
 
 
-def test_a_goal_that_is_refused_on_the_way_ends_the_wish(bench: Bench) -> None:
+def test_a_refused_goal_on_the_way_ends_the_wish(bench: Bench) -> None:
     bench.command(close=True)
     bench.grant(0.0, 0.0)
     bench.wait(lambda: bench.client.closed, "it is closed")
@@ -166,7 +167,7 @@ def test_a_gripper_behind_a_topic_waits_too_and_two_presses_before_an_answer_are
         assert bench.client.state == "open"
 
 
-def test_a_press_on_a_gripper_s_topic_that_nobody_reads_says_so(domain: int) -> None:
+def test_a_press_is_reported_if_no_node_reads_the_grippers_topic(domain: int) -> None:
     with spun_node(domain, "alone") as node:
         settings = GripperSettings(action_type=GripperType.FLOAT64_MULTI_ARRAY, closed_position=_CLOSED)
         client = GripperClient(node, "/nobody", settings)

@@ -1,4 +1,4 @@
-"""Grippers ask the controller before they move: fingers are bodies where they are, in ROS as in the pipeline's loop."""
+"""Grippers ask the controller before they move. As in the pipeline, fingers are monitored where they are."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ from tests.ros.processes import wait_until
 
 pytestmark = pytest.mark.alone
 
-_ARRIVED = 0.002  # of a tool at its target [m]
+_ARRIVED = 0.002  # Largest distance of a tool that has reached its target [m].
 _FINGERS = ("left_finger_joint_1", "left_finger_joint_2")
 
 
 class Gripper:
-    """The left gripper, commanded as an arm's node commands it; and what its fingers do."""
+    """The left gripper, commanded like by an arm's node, and the measured motion of its fingers."""
 
     def __init__(self, cell: Cell) -> None:
         self.began = 0.0
-        self._cell, self.opening = cell, 1.0  # 0 closed .. 1 open, as joint states have it
+        self._cell, self.opening = cell, 1.0  # Opening from 0 for closed to 1 for open, as in joint states.
         cell.node.create_subscription(JointState, "/joint_states", self._on_joint_state, STREAM_QOS)
         self.grants = OpeningGrants(cell.node, "/cartesian_controller", "left", "/q2r2/left/target_frame")
         self.client = GripperClient(cell.node, "/q2r2/left_gripper/gripper_cmd", GripperSettings(), self.grants)
@@ -71,7 +71,7 @@ class Gripper:
 def config(tmp_path_factory: pytest.TempPathFactory) -> str:
     data = BLOCK_CELL.model_dump(mode="json")
     data["arms"]["right"]["gripper"]["object"] = {}
-    alone: dict[str, Any] = {"objects": {}}  # nothing lies where the gripper goes
+    alone: dict[str, Any] = {"objects": {}}  # No object is in the gripper's way.
     folder = tmp_path_factory.mktemp("cell")
     return changed_cell(folder, obstacles=data["obstacles"], arms=data["arms"], mujoco=alone)
 
@@ -94,7 +94,7 @@ def _go(stream: Stream, goal: pin.SE3) -> None:
 def test_a_gripper_that_does_not_close_holds_its_object(cell: Cell) -> None:
     wanted = cell.node.create_publisher(Float64MultiArray, "/q2r2/right/target_frame/wanted_opening", LATCHED_QOS)
     assert cell.state("right_holds_object") is False
-    wanted.publish(Float64MultiArray(data=[0.3, math.nan]))  # and no goal: it stays open
+    wanted.publish(Float64MultiArray(data=[0.3, math.nan]))  # There is no goal, so that the gripper stays open.
     wait_until(lambda: cell.state("right_holds_object") is True, "the object counts")
     cell.stop_and_reset()
     wait_until(lambda: cell.state("phase") == "active", "the arms are active")
@@ -103,7 +103,7 @@ def test_a_gripper_that_does_not_close_holds_its_object(cell: Cell) -> None:
     wait_until(lambda: cell.state("right_holds_object") is False, "the object does not count any more")
 
 
-def test_an_opening_that_is_none_is_refused_by_name_and_the_last_one_stays(cell: Cell) -> None:
+def test_an_invalid_opening_is_refused_by_name_and_the_last_one_stays(cell: Cell) -> None:
     bad, topic = [0.5, 3.0], "/q2r2/left/target_frame/wanted_opening"
     gripper = Gripper(cell)
     gripper.grants.ask(1.0)
@@ -115,18 +115,18 @@ def test_an_opening_that_is_none_is_refused_by_name_and_the_last_one_stays(cell:
     cell.node.destroy_publisher(sender)
 
 
-def test_a_gripper_opens_as_far_as_is_proven(cell: Cell, module_processes: Processes, config: str) -> None:
+def test_a_gripper_opens_as_far_as_proven(cell: Cell, module_processes: Processes, config: str) -> None:
     gripper = Gripper(cell)
     wait_until(lambda: gripper.grants.answered, "the controller answers")
     stream = cell.engage("left")
     _go(stream, ABOVE)
     gripper.close()
     gripper.wait_until(lambda: gripper.opening < 0.02 and gripper.client.closed, "the gripper is closed")
-    # An open gripper's fingers would be 12 mm inside of the block.
+    # The fingers of an open gripper would be 12 mm inside the block.
     _go(stream, BESIDE)
     cell.wait_until_there("left", BESIDE, _ARRIVED)
     stream.end()
-    # Stopped and activated anew where they are: nothing is too close, so nothing moves.
+    # The arms are stopped and activated again where they are. Nothing is too close, so that nothing moves.
     rest = cell.joints.wait_for_rest()
     cell.stop_and_reset()
     wait_until(lambda: cell.state("phase") == "active", "the arms are active")
@@ -149,7 +149,7 @@ def test_a_gripper_opens_as_far_as_is_proven(cell: Cell, module_processes: Proce
     start_controller(module_processes, *PATIENT, config=config)
     wait_until(lambda: cell.state("phase") == "active", "the new controller is active")
     gripper.pass_time(1.5)
-    # The fingers rest where they are just proven; at most a millimetre of tracking is given back.
+    # The fingers rest where they are just proven. At most a millimetre of tracking is given back.
     assert cell.joints.tool_farthest_from(rest, gripper.began) < 0.002
     assert 0.3 < gripper.opening < 0.5
 

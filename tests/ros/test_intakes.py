@@ -1,4 +1,4 @@
-"""Messages that the middleware tells nodes of: late ones, joint states in parts, torques, refusals."""
+"""Messages that nodes get from the middleware: late ones, joint states in parts, torques, refusals."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from q2r2_control.types import RobotState
 from q2r2_control.wording import sentence
 from tests.ros.processes import as_arguments, wait_until
 
-USUAL, LATE = 1_000_000, 1_000_000_000  # from sending to receipt [ns]
+USUAL, LATE = 1_000_000, 1_000_000_000  # Times from sending to receipt [ns].
 
 
 class Arrivals:
@@ -45,7 +45,7 @@ class Arrivals:
         self._number = 0
 
     def arrive(self, message: Any, took: int | None = None) -> None:
-        """``took``: time on the way [ns], of callbacks that look at it."""
+        """Deliver a message; ``took`` is its time on the way [ns], for callbacks that examine it."""
         if took is None:
             self._subscription.callback(message)
             return
@@ -79,7 +79,7 @@ def test_a_late_target_is_passed_on_as_none_and_reported(context: Any, robot: Ro
     node.destroy_node()
 
 
-def test_a_target_that_was_made_before_its_sender_stood_still_is_late_by_its_stamp(
+def test_a_target_from_before_the_standstill_of_its_sender_is_late_by_its_stamp(
     context: Any, robot: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     node = BaseNode("intake", context=context)
@@ -87,9 +87,10 @@ def test_a_target_that_was_made_before_its_sender_stood_still_is_late_by_its_sta
     taken: list[bool] = []
     intake.subscribe(lambda arm, pose, *_: taken.append(pose is not None), lambda arm: None)
     targets = Arrivals(node, "/q2r2/left/target_frame")
-    stream = [(100.00, 99.0), (100.04, 99.01)]  # of which the second one was late a little
-    stream += [(102.05, 99.02), (102.06, 101.06), (105.0, 101.06)]  # old, in time, and repeated
-    stream += [(105.0 + 0.4 * tick, 102.0 + 0.1 * tick) for tick in range(1, 4)]  # a slow clock
+    stream = [(100.00, 99.0), (100.04, 99.01)]  # The second one was a little late.
+    # One target is old, one is in time, and one is repeated.
+    stream += [(102.05, 99.02), (102.06, 101.06), (105.0, 101.06)]
+    stream += [(105.0 + 0.4 * tick, 102.0 + 0.1 * tick) for tick in range(1, 4)]  # The clock is slow.
     for received, made in stream:
         monkeypatch.setattr(BaseNode, "now", received)
         targets.arrive(stamped_pose(pin.SE3.Identity(), "world", made), USUAL)
@@ -128,7 +129,7 @@ def test_a_late_command_does_not_move_the_simulated_robot_and_is_reported(defaul
     node.destroy_node()
 
 
-def test_joint_states_of_an_arm_each_are_merged_and_need_all_joints(context: Any, robot: Robot) -> None:
+def test_joint_states_of_single_arms_are_merged_and_need_all_joints(context: Any, robot: Robot) -> None:
     given = as_arguments(*(f"{arm}.joint_states_topic:=/{arm}/joint_states" for arm in robot.arms))
     node = BaseNode("intake", context=context, cli_args=given)
     intake = JointIntake(node, robot)
@@ -142,7 +143,7 @@ def test_joint_states_of_an_arm_each_are_merged_and_need_all_joints(context: Any
         Arrivals(node, f"/{arm}/joint_states").arrive(JointState(name=list(names), position=list(values)))
 
     part("left")
-    assert taken == []  # nothing is known of the right arm yet
+    assert taken == []  # Nothing is known about the right arm yet.
     part("right")
     (state,) = taken
     assert isinstance(state, RobotState)
@@ -150,11 +151,12 @@ def test_joint_states_of_an_arm_each_are_merged_and_need_all_joints(context: Any
     part("right", without="right_A3")
     for _ in range(2):
         part("left")
-    assert taken[-2].stamp == taken[-1].stamp > state.stamp  # as old as the joint that was measured longest ago
+    # The state is as old as the joint that was measured longest ago.
+    assert taken[-2].stamp == taken[-1].stamp > state.stamp
     node.destroy_node()
 
 
-def test_turns_of_endless_joints_are_counted_for_each_arm_s_topic_on_its_own(
+def test_turns_of_endless_joints_are_counted_separately_for_each_arms_topic(
     context: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     robot = Robot.from_config(load_config("config/dual_kinova.yaml"))
@@ -173,7 +175,7 @@ def test_turns_of_endless_joints_are_counted_for_each_arm_s_topic_on_its_own(
         Arrivals(node, f"/{arm}/joint_states").arrive(JointState(name=list(names), position=list(values)))
 
     for arm in ("right", "left", "right"):
-        report(arm, 6.0)  # Of a driver that counts turns itself.
+        report(arm, 6.0)  # The driver itself counts turns.
     assert taken[-1].q[joint] == 6.0, "what was not measured before says nothing about turns"
     report("right", 3.1, after=5.0)
     report("right", -3.1)
@@ -186,9 +188,7 @@ def test_turns_of_endless_joints_are_counted_for_each_arm_s_topic_on_its_own(
     node.destroy_node()
 
 
-def test_publishers_on_one_topic_are_merged_by_joint_and_a_joint_that_none_sends_is_named(
-    context: Any, robot: Robot
-) -> None:
+def test_publishers_on_one_topic_are_merged_by_joint_and_a_missing_joint_is_named(context: Any, robot: Robot) -> None:
     node = BaseNode("intake", context=context)
     intake = JointIntake(node, robot)
     taken: list[Any] = []
@@ -206,13 +206,13 @@ def test_publishers_on_one_topic_are_merged_by_joint_and_a_joint_that_none_sends
     q += 0.1
     send(5, 14)
     np.testing.assert_allclose(taken[-1].q, [*(q[:5] - 0.1), *q[5:]])
-    assert taken[-1].stamp == taken[-2].stamp  # of the first publisher, which may have ceased
+    assert taken[-1].stamp == taken[-2].stamp  # The state is of the first publisher, which may have ended.
     send(0, 5)
     assert taken[-1].stamp > taken[-2].stamp
     node.destroy_node()
 
 
-def test_joints_that_a_driver_calls_otherwise_are_taken_on_an_arms_own_topic_until_its_own_names_come(
+def test_joints_with_other_names_are_accepted_on_an_arms_own_topic_until_the_right_names_come(
     context: Any, robot: Robot
 ) -> None:
     given = as_arguments("left.joint_states_topic:=/left/joint_states", "right.joint_states_topic:=joint_states")
@@ -231,7 +231,7 @@ def test_joints_that_a_driver_calls_otherwise_are_taken_on_an_arms_own_topic_unt
     np.testing.assert_allclose(intake.state.q[left], 0.1)
     assert intake.theirs["left_A3"] == "lbr_A3"
     for topic, prefix in (("/left/joint_states", "other"), ("/left/joint_states", "right"), ("/joint_states", "lbr")):
-        send(topic, prefix, 0.3)  # other robots
+        send(topic, prefix, 0.3)  # These are other robots.
         np.testing.assert_allclose(intake.state.q, np.where(np.isin(np.arange(14), left), 0.1, 0.2))
     send("/left/joint_states", "left", 0.4)
     np.testing.assert_allclose(intake.state.q[left], 0.4)
@@ -297,7 +297,7 @@ def controller_state(arm: str, fault: Reason | None, outcome: Reason | None = No
 @pytest.mark.parametrize(
     ("arm", "fault", "unready"),
     [
-        ("following", Reason(ReasonKind.STOP_SERVICE), None),  # the arm's state decides
+        ("following", Reason(ReasonKind.STOP_SERVICE), None),  # The arm's state decides.
         ("paused", None, "controller_on_pause"),
         ("inactive", None, "controller_phase"),
         ("inactive", Reason(ReasonKind.CLOCK_NOT_FINITE), "controller_fault"),
@@ -305,7 +305,7 @@ def controller_state(arm: str, fault: Reason | None, outcome: Reason | None = No
         ("deactivated", Reason.of(ReasonKind.CONTROLLER_DEACTIVATED, controller="/c"), "controller_deactivated"),
     ],
 )
-def test_what_keeps_a_controller_from_following_is_read_from_its_state(
+def test_the_reason_why_a_controller_does_not_follow_is_read_from_its_state(
     arm: str, fault: Reason | None, unready: str | None, context: Any
 ) -> None:
     node = BaseNode("arm", context=context)
@@ -314,11 +314,11 @@ def test_what_keeps_a_controller_from_following_is_read_from_its_state(
     Arrivals(node, "/c/state").arrive(String(data=controller_state(arm, fault)))
     assert (watch.unready and str(watch.unready.kind)) == unready
     assert watch.unready is None or watch.unready.root == (fault or watch.unready)
-    assert watch.unready is None or sentence(watch.unready)  # whose fields are all there
+    assert watch.unready is None or sentence(watch.unready)  # The sentence has all of its fields.
     node.destroy_node()
 
 
-def test_an_arm_is_not_ready_before_each_controller_has_said_whether_it_has_joint_states(context: Any) -> None:
+def test_an_arm_is_not_ready_before_each_controller_has_reported_its_joint_states(context: Any) -> None:
     arm = LeftArmController(context=context)
     states = Arrivals(arm, "/cartesian_controller/state")
 
@@ -340,7 +340,7 @@ def test_an_arm_is_not_ready_before_each_controller_has_said_whether_it_has_join
 
 
 def test_a_subclass_without_a_preset_is_not_ready_for_another_projects_controller(context: Any) -> None:
-    """It would get the built-in controller's targets, whose steps are as wide as that one's own limits allow."""
+    """It would get the built-in controller's targets, whose steps are as large as that controller's limits allow."""
     prefix = "/bh_robot/left_arm_clik_controller"
     arm = BaseArmController("left", "bh_robot", ctrl_prefix=prefix, context=context)
     theirs = BaseNode("left_arm_clik_controller", namespace="/bh_robot", context=context)
@@ -365,7 +365,9 @@ def test_a_subclass_without_a_preset_is_not_ready_for_another_projects_controlle
         node.destroy_node()
 
 
-def test_what_cannot_be_read_is_dropped_with_a_warning_a_topic(context: Any, capfd: pytest.CaptureFixture[str]) -> None:
+def test_an_unreadable_message_is_dropped_with_one_warning_a_topic(
+    context: Any, capfd: pytest.CaptureFixture[str]
+) -> None:
     arm, name, text = LeftArmController(context=context), "/cartesian_controller", String(data="[]")
     bad: dict[str, Any] = {f"{name}/state": text, f"{name}/condition/left": text, "/recorder/state": text}
     bad |= {"/tf_static": b"no message", f"{name}/opening/left": Float64MultiArray(data=[2.0, 1.0])}
@@ -390,14 +392,14 @@ def joint_state(**changes: Any) -> JointState:
     return JointState(**(fields | changes))
 
 
-def test_joints_are_matched_by_name_others_may_be_not_finite_and_torques_missing() -> None:
+def test_joints_are_matched_by_name_and_others_may_be_not_finite_and_torques_missing() -> None:
     state = robot_state(joint_state(), NAMES, 7.0)
     assert isinstance(state, RobotState)
     assert (state.q.tolist(), state.v.tolist(), state.tau.tolist()) == ([1.0, 2.0, 3.0], [0.1, 0.2, 0.3], [0.0] * 3)
     assert state.stamp == 7.0
 
 
-def test_numbers_that_are_not_measured_are_zero_as_missing_ones() -> None:
+def test_unmeasured_numbers_are_zero_like_missing_ones() -> None:
     unmeasured = [math.nan] * 4
     state = robot_state(joint_state(velocity=unmeasured, effort=[1.0, math.nan, math.nan, 2.0]), NAMES, 7.0)
     assert isinstance(state, RobotState)
@@ -417,7 +419,7 @@ def test_numbers_that_are_not_measured_are_zero_as_missing_ones() -> None:
         ({"position": []}, "0 position values for 4 joints"),
     ],
 )
-def test_a_state_that_is_none_is_refused_by_name(changes: dict[str, Any], fault: str) -> None:
+def test_an_invalid_state_is_refused_by_name(changes: dict[str, Any], fault: str) -> None:
     assert robot_state(joint_state(**changes), NAMES, 0.0) == fault
 
 
@@ -431,5 +433,5 @@ def test_a_pose_is_read_with_its_quaternion_normalized() -> None:
     ("position", "orientation"),
     [({"x": math.nan}, TURN), ({"y": math.inf}, TURN), ({}, {"w": 0.0}), ({}, {"w": 1.1}), ({}, {"w": math.nan})],
 )
-def test_numbers_that_are_no_pose_are_none(position: dict[str, float], orientation: dict[str, float]) -> None:
+def test_numbers_that_are_not_a_pose_give_none(position: dict[str, float], orientation: dict[str, float]) -> None:
     assert pose_of(Pose(position=Point(**position), orientation=Quaternion(**orientation))) is None

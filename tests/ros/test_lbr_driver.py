@@ -1,4 +1,4 @@
-"""Two arms behind lbr_fri_ros2_stack, as its releases name things: sessions that begin and end, and its guards."""
+"""Two arms behind lbr_fri_ros2_stack, with the names of its releases: sessions that begin and end, and its guards."""
 
 from __future__ import annotations
 
@@ -35,12 +35,13 @@ from tests.ros.test_intakes import Arrivals
 from tests.ros.virtual_lbrs import Operator, lbr_cell, virtual_lbrs
 
 PAGE = Path(__file__).parents[2] / "docs/kuka.md"
-FILTERS = re.findall(r"^\| (0[.\d]*) \| ([.\d]+) \| ([.\d]+) \|$", PAGE.read_text(), re.MULTILINE)  # rows of its table
+# The rows of the page's table.
+FILTERS = re.findall(r"^\| (0[.\d]*) \| ([.\d]+) \| ([.\d]+) \|$", PAGE.read_text(), re.MULTILINE)
 
 
 @pytest.mark.parametrize("sessions", [15, pytest.param(500, marks=pytest.mark.soak)])
 @pytest.mark.parametrize("release", TOPICS)
-def test_sessions_that_end_in_every_way_there_is_trip_no_guard_and_jump_nowhere(
+def test_sessions_that_end_in_every_possible_way_trip_no_guard_and_never_jump(
     release: str, sessions: int, domain: int
 ) -> None:
     with virtual_lbrs(release, domain, sessions) as virtual:
@@ -85,7 +86,7 @@ def test_the_drivers_filter_delays_a_ramp_and_is_faster_after_two_commands_as_th
     assert driver.v / ramp == pytest.approx(speed, abs=0.005)
 
 
-def test_external_torques_are_told_once_both_drivers_have_and_none_that_are_no_numbers(
+def test_external_torques_are_passed_on_after_both_drivers_have_sent_them_and_only_if_finite(
     context: Any, robot: Robot
 ) -> None:
     node, told = BaseNode("controller", context=context), list[Array]()
@@ -98,11 +99,12 @@ def test_external_torques_are_told_once_both_drivers_have_and_none_that_are_no_n
     node.destroy_node()
 
 
-def test_an_arm_is_ready_only_once_its_driver_tells_of_commanding_active(domain: int) -> None:
+def test_an_arm_is_ready_only_after_its_driver_reports_commanding_active(domain: int) -> None:
     with virtual_lbrs("for Jazzy", domain) as virtual:
         Operator(virtual)
         supervisor, left, right = virtual.node._supervisor, virtual.drivers["left"], virtual.drivers["right"]
-        virtual.change = lambda topic, message: None if topic == "/left/lbr_state" else message  # no broadcaster
+        # There is no broadcaster.
+        virtual.change = lambda topic, message: None if topic == "/left/lbr_state" else message
         for driver in virtual.drivers.values():
             driver.begin()
         virtual.run(lambda: supervisor.phase is Phase.ACTIVE or virtual.now > 5.0)
@@ -121,7 +123,7 @@ def test_an_arm_is_ready_only_once_its_driver_tells_of_commanding_active(domain:
 
 
 @pytest.mark.parametrize("topics", [("/left/joints", "/right/command/joints"), ("/lbr/command/a", "/lbr/command/b")])
-def test_commands_go_where_each_driver_tells_of_its_session(
+def test_commands_use_the_topic_on_which_each_driver_reports_its_session(
     topics: tuple[str, str], context: Any, robot: Robot
 ) -> None:
     node = BaseNode("controller", context=context)
@@ -138,7 +140,7 @@ def test_commands_go_where_each_driver_tells_of_its_session(
 
 
 @pytest.mark.parametrize("release", TOPICS)
-def test_the_releases_whose_topics_a_driver_has_are_told_once(
+def test_the_release_that_a_drivers_topics_belong_to_is_reported_once(
     release: str, context: Any, robot: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     node, told, (_, name) = BaseNode("controller", context=context), list[str](), TOPICS[release]
@@ -166,14 +168,14 @@ def test_the_releases_whose_topics_a_driver_has_are_told_once(
         (("right_joint_1", "right_joint_2"), []),
     ],
 )
-def test_names_are_told_apart_by_their_last_part_where_that_tells_one_of_this_arm(
+def test_names_are_recognised_by_their_last_part_if_it_identifies_one_joint_of_this_arm(
     given: tuple[str, ...], theirs: list[str]
 ) -> None:
     ours = ("left_A1", "left_A2")
     assert called_otherwise(ours, given, ("right",)) == dict(zip(ours, theirs, strict=False))
 
 
-def test_a_cell_of_their_driver_keeps_its_limits_unless_told_otherwise(tmp_path: Path) -> None:
+def test_a_cell_of_this_driver_keeps_its_limits_unless_the_yaml_differs(tmp_path: Path) -> None:
     text = find_resource("config/dual_iiwa7_fri.yaml").read_text()
     assert load_config(CONFIG).control.position_margin == 0.01
     assert parse_config(text, "cell.yaml").control.position_margin == 0.105
@@ -186,7 +188,7 @@ def test_a_cell_of_their_driver_keeps_its_limits_unless_told_otherwise(tmp_path:
     assert parse_config(changed, "cell.yaml").control.velocity_scale == 1.0
 
 
-def test_the_margin_holds_the_soft_limits_of_their_driver_and_the_step_of_its_safe_stop(
+def test_the_margin_contains_the_drivers_soft_limits_and_the_step_of_its_safe_stop(
     robot: Robot, tmp_path: Path
 ) -> None:
     margin, longest_period = load_config(lbr_cell(tmp_path)).control.position_margin, 0.01

@@ -28,11 +28,12 @@ from tests.ros.test_set_listener import COMMAND, LONG
 from tests.ros.virtual_lbrs import lbr_cell
 
 STATE, COMMAND_TYPE = "lbr_fri_idl/msg/LBRState", "lbr_fri_idl/msg/LBRJointPositionCommand"
-ENDS, SPEEDS = (170, 120, 170, 120, 170, 120, 175), (98, 98, 100, 130, 140, 180, 180)  # of an iiwa 7 [deg], [deg/s]
+# Limits of an iiwa 7 [deg], [deg/s].
+ENDS, SPEEDS = (170, 120, 170, 120, 170, 120, 175), (98, 98, 100, 130, 140, 180, 180)
 
 
 def urdf(ends: float = 1.0, speed_of_a1: float = 1.0, prefix: str = "lbr_A") -> str:
-    """With limits that are these multiples of the model's."""
+    """Return a URDF whose limits are these multiples of the model's."""
     parts = ['<link name="link_0"/>']
     for number, (end, speed) in enumerate(zip(ENDS, SPEEDS, strict=True), start=1):
         limit, fastest = math.radians(ends * end), math.radians((speed_of_a1 if number == 1 else 1.0) * speed)
@@ -60,7 +61,7 @@ def found(cell: Config, *drivers: DriverView, nodes: tuple[NodeView, ...] = ()) 
     return examine_drivers(SetView(nodes, (), (), (), drivers), cell)
 
 
-def test_nothing_is_found_of_drivers_as_lbr_fri_ros2_stack_starts_them(cell: Config) -> None:
+def test_there_are_no_findings_about_drivers_as_lbr_fri_ros2_stack_starts_them(cell: Config) -> None:
     assert found(cell, driver(), driver("right", description=urdf(169 / 170))) == []
     assert found(cell) == []
 
@@ -109,7 +110,7 @@ CASES = {
 
 
 @pytest.mark.parametrize(("changes", "what", "cure"), CASES.values(), ids=CASES)
-def test_what_keeps_a_driver_from_following_is_found_with_its_cure(
+def test_every_fault_that_keeps_a_driver_from_following_is_found_with_its_cure(
     changes: dict[str, Any], what: str, cure: str, cell: Config
 ) -> None:
     (finding,) = found(cell, driver(**changes))
@@ -124,22 +125,22 @@ def test_limits_that_cannot_be_compared_are_a_warning(cell: Config) -> None:
     assert "its limits are not compared" in finding.what
 
 
-def test_a_controller_that_runs_judges_the_session_itself(cell: Config) -> None:
+def test_a_running_controller_judges_the_session_itself(cell: Config) -> None:
     controller = NodeView("/controller", "error", "waits", 0.1, {"phase": "inactive"})
     assert found(cell, driver(state=WAITS), nodes=(controller,)) == []
 
 
-def test_messages_that_are_not_built_are_found_with_the_command_that_builds_them(
+def test_missing_message_packages_are_found_with_the_command_that_builds_them(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "lbr_fri_idl" else find(name))
-    _, findings = examine_environment({"ROS_DOMAIN_ID": "-1"})  # so that no node is tried
+    _, findings = examine_environment({"ROS_DOMAIN_ID": "-1"})  # With this domain, no node is tried.
     (finding,) = (one for one in findings if "lbr_fri_idl" in one.what)
     assert (finding.stops_arms, finding.cure) == (True, "q2r2 ros build-interfaces")
 
 
-def test_a_driver_is_listened_to_and_no_command_is(node: Any, domain: int, cell: Config) -> None:
+def test_the_doctor_listens_to_a_driver_but_not_to_commands(node: Any, domain: int, cell: Config) -> None:
     state = node.create_publisher(LBRState, "/left/state", 10)
     node.create_publisher(String, "/left/robot_description", LATCHED_QOS).publish(String(data="<robot/>"))
     node.create_subscription(LBRJointPositionCommand, "/left/command/joint_position", lambda message: None, 1)

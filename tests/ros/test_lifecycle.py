@@ -1,4 +1,4 @@
-"""The controller as a managed node: rest before the answer, no commands while inactive, and no jump later."""
+"""The controller as a managed node: it rests before it answers, sends no commands while inactive, and never jumps."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Managed(Cell):
         self.commander.publish(JointTrajectory(joint_names=list(self.robot.joint_names), points=[point]))
 
     def move_by_another(self, q: Any) -> None:
-        """Joint commands of another node to ``q`` [rad], evenly, within a second."""
+        """Send joint commands of another node to ``q`` [rad], evenly, within a second."""
         start, began = self.q.copy(), time.monotonic()
         while (share := time.monotonic() - began) < 1.5:
             self.command(start + min(share, 1.0) * (q - start))
@@ -73,7 +73,7 @@ def cell(module_node: Any, module_processes: Processes, robot: Robot) -> Managed
     return cell
 
 
-def test_it_starts_active_and_comes_to_rest_before_it_answers_that_it_is_not(cell: Managed, robot: Robot) -> None:
+def test_the_controller_starts_active_and_rests_before_it_answers_a_deactivation(cell: Managed, robot: Robot) -> None:
     assert cell.lifecycle() == "active"
     stream = cell.engage("left")
     stream.move("left", (0.0, 0.0, 0.15))
@@ -82,7 +82,7 @@ def test_it_starts_active_and_comes_to_rest_before_it_answers_that_it_is_not(cel
     assert cell.lifecycle() == "inactive"
     assert not cell.ask(Transition.TRANSITION_CLEANUP)
     last = np.array(cell.commands[-1].points[0].velocities)
-    assert np.abs(last).max() < 1e-3  # the last command is one at rest
+    assert np.abs(last).max() < 1e-3  # The last command is one at rest.
     time.sleep(0.3)
     cell.commands.clear()
     at_rest = cell.q.copy()
@@ -96,7 +96,7 @@ def test_it_starts_active_and_comes_to_rest_before_it_answers_that_it_is_not(cel
     wait_until(lambda: cell.state("left_state") == "deactivated", "its state says so")
 
 
-def test_it_takes_over_where_another_node_that_is_silent_has_left_the_arms(cell: Managed, robot: Robot) -> None:
+def test_the_controller_takes_over_where_another_silent_node_has_left_the_arms(cell: Managed, robot: Robot) -> None:
     if cell.lifecycle() == "active":
         assert cell.ask(Transition.TRANSITION_DEACTIVATE)
     goal = cell.q.copy()
@@ -123,10 +123,10 @@ def test_it_takes_over_where_another_node_that_is_silent_has_left_the_arms(cell:
 
 
 @pytest.mark.parametrize("output", ["velocity", "torque"])
-def test_arms_that_are_commanded_speeds_or_torques_follow_are_left_at_rest_and_taken_over(
+def test_arms_that_follow_velocities_or_torques_are_left_at_rest_and_taken_over(
     domain: int, module_processes: Processes, processes: Processes, robot: Robot, output: str, tmp_path: Path
 ) -> None:
-    module_processes.end_all()  # whose nodes have the same names
+    module_processes.end_all()  # The nodes of this process have the same names.
     config = changed_cell(tmp_path, impedance=SOFT)
     with spun_node(domain) as node:
         controller = start_controller(processes, *PATIENT, f"output:={output}", config=config)

@@ -1,4 +1,4 @@
-"""Settings of arms and of the controller: from a cell's YAML, at the start, and while an arm moves, without a jump."""
+"""Settings of arms and of the controller, from the YAML, at the start and while an arm moves. Nothing jumps."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ from tests.ros.arm_rig import TOOL, ArmRig, assert_same, offset, steps, target_o
 
 
 def set_in(node: Any, **values: Any) -> Any:
-    """The result; ``__`` in a name stands for a dot."""
+    """Set parameters and return the result; ``__`` in a name stands for a dot."""
     parameters = [Parameter(name.replace("__", "."), value=value) for name, value in values.items()]
     return node.set_parameters_atomically(parameters)
 
 
-def test_scale_and_guard_that_are_set_in_motion_count_without_a_jump(node: Any, processes: Processes) -> None:
+def test_scale_and_guard_that_are_set_during_motion_apply_without_a_jump(node: Any, processes: Processes) -> None:
     rig = ArmRig(node)
     rig.start(processes)
     client = AsyncParameterClient(node, "left_q2r2_arm_controller")
@@ -63,11 +63,11 @@ def test_scale_and_guard_that_are_set_in_motion_count_without_a_jump(node: Any, 
     began, before = time.monotonic(), rig.newest()
     rig.move((0.12, 0.0, 0.0))
     way = np.linalg.norm(rig.newest().translation - before.translation)
-    assert way < 0.05 * (time.monotonic() - began)  # of 0.06 m that are asked for
+    assert way < 0.05 * (time.monotonic() - began)  # The hand asks for 0.06 m.
     assert_same(rig.wait_for_rest(), offset(before, (0.06, 0.0, 0.0)), 1e-3)
 
 
-def test_what_cannot_be_set_is_refused_with_the_reason_and_changes_nothing(context: Any) -> None:
+def test_an_impossible_setting_is_refused_with_the_reason_and_changes_nothing(context: Any) -> None:
     node = LeftArmController(context=context)
     for values, reason in (
         ({"teleop__position_scale": 0.5, "teleop__precision_scale": 7.0}, "precision_scale"),
@@ -102,7 +102,7 @@ def test_distances_and_gains_of_the_controller_are_set_together_or_not_at_all(co
     node.destroy_node()
 
 
-def test_an_impedance_that_is_set_counts_for_both_arms_if_it_is_allowed(context: Any, robot: Robot) -> None:
+def test_a_permitted_impedance_applies_to_both_arms(context: Any, robot: Robot) -> None:
     impedance = ImpedanceController(robot, ImpedanceSettings(ramp_time=0.1))
     zero = np.zeros(robot.model.nv)
     at_home = RobotState(robot.home, zero, zero, None, 0.0)
@@ -120,12 +120,13 @@ def test_an_impedance_that_is_set_counts_for_both_arms_if_it_is_allowed(context:
         assert not refused.successful
         assert name in refused.reason
     node.destroy_node()
-    assert [impedance.in_force(arm) for arm in robot.arms] == [before] * 2  # until the arms are commanded
+    # The change applies only after the arms are commanded.
+    assert [impedance.in_force(arm) for arm in robot.arms] == [before] * 2
     impedance.reset(at_home)
     assert [impedance.in_force(arm) for arm in robot.arms] == [asked] * 2
 
 
-def test_a_cells_yaml_names_the_external_controller_and_parameters_change_that(
+def test_a_cells_yaml_names_the_external_controller_and_parameters_override_it(
     context: Any, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     cell = external()
@@ -160,11 +161,14 @@ def test_a_subclass_may_mirror_its_arm_and_give_its_filter_in_samples(context: A
     made = BaseArmController("right", "bh_robot", mirror=True, filter_window_size=4, context=context)
     assert made.get_name() == "right_bh_robot_arm_controller"
     assert (made.parameters.teleop.stance, made.hand) == ("mirror", "left")
-    assert made.parameters.teleop.filter.smoothing_delay == pytest.approx(1.5 / 75.0)  # half of 4 - 1 periods
+    # The delay is half of 4 - 1 periods.
+    assert made.parameters.teleop.filter.smoothing_delay == pytest.approx(1.5 / 75.0)
     made.destroy_node()
 
 
-def test_an_arm_whose_tool_is_on_a_topic_pauses_when_that_ends(rig: ArmRig, node: Any, processes: Processes) -> None:
+def test_an_arm_whose_tool_is_on_a_topic_pauses_when_that_topic_ends(
+    rig: ArmRig, node: Any, processes: Processes
+) -> None:
     rig.sends_tool = False
     publisher = node.create_publisher(PoseStamped, "/left/current_pose", 10)
     timer = node.create_timer(0.01, lambda: publisher.publish(stamped_pose(rig.tool, "world", 0.0)))
@@ -180,11 +184,12 @@ def test_an_arm_whose_tool_is_on_a_topic_pauses_when_that_ends(rig: ArmRig, node
     assert "/left/current_pose from /test" in rig.state["last_event"]
 
 
-@pytest.mark.parametrize("preset", ["fzi", "jtc"])  # one takes poses, the other joints of the built-in controller
-def test_an_arm_waits_while_its_controllers_tool_is_elsewhere(
+# The first takes poses, the second takes joints of the built-in controller.
+@pytest.mark.parametrize("preset", ["fzi", "jtc"])
+def test_an_arm_waits_while_the_tool_of_its_controller_is_elsewhere(
     rig: ArmRig, node: Any, processes: Processes, preset: str
 ) -> None:
-    safe = offset(TOOL, (0.0, 0.0, 0.15))  # as with a tool_frame that is not the cell's
+    safe = offset(TOOL, (0.0, 0.0, 0.15))  # The pose is that of a tool_frame that is not the cell's.
     publisher = node.create_publisher(PoseStamped, "/cartesian_controller/safe_target/left", 10)
     timer = node.create_timer(0.01, lambda: publisher.publish(stamped_pose(safe, "world", 0.0)))
     node.create_subscription(PoseStamped, "/theirs/target_frame", lambda _: None, 10)
@@ -194,15 +199,16 @@ def test_an_arm_waits_while_its_controllers_tool_is_elsewhere(
     rig.wait(lambda: rig.state["last_event_kind"] == ReasonKind.SAFE_TARGET_AWAY, "the press is refused")
     says = "safe_target/left is 0.150 m and 0.00 rad from left_tool_frame: the arm moves, or left_tool_frame is not the"
     assert says in rig.state["last_event"]
-    assert process.output.count(f"controller]: /cartesian_controller/{says}") == 1  # not again at each tick
+    # The line does not come again at each tick.
+    assert process.output.count(f"controller]: /cartesian_controller/{says}") == 1
     assert not rig.targets
     safe = TOOL
     rig.engage()
     node.destroy_timer(timer)
 
 
-def test_a_target_that_slips_on_its_leash_is_felt(rig: ArmRig, processes: Processes) -> None:
-    rig.follows = False  # as if something were in the way
+def test_a_hand_feels_a_target_that_slips_on_its_leash(rig: ArmRig, processes: Processes) -> None:
+    rig.follows = False  # The arm behaves as if an obstacle were in the way.
     rig.start(processes, {"teleop.leash.distance": 0.05})
     rig.engage()
     rig.wait(lambda: (0.0, 0.0) in rig.pulses, "engaging is felt")

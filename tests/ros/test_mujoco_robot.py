@@ -1,4 +1,4 @@
-"""The simulated robot as a ROS process: what it publishes, what it follows, and what it does when commands end."""
+"""The simulated robot as a ROS process: its topics, its commands, and its behaviour when commands end."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def started(module_node: Any, module_processes: Processes, robot: Robot) -> Cell
 
 @pytest.fixture
 def cell(started: Cell, robot: Robot) -> Cell:
-    """At home, at rest, without commands."""
+    """Return a cell at home, at rest, without commands."""
     wait_until(lambda: started.state("mode", "mujoco_robot") == "holding", "the robot holds")
     started.call("/mujoco_robot/reset")
     wait_until(lambda: np.abs(started.q - robot.home).max() < 1e-3, "the arms are at home")
@@ -87,7 +87,7 @@ def test_links_are_where_robot_state_publisher_puts_them_each_in_its_parent_s_fr
 
 
 @pytest.mark.parametrize("kind", ["joint_trajectory", "joint_commands", "position_commands"])
-def test_it_follows_positions_in_any_order_of_names_and_stays_there(cell: Cell, robot: Robot, kind: str) -> None:
+def test_the_robot_follows_positions_in_any_order_of_names_and_stays_there(cell: Cell, robot: Robot, kind: str) -> None:
     postures = [robot.home.copy() for _ in range(80)]
     for step, q in enumerate(postures, 1):
         q[0] += 0.2 * min(step / 50, 1.0)
@@ -104,7 +104,7 @@ def test_it_follows_positions_in_any_order_of_names_and_stays_there(cell: Cell, 
     assert np.abs(cell.joints.wait_for_rest() - postures[-1]).max() < 0.01
 
 
-def test_each_arm_may_have_a_sender_of_its_own_on_one_topic(cell: Cell, robot: Robot) -> None:
+def test_each_arm_may_have_its_own_sender_on_one_topic(cell: Cell, robot: Robot) -> None:
     joints = {arm: robot.arms[arm].joints for arm in robot.arms}
     senders = {arm: cell.node.create_publisher(JointTrajectory, "joint_trajectory", COMMAND_QOS) for arm in joints}
     for sender in senders.values():
@@ -115,7 +115,7 @@ def test_each_arm_may_have_a_sender_of_its_own_on_one_topic(cell: Cell, robot: R
         for arm, its in joints.items():
             senders[arm].publish(trajectory(robot, goal[its], tuple(robot.joint_names[joint] for joint in its)))
         time.sleep(0.05)
-        os.kill(cell.processes[0].pid, signal.SIGCONT)  # both have arrived before either is taken
+        os.kill(cell.processes[0].pid, signal.SIGCONT)  # Both commands have arrived before one is taken.
         wait_until(partial(is_at, cell, goal), "both arms are there")
 
 
@@ -139,7 +139,7 @@ def test_commands_that_cannot_be_followed_move_nothing_and_are_reported_once(cel
     assert cell.processes[0].output.count("joint_trajectory: refused") == 1
 
 
-def test_a_gripper_closes_on_nothing_opens_and_refuses_what_it_cannot_reach(cell: Cell) -> None:
+def test_an_empty_gripper_closes_opens_and_refuses_unreachable_goals(cell: Cell) -> None:
     client = ActionClient(cell.node, GripperCommand, "/q2r2/left_gripper/gripper_cmd")
     assert client.wait_for_server(PATIENCE)
     for position in (0.05, 0.0):
@@ -162,7 +162,7 @@ def result_of(client: ActionClient, position: float) -> Any:
     return ended.result().result
 
 
-def test_external_torques_are_of_the_tick_of_joint_states(cell: Cell) -> None:
+def test_external_torques_belong_to_the_tick_of_their_joint_states(cell: Cell) -> None:
     stamps: dict[str, list[int]] = {"/joint_states": [], "/mujoco_robot/external_torque": []}
 
     for topic, its in stamps.items():

@@ -1,4 +1,4 @@
-"""A set in a namespace: every topic and service of its nodes is in it, so that two sets in one domain do not meet."""
+"""A set in a namespace contains all topics and services of its nodes, so that two sets in one domain do not meet."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from q2r2_control.ros.nodes.simulation_input import SimulationInput
 from q2r2_control.ros.nodes.tcp_endpoint import TcpEndpoint
 
 NAMESPACE = "/cell"
-OF_ROS = {"/rosout", "/parameter_events", "/clock"}  # which rclpy itself makes
+OF_ROS = {"/rosout", "/parameter_events", "/clock"}  # rclpy itself makes these topics.
 NODES = {
     "mujoco_robot": MujocoRobot,
     "cartesian_controller": CartesianControllerNode,
@@ -42,7 +42,7 @@ def in_namespace(domain: int, tmp_path: Any) -> Iterator[None]:
 
 
 def names_of(node: Any) -> set[str]:
-    """Topics and services of a node, as the graph knows them."""
+    """Return topics and services of a node, as the graph knows them."""
     of_node = node.get_name(), node.get_namespace()
     found = [
         *node.get_publisher_names_and_types_by_node(*of_node),

@@ -1,4 +1,4 @@
-"""Reports of all nodes, how they tick and end, and how they find each other, as the user has set it."""
+"""Properties of all nodes: reports, ticks, ends, and discovery with the user's settings."""
 
 from __future__ import annotations
 
@@ -30,9 +30,7 @@ from q2r2_control.ros.base_node import LATCHED_QOS, BaseNode
 from q2r2_control.ros.executor import TickExecutor
 
 
-def test_only_the_thread_that_ticks_has_its_nodes_real_time_priority_where_permitted(
-    node: Any, processes: Processes
-) -> None:
+def test_only_the_thread_that_ticks_has_real_time_priority_where_permitted(node: Any, processes: Processes) -> None:
     if sys.platform != "linux":
         pytest.skip("only Linux has SCHED_FIFO")
     states = States(node, "simulation_input")
@@ -46,7 +44,7 @@ def test_only_the_thread_that_ticks_has_its_nodes_real_time_priority_where_permi
     assert set(found[1:]) == {(0, 0)}
 
 
-# Runs an entry point and presses Ctrl-C when a module is about to be imported.
+# The program runs an entry point and presses Ctrl-C when a module is about to be imported.
 RUN = """
 import os, signal, sys
 from importlib import import_module
@@ -72,7 +70,7 @@ def test_ctrl_c_while_importing_ends_a_command_and_prints_nothing(name: str) -> 
     assert run.returncode == -signal.SIGINT
 
 
-def test_help_of_an_executable_says_what_its_node_does_and_starts_none(tmp_path: Path) -> None:
+def test_the_help_of_an_executable_describes_its_node_and_starts_none(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "q2r2_control.ros.launch.executables", "recorder", "--help"]
     path = {"PYTHONPATH": os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))}
     run = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, env=os.environ | path)
@@ -82,7 +80,7 @@ def test_help_of_an_executable_says_what_its_node_does_and_starts_none(tmp_path:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_controller_refuses_an_arm_with_a_link_that_nothing_watches(domain: int, tmp_path: Path) -> None:
+def test_a_controller_refuses_an_arm_with_a_link_that_is_not_monitored(domain: int, tmp_path: Path) -> None:
     (file := tmp_path / "z1.yaml").write_text(
         "name: z1\narms:\n  left:\n    model: example-robot-data:z1\n    tip: gripperStator\n"
         "    home: [0, 1, -0.5, 0, 0, 0]\n"
@@ -142,7 +140,7 @@ print(executables._executable("hangs")(), 0.0 < left() <= 2.0)
 
 
 @pytest.mark.parametrize(("hangs", "said", "code"), [("hangs", "", -signal.SIGALRM), ("ends", "0 True\n", 0)])
-def test_a_node_goes_in_time_whatever_its_middleware_does_and_does_not_go_first_meanwhile(
+def test_a_node_ends_in_time_whatever_its_middleware_does_and_without_priority_meanwhile(
     hangs: str, said: str, code: int
 ) -> None:
     command = [sys.executable, "-c", HANGS, hangs]
@@ -170,17 +168,17 @@ rclpy.spin(node)
         {"ROS_STATIC_PEERS": "192.168.1.7", "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"},
     ],
 )
-def test_what_the_user_has_set_stays(environment: dict[str, str]) -> None:
+def test_settings_of_the_user_are_kept(environment: dict[str, str]) -> None:
     before = dict(environment)
     set_up_middleware(environment)
     assert environment == before
 
 
 @pytest.mark.parametrize("ours", [{}, {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}], ids=["subnet", "localhost"])
-def test_a_profile_of_ours_is_set_and_stays(ours: dict[str, str]) -> None:
+def test_our_own_profile_is_set_and_kept(ours: dict[str, str]) -> None:
     set_up_middleware(ours)
     assert Path(ours["FASTRTPS_DEFAULT_PROFILES_FILE"]).is_file()
-    # Either says UDP alone: the one by a variable, the other by its profile, which the range has to leave alone.
+    # Both settings allow only UDP: one by a variable, the other by its profile, which the range has to keep.
     assert (
         ours.get("FASTDDS_BUILTIN_TRANSPORTS") == "UDPv4" or ours["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "SYSTEM_DEFAULT"
     )
@@ -196,7 +194,9 @@ def shared_memory(process: Any) -> list[str]:
     return [line for line in mapped.read_text().splitlines() if "/dev/shm/fastrtps" in line]
 
 
-def test_a_node_of_this_machine_alone_hears_others_and_shares_memory_with_none(node: Any, processes: Processes) -> None:
+def test_a_node_that_is_confined_to_this_machine_hears_others_and_shares_no_memory(
+    node: Any, processes: Processes
+) -> None:
     environment = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
     set_up_middleware(environment)
     listener = processes.start(sys.executable, "-c", LISTENER, name="listener", **environment)
@@ -205,7 +205,7 @@ def test_a_node_of_this_machine_alone_hears_others_and_shares_memory_with_none(n
     assert not shared_memory(listener)
 
 
-PERIOD = 0.01  # of the node's tick [s]
+PERIOD = 0.01  # Period of the node's tick [s].
 
 
 class Ticking(BaseNode):
@@ -250,7 +250,9 @@ def say(publisher: Any, executor: TickExecutor, *words: str) -> None:
     time.sleep(0.1)
 
 
-def test_all_that_has_arrived_is_taken_in_order_before_the_tick(ticking: Ticking, executor: TickExecutor) -> None:
+def test_all_messages_that_have_arrived_are_taken_in_order_before_the_tick(
+    ticking: Ticking, executor: TickExecutor
+) -> None:
     times: list[Mapping[str, int]] = []
     ticking.create_subscription(String, "words", lambda _, info: times.append(info), 10)
     say(ticking.listen(), executor, "one", "two", "three")
@@ -271,7 +273,9 @@ def test_latched_messages_are_heard_and_a_cancelled_tick_is_silent(ticking: Tick
     assert ticking.log == []
 
 
-def test_a_subscription_that_a_message_destroys_gets_no_other_one(ticking: Ticking, executor: TickExecutor) -> None:
+def test_a_subscription_that_a_message_destroys_gets_no_further_message(
+    ticking: Ticking, executor: TickExecutor
+) -> None:
     subscriptions: list[Any] = []
 
     def hear(message: Any) -> None:
@@ -309,7 +313,7 @@ def test_services_are_answered_and_coroutines_run(ticking: Ticking, executor: Ti
 
 
 @pytest.mark.parametrize("make", [BaseNode.create_tick, BaseNode.create_timer], ids=["a tick's", "a slow timer's"])
-def test_an_error_of_a_callback_comes_out(make: Any, ticking: Ticking, executor: TickExecutor) -> None:
+def test_an_error_of_a_callback_is_raised(make: Any, ticking: Ticking, executor: TickExecutor) -> None:
     def fail() -> None:
         raise ValueError("of the callback")
 
@@ -318,7 +322,7 @@ def test_an_error_of_a_callback_comes_out(make: Any, ticking: Ticking, executor:
         spin_until(executor, lambda: False)
 
 
-def test_another_executor_runs_ticks_and_messages_as_well(ticking: Ticking, context: Any) -> None:
+def test_another_executor_runs_ticks_and_messages_too(ticking: Ticking, context: Any) -> None:
     plain, publisher = SingleThreadedExecutor(context=context), ticking.listen()
     plain.add_node(ticking)
     ticking.create_tick(PERIOD, lambda: ticking.log.append("tick"))
@@ -328,7 +332,7 @@ def test_another_executor_runs_ticks_and_messages_as_well(ticking: Ticking, cont
     plain.shutdown()
 
 
-def test_it_ends_with_its_context(executor: TickExecutor, context: Any) -> None:
+def test_the_executor_ends_with_its_context(executor: TickExecutor, context: Any) -> None:
     executor.spin_once(timeout_sec=0.0)
     context.try_shutdown()
     with pytest.raises(ExternalShutdownException):

@@ -1,4 +1,4 @@
-"""Moving obstacles as markers: what counts, and one line for what cannot be used."""
+"""Moving obstacles as markers: the valid ones, and one line about each invalid one."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ def controller(robot: Robot) -> CartesianController:
 
 
 def marker(**changes: Any) -> Marker:
-    """A ball of 0.2 m across, far from both arms."""
+    """Return a ball with a diameter of 0.2 m, far from both arms."""
     values = {"ns": "hand", "type": Marker.SPHERE, "scale": Vector3(x=0.2, y=0.2, z=0.2), "text": "speed: 0.25"}
     pose = Pose(position=Point(x=0.6, y=1.4, z=0.4))
     return Marker(**{"header": Header(frame_id="world"), "pose": pose, **values, **changes})
 
 
 class Taken:
-    """An intake that messages come to, and the lines that its node logs."""
+    """An intake with its messages, and the lines that its node logs."""
 
     def __init__(self, context: Any, controller: CartesianController, monkeypatch: pytest.MonkeyPatch) -> None:
         self.node = BaseNode("intake", context=context)
@@ -87,7 +87,7 @@ def test_a_marker_is_an_obstacle_until_it_is_deleted(take: Taken, controller: Ca
         pytest.param({"pose": Pose(position=Point(x=float("nan")))}, "pose", id="a pose that is none"),
     ],
 )
-def test_what_cannot_be_used_is_said_once(
+def test_an_invalid_marker_is_reported_once(
     take: Taken, controller: CartesianController, changes: dict[str, Any], says: str
 ) -> None:
     for _ in range(3):

@@ -1,4 +1,4 @@
-"""Messages of outputs, and when they give their receiver up; reports of the controller for hands to feel."""
+"""Messages of outputs, the time when they give up their receiver, and the controller's reports that hands feel."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ from q2r2_control.teleop.arm_states import ArmState
 from q2r2_control.teleop.haptics import ArmCondition
 from q2r2_control.types import Command, CommandMode
 
-TIMEOUT = 0.5  # more than a busy machine takes to acknowledge [s]
+TIMEOUT = 0.5  # The timeout is longer than a busy machine needs to acknowledge [s].
 
 
 class Stream:
@@ -54,7 +54,7 @@ class Stream:
         self.published = self.left_out = 0
 
     def run(self, seconds: float, fault: Callable[[], Reason | None] | None = None) -> Reason | None:
-        """Publish for so long, or until there is a ``fault``, by default the listener's silence; returns it."""
+        """Publish for this time, or until there is a ``fault``, by default the listener's silence. Return the fault."""
         end, find = time.monotonic() + seconds, fault or self._publisher.silence
         while time.monotonic() < end:
             if (found := find()) is not None:
@@ -84,7 +84,7 @@ class Commands:
         wait_until(lambda: self._publisher.listeners > known, "the listener is found")
 
     def send(self, seconds: float, off_reference: bool) -> Reason | None:
-        """Send 200 commands a second; what was found to be wrong, if anything."""
+        """Send 200 commands a second, and return the fault that was found, if any."""
         stream = Stream(self._publisher, 200.0, Float64MultiArray)
         return stream.run(seconds, lambda: self.output.listener_fault(off_reference))
 
@@ -92,12 +92,13 @@ class Commands:
         self.taken += 1
 
 
-def test_a_receiver_of_positions_is_not_given_up_while_the_arms_are_off_their_reference(node: Any) -> None:
+def test_a_receiver_of_positions_is_kept_while_the_arms_are_off_their_reference(node: Any) -> None:
     commands = Commands(node, positions=True)
     assert commands.send(0.2, off_reference=False) is None
     before = commands.taken
     assert commands.send(3.0 * TIMEOUT, off_reference=True) is None
-    assert commands.taken - before > 100  # of some 300: the others were left out, or late on a busy machine
+    # There are some 300 commands. The others were left out, or late on a busy machine.
+    assert commands.taken - before > 100
 
 
 @pytest.mark.parametrize(("positions", "off_reference"), [(True, True), (True, False), (False, True)])
@@ -111,8 +112,8 @@ def test_a_new_receiver_is_noticed_while_arms_are_off_their_reference(
     assert (fault is not None and fault.kind is ReasonKind.NEW_RECEIVER) == (positions and off_reference)
 
 
-def test_arms_with_a_topic_each_get_their_own_joints_there(node: Any, robot: Robot, context: Any) -> None:
-    # The right arm's topic is by the pattern for all, the left one's by itself.
+def test_arms_with_separate_topics_get_their_own_joints_there(node: Any, robot: Robot, context: Any) -> None:
+    # The right arm's topic comes from the pattern for all arms, and the left one's from its own setting.
     given = ("output_topic:=/{arm}/commands", "left.output_topic:=/left/commands")
     sender = BaseNode("sender", context=context, cli_args=as_arguments(*given))
     output = make_output("trajectory", sender, robot, load_config(CONFIG), 0.004)
@@ -148,10 +149,10 @@ def test_torques_for_an_lbr_are_without_gravity(robot: Robot, monkeypatch: pytes
     np.testing.assert_array_equal(sent.joint_position, robot.home[joints])
 
 
-PUSH = np.array([0.0, 0.0, 20.0])  # at the left tool [N]
+PUSH = np.array([0.0, 0.0, 20.0])  # Force on the left tool [N].
 
 
-def test_nearness_limits_and_contact_of_each_arm_are_told_as_they_are(node: Any, robot: Robot) -> None:
+def test_nearness_limits_and_contact_of_each_arm_are_reported_correctly(node: Any, robot: Robot) -> None:
     controller = CartesianController(robot)
     controller.reset(robot.home)
     told: dict[str, ArmCondition] = {}
@@ -183,7 +184,7 @@ def test_nearness_limits_and_contact_of_each_arm_are_told_as_they_are(node: Any,
 
 
 @pytest.mark.parametrize(("state", "ends"), [(ArmState.PAUSED, 1), (ArmState.LOST, 0)])
-def test_a_stream_says_that_it_ends_only_where_its_operator_paused_the_arm(
+def test_a_stream_reports_its_end_only_if_its_operator_paused_the_arm(
     state: ArmState, ends: int, node: Any, context: Any
 ) -> None:
     arm, at = LeftArmController(context=context), pin.SE3.Identity()
@@ -192,7 +193,7 @@ def test_a_stream_says_that_it_ends_only_where_its_operator_paused_the_arm(
     (end,) = (one for one in arm.publishers if one.topic_name == f"{output.topic}/ended")
 
     def step(target: pin.SE3 | None, state: ArmState) -> int:
-        """How many targets have come."""
+        """Return how many targets have come."""
         now = time.monotonic()
         output.take_fault(now)
         output.step(target, at, at, now, now, state=state)
@@ -207,7 +208,7 @@ def test_a_stream_says_that_it_ends_only_where_its_operator_paused_the_arm(
     arm.destroy_node()
 
 
-_LOST = "_NODE_NAME_UNKNOWN_"  # as rcl says
+_LOST = "_NODE_NAME_UNKNOWN_"  # rcl uses this name.
 LISTENER = """
 import rclpy
 from geometry_msgs.msg import PoseStamped
@@ -224,7 +225,7 @@ def listener(processes: Processes) -> RosProcess:
 
 
 @pytest.mark.parametrize(("rate", "acknowledged"), [(50.0, False), (500.0, True)])
-def test_a_frozen_listener_alone_is_reported(rate: float, acknowledged: bool, node: Any, listener: RosProcess) -> None:
+def test_only_a_frozen_listener_is_reported(rate: float, acknowledged: bool, node: Any, listener: RosProcess) -> None:
     publisher = WatchedPublisher(node, PoseStamped, "/watched", TIMEOUT)
     wait_until(lambda: publisher.listeners == 1, "the listener is found")
     publisher.begin(acknowledged)
@@ -247,10 +248,10 @@ def test_a_listener_that_ended_before_is_not_reported(node: Any, listener: RosPr
     listener.wait()
     publisher.begin()
     assert Stream(publisher, 100.0).run(3.0 * TIMEOUT) is None
-    assert publisher.listeners == 1  # as the graph says
+    assert publisher.listeners == 1  # The graph says so.
 
 
-def test_an_endpoint_keeps_the_name_of_its_node_where_the_graph_has_lost_it() -> None:
+def test_an_endpoint_keeps_the_name_of_its_node_when_the_graph_has_lost_it() -> None:
     known, lost, other = (
         TopicEndpointInfo(node_namespace=space, node_name=name, endpoint_gid=[number] * 16)
         for space, name, number in (("/", "talker", 1), ("_NODE_NAMESPACE_UNKNOWN_", _LOST, 1), ("/", _LOST, 2))

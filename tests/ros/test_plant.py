@@ -1,4 +1,4 @@
-"""A loop in this process moves a robot behind ROS, and leaves it alone where others move it."""
+"""A loop in this process moves a robot behind ROS, and does not disturb it if others move it."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ from q2r2_control.ros.plant import RosPlant
 from tests.ros.cell import NODE_RATE, Cell, start_robot
 from tests.ros.processes import subscribed, wait_until
 
-UNDER_WAY = 10  # commands that a new receiver may get before the loop knows of it
-MOVED = 0.1  # of one joint [rad]
+UNDER_WAY = 10  # Number of commands that a new receiver may get before the loop notices it.
+MOVED = 0.1  # Motion of one joint [rad].
 
 
 @pytest.fixture
@@ -49,7 +49,7 @@ def cell(node: Any, processes: Processes, robot: Robot) -> Cell:
 
 @contextmanager
 def driven(config: Config, robot: Robot, goal: np.ndarray) -> Iterator[tuple[list[Tick], Callable[[], RunSummary]]]:
-    """A policy that leads the joints to ``goal``, slowly, from wherever they are, and closes the left gripper."""
+    """Return a run whose policy moves the joints slowly to ``goal`` and closes the left gripper."""
     policy, ticks, ended = PolicyInput(rate=20.0), list[Tick](), Event()
     loop = Pipeline(config, robot, policy, RosPlant(robot, config))
     found: list[RunSummary] = []
@@ -89,7 +89,7 @@ def test_a_policy_moves_the_arms_and_a_gripper_of_a_robot_behind_ros(cell: Cell,
         assert summary().arms["left"].policy_s > 0.0
 
 
-def test_arms_rest_when_the_robot_ends_and_go_on_without_a_jump_from_where_its_successor_has_them(
+def test_arms_rest_when_the_robot_ends_and_go_on_without_a_jump_from_the_posture_of_its_successor(
     cell: Cell, config: Config, processes: Processes
 ) -> None:
     goal = cell.q.copy()
@@ -98,18 +98,18 @@ def test_arms_rest_when_the_robot_ends_and_go_on_without_a_jump_from_where_its_s
         wait_until(lambda: np.abs(cell.q - goal).max() < 5e-3, "the arms are there")
         cell.processes[0].end()
         wait_until(lambda: ticks[-1].states["left"] != "policy", "the policy has not the arms any more")
-        start_robot(processes)  # at home again
+        start_robot(processes)  # The robot is at home again.
         cell.forget()
         began = cell.joints.states[0].t
         wait_until(lambda: np.abs(cell.q - goal).max() < 5e-3, "the arms are there again")
-        # The policy leads a joint by 0.05 rad at most, in a twentieth of a second.
+        # The policy moves a joint by at most 0.05 rad, in a twentieth of a second.
         assert cell.joints.fastest(began) < 1.0
 
 
-def test_a_new_receiver_of_commands_gets_none_while_the_arms_are_not_where_these_are(
+def test_a_new_receiver_gets_no_commands_while_the_arms_are_elsewhere(
     node: Any, robot: Robot, config: Config, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(RosPlant, "standstill", None)  # which these arms do
+    monkeypatch.setattr(RosPlant, "standstill", None)  # These arms stand still.
     states = node.create_publisher(JointState, "joint_states", 10)
     still = joint_state_message(robot.joint_names, robot.home, 0.0 * robot.home, 0.0 * robot.home, 0.0)
     timer = node.create_timer(0.01, lambda: states.publish(still))
@@ -120,7 +120,7 @@ def test_a_new_receiver_of_commands_gets_none_while_the_arms_are_not_where_these
         with driven(config, robot, goal) as (ticks, _):
             wait_until(lambda: ticks and np.abs(ticks[-1].reference.q - robot.home).max() > 0.04, "a command is away")
             heard = subscribed(node, JointTrajectory, "joint_trajectory", COMMAND_QOS)
-            # Commands may be under way between the middleware's noticing the receiver and the loop's.
+            # Commands may be on their way between the middleware's notice of the receiver and the loop's.
             commands = (heard.get(timeout=PATIENCE).points[0].positions for _ in range(UNDER_WAY))
             assert any(np.abs(np.array(command) - robot.home).max() < 0.03 for command in commands)
             assert "a new receiver takes the commands" in caplog.text
@@ -129,7 +129,7 @@ def test_a_new_receiver_of_commands_gets_none_while_the_arms_are_not_where_these
 
 
 @pytest.mark.parametrize("begins", ["a publisher that appears", "one that was silent"])
-def test_arms_that_another_node_commands_while_the_loop_does_are_left_alone_and_it_is_named(
+def test_arms_that_another_node_commands_are_released_and_the_node_is_named(
     begins: str, cell: Cell, config: Config, caplog: pytest.LogCaptureFixture
 ) -> None:
     goal, other = cell.q.copy(), None
@@ -146,7 +146,7 @@ def test_arms_that_another_node_commands_while_the_loop_does_are_left_alone_and_
         wait_until(lambda: "/test commands the arms on /joint_trajectory" in caplog.text, "the other is named")
 
 
-def test_arms_that_others_command_or_that_are_not_there_are_one_line(
+def test_arms_that_others_command_and_missing_arms_give_one_line(
     node: Any, robot: Robot, config: Config, processes: Processes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(plant_module, "_WAIT", 0.5)
@@ -158,7 +158,7 @@ def test_arms_that_others_command_or_that_are_not_there_are_one_line(
     wait_until(lambda: cell.joints.states, "joint states come")
     other = node.create_publisher(JointTrajectory, "joint_trajectory", COMMAND_QOS)
     timer = node.create_timer(0.02, lambda: other.publish(JointTrajectory()))
-    monkeypatch.setattr(plant_module, "_QUIET", 4.0)  # discovery takes its time on a busy machine
+    monkeypatch.setattr(plant_module, "_QUIET", 4.0)  # Discovery takes its time on a busy machine.
     try:
         with pytest.raises(PlantError, match="/test commands the arms on /joint_trajectory"):
             plant.reset()

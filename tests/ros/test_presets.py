@@ -1,4 +1,4 @@
-"""Another project's controller moves the arms: what it gets keeps its rules, in both modes.
+"""Another project's controller moves the arms. Its targets keep its rules in both modes.
 
 This package's own controller stands in for it, with another name and topics. The left arm's node sends it the hand's
 target itself, the right arm's what the built-in controller makes of that.
@@ -44,10 +44,10 @@ from tests.ros.cell import PATIENT, Cell, start_controller, start_robot
 from tests.ros.processes import wait_until
 
 PRESET = "kuka_lbr_impedance"
-STILL = 4e-3  # how far a tool at rest may move [m]
-NEAR = 6e-3  # a tool this near has arrived [m]
-SETTLED = 4e-3  # from a tool or a target that rests [m]
-LONGEST_GAP = 0.3  # in a stream, on a machine with other load [s]
+STILL = 4e-3  # Largest motion of a tool at rest [m].
+NEAR = 6e-3  # A tool within this distance has arrived [m].
+SETTLED = 4e-3  # Distance from a resting tool or target [m].
+LONGEST_GAP = 0.3  # Longest gap in a stream, on a machine with other load [s].
 NAMES = {
     **dict.fromkeys(("builtin", "kuka_lbr_clik", "kuka_lbr_impedance", "fzi"), "target_frame"),
     **{"mayr": "reference_pose", "crisp": "target_pose", "moveit_servo": "pose_target_cmds"},
@@ -57,11 +57,12 @@ JOINTS = ("lbr_position", "lbr_torque", "forward_position", "jtc")
 
 
 class Theirs:
-    """The controller of both arms that stands in for another project's, and all targets that it gets."""
+    """The controller of both arms that replaces another project's, and all targets that it gets."""
 
     def __init__(self, node: Any, processes: Processes, robot: Robot) -> None:
         self._processes, self.robot = processes, robot
-        self.targets: dict[str, list[tuple[PoseStamped, pin.SE3]]] = {arm: [] for arm in robot.arms}  # and the tool
+        # Targets with the tool's pose at the same time.
+        self.targets: dict[str, list[tuple[PoseStamped, pin.SE3]]] = {arm: [] for arm in robot.arms}
         self.wrenches: list[WrenchStamped] = []
         self.cell = Cell(node, robot, targets="/not_used/{arm}")
         for arm in robot.arms:
@@ -80,7 +81,7 @@ class Theirs:
         self.targets[arm].append((message, self.cell.joints.tool(arm)))
 
     def assert_rules_kept(self) -> None:
-        """Unit quaternions in the arm's own frame; streams that begin at the tool, no faster than the preset says."""
+        """Assert unit quaternions in the arm's own frame, and streams that begin at the tool at the preset's speed."""
         fastest = PRESETS[PRESET].guard.max_velocity * 1.1
         for arm, targets in self.targets.items():
             assert len(targets) > 30, "on a slow computer not all of them are heard"
@@ -107,7 +108,7 @@ def distance(one: pin.SE3, other: pin.SE3) -> float:
 
 @pytest.fixture
 def theirs(domain: int, robot: Robot, processes: Processes, tmp_path: Path) -> Iterator[Theirs]:
-    """Robot and both controllers; the built-in one has the right arm alone, as it moves neither."""
+    """Return robot and both controllers. The built-in controller has only the right arm, because it moves neither."""
     cell = yaml.safe_load(find_resource(CONFIG).read_text())
     del cell["arms"]["left"]
     (right_arm := tmp_path / "right_arm.yaml").write_text(yaml.safe_dump(cell))
@@ -126,7 +127,7 @@ def start_arm(node: Any, processes: Processes, arm: str, mode: str) -> ArmRig:
     given = {
         **{"preset": PRESET, "mode": mode, "ctrl_prefix": prefix, "controller_node": "/theirs"},
         **{"base_frame_id": f"{arm}_link_0", "world_frame_id": "world", "teleop.linked": False},
-        **{"teleop.leash.distance": 0.0},  # an arm that lags on a machine with other load is not held up
+        **{"teleop.leash.distance": 0.0},  # An arm that lags on a machine with other load is not held up.
     }
     processes.start_node(f"{arm}_arm_controller", *patient(given))
     return rig
@@ -162,7 +163,7 @@ def test_a_controller_gets_targets_by_its_rules_in_both_modes(
         move((0.0, 0.0, 0.06))
         os.kill(theirs.process.pid, signal.SIGKILL)
         theirs.process.wait()
-        rigs.move((0.1, 0.0, 0.0), 0.3)  # the restarted controller must not be asked to catch up with that
+        rigs.move((0.1, 0.0, 0.0), 0.3)  # The restarted controller must not be asked to catch up with that motion.
         rigs.wait_for_pause()
         joints.wait_for_rest()
         with joints.tools_rest(STILL, "its controller is restarted"):
@@ -176,14 +177,12 @@ def test_a_controller_gets_targets_by_its_rules_in_both_modes(
     assert (wrench.wrench.force.x, wrench.wrench.force.z, wrench.wrench.torque.x) == (0.0, 0.0, 0.0)
 
 
-def test_moveit_servo_is_told_to_take_poses_after_each_of_its_starts(
-    node: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_moveit_servo_is_switched_to_poses_after_each_of_its_starts(node: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     service, module = "/servo/switch_command_type", "moveit_msgs.srv"
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(ConfigError, match="moveit_msgs, which cannot be imported"):
         CommandType(node, service)
-    # SetBool is on the wire, since moveit_msgs is not installed here; 2 means poses.
+    # SetBool replaces the real service type, because moveit_msgs is not installed here; 2 stands for poses.
     asks = {"__init__": lambda self, command_type: SetBool.Request.__init__(self, data=command_type == 2)}
     request = type(SetBool.Request.__name__, (SetBool.Request,), {**asks, "__module__": SetBool.Request.__module__})
     kind = type("ServoCommandType", (SetBool,), {"Request": request})
@@ -199,25 +198,25 @@ def test_moveit_servo_is_told_to_take_poses_after_each_of_its_starts(
         response.success = len(asked) > 1
         return response
 
-    assert not agreed(0)  # no service yet
+    assert not agreed(0)  # There is no service yet.
     node.create_service(SetBool, service, answer)
     wait_until(lambda: agreed(0), "it agrees")
-    assert asked == [True, True]  # the first time it refused
+    assert asked == [True, True]  # It refused the first time.
     assert agreed(0)
-    assert not agreed(1)  # it was started again
+    assert not agreed(1)  # It was restarted.
     wait_until(lambda: agreed(1), "it agrees again")
     assert asked == [True, True, True]
 
 
 @pytest.mark.parametrize("name", ["fzi", "mayr", "crisp", "kuka_lbr_clik"])
-def test_a_preset_that_is_not_run_differs_from_the_one_that_is_in_names_and_what_it_asks_for(name: str) -> None:
+def test_a_preset_that_is_not_run_differs_from_the_tested_one_only_in_names_and_requests(name: str) -> None:
     preset, run = PRESETS[name], PRESETS[PRESET]
     assert (preset.hold, preset.guard, preset.takes_poses) == (run.hold, run.guard, run.takes_poses)
     assert preset.command_type is None
 
 
 def test_the_presets_have_the_topics_of_their_controllers() -> None:
-    # lbr_fri_ros2_stack names it relative to its controller's node: the name resolves in the robot's namespace.
+    # lbr_fri_ros2_stack names it relative to its controller's node, so that the name resolves in the robot's namespace.
     lbr = PRESETS["lbr_position"].topic_of
     assert lbr("/left/lbr_joint_position_command_controller") == "/left/command/lbr_joint_position_command"
     assert lbr("/lbr_joint_position_command_controller") == "/command/lbr_joint_position_command"

@@ -1,4 +1,4 @@
-"""``q2r2 ros up``: processes that start together, are reported when they end, and end together."""
+"""``q2r2 ros up`` starts processes together, reports their ends, and ends them together."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from tests.support.processes import alive, children
 need_ros()
 pytestmark = pytest.mark.alone
 
-# Two programs instead of nodes, through the same function as the command.
+# Two programs run instead of nodes, through the same function as in the command.
 PROGRAM = """
 import signal, sys, time
 signal.signal(signal.SIGINT, lambda *_: sys.exit(0))
@@ -70,7 +70,7 @@ def test_a_process_that_dies_is_reported_and_ends_the_others(pair: RosProcess) -
     assert not alive(second)
 
 
-def test_a_set_whose_recording_failed_says_so_by_its_exit_code(processes: Processes) -> None:
+def test_a_set_whose_recording_failed_has_its_own_exit_code(processes: Processes) -> None:
     process = processes.start(sys.executable, "-c", PAIR.replace("sys.exit(0)", f"sys.exit({NOT_RECORDED})"), name="up")
     for name in ("first", "second"):
         process.wait_for(f"[{name}] ready")
@@ -143,7 +143,7 @@ def test_a_set_has_the_controller_that_its_preset_needs_with_its_topics_and_fram
 
 def test_the_command_adds_a_recorder_first_and_a_page_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("viser", reason="the extra web brings it")
-    monkeypatch.chdir(tmp_path)  # where the folder of recordings is made
+    monkeypatch.chdir(tmp_path)  # The folder of recordings is made here.
     started: list[NodeProcess] = []
 
     def start(nodes: list[NodeProcess], say: object) -> int:
@@ -165,7 +165,7 @@ def test_the_command_adds_a_recorder_first_and_a_page_last(tmp_path: Path, monke
     assert "--anonymous needs --record" in q2r2(*f"ros up {CONFIG} --anonymous".split()).stderr
 
 
-def test_what_the_command_is_given_for_ros_reaches_every_node(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_arguments_for_ros_reach_every_node(monkeypatch: pytest.MonkeyPatch) -> None:
     started: list[NodeProcess] = []
 
     def start(nodes: list[NodeProcess], say: object) -> int:
@@ -185,7 +185,7 @@ def test_what_the_command_is_given_for_ros_reaches_every_node(monkeypatch: pytes
     )
 
 
-def test_arms_have_a_process_each_where_that_is_asked_for_and_a_cell_with_one_arm_has_its_nodes(tmp_path: Path) -> None:
+def test_arms_have_separate_processes_on_request_and_a_cell_with_one_arm_has_its_nodes(tmp_path: Path) -> None:
     assert names(nodes_of(CONFIG, "none"))[2:] == ["arm_controllers"]
     assert names(nodes_of(CONFIG, "none", separate=True))[2:] == ["left_arm_controller", "right_arm_controller"]
     cell = external() | {"controller": "builtin"}
@@ -195,7 +195,7 @@ def test_arms_have_a_process_each_where_that_is_asked_for_and_a_cell_with_one_ar
 
 
 @pytest.mark.parametrize(("stance", "hand"), [("side_by_side", "right"), ("mirror", "left")])
-def test_a_scripted_input_has_only_the_hand_that_leads_the_one_arm_of_a_cell(
+def test_in_a_cell_with_one_arm_a_scripted_input_has_only_the_hand_that_leads_it(
     tmp_path: Path, stance: str, hand: str
 ) -> None:
     cell = yaml.safe_load((ROOT / "config" / "iiwa7.yaml").read_text())
@@ -219,7 +219,7 @@ def test_every_node_of_a_set_is_an_executable(tmp_path: Path) -> None:
 
 @pytest.fixture
 def launch(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Stands for launch, which is not in the Python registry, and keeps what its classes were made with."""
+    """A replacement for launch, which is not in the Python registry. It keeps the arguments of its classes."""
     made = MagicMock()
     made.LaunchConfiguration = lambda name: SimpleNamespace(perform=lambda context: context[name])
     made.ParameterValue = lambda value, value_type: (value, value_type)
@@ -233,7 +233,7 @@ def launch(monkeypatch: pytest.MonkeyPatch) -> Any:
     ("preset", "source", "folder", "separate"),
     [("builtin", "headset", "recordings", "true"), ("jtc", "none", "", "false")],
 )
-def test_the_launch_file_starts_what_the_command_starts(
+def test_the_launch_file_starts_the_same_as_the_command(
     launch: Any, tmp_path: Path, preset: str, source: str, folder: str, separate: str
 ) -> None:
     config = CONFIG if preset == "builtin" else external_cell(tmp_path, preset, "filtered")

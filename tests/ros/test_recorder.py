@@ -1,4 +1,4 @@
-"""The recorder's node: what it keeps of real nodes, episodes by controls and services, and what it does in trouble."""
+"""The recorder's node: recorded messages of real nodes, episodes by controls and services, and faults."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ from tests.ros.processes import States, call, wait_until
 from tests.support.processes import children
 
 HAND = "/q2r_left_hand_pose"
-HANDED_OVER = 20  # messages that wait for the writer
+HANDED_OVER = 20  # Number of messages that wait for the writer.
 
 
 class RunningRecorder:
@@ -57,15 +57,15 @@ class RunningRecorder:
         wait_until(lambda: self.state()[key] == value, f"{key} is {value}")
 
     def poses(self) -> list[bytes]:
-        """Of the hand, in the file while it is being written."""
-        with suppress(RecordingError):  # in the middle of a write
+        """Return poses of the hand in the file while it is written."""
+        with suppress(RecordingError):  # A write may be going on.
             recording = open_recording(self.folder)
             return [message.payload for messages in recording.messages((HAND,)) for message in messages]
         return []
 
     def discarded(self) -> list[bool]:
-        """Of each episode in the file while it is being written."""
-        with suppress(RecordingError):  # in the middle of a write
+        """Return whether each episode in the file was discarded, while it is written."""
+        with suppress(RecordingError):  # A write may be going on.
             return [span.discarded for span in read_spans(open_recording(self.folder))]
         return []
 
@@ -80,17 +80,20 @@ def recorder(node: Any, processes: Processes, tmp_path: Path) -> RunningRecorder
 
 
 def record_poses(recorder: RunningRecorder, node: Any, count: int) -> bytes:
-    """Publish poses of a hand, slowly enough for best effort; returns how the last one begins, once it is taken."""
+    """Publish poses of a hand slowly enough for best effort.
+
+    Return the beginning of the last one after it is recorded.
+    """
     publisher = node.create_publisher(PoseStamped, HAND, STREAM_QOS)
     message = PoseStamped()
-    # Publisher and recorder find each other each in its own time.
+    # Publisher and recorder discover each other at different times.
     wait_until(lambda: publisher.publish(message) or recorder.poses(), "the recorder takes poses")
     for number in range(count):
         message.pose.position.x = float(number)
         message.header.stamp.sec = 1000 + number
         publisher.publish(message)
         time.sleep(0.002)
-    last = serialize_message(message)[:8]  # with its seconds
+    last = serialize_message(message)[:8]  # These bytes contain its seconds.
     wait_until(lambda: recorder.poses()[-1].startswith(last), "the last pose is in the file")
     return last
 
@@ -98,9 +101,9 @@ def record_poses(recorder: RunningRecorder, node: Any, count: int) -> bytes:
 def test_messages_are_in_the_file_to_the_byte_without_ros(recorder: RunningRecorder, node: Any, tmp_path: Path) -> None:
     from rosbags.highlevel import AnyReader
 
-    # Bytes between a message's fields are whatever the sender's memory held: compare with what another listener gets.
+    # Bytes between a message's fields are arbitrary memory of the sender. Compare with the bytes of another listener.
     heard: list[bytes] = []
-    qos = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)  # as deep as the recorder's
+    qos = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)  # The depth is that of the recorder.
     node.create_subscription(PoseStamped, HAND, heard.append, qos, raw=True)
     before = time.time_ns()
     strange = node.create_publisher(String, arm_events("left"), RECORDED_QOS)
@@ -121,7 +124,7 @@ def test_messages_are_in_the_file_to_the_byte_without_ros(recorder: RunningRecor
     assert Recording(folder).closed
 
 
-def test_hand_and_services_tell_of_episodes_to_each_other(node: Any, processes: Processes, tmp_path: Path) -> None:
+def test_hand_and_services_know_each_others_episodes(node: Any, processes: Processes, tmp_path: Path) -> None:
     rig = ArmRig(node)
     rig.start(processes, {"teleop.bindings.grip": "record_toggle"})
     squeeze(rig)
@@ -137,7 +140,7 @@ def test_hand_and_services_tell_of_episodes_to_each_other(node: Any, processes: 
     felt(rig, EPISODE_ENDS)
     refused = call(node, "/recorder/stop")
     assert not refused.success
-    felt(rig, EPISODE_REJECTED)  # the verdict on it, which is stronger than a discard that comes meanwhile
+    felt(rig, EPISODE_REJECTED)  # This is the verdict. It is stronger than a discard that comes meanwhile.
     squeeze(rig)
     recorder.wait("episode_open", True)
     assert call(node, "/recorder/discard").success
@@ -153,14 +156,14 @@ def squeeze(rig: ArmRig) -> None:
 
 
 def felt(rig: ArmRig, pulse: Pulse) -> None:
-    """Wait until it has been felt, and has ended: a weaker one that begins meanwhile is not felt."""
+    """Wait until a vibration has been felt and has ended. A weaker one that begins meanwhile is not felt."""
     wanted = (round(pulse.frequency, 3), round(pulse.amplitude, 3))
     rig.wait(lambda: wanted in rig.pulses and rig.pulses[-1] == (0.0, 0.0), f"{pulse} is felt")
 
 
 @pytest.mark.alone
 def test_a_killed_recorder_leaves_a_file_that_its_writer_closes(recorder: RunningRecorder, node: Any) -> None:
-    """A kill costs what the node has not handed over yet, and with the writer the chunk that it has not written yet."""
+    """A kill costs the messages that the node has not passed on, and those of the chunk that is not written."""
     record_poses(recorder, node, 100)
     folder, (writer,) = recorder.folder, children(recorder.process.pid)
     os.kill(writer, signal.SIGSTOP)
@@ -173,9 +176,9 @@ def test_a_killed_recorder_leaves_a_file_that_its_writer_closes(recorder: Runnin
                 publisher.publish(PoseStamped())
             return int(recorder.state()["messages"]) - taken
 
-        # Its count is of all topics, and the newest messages may still be on the way to the pipe.
+        # The count is that of all topics, and the newest messages may still be on the way to the pipe.
         wait_until(lambda: sent() >= 2 * HANDED_OVER, "the node hands over what is not written", patience=600.0)
-        recorder.state()  # by then they are in the pipe
+        recorder.state()  # By then, they are in the pipe.
         os.kill(recorder.process.pid, signal.SIGKILL)
     finally:
         os.kill(writer, signal.SIGCONT)
@@ -206,7 +209,7 @@ def test_an_anonymous_recording_names_neither_the_operator_nor_the_computer(
 
 @pytest.mark.slow
 @pytest.mark.alone
-def test_a_whole_set_is_recorded_judged_and_ends_at_ctrl_c(node: Any, processes: Processes, tmp_path: Path) -> None:
+def test_a_whole_set_is_recorded_and_judged_and_ends_at_ctrl_c(node: Any, processes: Processes, tmp_path: Path) -> None:
     process = processes.start(
         *(sys.executable, "-m", "q2r2_control", "ros", "up", CONFIG, "--record", str(tmp_path), "--operator", "Ada"),
         name="up",
@@ -220,10 +223,10 @@ def test_a_whole_set_is_recorded_judged_and_ends_at_ctrl_c(node: Any, processes:
     )
     assert call(node, "/recorder/start").success
     states = States(node, "recorder")
-    enough = states.wait_for()["messages"] + 10_000  # of some 10 topics a tick
+    enough = states.wait_for()["messages"] + 10_000  # There are some 10 topics a tick.
     wait_until(lambda: states.wait_for()["messages"] > enough, "the arms are moved", patience=600.0)
     assert call(node, "/recorder/stop").success
-    # The process that judges gets no time while nodes with real-time priority keep both processors busy.
+    # The judging process gets no time while nodes with real-time priority use both processors.
     others = [pid for pid in children(process.pid) if "recorder" not in Path(f"/proc/{pid}/cmdline").read_text()]
     for pid in others:
         os.kill(pid, signal.SIGSTOP)

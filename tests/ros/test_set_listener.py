@@ -1,4 +1,4 @@
-"""The listener of a set: it hears what nodes say and how often, and takes no part in what they do."""
+"""The listener of a set hears the reports of nodes and their rates, and does not influence them."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from tests.ros.processes import CONFIG, PATIENCE, Processes, States, wait_until
 need_ros()
 
 
-# The command tries ROS in a process of its own first, and listens for seconds [s].
+# The command first tries ROS in a separate process, and then listens for this time [s].
 LONG = 4.0 * PATIENCE
 COMMAND = (sys.executable, "-m", "q2r2_control", "ros")
 CELL = load_config(CONFIG)
 NO_TOOL_POSE = ReasonKind.NO_TOOL_POSE.template.format(cause="")
 
 
-def test_rates_are_what_the_senders_say_and_no_topic_but_states_is_listened_to(node: Any, domain: int) -> None:
+def test_rates_are_those_of_the_senders_and_only_states_are_listened_to(node: Any, domain: int) -> None:
     state = node.create_publisher(String, "/test/state", 10)
     other = node.create_publisher(String, "/stranger/state", 10)
     sender = node.create_publisher(PoseStamped, "/target", 10)
@@ -51,7 +51,7 @@ def test_rates_are_what_the_senders_say_and_no_topic_but_states_is_listened_to(n
             return {topic.name: topic.rate for topic in listener.view().topics}
 
         wait_until(lambda: (rates().get("/target") or 0.0) > 10.0, "the topics have rates")
-        assert "/stranger" not in {one.name for one in listener.view().nodes}  # which says something else
+        assert "/stranger" not in {one.name for one in listener.view().nodes}  # This node reports something else.
         assert node.count_subscribers("/target") == 0
     node.destroy_timer(timer)
     node.destroy_publisher(sender)
@@ -78,7 +78,7 @@ def test_the_command_watches_nodes_and_subscribes_to_no_command_and_no_hand(node
         look()
         time.sleep(0.05)
     assert {topic.rpartition("/")[2] for topic in taken} == {"state"}
-    states.wait_for(without_subscriber=["right"])  # it does not play for who watches
+    states.wait_for(without_subscriber=["right"])  # The scripted hands do not play for a listener.
     assert watch.wait(LONG) == 0
     found = json.loads(watch.output.splitlines()[-1])
     left, right = found["arms"]
@@ -159,12 +159,12 @@ WHY: dict[str, tuple[tuple[NodeView, ...], str]] = {
 
 
 @pytest.mark.parametrize(("nodes", "why"), WHY.values(), ids=WHY)
-def test_a_line_says_why_an_arm_is_where_it_is(nodes: tuple[NodeView, ...], why: str) -> None:
+def test_a_line_gives_the_reason_for_the_state_of_an_arm(nodes: tuple[NodeView, ...], why: str) -> None:
     left, right = arm_views(nodes, CELL)
     assert why in left.why
     assert (left.name, right.name, right.node) == ("left", "right", "")
 
 
-def test_two_nodes_of_one_arm_are_two_rows() -> None:
+def test_two_nodes_of_one_arm_have_two_rows() -> None:
     views = arm_views((arm(), NodeView("/other", "ok", "running", 0.1, ARM)), CELL)
     assert [(view.name, view.node) for view in views] == [("left", "/left_arm"), ("left", "/other"), ("right", "")]

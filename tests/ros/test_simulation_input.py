@@ -1,4 +1,4 @@
-"""The scripted hands as other processes hear them, compared with the script itself."""
+"""The scripted hands as other processes receive them, compared with the script itself."""
 
 from __future__ import annotations
 
@@ -40,17 +40,17 @@ def subscribe(node: Any, hand: str) -> dict[str, Queue[Any]]:
 
 
 def assert_a_part_of(received: Array, script: Array) -> None:
-    """``received`` is a run of rows of ``script``; the first few may be lost, until both sides know each other."""
+    """Assert that ``received`` is a run of rows of ``script``. The first rows may be lost before discovery."""
     starts = range(len(script) - len(received) + 1)
     assert min(float(np.abs(script[start : start + len(received)] - received).max()) for start in starts) <= 1e-6
 
 
-def test_poses_inputs_and_twists_are_the_scripts_own(node: Any, processes: Processes) -> None:
+def test_poses_inputs_and_twists_equal_those_of_the_script(node: Any, processes: Processes) -> None:
     queues = subscribe(node, "right")
     start(processes, side="right", trajectory="rotate", rate=RATE)
     wait_until(lambda: all(queue.qsize() >= 300 for queue in queues.values()), "six seconds of each topic")
     poses, inputs, twists = (drained(queues[suffix])[:300] for suffix in ("pose", "inputs", "twist"))
-    # At first the hand rests, while nobody has said yet whether there is an arm that listens.
+    # At first, the hand rests, because no arm has reported yet.
     press = next(i for i, message in enumerate(inputs) if message.button_lower)
     poses, inputs, twists = (messages[press - 20 : press + 130] for messages in (poses, inputs, twists))
 
@@ -74,7 +74,7 @@ def test_poses_inputs_and_twists_are_the_scripts_own(node: Any, processes: Proce
     assert_a_part_of(velocities, np.array([[*m.linear, *m.angular] for m in motions]))
 
 
-def test_the_script_waits_until_both_hands_are_listened_to(node: Any, processes: Processes) -> None:
+def test_the_script_waits_until_both_hands_have_subscribers(node: Any, processes: Processes) -> None:
     states = States(node, "simulation_input")
     left = subscribe(node, "left")
     process = start(processes, side="both", frame_id="room")
@@ -88,14 +88,14 @@ def test_the_script_waits_until_both_hands_are_listened_to(node: Any, processes:
 
 
 def speaking_arm(node: Any, ready: bool, message: str) -> dict[str, Any]:
-    """The report of an arm of the left hand, ten times a second, from this node; tests change it."""
+    """Return the report of the left hand's arm, which this node sends ten times a second. Tests change it."""
     arm = {"level": "ok", "hand": "left", "engaged": False, "ready": ready, "message": message, "last_event": ""}
     said = node.create_publisher(String, f"{node.get_fully_qualified_name()}/state", 10)
     node.create_timer(0.1, lambda: said.publish(String(data=json.dumps(arm))))
     return arm
 
 
-def test_the_script_waits_for_an_arm_to_be_ready_and_presses_until_it_follows(node: Any, processes: Processes) -> None:
+def test_the_script_waits_for_a_ready_arm_and_presses_until_it_follows(node: Any, processes: Processes) -> None:
     arm = speaking_arm(node, ready=False, message="no tool yet")
     states, left = States(node, "simulation_input"), subscribe(node, "left")
     start(processes, side="left", trajectory="line")
@@ -113,7 +113,7 @@ def test_the_script_waits_for_an_arm_to_be_ready_and_presses_until_it_follows(no
     arm["engaged"] = True
     rest = left["pose"].get(timeout=PATIENCE).pose.position.x
     wait_until(lambda: left["pose"].get(timeout=PATIENCE).pose.position.x > rest + 0.02, "the hand moves")
-    arm |= {"engaged": False, "ready": False}  # stopped by a fault at once, and not ready for a moment
+    arm |= {"engaged": False, "ready": False}  # A fault stops it at once, and it is not ready for a moment.
     wait_until(lambda: left["pose"].get(timeout=PATIENCE).pose.position.x == rest, "the hand is where it was")
     drained(left["inputs"])
     time.sleep(0.5)
@@ -122,7 +122,7 @@ def test_the_script_waits_for_an_arm_to_be_ready_and_presses_until_it_follows(no
     wait_until(lambda: left["inputs"].get(timeout=PATIENCE).button_lower, "the button is pressed")
     arm["engaged"] = True
     time.sleep(7.0)
-    arm["engaged"] = False  # from now on it takes a person
+    arm["engaged"] = False  # From now on, only a person can engage it.
     time.sleep(0.5)
     drained(left["inputs"])
     time.sleep(2.0)
@@ -130,7 +130,7 @@ def test_the_script_waits_for_an_arm_to_be_ready_and_presses_until_it_follows(no
 
 
 class PlayedHand(SimulationInput):
-    """A left hand whose clock, and whose arm's report, are the test's."""
+    """A left hand whose clock and whose arm's report belong to the test."""
 
     now = 0.0
 
@@ -156,12 +156,10 @@ class PlayedHand(SimulationInput):
 @pytest.mark.parametrize(
     ("kind", "presses"), [("states_silent", 4), ("pause_service", 1), ("reset_service", 1), ("homing_arrived", 1)]
 )
-def test_an_arm_is_not_engaged_again_after_somebody_asked_for_something_else(
-    kind: str, presses: int, context: Any
-) -> None:
+def test_an_arm_is_not_engaged_again_after_a_request_of_another_program(kind: str, presses: int, context: Any) -> None:
     hand = PlayedHand("line", context)
     assert hand.play(0.9) == 1, "what was asked for before does not count"
-    hand.play(1.3, last_event_kind="no_subscriber")  # it was refused, and the script begins anew
+    hand.play(1.3, last_event_kind="no_subscriber")  # The press was refused, and the script begins again.
     assert hand.play(5.0, last_event_kind=kind) == presses
     hand.destroy_node()
 

@@ -1,4 +1,4 @@
-"""The endpoint between a headset on a real TCP connection and this process on real topics; the view of both hands."""
+"""The endpoint between a headset on real TCP and real topics in this process, and the view of both hands."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def start_endpoint(processes: Processes, *parameters: str) -> tuple[RosProcess, 
 
 
 class KeepaliveHeadset(FakeHeadset):
-    """Sends a keepalive now and then, as the app does, so that a slow machine does not make it look dead."""
+    """Sends a keepalive from time to time like the app, so that a slow machine does not end the connection."""
 
     def __init__(self, address: tuple[str, int], dialect: str = "ros2") -> None:
         super().__init__(address, dialect)
@@ -66,11 +66,14 @@ class Hand:
         self.queues = {what: subscribed(node, kind, f"q2r_{name}_hand_{what}") for what, kind in kinds.items()}
 
     def meet(self, headset: FakeHeadset) -> None:
-        """Until publisher and subscriber know each other a message may be lost: send until each topic has come."""
+        """Send until each topic has come, because a message may be lost before publisher and subscriber know each
+        other.
+        """
         for suffix, queue in self.queues.items():
             for attempt in attempts(1):
                 probe = {
-                    "pose": headset.pose(self.name, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, float(attempt))),  # not frozen
+                    # The pose must not be frozen.
+                    "pose": headset.pose(self.name, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, float(attempt))),
                     "twist": headset.twist(self.name, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
                     "inputs": headset.inputs(self.name),
                 }[suffix]
@@ -81,7 +84,7 @@ class Hand:
                 assert attempt < 10.0 * PATIENCE, f"no {suffix} of the {self.name} hand"
 
     def next(self, suffix: str, count: int) -> list[Any]:
-        """The next ``count`` messages that are no probes, some of which may still be on their way."""
+        """Return the next ``count`` messages that are no probes. Some probes may still be on their way."""
         messages: list[Any] = []
         while len(messages) < count:
             message = self.queues[suffix].get(timeout=PATIENCE)
@@ -91,14 +94,14 @@ class Hand:
 
 
 def numbers(message: Any) -> list[float]:
-    """Position or linear velocity or buttons: what is all zero in a probe."""
+    """Return position, linear velocity or buttons, which are all zero in a probe."""
     if hasattr(message, "button_upper"):
         return [message.button_upper, message.button_lower, message.press_index]
     vector = message.linear if hasattr(message, "linear") else message.pose.position
     return [vector.x, vector.y, vector.z]
 
 
-def test_headset_data_are_published_number_by_number(node: Any, processes: Processes) -> None:
+def test_headset_data_are_published_with_all_numbers(node: Any, processes: Processes) -> None:
     _, address = start_endpoint(processes, "right_frame_id:=base")
     hands = [Hand(node, name) for name in ("left", "right")]
     random = np.random.default_rng(3)
@@ -107,7 +110,8 @@ def test_headset_data_are_published_number_by_number(node: Any, processes: Proce
         for hand in hands:
             hand.meet(headset)
         for hand in hands:
-            poses = random.normal(size=(8, 7)).tolist()  # not normalised: that is not the endpoint's to decide
+            # The quaternions are not normalised, because the endpoint does not check this.
+            poses = random.normal(size=(8, 7)).tolist()
             twists = random.normal(size=(8, 6)).tolist()
             asked = node.get_clock().now().nanoseconds
             for pose, twist in zip(poses, twists, strict=True):
@@ -159,7 +163,7 @@ def test_vibrations_reach_a_headset_that_subscribed_byte_by_byte(node: Any, proc
         headset.send(headset.registrations())
         headset.read_until("__topic_list")
         frame = None
-        while frame is None:  # both sides may not know each other yet
+        while frame is None:  # Both sides may not know each other yet.
             haptic.publish(OVR2ROSHapticFeedback(frequency=0.25, amplitude=7.0))
             with suppress(TimeoutError):
                 frame = headset.read_frame(0.2)
@@ -186,7 +190,7 @@ def test_topics_are_silent_without_a_headset_and_another_one_may_follow(node: An
         headset.send(headset.registrations() + headset.pose("left", (2.0, 0.0, 0.0), IDENTITY))
         assert numbers(hand.next("pose", 1)[0]) == [2.0, 0.0, 0.0]
         states.wait_for(level="ok", dialect="ROS1", connections=2)
-        headset.send(b"\xff" * 64)  # no protocol at all
+        headset.send(b"\xff" * 64)  # These bytes belong to no protocol.
         process.wait_for("dropped: frame of")
     assert process.interrupt() == 0
 
@@ -216,7 +220,7 @@ LONG = 2.0 * PATIENCE
 
 @contextmanager
 def left_hand_publishing(node: Any) -> Iterator[None]:
-    """Pose, inputs and twist of the left hand with numbers of their own, for as long as the context lasts."""
+    """Publish pose, inputs and twist of the left hand with different numbers, while the context lasts."""
     from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion, Twist, Vector3
     from quest2ros.msg import OVR2ROSInputs
 
@@ -232,7 +236,7 @@ def left_hand_publishing(node: Any) -> Iterator[None]:
         node.destroy_timer(timer)
 
 
-def test_it_shows_values_rate_and_age_and_tells_a_timeout(node: Any, processes: Processes) -> None:
+def test_the_view_shows_values_rate_and_age_and_reports_a_timeout(node: Any, processes: Processes) -> None:
     states = States(node, "check_tcp_connection")
     check = processes.start_node(NAME)
     with left_hand_publishing(node):

@@ -1,4 +1,4 @@
-"""The nodes of both arms share one teleoperation, and go home as the controller and either hand say."""
+"""The nodes of both arms share one teleoperation, and go home at the request of the controller or of either hand."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from q2r2_control.teleop.teleop import Teleop
 
 
 class WayHome:
-    """A client in step with the test, which is the controller; it begins where the controller goes home by itself."""
+    """A client in step with the test, which is the controller. It begins when the controller goes home by itself."""
 
     def __init__(self) -> None:
         self.teleop = Teleop(TeleopSettings(), ["left", "right"])
@@ -35,7 +35,7 @@ class WayHome:
         self._client: Any = HomeClient(node, "/c")
 
     def update(self, now: float, goes: bool, outcome: Reason | None = None) -> list[str]:
-        """The events of this time [s]: the state that an arm comes to, and why."""
+        """Return the events of this time [s]: the new state of an arm, and the reason."""
         self._client.update(self.teleop, goes, outcome, now)
         return [f"{event.destination}: {kinds(event.reason)}" for event in self.teleop.take_events()]
 
@@ -49,7 +49,7 @@ class WayHome:
         (None, "lost: homing_fault: homing_ended"),
     ],
 )
-def test_a_way_home_ends_with_the_outcome_that_the_controller_tells_and_without_one_by_a_fault(
+def test_a_way_home_ends_with_the_outcome_of_the_controller_or_else_with_a_fault(
     outcome: Reason | None, event: str
 ) -> None:
     way = WayHome()
@@ -78,7 +78,7 @@ def test_a_way_home_that_the_controller_does_not_begin_ends(answer: tuple[bool, 
     assert (way.update(1.0, goes=False) or way.update(3.0, goes=False)) == [event] * 2
 
 
-def test_a_pause_on_the_way_home_lets_the_controller_hold() -> None:
+def test_a_pause_on_the_way_home_makes_the_controller_hold() -> None:
     way = WayHome()
     way.update(0.0, goes=True)
     way.teleop.pause(0.5, Reason(ReasonKind.PAUSE_SERVICE))
@@ -96,7 +96,7 @@ def both(context: Any) -> Iterator[tuple[LeftArmController, RightArmController]]
 
 
 @pytest.mark.parametrize(("left", "right", "in_step"), [(1, 1, True), (1, 2, False), (None, None, False)])
-def test_the_relation_of_tools_is_corrected_only_by_references_of_one_moment(
+def test_the_relation_of_tools_is_corrected_only_by_references_of_the_same_time(
     left: int | None, right: int | None, in_step: bool, both: tuple[Any, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     loop, stamps = both[0].loop, {"left": left, "right": right}
@@ -115,7 +115,7 @@ def test_the_relation_of_tools_is_corrected_only_by_references_of_one_moment(
 
 
 @pytest.mark.parametrize("given", ["mirror:=true", "rate:=125.0", "teleop.linked:=false", "mode:=filtered"])
-def test_nodes_that_cannot_be_one_teleoperation_are_refused(given: str, context: object) -> None:
+def test_nodes_that_cannot_share_one_teleoperation_are_refused(given: str, context: object) -> None:
     left = LeftArmController(context=context)
     with pytest.raises(ConfigError, match=f"{given.split(':')[0].split('.')[0]}.* differ; allowed: the same in both"):
         RightArmController(context=context, partner=left, cli_args=as_arguments(given))

@@ -1,4 +1,4 @@
-"""The topics and code of the views, the README and the docs exist and work as they stand there."""
+"""The topics and code of the views, the README and the docs exist and work unchanged."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from tests.ros.arm_rig import TOOL, ArmRig, assert_same, offset, patient, stampe
 
 VIEWS = ROOT / "views"
 
-# The types that RViz's displays and Foxglove's panels take.
+# The displays of RViz and the panels of Foxglove accept these types.
 TEXT, POSE, MARKER = "std_msgs/msg/String", "geometry_msgs/msg/PoseStamped", "visualization_msgs/msg/Marker"
 KINDS = {"RobotModel": TEXT, "Marker": MARKER, "Pose": POSE, "TF": "tf2_msgs/msg/TFMessage"}
 
@@ -63,7 +63,7 @@ def foxglove_paths() -> list[str]:
 
 
 def check_field(topic: Topic, fields: list[str]) -> None:
-    """Check that a path of fields ends at a number of the topic's message, and that its index is one of those there."""
+    """Check that a path of fields ends at a number of the topic's message, and that its index exists."""
     store: Any = get_typestore(Stores.ROS2_JAZZY)
     kind = topic.type
     for field in fields:
@@ -88,7 +88,7 @@ def test_every_plot_of_a_recording_has_its_field(robot: Robot) -> None:
         check_field(recorded[name], fields.split("."))
 
 
-def test_no_view_of_a_running_set_listens_to_a_command() -> None:
+def test_no_view_of_a_running_set_subscribes_to_a_command() -> None:
     plotted = [path.partition(".")[0] for path in foxglove_paths()]
     shown = {*recorded_by_hand(), *rviz_topics(), *foxglove_topics(), *plotted}
     assert not [name for name in shown if re.search(r"target_frame|trajectory|command|_hand_", name)]
@@ -100,7 +100,7 @@ def recorded_by_hand() -> list[str]:
 
 
 @pytest.mark.alone
-def test_every_display_shows_what_the_set_publishes(node: Any, robot: Robot, processes: Processes) -> None:
+def test_every_display_shows_a_topic_that_the_set_publishes(node: Any, robot: Robot, processes: Processes) -> None:
     from visualization_msgs.msg import Marker
 
     start_robot(processes)

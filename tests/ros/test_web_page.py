@@ -1,4 +1,4 @@
-"""The page of a set of real nodes: what it shows, and what its buttons ask for."""
+"""The page of a set of real nodes: its content, and the requests of its buttons."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ from tests.support.page_client import PageClient
 from tests.support.processes import children
 
 CAMERA = {"front": {"topic": "/front/compressed"}}
-PATIENCE = 120.0  # for a whole set on a busy machine [s]
-RATE = 60.0  # a quarter of the default: a page shows the same, and six nodes share what a busy machine leaves [Hz]
-# Does as `q2r2 ros up` does, with parameters of its nodes by which none is lost beside other load.
+PATIENCE = 120.0  # Timeout for a whole set on a busy machine [s].
+RATE = 60.0  # The rate is a quarter of the default. The page shows the same, and six nodes share a busy machine [Hz].
+# The program does the same as `q2r2 ros up`, with parameters that tolerate other load.
 SET = """
 import json, sys
 from dataclasses import replace
@@ -83,16 +83,16 @@ def test_the_page_of_a_set_shows_its_arms_and_its_buttons_reach_the_nodes(
         page.wait_until(lambda: all("the pause service" in why for why in page.row("why")))
         page.press("Bring both")
         page.wait_until(lambda: page.row("state") == ["homing", "homing"])
-        page.press("Pause both")  # the way home too
+        page.press("Pause both")  # The pause also ends the way home.
         page.wait_until(lambda: "homing" not in page.row("state"))
         page.press("Stop")
         page.wait_until(lambda: all("the stop service" in why for why in page.row("why")))
         page.press("Bring both")
-        page.wait_until(lambda: "/cartesian_controller/home: " in page.words)  # it is refused, and says why
+        page.wait_until(lambda: "/cartesian_controller/home: " in page.words)  # It is refused with a reason.
         page.press("Take a stop back")
         page.wait_until(lambda: all("waits for its operator" in why for why in page.row("why")))
         assert "engaged" not in page.row("state")
-        page.press("Engage both")  # which the scripted hands do not do again
+        page.press("Engage both")  # The scripted hands do not engage again.
         page.wait_until(lambda: page.row("state") == ["engaged", "engaged"])
 
         for label, told in (("Begin or end", "episode begins"), ("Mark", "mark"), ("Begin or end", "episode ends")):
@@ -101,7 +101,7 @@ def test_the_page_of_a_set_shows_its_arms_and_its_buttons_reach_the_nodes(
     assert up.interrupt(PATIENCE) == 0
 
 
-def test_neither_a_page_that_is_gone_nor_a_strange_message_ends_a_set(node: Any, processes: Processes) -> None:
+def test_neither_a_closed_page_nor_a_strange_message_ends_a_set(node: Any, processes: Processes) -> None:
     process = processes.start_node("web_page", f"config:={CONFIG}", "web_port:=0")
     url_of(process)
     publisher = node.create_publisher(String, arm_events("left"), RECORDED_QOS)
@@ -114,7 +114,7 @@ def test_neither_a_page_that_is_gone_nor_a_strange_message_ends_a_set(node: Any,
     assert process.interrupt(60.0) == 0
 
 
-def test_a_cell_without_the_built_in_controller_has_nothing_to_show(processes: Processes, tmp_path: Path) -> None:
+def test_a_cell_without_the_built_in_controller_has_no_page(processes: Processes, tmp_path: Path) -> None:
     process = processes.start_node("web_page", f"config:={external_cell(tmp_path, 'fzi', 'raw')}")
     assert process.wait(60.0) == 2
     assert "has no ticks to show; allowed: controller: builtin, or mode: filtered" in process.output

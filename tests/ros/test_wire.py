@@ -1,4 +1,4 @@
-"""Messages written and read as bytes are those that rclpy and rosbags make and read."""
+"""Messages that are written and read as bytes equal those of rclpy and rosbags."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_joint_states_are_written_and_read_as_by_rclpy(names: list[str], t: floa
     assert deserialize_message(data, JointState) == joint_state_message(names, none, none, tau, t)
 
 
-def test_joint_states_of_many_senders_are_told_apart_whatever_they_leave_out() -> None:
+def test_joint_states_of_many_senders_are_distinguished_whatever_fields_are_empty() -> None:
     read = joint_state_reader()
     for _ in range(3):
         for names in NAMES:
@@ -70,7 +70,7 @@ def test_joint_states_of_many_senders_are_told_apart_whatever_they_leave_out() -
     assert read(message) is message
 
 
-def test_bytes_that_are_no_message_are_refused() -> None:
+def test_bytes_that_are_not_a_message_are_refused() -> None:
     point = JointTrajectoryPoint(positions=[1.0])
     messages = {
         joint_state_reader(): JointState(name=["one"], position=[1.0], velocity=[2.0], effort=[3.0]),
@@ -81,7 +81,7 @@ def test_bytes_that_are_no_message_are_refused() -> None:
     for read, message in messages.items():
         whole = serialize_message(message)
         read(whole)
-        text = 16 if isinstance(message, TFMessage) else 12  # where the length of the first text is
+        text = 16 if isinstance(message, TFMessage) else 12  # The length of the first text is here.
         endless = whole[:text] + b"\xff\xff\xff\x7f" + whole[text + 4 :]
         for data in (whole[:24], endless, b"\x00\x00" + whole[2:], b""):
             with pytest.raises(SerdeError):
@@ -106,7 +106,7 @@ def test_a_trajectory_of_the_output_is_written_and_read_as_by_rclpy(robot: Robot
 
 
 @pytest.mark.parametrize("count", [0, 2])
-def test_a_trajectory_of_another_number_of_points_has_as_many(count: int) -> None:
+def test_a_trajectory_with_another_number_of_points_keeps_that_number(count: int) -> None:
     points = [JointTrajectoryPoint(positions=[1.0 * n]) for n in range(count)]
     message = JointTrajectory(joint_names=["a"], points=points)
     assert len(trajectory_reader()(serialize_message(message)).points) == count
@@ -125,7 +125,7 @@ def test_poses_are_written_and_read_as_by_rclpy(frame: str, t: float) -> None:
     np.testing.assert_allclose(read.numbers, read_pose(expected).numbers, atol=1e-15)
 
 
-def test_transforms_of_many_senders_are_told_apart() -> None:
+def test_transforms_of_many_senders_are_distinguished() -> None:
     read = transforms_reader()
     for _ in range(3):
         for links in (["a"], ["b"], ["a", "bc"], ["ab", "c"], []):

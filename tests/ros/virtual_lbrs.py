@@ -1,4 +1,4 @@
-"""The node ``cartesian_controller`` between two KUKA drivers and an operator, in a time of their own.
+"""The node ``cartesian_controller`` between two KUKA drivers and an operator, in virtual time.
 
 The node's callbacks are called directly: no message crosses a network, and nothing depends on how busy the machine is.
 """
@@ -36,13 +36,13 @@ from q2r2_control.types import SIDES, Array
 from tests.ros.fake_lbr import PERIOD, TAU, TOPICS, FakeLbr
 from tests.support.external_cell import external
 
-_TARGETS = 0.01  # between two of the operator's [s]
-_SOON, _LATE_SHARE = 0.002, 0.01  # delivery of messages [s], and how many take longer
-_LATE = 0.25 * TAU  # at most: the filter's time constant bounds what the driver bears [s]
+_TARGETS = 0.01  # Time between two targets of the operator [s].
+_SOON, _LATE_SHARE = 0.002, 0.01  # Delivery time of messages [s], and share of messages that take longer.
+_LATE = 0.25 * TAU  # Largest delay [s]. The filter's time constant bounds what the driver tolerates.
 
 
 def lbr_cell(folder: Path) -> str:
-    """A file with the shipped cell behind a driver for each arm."""
+    """Return a file with the shipped cell behind a driver for each arm."""
     cell = external()
     arms = {
         arm: {
@@ -58,7 +58,7 @@ def lbr_cell(folder: Path) -> str:
 
 
 class DirectPublisher:
-    """In place of a :class:`WatchedPublisher`: what is sent is delivered at once."""
+    """A replacement for :class:`WatchedPublisher` that delivers at once."""
 
     def __init__(self, node: Any, kind: type, topic: str, timeout: float) -> None:
         self.topic_name, self.sent = topic, 0
@@ -75,7 +75,7 @@ class DirectPublisher:
         return True
 
     def begin(self, acknowledged: bool = False) -> None:
-        """There are no acknowledgements."""
+        """Begin without acknowledgements."""
 
     def waits(self) -> bool:
         return False
@@ -85,20 +85,21 @@ class DirectPublisher:
 
 
 class VirtualLbrs:
-    """The controller's node and a driver for each arm, in virtual time; each has its own clock."""
+    """The controller's node and a driver for each arm in virtual time. Each has its own clock."""
 
     def __init__(self, node: CartesianControllerNode, robot: Robot, release: str, seed: int) -> None:
         self.node, self.robot, self.random = node, robot, np.random.default_rng(seed)
         self.drivers = {arm: FakeLbr(robot, arm) for arm in SIDES}
         self.now = 1.0  # [s]
         self._clock: Any = node.get_clock()
-        self.frozen_until = 0.0  # the node [s]
-        self.change: Callable[[str, Any], Any] = lambda topic, message: message  # of what drivers say; None: it is lost
+        self.frozen_until = 0.0  # Time until which the node is frozen [s].
+        # Changes messages of drivers; None loses them.
+        self.change: Callable[[str, Any], Any] = lambda topic, message: message
         self.on_command: Callable[[str, Array], None] = lambda arm, q: None
         self._queue: list[tuple[float, int, Callable[[], None]]] = []
         self._numbers = itertools.count()
-        self._last: dict[str, float] = {}  # delivery on each topic [s]
-        self._waiting: list[Callable[[], None]] = []  # messages for a frozen node
+        self._last: dict[str, float] = {}  # Last delivery on each topic [s].
+        self._waiting: list[Callable[[], None]] = []  # Messages for a frozen node.
         self._callbacks = {one.topic_name: one.callback for one in node.subscriptions}
         command, self._state = TOPICS[release]
         outputs: dict[str, Any] = {one.publisher.topic_name: one.publisher for one in node._output._channels}
@@ -118,7 +119,7 @@ class VirtualLbrs:
             act()
 
     def target(self, arm: str, pose: pin.SE3) -> None:
-        """Of the operator, who sends in order and at once."""
+        """Send a target of the operator, in order and at once."""
         received = int(1e9 * self.now)
         info = {"publication_sequence_number": None, "source_timestamp": received, "received_timestamp": received}
         take = self._callbacks[f"/q2r2/{arm}/target_frame"]
@@ -138,7 +139,7 @@ class VirtualLbrs:
         self.at(start, partial(again, 0))
 
     def _sent(self, topic: str, act: Callable[[], None]) -> None:
-        """Messages of a topic arrive in order, mostly within 2 ms."""
+        """Deliver messages of a topic in order, mostly within 2 ms."""
         longest = _LATE if self.random.random() < _LATE_SHARE else _SOON
         self._last[topic] = max(self._last.get(topic, 0.0), self.now + float(self.random.uniform(1e-4, longest)))
         self.at(self._last[topic], act)
@@ -173,12 +174,12 @@ class VirtualLbrs:
 
 
 class Operator:
-    """Presses again a moment after both arms are ready, and lets go a moment after they are not."""
+    """An operator who presses a moment after both arms are ready, and lets go a moment after they are not."""
 
     def __init__(self, virtual: VirtualLbrs) -> None:
         self._virtual, self._random = virtual, virtual.random
         self.moves = False
-        self.not_before = 0.0  # the next press [s]
+        self.not_before = 0.0  # Earliest time of the next press [s].
         self._began = self._ready_since = 0.0
         self._starts: dict[str, pin.SE3] = {}
         self._ways: dict[str, tuple[Array, Array, float]] = {}
@@ -194,7 +195,8 @@ class Operator:
         elif not self.moves and ready and virtual.now >= self.not_before and random.random() < 0.1:
             self.moves, self._began = True, virtual.now
             self._starts = {arm: virtual.robot.tool_pose(virtual.measured(), arm) for arm in SIDES}
-            far = random.random() < 0.3  # out of reach, to the joints' ends, or as fast as they go
+            # The target is out of reach, at joint limits, or as fast as the joints can move.
+            far = random.random() < 0.3
             scale = (0.8, 1.5) if far else (0.12, 0.3)
             self._ways = {
                 arm: (scale[0] * random.uniform(-1, 1, 3), scale[1] * random.uniform(-1, 1, 3), random.uniform(0.3, 1))
@@ -219,7 +221,7 @@ def virtual_lbrs(release: str, domain: int, seed: int = 0) -> Iterator[VirtualLb
         try:
             with patch.object(joint_outputs, "WatchedPublisher", DirectPublisher):
                 node = CartesianControllerNode()
-            node.get_logger().set_level(LoggingSeverity.FATAL)  # a session's end is none
+            node.get_logger().set_level(LoggingSeverity.FATAL)  # The end of a session is not a fault of the test.
             yield VirtualLbrs(node, Robot.from_config(load_config(cell)), release, seed)
             node.get_logger().set_level(LoggingSeverity.UNSET)
             node.destroy_node()

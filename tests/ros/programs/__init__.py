@@ -1,1 +1,1 @@
-"""Programs that tests start as processes of their own: ``python -m tests.ros.programs.<name>``."""
+"""Programs that tests start as separate processes: ``python -m tests.ros.programs.<name>``."""

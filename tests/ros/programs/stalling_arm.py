@@ -1,4 +1,4 @@
-"""The left arm's node, which at SIGUSR1 stands still for a while in the middle of a tick, its target decided on."""
+"""The left arm's node, which stands still at SIGUSR1 in the middle of a tick, after it has computed its target."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 from q2r2_control.ros.base_node import run_node
 from q2r2_control.ros.nodes.arm_controllers import LeftArmController
 
-STALL = 3.0  # more than the timeouts of the tests' arm rig [s]
+STALL = 3.0  # The stall is longer than the timeouts of the tests' arm rig [s].
 
 
 class StallingArm(LeftArmController):
