@@ -1,4 +1,4 @@
-"""A run's figures: what they mean, that they are numbers, and that they are right."""
+"""The figures of a run: their meaning, that they are numbers, and that they are right."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from q2r2_control.types import SIDES, ArmTarget, StepReport, StepStatus, moved_b
 from tests.support.processes import cell
 from tests.viewer.conftest import tick_at
 
-# Scripts and dashboards rely on these.
+# Scripts and dashboards rely on these keys.
 KEYS = (
     "ticks duration_s loop_rate_hz real_time_factor tick_us lateness_us input_to_command_ms arms min_distance_mm "
     "closest_pair max_velocity_ratio max_acceleration_ratio min_position_margin_rad fallback_ticks uncertified_ticks "
@@ -44,7 +44,7 @@ def statistics() -> RunStatistics:
 def add(
     statistics: RunStatistics, *, error: pin.SE3 | None = None, target: ArmTarget | None = None, **changes: Any
 ) -> None:
-    """One tick of 1 ms at home, both arms engaged when there is an ``error`` of the tool against its target.
+    """Add a tick of 1 ms at home. Both arms are engaged if the tool has an ``error`` relative to its target.
 
     ``changes``: of the tick's record, or of its reference.
     """
@@ -69,7 +69,7 @@ def test_the_largest_slip_of_an_engagement_is_reported(statistics: RunStatistics
     assert figures["left"].slip_deg_max == pytest.approx(60.0)
 
 
-def test_how_long_a_gripper_was_held_is_reported_with_the_last_pair_that_did(statistics: RunStatistics) -> None:
+def test_the_time_for_which_a_gripper_was_held_is_reported_with_the_last_pair(statistics: RunStatistics) -> None:
     for held in ({"left": ("left_finger", "table")}, {"left": ("left_finger", "right_link_5")}, {}):
         add(statistics, held_grippers=held, dt=0.25)
     figures = statistics.summary(1.0).arms
@@ -77,7 +77,7 @@ def test_how_long_a_gripper_was_held_is_reported_with_the_last_pair_that_did(sta
     assert (figures["right"].gripper_held_s, figures["right"].gripper_held_by) == (0.0, None)
 
 
-def test_a_run_s_json_has_every_key_that_others_read() -> None:
+def test_the_json_of_a_run_has_every_key_that_others_read() -> None:
     loop = Pipeline.from_config(cell(), input=ScriptedInput("circle"), plant="kinematic")
     data = json.loads(json.dumps(loop.run(1.0, realtime=False).as_json(), allow_nan=False))
     assert " ".join(data) == KEYS
@@ -91,7 +91,7 @@ def test_a_run_s_json_has_every_key_that_others_read() -> None:
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-7, 0.5, 3.0, np.pi], ids="{:g} rad".format)
-def test_the_angle_of_a_rotation_error_is_exact_from_none_to_half_a_turn(
+def test_the_angle_of_a_rotation_error_is_exact_from_zero_to_half_a_turn(
     statistics: RunStatistics, angle: float
 ) -> None:
     add(statistics, error=pin.SE3(pin.exp3(np.array([0.0, 0.0, angle])), np.zeros(3)))
@@ -99,7 +99,7 @@ def test_the_angle_of_a_rotation_error_is_exact_from_none_to_half_a_turn(
     assert found == pytest.approx(np.degrees(angle), abs=1e-7)
 
 
-def test_no_tick_at_all_makes_valid_json(statistics: RunStatistics) -> None:
+def test_a_run_without_ticks_gives_valid_json(statistics: RunStatistics) -> None:
     summary = statistics.summary(0.0)
     assert summary.arms["left"].position_error_mm_rms is summary.min_distance_mm is summary.closest_pair is None
     assert (summary.ticks, summary.duration_s, summary.loop_rate_hz) == (0, 0.0, 0.0)
@@ -118,13 +118,13 @@ def test_errors_are_root_mean_squares_over_the_engaged_ticks(statistics: RunStat
     assert figures.rotation_error_deg_rms == pytest.approx(np.degrees(np.sqrt(0.00025)))
 
 
-def test_a_gripper_s_changes_are_counted_not_its_first_opening(statistics: RunStatistics) -> None:
+def test_changes_of_a_gripper_are_counted_but_not_its_first_opening(statistics: RunStatistics) -> None:
     for gripper in (0.0, 0.0, 1.0, 1.0, 0.0):
         add(statistics, target=ArmTarget(None, gripper))
     assert statistics.summary(1.0).arms["right"].gripper_changes == 2
 
 
-def test_ratios_and_margin_are_the_worst_of_all_ticks_against_the_limits_in_force() -> None:
+def test_ratios_and_margin_are_the_worst_of_all_ticks_relative_to_the_limits_in_force() -> None:
     control = cell().control.model_copy(update={"velocity_scale": 0.5, "acceleration_limit": 4.0})
     statistics = RunStatistics(Robot.from_config(cell()), control)
     add(statistics, v=-0.25 * statistics.robot.velocity_limit, a=np.full(14, -3.0))
@@ -139,7 +139,7 @@ def test_ratios_and_margin_are_the_worst_of_all_ticks_against_the_limits_in_forc
 
 def test_an_acceleration_counts_against_the_limit_of_its_joint(statistics: RunStatistics) -> None:
     a = np.zeros(14)
-    a[[0, 8]] = 3.0, -2.72  # A1 of the left arm, A2 of the right one, which may do less
+    a[[0, 8]] = 3.0, -2.72  # The joints are A1 of the left arm and A2 of the right one, whose limit is lower.
     add(statistics, a=a)
     assert statistics.summary(1.0).max_acceleration_ratio == pytest.approx(2.72 / 5.44)
 
@@ -155,7 +155,7 @@ def test_counts_and_the_closest_pair_come_from_the_reports(statistics: RunStatis
 
 
 @pytest.mark.parametrize(("speed", "at_rest"), [(0.0, True), (0.01, False)])
-def test_whether_the_run_ended_at_rest(statistics: RunStatistics, speed: float, at_rest: bool) -> None:
+def test_the_summary_says_whether_the_run_ended_at_rest(statistics: RunStatistics, speed: float, at_rest: bool) -> None:
     add(statistics, v=np.full(14, 0.5))
     add(statistics, v=np.full(14, -speed))
     assert statistics.summary(1.0).at_rest is at_rest
@@ -180,7 +180,7 @@ def summary() -> TorqueSummary:
     return TorqueSummary({"left": 0.0, "right": 0.0})
 
 
-def test_extremes_are_kept_and_ticks_are_counted_once_however_many_joints(summary: TorqueSummary) -> None:
+def test_extremes_are_kept_and_each_tick_counts_once_for_any_number_of_joints(summary: TorqueSummary) -> None:
     pressed = replace(FREE, pressing=(HANDS, ELBOWS), force=30.0, closest_pair=HANDS, closest_distance=0.015)
     summary.add(0.002, replace(QUIET, saturated=("left_A1", "left_A2"), clipped=("right",)), pressed)
     summary.add(0.002, replace(QUIET, rate_limited=("left_A1",), clipped=("right",)), replace(pressed, force=20.0))
@@ -193,7 +193,7 @@ def test_extremes_are_kept_and_ticks_are_counted_once_however_many_joints(summar
     assert summary.off_reference_s == {"left": 0.0, "right": pytest.approx(0.004)}
 
 
-def test_a_distance_that_was_not_measured_is_no_distance(summary: TorqueSummary) -> None:
+def test_an_unmeasured_distance_is_not_reported(summary: TorqueSummary) -> None:
     blind = replace(QUIET, held=True), replace(FREE, closest_pair=("", ""), closest_distance=math.nan)
     summary.add(0.001, *blind)
     summary.add(0.001, QUIET, replace(FREE, closest_pair=("", ""), closest_distance=math.inf))
@@ -204,7 +204,7 @@ def test_a_distance_that_was_not_measured_is_no_distance(summary: TorqueSummary)
 
 
 @pytest.mark.parametrize("size", [1, 2, 99, 5000])
-def test_percentiles_are_numpy_s_to_a_thousandth_of_the_unit(size: int) -> None:
+def test_percentiles_equal_those_of_numpy_to_a_thousandth_of_the_unit(size: int) -> None:
     values = np.random.default_rng(size).exponential(3e-4, size)
     histogram = Histogram(1e-3)
     for value in values:
