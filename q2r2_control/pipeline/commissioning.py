@@ -1,4 +1,4 @@
-"""Measurements of a commissioning, of arms that are led slowly: joints, loads, stops. Each has a stated bound."""
+"""Measurements of a commissioning with slowly led arms: joints, loads, stops. Each has a stated bound."""
 
 from __future__ import annotations
 
@@ -14,29 +14,30 @@ from q2r2_control.robot.load import LEAST_POSTURES, MODEL, PENDANT, LoadReport, 
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
-_STEP = np.radians(1.17)  # of a joint, of which the way leaves 0.17 degrees
-_REACHED, _BEHIND = 0.2, 0.8  # how far a measured joint may be from the commanded one, at rest and on the way [deg]
-# Of A2 .. A7 about the first posture; turning A1 changes no torque [rad].
+_STEP = np.radians(1.17)  # Commanded step of a joint, 0.17 degrees of which may be missing.
+# Largest distance of a measured joint from the commanded one, at rest and on the way [deg].
+_REACHED, _BEHIND = 0.2, 0.8
+# Displacements of A2 .. A7 from the first posture; turning A1 changes no torque [rad].
 _SPREAD = np.array([0.0, 0.1, 0.2, 0.25, 0.4, 0.5, 0.5])
 _TRIES = 40
-LED = 2.0  # upwards before the hand lets go [s]
+LED = 2.0  # Time of the upward motion before the hand lets go [s].
 _LATENCY = 0.15  # Longest time from when a hand lets go until the arm brakes: the time-out of a silent hand [s].
-LEAST_SPEED = 0.01  # of the tool, to be stopped from [m/s]
-_STANDS = 1e-3  # joints that are nearer to where they come to rest [rad]
+LEAST_SPEED = 0.01  # Least speed of the tool from which a stop is measured [m/s].
+_STANDS = 1e-3  # Joints nearer than this to their place of rest count as resting [rad].
 
 
 @dataclass(frozen=True, slots=True)
 class JointMotion:
-    """A joint that was commanded a degree away and back."""
+    """The motion of a joint that was commanded a degree away and back."""
 
     joint: str
     commanded_deg: float
     measured_deg: float
-    behind_deg: float  # the most on the way
-    others_deg: float  # the most that another joint has moved
+    behind_deg: float  # Largest lag on the way.
+    others_deg: float  # Largest motion of another joint.
 
     def check(self) -> JointMotion:
-        """Itself. Raises :class:`PlantError` for a joint that did not follow, or not alone."""
+        """Return this report. Raises :class:`PlantError` for a joint that did not follow, or did not move alone."""
         off = abs(self.measured_deg - self.commanded_deg)
         if off > _REACHED or self.behind_deg > _BEHIND or self.others_deg > _REACHED:
             raise PlantError(
@@ -48,7 +49,7 @@ class JointMotion:
 
 
 def measure_joint(run: SlowRun, joint: int) -> JointMotion:
-    """Lead ``joint``, an index of ``Robot.joint_names``, a degree towards its middle and back, and check."""
+    """Lead ``joint``, an index of ``Robot.joint_names``, a degree towards its middle and back, and check the motion."""
     robot, start = run.robot, run.reference
     goal = start.copy()
     middle = 0.5 * (robot.position_lower + robot.position_upper)[joint]
@@ -71,15 +72,15 @@ def measure_joint(run: SlowRun, joint: int) -> JointMotion:
 
 
 class LoadSurvey:
-    """Leads all arms through postures about the one that they rest in, and finds what each carries."""
+    """Leads all arms through postures near their posture of rest, and finds the load of each."""
 
     def __init__(self, run: SlowRun) -> None:
         self._run, self._start = run, run.reference
         self._goals = _postures(run.robot, self._start)
-        self._rests: list[Array] = []  # (3, nv) posture [rad], torque, external torque [Nm] of each
+        self._rests: list[Array] = []  # For each, (3, nv): posture [rad], torque and external torque [Nm].
 
     def measure(self) -> list[LoadReport] | None:
-        """Of each arm, against its model and against the pendant; None where the cabinets measure no torques.
+        """Return the load of each arm, compared with model and pendant; None if the cabinets measure no torques.
 
         Where it raises :class:`PlantError`, the next call goes on with the next posture.
         """
@@ -105,7 +106,7 @@ class LoadSurvey:
 
 
 def _postures(robot: Robot, start: Array) -> Iterator[Array]:
-    """Goals (nv,) about ``start``, the same at every time."""
+    """Yield goals (nv,) near ``start``, which are the same each time."""
     random = np.random.default_rng(0)
     for _ in range(_TRIES):
         goal = start.copy()
@@ -116,18 +117,18 @@ def _postures(robot: Robot, start: Array) -> Iterator[Array]:
 
 @dataclass(frozen=True, slots=True)
 class StopReport:
-    """An arm that stopped as its hand let go, or as the program was killed."""
+    """The stop of an arm after its hand let go, or after the program was killed."""
 
     arm: str
     cause: str
     tool_speed_mm_s: float
     stopped_mm: float
-    allowed_mm: float  # by the certified stop, after the latency
+    allowed_mm: float  # Largest distance of the certified stop, after the latency.
     stopped_s: float
     allowed_s: float
 
     def check(self) -> StopReport:
-        """Itself. Raises :class:`PlantError` for a stop that was longer or later than it may be."""
+        """Return this report. Raises :class:`PlantError` for a stop that was too long or too late."""
         if self.tool_speed_mm_s < 1e3 * LEAST_SPEED:
             raise PlantError(f"the {self.arm} arm did not go up; begin where its tool has 100 mm of room above it")
         if self.stopped_mm > self.allowed_mm or self.stopped_s > self.allowed_s:
@@ -140,12 +141,12 @@ class StopReport:
 
 
 def measure_stop(run: SlowRun, arm: str) -> StopReport:
-    """Let a hand lead ``arm`` upwards and let go, as an operator's does, and check."""
+    """Let a hand lead ``arm`` upwards and let go, like an operator's hand, and check the stop."""
     return let_go_report(run.robot, arm, run.let_go([arm], LED)).check()
 
 
 def let_go_report(robot: Robot, arm: str, moments: list[Moment]) -> StopReport:
-    """Of ``moments`` in which ``arm`` was led by a hand, and came to rest."""
+    """Return the report on ``moments`` in which a hand led ``arm`` until the arm came to rest."""
     led = [index for index, moment in enumerate(moments) if moment.engaged[arm]]
     if not led:
         raise PlantError(f"the {arm} arm did not follow the hand")
@@ -159,7 +160,7 @@ def let_go_report(robot: Robot, arm: str, moments: list[Moment]) -> StopReport:
 def stop_report(
     robot: Robot, arm: str, cause: str, last: Moment, released: Array, rest: Array, took: float
 ) -> StopReport:
-    """Of an ``arm`` that was led until the moment ``last``, and then ``took`` so long [s] to come to rest.
+    """Return the report on an ``arm`` that was led until the moment ``last``, and then ``took`` this time [s] to rest.
 
     ``released`` and ``rest`` (nv,): measured joints as it began to stop, and afterwards [rad].
     """
@@ -180,6 +181,6 @@ def stop_report(
 
 
 def tool_speed(robot: Robot, arm: str, moment: Moment) -> float:
-    """Of the reference, as the next 10 ms show it [m/s]."""
+    """Return the speed of the reference during the next 10 ms [m/s]."""
     at, ahead = (robot.tool_pose(q, arm).translation for q in (moment.reference, moment.reference + 0.01 * moment.v))
     return float(100.0 * np.linalg.norm(ahead - at))

@@ -21,12 +21,12 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
 _LOOKS = 0.005  # [s]
-_PATIENCE = 5.0  # for the ports to be released [s]
-_FREEING = 0.5  # for the system to free the memory of a program that is killed, before anybody sees its end [s]
+_PATIENCE = 5.0  # Longest time until the ports are released [s].
+_FREEING = 0.5  # Time in which the system frees the memory of a killed program, before its end can be seen [s].
 
 
 def main(requests: Iterator[Config], answer: Callable[[Any], None]) -> None:
-    """In the process that is killed: lead all arms of each cell upwards, and answer every moment."""
+    """Lead all arms of each cell upwards, and answer every moment. This runs in the process that is killed."""
     for config in requests:
         with SlowRun(config, FriPlant, listener=answer) as run:
             run.let_go(list(run.robot.arms), 1.5 * LED)
@@ -34,7 +34,7 @@ def main(requests: Iterator[Config], answer: Callable[[Any], None]) -> None:
 
 
 def measure_kill(config: Config, posture: Callable[[], Array], led: float = LED) -> list[StopReport]:
-    """Kill a run after its tools have gone up for ``led`` [s]; how each stopped, which nothing has checked yet.
+    """Kill a run after its tools have moved up for ``led`` [s], and return the unchecked report of each arm's stop.
 
     ``posture`` is called when nothing commands the arms any more, and returns where they rest (nv,) [rad]. Raises
     :class:`PlantError` where the arms do not go up.
@@ -45,7 +45,7 @@ def measure_kill(config: Config, posture: Callable[[], Array], led: float = LED)
     process = HelperProcess("leads the arms", __name__, moments.append)
     process.send(config)
     try:
-        # A loop that was late lately goes up slower than a stop can be measured from.
+        # After a late loop, an arm may move up too slowly for a measurement of its stop.
         while _led(moments) < led or not _goes_up(robot, moments[-1]):
             if not process.alive:
                 raise PlantError(process.fault or "the arms did not follow the hands")
@@ -65,12 +65,12 @@ def measure_kill(config: Config, posture: Callable[[], Array], led: float = LED)
 
 
 def _goes_up(robot: Robot, moment: Moment) -> bool:
-    """Whether all tools are fast enough for a stop that can be measured."""
+    """Return whether all tools are fast enough for a stop that can be measured."""
     return min(tool_speed(robot, arm, moment) for arm in robot.arms) >= LEAST_SPEED
 
 
 def _led(moments: list[Moment]) -> float:
-    """For how long all arms have followed their hands by now [s]."""
+    """Return how long all arms have followed their hands by now [s]."""
     if not moments or not all(moments[-1].engaged.values()):
         return 0.0
     begun = next((moment for moment in moments if all(moment.engaged.values())), moments[-1])

@@ -1,4 +1,4 @@
-"""The operator's side of one run: input, teleop layer, way home, what a program asks for, vibrations and log."""
+"""The operator's side of one run: input, teleop layer, way home, requests of a program, vibrations and log."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from q2r2_control.teleop.teleop import Teleop
 from q2r2_control.types import ActionChunk, ArmTarget, HandSample, Observation
 from q2r2_control.wording import event_line, sentence
 
-_PERIOD = 0.02  # of looking at more of an arm than its events [s]
+_PERIOD = 0.02  # Period in which more of an arm than its events is examined [s].
 _logger = logging.getLogger(__name__)
 
 
@@ -48,21 +48,21 @@ class OperatorSide:
     ) -> None:
         self._teleop, self._input, self._supervisor = teleop, source, supervisor
         self._policy = source if isinstance(source, PolicySource) else None
-        self.chunks: list[ActionChunk] = []  # of a policy, since the last poll
-        self._feels = getattr(source, "feels", True)  # False: there is no device that could vibrate
+        self.chunks: list[ActionChunk] = []  # Chunks of a policy since the last poll.
+        self._feels = getattr(source, "feels", True)  # False if no device can vibrate.
         self._controller, self._requests, self._impedance = controller, requests, impedance
-        self._homing = False  # supervision is on the way home
-        self._in_the_way: frozenset[str] = frozenset()  # moving obstacles, at their last report
+        self._homing = False  # True while supervision is on the way home.
+        self._in_the_way: frozenset[str] = frozenset()  # Moving obstacles that were in the way at their last report.
         self.connected = False
         arms = controller.robot.arms
         self._conditions = ArmConditions(controller)
         self._pulses = {arm: HapticPulses(teleop.settings.haptics) for arm in arms}
         self._grips = {arm: Grip(arms[arm].stroke) for arm in arms}
-        # One arm after the other: both in one tick would make that tick a long one.
+        # Only one arm is examined in a tick, because both would make that tick long.
         self._turns, self._wait, self._due = cycle(arms), _PERIOD / len(arms), -np.inf
 
     def poll(self, now: float) -> list[HandSample]:
-        """Samples of the hands; a connection that is lost stops the arms that hands drive."""
+        """Take samples of the hands. A lost connection stops the arms that hands drive."""
         samples = check_samples(self._input.poll(now))
         self.chunks = [] if self._policy is None else self._policy.chunks()
         was_connected, self.connected = self.connected, self._input.connected
@@ -71,11 +71,11 @@ class OperatorSide:
         return samples
 
     def targets(self, samples: list[HandSample], tools: Mapping[str, pin.SE3], now: float) -> dict[str, ArmTarget]:
-        """The operator's targets for the arms; see :meth:`Teleop.update`."""
+        """Return the operator's targets for the arms; see :meth:`Teleop.update`."""
         if self._requests:
             self._fulfil(now)
         commanded = {arm: self._controller.tool_pose(arm) for arm in tools}
-        # Arms whose plant ended its session wait for the next one, and a press is refused meanwhile.
+        # Arms whose plant ended its session wait for the next one. Meanwhile, a press is refused.
         waits = self._supervisor.phase is not Phase.ACTIVE and self._supervisor.fault
         obstacles = dict.fromkeys(tools, waits) if waits else None
         targets = self._teleop.update(samples, tools, now, commanded, obstacles, chunks=self.chunks)
@@ -83,17 +83,17 @@ class OperatorSide:
         return targets
 
     def take_events(self, start: float) -> list[Event]:
-        """Events of the arms since the last call, by the time since ``start`` [s]; they are logged."""
+        """Return and log the events of the arms since the last call, with times since ``start`` [s]."""
         events = [replace(event, t=event.t - start) for event in self._teleop.take_events()]
         for event in events:
-            if is_fault(event) and event.kind is not ReasonKind.RECORDING_ENDED:  # which the recorder has logged
+            if is_fault(event) and event.kind is not ReasonKind.RECORDING_ENDED:  # The recorder has logged this fault.
                 _logger.warning("%s arm: %s", event.arm, sentence(event.reason))
             elif _logger.isEnabledFor(logging.DEBUG):
                 _logger.debug("%s arm: %s -> %s", event.arm, event.source, event_line(event))
         return events
 
     def feed_back(self, tick: Tick) -> None:
-        """Send the vibrations of one tick to the hands, and what a policy may see of it."""
+        """Send the vibrations of one tick to the hands, and give a policy the state that it may see."""
         now = tick.now
         if self._policy is not None:
             self._policy.observe(Observation(now, tick.state, tick.openings, tick.tools))
@@ -102,7 +102,7 @@ class OperatorSide:
         for event in tick.events:
             self._pulses[event.arm].start_pulse(event)
         self._conditions.note(tick.reference.report, now)
-        self._due = max(self._due, now - _PERIOD + self._wait)  # each arm once at most
+        self._due = max(self._due, now - _PERIOD + self._wait)  # Each arm is examined at most once.
         while now >= self._due:
             self._due += self._wait
             self._inspect(next(self._turns), tick)
@@ -119,7 +119,7 @@ class OperatorSide:
             pulses.grasps(self._grips[arm].look(commanded, opening, tick.now))
 
     def _fulfil(self, now: float) -> None:
-        for _ in range(len(self._requests)):  # those of now, however fast others come
+        for _ in range(len(self._requests)):  # Only present requests are done, even if others come fast.
             request = self._requests.popleft()
             if isinstance(request, TeleopSettings):
                 request = change_of(self._teleop.settings, request)
@@ -127,7 +127,7 @@ class OperatorSide:
             self._do(request, now)
 
     def _do(self, request: Reason, now: float) -> None:
-        """Do what a program asks for; what became of a recording is an event only."""
+        """Do what a program asks for. The outcome of a recording is only an event."""
         match request.kind:
             case ReasonKind.HOME_REQUESTED:
                 self._teleop.home(now)
@@ -167,7 +167,7 @@ class OperatorSide:
         self._teleop.record_event(now, outcome)
 
     def _go_home(self, now: float) -> None:
-        """Begin and end the way home as the operator asks, and tell the operator how it ended."""
+        """Begin and end the way home as the operator asks, and report how it ended."""
         asked, homing = self._teleop.homing, self._supervisor.homing
         if asked and not self._homing:
             refusal = self._supervisor.go_home()

@@ -19,7 +19,7 @@ from q2r2_control.inputs.base import Input
 
 
 class RequestedRun:
-    """The requests to a run. Each waits as the reason that is recorded, or as the settings that it is made of."""
+    """The requests to a run. Each waits as the reason that is recorded, or as the settings from which it is made."""
 
     config: Config
     input: Input
@@ -30,11 +30,14 @@ class RequestedRun:
 
     @property
     def impedance(self) -> ImpedanceController | None:
-        """Of torque mode."""
+        """The impedance, which exists only in torque mode."""
         return self.drive.impedance if isinstance(self.drive, TorqueDrive) else None
 
     def go_home(self) -> None:
-        """Bring both arms home, as an operator may; from any thread. Any press ends it; events say how it went."""
+        """Bring both arms home, as an operator may
+
+        from any thread. Any press ends it, and events report the result.
+        """
         self.requests.append(Reason(ReasonKind.HOME_REQUESTED))
 
     def pause(self) -> None:
@@ -42,7 +45,7 @@ class RequestedRun:
         self.requests.append(Reason(ReasonKind.PAUSE_REQUESTED))
 
     def engage(self) -> None:
-        """Press for both hands what engages their arms, with all that a press needs and does; from any thread."""
+        """Press for both hands the controls that engage their arms, with all conditions of a press; from any thread."""
         self.requests.append(Reason(ReasonKind.ENGAGE_REQUESTED))
 
     def give_back(self) -> None:
@@ -59,7 +62,7 @@ class RequestedRun:
         self.requests.append(Reason.of(ReasonKind.RECORDING_REQUESTED, action=str(action)))
 
     def change_teleop(self, settings: TeleopSettings) -> None:
-        """Other settings of the operator's for the rest of this run, without a jump; from any thread.
+        """Change settings of the operator for the rest of this run, without a jump; from any thread.
 
         :meth:`Teleop.change` says when they count, and an event whether they did. Raises :class:`ConfigError` for a
         binding to a control that the input lacks.
@@ -69,7 +72,7 @@ class RequestedRun:
         self.requests.append(settings)
 
     def change_control(self, values: Mapping[str, float]) -> None:
-        """Other settings of the controller, by name, for the rest of this run, without a jump; from any thread.
+        """Change settings of the controller by name for the rest of this run, without a jump; from any thread.
 
         In torque mode those of ``LIVE_IMPEDANCE`` too. :meth:`CartesianController.change` and
         :meth:`ImpedanceController.change` say how they come to count, and an event whether they did. Raises
@@ -82,7 +85,7 @@ class RequestedRun:
         self.requests.append(Reason.of(ReasonKind.CONTROL_REQUESTED, changes=dict(values)))
 
     def move_obstacle(self, name: str, obstacle: MovingObstacle | None) -> None:
-        """Say where a moving obstacle is now, or that it is gone; from any thread.
+        """Report where a moving obstacle is now, or that it is gone; from any thread.
 
         :meth:`CartesianController.move_obstacle` says what follows, and an event names a pair that is in the way.
         Raises :class:`ConfigError` for a name that ``control.moving_obstacles`` lacks.
@@ -92,12 +95,12 @@ class RequestedRun:
         self.requests.append(Reason.of(ReasonKind.OBSTACLE_REPORTED, name=name, obstacle=given))
 
     def record_outcome(self, reason: Reason) -> None:
-        """Let the operator know what became of the recording or of an episode in it; from any thread."""
+        """Report the outcome of the recording, or of an episode in it, to the operator; from any thread."""
         check_kind("reason", reason, Reason, "a Reason")
         self.requests.append(reason)
 
 
-# Kinds of requests, which a replay asks for again; a recording that ended does not end again.
+# Kinds of requests that a replay repeats. The end of a recording is not repeated.
 REPEATED = {
     *(ReasonKind.HOME_REQUESTED, ReasonKind.PAUSE_REQUESTED, ReasonKind.POLICY_REQUESTED, ReasonKind.ENGAGE_REQUESTED),
     ReasonKind.OBSTACLE_REPORTED,
@@ -106,13 +109,13 @@ REPEATED = {
 
 
 def change_of(old: TeleopSettings, new: TeleopSettings) -> Reason:
-    """The request for other settings, by what is not as it is in the ``old`` ones."""
+    """Return the request for other settings, with the values that differ from the ``old`` ones."""
     changes = _difference(old.model_dump(mode="json"), new.model_dump(mode="json"))
     return Reason.of(ReasonKind.SETTINGS_REQUESTED, changes=changes)
 
 
 def changed(settings: TeleopSettings, changes: Mapping[str, Any]) -> TeleopSettings:
-    """The settings that such a request asks for. Raises :class:`ConfigError` for changes that are none."""
+    """Return the settings that such a request asks for. Raises :class:`ConfigError` for invalid changes."""
     return TeleopSettings.model_validate(_merged(settings.model_dump(mode="json"), changes))
 
 

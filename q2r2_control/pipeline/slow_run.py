@@ -1,4 +1,4 @@
-"""Arms led slowly, joint by joint or by a hand of the program's, while a person at a terminal looks on.
+"""Arms that are led slowly, joint by joint or by a hand of the program, while a person at a terminal watches.
 
 The pipeline runs in a thread of its own, with every promise of an ordinary run, and holds the arms between the motions.
 Its controller knows 5 % of the joints' speeds as their limits, so that nothing can ask for more.
@@ -33,16 +33,16 @@ from q2r2_control.supervision.supervisor import Phase
 from q2r2_control.types import SIDES, Array, HandInputs
 from q2r2_control.wording import sentence
 
-SPEED = 0.05  # of the joints' speeds
+SPEED = 0.05  # Share of the joints' speeds.
 HAND_SPEED = 0.03  # [m/s]
-_PATIENCE = 20.0  # for the cabinets to command, and for arms to come to rest [s]
-STILL, REST = 2e-3, 0.3  # joints at rest move less than this [rad] for so long [s]
+_PATIENCE = 20.0  # Longest time until the cabinets command, and until arms come to rest [s].
+STILL, REST = 2e-3, 0.3  # Joints at rest move less than this [rad] in this time [s].
 _LOOKS = 0.05  # [s]
-_RATE = 75.0  # of the hands [Hz]
+_RATE = 75.0  # Rate of the hands [Hz].
 
 
 class _Hands(PlayedInput):
-    """Both hands, at rest until they are held: then their arms are engaged, and go up."""
+    """Both hands, which rest until their buttons are held. Then their arms are engaged and move up."""
 
     def __init__(self) -> None:
         self.held: tuple[str, ...] = ()
@@ -58,20 +58,20 @@ class _Hands(PlayedInput):
 
 
 class Moment(NamedTuple):
-    """One tick. Joints are (nv,) [rad]."""
+    """The state in one tick. Joints are (nv,) [rad]."""
 
-    now: float  # by the loop's clock [s]
-    q: Array  # measured
-    tau: Array  # measured [Nm]
-    external: Array  # that the cabinet's model does not explain [Nm]; NaN where it does not tell
+    now: float  # Time by the loop's clock [s].
+    q: Array  # Measured positions.
+    tau: Array  # Measured torques [Nm].
+    external: Array  # Torques that the cabinet's model does not explain [Nm]; NaN if the cabinet does not report them.
     reference: Array
-    v: Array  # of the reference [rad/s]
-    deceleration: Array | None  # of the certified stop from there [rad/s^2]
-    engaged: dict[str, bool]  # arms that follow a hand
+    v: Array  # Velocities of the reference [rad/s].
+    deceleration: Array | None  # Deceleration of the certified stop from there [rad/s^2].
+    engaged: dict[str, bool]  # Arms that follow a hand.
 
 
 class SlowRun:
-    """A context in which the arms of ``plant`` are led. Leaving it brings them to rest, and closes the plant.
+    """A context manager that leads the arms of ``plant``. Leaving it brings them to rest, and closes the plant.
 
     Every method raises :class:`PlantError` where the arms do not do what they are asked to. It may be called again,
     unless the run :attr:`is_over`.
@@ -84,7 +84,7 @@ class SlowRun:
         realtime: bool = True,
         listener: Callable[[Moment], None] | None = None,
     ) -> None:
-        """``listener`` gets each tick's moment, in the loop's own thread."""
+        """Make a slow run; ``listener`` gets each tick's moment in the loop's own thread."""
         control = config.control.model_copy(update={"velocity_scale": SPEED})
         teleop = TeleopSettings(bindings=BindingSettings(lower=Action.NONE, grip=Action.DEAD_MAN))
         slow = config.model_copy(update={"control": control, "teleop": teleop})
@@ -96,11 +96,11 @@ class SlowRun:
         self._thread = Thread(target=self._run, args=(realtime,), name="slow run")
         self._listener = listener
         self._error: BaseException | None = None
-        self._goal: Array | None = None  # for the loop to take up
+        self._goal: Array | None = None  # The next goal, which the loop takes.
         self._newest: Moment | None = None
-        self._rest: Moment  # since which the arms rest
-        self._moments: list[Moment] | None = None  # of a motion that goes on
-        self._lost: Reason | None = None  # why the arms ceased to be commanded in it
+        self._rest: Moment  # The first moment of the present rest.
+        self._moments: list[Moment] | None = None  # The moments of a motion that goes on.
+        self._lost: Reason | None = None  # Why the arms were not commanded any more during the motion.
 
     def __enter__(self) -> SlowRun:
         self._thread.start()
@@ -117,23 +117,23 @@ class SlowRun:
         self._end_run()
 
     def _end_run(self) -> None:
-        with stop_on_signals(self._pipeline.stop):  # the arms come to rest first
+        with stop_on_signals(self._pipeline.stop):  # A signal brings the arms to rest first.
             self._pipeline.stop()
             self._thread.join()
 
     @property
     def reference(self) -> Array:
-        """Where the joints are led to by now (nv,) [rad]."""
+        """The present target of the joints (nv,) [rad]."""
         assert self._newest is not None
         return self._newest.reference
 
     @property
     def is_over(self) -> bool:
-        """Whether a fault has ended the run, so that nothing can be led any more."""
+        """True if a fault has ended the run, so that no arm can be led any more."""
         return not self._thread.is_alive()
 
     def lead_to(self, goal: Array) -> list[Moment] | None:
-        """Lead all joints straight to ``goal`` (nv,) [rad], and wait until the arms rest; all ticks from rest to rest.
+        """Lead all joints straight to ``goal`` (nv,) [rad] and wait for rest. Return all ticks from rest to rest.
 
         None: the straight way there is not free, and nothing has moved.
         """
@@ -150,7 +150,7 @@ class SlowRun:
         return self._end()
 
     def let_go(self, arms: Sequence[str], duration: float) -> list[Moment]:
-        """Let hands lead ``arms`` upwards for ``duration`` [s], and let go; all ticks from rest to rest."""
+        """Let hands lead ``arms`` upwards for ``duration`` [s] and let go. Return all ticks from rest to rest."""
         self._begin()
         self._hands.held = tuple(self._pipeline.teleop.hand_of(arm) for arm in arms)
         try:
@@ -182,14 +182,14 @@ class SlowRun:
 
     def _run(self, realtime: bool) -> None:
         try:
-            # A loop that never sleeps may not come first: it would leave nobody a processor.
+            # A loop that never sleeps must not have priority, because other threads would get no processor.
             with real_time() if realtime else nullcontext():
                 self._pipeline.run(realtime=realtime)
         except BaseException as error:
             self._error = error
 
     def _look(self, tick: Tick) -> None:
-        """In the loop's own thread, once a tick."""
+        """Observe a tick. This runs in the loop's own thread."""
         moment = Moment(
             tick.now,
             tick.state.q,
@@ -202,7 +202,8 @@ class SlowRun:
         )
         self._newest = moment
         if self._moments is not None:
-            if self._phase is not Phase.ACTIVE and self._lost is None:  # a session may be back before anybody looks
+            # The session may be back before the main thread notices its loss.
+            if self._phase is not Phase.ACTIVE and self._lost is None:
                 self._lost = self._pipeline.supervisor.fault
             self._moments.append(moment)
             moved = np.abs((moment.q - self._rest.q, moment.reference - self._rest.reference)).max()
@@ -216,7 +217,7 @@ class SlowRun:
 
     @property
     def _now(self) -> float:
-        """By the loop's clock, which moves the arms [s]."""
+        """Return the time of the loop's clock, which moves the arms [s]."""
         return 0.0 if self._newest is None else self._newest.now
 
     def _wait(self, until: Callable[[], bool]) -> None:
@@ -233,7 +234,7 @@ class SlowRun:
             time.sleep(_LOOKS)
 
     def _fail(self, otherwise: str) -> None:
-        """Raise :class:`PlantError` that says what has ended the run, or why the arms are not commanded."""
+        """Raise :class:`PlantError` with the reason why the run ended, or why the arms are not commanded."""
         while self._phase in (Phase.BRAKING, Phase.STOPPED) and not self.is_over:
             time.sleep(_LOOKS)
         if self.is_over:
@@ -243,5 +244,5 @@ class SlowRun:
 
 
 def resting(moments: list[Moment]) -> list[Moment]:
-    """Those at the end, in which the arms rested."""
+    """Return the last moments, in which the arms rested."""
     return [moment for moment in moments if moments[-1].now - moment.now <= REST]
