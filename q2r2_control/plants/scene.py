@@ -1,4 +1,4 @@
-"""Floor, sky and light of the simulated cell, and how obstacles and the fingers on them touch."""
+"""Floor, sky and light of the simulated cell, and the contacts of obstacles with fingers."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import mujoco
 from q2r2_control.config.cell import Config
 from q2r2_control.robot.floor import FLOOR
 
-# Geom groups: MuJoCo's viewers draw 0 to 2 and leave out the others until asked.
+# Geom groups. MuJoCo's viewers draw 0 to 2, and others only on request.
 VISUAL_GROUP, COLLISION_GROUP, ENVELOPE_GROUP = 2, 3, 4
 
 
@@ -32,7 +32,7 @@ def furnish(spec: mujoco.MjSpec, floor: bool) -> None:
     spec.visual.headlight.specular = (0.0, 0.0, 0.0)
     spec.visual.quality.shadowsize = 8192
     spec.visual.quality.offsamples = 8
-    # Large enough for any picture that is asked for.
+    # The size is sufficient for any picture.
     spec.visual.global_.offwidth, spec.visual.global_.offheight = 3840, 2160
     spec.visual.global_.azimuth, spec.visual.global_.elevation = 145, -20
     spec.stat.center, spec.stat.extent = (0.4, 0.0, 0.4), 1.6
@@ -58,12 +58,12 @@ def _add_floor(spec: mujoco.MjSpec, body: mujoco.MjsBody | None) -> None:
     if body is None:
         plane.contype, plane.conaffinity = 0, 0
         return
-    for box in body.geoms[:-1]:  # what the URDF has for want of planes
+    for box in body.geoms[:-1]:  # These boxes replace a plane in the URDF, which has none.
         spec.delete(box)
 
 
 def _add_lights(spec: mujoco.MjSpec) -> None:
-    """A lamp overhead that casts shadows, and a weak light from all over the other side that does not."""
+    """Add a lamp overhead that casts shadows, and a weak light from the other side that casts none."""
     spec.worldbody.add_light(
         name="lamp",
         type=mujoco.mjtLightType.mjLIGHT_SPOT,
@@ -85,25 +85,25 @@ def _add_lights(spec: mujoco.MjSpec) -> None:
     )
 
 
-# Of contacts, of which the larger one's properties count: gripper pads before all else, and obstacles before pads.
+# Priorities of contacts, in which the larger one decides: first gripper pads, then obstacles.
 PAD_PRIORITY, _OBSTACLE_PRIORITY = 1, 2
 
 # Torsion [m] and rolling [m] of a contact of about a square centimetre.
 TORSION, ROLLING = 0.02, 0.001
 
-# T_n [s], MuJoCo's usual one, and damping ratio. The pads' would make a table of millions of N/m of it, with the
-# inertia of a whole arm behind them.
+# T_n [s], which is MuJoCo's usual one, and the damping ratio. With the pads' values and the inertia of a whole arm, a
+# table would have millions of N/m.
 _STIFFNESS = (0.02, 1.0)
 
 # T_f [s]; a damping ratio has no effect on friction.
 _SLIDING = (0.1, 1.0)
 
-# Stiffness of friction against that of the normal direction: holds what is grasped, and a finger on an obstacle.
+# Stiffness of friction relative to that of the normal direction. It holds grasped objects, and a finger on an obstacle.
 FRICTION_IMPEDANCE = 100.0
 
 
 def set_obstacles(spec: mujoco.MjSpec, config: Config) -> None:
-    """Contacts of what stands in the cell; they count before those of the pads."""
+    """Set the contacts of obstacles, which have priority over those of the pads."""
     for name in config.obstacles:
         for geom in spec.body(name).geoms:
             geom.condim, geom.friction = 4, (config.mujoco.obstacle_friction, TORSION, ROLLING)
@@ -124,13 +124,15 @@ def let_fingers_slide(spec: mujoco.MjSpec, config: Config) -> None:
                 pair.solref, pair.solreffriction = _STIFFNESS, _SLIDING
 
 
-# Of the contacts of soft objects: share of MuJoCo's rigid answer, time in which foam takes its shape again [s], and
-# points at which a box stands.
+# Contacts of soft objects: share of MuJoCo's rigid answer, time in which foam takes its shape again [s], and number of
+# points on which a box stands.
 _SHARE, _RECOVERY, _CORNERS = 0.9, 0.02, 4
 
 
 def let_objects_yield(spec: mujoco.MjSpec, config: Config) -> None:
-    """Contacts of soft objects with obstacles, in MuJoCo's terms: per mass and corner (its documentation, solref)."""
+    """Set contacts of soft objects with obstacles in MuJoCo's terms, per mass and corner (see its documentation,
+    solref).
+    """
     for name, thing in config.mujoco.objects.items():
         if thing.stiffness is None:
             continue
@@ -143,7 +145,7 @@ def let_objects_yield(spec: mujoco.MjSpec, config: Config) -> None:
 
 
 def _add_pair(spec: mujoco.MjSpec, one: mujoco.MjsGeom, other: mujoco.MjsGeom, friction: float) -> mujoco.MjsPair:
-    for shape in (one, other):  # a pair needs names
+    for shape in (one, other):  # A pair needs names.
         number = next(i for i, geom in enumerate(shape.parent.geoms) if geom == shape)
         shape.name = shape.name or f"{shape.parent.name}_shape_{number}"
     pair = spec.add_pair(geomname1=one.name, geomname2=other.name)

@@ -1,4 +1,4 @@
-"""The simulated cell behind ``mujoco_robot``: commands come at any time, the plant runs in fixed steps."""
+"""The simulated cell behind ``mujoco_robot``. Commands come at any time, and the plant runs in fixed steps."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Command, CommandMode, RobotState
 
-# How long a joint goes on at the commanded velocity when the next command is late [s]. It is three intervals between
-# commands, within these bounds, since a busy machine delivers them unevenly.
+# Bounds of the time for which a joint goes on at its velocity when the next command is late [s]. The time is three
+# intervals between commands, because a busy machine delivers them unevenly.
 _COAST_INTERVALS, _SHORTEST_COAST, _LONGEST_COAST = 3.0, 0.01, 0.1
 # Share of the newest interval in its running mean.
 _INTERVAL_SHARE = 0.1
 
 
 class JointFollower:
-    """Where each joint has to be at any time, from the newest command that names it.
+    """Computes the wanted place of each joint at any time, from the newest command that names it.
 
     A command says posture and velocity at a time; in between the joint moves on at that velocity. When the next command
     stays out the joint brakes at its ``acceleration_limit`` (nv,) [rad/s^2], so that a velocity never outlives its
@@ -41,14 +41,14 @@ class JointFollower:
         self._interval = np.full(len(q), _SHORTEST_COAST)
 
     def command(self, joints: Array, q: Array, v: Array | None, due: float) -> None:
-        """Posture ``q`` and velocity ``v`` of the joints with these indices at time ``due`` [s].
+        """Take posture ``q`` and velocity ``v`` of the joints with these indices at time ``due`` [s].
 
         Without ``v`` the velocity is what leads from the last command to this one in the time between two.
         """
         interval = due - self._due[joints]
         known = (interval > 0.0) & (interval <= _LONGEST_COAST)
         mean = self._interval[joints]
-        # The first interval after a silence says nothing.
+        # The first interval after a silence is not used.
         mean = np.where(known, mean + _INTERVAL_SHARE * (interval - mean), mean)
         if v is None:
             v = np.where(known, (q - self._command_q[joints]) / mean, 0.0)
@@ -70,19 +70,19 @@ class JointFollower:
         )
         bounded = np.minimum(np.maximum(way, -reach), reach)
         self.q = self.q + bounded
-        # A joint that is far from where it should be catches up at its limit; its velocity is then that of this way.
+        # A joint far from its wanted place catches up at its limit. Its velocity is then that of this motion.
         on_time = np.abs(way) <= reach
         self.v = np.where(fresh, np.where(on_time, self._command_v, bounded / dt), slower)
 
 
-# A loop that fell further behind drops the time instead of catching up in one leap [s].
+# A loop that is farther behind drops the time, instead of catching up with a jump [s].
 _LONGEST_CATCH_UP = 0.05
-# How long one torque acts [s]. A robot stops when its sender misses a few periods; the simulation waits instead.
+# Time for which one torque acts [s]. A robot stops if its sender misses a few periods. The simulation waits instead.
 _LONGEST_TORQUE = 0.012
 
 
 class SimulatedCell:
-    """Plant and follower of commands; without commands it stops, and position servos hold it, in any mode.
+    """A plant that follows commands. Without commands, position servos stop and hold it in any mode.
 
     Every refusal is a line of text that is returned; nothing is commanded then.
     """
@@ -91,10 +91,10 @@ class SimulatedCell:
         self.robot = robot
         self.plant = MujocoPlant(robot, config)
         self.loose_objects = frozenset(config.mujoco.objects)
-        self.dropped = 0.0  # time that the simulation fell behind, or waited for torques, in all [s]
+        self.dropped = 0.0  # Total time that the simulation fell behind, or waited for torques [s].
         self._hold_after, self._max_jump = hold_after, max_jump
         self._columns = {name: index for index, name in enumerate(robot.joint_names)}
-        self._select = lru_cache(maxsize=16)(self._find)  # senders name the same joints again and again
+        self._select = lru_cache(maxsize=16)(self._find)  # Senders name the same joints again and again.
         self._timestep = config.mujoco.timestep
         self._follower = JointFollower(
             robot.home, robot.capped_acceleration(config.control.acceleration_limit), robot.velocity_limit
@@ -109,7 +109,7 @@ class SimulatedCell:
         self.reset()
 
     def reset(self) -> None:
-        """Home, at rest, grippers open, no command."""
+        """Return home, at rest, with open grippers and without a command."""
         self.plant.reset()
         self._follower.stop(self.robot.home, np.zeros_like(self.robot.home))
         self._tau: Array | None = None
@@ -125,7 +125,8 @@ class SimulatedCell:
     def command_positions(
         self, names: Sequence[str], q: Array, v: Array | None, now: float, delay: float = 0.0
     ) -> str | None:
-        """Follow positions [rad] and velocities [rad/s], if known, of the joints ``names``; others' may be among them.
+        """Follow positions [rad] and velocities [rad/s], if known, of the joints ``names``, which may include others'
+        joints.
 
         They came at ``now`` and are due ``delay`` later [s].
         """
@@ -148,16 +149,16 @@ class SimulatedCell:
         return None
 
     def command_velocities(self, v: Array, now: float) -> str | None:
-        """Move all joints on at velocities ``v`` (nv,) [rad/s] that came at ``now`` [s], from where they are due."""
+        """Move all joints on at velocities ``v`` (nv,) [rad/s] that came at ``now`` [s], from their wanted places."""
         if len(v) != len(self._columns):
             return f"{len(v)} velocities for {len(self._columns)} joints"
         q = self._follower.q if self._tau is None else self.plant.state().q
-        if self._time is not None:  # where it is due now; the follower stands at the last step
+        if self._time is not None:  # This is the place for now, because the follower stands at the last step.
             q = q + v * min(max(now - self._time, 0.0), _LONGEST_CATCH_UP)
         return self.command_positions(self.robot.joint_names, q, v, now)
 
     def command_torques(self, tau: Array, now: float) -> str | None:
-        """Apply joint torques (nv,) [Nm] that came at ``now`` [s]; gravity is the sender's to bear."""
+        """Apply joint torques (nv,) [Nm] that came at ``now`` [s]. The sender has to compensate gravity."""
         if len(tau) != len(self._columns):
             return f"{len(tau)} torques for {len(self._columns)} joints"
         if not np.isfinite(tau).all():
@@ -171,22 +172,22 @@ class SimulatedCell:
         self._openings[arm] = opening
 
     def gripper_force(self, arm: str) -> float:
-        """The force of an arm's gripper [N]."""
+        """Return the force of an arm's gripper [N]."""
         return float(np.abs(self.plant.data.actuator_force[self._finger_actuators[arm]]).max(initial=0.0))
 
     def finger_positions(self) -> Array:
-        """Positions of ``fingers`` [m or rad]."""
+        """Return positions of ``fingers`` [m or rad]."""
         return np.array(self.plant.data.qpos[self._finger_q])
 
     def finger_velocities(self) -> Array:
-        """Velocities of ``fingers`` [m/s or rad/s]."""
+        """Return velocities of ``fingers`` [m/s or rad/s]."""
         return np.array(self.plant.data.qvel[self._finger_v])
 
     def advance(self, now: float) -> RobotState:
-        """Let the whole physics steps pass that are due at ``now`` [s], and measure."""
+        """Do all physics steps that are due at ``now`` [s], and measure."""
         before = now if self._time is None else self._time
         time = max(before, now - _LONGEST_CATCH_UP)
-        # While the last torque is too old to act, and not yet so old that the arms are held, its sender is waited for.
+        # If the last torque is too old to act, but the arms are not held yet, the simulation waits for the sender.
         age = now - self._last_command
         if self._tau is not None and _LONGEST_TORQUE < age <= self._hold_after:
             time = min(time + age - _LONGEST_TORQUE, now)
@@ -198,7 +199,7 @@ class SimulatedCell:
         return self.plant.state()
 
     def _drive(self, now: float, dt: float) -> None:
-        # A torque that nobody renews is a push without end.
+        # A torque that is not renewed would push for ever.
         if self._tau is not None and now - self._last_command > self._hold_after:
             self._back_to_servos()
         zero = np.zeros_like(self.robot.home)
@@ -217,7 +218,7 @@ class SimulatedCell:
         self._tau = None
 
     def _unusable(self, names: Sequence[str], q: Array, v: Array | None, delay: float) -> str | None:
-        """The fault of commanded positions, or None."""
+        """Return the fault of commanded positions, or None."""
         if len(q) != len(names) or (v is not None and len(v) != len(names)):
             return f"{len(q)} positions for {len(names)} joints"
         if not (np.isfinite(q).all() and (v is None or np.isfinite(v).all())):
@@ -227,7 +228,7 @@ class SimulatedCell:
         return None
 
     def _find(self, names: tuple[str, ...]) -> tuple[list[int], Array] | str:
-        """The places of our joints among ``names``, and their indices here; or the fault of these names."""
+        """Return the places of our joints among ``names``, and their indices here; or the fault of these names."""
         if len(set(names)) != len(names):
             return "a joint is named twice"
         if not (ours := [place for place, name in enumerate(names) if name in self._columns]):

@@ -1,4 +1,4 @@
-"""One Sunrise cabinet that stands in for a real one: its session, its guards and its arm, in a time that is passed in.
+"""A simulated Sunrise cabinet: its session, its guards and its arm, with a time that is passed in.
 
 It is the test of a client, not a model of KUKA's controller. The states and their conditions follow the public client
 kits; where those are silent, such as in how long a client may miss, it is stricter rather than more lenient.
@@ -28,16 +28,16 @@ from q2r2_control.plants.fri.wire import (
     read_command,
 )
 
-_WINDOW = 50  # answers that the quality is judged by
-# Share of them that came in time. KUKA publishes no such numbers. With 0.9 a loss of 1 % each way ends a session within
-# minutes, by six misses in 50 that chance brings together.
+_WINDOW = 50  # Number of answers by which the quality is judged.
+# Least share of answers in time. KUKA publishes no such numbers. With 0.9, a loss of 1 % in each direction ends a
+# session within minutes, by six random misses in 50.
 _FAIR, _GOOD, _EXCELLENT = 0.5, 0.8, 0.98
-_MISSES = 10  # answers in a row that may be late while the client commands
-_NEAR = 1e-3  # how far the first command may be from the cabinet's own position [rad]
-_ROUNDING = 1e-6  # relative, of the limits
-_T1_SPEED = 0.25  # of a tool, in T1 [m/s]
-_LONGEST_TORQUE_PERIOD = 0.005  # between two answers to an application that overlays torques [s]
-_LARGEST_LOAD_ERROR = 2.0  # of a joint's external torque before torques are overlaid [Nm]
+_MISSES = 10  # Number of successive answers that may be late while the client commands.
+_NEAR = 1e-3  # Largest distance of the first command from the cabinet's own position [rad].
+_ROUNDING = 1e-6  # Relative tolerance of the limits.
+_T1_SPEED = 0.25  # Largest speed of a tool in T1 [m/s].
+_LONGEST_TORQUE_PERIOD = 0.005  # Longest time between two answers to an application that overlays torques [s].
+_LARGEST_LOAD_ERROR = 2.0  # Largest external torque of a joint before torques are overlaid [Nm].
 
 
 class Trip(StrEnum):
@@ -63,26 +63,26 @@ class CabinetArm(Protocol):
 
     @property
     def q(self) -> Joints:
-        """Measured [rad]."""
+        """Measured positions [rad]."""
 
     @property
     def tau(self) -> Joints:
-        """Measured [Nm]."""
+        """Measured torques [Nm]."""
 
     @property
     def external_tau(self) -> Joints:
-        """By contacts [Nm]."""
+        """Torques by contacts [Nm]."""
 
     def advance(self, dt: float, q: Joints, tau: Joints | None) -> None:
         """Let ``dt`` [s] pass: the drives move to ``q`` [rad]; ``tau`` [Nm] is added to their impedance."""
 
     def tool_way(self, start: Joints, end: Joints) -> float:
-        """How far the tool is between two postures [m]."""
+        """Return the distance of the tool between two postures [m]."""
 
 
 @dataclass(slots=True)
 class StillArm:
-    """An arm that is where it was commanded to be."""
+    """An arm that is always where it was commanded to be."""
 
     q: Joints
     tau: Joints = (0.0,) * JOINTS
@@ -92,7 +92,7 @@ class StillArm:
         self.q = q
 
     def tool_way(self, start: Joints, end: Joints) -> float:
-        """Of a tool that is a metre from each axis."""
+        """Return the distance of a tool that is a metre from each axis."""
         return _apart(start, end)
 
 
@@ -100,14 +100,14 @@ class StillArm:
 class CabinetSettings:
     """One cabinet's FRI settings and guards. Joints are A1 .. A7."""
 
-    lower: Joints  # allowed positions [rad]
+    lower: Joints  # Allowed positions [rad].
     upper: Joints
     velocity: Joints  # [rad/s]
     acceleration: Joints  # [rad/s^2]
-    torque: Joints  # of the overlay [Nm]
+    torque: Joints  # Limits of the overlay [Nm].
     version: int = 2
-    period: float = 0.005  # between two messages [s]
-    multiplier: int = 1  # one answer is due for so many messages
+    period: float = 0.005  # Time between two messages [s].
+    multiplier: int = 1  # Number of messages for which one answer is due.
     command: CommandKind = CommandKind.POSITION
 
     def __post_init__(self) -> None:
@@ -118,38 +118,42 @@ class CabinetSettings:
 
     @property
     def answer_period(self) -> float:
-        """Between two answers [s]."""
+        """Time between two answers [s]."""
         return self.period * self.multiplier
 
 
 class Cabinet:
-    """In each period: :meth:`send`, and :meth:`receive` for each datagram that comes before the next."""
+    """A cabinet. In each period, call :meth:`send`, and then :meth:`receive` for each datagram before the next one."""
 
     def __init__(
         self, settings: CabinetSettings, arm: CabinetArm, outputs: Mapping[str, IoValue] | None = None
     ) -> None:
-        """``outputs`` are those that the application registers for a client, with their values at the start."""
+        """Make a cabinet
+
+        ``outputs`` are those that the application registers for a client, with their first values.
+        """
         self.settings, self.arm = settings, arm
         self.session, self.safety, self.operation = Session.MONITORING_WAIT, Safety.NORMAL, Operation.AUTOMATIC
-        self.load_fits = True  # the load data are those of the tool, without which no client may command
-        self.inputs: dict[str, IoValue] = {}  # for the client
-        self.outputs = dict(outputs or {})  # by the client, whatever the session's state
-        self.trips: list[Trip] = []  # of all sessions, in order
-        self._sent = 0  # messages so far
-        self._heard: int | None = None  # counter of the client's newest message
-        self._answer: FriCommand | None = None  # to the newest message that asked for one
+        self.load_fits = True  # True if the load data fit the tool. Otherwise, no client may command.
+        self.inputs: dict[str, IoValue] = {}  # Values for the client.
+        self.outputs = dict(outputs or {})  # Values from the client, in any state of the session.
+        self.trips: list[Trip] = []  # Trips of all sessions, in order.
+        self._sent = 0  # Number of messages so far.
+        self._heard: int | None = None  # Counter of the client's newest message.
+        self._answer: FriCommand | None = None  # Answer to the newest message that asked for one.
         self._in_time: deque[bool] = deque(maxlen=_WINDOW)
-        self._misses = 0  # in a row
-        self.missed = 0  # of a client that commanded and answered again: not those of one that has ended
-        self._overlay = False  # the application asks for the client's command
-        self._held: Joints = arm.q  # by the cabinet's own motion, a hold of its position
-        self.commanded: Joints = arm.q  # by that motion, or by the client
+        self._misses = 0  # Number of successive misses.
+        # Misses of a client that commanded and answered again. Those of a client that has ended do not count.
+        self.missed = 0
+        self._overlay = False  # True if the application asks for the client's command.
+        self._held: Joints = arm.q  # Position that the cabinet's own motion holds.
+        self.commanded: Joints = arm.q  # Position that this motion, or the client, commands.
         self._velocity: Joints = (0.0,) * JOINTS
         self._tau: Joints | None = None
 
     @property
     def quality(self) -> Quality:
-        """By the answers that came in time."""
+        """The quality, judged by the answers that came in time."""
         if len(self._in_time) < _WINDOW:
             return Quality.POOR
         share = sum(self._in_time) / len(self._in_time)
@@ -157,11 +161,11 @@ class Cabinet:
 
     @property
     def is_answered(self) -> bool:
-        """Whether the newest message was answered, or asks for no answer."""
+        """True if the newest message was answered, or asks for no answer."""
         return self._answer is not None or self._sent % self.settings.multiplier > 0
 
     def start_overlay(self) -> None:
-        """The application asks for the client's command, as after a press on the pendant."""
+        """Ask for the client's command, as the application does after a press on the pendant."""
         self._overlay = True
 
     def stop(self, trip: Trip = Trip.STOPPED) -> None:
@@ -176,7 +180,7 @@ class Cabinet:
         self._held = self.commanded = self.arm.q
 
     def safety_stop(self, stop: Safety) -> None:
-        """A stop that the safety controller asks for; ``NORMAL`` ends it."""
+        """Begin a stop that the safety controller asks for; ``NORMAL`` ends it."""
         self.safety = stop
         if stop is not Safety.NORMAL:
             self.stop(Trip.SAFETY)
@@ -236,7 +240,7 @@ class Cabinet:
 
     @property
     def _bears_the_load(self) -> bool:
-        """Whether the load data explain the torques of an arm that is to be overlaid with torques."""
+        """Return whether the load data explain the torques of an arm before an overlay of torques."""
         torques = self.settings.command is CommandKind.TORQUE
         return self.load_fits and not (torques and max(map(abs, self.arm.external_tau)) > _LARGEST_LOAD_ERROR)
 
@@ -259,7 +263,7 @@ class Cabinet:
             elif not self._bears_the_load or answer is None or answer.q is None:
                 return
             elif self.settings.command is CommandKind.TORQUE and answer.tau is None:
-                return  # torques have to come before they count, too
+                return  # Torques have to come before they count.
             elif _apart(answer.q, self._held) <= _NEAR:
                 self.session = Session.COMMANDING_ACTIVE
                 self._follow(answer)
@@ -280,7 +284,7 @@ class Cabinet:
         self.commanded, self._tau = answer.q, answer.tau
 
     def _guard(self, answer: FriCommand) -> Trip | None:
-        """The reason why an answer cannot be followed; a missed one before it gives no more time."""
+        """Return the reason why an answer cannot be followed. A missed answer before it gives no more time."""
         limits, period = self.settings, self.settings.answer_period
         if answer.q is None:
             return Trip.NO_POSITION

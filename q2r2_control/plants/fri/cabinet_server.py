@@ -1,4 +1,4 @@
-"""Cabinets on real sockets, in real time, with a simulated cell behind them: for a rehearsal at the desk."""
+"""Cabinets on real sockets and in real time, with a simulated cell behind them, for rehearsals."""
 
 from __future__ import annotations
 
@@ -33,23 +33,23 @@ from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Command, CommandMode
 
-_LONGEST_STALL = 1.0  # of this process; a longer one is the cabinet's [s]
-_LONGEST_CATCH_UP = 0.05  # what it falls behind by more is dropped [s]
-_LOOK_AGAIN = 2e-4  # whether the answer has come that a message waits for, which is late already [s]
+_LONGEST_STALL = 1.0  # Longest stall of this process that is compensated; a longer one counts as the cabinet's [s].
+_LONGEST_CATCH_UP = 0.05  # Longest delay that is caught up; the rest is dropped [s].
+_LOOK_AGAIN = 2e-4  # Time between two checks for the answer that a late message waits for [s].
 _ROUNDING = 1e-6
-_SAG = 1e-3  # the simulated arm may be this much beyond its limits [rad]
-_DAMPING_RATIO = 0.7  # of the application's joint impedance: the cabinet's own without another setting
-_HOLDING = 0.02  # time constant by which a cabinet holds an arm that no torque overlays, critically damped [s]
+_SAG = 1e-3  # The simulated arm may be this far beyond its limits [rad].
+_DAMPING_RATIO = 0.7  # Damping ratio of the application's joint impedance. It is the cabinet's default.
+_HOLDING = 0.02  # Time constant with which a cabinet holds an arm without an overlay of torques, critically damped [s].
 
 
 @dataclass(frozen=True, slots=True)
 class Network:
-    """Faults of the way between cabinet and client."""
+    """Faults of the network between cabinet and client."""
 
-    loss: float = 0.0  # share of the datagrams, each way
-    duplicate: float = 0.0  # share of the messages that come twice
-    jitter: float = 0.0  # each datagram is late by up to this, and may overtake another [s]
-    cut: float = 0.0  # share of the datagrams that arrive without their end, each way
+    loss: float = 0.0  # Share of lost datagrams in each direction.
+    duplicate: float = 0.0  # Share of messages that come twice.
+    jitter: float = 0.0  # Largest delay of a datagram, which another one may overtake [s].
+    cut: float = 0.0  # Share of datagrams that lose their end, in each direction.
 
 
 _PERFECT = Network()
@@ -78,7 +78,7 @@ class SimulatedArm:
         return (0.0,) * JOINTS if external is None else joints_of(external[self._joints])
 
     def advance(self, dt: float, q: Joints, tau: Joints | None) -> None:
-        """Begin to go to ``q``, which takes ``dt`` [s]; the cell's own time goes on by itself."""
+        """Begin a motion to ``q`` that takes ``dt`` [s]. The cell's own time goes on by itself."""
         self._from, self._to, self._began, self._lasts = self._to, q, self._cell.now, dt
         self.overlay = tau
 
@@ -91,9 +91,9 @@ class SimulatedArm:
         return float(np.linalg.norm(tools[1] - tools[0]))
 
     def wanted(self, t: float) -> tuple[Array, Array]:
-        """Where the drives are to be at ``t`` [s], and how fast."""
+        """Return the wanted position of the drives at ``t`` [s], and their velocity."""
         share, way = (t - self._began) / self._lasts, np.subtract(self._to, self._from)
-        if share > 1.0 + _ROUNDING:  # at the end itself, which every message comes at, they still move
+        if share > 1.0 + _ROUNDING:  # At the end itself, when every message comes, the drives still move.
             return np.array(self._to), np.zeros(JOINTS)
         return np.add(self._from, max(share, 0.0) * way), way / self._lasts
 
@@ -102,7 +102,7 @@ class SimulatedArms:
     """All arms of a cell in one simulation."""
 
     def __init__(self, robot: Robot, config: Config, stiffness: float = 0.0) -> None:
-        """``stiffness``: of the joint impedance that overlays of torque come on top of [Nm/rad]."""
+        """Make the arms; ``stiffness`` is that of the joint impedance to which torque commands are added [Nm/rad]."""
         self.robot, self.plant, self._stiffness = robot, MujocoPlant(robot, config), stiffness
         self.now, self.openings = 0.0, dict.fromkeys(self.plant.gripper_openings(), 1.0)
         self._simulated, self._step = 0.0, (1.0 - _ROUNDING) * config.mujoco.timestep
@@ -111,7 +111,7 @@ class SimulatedArms:
         self._data = robot.model.createData()
 
     def advance(self, now: float) -> None:
-        """Let the time until ``now`` [s] pass. The physics wait until one of its steps is due."""
+        """Let the time until ``now`` [s] pass. The physics waits until one of its steps is due."""
         self.now = now
         passed = now - self._simulated
         if passed >= self._step:
@@ -121,7 +121,7 @@ class SimulatedArms:
             self.state = self.plant.state()
 
     def work_gripper(self, arm: str, gripper: GripperIoConfig, cabinet: Cabinet) -> None:
-        """Let a cabinet's output command the arm's gripper, whose opening its input shows."""
+        """Let a cabinet's output command the arm's gripper, and its input show the opening."""
         self.openings[arm] = min(max(float(cabinet.outputs[gripper.output]), 0.0), 1.0)
         if gripper.input is not None:
             cabinet.inputs[gripper.input] = self.plant.gripper_openings()[arm]
@@ -145,14 +145,14 @@ class SimulatedArms:
 
 
 def outputs_of(gripper: GripperIoConfig | None) -> dict[str, IoValue]:
-    """Outputs that the application of a cabinet registers for ``gripper``, which is open at the start."""
+    """Return outputs that the application of a cabinet registers for ``gripper``, which is open at the start."""
     return {} if gripper is None else {gripper.output: True if gripper.digital else 1.0}
 
 
 def settings_of(
     robot: Robot, arm: str, kind: CommandKind, version: int, period: float, multiplier: int = 1
 ) -> CabinetSettings:
-    """A cabinet with the guards of an arm: the limits of the robot, and what catching up adds to its accelerations."""
+    """Return settings of a cabinet that guards an arm: the robot's limits, plus the accelerations of catching up."""
     joints = robot.arms[arm].joints
     acceleration = (1.0 + CATCH_UP) ** 2 * robot.acceleration_limit + CATCH_UP_RAMP * robot.velocity_limit
     return CabinetSettings(
@@ -169,7 +169,7 @@ def settings_of(
 
 
 class CabinetServer:
-    """Sends each cabinet's messages to its client's address, and hears the answers."""
+    """Sends each cabinet's messages to its client's address, and receives the answers."""
 
     def __init__(
         self,
@@ -181,7 +181,8 @@ class CabinetServer:
         network: Network,
         seed: int = 0,
     ) -> None:
-        """``origins``: address and port of each arm's cabinet, port 0: any free one; ``clients``: those of its client.
+        """Bind ``origins``, address and port of each arm's cabinet (0: any free port); ``clients`` are those of its
+        client.
 
         Raises :class:`ConfigError` for an origin that cannot be bound, such as one that another program has.
         """
@@ -194,10 +195,10 @@ class CabinetServer:
         self._sockets = {arm: _opened(arm, *origins[arm]) for arm in self.cabinets}
         self._queue: list[tuple[float, int, Callable[[], None]]] = []
         self._serial = 0
-        self._sent_at: dict[str, float] = {}  # the newest message of each arm [s]
+        self._sent_at: dict[str, float] = {}  # Time of the newest message of each arm [s].
 
     def run(self, until: Callable[[float], bool], tick: Callable[[float], None] = lambda t: None) -> None:
-        """Go on until a function of the time since the begin [s] says so; ``tick`` is called for each message."""
+        """Go on until a function of the time since the begin [s] returns True; ``tick`` is called for each message."""
         self._began, now, arms = time.monotonic(), 0.0, {opened: arm for arm, opened in self._sockets.items()}
         for index, (arm, cabinet) in enumerate(self.cabinets.items()):
             self._at(index * 0.37 * cabinet.settings.period, lambda arm=arm: self._send(arm, 0.0, tick))  # type: ignore[misc]
@@ -208,7 +209,8 @@ class CabinetServer:
                 now = time.monotonic() - self._began
                 for opened in ready:
                     self._hear(arms[opened], now)
-                if self._queue[0][0] <= now:  # one at a time: an answer that has come is heard before the next
+                # One message is sent at a time, so that an answer that has come is read before the next message.
+                if self._queue[0][0] <= now:
                     heapq.heappop(self._queue)[2]()
         finally:
             for opened in self._sockets.values():
@@ -219,7 +221,10 @@ class CabinetServer:
         heapq.heappush(self._queue, (t, self._serial, act))
 
     def _after(self, late: float, t: float, act: Callable[[], None]) -> None:
-        """``act`` at once, or ``late`` after ``t`` [s]. An answer that has come may not queue behind a late message."""
+        """Call ``act`` at once, or ``late`` after ``t`` [s].
+
+        An answer that has come must not wait behind a late message.
+        """
         if late > 0.0:
             self._at(t + late, act)
         else:
@@ -227,7 +232,7 @@ class CabinetServer:
 
     def _send(self, arm: str, due: float, tick: Callable[[float], None]) -> None:
         cabinet, opened, client = self.cabinets[arm], self._sockets[arm], self._clients[arm]
-        # A client that commands is not to have less time because this process was late.
+        # A client that commands must not have less time because this process was late.
         commands = cabinet.session >= Session.COMMANDING_WAIT
         enough, now = self._sent_at.get(arm, -math.inf) + cabinet.settings.period, time.monotonic() - self._began
         if commands and not cabinet.is_answered and now < enough:
@@ -250,7 +255,7 @@ class CabinetServer:
         while True:
             try:
                 datagram, source = self._sockets[arm].recvfrom(LONGEST + 1)
-            except OSError:  # no more, or nobody is there yet
+            except OSError:  # There are no more datagrams, or no client listens yet.
                 return
             if source[:2] == self._clients[arm]:
                 for late in self._ways(0.0):
@@ -261,7 +266,7 @@ class CabinetServer:
         return datagram[: self._random.integers(len(datagram))] if is_cut else datagram
 
     def _ways(self, duplicate: float) -> Iterable[float]:
-        """How late each copy of a datagram is [s]; none: it is lost."""
+        """Return the delay of each copy of a datagram [s]; no delay if the datagram is lost."""
         if self._network == _PERFECT:
             return [0.0]
         copies = 0 if self._random.random() < self._network.loss else 1 + (self._random.random() < duplicate)
@@ -271,7 +276,7 @@ class CabinetServer:
 def _sent(opened: socket.socket, datagram: bytes, client: tuple[str, int]) -> None:
     try:
         opened.sendto(datagram, client)
-    except OSError:  # nobody is there yet
+    except OSError:  # No client listens yet.
         return
 
 

@@ -1,4 +1,4 @@
-"""KUKA's Fast Robot Interface on the wire: datagrams in, messages out, and the other way round.
+"""Messages of KUKA's Fast Robot Interface, converted from and to datagrams.
 
 A cabinet sends a :class:`Monitoring` datagram every period, its client answers with a :class:`FriCommand`. FRI 1 sends
 the protobuf message itself; FRI 2 puts its length before it and a CRC-32 behind it, both uint32, little endian.
@@ -22,12 +22,12 @@ from q2r2_control.errors import ProtocolError
 from q2r2_control.plants.fri.schema import CommandMessage, MonitoringMessage
 
 JOINTS = 7
-LONGEST = 1500  # of a datagram [bytes]
-_MONITORING, _COMMAND = 0x245142, 0x34001  # identifiers of the two messages
-_FIRST_FIELD = 0x0A  # the first byte of a message whose field 1 is a message
+LONGEST = 1500  # Longest datagram [bytes].
+_MONITORING, _COMMAND = 0x245142, 0x34001  # Identifiers of the two messages.
+_FIRST_FIELD = 0x0A  # First byte of a message whose field 1 is a message.
 _LENGTH = struct.Struct("<I")
 
-Joints = tuple[float, ...]  # seven of them
+Joints = tuple[float, ...]  # The positions, velocities or torques of seven joints.
 IoValue = bool | int | float
 
 
@@ -36,7 +36,7 @@ def joints_of(values: np.ndarray) -> Joints:
 
 
 class Session(IntEnum):
-    """How far a cabinet and its client have come."""
+    """The state of the session between a cabinet and its client."""
 
     IDLE = 0
     MONITORING_WAIT = 1
@@ -46,7 +46,7 @@ class Session(IntEnum):
 
 
 class Quality(IntEnum):
-    """Of the connection, as the cabinet judges it by answers in time; it lets a client command from GOOD on."""
+    """Quality of the connection, which the cabinet judges by answers in time. A client may command from GOOD on."""
 
     POOR = 0
     FAIR = 1
@@ -55,7 +55,7 @@ class Quality(IntEnum):
 
 
 class Safety(IntEnum):
-    """Stop that the cabinet's safety controller asks for."""
+    """The stop that the cabinet's safety controller asks for."""
 
     NORMAL = 0
     STOP_0_OR_1 = 1
@@ -64,7 +64,7 @@ class Safety(IntEnum):
 
 
 class Operation(IntEnum):
-    """Of the cabinet's key switch."""
+    """The position of the cabinet's key switch."""
 
     T1 = 0
     T2 = 1
@@ -72,7 +72,7 @@ class Operation(IntEnum):
 
 
 class Drives(IntEnum):
-    """State of the drives; that of the worst joint."""
+    """The state of the drives, which is that of the worst joint."""
 
     OFF = 0
     TRANSITIONING = 1
@@ -84,7 +84,7 @@ def in_words(state: IntEnum) -> str:
 
 
 class CommandKind(IntEnum):
-    """The commands that the Sunrise application lets a client overlay."""
+    """The commands that the Sunrise application allows a client to overlay."""
 
     NONE = 0
     POSITION = 1
@@ -101,31 +101,32 @@ _IN, _OUT = 0, 1
 
 @dataclass(frozen=True, slots=True)
 class Monitoring:
-    """One message of a cabinet. Joints are A1 .. A7 [rad, Nm]; None: the message has none."""
+    """A message of a cabinet. Joints are A1 .. A7 [rad, Nm]. A field is None if the message does not contain it."""
 
     version: int  # 1 or 2
-    counter: int  # of the cabinet's messages
-    reflected: int  # counter of the client's message that the cabinet heard last
+    counter: int  # Counter of the cabinet's messages.
+    reflected: int  # Counter of the client's message that the cabinet received last.
     session: Session
     quality: Quality
-    period: float  # between two messages of the cabinet [s]
-    multiplier: int  # one answer is due for so many messages
-    q: Joints  # measured
-    stamp: float = 0.0  # by the cabinet's clock [s]
-    tau: Joints | None = None  # measured
-    external_tau: Joints | None = None  # by contacts, as the cabinet estimates it
-    commanded_q: Joints | None = None  # of FRI 1
-    ipo_q: Joints | None = None  # where the cabinet's own motion is, which a client's command overlays
+    period: float  # Time between two messages of the cabinet [s].
+    multiplier: int  # Number of messages for which one answer is due.
+    q: Joints  # Measured positions.
+    stamp: float = 0.0  # Time of the cabinet's clock [s].
+    tau: Joints | None = None  # Measured torques.
+    external_tau: Joints | None = None  # Torques by contacts, which the cabinet estimates.
+    commanded_q: Joints | None = None  # Commanded positions, only in FRI 1.
+    ipo_q: Joints | None = None  # Position of the cabinet's own motion, which a client's command overlays.
     command: CommandKind = CommandKind.NONE
     safety: Safety = Safety.NORMAL
     operation: Operation = Operation.AUTOMATIC
     drives: Drives = Drives.ACTIVE
-    io: dict[str, IoValue] = field(default_factory=dict)  # inputs and outputs that the application registered
-    outputs: frozenset[str] = frozenset()  # those of ``io`` that a client may write
-    commanded_tau: Joints | None = None  # by the cabinet's controller, with the client's overlay; written, never read
+    io: dict[str, IoValue] = field(default_factory=dict)  # Inputs and outputs that the application registered.
+    outputs: frozenset[str] = frozenset()  # Names in ``io`` that a client may write.
+    # Torques of the cabinet's controller with the client's overlay. They are written, but never read.
+    commanded_tau: Joints | None = None
 
     def output(self, name: str, value: IoValue) -> IoValue | None:
-        """``value`` as the cabinet's output ``name`` takes it; None if the cabinet has no such output of that kind.
+        """Return ``value`` in the type of the cabinet's output ``name``; None if it has no such output of that kind.
 
         KUKA's own clients raise an exception for an output that the cabinet does not list.
         """
@@ -137,17 +138,17 @@ class Monitoring:
 
 @dataclass(frozen=True, slots=True)
 class FriCommand:
-    """One answer of a client."""
+    """An answer of a client."""
 
-    counter: int  # of the client's messages, from 0
-    reflected: int  # counter of the message that is answered
-    q: Joints | None = None  # due one answer's period from now [rad]
-    tau: Joints | None = None  # added to the cabinet's own joint impedance [Nm]
+    counter: int  # Counter of the client's messages, from 0.
+    reflected: int  # Counter of the message that is answered.
+    q: Joints | None = None  # Positions that are due after one answer's period [rad].
+    tau: Joints | None = None  # Torques that are added to the cabinet's own joint impedance [Nm].
     io: dict[str, IoValue] = field(default_factory=dict)
 
 
 def read_monitoring(datagram: bytes) -> Monitoring:
-    """A cabinet's message. Raises :class:`ProtocolError` for bytes that are none."""
+    """Return a cabinet's message. Raises :class:`ProtocolError` for other bytes."""
     version, message = _parsed(datagram, MonitoringMessage, _MONITORING)
     data, connection, ipo, robot = message.data, message.connection, message.ipo, message.robot
     if (q := _joints(data, "q")) is None:
@@ -200,7 +201,7 @@ def write_monitoring(monitoring: Monitoring) -> bytes:
 
 
 def read_command(datagram: bytes) -> tuple[int, FriCommand]:
-    """Version and answer of a client. Raises :class:`ProtocolError` for bytes that are none."""
+    """Return version and answer of a client. Raises :class:`ProtocolError` for other bytes."""
     version, message = _parsed(datagram, CommandMessage, _COMMAND)
     data, header = message.data, message.header
     return version, FriCommand(
@@ -209,7 +210,7 @@ def read_command(datagram: bytes) -> tuple[int, FriCommand]:
 
 
 def write_command(command: FriCommand, version: int) -> bytes:
-    """The datagram of an answer in FRI ``version`` 1 or 2."""
+    """Return the datagram of an answer in FRI ``version`` 1 or 2."""
     message = CommandMessage()
     _set_header(message, _COMMAND, command.counter, command.reflected)
     _set_joints(message.data, "q", command.q)
@@ -219,7 +220,7 @@ def write_command(command: FriCommand, version: int) -> bytes:
 
 
 def version_of(datagram: bytes) -> int:
-    """FRI 1 or 2. The length that FRI 2 begins with is below 1500, so its second byte is never a message's length."""
+    """Return FRI 1 or 2. The length at the begin of FRI 2 is below 1500, so that its second byte differs from FRI 1."""
     return 1 if len(datagram) > 1 and datagram[0] == _FIRST_FIELD and datagram[1] > 5 else 2
 
 
@@ -259,7 +260,7 @@ def _set_header(message: Any, identifier: int, counter: int, reflected: int) -> 
 
 
 def _joints(message: Any, name: str) -> Joints | None:
-    """Seven finite numbers, or None where the message has none."""
+    """Return seven finite numbers, or None if the message has none."""
     values = tuple(getattr(message, name).value)
     if not values:
         return None
@@ -273,7 +274,7 @@ def _set_joints(message: Any, name: str, values: Joints | None) -> None:
         getattr(message, name).value.extend(values)
 
 
-# An enum's own call takes ten times as long, six times a message.
+# Calling an enum takes ten times as long, and this happens six times a message.
 _ENUMS: tuple[type[IntEnum], ...] = (Session, Quality, CommandKind, Safety, Operation, Drives)
 _MEMBERS = {kind: {one.value: one for one in kind} for kind in _ENUMS}
 
@@ -286,7 +287,7 @@ def _member(kind: type[IntEnum], value: int) -> Any:
 
 
 def _io_of(values: Any) -> dict[str, IoValue]:
-    """Values by name: booleans, numbers of bits, and analog ones."""
+    """Return values by name: booleans, numbers of bits, and analog values."""
     kinds: tuple[Any, ...] = (lambda io: bool(io.digital), lambda io: io.digital, lambda io: io.analog)
     return {_name_of(io.name): kinds[io.type](io) for io in values if 0 <= io.type < len(kinds)}
 
