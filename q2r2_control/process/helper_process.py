@@ -116,15 +116,15 @@ class HelperProcess:
         A process that it has started would otherwise keep files and ports, and the pipe that shows its end.
         """
         self._killed = True
-        if self._process.returncode is None:  # otherwise another process may have its number by now
-            with suppress(OSError):  # of a group that has ended
+        if self._process.returncode is None:  # Otherwise, another process may have its number by now.
+            with suppress(OSError):  # The process group has ended.
                 os.killpg(self.pid, signal.SIGKILL)
         self._queue.put(None)
         self._listener.join(_AFTER_KILL)
 
     def _is_ready_to_run(self) -> bool:
-        """Whether one of its threads runs or could; only Linux says that."""
-        with suppress(OSError):  # of a thread that has ended
+        """Return whether one of its threads runs or could run. Only Linux tells this."""
+        with suppress(OSError):  # The thread has ended.
             states = [file.read_text() for file in Path(f"/proc/{self.pid}/task").glob("*/stat")]
             return any(state.rpartition(")")[2].split()[0] == "R" for state in states)
         return False
@@ -132,7 +132,7 @@ class HelperProcess:
     def _feed(self) -> None:
         stream = self._process.stdin
         assert stream is not None
-        with suppress(OSError):  # of a process that has ended
+        with suppress(OSError):  # The process has ended.
             while True:
                 try:
                     entry = self._queue.get(timeout=self._idle)
@@ -169,7 +169,7 @@ class HelperProcess:
 def start_python(
     code: str, environment: dict[str, str], stdout: int = subprocess.DEVNULL, files: Sequence[int] = ()
 ) -> subprocess.Popen[bytes]:
-    """A new process that runs ``code`` with this one's modules and its open ``files``, and gets input by a pipe.
+    """Start a process that runs ``code`` with this one's modules and open ``files``, and gets input by a pipe.
 
     ``environment``: variables, where this process does not have them.
     """
@@ -181,24 +181,27 @@ def start_python(
         stderr=subprocess.DEVNULL,
         env=environment | os.environ | paths,
         pass_fds=files,
-        process_group=0,  # a terminal's Ctrl-C is for the run
+        process_group=0,  # Ctrl-C of a terminal is only for the run.
     )
 
 
 def leave_signals_to_the_run() -> None:
-    """Inside such a process: the run ends it."""
+    """Ignore signals in a helper process, because the run ends it."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
 
 
 def run_helper(module: str) -> None:
-    """Inside the process: call ``module.main``; the last answer is a RuntimeError of what went wrong."""
+    """Call ``module.main`` in the helper process.
+
+    After a failure, the last answer is a RuntimeError with the reason.
+    """
     leave_signals_to_the_run()
-    stream, sys.stdout = sys.stdout.buffer, sys.stderr  # what a library prints is no answer
-    lock = Lock()  # answers may come from several threads
+    stream, sys.stdout = sys.stdout.buffer, sys.stderr  # Output that a library prints is no answer.
+    lock = Lock()  # Several threads may send answers.
 
     def answer(content: Any) -> None:
-        with lock, suppress(BrokenPipeError):  # of a run that was killed
+        with lock, suppress(BrokenPipeError):  # The run was killed.
             pickle.dump(content, stream)
             stream.flush()
 
@@ -209,7 +212,7 @@ def run_helper(module: str) -> None:
 
 
 def _requests() -> Iterator[Any]:
-    """All that the run sends; ends when the run has ended, also where it was killed."""
+    """Yield everything that the run sends, until the run has ended or was killed."""
     with suppress(EOFError, pickle.UnpicklingError):
         while True:
             yield pickle.load(sys.stdin.buffer)
