@@ -13,12 +13,12 @@ from q2r2_control.quaternions import floats_of, se3_of
 from q2r2_control.teleop.filters import Interpolator
 from q2r2_control.types import is_number
 
-_DELAY_PERIODS = 1.25  # so that a sample which comes late by a quarter of a period is in time
+_DELAY_PERIODS = 1.25  # With this delay, a sample that is late by a quarter of a period is in time.
 _SLOWEST, _FASTEST = 1.0, 500.0  # [Hz]
 
 
 class SampledTargets:
-    """Tool targets at every step, straight from each sample to the next.
+    """Tool targets at every step, on straight lines from each sample to the next.
 
     A target that is held until its next sample stands still in most steps and jumps in one of them. The controller
     follows such a target with a joint at its limit of acceleration in most steps, at 90 samples a second. Here
@@ -46,7 +46,7 @@ class SampledTargets:
         check_kind("controller", controller, CartesianController, "a CartesianController", RobotError)
         if not is_number(rate_hz) or not _SLOWEST <= rate_hz <= _FASTEST:
             raise RobotError(f"rate_hz = {shown(rate_hz)}: allowed: {_SLOWEST:g} .. {_FASTEST:g}")
-        self.delay = _DELAY_PERIODS / rate_hz  # from a sample to its target [s]
+        self.delay = _DELAY_PERIODS / rate_hz  # Delay from a sample to its target [s].
         self._controller, self._period = controller, 1.0 / rate_hz
         self._lines: dict[str, Interpolator] = {}
 
