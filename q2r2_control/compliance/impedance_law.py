@@ -99,7 +99,7 @@ class ImpedanceModel(NamedTuple):
     """Data that do not change between ticks."""
 
     chain: Chain
-    tools: Tools  # of k arms
+    tools: Tools  # Tools of k arms.
     limits: PositionLimits
     torque_limit: Array  # (nv,) [Nm]
     largest_error: Array  # (2,) [m, rad]
@@ -121,16 +121,16 @@ class ImpedanceData(NamedTuple):
     clipped: BoolArray  # (k,) Arms whose way was longer.
     repulsion: Array  # (nv,) Torque from position limits [Nm].
     wanted_twist: Array  # (k, 6)
-    wanted_rotation: Array  # (k, 3, 3) of the tools
+    wanted_rotation: Array  # (k, 3, 3) Wanted rotations of the tools.
     wanted_translation: Array  # (k, 3) [m]
-    rotation: Array  # (3, 3) scratch: of a measured tool
+    rotation: Array  # (3, 3) Scratch: rotation of a measured tool.
     translation: Array  # (3,) [m]
-    turn: Array  # (3, 3) scratch: from the measured to the wanted rotation
-    placements: Placements  # scratch
+    turn: Array  # (3, 3) Scratch: rotation from the measured to the wanted orientation.
+    placements: Placements  # Scratch.
 
     @classmethod
     def empty(cls, model: ImpedanceModel, springs: Array) -> ImpedanceData:
-        """Arrays of the sizes that ``model`` needs."""
+        """Return arrays of the sizes that ``model`` needs."""
         k, nv = model.tools.member.shape
         return cls(
             inputs=np.zeros((6, nv)),

@@ -64,15 +64,16 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Interval
 
 _LONGEST_PERIOD = 0.002  # T [s]
-_STIFFEST = 0.25 / _LONGEST_PERIOD**2  # of sum k / m [1/s^2]
-_MOST_DAMPED = 0.5 / _LONGEST_PERIOD  # of sum c / m [1/s]
-_BAND = 0.002  # over which damping fades in inside the shell, and a pair's share in the sums outside it [m]
+_STIFFEST = 0.25 / _LONGEST_PERIOD**2  # Largest sum k / m [1/s^2].
+_MOST_DAMPED = 0.5 / _LONGEST_PERIOD  # Largest sum c / m [1/s].
+# Band inside the shell in which damping fades in, and outside it in which a pair's share in the sums does [m].
+_BAND = 0.002
 _IMMOBILE = 1e-9  # [1/kg]
-# Of the sum of radii and the distance that a pair keeps: the smoothing length of distances, 0.3 mm of error at most.
+# Smoothing length of distances, relative to the radii and the kept distance. The error is at most 0.3 mm.
 _SMOOTHING = 0.07
-# Cores closer than this part of the radii are measured as they are: so deep, the smoothing would weaken the force.
+# Cores that are closer than this part of the radii are measured exactly, because smoothing would weaken the force.
 _DEEP = 0.25
-# Of the radii: how deep two bodies that may touch have to be in each other before the wall pushes.
+# Depth of two bodies that may touch from which the wall pushes, relative to the radii.
 _SOFT = 0.5
 _OUT_OF_REACH = MovingObstacle(shape="sphere", size=(0.1,), position=(0.0, 0.0, -20.0), speed=0.0)
 
@@ -82,22 +83,22 @@ class RepulsionModel(NamedTuple):
 
     collision: CollisionModel
     smoothing: Array  # (p,) [m^2]
-    deep: Array  # (p,) distance from which it is measured as it is [m]
-    shell: Array  # (p,) distance that the pair keeps [m]
+    deep: Array  # (p,) Distance below which it is measured exactly [m].
+    shell: Array  # (p,) Distance that the pair keeps [m].
     stiffness: float  # [N/m]
     damping_ratio: float
     maximum_force: float  # [N]
 
 
 class RepulsionData(NamedTuple):
-    """One tick's measurement and arrays written anew."""
+    """The measurement of one tick, and arrays that are written in it."""
 
     measured: Array  # (2, nv) q and v
     M: Array  # (nv, nv) mass matrix, read from its upper triangle; overwritten
-    collision: CollisionData  # at q
-    near: IntArray  # (p,) pairs in the shell or just outside
-    depth: Array  # (p,) of them [m]
-    rows: Array  # (p, nv) gradients of their distances
+    collision: CollisionData  # Collision data at q.
+    near: IntArray  # (p,) Pairs in the shell or just outside.
+    depth: Array  # (p,) Their depths [m].
+    rows: Array  # (p, nv) Gradients of their distances.
     mobility: Array  # (p,) 1 / m [1/kg]
     force: Array  # (p,) [N]
     row: Array  # (nv,)
@@ -122,7 +123,7 @@ class RepulsionData(NamedTuple):
 
 @kernel
 def find_near(model_pointer: KernelPointer, data_pointer: KernelPointer) -> tuple[int, int, float]:
-    """Depths and gradients of the pairs in the shell or just outside.
+    """Write depths and gradients of the pairs in the shell or just outside.
 
     Returns how many these are, the closest pair of all and its distance; -1 where q or v is not finite.
     """
@@ -135,11 +136,11 @@ def find_near(model_pointer: KernelPointer, data_pointer: KernelPointer) -> tupl
         if at_least(model.collision, data.collision, p) >= max(least, model.shell[p] + _BAND):
             continue
         distance = measure(model.collision, data.collision, p)
-        # Pairs that touch as they may hide none that meets.
+        # A pair that may touch must not hide a pair that must not.
         apart = max(distance, 0.0) if model.shell[p] < 0.0 else distance
         if apart < least:
             least, closest = apart, p
-        # The smooth distance is no smaller.
+        # The smooth distance is at least as large.
         if distance >= model.shell[p] + _BAND:
             continue
         if distance > model.deep[p]:
@@ -153,7 +154,7 @@ def find_near(model_pointer: KernelPointer, data_pointer: KernelPointer) -> tupl
 
 @kernel
 def repulsion_torque(model_pointer: KernelPointer, data_pointer: KernelPointer, count: int) -> float:
-    """Add up the torques of the ``count`` pairs found near; returns the energy stored in the wall [J]."""
+    """Add up the torques of the ``count`` near pairs, and return the energy stored in the wall [J]."""
     model, data, v = pointee(model_pointer), pointee(data_pointer), pointee(data_pointer).measured[1]
     depth, mobility, force = data.depth, data.mobility, data.force
     factorise(data.M)
@@ -170,7 +171,7 @@ def repulsion_torque(model_pointer: KernelPointer, data_pointer: KernelPointer, 
     damping = 2.0 * model.damping_ratio * min(1.0, _MOST_DAMPED / max(total, _IMMOBILE))
     data.tau[:] = 0.0
     energy = 0.0
-    softest = model.maximum_force / stiffness  # depth from which the force is constant
+    softest = model.maximum_force / stiffness  # From this depth on, the force is constant.
     for i in range(count):
         force[i] = 0.0
         x = depth[i]
@@ -190,7 +191,7 @@ def repulsion_torque(model_pointer: KernelPointer, data_pointer: KernelPointer, 
 
 @kernel
 def _mobility(factor: Array, row: Array, out: Array) -> float:
-    """Inverse of the effective mass along ``row``, g' M^-1 g = |L^-1 g|^2 [1/kg]."""
+    """Return the inverse of the effective mass along ``row``, g' M^-1 g = |L^-1 g|^2 [1/kg]."""
     total = 0.0
     for i in range(row.shape[0]):
         value = row[i]
@@ -205,19 +206,19 @@ def _mobility(factor: Array, row: Array, out: Array) -> float:
 class WallReport:
     """The wall's action in one tick."""
 
-    tau: Array  # (nv,) to be added to the commanded torque [Nm]
-    pressing: tuple[tuple[str, str], ...]  # geometry names of the pairs that the wall pushes apart
-    force: float  # the largest of them [N]
-    energy: float  # stored in the wall [J]
-    closest_pair: tuple[str, str]  # measured
-    closest_distance: float  # [m]; 0 where pairs touch that may, NaN if q or v is not finite
+    tau: Array  # (nv,) Torque that is added to the commanded one [Nm].
+    pressing: tuple[tuple[str, str], ...]  # Names of the bodies that the wall pushes apart.
+    force: float  # The largest force of a pair [N].
+    energy: float  # Energy stored in the wall [J].
+    closest_pair: tuple[str, str]  # The closest pair of measured bodies.
+    closest_distance: float  # Its distance [m]; 0 if pairs touch that may, NaN if q or v is not finite.
 
 
 class MeasuredSeparation:
-    """Keeps the measured links apart in torque mode. Holds nothing between ticks but scratch."""
+    """Keeps the measured links apart in torque mode. It keeps no state between ticks."""
 
     def __init__(self, robot: Robot, settings: ControllerSettings, wall_settings: WallSettings | None = None) -> None:
-        """Uses the distances that pairs keep of ``settings``.
+        """Make a wall with the distances that pairs keep by ``settings``.
 
         Raises :class:`RobotError` for a shape that no kernel measures, :class:`ConfigError` as the controller does.
         """
@@ -229,7 +230,7 @@ class MeasuredSeparation:
         pairs = collision.pairs
         self._bodies, self._pairs = collision.bodies, pairs
         self._shell, self._smoothing, self._deep = np.zeros((3, len(pairs.first)))
-        # Of each obstacle the pairs of arms, without the last ones, which are those of held objects.
+        # For each obstacle, its pairs with the arms. The last pairs are those of held objects, and are left out.
         by_obstacle = kept_by_obstacles(robot, settings).values.reshape(max(len(self._obstacles), 1), -1)
         count = by_obstacle.shape[1] - len(robot.objects.by_arm) if self._obstacles else 0
         self._kept_by_obstacles = by_obstacle[:, :count].ravel()
@@ -239,38 +240,38 @@ class MeasuredSeparation:
         model = RepulsionModel(collision, *by_pair, law.stiffness, law.damping_ratio, law.maximum_force)
         self._fingers = FingerOpenings(robot, collision.bodies)
         self._kernel_data = RepulsionData.empty(model)
-        self._measured = self._kernel_data.measured.reshape(-1)  # a view
+        self._measured = self._kernel_data.measured.reshape(-1)  # This is a view.
         self._model_pointer, self._data_pointer = pointer_to(model), pointer_to(self._kernel_data)
         self._pair_names = [(names[one], names[other]) for one, other in zip(pairs.first, pairs.second, strict=True)]
-        # Every kernel runs once here, so that none is compiled in mid-motion.
+        # Every kernel runs once here, so that none is compiled during a motion.
         self._find_near = bound(find_near, self._model_pointer, self._data_pointer)
         self._repulsion_torque = bound(repulsion_torque, self._model_pointer, self._data_pointer, 0)
         self._no_torque = np.zeros(robot.model.nv)
         self._no_torque.flags.writeable = False
 
     def set_openings(self, openings: Mapping[str, Interval]) -> None:
-        """Between which openings each arm's gripper is; of an arm that is not named, all of the way."""
+        """Set the interval of openings of each arm's gripper. An arm that is not named gets the whole interval."""
         self._fingers.set_all(openings)
         if self._fingers.turn:
             self.set_kept_distances(self._kept)
 
     def set_obstacles(self, obstacles: Mapping[str, MovingObstacle]) -> None:
-        """The moving obstacles that stay where they are, by name; the others are out of reach."""
+        """Set the moving obstacles that stay where they are, by name. All others are put out of reach."""
         for name, number in self._obstacles.items():
             write_body(self._bodies, number, obstacles.get(name, _OUT_OF_REACH))
         self.set_kept_distances(self._kept)
 
     def set_kept_distances(self, kept: Array) -> None:
-        """How far apart every pair stays, (p,) [m], which is where its wall begins."""
+        """Set the distance (p,) [m] that every pair keeps, which is where its wall begins."""
         self._kept, radius = kept, self._bodies.radius
         radii = radius[self._pairs.first] + radius[self._pairs.second]
         self._deep[:] = (_DEEP - 1.0) * radii
-        # Pairs that may touch meet the wall only where they are deeper in each other than bodies get that touch.
+        # Pairs that may touch meet the wall only at depths that a touch does not reach.
         self._shell[:] = np.maximum(np.append(kept, self._kept_by_obstacles), -_SOFT * radii)
         self._smoothing[:] = (_SMOOTHING * (radii + self._shell)) ** 2
 
     def update(self, q: Array, v: Array) -> WallReport:
-        """Wall torque at the measured ``q`` [rad] and ``v`` [rad/s], (nv,) each.
+        """Return the wall's torque at the measured ``q`` [rad] and ``v`` [rad/s], (nv,) each.
 
         Never raises because of a number: where one is not finite nothing can be known, and no torque is given.
         """
