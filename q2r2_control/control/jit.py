@@ -31,7 +31,7 @@ def numpy_kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     return _compiled(function)
 
 
-_kernels: list[Any] = []  # every dispatcher of this process
+_kernels: list[Any] = []  # All dispatchers of this process.
 
 
 def _compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
@@ -47,7 +47,7 @@ def _compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any
 
 
 class _Progress(Listener):
-    """Tells how many kernels have been compiled; helpers of Numba's own do not count."""
+    """Reports how many kernels have been compiled, without Numba's own helpers."""
 
     def __init__(self, progress: Callable[[int, int], None]) -> None:
         self._progress = progress
@@ -70,7 +70,7 @@ class _Progress(Listener):
 
 @contextmanager
 def compiling(progress: Callable[[int, int], None]) -> Iterator[None]:
-    """Tell ``progress`` as kernels are compiled: how many are done, of how many that this process may need.
+    """Report to ``progress`` the number of compiled kernels, and of those that this process may need.
 
     It is called before the first one, and after each; never where all come from the cache.
     """
@@ -79,11 +79,11 @@ def compiling(progress: Callable[[int, int], None]) -> Iterator[None]:
 
 
 def bound(function: Callable[..., Any], *arguments: Any) -> Callable[..., Any]:
-    """A kernel's machine code for arguments of the types of these, with which it runs once.
+    """Return a kernel's machine code for the types of these arguments, after one run with them.
 
     It does not look at the types of its arguments, which saves time: hand it exactly these types and layouts.
     """
     function(*arguments)
-    dispatcher: Any = function  # get_overload is set by Numba at run time too
+    dispatcher: Any = function  # At run time, Numba sets get_overload too.
     code: Callable[..., Any] = dispatcher.get_overload(tuple(numba.typeof(argument) for argument in arguments))
     return code

@@ -27,14 +27,14 @@ _VERSION = re.compile("[0-9a-f]{16}")
 
 
 def compiled_sources() -> list[Path]:
-    """Files of kernels, of the types of their arguments, and of how they are compiled; kernels use no other file."""
+    """Return the files of kernels, of their argument types, and of their compilation. Kernels use no other file."""
     package = Path(__file__).parents[1]
     sources = sorted(source for room in _ROOMS for source in (package / room).rglob("*.py"))
     return [source for source in sources if _COMPILED.search(source.read_text(encoding="utf-8"))]
 
 
 def _cache_folder() -> Path:
-    """The folder of this version's machine code; makes it the newest and deletes all but the two newest.
+    """Return the folder of this version's machine code. It becomes the newest, and all but the two newest are deleted.
 
     A folder that another process has loaded from may be deleted: its machine code is in memory, and what that process
     still compiles is written anew. Where the cache cannot be written, what it holds is still used.
@@ -49,13 +49,13 @@ def _cache_folder() -> Path:
                 pass
         except OSError:
             if any(folder.rglob("*.nbi")):
-                return folder  # compiled before, and only to be read
+                return folder  # The machine code was compiled before, and is only read.
             raise
         os.utime(folder)
         _delete_old_versions(root)
         return folder
     except (OSError, RuntimeError) as error:
-        # Numba loads what it finds there as code, so a folder that others could have made will not do.
+        # Numba runs the content as code. A folder that others could have made is therefore refused.
         warnings.warn(
             f"compiled kernels cannot be kept: {error}. Every start compiles them anew; set XDG_CACHE_HOME to a folder "
             "that can be written",
@@ -73,7 +73,7 @@ def _delete_old_versions(root: Path) -> None:
             if _VERSION.fullmatch(folder.name) and not folder.is_symlink():
                 used.append((folder.stat().st_mtime_ns, folder))
         except FileNotFoundError:
-            continue  # another process deleted it
+            continue  # Another process has deleted it.
     for _, folder in sorted(used)[:-2]:
         shutil.rmtree(folder, ignore_errors=True)
 
@@ -82,10 +82,10 @@ _FOLDER = str(_cache_folder())
 
 
 class _ContentLocator(_CacheLocator):
-    """Finds a function's machine code by the name of its module and the content of its file, wherever that is."""
+    """Finds a function's machine code by the name of its module and the content of its file, in any folder."""
 
     def __init__(self, function: Callable[..., Any], file: str) -> None:
-        self._py_file = file  # which the cache names in a warning
+        self._py_file = file  # The cache names this file in a warning.
         self._folder = str(Path(_FOLDER) / re.sub(r"\W", "_", function.__module__))
         self._line = function.__code__.co_firstlineno
         self._stamp = hashlib.sha256(Path(file).read_bytes()).hexdigest()
@@ -109,10 +109,10 @@ class _KernelCacheImpl(CompileResultCacheImpl):
 
 
 class KernelCache(FunctionCache):
-    """Numba's cache, with another way to find a file; it is only read where it cannot be written."""
+    """Numba's cache with another way to find a file. It is only read if it cannot be written."""
 
     _impl_class = _KernelCacheImpl
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        with suppress(OSError):  # the kernel works all the same, and the next start compiles it again
+        with suppress(OSError):  # Without this, the kernel still works, and the next start compiles it again.
             super().save_overload(sig, data)

@@ -20,7 +20,10 @@ from numba.core.sigutils import normalize_signature
 
 
 class _PartLibrary(JITCodeLibrary):
-    """Code of a kernel that is compiled on behalf of another one: only linked into that one, and not run by itself."""
+    """Code of a kernel that is compiled as a part of another one.
+
+    It is only linked into that one, and does not run alone.
+    """
 
     def finalize(self) -> None:
         """Mark the library as complete. The whole kernel links, optimises and translates it."""
@@ -30,16 +33,16 @@ class _PartLibrary(JITCodeLibrary):
     def _get_module_for_linking(self) -> Any:
         for function in self._final_module.functions:
             if not function.is_declaration and function.linkage.name == "external":
-                function.linkage = "linkonce_odr"  # several whole kernels may link this function
+                function.linkage = "linkonce_odr"  # Several whole kernels may link this function.
         return self._final_module
 
     def get_pointer_to_function(self, name: str) -> int:
-        """Returns no address, since there is no machine code."""
+        """Return no address, because there is no machine code."""
         return 0
 
     @property
     def codegen(self) -> Any:
-        """This library itself, to which Numba hands the function's Python objects; kernels have none."""
+        """This library itself. Numba passes the function's Python objects to it, but kernels have none."""
         return self
 
     def set_env(self, name: str, environment: Any) -> None:
@@ -47,7 +50,7 @@ class _PartLibrary(JITCodeLibrary):
 
 
 class _WholeLibrary(JITCodeLibrary):
-    """Code of a kernel that Python calls, with all the parts that it consists of."""
+    """Code of a kernel that Python calls, with all of its parts."""
 
     _linking_libraries: list[Any]
 
@@ -88,18 +91,18 @@ class _PartCompiler(_WholeCompiler):
 class Kernel(CPUDispatcher):
     """A function that is compiled for each combination of types that it is called with."""
 
-    _being_compiled = 0  # how many kernels, each on behalf of the one before
+    _being_compiled = 0  # Number of kernels in compilation, each as a part of the one before.
 
     def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
         super().__init__(function, targetoptions=options, pipeline_class=_WholeCompiler)
-        self.parts: dict[tuple[Any, ...], Any] = {}  # what other kernels link, by the types of the arguments
+        self.parts: dict[tuple[Any, ...], Any] = {}  # Code that other kernels link, by the types of the arguments.
         self._wanted_as_part = False
         part_options = options | {"no_cpython_wrapper": True}
         numba_compiler = type(self._compiler)
         self._part_compiler = numba_compiler(function, self.targetdescr, part_options, {}, _PartCompiler)
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
-        """Tell a caller that is being compiled what it has to know; another kernel needs this one as a part only."""
+        """Return a caller's template during its compilation. Another kernel needs this one only as a part."""
         with global_compiler_lock:
             self._wanted_as_part = Kernel._being_compiled > 0
             return super().get_call_template(args, kws)
@@ -110,7 +113,7 @@ class Kernel(CPUDispatcher):
         return [compiled.signature for compiled in (self.overloads | self.parts).values()]
 
     def get_overload(self, sig: Any) -> Any:
-        """The part for ``sig`` while a kernel that calls it is compiled, else the whole."""
+        """Return the part for ``sig`` while a kernel that calls it is compiled, else the whole."""
         with global_compiler_lock:
             part = self.parts.get(normalize_signature(sig)[0]) if Kernel._being_compiled else None
             return super().get_overload(sig) if part is None else part.entry_point
@@ -129,7 +132,9 @@ class Kernel(CPUDispatcher):
                 Kernel._being_compiled -= 1
 
     def _part(self, arguments: Any, result: Any) -> Any:
-        """A part is compiled also where Python calls the kernel: what is left of an optimised whole may lack pieces."""
+        """Return a separate part even if Python calls the kernel, because the rest of an optimised whole may lack
+        pieces.
+        """
         known = self.parts.get(tuple(arguments))
         if known is None:
             details = {"dispatcher": self, "args": arguments, "return_type": result}

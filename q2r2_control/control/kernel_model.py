@@ -21,16 +21,16 @@ from q2r2_control.robot.pairs import pair_names
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
-# Of pairs that may touch: rows that aim at the very distance would leave the certificate nothing [m].
+# For pairs that may touch: rows that aim exactly at the distance would leave the certificate no room [m].
 LEAST_BUFFER = 0.00025
-# How far before contact pairs that may touch are slowed down; bodies are a little larger than what they enclose [m].
+# Pairs that may touch are slowed down this far before contact, because bodies are larger than their contents [m].
 _CONTACT_ZONE = 0.002
-# Of the depth at which the cores of two bodies meet: as far as they may get into each other.
+# Largest depth, relative to the depth at which the cores of two bodies meet.
 _DEEPEST = 0.8
 
 
 class KernelModel(NamedTuple):
-    """Data that do not change in a tick, by the rooms that read it."""
+    """Data that do not change in a tick, by the packages that read them."""
 
     safety: SafetyModel
     tasks: TaskModel
@@ -45,7 +45,7 @@ def kernel_model_of(robot: Robot, settings: ControllerSettings) -> KernelModel:
     check_priority(settings.priority, tuple(robot.arms))
     kept, geometry = kept_distances(robot, settings), with_obstacle_bodies(robot, settings.moving_obstacles)
     more = len(geometry.collisionPairs) - len(kept.values)
-    min_distance = np.append(kept.values, np.full(more, -np.inf))  # nothing is held, no obstacle is known yet
+    min_distance = np.append(kept.values, np.full(more, -np.inf))  # No object is held, and no obstacle is known yet.
     contact_speed = np.append(kept.contact_speed, np.full(more, np.inf))
     depth = np.append(-kept.values, np.zeros(more))
     collision = with_rounded_boxes(collision_model_of(robot, geometry), depth)
@@ -79,14 +79,14 @@ def kernel_model_of(robot: Robot, settings: ControllerSettings) -> KernelModel:
 
 
 def _of_two_arms(pairs: Pairs) -> IntArray:
-    """Which pairs (p,) have two bodies that move each by joints of its own."""
+    """Return which pairs (p,) have two bodies that are moved by different joints."""
     own = (pairs.carried == 0) & (pairs.sign > 0).any(axis=1) & (pairs.sign < 0).any(axis=1)
     return own.astype(np.int64)
 
 
 def _check_depths(robot: Robot, collision: CollisionModel, kept: KeptDistances) -> None:
-    """Raises :class:`ConfigError` where two bodies may get so deep into each other that no direction leads out."""
-    radius = collision.bodies.radius.copy()  # the least that each body ever has [m]
+    """Raise :class:`ConfigError` if two bodies may penetrate so deeply that no direction leads out."""
+    radius = collision.bodies.radius.copy()  # The least radius that each body ever has [m].
     for number, finger in turning_bodies(robot):
         radius[number] = finger.radius
     until_cores_meet = radius[collision.pairs.first] + radius[collision.pairs.second]
@@ -99,18 +99,18 @@ def _check_depths(robot: Robot, collision: CollisionModel, kept: KeptDistances) 
 
 
 def stop_buffer(min_distance: Array, settings: ControllerSettings) -> Array:
-    """How much farther from each other pairs stop in the QP (p,) [m]."""
+    """Return the additional distance at which the QP stops each pair (p,) [m]."""
     return np.minimum(settings.distance_buffer, np.maximum(0.5 * min_distance, LEAST_BUFFER))
 
 
 class KernelData(NamedTuple):
-    """Data that change from tick to tick, by the rooms that write it."""
+    """Data that change from tick to tick, by the packages that write them."""
 
     safety: SafetyData
     tasks: TaskData
 
     @classmethod
     def empty(cls, model: KernelModel) -> KernelData:
-        """Arrays of the sizes that ``model`` needs."""
+        """Return arrays of the sizes that ``model`` needs."""
         safety = SafetyData.empty(model.safety)
         return cls(safety, TaskData.empty(model.tasks, safety.collision.placements))

@@ -27,10 +27,10 @@ from q2r2_control.control.targets import update_targets
 from q2r2_control.control.tasks.built_in import write_task_cost
 from q2r2_control.types import Array
 
-SOFTNESS = 1e-5  # part of its correction by which a row gives way
+SOFTNESS = 1e-5  # Part of its correction by which a row yields.
 
 
-@dataclass(slots=True)  # not frozen: that would cost a microsecond a tick
+@dataclass(slots=True)  # A frozen class would cost a microsecond a tick.
 class QpProblem:
     """The problem of one step, for nv joints.
 
@@ -94,14 +94,14 @@ class Solver(Protocol):
 
 
 def row_softness(H: Array, rows: Array) -> Array:
-    """rho_i = SOFTNESS a_i' H^-1 a_i of each of the ``rows`` (m, nv), (m,)."""
+    """Return rho_i = SOFTNESS a_i' H^-1 a_i of each of the ``rows`` (m, nv), (m,)."""
     compliance: Array = np.sum(rows * np.linalg.solve(H, rows.T).T, axis=1)
     return SOFTNESS * compliance
 
 
 @kernel
 def find_minimum(data_pointer: KernelPointer) -> bool:
-    """Write -H^-1 g to ``tasks.minimum`` (nv,) [rad/s]; whether it is finite and within the box and all rows."""
+    """Write -H^-1 g to ``tasks.minimum`` (nv,) [rad/s]. Return whether it is finite and within the box and all rows."""
     return _find_minimum(pointee(data_pointer))
 
 
@@ -118,7 +118,7 @@ def _find_minimum(data: KernelData) -> bool:
         return False
     substitute(tasks.factor, minimum)
     for j in range(nv):
-        # Written so that what is no number is outside.
+        # The comparison is written so that NaN counts as outside.
         if not (box.lower[j] <= minimum[j] <= box.upper[j]):
             return False
     kept = True
@@ -131,7 +131,7 @@ def _find_minimum(data: KernelData) -> bool:
 def assemble(
     model_pointer: KernelPointer, targets_pointer: KernelPointer, data_pointer: KernelPointer, h: float, tick: float
 ) -> tuple[bool, bool, bool]:
-    """Cost, rows and box of a step of ``h`` [s] from an observed reference.
+    """Write cost, rows and box of a step of ``h`` [s] from an observed reference.
 
     ``tick`` [s]: of which it is the first step, with the targets that were offered; below 0: it is another one. Returns
     whether all targets were usable, whether all joints are within their limits, and what :func:`find_minimum` says.

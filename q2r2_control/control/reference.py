@@ -1,4 +1,4 @@
-"""The reference: observed where it is, moved by what the safety filter lets through, compiled."""
+"""The reference: its observation, and its motion as far as the safety filter allows, compiled."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Observed = tuple[int, float, int, float]
 
 @kernel
 def start_reference(model_pointer: KernelPointer, data_pointer: KernelPointer) -> bool:
-    """Observe after a reset; whether a stop is known to keep all apart."""
+    """Observe after a reset. Return whether a stop is known that keeps all pairs apart."""
     model, data = pointee(model_pointer), pointee(data_pointer)
     rest_always(data.safety.history, data.safety.state.q)
     _observe(model, data)
@@ -32,7 +32,7 @@ def start_reference(model_pointer: KernelPointer, data_pointer: KernelPointer) -
 
 @kernel
 def observe_bodies(model_pointer: KernelPointer, data_pointer: KernelPointer, grown: IntArray) -> tuple[Observed, int]:
-    """Observe after bodies, some of which have ``grown`` (g,), or kept distances were changed.
+    """Observe after bodies, some of which have ``grown`` (g,), or kept distances have changed.
 
     Also returns the pair in the way, see :func:`certify_bodies`; -1 where the bodies may be as they are.
     """
@@ -44,7 +44,10 @@ def observe_bodies(model_pointer: KernelPointer, data_pointer: KernelPointer, gr
 def move_reference(
     model_pointer: KernelPointer, data_pointer: KernelPointer, solution: Array, usable: bool, h: float, share: float
 ) -> tuple[Observed, int, float]:
-    """One step of ``h`` [s] with the solver's next velocities (nv,), observed, and what the safety filter says."""
+    """Do one step of ``h`` [s] with the solver's next velocities (nv,), and observe.
+
+    Return the safety filter's result.
+    """
     model, data = pointee(model_pointer), pointee(data_pointer)
     outcome, slack = apply_safety_filter(model.safety, data.safety, solution, usable, h, share)
     return _observe(model, data), outcome, slack
@@ -52,7 +55,7 @@ def move_reference(
 
 @kernel
 def spare_distance(model_pointer: KernelPointer, data_pointer: KernelPointer, pairs: IntArray) -> float:
-    """The least that some ``pairs`` (p,) have to spare at the reference [m]: their distance less what they keep."""
+    """Return the least margin of some ``pairs`` (p,) at the reference [m]: their distance minus the kept distance."""
     model, data = pointee(model_pointer).safety, pointee(data_pointer).safety
     least = np.inf
     for p in pairs:
@@ -63,7 +66,7 @@ def spare_distance(model_pointer: KernelPointer, data_pointer: KernelPointer, pa
 
 @kernel
 def _observe(model: KernelModel, data: KernelData) -> Observed:
-    """Tool poses and distances at the reference."""
+    """Compute tool poses and distances at the reference."""
     collision, safety = model.safety.collision, data.safety
     update_placements(collision, safety.collision, safety.state.q)
     update_body_velocities(collision, safety.collision, safety.state.v, safety.velocities)
@@ -73,7 +76,7 @@ def _observe(model: KernelModel, data: KernelData) -> Observed:
     if safety.distance.shape[0] == 0:
         return 0, np.inf, 0, np.inf
     closest = measure_pairs(model.safety, safety)
-    while True:  # what is a lower bound of a distance is measured until the least margin is of none
+    while True:  # Lower bounds are replaced by exact distances until the least margin is an exact one.
         tightest, least = 0, np.inf
         for p in range(safety.distance.shape[0]):
             margin = safety.distance[p] - model.safety.min_distance[p]

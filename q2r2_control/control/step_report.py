@@ -24,11 +24,11 @@ class LimitNames:
         names = [item.name for item in geometry.geometryObjects]
         pairs = collision_model_of(
             robot, geometry
-        ).pairs  # the kernels' know boxes that may be touched by other numbers
+        ).pairs  # In the kernels, boxes that may be touched have other numbers.
         both = zip(pairs.first.tolist(), pairs.second.tolist(), strict=True)
         self.pairs = [
             (names[first], names[second]) for first, second in both
-        ]  # of the cell, then of objects, then of obstacles
+        ]  # The pairs are those of the cell, then of objects, then of obstacles.
         # In most ticks the same limits are active as in the last one.
         self._last: tuple[bytes, tuple[ActiveLimit, ...]] = b"", ()
         self._by_kind: dict[int, list[ActiveLimit]] = {

@@ -1,4 +1,4 @@
-"""The task of each arm: checked targets, their own velocity, and the pose of a held arm."""
+"""The task of each arm: a checked target with its velocity, or the pose of a held arm."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from q2r2_control.control.tasks.built_in import TaskModel
 from q2r2_control.control.tasks.frame import rotation_vector, times_transposed
 from q2r2_control.types import Array
 
-# Farther than any cell; keeps squares of what is merely far away finite.
+# The distance is larger than any cell, so that squares of larger ones stay finite.
 _FARTHEST = 100.0  # [m]
 _ORTHONORMAL = 1e-3
 _AT_REST = 1e-2  # [rad/s]
-_NONE, _POSE, _NO_POSE = 0, 1, 2  # what was offered to an arm
-# A target faster than this many times the tool's own limit did not move, it was put elsewhere.
+_NONE, _POSE, _NO_POSE = 0, 1, 2  # Kinds of offers to an arm.
+# A target faster than this multiple of the tool's own limit has jumped.
 _TELEPORT = 3.0
 
 
 class PoseScratch(NamedTuple):
-    """Scratch of an offered pose that is being checked."""
+    """Scratch for checking an offered pose."""
 
     rotation: Array  # (3, 3)
     gram: Array  # (3, 3)
@@ -40,18 +40,18 @@ class PoseScratch(NamedTuple):
 class TaskTargets(NamedTuple):
     """Targets of the arms in one tick."""
 
-    member: Array  # (n, nv) 1 where a joint is the arm's
-    follows: IntArray  # (n,) 1: the tool follows its target, 0: the arm's joints hold
+    member: Array  # (n, nv) 1 if a joint belongs to the arm.
+    follows: IntArray  # (n,) 1 if the tool follows its target, 0 if the arm's joints hold.
     rotation: Array  # (n, 3, 3)
     translation: Array  # (n, 3) [m]
-    feed_forward: Array  # (n, 6) the target's own twist [m/s, rad/s]
-    hold: Array  # (nv,) joint positions to hold [rad]
-    posture: Array  # (nv,) joint positions that the arms take where the tools leave them free to [rad]
-    latched: IntArray  # (n,) 1: the arm has come to rest where it holds
-    offered: IntArray  # (n,) what this tick brought: nothing, a pose, something else
-    pose: Array  # (n, 4, 4) homogeneous, as offered
-    feed_forward_time: float  # in which the feed-forward is smoothed [s]
-    teleport_speed: float  # a faster target did not move, it was put elsewhere [m/s]
+    feed_forward: Array  # (n, 6) Twist of the target itself [m/s, rad/s].
+    hold: Array  # (nv,) Joint positions to hold [rad].
+    posture: Array  # (nv,) Joint positions for the joints that the tools leave free [rad].
+    latched: IntArray  # (n,) 1 if the arm has come to rest where it holds.
+    offered: IntArray  # (n,) What this tick offered: nothing, a pose, something else.
+    pose: Array  # (n, 4, 4) Homogeneous pose, as offered.
+    feed_forward_time: float  # Time constant that smooths the feed-forward [s].
+    teleport_speed: float  # A faster target has jumped [m/s].
     teleport_turn: float  # [rad/s]
     scratch: PoseScratch
 
@@ -93,7 +93,7 @@ class TargetTracker:
         self._targets.posture[:] = self._home
 
     def hold_at(self, q: Array | None) -> None:
-        """Arms that follow no target go to ``q`` (nv,) [rad] and hold there; None: where they come to rest."""
+        """Let arms without a target move to ``q`` (nv,) [rad] and hold there; None: where they come to rest."""
         if q is None:
             self._targets.latched[:] = 0
         else:
@@ -101,19 +101,22 @@ class TargetTracker:
             self._targets.latched[:] = 1
 
     def aim_posture(self, posture: npt.ArrayLike | None) -> None:
-        """Let the free joints go to ``posture`` (nv,) [rad], home where there is none; a bad one changes nothing."""
+        """Let the free joints move to ``posture`` (nv,) [rad], or home without one.
+
+        An invalid posture changes nothing.
+        """
         if posture is None:
             self._targets.posture[:] = self._home
             return
         try:
             posture = np.asarray(posture)
-        except Exception:  # rows of different lengths, or whatever an object of the caller's does
+        except Exception:  # Rows may have different lengths, and an object of the caller may raise anything.
             return
         if posture.shape == self._home.shape and posture.dtype.kind in "fiu" and np.isfinite(posture).all():
             self._targets.posture[:] = posture
 
     def offer(self, targets: Mapping[str, pin.SE3 | None]) -> bool:
-        """Write the targets of one tick to where :func:`update_targets` looks; whether every name is an arm's."""
+        """Write the targets of one tick for :func:`update_targets`. Return whether every name is an arm's."""
         known = 0
         for i, arm in enumerate(self._arms):
             target = targets.get(arm)
@@ -126,14 +129,14 @@ class TargetTracker:
         return known == len(targets)
 
     def rejected(self, targets: Mapping[str, pin.SE3 | None]) -> tuple[str, ...]:
-        """Of what was offered and taken, the names whose target is not usable, unknown names among them."""
+        """Return the names whose offered target is not usable, including unknown names."""
         rejected = [arm for arm, offered in zip(self._arms, self._offered, strict=True) if offered == _NO_POSE]
         return (*rejected, *(str(name) for name in targets if name not in self._arms))
 
 
 @kernel
 def update_targets(targets: TaskTargets, q: Array, v: Array, dt: float) -> bool:
-    """Make what was offered each arm's target, or hold it where there is nothing usable; False if something was not.
+    """Make each offered pose the arm's target, or hold the last one. Return False if an offer was not usable.
 
     A target that is no pose is marked so in ``targets.offered``.
     """
@@ -156,7 +159,7 @@ def update_targets(targets: TaskTargets, q: Array, v: Array, dt: float) -> bool:
 
 @kernel
 def _hold(targets: TaskTargets, i: int, q: Array, v: Array) -> None:
-    """A moving arm is braked first and holds where it comes to rest, so that it need not come back."""
+    """Brake a moving arm first, and hold it where it comes to rest, so that it need not come back."""
     speed = 0.0
     for j in range(q.shape[0]):
         if targets.member[i, j] == 1.0:
@@ -168,7 +171,8 @@ def _hold(targets: TaskTargets, i: int, q: Array, v: Array) -> None:
 
 @kernel
 def _update_pose(targets: TaskTargets, i: int, dt: float) -> bool:
-    """Make the offered homogeneous pose the target of arm ``i``; False, and no change, if it is not a finite pose.
+    """Make the offered homogeneous pose the target of arm ``i``. Return False without a change if it is not a finite
+    pose.
 
     A target that moves has its twist smoothed over a time; one that was put elsewhere, faster than any tool, has none.
     """
@@ -201,7 +205,7 @@ def _update_pose(targets: TaskTargets, i: int, dt: float) -> bool:
 
 @kernel
 def _checked_pose(pose: Array, scratch: PoseScratch) -> bool:
-    """Split a pose (4, 4) into ``scratch``, its rotation made orthonormal; False if not finite or no rotation."""
+    """Split a pose (4, 4) into ``scratch`` with an orthonormal rotation. Return False if it is not a finite pose."""
     rotation, translation, gram = scratch.rotation, scratch.translation, scratch.gram
     largest, total, error = 0.0, 0.0, 0.0
     for i in range(3):
@@ -220,7 +224,7 @@ def _checked_pose(pose: Array, scratch: PoseScratch) -> bool:
     for i in range(3):
         j, k = (i + 1) % 3, (i + 2) % 3
         determinant += rotation[0, i] * (rotation[1, j] * rotation[2, k] - rotation[1, k] * rotation[2, j])
-    # A maximum may pass over NaN and infinities may cancel; what is not finite shows in the sum.
+    # A maximum may ignore NaN, and infinities may cancel. In the sum, such numbers show.
     if not (np.isfinite(total) and error < _ORTHONORMAL and determinant > 0.0):
         return False
     if largest > _FARTHEST:

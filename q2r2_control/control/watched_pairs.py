@@ -110,7 +110,7 @@ class WatchedPairs:
         """
         if not self._objects.set_holding(arm, holds):
             return
-        self._active.used[0] = 0  # what it names may not count any more
+        self._active.used[0] = 0  # The pair that it names may not be monitored any more.
         self._obstacles.hold(self._objects.holding)
         self._observe_again(self._unchanged)
         self._objects.begin()
@@ -144,7 +144,7 @@ class WatchedPairs:
             ConfigError: If there is no such name.
         """
         changed = self._obstacles.put(name, obstacle)
-        self._active.used[0] = 0  # what it names may not count any more
+        self._active.used[0] = 0  # The pair that it names may not be monitored any more.
         blocked = self._observe_again(changed) if self._state.v.any() else -1
         self._certified &= blocked < 0
         self._obstacles.keep_clear(0.0)

@@ -96,7 +96,7 @@ def products(a0: Array, a1: Array, b0: Array, b1: Array) -> tuple[float, float, 
 @kernel
 def _middle_of_overlap(aa: float, ab: float, ar: float) -> float:
     """Parameter on a of the middle of what b covers of it, for parallel segments."""
-    start, end = -ar / aa, (ab - ar) / aa  # of b on a
+    start, end = -ar / aa, (ab - ar) / aa  # Parameters of b on a.
     return 0.5 * (clamp(start, 0.0, 1.0) + clamp(end, 0.0, 1.0))
 
 
@@ -201,7 +201,7 @@ def _push_out(a0: Array, a1: Array, half: Array, on_a: Array, on_box: Array, nor
         normal[k] = 0.0
         on_box[k] = on_a[k]
     on_box[axis] = sign * half[axis]
-    normal[axis] = -sign  # from the segment into the box: against the way out
+    normal[axis] = -sign  # The normal leads from the segment into the box, against the way out.
     return -best
 
 
@@ -223,7 +223,7 @@ def _depth_across(a0: Array, a1: Array, half: Array, k: int, least: float, norma
 
 @kernel
 def _across_edge(a0: Array, a1: Array, half: Array, k: int, on_a: Array, on_box: Array, normal: Array) -> None:
-    """Where the segment passes the edge along axis ``k`` that it leaves the box across, against ``normal``."""
+    """Return where the segment crosses the box's edge along axis ``k`` when it leaves against ``normal``."""
     i, j = (k + 1) % 3, (k + 2) % 3
     for axis in (i, j):
         on_box[axis] = -half[axis] if normal[axis] > 0.0 else half[axis]

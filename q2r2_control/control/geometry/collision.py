@@ -1,4 +1,4 @@
-"""A robot's collision geometries and monitored pairs as arrays, and where they are at a posture, compiled.
+"""A robot's collision geometries and monitored pairs as arrays, and their places at a posture, compiled.
 
 Every geometry is a segment with a radius (capsule, sphere) or a box. Only joints that move one body of a pair relative
 to the other are listed with the pair.
@@ -28,23 +28,24 @@ class CollisionBodies(NamedTuple):
 
     joint: IntArray  # (g,) 0 is the world
     box: IntArray  # (g,) 1 for a box
-    start: Array  # (g, 3) segment start [m]; box: centre
-    end: Array  # (g, 3) segment end [m]
-    radius: Array  # (g,) [m]; box: 0, or what its edges are rounded with
-    half: Array  # (g, 3) half sides of a box [m]
-    rotation: Array  # (g, 3, 3) of a box
-    size: Array  # (g,) radius of the ball around the middle that holds it all [m]
+    start: Array  # (g, 3) Start of the segment, or centre of the box [m].
+    end: Array  # (g, 3) End of the segment [m].
+    radius: Array  # (g,) Radius [m]; for a box 0, or the radius of its rounded edges.
+    half: Array  # (g, 3) Half sides of a box [m].
+    rotation: Array  # (g, 3, 3) Rotation of a box.
+    size: Array  # (g,) Radius of the ball around its middle that contains the geometry [m].
 
 
 class Pairs(NamedTuple):
-    """Which geometries must not meet, and the joints that move them relative to each other."""
+    """The pairs of geometries that must not meet, and the joints that move them relative to each other."""
 
-    first: IntArray  # (p,) geometry index; never a box
+    first: IntArray  # (p,) Index of a geometry that is never a box.
     second: IntArray  # (p,)
     joint: IntArray  # (p, k) joint indices, padded with 0
     sign: Array  # (p, k) +1: the joint moves the second geometry, -1: the first
-    reach: Array  # (p, k) bound on how far the geometry's points are from the joint's axis [m]; 1 for a sliding joint
-    leverage: Array  # (p,) sum of reach
+    # (p, k) Bound on the distance of the geometry's points from the joint's axis [m]; 1 for a sliding joint.
+    reach: Array
+    leverage: Array  # (p,) Sum of reach.
     carried: IntArray  # (p,) 1: some joint moves both geometries alike, and is not listed
 
 
@@ -101,7 +102,8 @@ def collision_model_of(robot: Robot, geometry: pin.GeometryModel | None = None) 
     chain, bodies = chain_of(robot.model), bodies_of(geometry)
     travel = np.maximum(np.abs(robot.position_lower), np.abs(robot.position_upper))
     extent = farthest_of(bodies)
-    for number, finger in turning_bodies(robot):  # capsules of other intervals are not within the one of all the way
+    # Capsules of other intervals may reach outside that of the whole interval.
+    for number, finger in turning_bodies(robot):
         extent[number] = max(extent[number], finger.extent)
     return CollisionModel(chain, bodies, pairs_of(geometry, chain, bodies, travel, extent))
 
@@ -142,13 +144,13 @@ def turning_bodies(robot: Robot) -> list[tuple[int, TurningBody]]:
 
 
 def farthest_of(bodies: CollisionBodies) -> Array:
-    """How far segments and boxes reach from the origins of their joints' frames (g,) [m]."""
+    """Return how far segments and boxes reach from the origins of their joints' frames (g,) [m]."""
     ends = np.maximum(np.linalg.norm(bodies.start, axis=1), np.linalg.norm(bodies.end, axis=1))
     return np.asarray(np.linalg.norm(bodies.half, axis=1) + ends)
 
 
 def pairs_of(model: pin.GeometryModel, chain: Chain, bodies: CollisionBodies, travel: Array, extent: Array) -> Pairs:
-    """Monitored pairs of ``model``; ``travel`` (nv,) is how far each joint can be from zero [rad or m].
+    """Return the monitored pairs of ``model``. Joints can be ``travel`` (nv,) away from zero [rad or m].
 
     ``extent`` (g,) is what :func:`farthest_of` the bodies never exceeds, whatever becomes of them [m]. Raises
     :class:`RobotError` for a pair of two boxes, which no kernel measures.
@@ -170,7 +172,7 @@ def pairs_of(model: pin.GeometryModel, chain: Chain, bodies: CollisionBodies, tr
                 if chain.prismatic[joint]:
                     farthest += travel[joint - 1]
                 if joint in moving:
-                    del moving[joint]  # moves both alike: no relative motion
+                    del moving[joint]  # The joint moves both bodies equally, without relative motion.
                     carried = True
                 else:
                     moving[joint] = (sign, 1.0 if chain.prismatic[joint] else float(farthest))
@@ -189,7 +191,7 @@ def pairs_of(model: pin.GeometryModel, chain: Chain, bodies: CollisionBodies, tr
 
 @kernel
 def update_placements(model: CollisionModel, data: CollisionData, q: Array) -> None:
-    """Joint frames and geometries in the world at ``q`` (nv,)."""
+    """Write joint frames and geometries in the world at ``q`` (nv,)."""
     bodies, placements, posed = model.bodies, data.placements, data.posed
     place(model.chain, q, placements)
     for g in range(bodies.joint.shape[0]):

@@ -1,4 +1,4 @@
-"""The fingers' bodies of one collision model, as their grippers' openings are known.
+"""The bodies of the fingers in one collision model, for the known openings of their grippers.
 
 They are changed in place, where the kernels read them. A part of a sliding finger's way is nowhere farther from a
 joint's axis than all of it (``Pairs.reach``, ``leverage``) and fits into a ball of that size about its own middle
@@ -22,15 +22,15 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.robot.turning_fingers import Capsules, TurningBody, TurningSweeps, sticks_out
 from q2r2_control.types import ALL_OF_THE_WAY, Interval
 
-# A gripper that is held asks for the same again and again, between intervals that it has.
+# A gripper that is held asks again and again for intervals that it already has.
 _REMEMBERED = 16
 
 
 class FingerOpenings:
-    """Between which openings the gripper of each arm may be; all of the way, until something else is set."""
+    """The interval of openings of each arm's gripper. At first, it is the whole interval."""
 
     def __init__(self, robot: Robot, bodies: CollisionBodies) -> None:
-        """``bodies`` are those of ``robot``, with fingers that are all of their way."""
+        """Begin with the ``bodies`` of ``robot``, in which fingers sweep their whole way."""
         self.intervals: dict[str, Interval] = dict.fromkeys(robot.arms, ALL_OF_THE_WAY)
         self._bodies = bodies
         names = [geometry.name for geometry in robot.collision_model.geometryObjects]
@@ -46,7 +46,7 @@ class FingerOpenings:
         self._parts: dict[int, tuple[float, float]] = {}
 
     def checked(self, arm: str, least: float, greatest: float) -> Interval:
-        """The interval as it can be set. Raises :class:`RobotError` for no interval."""
+        """Return the interval in a form that can be set. Raises :class:`RobotError` for an invalid interval."""
         usable = all(isinstance(value, int | float | np.floating) for value in (least, greatest))
         if not (usable and -math.inf < least <= greatest < math.inf):
             raise RobotError(
@@ -55,7 +55,7 @@ class FingerOpenings:
         return float(min(max(least, 0.0), 1.0)), float(min(max(greatest, 0.0), 1.0))
 
     def set(self, arm: str, interval: Interval) -> IntArray:
-        """Make an arm's fingers what they sweep in ``interval``; returns a 1 for each body (g,) that has grown.
+        """Let an arm's fingers sweep ``interval``. Return 1 for each body (g,) that has grown.
 
         That is: is not within what it was before. One that slides grows by a wider interval only, one that turns may
         by a narrower one.
@@ -76,17 +76,17 @@ class FingerOpenings:
 
     @property
     def turn(self) -> bool:
-        """Whether some fingers turn, so that radii change too."""
+        """True if some fingers turn, so that radii change too."""
         return bool(self._turning)
 
     def set_all(self, intervals: Mapping[str, Interval]) -> None:
-        """The same for every arm; one that is not named is all of its way."""
+        """Set the interval of every arm. An arm that is not named gets the whole interval."""
         for arm in self._fingers:
             self.set(arm, intervals.get(arm, ALL_OF_THE_WAY))
 
 
 class _Turning:
-    """The fingers of one arm that turn, as capsules of their own for each interval."""
+    """The turning fingers of one arm, with separate capsules for each interval."""
 
     def __init__(self, found: Sequence[tuple[int, TurningBody]], bodies: CollisionBodies) -> None:
         self._bodies, self._indices = bodies, np.array([index for index, _ in found])
@@ -94,7 +94,7 @@ class _Turning:
         self._capsules = lru_cache(maxsize=_REMEMBERED)(TurningSweeps([body for _, body in found]).capsules)
 
     def set(self, interval: Interval, grown: IntArray) -> None:
-        """Take what ``interval`` takes up, and mark in ``grown`` (g,) what is not within what it was."""
+        """Set the volume of ``interval``, and mark in ``grown`` (g,) the bodies that exceed their last volume."""
         bodies, at = self._bodies, self._indices
         capsules = self._all if interval == ALL_OF_THE_WAY else self._capsules(interval)
         changed = sticks_out(capsules, self._now())

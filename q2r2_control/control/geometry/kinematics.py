@@ -18,7 +18,7 @@ from q2r2_control.types import Array
 
 IntArray = npt.NDArray[np.int64]
 
-_ANY_MOTION = 1e-9  # of a unit axis: more than rounding
+_ANY_MOTION = 1e-9  # Least length of a unit axis that is more than rounding.
 
 
 class Chain(NamedTuple):
@@ -72,7 +72,7 @@ def chain_of(model: pin.Model) -> Chain:
 
 @kernel
 def place(chain: Chain, q: Array, placements: Placements) -> None:
-    """World placement of every joint frame at ``q`` (nv,)."""
+    """Write the world placement of every joint frame at ``q`` (nv,)."""
     for i in range(1, chain.parent.shape[0]):
         parent = chain.parent[i]
         x, y, z = chain.axis[i, 0], chain.axis[i, 1], chain.axis[i, 2]

@@ -40,7 +40,7 @@ from q2r2_control.control.safety.speed_bound import speed_of, way
 from q2r2_control.control.safety.stop_rollout import sample_of
 from q2r2_control.types import Array
 
-_STOP_SPACING = 0.015  # of the instants at which a stop is looked at, at most [s]
+_STOP_SPACING = 0.015  # Longest time between two examined instants of a stop [s].
 
 
 @kernel
@@ -66,7 +66,7 @@ def write_way(model: SafetyModel, data: SafetyData, h: float, duration: float) -
 
 @inlined_kernel
 def _stride(data: SafetyData, duration: float, finely: bool) -> int:
-    """From one instant of a stop of ``duration`` [s] that is looked at to the next, in samples."""
+    """Return the number of samples from one examined instant of a stop to the next, for ``duration`` [s]."""
     stride = data.rollout.q.shape[0] - 1
     while stride > 1 and duration * stride / (data.rollout.q.shape[0] - 1) > _STOP_SPACING:
         stride //= 2
@@ -75,7 +75,7 @@ def _stride(data: SafetyData, duration: float, finely: bool) -> int:
 
 @inlined_kernel
 def is_far(model: SafetyModel, data: SafetyData, p: int, time: float) -> bool:
-    """Whether pair ``p`` of two arms is farther apart than both can come closer on their own; see the claim's end.
+    """Return whether pair ``p`` of two arms is too far apart to meet on their own ways; see the claim's end.
 
     ``time`` is that of the step and the stop, h + T / 2 [s]. Needs :func:`write_way`.
     """
@@ -87,7 +87,7 @@ def is_far(model: SafetyModel, data: SafetyData, p: int, time: float) -> bool:
 
 @kernel
 def keeps_apart_at_any_time(model: SafetyModel, data: SafetyData, p: int, duration: float, threshold: float) -> bool:
-    """Whether a plane proves pair ``p`` of two arms beyond ``threshold`` [m], wherever on its way each arm is."""
+    """Return whether a plane proves pair ``p`` beyond ``threshold`` [m] at all places of both arms' ways."""
     measure(model.collision, data.collision, p)
     pairs, bodies = model.collision.pairs, model.collision.bodies
     first, second = pairs.first[p], pairs.second[p]
@@ -97,7 +97,7 @@ def keeps_apart_at_any_time(model: SafetyModel, data: SafetyData, p: int, durati
     if gap - needed >= way(model, p, data.history.bend[1]):
         return True
     if gap - needed < way(model, p, data.history.bend[2]):
-        return False  # a finer look finds no more room
+        return False  # More instants would find no more room.
     gap = _lowest_on_way(model, data, second, 1.0, duration, True)
     gap += _lowest_on_way(model, data, first, -1.0, duration, True)
     return gap - needed >= way(model, p, data.history.bend[2])
@@ -107,7 +107,7 @@ def keeps_apart_at_any_time(model: SafetyModel, data: SafetyData, p: int, durati
 def _lowest_on_way(
     model: SafetyModel, data: SafetyData, body: int, side: float, duration: float, finely: bool
 ) -> float:
-    """Least of a ``body``'s core along the normal times ``side`` at all instants of its way that are looked at [m]."""
+    """Return the least place of a ``body``'s core along the normal times ``side``, at all examined instants [m]."""
     collision, bodies, history = model.collision, model.collision.bodies, data.history
     normal = data.collision.contact.normal
     lowest = _lowest(bodies, data.collision.posed, body, side, normal)
@@ -127,7 +127,7 @@ def _lowest_on_way(
 
 @inlined_kernel
 def _lowest(bodies: CollisionBodies, posed: BodyPlacements, body: int, side: float, normal: Array) -> float:
-    """Least of a body's core along ``normal`` (3,) times ``side`` [m]."""
+    """Return the least place of a body's core along ``normal`` (3,) times ``side`` [m]."""
     start, end, beside = 0.0, 0.0, 0.0
     for k in range(3):
         start += side * normal[k] * posed.start[body, k]

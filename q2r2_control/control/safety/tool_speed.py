@@ -41,16 +41,16 @@ from q2r2_control.types import Array
 if TYPE_CHECKING:
     from q2r2_control.control.safety.safety_data import SafetyData, SafetyModel
 
-_SAME_TIME = 1e-9  # two joints whose stops differ by less rest together; relative
+_SAME_TIME = 1e-9  # Relative tolerance: two joints whose stops differ by less rest together.
 
 
 class ToolLimits(NamedTuple):
-    """The origins of all tools, and how fast they may be."""
+    """The origins of all tools, and their largest speed."""
 
     joint: IntArray  # (n,) joint that carries the tool
     translation: Array  # (n, 3) in the joint's frame [m]
     reach: Array  # (n, nv) bound on how far the tool is from a joint's axis [m]; 1 for a sliding joint
-    speed: float  # that no tool exceeds, infinite without a limit [m/s]
+    speed: float  # Speed that no tool exceeds, infinite without a limit [m/s].
 
 
 def tool_limits_of(robot: Robot, chain: Chain, speed: float | None) -> ToolLimits:
@@ -63,7 +63,7 @@ def tool_limits_of(robot: Robot, chain: Chain, speed: float | None) -> ToolLimit
         frame = robot.model.frames[arm.frame_id]
         limits.joint[i], limits.translation[i] = frame.parentJoint, frame.placement.translation
         farthest, joint = float(np.linalg.norm(frame.placement.translation)), int(frame.parentJoint)
-        while joint != 0:  # as for bodies, see pairs_of
+        while joint != 0:  # See pairs_of, which does the same for bodies.
             slides = chain.prismatic[joint] == 1
             farthest += travel[joint - 1] if slides else 0.0
             limits.reach[i, joint - 1] = 1.0 if slides else farthest
@@ -88,7 +88,7 @@ class ToolSpeeds(NamedTuple):
 
 @kernel
 def keeps_tool_speed(model: SafetyModel, data: SafetyData, h: float) -> bool:
-    """Whether no tool is too fast in the step to ``data.candidate`` in ``h`` [s] and the full stop from there.
+    """Return whether no tool is too fast in the step to ``data.candidate`` in ``h`` [s] and the full stop after it.
 
     Needs the placements at the reference, where tools are not too fast, or the stop at hand is executed.
     """
@@ -105,7 +105,7 @@ def keeps_tool_speed(model: SafetyModel, data: SafetyData, h: float) -> bool:
 
 @kernel
 def fastest_tool(model: SafetyModel, data: SafetyData, i: int, h: float) -> float:
-    """B of tool ``i``: see the claim [m/s]."""
+    """Return B of tool ``i``; see the claim [m/s]."""
     parent, v_next, deceleration = model.collision.chain.parent, data.candidate.v, data.candidate.deceleration
     _write_columns(model, data, i)
     fastest, longest = 0.0, 0.0
@@ -130,7 +130,7 @@ def fastest_tool(model: SafetyModel, data: SafetyData, i: int, h: float) -> floa
 
 @kernel
 def _drift(model: SafetyModel, i: int, v: Array, v_next: Array) -> float:
-    """c of tool ``i`` for joints that have ``v``, ``v_next`` (nv,) or a speed in between [m/s^2]."""
+    """Return c of tool ``i`` for joints that have ``v``, ``v_next`` (nv,) or a speed in between [m/s^2]."""
     parent, total = model.collision.chain.parent, 0.0
     j = model.tools.joint[i]
     while j != 0:
@@ -152,7 +152,7 @@ def _faster(v: Array, v_next: Array, joint: int) -> float:
 
 @kernel
 def _write_columns(model: SafetyModel, data: SafetyData, i: int) -> None:
-    """J_j v+_j of all joints that move tool ``i``, at the reference."""
+    """Write J_j v+_j of all joints that move tool ``i``, at the reference."""
     limits, chain, placements = model.tools, model.collision.chain, data.collision.placements
     origin, columns = data.tools.origin, data.tools.columns
     j = limits.joint[i]

@@ -10,7 +10,7 @@ import numpy as np
 from q2r2_control.control.qp import SOFTNESS, QpProblem, QpSolution
 
 _UNBOUNDED = 1e30
-_HARD, _SOFT = 0, 8  # how DAQP marks a row
+_HARD, _SOFT = 0, 8  # Marks of a row in DAQP.
 
 
 class DaqpSolver:
@@ -25,11 +25,11 @@ class DaqpSolver:
         options: settings of ``daqp.solve``, such as ``iter_limit``.
     """
 
-    _OPTIMAL = (1, 2)  # 2: optimal with a soft row violated
+    _OPTIMAL = (1, 2)  # The value 2 means optimal with a violated soft row.
 
     def __init__(self, nv: int, time_limit: float | None = None, **options: Any) -> None:
         self._nv = nv
-        self._options = {"rho_soft": SOFTNESS, "time_limit": time_limit or 0.0} | options  # 0: no limit
+        self._options = {"rho_soft": SOFTNESS, "time_limit": time_limit or 0.0} | options  # The value 0 means no limit.
         self._upper = np.full(nv, _UNBOUNDED)
         self._lower = np.full(nv, -_UNBOUNDED)
         self._sense = np.zeros(nv, dtype=np.int32)

@@ -1,4 +1,4 @@
-"""Keeps a solver that is not ours from the controller's arrays, and its failures from a step.
+"""Keeps a foreign solver away from the controller's arrays, and its failures out of a step.
 
 The safety filter clamps the answer to the very box that a solver is handed. A solver that wrote into that box would
 move the limits, and the certificate would be about the moved ones. A solver therefore gets copies.
@@ -19,7 +19,7 @@ import numpy as np
 from q2r2_control.control.qp import QpProblem, QpSolution, Solver
 from q2r2_control.errors import raised, shown
 
-_REAL = "fiu"  # kinds of dtype that are real numbers
+_REAL = "fiu"  # Kinds of dtype that are real numbers.
 # Numbers of a problem that may be solved, and the least diagonal of its cost's Cholesky factor. Ours are near 1.
 _LARGEST, _FLATTEST = 1e12, 1e-8
 _FAILED = QpSolution(None, 0.0)
@@ -59,9 +59,9 @@ class Guard:
             self.failure = "no solution" if v is None else self._fault(v, solve_time)
             if self.failure is None:
                 return QpSolution(np.array(v, dtype=float), max(float(solve_time), measured))
-        except (KeyboardInterrupt, SystemExit):  # of a signal's handler, which ends the program
+        except (KeyboardInterrupt, SystemExit):  # The handler of a signal ends the program.
             raise
-        except BaseException as error:  # as a panic in Rust is; whatever it raises is one tick without a solution
+        except BaseException as error:  # A panic in Rust is one too. Each means a tick without a solution.
             self.failure = raised(error)
         return _FAILED
 
@@ -76,9 +76,9 @@ class Guard:
 
 
 def _fault_of(problem: QpProblem) -> str | None:
-    """Why nobody can solve the ``problem``; None where somebody may."""
+    """Return why no solver can solve the ``problem``; None if one may."""
     for part in (problem.H, problem.g, problem.rows, problem.rows_lower):
-        if not np.abs(part).max(initial=0.0) <= _LARGEST:  # written so that NaN is too large as well
+        if not np.abs(part).max(initial=0.0) <= _LARGEST:  # The comparison is written so that NaN is too large as well.
             return f"the problem has numbers that are not finite, or above {_LARGEST:g}"
     try:
         factor = np.linalg.cholesky(problem.H)

@@ -24,12 +24,12 @@ import scipy.sparse
 from q2r2_control.control.qp import SOFTNESS, QpProblem, QpSolution
 from q2r2_control.types import Array
 
-_ROWS_STEP = 16  # from one number of rows that OSQP is set up for to the next
-# adaptive_rho_interval counts iterations: by the clock, as it may be, a run would not be repeatable.
+_ROWS_STEP = 16  # Step between the numbers of rows for which OSQP is set up.
+# adaptive_rho_interval counts iterations. With the clock, which is the alternative, a run would not be repeatable.
 _DEFAULTS: dict[str, Any] = {
     "eps_abs": 1e-5,
     "eps_rel": 1e-5,
-    "max_iter": 10000,  # 60 rows that contradict each other take half of it from a cold start
+    "max_iter": 10000,  # From a cold start, 60 contradictory rows need half of this.
     "check_termination": 10,
     "adaptive_rho_interval": 50,
     "scaling": 0,
@@ -73,8 +73,9 @@ class _SizedOsqp:
         # All entries of the columns of w, also zeros, then one entry in each column of t.
         pattern = scipy.sparse.csc_matrix(np.hstack([np.ones((nv + capacity, nv)), np.eye(nv + capacity)[:, nv:]]))
         self._entries = pattern.data.copy()
-        self._matrix = self._entries[: (nv + capacity) * nv].reshape((nv + capacity, nv), order="F")  # shares memory
-        self._slacks = self._entries[self._matrix.size :]  # the same
+        # The array shares memory.
+        self._matrix = self._entries[: (nv + capacity) * nv].reshape((nv + capacity, nv), order="F")
+        self._slacks = self._entries[self._matrix.size :]  # The array shares memory.
         self._slacks[:] = pattern.data[self._matrix.size :] = math.sqrt(SOFTNESS)
         self._lower, self._upper = np.full(nv + capacity, -np.inf), np.full(nv + capacity, np.inf)
         self._cost = np.zeros(nv + capacity)
@@ -90,7 +91,7 @@ class _SizedOsqp:
         answer = self._solver.solve(raise_error=False)
         time = answer.info.update_time + answer.info.solve_time
         if answer.info.status_val != osqp.SolverStatus.OSQP_SOLVED:
-            self._solver.warm_start(x=self._cold, y=self._cold)  # where it is may be anywhere
+            self._solver.warm_start(x=self._cold, y=self._cold)  # The last solution may be anywhere.
             return QpSolution(None, time)
         v: Array = answer.x[: self._nv] @ inverse
         return QpSolution(v, time)
@@ -108,12 +109,12 @@ class _SizedOsqp:
         self._lower[nv : nv + m] = problem.rows_lower / norms[nv:]
         self._cost[:nv] = inverse @ problem.g
         self._slacks[:] = math.sqrt(SOFTNESS)
-        self._slacks[m - problem.hard : m] = 0.0  # a hard row has none
+        self._slacks[m - problem.hard : m] = 0.0  # A hard row has no slack.
         self._solver.update(q=self._cost, l=self._lower, u=self._upper, Ax=self._entries)
 
 
 def _inverse_factor(H: Array) -> Array:
-    """L^-1 of H = L L' (nv, nv). Other BLAS routines start a thread for each core even for so small a matrix."""
+    """Return L^-1 of H = L L' (nv, nv). Other BLAS routines start threads even for so small a matrix."""
     factor, failed = scipy.linalg.lapack.dpotrf(H, lower=True)
     if failed:
         raise np.linalg.LinAlgError("H is not positive definite")

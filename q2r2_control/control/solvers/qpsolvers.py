@@ -1,4 +1,4 @@
-"""Any solver of the package qpsolvers, which knows some twenty by their names.
+"""Any solver of the package qpsolvers, which contains some twenty by name.
 
 Such a solver has no soft rows, so every row gets a slack of its own: x = [v; s],
 
@@ -19,11 +19,11 @@ import scipy.sparse
 
 from q2r2_control.control.qp import QpProblem, QpSolution, row_softness
 
-_WIDE = 1.0  # of bounds that an equation makes needless, and which must be finite for some solvers [rad/s]
+_WIDE = 1.0  # Width of bounds that an equation makes needless, but which some solvers need as finite numbers [rad/s].
 
 
 def slack_problem(problem: QpProblem, sparse: bool = False, scaled: bool = False) -> qpsolvers.Problem:
-    """The problem with a slack for each row.
+    """Return the problem with a slack for each row.
 
     Args:
         problem: of nv joints and m rows.
@@ -54,10 +54,10 @@ def slack_problem(problem: QpProblem, sparse: bool = False, scaled: bool = False
     )
 
 
-# Options without which a solver is of no use in a loop.
+# A solver is useless in a loop without these options.
 _DEFAULTS: dict[str, dict[str, Any]] = {
-    "highs": {"output_flag": False, "qp_iteration_limit": 1000},  # its active set may cycle for ever
-    "scs": {"max_iters": 10000},  # ten times as many, as it may take, are a second
+    "highs": {"output_flag": False, "qp_iteration_limit": 1000},  # Its active set may cycle for ever.
+    "scs": {"max_iters": 10000},  # With the default, which is ten times as many, a solve takes a second.
 }
 
 
@@ -97,7 +97,7 @@ class QpSolversSolver:
 
 
 def _state_equations(problem: qpsolvers.Problem, sparse: bool) -> None:
-    """Turn pairs of equal bounds into equations, since quadprog finds no solution between two bounds without room."""
+    """Turn pairs of equal bounds into equations, because quadprog finds no solution between such bounds."""
     lower, upper = np.asarray(problem.lb), np.asarray(problem.ub)
     fixed = lower == upper
     if not fixed.any():

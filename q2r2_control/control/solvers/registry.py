@@ -1,4 +1,4 @@
-"""The solver of a name."""
+"""Solvers by name."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ DAQP, OSQP = OURS = ("daqp", "osqp")
 def make_solver(
     name: str, nv: int, time_limit: float | None = None, options: Mapping[str, Any] | None = None
 ) -> Solver:
-    """The solver called ``name``.
+    """Return the solver called ``name``.
 
     Args:
         name: ``daqp`` and ``osqp`` are called directly, any other of ``qpsolvers.available_solvers`` through qpsolvers.
@@ -41,7 +41,7 @@ def make_solver(
     try:
         with printing_to_stderr():
             solver = _made(name, nv, time_limit, given)
-            solver.solve(_smallest_problem(nv))  # an option that is unknown shows here, and not in motion
+            solver.solve(_smallest_problem(nv))  # An unknown option raises here, and not during motion.
     except Exception as error:
         reason = " ".join(str(error).split())
         raise ConfigError(f"control.solver_options = {shown(given)}: {name} refuses: {reason:.120}") from error
@@ -49,7 +49,7 @@ def make_solver(
 
 
 def solver_of(settings: ControllerSettings, nv: int) -> Solver:
-    """The solver that ``settings`` ask for; see :func:`make_solver`."""
+    """Return the solver that ``settings`` ask for; see :func:`make_solver`."""
     return make_solver(settings.solver, nv, settings.solve_time_limit, settings.solver_options)
 
 
@@ -60,7 +60,7 @@ def _made(name: str, nv: int, time_limit: float | None, options: dict[str, Any])
         from q2r2_control.control.solvers.osqp import OsqpSolver
 
         return OsqpSolver(nv, time_limit, **options)
-    # Imported only when asked for: qpsolvers loads every solver that is installed, which takes a second.
+    # The import is local, because qpsolvers loads every installed solver, which takes a second.
     from q2r2_control.control.solvers.qpsolvers import QpSolversSolver
 
     return QpSolversSolver(name, **options)
@@ -68,11 +68,11 @@ def _made(name: str, nv: int, time_limit: float | None, options: dict[str, Any])
 
 @contextmanager
 def printing_to_stderr() -> Iterator[None]:
-    """Send the output to stderr, also that of compiled libraries, since stdout carries the result as JSON."""
+    """Send output to stderr, also that of compiled libraries, because stdout carries the result as JSON."""
     try:
         sys.stdout.flush()
         stdout = os.dup(1)
-    except (OSError, ValueError, AttributeError):  # the process has no stdout
+    except (OSError, ValueError, AttributeError):  # The process has no stdout.
         yield
         return
     try:
@@ -84,10 +84,10 @@ def printing_to_stderr() -> Iterator[None]:
 
 
 def check_installed(name: str) -> None:
-    """Raises :class:`ConfigError`, with what there is, unless a solver called ``name`` is installed."""
+    """Raise :class:`ConfigError` with the installed solvers, unless a solver called ``name`` is installed."""
     if name in OURS:
         return
-    import qpsolvers  # see _made
+    import qpsolvers  # See _made.
 
     if name not in qpsolvers.available_solvers:
         installed = ", ".join(sorted({*OURS, *qpsolvers.available_solvers}))
@@ -98,7 +98,7 @@ def check_installed(name: str) -> None:
 
 
 def _smallest_problem(nv: int) -> QpProblem:
-    """A problem in which a row and the box hold the cost's minimum back."""
+    """Return a problem in which a row and the box hold the cost's minimum back."""
     row = np.zeros((1, nv))
     row[0, 0] = 1.0
     one = np.ones(nv)

@@ -1,4 +1,4 @@
-"""Checks of the arguments that tasks are made of; each error names the argument and what is allowed."""
+"""Checks of the arguments of tasks. Each error names the argument and what is allowed."""
 
 from __future__ import annotations
 
@@ -20,7 +20,10 @@ def check_robot(robot: Robot) -> None:
 
 
 def chosen_arms(robot: Robot, arms: Sequence[str] | None) -> list[str]:
-    """The names in ``arms``, or all arms where it is None. Raises :class:`ConfigError` for a name without an arm."""
+    """Return the names in ``arms``, or all arms if it is None.
+
+    Raises :class:`ConfigError` for a name without an arm.
+    """
     names = list(robot.arms) if arms is None else arms
     if not isinstance(names, list | tuple) or not names or any(name not in [*robot.arms] for name in names):
         raise ConfigError(f"arms = {shown(arms)}: allowed: a list of some of {', '.join(robot.arms)}")
@@ -28,7 +31,10 @@ def chosen_arms(robot: Robot, arms: Sequence[str] | None) -> list[str]:
 
 
 def positive(key: str, value: float, most: float = math.inf) -> float:
-    """``value`` as a float. Raises :class:`ConfigError` unless it is a number above 0, and at most ``most`` [rad]."""
+    """Return ``value`` as a float.
+
+    Raises :class:`ConfigError` unless it is a number above 0, and at most ``most`` [rad].
+    """
     if isinstance(value, bool) or not isinstance(value, float | int) or not (0.0 < value <= most and value < math.inf):
         up_to = "" if most == math.inf else f", at most {most:.2f} rad"
         raise ConfigError(f"{key} = {shown(value, 40)}: allowed: a number above 0{up_to}")
@@ -36,7 +42,7 @@ def positive(key: str, value: float, most: float = math.inf) -> float:
 
 
 def vector(key: str, value: Sequence[float]) -> Array:
-    """``value`` as an array (3,). Raises :class:`ConfigError` unless it is three finite numbers."""
+    """Return ``value`` as an array (3,). Raises :class:`ConfigError` unless it is three finite numbers."""
     try:
         numbers = np.array(value, dtype=np.float64)
     except (TypeError, ValueError):
@@ -47,7 +53,10 @@ def vector(key: str, value: Sequence[float]) -> Array:
 
 
 def direction(key: str, value: Sequence[float]) -> Array:
-    """``value`` as a unit vector (3,). Raises :class:`ConfigError` unless it is three finite numbers, not all 0."""
+    """Return ``value`` as a unit vector (3,).
+
+    Raises :class:`ConfigError` unless it is three finite numbers, not all 0.
+    """
     numbers = vector(key, value)
     if (length := float(np.linalg.norm(numbers))) < _TINY:
         raise ConfigError(f"{key} = {' '.join(str(value).split())[:60]}: allowed: three numbers, not all 0")

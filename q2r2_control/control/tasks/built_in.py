@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 class TaskModel(NamedTuple):
-    """The constants of a tick. Between ticks, arrays made of settings that are live may (live_settings.py)."""
+    """The constants of a tick. Arrays of live settings may change between ticks (live_settings.py)."""
 
     chain: Chain
     tools: Tools
@@ -31,24 +31,24 @@ class TaskModel(NamedTuple):
 
 
 def task_model_of(robot: Robot, settings: ControllerSettings, chain: Chain) -> TaskModel:
-    """The models of all tasks."""
+    """Return the models of all tasks."""
     return TaskModel(
         chain, tools_of(robot), motion_of(settings), posture_of(robot, settings), priority_of(robot, settings)
     )
 
 
 class TaskData(NamedTuple):
-    """Tools at the reference, the data of all tasks, and the cost that they make."""
+    """Tools at the reference, the data of all tasks, and their total cost."""
 
-    placements: Placements  # of the joint frames at the reference
-    rotation: Array  # (n, 3, 3) of the tools
+    placements: Placements  # Placements of the joint frames at the reference.
+    rotation: Array  # (n, 3, 3) Rotations of the tools.
     translation: Array  # (n, 3) [m]
-    J: Array  # (6 n, nv) tool Jacobians, one below the other, zero where an arm follows no target
+    J: Array  # (6 n, nv) Tool Jacobians, one below the other, zero if an arm follows no target.
     frame: FrameData
     posture: PostureData
-    H: Array  # (nv, nv) of the cost 1/2 v' H v + g' v
+    H: Array  # (nv, nv) H of the cost 1/2 v' H v + g' v.
     g: Array  # (nv,)
-    minimum: Array  # (nv,) of that cost without bounds [rad/s]
+    minimum: Array  # (nv,) Minimum of that cost without bounds [rad/s].
     factor: Array  # (nv, nv) Cholesky factor of H
 
     @classmethod

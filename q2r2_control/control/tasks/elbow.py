@@ -30,7 +30,7 @@ _UP = np.array([0.0, 0.0, 1.0])
 # Below these the cost fades out: |p| [m], and |l|, the sine of the angle between the line and V.
 _FULL_RADIUS, _FULL_SINE = 0.05, 0.2
 _TINY = 1e-6
-_DAMPING = 1e-6  # of the projection into the nullspace of the tool's motion
+_DAMPING = 1e-6  # Damping of the projection into the nullspace of the tool's motion.
 
 
 class ElbowSwivel:
@@ -78,7 +78,7 @@ class ElbowSwivel:
         }
 
     def angle(self, arm: str, q: Array) -> float:
-        """Swivel angle of an arm at a posture ``q`` (nv,), in (-pi, pi] [rad]."""
+        """Return the swivel angle of an arm at a posture ``q`` (nv,), in (-pi, pi] [rad]."""
         pin.computeJointJacobians(self._robot.model, self._data, q)
         return self._swivel(arm)[0]
 
@@ -98,7 +98,7 @@ class ElbowSwivel:
         return H, g
 
     def _swivel(self, arm: str) -> tuple[float, float, Array]:
-        """Angle [rad], the share of 0 .. 1 to which it is defined, and its gradient (nv,)."""
+        """Return the angle [rad], the share of 0 .. 1 to which it is defined, and its gradient (nv,)."""
         model, data = self._robot.model, self._data
         joints, axes = self._joints[arm], pin.LOCAL_WORLD_ALIGNED
         S, E, W = (data.oMi[joint].translation for joint in joints)
@@ -119,7 +119,7 @@ class ElbowSwivel:
 
 
 def _joint(robot: Robot, arm: str, name: str) -> int:
-    """Number of an arm's joint in the model. Raises :class:`ConfigError`."""
+    """Return the number of an arm's joint in the model. Raises :class:`ConfigError`."""
     if arm not in robot.arms:
         raise ConfigError(f"angles: no arm {arm!r:.40}; allowed: {', '.join(robot.arms)}")
     own = {robot.joint_names[j].removeprefix(f"{arm}_"): int(j) + 1 for j in robot.arms[arm].joints}

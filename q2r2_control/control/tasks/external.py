@@ -1,4 +1,4 @@
-"""Tasks of a program's own and of other packages: costs on the next joint velocities, written in NumPy.
+"""Tasks of the user's program and of other packages: costs on the next joint velocities, written in NumPy.
 
 A program hands its tasks to the controller as objects. A package names its task as an entry point of the group
 ``q2r2_control.tasks``; a cell's YAML asks for it, with its settings, under ``control.tasks``. Their costs are added to
@@ -31,7 +31,7 @@ class Task(Protocol):
     """
 
     def cost(self, q: Array, v: Array) -> tuple[Array, Array]:
-        """The cost 1/2 v+' H v+ + g' v+ of the next joint velocities v+.
+        """Return the cost 1/2 v+' H v+ + g' v+ of the next joint velocities v+.
 
         A task that wants J v+ = u with a weight w returns H = w J'J and g = -w J'u. A tool's own error has the weight
         1 for metres and 0.09 for radians, the posture 1e-3. The method is asked at every substep and by
@@ -48,7 +48,10 @@ class Task(Protocol):
 
 
 def load_tasks(robot: Robot, wanted: Mapping[str, Mapping[str, Any]]) -> dict[str, Task]:
-    """The tasks that the settings ask for, by key. Raises :class:`ConfigError` for an unknown one and bad settings."""
+    """Return the tasks that the settings ask for, by key.
+
+    Raises :class:`ConfigError` for unknown ones and bad settings.
+    """
     if not wanted:
         return {}
     installed = {entry.name: entry for entry in entry_points(group=GROUP)}
@@ -65,7 +68,7 @@ def load_tasks(robot: Robot, wanted: Mapping[str, Mapping[str, Any]]) -> dict[st
 
 
 def _fault(made: Any, settings: Mapping[str, Any], error: Exception) -> str:
-    """The first setting that is unknown or missing; else what the task itself says."""
+    """Return the first unknown or missing setting, or else the task's own message."""
     parameters = list(inspect.signature(made).parameters.values())[1:]
     known = [one.name for one in parameters if one.kind not in (one.VAR_KEYWORD, one.VAR_POSITIONAL)]
     allowed = f"; its settings: {', '.join(known) or 'none'}"
@@ -79,10 +82,10 @@ def _fault(made: Any, settings: Mapping[str, Any], error: Exception) -> str:
 
 
 class ExternalTasks:
-    """The tasks of one controller that are asked at every substep, those of its settings first."""
+    """The tasks of one controller that are called at every substep. Those of its settings come first."""
 
     def __init__(self, robot: Robot, settings: Mapping[str, Mapping[str, Any]], own: Sequence[Task]) -> None:
-        """Raises :class:`ConfigError` for what is no task, and for one that has no usable cost at home."""
+        """Raise :class:`ConfigError` for an object that is not a task, or whose cost at home is not usable."""
         if not isinstance(own, list | tuple):
             raise ConfigError(f"tasks = {shown(own)}: allowed: a list of objects with a method cost(q, v)")
         self._tasks = load_tasks(robot, settings)
@@ -99,7 +102,7 @@ class ExternalTasks:
         return bool(self._tasks)
 
     def add_costs(self, H: Array, g: Array, q: Array, v: Array) -> tuple[str, ...]:
-        """Add the cost of each task at ``q`` and ``v`` to H (nv, nv) and g (nv,); returns why some were not used."""
+        """Add the cost of each task at ``q`` and ``v`` to H (nv, nv) and g (nv,). Return why some were not used."""
         faults = []
         for key, task in self._tasks.items():
             cost = _cost_of(task, q, v)

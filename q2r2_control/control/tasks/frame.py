@@ -41,7 +41,7 @@ class Tools(NamedTuple):
 
 
 def tools_of(robot: Robot) -> Tools:
-    """The tool frames of a robot's arms."""
+    """Return the tool frames of a robot's arms."""
     n, nv = len(robot.arms), robot.model.nv
     tools = Tools(np.zeros(n, dtype=np.int64), np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros((n, nv)))
     for i, arm in enumerate(robot.arms.values()):
@@ -54,21 +54,22 @@ def tools_of(robot: Robot) -> Tools:
 
 
 ROTATION_LENGTH = 0.3  # [m/rad]
-_SHARE_OF_LIMIT = 0.9  # of a tool's speed limit that its task asks for: the certificate needs some of it
+# Share of a tool's speed limit that its task asks for, because the certificate needs a part of it.
+_SHARE_OF_LIMIT = 0.9
 
 
 class Motion(NamedTuple):
-    """How a tool approaches its target, linear then angular; all of it may change between ticks."""
+    """The approach of a tool to its target, linear then angular. All values may change between ticks."""
 
     gain: Array  # (2,) [1/s]
     deceleration: Array  # (2,) [m/s^2, rad/s^2]
     full_speed: Array  # (2,) [m/s, rad/s]
     stretch_gain: Array  # (1,) k [1/s]
-    weight: Array  # (6,) of the error along the world's axes and about the tool's, 0 .. 1
+    weight: Array  # (6,) Weights of the error along the world's axes and about the tool's, 0 .. 1.
 
 
 def motion_of(settings: ControllerSettings) -> Motion:
-    """Gains and speeds as the kernels read them."""
+    """Return gains and speeds as the kernels read them."""
     limit = np.inf if settings.tool_speed_limit is None else settings.tool_speed_limit
     return Motion(
         gain=np.array([settings.position_gain, settings.rotation_gain]),
@@ -80,11 +81,11 @@ def motion_of(settings: ControllerSettings) -> Motion:
 
 
 class FrameData(NamedTuple):
-    """Written at each tick."""
+    """Data that are written at each tick."""
 
-    twist: Array  # (n, 6) wanted [m/s, rad/s]
-    feedback: Array  # (n, 6) the part of it that the error makes
-    turn: Array  # (3, 3) scratch: rotation from tool to target
+    twist: Array  # (n, 6) Wanted twist [m/s, rad/s].
+    feedback: Array  # (n, 6) Part of the twist that comes from the error.
+    turn: Array  # (3, 3) Scratch: rotation from tool to target.
 
     @classmethod
     def empty(cls, n: int) -> FrameData:
@@ -118,7 +119,7 @@ def accumulate_frame_cost(model: TaskModel, data: TaskData, targets: TaskTargets
 
 @kernel
 def tool_pose(placements: Placements, tools: Tools, i: int, rotation: Array, translation: Array) -> None:
-    """World pose of tool ``i`` into ``rotation`` (3, 3) and ``translation`` (3,)."""
+    """Write the world pose of tool ``i`` into ``rotation`` (3, 3) and ``translation`` (3,)."""
     joint = tools.joint[i]
     for row in range(3):
         axes = placements.rotation[joint, row]
@@ -129,7 +130,7 @@ def tool_pose(placements: Placements, tools: Tools, i: int, rotation: Array, tra
 
 @kernel
 def tool_jacobian(chain: Chain, placements: Placements, tools: Tools, i: int, translation: Array, J: Array) -> None:
-    """Jacobian (6, nv) of tool ``i``: linear, then angular velocity in world axes at the tool's origin."""
+    """Write the Jacobian (6, nv) of tool ``i``: linear, then angular velocity in world axes at the tool's origin."""
     J[:] = 0.0
     joint = tools.joint[i]
     while joint != 0:
@@ -159,7 +160,7 @@ def express_in(rotation: Array, vector: Array) -> None:
 
 @kernel
 def rotation_vector(R: Array, out: Array) -> None:
-    """Rotation vector [rad] of a rotation matrix (3, 3), angle in [0, pi], through its quaternion of largest part.
+    """Write the rotation vector [rad] of a rotation matrix (3, 3), with its angle in [0, pi].
 
     That of :mod:`q2r2_control.quaternions` takes a quaternion of Python floats, which a kernel has none of.
     """
@@ -186,7 +187,7 @@ def rotation_vector(R: Array, out: Array) -> None:
 
 @kernel
 def times_transposed(A: Array, B: Array, product: Array) -> None:
-    """A B' of two 3 by 3 matrices."""
+    """Write A B' of two 3 by 3 matrices."""
     for i in range(3):
         for j in range(3):
             product[i, j] = dot(A[i], B[j])
@@ -194,7 +195,7 @@ def times_transposed(A: Array, B: Array, product: Array) -> None:
 
 @kernel
 def approach_speed(error: float, gain: float, deceleration: float) -> float:
-    """Speed towards a target ``error`` away: proportional when near, that of constant deceleration when far.
+    """Return the speed towards a target at distance ``error``: proportional when near, constant deceleration when far.
 
     v = gain e up to e0 = deceleration / gain^2, then v = sqrt(2 deceleration e - (deceleration / gain)^2), which
     continues it smoothly. A purely proportional law asks for deceleration gain v, more than the joints have at speed.
@@ -206,7 +207,9 @@ def approach_speed(error: float, gain: float, deceleration: float) -> float:
 
 @kernel
 def wanted_twist(motion: Motion, data: TaskData, targets: TaskTargets, i: int) -> None:
-    """Twist of tool ``i`` towards its target into ``data.frame.twist``, and the part that the error makes."""
+    """Write the twist of tool ``i`` towards its target into ``data.frame.twist``, and the part that comes from the
+    error.
+    """
     twist, feedback, feed_forward = data.frame.twist[i], data.frame.feedback[i], targets.feed_forward[i]
     times_transposed(targets.rotation[i], data.rotation[i], data.frame.turn)
     for k in range(3):
@@ -275,7 +278,7 @@ def accumulate_stretch_damping(model: TaskModel, data: TaskData, i: int) -> None
 
 @kernel
 def _stiffness(chain: Chain, placements: Placements, near: int, far: int, J: Array, s: Array) -> float:
-    """s' d2x / dq_near dq_far for the linear part of the tool's motion: z_near x J_far, none for a sliding joint."""
+    """Return s' d2x / dq_near dq_far for the tool's linear motion: z_near x J_far, 0 for a sliding joint."""
     if chain.prismatic[near] == 1:
         return 0.0
     x, y, z = placements.axis[near, 0], placements.axis[near, 1], placements.axis[near, 2]

@@ -22,7 +22,7 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
 _TINY = 1e-9
-_SOFT_EDGE = 0.05  # beyond the cone, over which ``upright`` gathers its weight [rad]
+_SOFT_EDGE = 0.05  # Angle beyond the cone over which the weight of ``upright`` grows [rad].
 
 
 class _Cost:
@@ -32,7 +32,7 @@ class _Cost:
         self.H, self.g = np.zeros((nv, nv)), np.zeros(nv)
 
     def add(self, J: Array, u: Array, weight: float | Array) -> None:
-        """``J`` (k, nv), ``u`` (k,), ``weight`` a number or (k,)."""
+        """Add a term with ``J`` (k, nv), ``u`` (k,) and a ``weight`` that is a number or (k,)."""
         weighted = J.T * weight
         self.H += weighted @ J
         self.g -= weighted @ u
@@ -42,14 +42,17 @@ class _Tools:
     """Poses and Jacobians of some tools, in world axes."""
 
     def __init__(self, robot: Robot, arms: Sequence[str] | None) -> None:
-        """Of ``arms``, or of all where that is None. Raises as :func:`chosen_arms` and :func:`check_robot` do."""
+        """Take the tools of ``arms``, or all tools if it is None.
+
+        Raises as :func:`chosen_arms` and :func:`check_robot`.
+        """
         check_robot(robot)
         names = chosen_arms(robot, arms)
         self._model, self._data = robot.model, robot.model.createData()
         self._frames = [robot.arms[name].frame_id for name in names]
 
     def at(self, q: Array) -> list[tuple[pin.SE3, Array]]:
-        """Of each tool its pose, and its Jacobian (6, nv): linear, then angular."""
+        """Return the pose of each tool, and its Jacobian (6, nv): linear, then angular."""
         pin.computeJointJacobians(self._model, self._data, q)
         return [
             (
@@ -61,7 +64,7 @@ class _Tools:
 
 
 class JointTarget:
-    """Joints go to positions of their own within their limits: w |v_j - k (q*_j - q_j)|^2 of each.
+    """Moves joints to their own positions within their limits, with the cost w |v_j - k (q*_j - q_j)|^2 of each.
 
     A YAML names it ``joints``.
 
@@ -237,7 +240,9 @@ class RelativePose:
 
 
 def _turn(of: Array, to: Array) -> Array:
-    """Shortest rotation vector (3,) [rad] from one unit vector to another; about any axis where they are opposite."""
+    """Return the shortest rotation vector (3,) [rad] from one unit vector to another, about any axis if they are
+    opposite.
+    """
     across = np.cross(of, to)
     sine = float(np.linalg.norm(across))
     if sine < _TINY:

@@ -1,4 +1,4 @@
-"""The cost of joints that no tool needs, which are pulled towards a posture.
+"""The cost of joints that no tool needs. They are pulled towards a posture.
 
 For all joints w |v - v_p|^2 with the posture velocity v_p projected into the tools' nullspace, so that at rest it
 leaves no tool error. Joints of an arm without a target are not pulled.
@@ -25,26 +25,26 @@ _PROJECTION_DAMPING = 1e-3
 
 
 class Posture(NamedTuple):
-    """Where joints go that the tools leave free; gain and weight may change between ticks."""
+    """The posture of the joints that the tools leave free. Gain and weight may change between ticks."""
 
     home: Array  # (nv,) [rad]
     gain: Array  # (1,) [1/s]
-    weight: Array  # (1,) against the tool task's 1
-    speed: float  # at most [rad/s]
+    weight: Array  # (1,) Weight, relative to the tool task's 1.
+    speed: float  # Largest speed [rad/s].
 
 
 def posture_of(robot: Robot, settings: ControllerSettings) -> Posture:
-    """Home, and how strongly the joints are pulled there."""
+    """Return home, and the strength of the pull towards it."""
     gain, weight = np.array([settings.posture_gain]), np.array([settings.posture_weight])
     return Posture(np.array(robot.home), gain, weight, settings.posture_speed)
 
 
 class PostureData(NamedTuple):
-    """Written at each tick."""
+    """Data that are written at each tick."""
 
-    v: Array  # (nv,) wanted where the tools leave joints free [rad/s]
+    v: Array  # (nv,) Wanted velocities where the tools leave joints free [rad/s].
     factor: Array  # (6 n, 6 n) Cholesky factor of J J', damped
-    moved: Array  # (6 n,) scratch
+    moved: Array  # (6 n,) Scratch.
 
     @classmethod
     def empty(cls, n: int, nv: int) -> PostureData:
@@ -80,7 +80,7 @@ def project_to_nullspace(J: Array, factor: Array, moved: Array, v: Array) -> Non
             factor[i, j] = dot(J[i], J[j])
         factor[i, i] += _PROJECTION_DAMPING * _PROJECTION_DAMPING
         moved[i] = dot(J[i], v)
-    factorise(factor)  # positive definite for any finite J; of another, J v is not finite either
+    factorise(factor)  # The matrix is positive definite for any finite J. With another J, J v is not finite either.
     substitute(factor, moved)
     for j in range(J.shape[1]):
         for i in range(J.shape[0]):

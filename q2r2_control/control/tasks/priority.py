@@ -1,4 +1,4 @@
-"""Which arm gives way where two arms are in each other's way: weights of the other tasks' costs."""
+"""The arm that gives way if two arms are in each other's way, as weights of the other tasks' costs."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from q2r2_control.types import Array
 
 
 class Priority(NamedTuple):
-    """Which arm gives way where two arms are in each other's way; the weights may change between ticks.
+    """The arm that gives way if two arms are in each other's way. The weights may change between ticks.
 
     Arms meet in the QP only where separation rows couple their joints. There all costs of an arm that gives way, also
     posture and damping, are multiplied by a small weight, so that its motion pays for a row that both arms need. Where
