@@ -1,4 +1,4 @@
-"""Cells that several tests look at; loading one takes a tenth of a second, so each is loaded once."""
+"""Cells for several tests. Loading one takes a tenth of a second, so that each is loaded once."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.control.cells import pandas
 
 
 def one_arm(**arm: Any) -> Config:
-    """A cell of one arm, by default a bare iiwa 7 with all joints at zero."""
+    """Return a cell of one arm, by default a bare iiwa 7 with all joints at zero."""
     return Config.model_validate({"name": "cell", "arms": {"left": {"model": "iiwa7", "home": [0.0] * 7} | arm}})
 
 

@@ -1,4 +1,4 @@
-"""Which joints and which tip an arm has where the configuration names neither."""
+"""The joints and the tip of an arm if the configuration names neither."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from q2r2_control.robot.description import LinkTree, load_description
 
 
 def tree(*joints: str) -> LinkTree:
-    """A model of joints, each written as parent, child, kind (by default fixed) and name (by default its child's)."""
+    """Return a model of joints, each given as parent, child, kind (default: fixed) and name (default: its child's)."""
     robot = ET.Element("robot")
     links: dict[str, None] = {}
     for text in joints:
@@ -22,7 +22,7 @@ def tree(*joints: str) -> LinkTree:
         joint = ET.SubElement(robot, "joint", name=name, type=kind)
         ET.SubElement(joint, "parent", link=parent)
         ET.SubElement(joint, "child", link=child)
-        ET.SubElement(joint, "origin", xyz=f"{len(links)} 0 0")  # every link at a place of its own
+        ET.SubElement(joint, "origin", xyz=f"{len(links)} 0 0")  # Every link has its own place.
         links |= {parent: None, child: None}
     for link in links:
         ET.SubElement(robot, "link", name=link)
@@ -44,7 +44,7 @@ ARM = ("base one revolute", "one two revolute", "two flange")
         pytest.param("example-robot-data:bravo7_gripper", "grasping_poing", 6, id="beside a sensor and fingers"),
     ],
 )
-def test_of_a_known_arm_it_is(model: str, tip: str, joints: int) -> None:
+def test_the_chain_of_a_known_arm_is_found(model: str, tip: str, joints: int) -> None:
     known = LinkTree(load_description(model).urdf, model)
     assert default_tip(known, (), "key") == tip
     assert len(known.chain(tip)) == joints
@@ -59,7 +59,7 @@ def test_of_a_known_arm_it_is(model: str, tip: str, joints: int) -> None:
         pytest.param(["flange jaw_a revolute drive", "flange jaw_b revolute other"], "flange", id="before fingers"),
     ],
 )
-def test_of_an_arm_with_a_side_branch_it_is(more: Sequence[str], tip: str) -> None:
+def test_the_chain_of_an_arm_with_a_side_branch_is_found(more: Sequence[str], tip: str) -> None:
     assert default_tip(tree(*ARM, *more), (), "key") == tip
 
 
@@ -79,7 +79,7 @@ def test_a_joint_that_the_gripper_drives_or_that_others_mimic_ends_the_arm() -> 
         (["flange plate", "flange stub"], "the arm could end at plate, stub: name the link that is meant"),
     ],
 )
-def test_where_there_is_doubt_the_user_is_asked(more: Sequence[str], says: str) -> None:
+def test_an_ambiguous_chain_is_refused_with_the_possible_tips(more: Sequence[str], says: str) -> None:
     with pytest.raises(ConfigError) as error:
         default_tip(tree(*ARM, *more), (), "key")
     assert str(error.value) == f"key: {says}"

@@ -1,4 +1,4 @@
-"""Whether the sign-off beside a cell is still of that cell."""
+"""Checks whether the sign-off beside a cell still belongs to that cell."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_addresses_mounts_tools_and_limits_are_in_the_fingerprint(old: str, new:
         ("mass: 0.1", "mass: 0.2"),
     ],
 )
-def test_obstacles_gains_home_and_the_simulation_are_not(old: str, new: str) -> None:
+def test_obstacles_gains_home_and_the_simulation_are_not_in_the_fingerprint(old: str, new: str) -> None:
     assert fingerprint(cell(old, new)) == fingerprint(cell())
 
 
@@ -52,11 +52,11 @@ def test_cabinets_on_this_computer_need_no_commissioning(tmp_path: Path) -> None
     assert not_commissioned(cell(text=TEXT), tmp_path / "cell.yaml") is None
 
 
-def test_joints_of_a_slowed_cell_go_at_a_tenth_of_what_it_allows() -> None:
+def test_joints_of_a_slowed_cell_move_at_a_tenth_of_the_allowed_speed() -> None:
     assert slowed(cell()).control.velocity_scale == pytest.approx(0.1 * cell().control.velocity_scale)
 
 
-def test_a_sign_off_counts_for_the_cell_it_was_made_of(tmp_path: Path) -> None:
+def test_a_sign_off_is_valid_only_for_its_own_cell(tmp_path: Path) -> None:
     file = tmp_path / "my_cell.yaml"
     assert not_commissioned(cell(), file) == "there is no my_cell.commissioned.json"
     sign_off_file(file).write_text(json.dumps({"fingerprint": fingerprint(cell()), "date": "2026-01-02"}))
@@ -66,7 +66,7 @@ def test_a_sign_off_counts_for_the_cell_it_was_made_of(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{}"])
-def test_a_sign_off_that_is_none_says_so(tmp_path: Path, text: str) -> None:
+def test_an_invalid_sign_off_is_reported(tmp_path: Path, text: str) -> None:
     file = tmp_path / "my_cell.yaml"
     sign_off_file(file).write_text(text)
     assert "my_cell.commissioned.json cannot be read" in (not_commissioned(cell(), file) or "")

@@ -29,7 +29,7 @@ def test_the_cell_names_its_parts_by_side(dual_iiwa7_cell: ComposedCell) -> None
     assert cell.obstacles == ("table",)
 
 
-def test_every_name_is_unique_of_its_kind_even_of_shapes_that_share_one(tmp_path: Path) -> None:
+def test_every_name_is_unique_for_its_kind_even_if_shapes_share_one(tmp_path: Path) -> None:
     text = find_resource("robots/iiwa7.urdf").read_text()
     file = tmp_path / "arm.urdf"
     file.write_text(re.sub(r'<(visual|collision) name="[^"]*"', r'<\1 name="shape"', text))
@@ -53,7 +53,7 @@ def test_mounts_and_obstacles_stand_where_the_config_puts_them() -> None:
     np.testing.assert_allclose(data.oMf[model.getFrameId("post", pin.FrameType.BODY)].translation, [4, 5, 6])
 
 
-def test_joints_that_nobody_drives_are_fixed_and_a_finger_that_mimics_a_driven_one_moves_with_it() -> None:
+def test_undriven_joints_are_fixed_but_a_finger_that_mimics_a_driven_one_moves_with_it() -> None:
     panda = {"model": "example-robot-data:panda", "home": [0, 0, 0, -1, 0, 1, 0]}
     cell = compose(one_arm(**panda))
     assert cell.tool_frames == {"left": "left_panda_hand_tcp"}
@@ -113,18 +113,18 @@ def test_obstacle_names_that_clash_or_break_out_are_refused(name: str) -> None:
     assert "\n" not in str(error.value)
 
 
-def test_the_floor_is_a_link_of_its_own_whose_surface_is_at_the_height_asked_for() -> None:
+def test_the_floor_is_its_own_link_with_its_surface_at_the_given_height() -> None:
     cell = compose(one_arm().model_copy(update={"floor": -0.25}))
     model = pin.buildModelFromXML(cell.urdf)
     geometry = pin.buildGeomFromUrdfString(model, cell.urdf, pin.GeometryType.COLLISION)
     floor = geometry.geometryObjects[geometry.getGeometryId("floor_0")]
     assert floor.parentJoint == 0
     assert floor.placement.translation[2] + floor.geometry.halfSide[2] == pytest.approx(-0.25)
-    assert min(floor.geometry.halfSide[:2]) > 40.0  # mounts lie within 20 m of the origin
+    assert min(floor.geometry.halfSide[:2]) > 40.0  # Mounts lie within 20 m of the origin.
     assert cell.obstacles == ()
 
 
-def test_an_obstacle_may_be_called_floor_only_where_the_cell_has_none_of_its_own() -> None:
+def test_an_obstacle_may_be_called_floor_only_if_the_cell_has_no_floor() -> None:
     slab = {"floor": {"shape": "box", "size": [2.0, 2.0, 0.1], "position": [0.0, 0.0, -0.05]}}
     data = one_arm().model_dump() | {"obstacles": slab}
     with pytest.raises(ConfigError, match=r"obstacles\.floor: the cell has a floor at z = 0 m; .* or set floor: null"):

@@ -30,7 +30,7 @@ ENDS = '<parent link="base"/><child link="tip"/>'
         (GOOD, "", "not XML"),
         (GOOD, "<sdf/>", "<sdf>"),
         ('radius="0.1"', 'radius="nan"', "radius = 'nan'"),
-        ('radius="0.1"', 'radius="1_0"', "radius = '1_0'"),  # a number to Python only
+        ('radius="0.1"', 'radius="1_0"', "radius = '1_0'"),  # Only Python accepts this as a number.
         ('radius="0.1"', 'radius="-0.1"', "more than 0"),
         ('xyz="0 0 1"', 'xyz="0 1"', "3 finite number"),
         ('xyz="0 0 1"', 'xyz="0 0 0"', "axis"),
@@ -53,7 +53,7 @@ ENDS = '<parent link="base"/><child link="tip"/>'
         ("<robot name", '<!DOCTYPE r [<!ENTITY a "aa">]><robot x="&c;" name', "not XML"),
     ],
 )
-def test_a_description_that_cannot_be_trusted_is_refused_in_one_line(old: str, new: str, complaint: str) -> None:
+def test_an_untrustworthy_description_is_refused_in_one_line(old: str, new: str, complaint: str) -> None:
     with pytest.raises(RobotError) as error:
         parse_urdf(GOOD.replace(old, new), "arm.urdf")
     assert str(error.value).startswith("arm.urdf: ")
@@ -69,7 +69,7 @@ def test_two_links_that_carry_each_other_beside_the_tree_are_refused() -> None:
         parse_urdf(GOOD.replace("</robot>", loop + "</robot>"), "arm.urdf")
 
 
-def test_a_joint_without_end_gets_two_turns_each_way() -> None:
+def test_a_joint_without_limits_gets_two_turns_in_each_direction() -> None:
     endless = GOOD.replace("revolute", "continuous").replace('lower="-1" upper="1" ', "")
     joint = parse_urdf(endless, "arm.urdf").find("joint")
     assert joint is not None
@@ -89,7 +89,7 @@ def test_a_joint_without_end_gets_two_turns_each_way() -> None:
         ("package://lbr/urdf/iiwa7.urdf", "AMENT_PREFIX_PATH"),
     ],
 )
-def test_a_model_that_is_not_there_says_what_is(model: str, complaint: str) -> None:
+def test_a_missing_model_is_named_with_the_existing_ones(model: str, complaint: str) -> None:
     with pytest.raises(ConfigError, match=complaint):
         load_description(model)
 

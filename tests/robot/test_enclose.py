@@ -21,7 +21,7 @@ from q2r2_control.types import Array
 
 
 def _reach(points: Array, start: Array, end: Array) -> Array:
-    """Distance of each point from the segment."""
+    """Return the distance of each point from the segment."""
     along = end - start
     share = np.clip((points - start) @ along / max(float(along @ along), 1e-300), 0, 1)
     return np.asarray(np.linalg.norm(points - start - np.outer(share, along), axis=1))
@@ -62,7 +62,7 @@ def _geometry(model: str) -> pin.GeometryModel:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("model", ["panda", "ur5", "xarm7"])
-def test_the_capsules_of_a_real_arm_hold_every_vertex_of_its_meshes(model: str) -> None:
+def test_the_capsules_of_a_real_arm_contain_every_vertex_of_its_meshes(model: str) -> None:
     meshes, enclosed = _geometry(f"example-robot-data:{model}"), _geometry(f"example-robot-data:{model}")
     enclose_shapes(enclosed)
     checked = 0
@@ -92,7 +92,7 @@ def _one(shape: coal.CollisionGeometry, parent_joint: int) -> pin.GeometryModel:
     ],
     ids=["post", "round table top", "tin", "box"],
 )  # fmt: skip
-def test_a_primitive_lies_inside_what_replaces_it(shape: coal.CollisionGeometry, parent_joint: int) -> None:
+def test_a_primitive_lies_inside_its_replacement(shape: coal.CollisionGeometry, parent_joint: int) -> None:
     geometry = _one(shape, parent_joint)
     before = geometry.geometryObjects[0].copy()
     enclose_shapes(geometry)
@@ -118,7 +118,7 @@ def _surface(shape: coal.CollisionGeometry) -> Array:
     return np.column_stack([shape.radius * np.cos(angle), shape.radius * np.sin(angle), side * shape.halfLength])
 
 
-def test_capsules_spheres_and_fixed_boxes_are_left_alone() -> None:
+def test_capsules_spheres_and_fixed_boxes_are_not_changed() -> None:
     for shape in (coal.Capsule(0.1, 0.4), coal.Sphere(0.1), coal.Box(1.0, 1.0, 1.0)):
         geometry = _one(shape, 0)
         enclose_shapes(geometry)
@@ -143,7 +143,7 @@ def test_a_mesh_without_triangles_is_refused(tmp_path: Path) -> None:
 
 
 def _slender_brick() -> coal.BVHModelOBBRSS:
-    """1 m long, with vertices at both ends only."""
+    """Return a brick 1 m long, with vertices at both ends only."""
     mesh = coal.BVHModelOBBRSS()
     mesh.beginModel(12, 8)
     corners = _clouds()["a brick"] * [1.0, 0.5, 2.5]
@@ -170,7 +170,7 @@ def _volume(capsules: list[pin.GeometryObject]) -> float:
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [2, 3, 4])
 @pytest.mark.parametrize("link", ["forearm_link", "upper_arm_link", "thing"])
-def test_capsules_of_a_link_hold_all_of_its_mesh_together(link: str, count: int) -> None:
+def test_the_capsules_of_a_link_together_contain_its_mesh(link: str, count: int) -> None:
     before = _one(_slender_brick(), 1) if link == "thing" else _geometry("example-robot-data:ur5")
     enclosed = before.copy()
     mesh = next(item for item in before.geometryObjects if item.name == f"{link}_0")
@@ -187,7 +187,7 @@ def test_capsules_of_a_link_hold_all_of_its_mesh_together(link: str, count: int)
     assert beyond.max() <= 0.0
 
 
-def test_three_capsules_are_clearly_less_than_one_around_a_forearm() -> None:
+def test_three_capsules_around_a_forearm_are_clearly_smaller_than_one() -> None:
     volumes = []
     for counts in ({}, {"forearm_link": 3}):
         geometry = _geometry("example-robot-data:ur5")
@@ -204,7 +204,7 @@ def _ur5(**keys: object) -> Config:
     return Config.model_validate({"name": "a", "arms": arms, **keys})
 
 
-def test_a_cell_watches_each_capsule_of_a_link() -> None:
+def test_a_cell_monitors_each_capsule_of_a_link() -> None:
     plain, fine = (Robot.from_config(_ur5(capsules=counts)) for counts in ({}, {"left_forearm_link": 3}))
     names = [item.name for item in fine.collision_model.geometryObjects]
     assert names == [*(item.name for item in plain.collision_model.geometryObjects), *_FOREARM[1:]]
@@ -224,15 +224,15 @@ def test_a_cell_watches_each_capsule_of_a_link() -> None:
     ],
     ids=["no link of the cell", "a box", "too many", "none", "one, of no link of the cell"],
 )
-def test_capsules_that_cannot_be_are_refused(capsules: dict[str, int], says: str) -> None:
+def test_impossible_numbers_of_capsules_are_refused(capsules: dict[str, int], says: str) -> None:
     text = yaml.safe_dump(_ur5().model_dump(mode="json", exclude_unset=True) | {"capsules": capsules})
     with pytest.raises(ConfigError, match=re.escape(says)):
         Robot.from_config(parse_config(text, "cell.yaml"))
 
 
-def test_a_round_mesh_needs_memory_for_its_points_only() -> None:
+def test_a_round_mesh_needs_memory_only_for_its_points() -> None:
     points = np.random.default_rng(0).normal(size=(3000, 3))
-    points /= np.linalg.norm(points, axis=1, keepdims=True)  # all of them are corners
+    points /= np.linalg.norm(points, axis=1, keepdims=True)  # All points are corners.
     tracemalloc.start()
     try:
         radius, _, _ = enclosing_capsule(points)

@@ -1,4 +1,4 @@
-"""A finger is watched as all that it sweeps."""
+"""The monitored body of a finger covers everything that the finger sweeps."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ LIMITS = 'velocity="1" effort="10"'
 
 
 def robot_with(shape: str, kind: str = "prismatic", second: str = "") -> Robot:
-    """An arm of one joint whose hand carries a finger that slides along its y."""
+    """Return an arm of one joint whose hand has a finger that slides along its y."""
     checking = '<collision_checking><capsule name="shape"/></collision_checking>' if "capsule" in shape else ""
     return Robot.from_urdf(
         f"""<robot name="r"><link name="base"/>
@@ -37,7 +37,7 @@ def robot_with(shape: str, kind: str = "prismatic", second: str = "") -> Robot:
         <origin xyz="0 0.03 0" rpy="0 0 1"/><axis xyz="0 1 0"/><limit lower="-0.01" upper="0.04" {LIMITS}/></joint>
         {second}</robot>""",
         {"left": "tool"},
-        unchecked_links=["tool"],  # no pair is monitored
+        unchecked_links=["tool"],  # No pair is monitored.
     )
 
 
@@ -46,14 +46,14 @@ def bodies(robot: Robot, link: str) -> list[pin.GeometryObject]:
 
 
 def beyond(point: Array, item: pin.GeometryObject) -> float:
-    """How far a point of the arm's last joint's frame is outside a capsule [m]."""
+    """Return how far a point of the arm's last joint's frame is outside a capsule [m]."""
     local = item.placement.actInv(point)
     half = getattr(item.geometry, "halfLength", 0.0)
     return float(np.linalg.norm(local - [0.0, 0.0, np.clip(local[2], -half, half)]) - item.geometry.radius)
 
 
 def finger_at(position: float) -> pin.SE3:
-    """The finger's link in the frame of the arm's joint."""
+    """Return the finger's link in the frame of the arm's joint."""
     tool = pin.SE3(pin.rpy.rpyToMatrix(0.3, -0.4, 0.5), np.array([0.2, 0.0, 0.0]))
     slide = pin.SE3(pin.rpy.rpyToMatrix(0.0, 0.0, 1.0), np.array([0.0, 0.03, 0.0]))
     moved: pin.SE3 = tool * slide * pin.SE3(np.eye(3), np.array([0.0, position, 0.0]))
@@ -61,7 +61,7 @@ def finger_at(position: float) -> pin.SE3:
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_the_body_holds_the_finger_wherever_it_is(shape: str) -> None:
+def test_the_body_contains_the_finger_at_every_opening(shape: str) -> None:
     (body,) = bodies(robot_with(shape), "finger")
     points = {
         "sphere": 0.01 * np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, -1]]),
@@ -77,7 +77,7 @@ def test_the_body_holds_the_finger_wherever_it_is(shape: str) -> None:
         assert 2 * body.geometry.halfLength == pytest.approx(0.05 if shape == "sphere" else 0.07)
 
 
-def test_a_finger_that_turns_is_all_that_it_sweeps_too_and_one_that_does_neither_stays_as_it_is() -> None:
+def test_a_turning_finger_covers_its_whole_sweep_and_a_fixed_one_stays_unchanged() -> None:
     (ball,) = bodies(robot_with("sphere", kind="planar"), "finger")
     assert isinstance(ball.geometry, coal.Sphere)
     (body,) = bodies(robot_with("cylinder across", kind="revolute"), "finger")
@@ -88,7 +88,7 @@ def test_a_finger_that_turns_is_all_that_it_sweeps_too_and_one_that_does_neither
 
 
 @pytest.mark.parametrize(("away", "count"), [(0.0, 1), (0.001, 2)], ids=["on its line", "beside it"])
-def test_a_second_finger_on_the_same_line_is_one_body_with_the_first(away: float, count: int) -> None:
+def test_a_second_finger_on_the_same_line_shares_the_body_of_the_first(away: float, count: int) -> None:
     second = f"""<link name="other"><collision>{SHAPES["sphere"]}</collision></link>
         <joint name="slide_2" type="prismatic"><parent link="tool"/><child link="other"/><origin xyz="{away} 0.03 0"
         rpy="0 0 1"/><axis xyz="0 -1 0"/><limit lower="0.02" upper="0.06" {LIMITS}/></joint>"""
@@ -101,7 +101,7 @@ def test_a_second_finger_on_the_same_line_is_one_body_with_the_first(away: float
             assert beyond(finger_at(position).translation, found[0]) == pytest.approx(-0.01, abs=1e-9)
 
 
-def test_the_slide_of_a_lift_that_carries_the_arm_is_no_finger() -> None:
+def test_the_slide_of_a_lift_that_carries_the_arm_is_not_a_finger() -> None:
     lift = f"""<robot name="r"><link name="base"/><link name="tool"/>
         <link name="column"><collision><geometry><sphere radius="0.05"/></geometry></collision></link>
         <joint name="lift" type="prismatic"><parent link="base"/><child link="column"/><axis xyz="0 0 1"/>

@@ -1,4 +1,6 @@
-"""A finger's body at a known opening: it holds the finger, no more than that, and only shrinks as more is known."""
+"""A finger's body at a known opening contains the finger, is not larger than necessary, and only shrinks with more
+knowledge.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,7 @@ LIMITS = 'velocity="1" effort="10"'
 
 
 def hand(mimic: str = "", axis: str = "0 -1 0", stroke: tuple[float, float] = (0.03, 0.0)) -> str:
-    """A hand whose fingers are spheres on two lines; the second one may mimic the first."""
+    """Return a hand whose fingers are spheres on two lines. The second one may mimic the first."""
     ball = '<collision><geometry><sphere radius="0.008"/></geometry></collision>'
     limit = f'<limit lower="{min(stroke) - 0.002}" upper="{max(stroke) + 0.002}" {LIMITS}/>'
     return f"""<robot name="hand"><link name="palm"/><link name="one">{ball}</link><link name="two">{ball}</link>
@@ -46,14 +48,14 @@ def ends_at(robot: Robot, name: str, interval: Interval) -> tuple[Array, Array]:
 
 
 def outside(point: Array, ends: tuple[Array, Array]) -> float:
-    """Distance of a point from a segment [m]."""
+    """Return the distance of a point from a segment [m]."""
     along = ends[1] - ends[0]
     share = float(np.clip((point - ends[0]) @ along / max(float(along @ along), 1e-30), 0.0, 1.0))
     return float(np.linalg.norm(point - ends[0] - share * along))
 
 
 def finger_at(robot: Robot, joint: str, position: float, points: Array) -> Array:
-    """Points of a finger's link in the frame of the arm's last joint, the finger's joint at ``position``."""
+    """Return points of a finger's link in the frame of the arm's last joint; its joint is at ``position``."""
     full = pin.buildModelFromXML(robot.urdf)
     q = pin.neutral(full)
     q[full.joints[full.getJointId(joint)].idx_q] = position
@@ -64,9 +66,9 @@ def finger_at(robot: Robot, joint: str, position: float, points: Array) -> Array
     return np.array([local.act(point) for point in points])
 
 
-def test_the_hand_e_holds_both_fingers_at_each_opening_of_the_interval() -> None:
+def test_the_body_of_the_hand_e_contains_both_fingers_at_each_opening_of_the_interval() -> None:
     robot = Robot.from_config(HAND_E)
-    # Both ends of the capsules that robots/hand_e.urdf draws around a tip, in the link of their finger.
+    # These are both ends of the capsules that robots/hand_e.urdf draws around a tip, in the link of their finger.
     drawn = {1: np.array([[0.00825, 0.0, 0.03725], [0.00825, 0.012, 0.03725]])}
     drawn[2] = drawn[1] * [1.0, -1.0, 1.0]
     name = "left_hand_e_finger_1_envelope_3"
@@ -79,7 +81,7 @@ def test_the_hand_e_holds_both_fingers_at_each_opening_of_the_interval() -> None
 
 
 @pytest.mark.parametrize("positions", [(0.03, 0.0), (0.0, 0.03)], ids=["opens outwards", "opens inwards"])
-def test_fingers_on_two_lines_are_their_own_way(positions: tuple[float, float], tmp_path: object) -> None:
+def test_fingers_on_two_lines_have_separate_ways(positions: tuple[float, float], tmp_path: object) -> None:
     robot = cell(hand(), ("slide", "other"), str(tmp_path), positions)
     assert {body.name for body in robot.finger_bodies if body.arm == "left"} == {"left_one_0", "left_two_0"}
     opened, closed = positions
@@ -93,7 +95,7 @@ def test_fingers_on_two_lines_are_their_own_way(positions: tuple[float, float], 
             assert np.linalg.norm(ends[1] - ends[0]) == pytest.approx(0.03 * np.ptp(interval) + beyond, abs=1e-9)
 
 
-def test_a_finger_that_mimics_another_is_where_that_one_puts_it(tmp_path: object) -> None:
+def test_a_finger_that_mimics_another_one_is_where_that_one_puts_it(tmp_path: object) -> None:
     mimic = '<mimic joint="slide" multiplier="-0.5" offset="0.001"/>'
     robot = cell(hand(mimic, axis="0 1 0"), ("slide",), str(tmp_path), (0.03, 0.0))
     ends = ends_at(robot, "left_two_0", (0.2, 0.6))
@@ -103,7 +105,7 @@ def test_a_finger_that_mimics_another_is_where_that_one_puts_it(tmp_path: object
     assert np.linalg.norm(ends[1] - ends[0]) == pytest.approx(0.5 * 0.03 * 0.4, abs=1e-9)
 
 
-def test_what_holds_more_openings_holds_the_body_of_fewer() -> None:
+def test_the_body_of_more_openings_contains_that_of_fewer() -> None:
     robot, random = Robot.from_config(HAND_E), np.random.default_rng(0)
     for body in robot.finger_bodies:
         assert isinstance(body, FingerBody)
@@ -114,7 +116,7 @@ def test_what_holds_more_openings_holds_the_body_of_fewer() -> None:
         assert body.part(ALL_OF_THE_WAY) == (0.0, 1.0)
 
 
-def test_a_robot_whose_closed_and_open_positions_are_not_known_has_fingers_that_are_all_of_their_way() -> None:
+def test_without_known_closed_and_open_positions_fingers_cover_their_whole_way() -> None:
     made = Robot.from_config(HAND_E)
     plain = Robot.from_urdf(made.urdf, {arm.name: arm.tool_frame for arm in made.arms.values()})
     assert plain.finger_bodies == ()

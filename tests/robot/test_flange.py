@@ -1,4 +1,4 @@
-"""Flanges between an arm and its tool: where they put the tool, which of their pairs are watched, what is refused."""
+"""Flanges between an arm and its tool: the place of the tool, the monitored pairs, and refused flanges."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ POSTURE = np.array([0.3, 0.5, -0.2, -1.3, 0.4, 1.1, -0.6])
 
 
 def with_flange(flange: dict[str, Any], cell: str = "dual_iiwa7") -> Config:
-    """A shipped cell whose arms both have a flange."""
+    """Return a shipped cell whose arms both have a flange."""
     data = load_config(f"config/{cell}.yaml").model_dump()
     for arm in data["arms"].values():
         arm["flange"] = flange
@@ -50,7 +50,7 @@ def test_the_tool_is_moved_outwards_by_the_thickness_and_the_arm_carries_the_mas
     assert moved.model.inertias[7].mass - plain.model.inertias[7].mass == pytest.approx(mass)
 
 
-def test_the_body_of_each_flange_is_watched_against_all_that_its_arm_can_meet() -> None:
+def test_the_body_of_each_flange_is_monitored_against_everything_that_its_arm_can_meet() -> None:
     plain, robot = Robot.from_config(load_config("config/dual_iiwa7.yaml")), Robot.from_config(with_flange(TOUCH))
     new = watched(robot) - watched(plain)
     assert watched(plain) <= watched(robot), "nothing else is watched less"
@@ -65,7 +65,7 @@ def test_the_body_of_each_flange_is_watched_against_all_that_its_arm_can_meet() 
 
 
 def test_the_sphere_of_the_touch_flange_encloses_its_drawing_and_what_link_7_does_not() -> None:
-    """Outline of the published mesh, from the end of the plain flanges, z outwards: radius at height [m]."""
+    """The outline is that of the published mesh, from the end of the plain flanges: radius at height z [m]."""
     outline = {-0.045: 0.055, -0.026: 0.0582, 0.0: 0.0553, 0.026: 0.0329}
     urdf = load_description("media_flange_touch_pneumatic").urdf
     sphere, centre = urdf.find("link/collision/geometry/sphere"), urdf.find("link/collision/origin")
@@ -77,7 +77,7 @@ def test_the_sphere_of_the_touch_flange_encloses_its_drawing_and_what_link_7_doe
     assert link_7 == pytest.approx(0.019, abs=5e-4)
 
 
-def test_pairs_known_of_tool_and_arm_are_not_believed_with_a_flange_between_them_that_no_file_knows() -> None:
+def test_known_pairs_of_tool_and_arm_are_not_used_with_an_unknown_flange_between_them() -> None:
     far = '"left_link_4" link2="left_hand_e_envelope"'
     assert far in compose(one_arm(tool=HAND)).srdf
     assert far in compose(one_arm(tool=HAND, flange=TOUCH)).srdf
@@ -87,7 +87,7 @@ def test_pairs_known_of_tool_and_arm_are_not_believed_with_a_flange_between_them
 
 
 def test_a_flange_of_one_s_own_is_a_urdf_whose_last_link_or_frame_carries_the_tool(tmp_path: Path) -> None:
-    """A coupler with a sensor beside it: two ends, of which the file names one."""
+    """The flange is a coupler with a sensor beside it: two ends, of which the file names one."""
     joint = '<joint name="{0}_joint" type="fixed"><parent link="disc"/><child link="{0}"/><origin xyz="{1}"/></joint>'
     links = '<link name="disc"/><link name="end"/><link name="side"/>'
     text = f'<robot name="disc">{links}{joint.format("end", "0 0 0.04")}{joint.format("side", "0.05 0 0.01")}</robot>'

@@ -1,4 +1,4 @@
-"""Joints that mimic others: where each is, how far it lets its driver go, and the same in every model of a robot."""
+"""Joints that mimic others: their positions, their limits on the driver, and equality in all models of a robot."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def followers(*joints: str, driven: tuple[str, ...] = ()) -> dict[str, Follower]
 CHAIN = (joint("c", "b -2 0.1"), joint("b", "a 0.5 0.2"), joint("a"))
 
 
-def test_a_follower_of_a_follower_follows_what_drives_that_one_in_whatever_order_they_stand() -> None:
+def test_a_follower_of_a_follower_follows_the_first_driver_in_any_order_of_the_file() -> None:
     found = followers(*CHAIN)
     assert found["b"] == Follower("a", 0.5, 0.2)
     assert (found["c"].driver, found["c"].multiplier) == ("a", -1.0)
@@ -59,7 +59,7 @@ def test_a_follower_of_a_follower_follows_what_drives_that_one_in_whatever_order
     assert positions == {"a": 0.4, "b": pytest.approx(0.4), "c": pytest.approx(-2 * 0.4 + 0.1)}
 
 
-def test_a_joint_that_has_a_motor_follows_none() -> None:
+def test_a_joint_with_a_motor_follows_no_other_joint() -> None:
     assert followers(*CHAIN, driven=("b",)) == {"c": Follower("b", -2.0, 0.1)}
 
 
@@ -82,7 +82,7 @@ def test_a_fixed_joint_follows_none() -> None:
         ),
     ],
 )
-def test_what_no_joint_can_follow_is_refused_by_name(joints: tuple[str, ...], complaint: str) -> None:
+def test_an_impossible_mimic_is_refused_by_name(joints: tuple[str, ...], complaint: str) -> None:
     with pytest.raises(RobotError, match=re.escape(complaint)) as error:
         parse_urdf(model(*joints), "arm.urdf")
     assert str(error.value).startswith("arm.urdf: joint")
@@ -100,7 +100,7 @@ def test_what_no_joint_can_follow_is_refused_by_name(joints: tuple[str, ...], co
         pytest.param(joint("b", "a -1 0", "0 0.8"), (0.0, 0.8), id="whose range has the wrong sign"),
     ],
 )
-def test_a_driver_goes_no_farther_than_its_follower(follower: str, limits: tuple[float, float]) -> None:
+def test_a_driver_moves_no_farther_than_its_follower(follower: str, limits: tuple[float, float]) -> None:
     root = parse_urdf(model(joint("a"), follower), "arm.urdf")
     found = {one.get("name"): joint_limits(one) for one in root.findall("joint")}
     assert found["a"] == pytest.approx(limits)
@@ -113,7 +113,7 @@ ROTOR = '<joint name="b" type="continuous"><parent link="base"/><child link="b_l
 
 
 @pytest.mark.parametrize("multiplier", [100.0, -2.0])
-def test_a_follower_that_turns_on_for_ever_leaves_its_driver_all_its_range(multiplier: float) -> None:
+def test_a_continuous_follower_leaves_its_driver_the_whole_range(multiplier: float) -> None:
     follower = ROTOR.format(f'<mimic joint="a" multiplier="{multiplier}"/>')
     text = ET.tostring(parse_urdf(model(joint("a", limit="-2.9 2.9"), follower), "arm.urdf"))
     for root in (ET.fromstring(text), parse_urdf(text, "written again")):
@@ -131,7 +131,7 @@ ARM = (joint("j1", limit="-2 2"), *(joint(f"j{n}", limit="-2 2", parent=f"j{n - 
 
 @pytest.fixture(scope="module")
 def cell(tmp_path_factory: pytest.TempPathFactory) -> Config:
-    """An arm of three joints, and a hand whose fingertip follows a joint that follows the driven one."""
+    """Return an arm of three joints, and a hand whose fingertip follows a joint that follows the driven one."""
     file = tmp_path_factory.mktemp("hand") / "arm.urdf"
     file.write_text(model(*ARM, *HAND))
     gripper = {"joints": ["finger"], "open_position": 0.5, "closed_position": 0.0}

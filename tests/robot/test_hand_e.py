@@ -1,4 +1,4 @@
-"""robots/hand_e.urdf: fingers, tool frame, and the envelopes that stand for the hand in every distance."""
+"""robots/hand_e.urdf: fingers, tool frame, and the envelopes that represent the hand in every distance."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def hand() -> tuple[pin.Model, pin.GeometryModel]:
 
 
 def _points_of(shape: coal.CollisionGeometry) -> Array:
-    """Points on and in a box or a cylinder, close enough to leave no gap a millimetre wide near an edge."""
+    """Return points on and in a box or a cylinder, without a gap of more than a millimetre near an edge."""
     if isinstance(shape, coal.Box):
         axes = [np.linspace(-half, half, 13) for half in shape.halfSide]
         return np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3)
@@ -40,7 +40,7 @@ def _outside(point: Array, capsule: pin.GeometryObject, placement: pin.SE3) -> f
 
 @pytest.mark.slow
 @pytest.mark.parametrize("opening", [0.0, 0.005, 0.0125, 0.02, 0.025])
-def test_envelopes_hold_body_and_fingers_at_every_opening(
+def test_envelopes_contain_body_and_fingers_at_every_opening(
     hand: tuple[pin.Model, pin.GeometryModel], opening: float
 ) -> None:
     model, geometry = hand

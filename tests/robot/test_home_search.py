@@ -1,4 +1,4 @@
-"""Homes that nobody has named."""
+"""Home postures that no file names."""
 
 from __future__ import annotations
 

@@ -21,12 +21,12 @@ from tests.robot.conftest import one_arm
 class DataSheet:
     """Figures of KUKA and of the public lbr_description for one robot."""
 
-    lengths: tuple[float, ...]  # base-shoulder, shoulder-elbow, elbow-wrist, wrist-flange [m]
-    masses: tuple[float, ...]  # of link 0..7 [kg]
+    lengths: tuple[float, ...]  # Lengths base-shoulder, shoulder-elbow, elbow-wrist, wrist-flange [m].
+    masses: tuple[float, ...]  # Masses of links 0..7 [kg].
     velocity: tuple[float, ...]  # [deg/s]
     torque: tuple[float, ...]  # [Nm]
-    acceleration: tuple[float, ...]  # as Drake publishes it [rad/s^2]
-    rotor: tuple[float, ...]  # inertia about the rotor's own axis [kg m^2]
+    acceleration: tuple[float, ...]  # Acceleration limits that Drake publishes [rad/s^2].
+    rotor: tuple[float, ...]  # Inertia about the rotor's own axis [kg m^2].
     gear: tuple[float, ...]
 
 

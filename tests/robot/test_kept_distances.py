@@ -1,4 +1,4 @@
-"""How far each pair stays apart: by what its bodies are, by their names, or else as all others do."""
+"""The distance that each pair keeps: by the class of its bodies, by their names, or else the common one."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from q2r2_control.robot.pairs import link_of
 from q2r2_control.robot.robot import Robot
 from tests.robot.conftest import one_arm
 
-# A different one for each class.
+# Each class has a different distance.
 BY_CLASS = {
     name: 0.001 * (index + 1)
     for index, name in enumerate(
@@ -26,7 +26,7 @@ BY_CLASS = {
 
 
 def kept(robot: Robot, **settings: Any) -> dict[frozenset[str], float]:
-    """By pair of links."""
+    """Return the distances by pair of links."""
     found = kept_distances(robot, ControllerSettings.model_validate(settings))
     pairs = robot.distances(robot.home)
     return {
@@ -54,14 +54,14 @@ def kept(robot: Robot, **settings: Any) -> dict[frozenset[str], float]:
         ("left_hand_e_finger_1_envelope", "floor", "finger_obstacle"),
     ],
 )
-def test_a_pair_keeps_what_its_class_does(dual_iiwa: Robot, a: str, b: str, name: str) -> None:
+def test_a_pair_keeps_the_distance_of_its_class(dual_iiwa: Robot, a: str, b: str, name: str) -> None:
     assert kept(dual_iiwa, distances=BY_CLASS)[frozenset((a, b))] == BY_CLASS[name]
     alone = kept(dual_iiwa, distances={name: 0.0})
     assert alone[frozenset((a, b))] == 0.0, "zero is a distance, and none is not"
     assert 0.02 in alone.values()
 
 
-def test_a_hand_that_is_part_of_its_arms_model_is_a_tool_and_what_its_gripper_moves_are_fingers() -> None:
+def test_a_hand_in_its_arms_model_is_a_tool_and_the_links_that_its_gripper_moves_are_fingers() -> None:
     gripper = {"joints": ["panda_finger_joint1"], "open_position": 0.04, "closed_position": 0.0}
     home = [0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785]
     config = one_arm(model="example-robot-data:panda", home=home, gripper=gripper)
@@ -70,13 +70,13 @@ def test_a_hand_that_is_part_of_its_arms_model_is_a_tool_and_what_its_gripper_mo
     found = kept(robot, distances=BY_CLASS)
     assert found[frozenset(("left_panda_hand", "table"))] == BY_CLASS["tool_obstacle"]
     assert found[frozenset(("left_panda_link6", "table"))] == BY_CLASS["arm_obstacle"]
-    for finger in ("leftfinger", "rightfinger"):  # the second one mimics the first
+    for finger in ("leftfinger", "rightfinger"):  # The second finger mimics the first.
         if frozenset((f"left_panda_{finger}", "table")) in found:
             assert found[frozenset((f"left_panda_{finger}", "table"))] == BY_CLASS["finger_obstacle"]
     assert frozenset(("left_panda_leftfinger", "table")) in found
 
 
-def test_a_pair_that_is_named_keeps_what_is_said_there_whatever_its_class_says(dual_iiwa: Robot) -> None:
+def test_a_named_pair_keeps_its_own_distance_instead_of_that_of_its_class(dual_iiwa: Robot) -> None:
     named = [
         {"pair": ["table", "left_*"], "distance": 0.05},
         {"pair": ["left_link_?", "table"], "distance": 0.06},
@@ -106,7 +106,7 @@ def test_names_that_no_pair_has_are_refused_in_one_line(dual_iiwa: Robot, pair: 
     assert len(str(caught.value).splitlines()) == 1
 
 
-def test_the_largest_distance_is_found_wherever_it_is_written() -> None:
+def test_the_largest_distance_is_found_in_any_setting() -> None:
     for settings, key in (
         ({}, "min_distance"),
         ({"distances": {"arm_self": 0.03}}, "distances.arm_self"),

@@ -1,4 +1,4 @@
-"""The load of an arm from torques measured at rest."""
+"""The load of an arm, identified from torques at rest."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from q2r2_control.robot.load import MODEL, PENDANT, LoadReport, identify_load
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
-ADDED, AT = 0.7, np.array([0.02, -0.03, 0.1])  # [kg], in the frame of the tool's base, which is the flange [m]
+# Mass [kg], and place in the frame of the tool's base, which is the flange [m].
+ADDED, AT = 0.7, np.array([0.02, -0.03, 0.1])
 
 
 @pytest.fixture(scope="module")
@@ -21,7 +22,7 @@ def robot() -> Robot:
 
 
 def measured(robot: Robot, count: int, spread: float) -> tuple[Array, Array]:
-    """Postures, and torques that the model does not explain, since the right arm carries something more."""
+    """Return postures, and torques that the model does not explain: the right arm carries an additional mass."""
     random, true = np.random.default_rng(1), robot.model.copy()
     base = robot.model.frames[robot.model.getFrameId("right_hand_e_base")]
     true.appendBodyToJoint(base.parentJoint, pin.Inertia(ADDED, AT, np.zeros((3, 3))), base.placement)
@@ -35,7 +36,7 @@ def measured(robot: Robot, count: int, spread: float) -> tuple[Array, Array]:
     return postures, np.array(missing)
 
 
-def test_what_an_arm_carries_more_than_its_model_is_found_in_the_flanges_frame(robot: Robot) -> None:
+def test_the_additional_load_of_an_arm_is_found_in_the_flanges_frame(robot: Robot) -> None:
     right, left = (identify_load(robot, arm, *measured(robot, 8, 0.4), MODEL) for arm in ("right", "left"))
     masses = np.array([right.expected_kg, ADDED])
     centre = masses @ np.array([right.expected_centre_mm, 1e3 * AT]) / masses.sum()
@@ -48,12 +49,12 @@ def test_what_an_arm_carries_more_than_its_model_is_found_in_the_flanges_frame(r
         right.check()
 
 
-def test_a_centre_that_is_off_is_refused_where_the_mass_is_right() -> None:
+def test_a_wrong_centre_of_mass_is_refused_even_if_the_mass_is_right() -> None:
     with pytest.raises(RobotError, match="60 mm away"):
         LoadReport("left", MODEL, 1.0, 1.0, [0.0, 60.0, 50.0], [0.0, 0.0, 50.0], 0.1).check()
 
 
-def test_a_load_is_not_judged_by_an_arms_model_that_does_not_explain_the_torques() -> None:
+def test_a_load_is_not_judged_by_a_model_that_does_not_explain_the_torques() -> None:
     heavy = 4.0, 1.0, [0.0, 0.0, 50.0], [0.0, 0.0, 50.0], 2.0
     LoadReport("left", MODEL, *heavy).check()
     with pytest.raises(
@@ -69,6 +70,6 @@ def test_a_load_is_not_judged_by_an_arms_model_that_does_not_explain_the_torques
         pytest.param(8, 0.0, "too alike", id="the same one"),
     ],
 )
-def test_postures_that_tell_too_little_are_refused(robot: Robot, count: int, spread: float, told: str) -> None:
+def test_postures_with_too_little_information_are_refused(robot: Robot, count: int, spread: float, told: str) -> None:
     with pytest.raises(RobotError, match=told):
         identify_load(robot, "left", *measured(robot, count, spread), MODEL)

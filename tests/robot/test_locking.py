@@ -11,7 +11,7 @@ from q2r2_control.robot.pinocchio_models import lock_joints, resting_position
 
 
 @pytest.mark.parametrize("model", ["iiwa7", "example-robot-data:tiago_dual", "example-robot-data:talos"])
-def test_a_locked_joint_stands_where_pinocchio_has_it_at_that_position(model: str) -> None:
+def test_a_locked_joint_is_where_pinocchio_has_it_at_that_position(model: str) -> None:
     urdf = load_description(model).urdf
     whole = pin.buildModelFromXML(ET.tostring(urdf, encoding="unicode"))
     random = np.random.default_rng(0)

@@ -1,4 +1,4 @@
-"""The URDF of an MJCF file: it moves, weighs and is shaped as MuJoCo says."""
+"""The URDF of an MJCF file has the motion, the masses and the shapes of MuJoCo."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ JOINTS = ("turn", "lift", "out", "spin", "a", "b")
 
 @pytest.fixture
 def arm(tmp_path: Path) -> Path:
-    """The file, with its mesh, which is not centred where it is drawn."""
+    """Return the file with its mesh, which is not centred where it is drawn."""
     (tmp_path / "parts").mkdir()
     corners = "v 0.1 0 0\nv 0.3 0 0\nv 0.1 0.1 0\nv 0.1 0 0.05\n"
     (tmp_path / "parts" / "wedge.obj").write_text(corners + "f 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n")
@@ -108,7 +108,7 @@ def _geom_centre(model: mujoco.MjModel, data: mujoco.MjData, g: int) -> np.ndarr
     return data.geom_xpos[g] + data.geom_xmat[g].reshape(3, 3) @ corners.mean(axis=0)
 
 
-def test_limits_are_the_files_and_speed_is_the_callers(arm: Path) -> None:
+def test_limits_come_from_the_file_and_velocity_limits_from_the_caller(arm: Path) -> None:
     urdf, _, _ = read(arm)
 
     def written(joint: str, element: str) -> dict[str, str]:
@@ -123,7 +123,7 @@ def test_limits_are_the_files_and_speed_is_the_callers(arm: Path) -> None:
     assert written("turn", "rotor") == {"inertia": "0.2", "gear": "1"}
 
 
-def test_a_capsule_stays_one_and_what_only_is_drawn_counts_where_nothing_else_does(arm: Path) -> None:
+def test_a_capsule_stays_a_capsule_and_drawings_count_only_without_collision_shapes(arm: Path) -> None:
     urdf, _, geometry = read(arm)
     shapes = {item.name.rpartition("_")[0]: item.geometry for item in geometry.geometryObjects}
     assert isinstance(shapes["shoulder"], coal.Capsule)
@@ -134,10 +134,10 @@ def test_a_capsule_stays_one_and_what_only_is_drawn_counts_where_nothing_else_do
     text = ARM.replace('<geom type="plane"', '<geom name="table" type="plane"').replace("</mujoco>", contact)
     arm.write_text(text.replace('type="mesh" mesh="wedge" contype', 'name="drawn" type="mesh" mesh="wedge" contype', 1))
     assert read(arm)[0].findall("link[@name='shoulder']/visual") == [], "a pair names it"
-    assert 2.0 * shapes["slide"].halfSide == pytest.approx([0.06, 0.1, 0.14])  # around the ellipsoid
+    assert 2.0 * shapes["slide"].halfSide == pytest.approx([0.06, 0.1, 0.14])  # The box is that around the ellipsoid.
 
 
-def test_arms_that_turn_against_the_world_and_two_in_one_file_get_a_root(arm: Path) -> None:
+def test_arms_at_an_angle_to_the_world_and_two_arms_in_one_file_get_a_root(arm: Path) -> None:
     text = re.sub(r'<body name="base"', '<body name="other" pos="0 1 0"><joint/><geom size="0.1"/></body>\\g<0>', ARM)
     arm.write_text(text)
     urdf, model, _ = read(arm)
@@ -149,7 +149,7 @@ def test_arms_that_turn_against_the_world_and_two_in_one_file_get_a_root(arm: Pa
         assert data.oMf[model.getFrameId(name)].translation == pytest.approx(theirs)
 
 
-def test_names_that_the_urdf_needs_besides_give_way_to_the_files(arm: Path) -> None:
+def test_additional_names_of_the_urdf_give_way_to_the_files(arm: Path) -> None:
     text = ARM.replace('name="slide"', 'name="shoulder_before_turn"').replace('name="spinner"', 'name="mjcf_world"')
     arm.write_text(text.replace('name="base"', 'name="base"><joint name="j"/><geom size="1"/></body><body name="b"'))
     assert LinkTree(read(arm)[0], "arm").root == "mjcf_world_"
@@ -167,7 +167,7 @@ def test_names_that_the_urdf_needs_besides_give_way_to_the_files(arm: Path) -> N
         ('<body name="base".*?</worldbody>.*</actuator>', "</worldbody>", "arm.xml: no joint that turns or slides"),
     ],
 )
-def test_a_file_that_makes_no_urdf_gets_one_line(arm: Path, change: str, to: str, says: str) -> None:
+def test_a_file_that_makes_no_urdf_gives_one_line(arm: Path, change: str, to: str, says: str) -> None:
     text = re.sub(change, to, ARM, count=1, flags=re.DOTALL)
     assert text != ARM
     arm.write_text(text)

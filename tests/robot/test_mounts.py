@@ -1,4 +1,4 @@
-"""The move between two sets of points."""
+"""The displacement between two sets of points."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ POINTS = np.array([[0.5, 0.1, 0.3], [0.6, -0.2, 0.3], [0.4, 0.0, 0.5], [0.55, 0.
 
 
 @pytest.mark.parametrize("count", [3, 4])
-def test_the_true_move_is_found(count: int) -> None:
+def test_the_true_displacement_is_found(count: int) -> None:
     points = POINTS[:count]
     move, off = fit_move(points, np.array([TRUE.actInv(point) for point in points]))
     assert_allclose(move.homogeneous, TRUE.homogeneous, atol=1e-12)
     assert_allclose(off, 0.0, atol=1e-12)
 
 
-def test_a_point_that_was_touched_elsewhere_is_off_most() -> None:
+def test_a_point_that_was_touched_elsewhere_has_the_largest_error() -> None:
     touched = np.array([TRUE.actInv(point) for point in POINTS])
     touched[2] += (0.0, 0.01, 0.0)
     _, off = fit_move(POINTS, touched)
@@ -30,13 +30,13 @@ def test_a_point_that_was_touched_elsewhere_is_off_most() -> None:
     assert 0.002 < off.max() < 0.01
 
 
-def test_a_mirror_image_is_no_move() -> None:
+def test_a_mirror_image_is_not_a_displacement() -> None:
     move, off = fit_move(POINTS, POINTS * (1.0, -1.0, 1.0))
     assert np.linalg.det(move.rotation) == pytest.approx(1.0)
     assert off.max() > 0.05
 
 
-def test_points_that_tell_no_rotation_are_refused() -> None:
+def test_points_that_determine_no_rotation_are_refused() -> None:
     line = np.array([[0.3, 0.0, 0.3], [0.5, 0.0, 0.31], [0.7, 0.0, 0.3]])
     with pytest.raises(RobotError, match="mm about a line; allowed: 30 mm or more"):
         fit_move(line, line)

@@ -1,4 +1,4 @@
-"""Pairs that are too near at home are named, with what to change, where a robot is made and where a cell is checked."""
+"""Pairs that are too near at home are named with a cure, when a robot is made and when a cell is checked."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def ur5() -> Path:
 def made(
     file: Path, caplog: pytest.LogCaptureFixture, tools: dict[str, str] | None = None, **options: object
 ) -> tuple[Robot, list[str]]:
-    """A robot of this file, and what was said of it."""
+    """Return a robot of this file, and the warnings about it."""
     caplog.clear()
     with caplog.at_level(logging.WARNING):
         shapeless = ("xtion_link", "arm_left_7_link", "arm_right_7_link") if "tiago" in file.name else ()
@@ -34,7 +34,7 @@ def made(
     return robot, [record.getMessage() for record in caplog.records]
 
 
-def test_own_links_that_hold_an_arm_up_are_named_with_lines_that_let_it_go(
+def test_own_links_that_hold_an_arm_up_are_named_with_lines_that_release_it(
     ur5: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     robot, (said,) = made(ur5, caplog)
@@ -53,9 +53,7 @@ def test_own_links_that_hold_an_arm_up_are_named_with_lines_that_let_it_go(
     assert errors[1] < 1e-3 < errors[0]
 
 
-def test_what_the_warning_says_is_python_that_leaves_nothing_to_say(
-    ur5: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_the_warning_is_python_code_that_removes_the_warning(ur5: Path, caplog: pytest.LogCaptureFixture) -> None:
     robot, (said,) = made(ur5, caplog)
     srdf, settings = said.partition("to change: ")[2].split(", or ")
     assert preflight_faults(robot, ControllerSettings(), None) != ()
@@ -72,7 +70,7 @@ def test_what_the_warning_says_is_python_that_leaves_nothing_to_say(
         ("tiago_dual", {"left": "hand_left_grasping_frame", "right": "hand_right_grasping_frame"}),
     ],
 )
-def test_where_home_and_links_that_hardly_part_are_in_the_way_both_are_named_and_only_both_let_arms_go(
+def test_too_near_home_and_hardly_parting_links_are_both_named_and_only_both_cures_release_the_arms(
     model: str, tools: dict[str, str], caplog: pytest.LogCaptureFixture
 ) -> None:
     file = load_description(f"example-robot-data:{model}").file
@@ -91,12 +89,12 @@ def test_where_home_and_links_that_hardly_part_are_in_the_way_both_are_named_and
         assert np.linalg.norm(controller.tool_pose(arm).translation - goal.translation) < 1e-3
 
 
-def test_an_srdf_that_names_the_pair_leaves_nothing_to_say(ur5: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_an_srdf_that_names_the_pair_prevents_the_warning(ur5: Path, caplog: pytest.LogCaptureFixture) -> None:
     both = NEVER + '<disable_collisions link1="forearm_link" link2="wrist_2_link" reason="Never"/>'
     assert made(ur5, caplog, srdf=f'<robot name="ur5">{both}</robot>')[1] == []
 
 
-def test_a_pair_that_can_part_is_a_matter_of_home(ur5: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_pair_that_can_part_needs_another_home(ur5: Path, caplog: pytest.LogCaptureFixture) -> None:
     bent = {"elbow_joint": 2.9, "shoulder_lift_joint": -1.2}
     robot, (said,) = made(ur5, caplog, home=bent)
     assert robot.home[1:3].tolist() == [-1.2, 2.9]
@@ -105,7 +103,7 @@ def test_a_pair_that_can_part_is_a_matter_of_home(ur5: Path, caplog: pytest.LogC
     assert "base_link and forearm_link overlap, and are not watched, though they can part" in said
 
 
-def test_a_start_that_is_refused_names_what_to_write_into_the_cell(ur5: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_refused_start_names_the_lines_for_the_cell(ur5: Path, caplog: pytest.LogCaptureFixture) -> None:
     robot, _ = made(ur5, caplog)
     (fault,) = preflight_faults(robot, ControllerSettings(), None)
     assert fault == (
@@ -126,7 +124,7 @@ def test_a_start_that_is_refused_names_what_to_write_into_the_cell(ur5: Path, ca
         ([0.0] * 6, "allowed: positions by joint"),
     ],
 )
-def test_a_home_that_is_none_is_refused(ur5: Path, home: object, said: str) -> None:
+def test_an_invalid_home_is_refused(ur5: Path, home: object, said: str) -> None:
     with pytest.raises(RobotError, match=r".*") as error:
         Robot.from_urdf(ur5, {"left": "ee_link"}, home=home)  # type: ignore[arg-type]
     assert said in str(error.value)

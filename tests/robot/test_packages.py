@@ -40,7 +40,7 @@ MODEL = "package://my_arm/urdf/arm.urdf.xacro"
 
 @pytest.fixture
 def package(tmp_path: Path) -> Path:
-    """A ROS package where no search path leads to."""
+    """Return a ROS package that is on no search path."""
     package = tmp_path / "checkout" / "description_of_my_arm"
     (package / "urdf").mkdir(parents=True)
     (package / "meshes").mkdir()
@@ -81,7 +81,7 @@ def test_arguments_have_the_defaults_of_the_file_and_an_srdf_beside_it_belongs_t
         ("hinge.xacro", 'lower="-1"', 'lower="${reach}m"', "<limit> has lower = '0.30000000000000004m'"),
     ],
 )
-def test_what_xacro_cannot_expand_is_named_in_one_line(package: Path, file: str, old: str, new: str, says: str) -> None:
+def test_an_error_of_xacro_gives_one_line(package: Path, file: str, old: str, new: str, says: str) -> None:
     broken = package / "urdf" / file
     broken.write_text(broken.read_text().replace(old, new, 1))
     with pytest.raises(Q2R2Error) as error:
@@ -91,7 +91,7 @@ def test_what_xacro_cannot_expand_is_named_in_one_line(package: Path, file: str,
     assert "\n" not in str(error.value)
 
 
-def test_arguments_of_a_model_that_is_no_xacro_are_refused() -> None:
+def test_arguments_of_a_model_without_xacro_are_refused() -> None:
     with pytest.raises(ConfigError, match=r"iiwa7: xacro_args are for models that end in \.xacro"):
         load_description("iiwa7", {"robot_name": "lbr"})
 

@@ -1,4 +1,4 @@
-"""Which pairs are monitored in the shipped cell and in a cell of two pandas."""
+"""The monitored pairs of the shipped cell and of a cell of two pandas."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from q2r2_control.robot.robot import Robot
 from tests.robot.conftest import one_arm
 from tests.support.modules import load_script
 
-FINGERS = "hand_e_finger_1_envelope"  # of both: they lie on the same lines
+FINGERS = "hand_e_finger_1_envelope"  # This is the body of both fingers, which lie on the same lines.
 MOVING = [*(f"link_{index}" for index in range(1, 8)), "hand_e_envelope", FINGERS]
 
 
@@ -24,7 +24,9 @@ def _links(robot: Robot) -> set[frozenset[str]]:
     return {frozenset(map(link_of, names)) for names in pair_names(robot.collision_model)}
 
 
-def test_every_moving_link_and_no_bare_hand_is_watched_against_the_other_arm_and_the_table(dual_iiwa: Robot) -> None:
+def test_every_moving_link_except_a_bare_hand_is_monitored_against_the_other_arm_and_the_table(
+    dual_iiwa: Robot,
+) -> None:
     watched = _links(dual_iiwa)
     for one, other in (("left", "right"), ("right", "left")):
         for a in MOVING:
@@ -38,7 +40,7 @@ def test_every_moving_link_and_no_bare_hand_is_watched_against_the_other_arm_and
 
 
 @pytest.mark.parametrize("side", ["left", "right"])
-def test_own_links_that_can_meet_are_watched_and_no_others(dual_iiwa: Robot, side: str) -> None:
+def test_exactly_the_own_links_that_can_meet_are_monitored(dual_iiwa: Robot, side: str) -> None:
     hand = "hand_e_envelope"
     near = [
         ("link_0", "link_2"), ("link_0", "link_3"), ("link_0", "link_4"), ("link_0", "link_5"), ("link_0", "link_6"),
@@ -54,7 +56,7 @@ def test_own_links_that_can_meet_are_watched_and_no_others(dual_iiwa: Robot, sid
 
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_the_floor_is_watched_against_the_links_that_can_come_near_it(dual_iiwa: Robot, side: str) -> None:
-    """Link 1 turns about the vertical alone, and link 2 is too short."""
+    """Link 1 turns only about the vertical, and link 2 is too short."""
     reach_it = {f"{side}_link_{index}" for index in range(3, 8)} | {f"{side}_hand_e_envelope", f"{side}_{FINGERS}"}
     with_floor = {link for pair in _links(dual_iiwa) if "floor" in pair for link in pair if link.startswith(side)}
     assert with_floor == reach_it
@@ -65,7 +67,7 @@ def test_the_floor_is_watched_against_the_links_that_can_come_near_it(dual_iiwa:
     [((0.0, 0.0, 0.7), 0.0), ((0.0, 0.5, 0.0), -0.3), ((0.0, 0.5, 0.0), 0.1), ((3.1416, 0.0, 0.0), -0.3)],
     ids=["upright", "tilted", "tilted, a floor that is high", "hung"],
 )
-def test_links_that_are_not_watched_against_the_floor_stay_away(rpy: tuple[float, ...], height: float) -> None:
+def test_links_that_are_not_monitored_against_the_floor_stay_away(rpy: tuple[float, ...], height: float) -> None:
     mount = {"position": (0.0, 0.0, 0.0), "rpy": rpy}
     robot = Robot.from_config(one_arm(mount=mount).model_copy(update={"floor": height}))
     geometry = robot.collision_model.copy()
@@ -85,7 +87,7 @@ def test_links_that_are_not_watched_against_the_floor_stay_away(rpy: tuple[float
     assert ((lowest > CLEARANCE) | (highest - lowest < 1e-5)).all()
 
 
-def test_a_link_named_floor_that_is_no_level_surface_is_a_link_like_any_other() -> None:
+def test_a_link_named_floor_that_is_not_a_level_surface_is_an_ordinary_link() -> None:
     urdf = compose(one_arm().model_copy(update={"floor": None})).urdf.replace("left_link_5", "floor")
     robot = Robot.from_urdf(urdf, arms={"left": "left_link_ee"})
     assert frozenset(("left_link_1", "floor")) in _links(robot)
@@ -103,7 +105,7 @@ def _disabled(text: str) -> set[tuple[str, ...]]:
 @pytest.mark.parametrize("arm", ["iiwa7", "iiwa14"])
 @pytest.mark.parametrize("flange", [None, pytest.param(TOUCH, marks=pytest.mark.slow)])
 def test_every_shipped_file_lists_what_the_program_finds(arm: str, flange: str | None) -> None:
-    gripper = load_config(f"config/dual_{arm}.yaml").arms["left"].gripper.model_dump()  # whose fingers are one body
+    gripper = load_config(f"config/dual_{arm}.yaml").arms["left"].gripper.model_dump()  # The fingers are one body.
     made = model_srdfs(one_arm(model=arm, flange={"model": flange}, tool=HAND, gripper=gripper), SAMPLES)
     on = f"{TOUCH}_on_{arm}" if flange else arm
     assert made.keys() == {f"{arm}.srdf", "hand_e.srdf", f"{on}.srdf", f"hand_e_on_{on}.srdf"}

@@ -25,7 +25,7 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> PairsWritten:
     return write_pairs(CONFIG, tmp_path_factory.mktemp("pairs") / "cell.srdf", 2000, 0.05)
 
 
-def test_what_is_written_leaves_only_pairs_unwatched_that_no_posture_brings_near(found: PairsWritten) -> None:
+def test_only_pairs_that_no_posture_brings_near_are_left_unmonitored(found: PairsWritten) -> None:
     assert found.never
     assert min(pair.nearest for pair in found.never) > 0.05
     robot, pruned = Robot.from_config(CONFIG), Robot.from_config(_with(CONFIG, srdf=found.file))
@@ -44,7 +44,7 @@ def test_what_is_written_leaves_only_pairs_unwatched_that_no_posture_brings_near
 
 
 @pytest.mark.parametrize("clearance", [0.0, 0.02, -1.0, 2.0, float("nan")])
-def test_a_clearance_that_is_no_more_than_what_is_kept_is_refused(tmp_path: Path, clearance: float) -> None:
+def test_a_clearance_that_is_not_above_the_kept_distance_is_refused(tmp_path: Path, clearance: float) -> None:
     with pytest.raises(ConfigError, match=r"clearance = .* allowed: above control.min_distance, 0.02, up to 1"):
         write_pairs(CONFIG, tmp_path / "cell.srdf", 200, clearance)
 

@@ -14,7 +14,7 @@ TOOLS = {"left": "left_tool_frame", "right": "right_tool_frame"}
 
 
 def _urdf(links: int = 3, limit: str = 'lower="-1" upper="1" velocity="1" effort="1"', kind: str = "revolute") -> str:
-    """A chain of links 0.3 m apart; each carries a sphere of 0.1 m."""
+    """Return a chain of links 0.3 m apart, each with a sphere of 0.1 m."""
     ball = '<collision><geometry><sphere radius="0.1"/></geometry></collision>'
     return '<robot name="chain"><link name="l0"/>' + "".join(
         f'<link name="l{n}">{ball}</link><joint name="j{n}" type="{kind}"><parent link="l{n - 1}"/>'
@@ -71,14 +71,14 @@ def test_the_urdf_it_carries_loads_to_the_same_robot(dual_iiwa7: Robot, dual_iiw
     )
 
 
-def test_one_arm_of_two_may_be_left_out(dual_iiwa7_cell: ComposedCell) -> None:
+def test_one_of_two_arms_may_be_left_out(dual_iiwa7_cell: ComposedCell) -> None:
     robot = Robot.from_urdf(dual_iiwa7_cell.urdf, {"left": "left_tool_frame"}, srdf=dual_iiwa7_cell.srdf)
     assert robot.joint_names == tuple(f"left_A{number}" for number in range(1, 8))
     watched = {frozenset(map(link_of, names)) for names in pair_names(robot.collision_model)}
     assert frozenset(("left_link_5", "right_link_5")) in watched
 
 
-def test_without_an_srdf_neighbours_and_what_touches_at_home_is_not_watched() -> None:
+def test_without_an_srdf_neighbours_and_pairs_that_touch_at_home_are_not_monitored() -> None:
     far = Robot.from_urdf(_urdf(4), {"left": "l4"})
     assert pair_names(far.collision_model) == (("l1_0", "l3_0"), ("l1_0", "l4_0"), ("l2_0", "l4_0"))
     fat = Robot.from_urdf(_urdf(4).replace('radius="0.1"', 'radius="0.31"'), {"left": "l4"})
@@ -86,7 +86,7 @@ def test_without_an_srdf_neighbours_and_what_touches_at_home_is_not_watched() ->
     assert fat.ignored_pairs == (("l1_0", "l3_0"), ("l2_0", "l4_0"))
 
 
-def test_without_an_srdf_an_arm_in_the_other_one_or_in_an_obstacle_at_home_is_still_watched() -> None:
+def test_without_an_srdf_an_arm_inside_the_other_one_or_an_obstacle_at_home_is_still_monitored() -> None:
     arms = _urdf(3).replace("</robot>", "").replace('"l', '"a_l').replace('"j', '"a_j') + _urdf(3).replace(
         '<robot name="chain">', ""
     ).replace("</robot>", "")
@@ -147,7 +147,7 @@ def test_arms_that_the_urdf_does_not_have_are_refused(arms: dict[str, str], comp
         Robot.from_urdf(_urdf(), arms)
 
 
-def test_a_robot_without_collision_shapes_whose_link_is_named_watches_no_pair() -> None:
+def test_a_robot_whose_only_link_without_shapes_is_named_monitors_no_pair() -> None:
     robot = Robot.from_urdf(BARE, {"left": "rod"}, unchecked_links=["rod"])
     assert robot.distances(robot.home) == []
     assert robot.ignored_pairs == ()

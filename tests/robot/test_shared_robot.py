@@ -59,7 +59,9 @@ TIAGO: dict[str, Any] = {
 
 
 def _tiago_pairs() -> str:
-    """Not listed by its maker: the forearm's capsule reaches into the palm's, the torso's into the shoulder's."""
+    """The maker does not list these pairs: the forearm's capsule reaches into the palm's, the torso's into the
+    shoulder's.
+    """
     hand = ("safety_box", "palm_link", "index_link", "mrl_link", "thumb_link")
     pairs = [(f"arm_{side}_5_link", f"hand_{side}_{part}") for side in ("left", "right") for part in hand]
     pairs += [("torso_lift_link", f"arm_{side}_2_link") for side in ("left", "right")]
@@ -69,7 +71,7 @@ def _tiago_pairs() -> str:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A user's folder with both cells."""
+    """Return a user's folder with both cells."""
     folder = tmp_path_factory.mktemp("cells")
     for cell in (BAXTER, TIAGO):
         (folder / f"{cell['name']}.yaml").write_text(yaml.safe_dump(cell))
@@ -87,7 +89,7 @@ def tiago(folder: Path) -> Robot:
     return Robot.from_config(load_config(folder / "tiago.yaml"))
 
 
-def test_the_arms_watch_each_other_and_the_torso_that_carries_them(baxter: Robot) -> None:
+def test_the_arms_are_monitored_against_each_other_and_the_torso_that_carries_them(baxter: Robot) -> None:
     watched = {frozenset(map(link_of, names)) for names in pair_names(baxter.collision_model)}
     for pair in (
         ("left_gripper_base_link", "right_gripper_base_link"),
@@ -101,7 +103,7 @@ def test_the_arms_watch_each_other_and_the_torso_that_carries_them(baxter: Robot
         assert frozenset(pair) in watched, pair
 
 
-def test_a_robot_without_an_srdf_watches_everything_that_can_be_parted() -> None:
+def test_a_robot_without_an_srdf_monitors_every_pair_that_can_be_parted() -> None:
     tiago = Robot.from_config(Config.model_validate(TIAGO | {"srdf": None}))
     watched = {frozenset(map(link_of, names)) for names in pair_names(tiago.collision_model)}
     for pair in (("arm_left_5_link", "arm_right_5_link"), ("arm_left_4_link", "torso_lift_link"),
@@ -144,7 +146,7 @@ def test_dynamics_are_those_of_the_whole_model_with_locked_joints(name: str, req
     np.testing.assert_array_equal(robot.torque_limit, expected.effortLimit)
 
 
-def test_a_joint_that_one_arm_names_moves_the_tools_of_both_and_is_refused_to_the_other() -> None:
+def test_a_joint_that_moves_both_tools_may_be_named_by_only_one_arm() -> None:
     cell = copy.deepcopy(TIAGO) | {"srdf": None, "robot": {"model": "example-robot-data:tiago_dual"}}
     names = [f"arm_left_{number}_joint" for number in range(1, 8)]
     left = cell["arms"]["left"]
@@ -161,7 +163,7 @@ def test_a_joint_that_one_arm_names_moves_the_tools_of_both_and_is_refused_to_th
 
 
 @pytest.mark.parametrize("name", ["baxter", "tiago"])
-def test_a_user_can_check_it_and_run_it(name: str, folder: Path) -> None:
+def test_a_user_can_check_and_run_the_cell(name: str, folder: Path) -> None:
     file = str(folder / f"{name}.yaml")
     checked = CliRunner().invoke(app, ["check", file, "--json"])
     assert checked.exit_code == 0, checked.output
@@ -175,7 +177,7 @@ def test_a_user_can_check_it_and_run_it(name: str, folder: Path) -> None:
     assert all(arm["position_error_mm_rms"] < 20.0 for arm in summary["arms"].values())
 
 
-def test_each_arm_can_carry_a_tool_whose_names_are_told_apart() -> None:
+def test_each_arm_can_carry_a_tool_with_its_own_names() -> None:
     cell = copy.deepcopy(BAXTER)
     fingers = {"joints": ["finger_joint_1", "finger_joint_2"], "open_position": 0.025}
     for arm in cell["arms"].values():
@@ -216,7 +218,7 @@ def _changed(path: str, value: object) -> Config:
         ("obstacles", {"torso": {"shape": "sphere", "size": [0.1]}}, "obstacles.torso: the cell has a link of this"),
     ],
 )
-def test_a_bad_share_ends_in_one_line_that_says_what_is_allowed(path: str, value: object, says: str) -> None:
+def test_a_bad_part_gives_one_line_that_says_what_is_allowed(path: str, value: object, says: str) -> None:
     with pytest.raises(ConfigError) as error:
         Robot.from_config(_changed(path, value))
     assert says in str(error.value)

@@ -12,7 +12,7 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.robot.stop_torque import stop_torques
 from tests.robot.conftest import one_arm
 
-FAST = np.full(7, 10.0)  # [rad/s^2]; more than an iiwa 7 has torque for
+FAST = np.full(7, 10.0)  # No iiwa 7 has enough torque for this [rad/s^2].
 UNEQUAL = np.array([8.0, 5.0, 6.0, 10.0, 11.0, 12.0, 13.0])
 
 
@@ -21,7 +21,7 @@ def robot() -> Robot:
     return Robot.from_config(one_arm(tool={"model": "hand_e"}))
 
 
-def test_the_torque_is_the_most_that_any_signs_of_the_decelerations_ask_for(robot: Robot) -> None:
+def test_the_torque_is_the_largest_over_all_signs_of_the_decelerations(robot: Robot) -> None:
     (stop,) = stop_torques(robot, UNEQUAL, postures=1, seed=1)
     data, q, rest = robot.model.createData(), np.array(stop.stop.posture), np.zeros(7)
     signs = np.array(list(product((-1.0, 1.0), repeat=7)))
@@ -37,7 +37,7 @@ def test_the_torque_is_the_most_that_any_signs_of_the_decelerations_ask_for(robo
     assert (stop.gravity.ratio, stop.gravity.posture) == (pytest.approx(at_rest.max()), stop.stop.posture)
 
 
-def test_the_share_and_what_is_bearable_agree(robot: Robot) -> None:
+def test_the_share_and_the_bearable_deceleration_agree(robot: Robot) -> None:
     (stop,) = stop_torques(robot, FAST, postures=1000)
     assert 0.05 < stop.stop.share_over < 0.15
     assert 0.0 < stop.bearable < 1.0
@@ -45,7 +45,7 @@ def test_the_share_and_what_is_bearable_agree(robot: Robot) -> None:
     assert stop_torques(robot, 1.001 * stop.bearable * FAST, postures=1000)[0].stop.share_over == 0.001
 
 
-def test_gravity_that_is_more_than_a_joint_has_is_told_apart_from_a_stop(robot: Robot) -> None:
+def test_too_much_gravity_for_a_joint_is_distinguished_from_a_stop(robot: Robot) -> None:
     weak = Robot.from_config(one_arm(tool={"model": "hand_e"}))
     weak.torque_limit[3] = 5.0
     (stop,) = stop_torques(weak, FAST, postures=1000)
@@ -56,6 +56,6 @@ def test_gravity_that_is_more_than_a_joint_has_is_told_apart_from_a_stop(robot: 
 
 
 def test_no_full_stop_at_the_limits_of_the_shipped_cells_asks_for_more_than_a_joint_has(dual_iiwa: Robot) -> None:
-    """Nor with their models' own limits, which a higher control.acceleration_limit lets hold."""
+    """The same holds for their models' own limits, which a higher control.acceleration_limit lets hold."""
     for acceleration in (dual_iiwa.capped_acceleration(10.0), dual_iiwa.acceleration_limit):
         assert max(stop.stop.ratio for stop in stop_torques(dual_iiwa, acceleration, postures=1000)) < 0.9

@@ -1,4 +1,4 @@
-"""The body of a finger that turns holds the finger at every opening of its interval, and hardly more."""
+"""The body of a turning finger contains the finger at every opening of its interval, and hardly more."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ Hand = tuple[Robot, RealHands, dict[str, TurningBody]]
 
 
 def outside(points: Array, body: tuple[Array, Array, float], radius: float) -> float:
-    """How far the farthest ball of ``radius`` about one of ``points`` (n, 3) sticks out of a capsule [m]."""
+    """Return how far the farthest ball of ``radius`` about one of ``points`` (n, 3) is outside a capsule [m]."""
     start, end, thick = body
     along = end - start
     share = np.clip((points - start) @ along / max(float(along @ along), 1e-30), 0.0, 1.0)
@@ -45,7 +45,7 @@ def hand(tmp_path_factory: pytest.TempPathFactory) -> Hand:
     return robot, RealHands(robot), bodies
 
 
-def test_every_moving_link_of_the_hand_has_a_body_that_holds_its_shape(hand: Hand) -> None:
+def test_every_moving_link_of_the_hand_has_a_body_that_contains_its_shape(hand: Hand) -> None:
     _, real, bodies = hand
     assert {name for name in bodies if name.startswith("left_")} == set(real.fingers)
     random = np.random.default_rng(0)
@@ -61,7 +61,7 @@ def test_every_moving_link_of_the_hand_has_a_body_that_holds_its_shape(hand: Han
             assert -0.05 < beyond <= 0.0, (name, interval)
 
 
-def test_at_one_opening_a_body_is_its_shape_and_a_narrow_interval_adds_little(hand: Hand) -> None:
+def test_at_one_opening_a_body_equals_its_shape_and_a_narrow_interval_adds_little(hand: Hand) -> None:
     _, real, bodies = hand
     for name in real.fingers:
         body = bodies[name]
@@ -70,11 +70,11 @@ def test_at_one_opening_a_body_is_its_shape_and_a_narrow_interval_adds_little(ha
             ends, drawn = real.ends("left", name, opening)
             np.testing.assert_allclose(np.sort([start, end], axis=0), np.sort(ends, axis=0), atol=1e-9)
             assert radius == pytest.approx(drawn, abs=1e-8)
-        # A finger of 44 mm of way goes 2.2 mm in a twentieth of it.
+        # A finger with a way of 44 mm moves 2.2 mm in a twentieth of it.
         assert body.capsule((0.5, 0.55))[2] - drawn < 0.0013
 
 
-def test_what_the_controller_and_coal_see_are_the_same_bodies(hand: Hand) -> None:
+def test_the_controller_and_coal_use_the_same_bodies(hand: Hand) -> None:
     robot, _, bodies = hand
     kernels = collision_model_of(robot).bodies
     fingers = FingerOpenings(robot, kernels)
@@ -91,7 +91,7 @@ def test_what_the_controller_and_coal_see_are_the_same_bodies(hand: Hand) -> Non
             assert kernels.size[number] == pytest.approx(item.geometry.halfLength + item.geometry.radius, abs=1e-12)
 
 
-def test_no_interval_reaches_farther_from_a_joint_than_the_kernels_bounds_know(hand: Hand) -> None:
+def test_no_interval_reaches_farther_from_a_joint_than_the_bounds_of_the_kernels(hand: Hand) -> None:
     robot, _, bodies = hand
     model, random = collision_model_of(robot), np.random.default_rng(1)
     names = [item.name for item in robot.collision_model.geometryObjects]
@@ -106,7 +106,7 @@ def test_no_interval_reaches_farther_from_a_joint_than_the_kernels_bounds_know(h
             assert max(np.linalg.norm(start), np.linalg.norm(end)) <= min(reach) + 1e-12
 
 
-# Any chain: turns and slides, of one driver or of several.
+# This is any chain with rotations and slides of one or several drivers.
 _NUMBERS = st.floats(-0.1, 0.1)
 _VECTORS = st.tuples(_NUMBERS, _NUMBERS, _NUMBERS)
 _AXES = st.sampled_from([(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.6, 0.8), (-0.48, 0.6, 0.64)])
@@ -117,14 +117,17 @@ def joints(draw: st.DrawFn) -> FingerJoint:
     slides = draw(st.booleans())
     size = 0.05 if slides else 1.6
     closed, opened, home = (size * draw(st.floats(-1.0, 1.0)) for _ in range(3))
-    beyond = 0.1 * (opened - closed)  # a part of the stroke that is the same for all joints of one driver
+    beyond = 0.1 * (opened - closed)  # The part of the stroke is the same for all joints of one driver.
     axis, point = np.array(draw(_AXES)), np.array(draw(_VECTORS))
     driver = draw(st.sampled_from("ab"))
     return FingerJoint(slides, axis, point, home, closed, opened, closed - beyond, opened + beyond, driver)
 
 
 def moved(chain: Sequence[FingerJoint], ends: Array, at: dict[str, float], travel: bool = False) -> Array:
-    """Ends (2, 3) of a shape with each driver at an opening in 0 .. 1, or at such a part of all of the travel."""
+    """Return the ends (2, 3) of a shape with each driver at an opening in 0 ..
+
+    1, or at such a part of the whole travel.
+    """
     for joint in reversed(chain):
         first, last = (joint.before, joint.beyond) if travel else (joint.closed, joint.open)
         by = first + at[joint.driver] * (last - first) - joint.home
@@ -138,7 +141,7 @@ def moved(chain: Sequence[FingerJoint], ends: Array, at: dict[str, float], trave
 @pytest.mark.slow
 @given(st.lists(joints(), min_size=1, max_size=4), _VECTORS, _VECTORS, st.tuples(st.floats(0, 1), st.floats(0, 1)))
 @settings(max_examples=50, deadline=None)
-def test_any_chain_of_fingers_is_in_its_body(
+def test_any_chain_of_fingers_is_inside_its_body(
     chain: list[FingerJoint], first: Array, second: Array, between: tuple[float, float]
 ) -> None:
     body = TurningBody("left", "finger_0", np.array([first, second]), 0.01, tuple(chain))
@@ -153,7 +156,7 @@ def test_any_chain_of_fingers_is_in_its_body(
 
 
 def test_between_samples_as_far_as_the_remainder_allows_is_held_too() -> None:
-    """A driver that turns by two turns, with as few samples as there may be: three drivers share them."""
+    """The driver turns by two turns, with as few samples as possible, because three drivers share them."""
     chain = [
         FingerJoint(False, np.array([0.0, 0.0, 1.0]), np.zeros(3), 0.0, -turn, turn, -turn, turn, driver)
         for driver, turn in (("a", 3.0), ("b", 3.0), ("c", 3.0))
@@ -165,7 +168,7 @@ def test_between_samples_as_far_as_the_remainder_allows_is_held_too() -> None:
         assert outside(moved(chain, body.ends, at), capsule, body.radius) <= 0.0
 
 
-def test_a_capsule_is_within_another_one_where_both_of_its_ends_are() -> None:
+def test_a_capsule_is_inside_another_one_if_both_of_its_ends_are() -> None:
     outer = Capsules(np.zeros((1, 3)), np.array([[0.0, 0.0, 0.1]]), np.array([0.02]))
     inside = Capsules(np.array([[0.005, 0.0, 0.0]]), np.array([[0.0, 0.004, 0.1]]), np.array([0.014]))
     assert not sticks_out(inside, outer).any()
@@ -174,7 +177,7 @@ def test_a_capsule_is_within_another_one_where_both_of_its_ends_are() -> None:
     assert sticks_out(inside._replace(radius=np.array([0.016])), outer).all()
 
 
-def test_several_bodies_at_once_are_what_each_is_alone_within_what_the_samples_leave(hand: Hand) -> None:
+def test_several_bodies_at_once_equal_each_one_alone_within_the_sampling_error(hand: Hand) -> None:
     _, _, bodies = hand
     together = TurningSweeps(list(bodies.values())).capsules((0.1, 0.4))
     for row, body in enumerate(bodies.values()):
@@ -185,7 +188,7 @@ def test_several_bodies_at_once_are_what_each_is_alone_within_what_the_samples_l
 
 
 def test_no_second_derivative_by_two_joints_exceeds_its_bound() -> None:
-    """By differences, for chains of turns and slides that one driver moves, anywhere on their travel."""
+    """Differences are computed for chains of rotations and slides that one driver moves, anywhere on their travel."""
     random, h = np.random.default_rng(2), 1e-3
     nearest = np.zeros((3, 3))
     for _ in range(300):
@@ -213,4 +216,4 @@ def test_no_second_derivative_by_two_joints_exceeds_its_bound() -> None:
             found = float(np.linalg.norm(second, axis=1).max()) / (4.0 * h**2)
             assert found <= bounds[i, k] + 1e-6, (i, k)
             nearest[i, k] = max(nearest[i, k], found / max(bounds[i, k], 1e-9) if bounds[i, k] else 0.0)
-    assert nearest.min() > 0.5  # bounds that say something
+    assert nearest.min() > 0.5  # A smaller value would show that the bounds are useless.

@@ -1,4 +1,4 @@
-"""Endless joints whose angle is reported within one turn: their positions go on, and nothing else is changed."""
+"""Endless joints whose angle is reported within one turn: their positions go on, and other joints are not changed."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ PERIOD = 0.01  # [s]
 
 @pytest.fixture
 def robot() -> Any:
-    """Three joints, of which the middle one ends and the others turn on for ever."""
+    """Return a robot of three joints. The middle one has limits, and the others are continuous."""
     return SimpleNamespace(endless=np.array([True, False, True]), velocity_limit=np.array([2.0, 2.0, 4.0]))
 
 
@@ -26,7 +26,7 @@ def wrapped(angle: Array) -> Array:
     return np.remainder(angle + np.pi, 2.0 * np.pi) - np.pi
 
 
-def test_positions_go_on_where_reports_begin_anew_at_half_a_turn(robot: Any) -> None:
+def test_positions_go_on_when_reports_wrap_around_at_half_a_turn(robot: Any) -> None:
     counter, t = TurnCounter(robot), np.arange(0.0, 12.0, PERIOD)
     real = np.stack([1.9 * t - 1.0, np.sin(t), -1.7 * t], axis=1)
     reported = real.copy()
@@ -35,20 +35,20 @@ def test_positions_go_on_where_reports_begin_anew_at_half_a_turn(robot: Any) -> 
     np.testing.assert_allclose(counted, real, atol=1e-9)
 
 
-def test_reports_that_count_turns_themselves_stay_as_they_are(robot: Any) -> None:
+def test_reports_that_count_turns_themselves_are_not_changed(robot: Any) -> None:
     counter = TurnCounter(robot)
     for now in np.arange(0.0, 8.0, PERIOD):
         q = np.array([9.0 + now, 0.1, -7.0 - now])
         assert counter.counted(q, now) is q
 
 
-def test_a_joint_that_ends_is_never_turned(robot: Any) -> None:
+def test_a_joint_with_limits_is_never_turned(robot: Any) -> None:
     counter = TurnCounter(robot)
     counter.counted(np.array([0.0, 3.1, 0.0]), 0.0)
     assert counter.counted(np.array([0.0, -3.1, 0.0]), PERIOD)[1] == -3.1
 
 
-def test_after_a_gap_in_which_a_joint_may_have_turned_by_half_the_report_is_believed(robot: Any) -> None:
+def test_after_a_gap_in_which_a_joint_may_have_made_half_a_turn_the_report_is_used_as_it_is(robot: Any) -> None:
     counter = TurnCounter(robot)
     counter.counted(np.array([3.1, 0.0, 3.1]), 0.0)
     found = counter.counted(np.array([-3.1, 0.0, -3.1]), 0.8)
@@ -56,7 +56,7 @@ def test_after_a_gap_in_which_a_joint_may_have_turned_by_half_the_report_is_beli
     assert found[0] == pytest.approx(2.0 * np.pi - 3.1), "at 2 rad/s it takes longer"
 
 
-def test_a_gap_of_one_joint_is_its_own(robot: Any) -> None:
+def test_a_gap_of_one_joint_does_not_affect_the_others(robot: Any) -> None:
     counter = TurnCounter(robot)
     counter.counted(np.array([3.1, 0.0, 3.1]), np.zeros(3))
     for now in np.arange(PERIOD, 2.0, PERIOD):
@@ -81,7 +81,7 @@ def test_a_held_posture_is_as_near_to_the_measured_one_as_its_angle_allows(
     assert state.held[0] == held, "the plant's own array is not written to"
 
 
-def test_a_report_without_a_number_is_left_for_others_to_judge_and_forgets_nothing(robot: Any) -> None:
+def test_a_report_that_is_not_finite_is_passed_on_and_forgets_nothing(robot: Any) -> None:
     counter = TurnCounter(robot)
     counter.counted(np.array([3.1, 0.0, 0.0]), 0.0)
     assert np.isnan(counter.counted(np.array([np.nan, 0.0, 0.0]), PERIOD)[0])

@@ -1,4 +1,4 @@
-"""An arm's links that nothing keeps off anything: refused by name, unless whoever made the robot names them too."""
+"""Links of an arm that keep no distance: they are refused by name, unless the cell names them too."""
 
 from __future__ import annotations
 
@@ -29,7 +29,10 @@ def weighs(mass: float) -> str:
 
 
 def chain(*contents: str) -> str:
-    """Links l1, l2, ... that turn on each other, 0.3 m apart, on a base l0; the last one is fixed to the one before."""
+    """Return links l1, l2, ...
+
+    0.3 m apart that turn on each other, on a base l0. The last one is fixed to the one before.
+    """
     joints = "".join(
         f'<joint name="j{n}" type="{"fixed" if n == len(contents) else "revolute"}"><parent link="l{n - 1}"/>'
         f'<child link="l{n}"/><origin xyz="0 0 0.3"/><axis xyz="0 1 0"/>'
@@ -41,7 +44,7 @@ def chain(*contents: str) -> str:
 
 
 def arm(third: str = BALL, last: str = BALL) -> str:
-    """Four balls that move, of which the third and the last may be something else."""
+    """Return four moving balls. The third and the last may have other properties."""
     return chain(BALL, BALL, third, BALL, last)
 
 
@@ -70,7 +73,7 @@ def test_a_frame_needs_no_shape(frame: str) -> None:
     assert Robot.from_urdf(arm(last=frame), {"left": "l5"}).unchecked_links == ()
 
 
-def test_every_link_that_is_missing_is_named_at_once() -> None:
+def test_all_missing_links_are_named_at_once() -> None:
     with pytest.raises(RobotError, match=r"l3: weighs 1 kg.*; l5: weighs 2 kg"):
         Robot.from_urdf(arm(weighs(1.0), weighs(2.0)), {"left": "l5"})
 
@@ -80,7 +83,7 @@ def test_a_link_that_no_arm_moves_needs_no_shape() -> None:
     assert Robot.from_urdf(base, {"left": "l5"}).unchecked_links == ()
 
 
-def test_an_arm_of_which_no_pair_is_monitored_is_refused_unless_its_tool_is_named() -> None:
+def test_an_arm_without_monitored_pairs_is_refused_unless_its_tool_is_named() -> None:
     neighbours = chain(BALL, BALL, "")
     with pytest.raises(RobotError, match=r"left arm: no pair of its shapes is monitored.* or unchecked_links=\['l3'\]"):
         Robot.from_urdf(neighbours, {"left": "l3"})
@@ -107,13 +110,13 @@ def test_the_shapes_of_another_arm_do_not_make_an_arm_checked() -> None:
         ("l3", "unchecked_links = 'l3': allowed: names of links"),
     ],
 )
-def test_names_of_no_link_are_refused(given: object, complaint: str) -> None:
+def test_names_of_missing_links_are_refused(given: object, complaint: str) -> None:
     with pytest.raises(RobotError, match=re.escape(complaint)):
         Robot.from_urdf(arm(), {"left": "l5"}, unchecked_links=given)  # type: ignore[arg-type]
 
 
 def z1(**keys: object) -> Config:
-    """A cell of Unitree's Z1, in whose model two heavy links are drawn and have no collision shape."""
+    """Return a cell of Unitree's Z1, in whose model two heavy links are drawn and have no collision shape."""
     model = str(load_description("example-robot-data:z1").file)
     made = one_arm(model=model, tip="gripperStator", home=[0.0, 1.0, -0.5, 0.0, 0.0, 0.0])
     return Config.model_validate(made.model_dump() | keys)
@@ -137,7 +140,7 @@ def test_a_cell_names_links_or_encloses_their_drawings() -> None:
     assert "left_link01" not in watched
 
 
-def test_what_commands_arms_refuses_them_with_the_line_of_check() -> None:
+def test_commands_that_move_arms_refuse_them_with_the_line_of_check() -> None:
     lines = "; ".join(unchecked_faults(Robot.from_config(z1())))
     with pytest.raises(RobotError, match=re.escape(f"{z1().name}: {lines}")):
         Pipeline.from_config(z1(), input="scripted", plant="kinematic")
@@ -145,7 +148,7 @@ def test_what_commands_arms_refuses_them_with_the_line_of_check() -> None:
         SlowRun(z1(), KinematicPlant)
 
 
-def test_a_named_link_with_a_shape_is_told_to_be_watched() -> None:
+def test_a_named_link_with_a_shape_is_still_monitored_and_a_note_says_so() -> None:
     robot = Robot.from_urdf(arm(), {"left": "l5"}, unchecked_links=["l3"])
     assert list(unchecked_notes(robot)) == [
         "unchecked_links: watched all the same, since they have collision shapes: l3"

@@ -1,4 +1,4 @@
-"""Forms of a URDF that readers take in different ways are brought to one, refused, or told."""
+"""Forms of a URDF that programs read in different ways are unified, refused, or reported."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def arm(**parts: str) -> ET.Element:
     return parse_urdf(ARM.format(**(USUAL | parts)), "arm.urdf")
 
 
-def test_an_origin_by_quaternion_is_the_pose_that_roll_pitch_and_yaw_say() -> None:
+def test_an_origin_by_quaternion_equals_that_by_roll_pitch_and_yaw() -> None:
     turned = pin.Quaternion(pin.rpy.rpyToMatrix(0.3, -0.7, 2.0)).coeffs()
     joint = arm(origin=f'quat_xyzw="{" ".join(map(str, turned))}"').find("joint")
     assert joint is not None
@@ -40,7 +40,7 @@ def test_an_origin_by_quaternion_is_the_pose_that_roll_pitch_and_yaw_say() -> No
 @pytest.mark.parametrize(
     "origin", ['quat_xyzw="0 0 0 2"', 'quat_xyzw="0 0 1"', 'quat_xyzw="a b c d"', 'quat_xyzw="0 0 0 1" rpy="0 0 0"']
 )
-def test_a_quaternion_that_says_no_rotation_or_says_it_twice_is_refused(origin: str) -> None:
+def test_an_invalid_or_contradictory_quaternion_is_refused(origin: str) -> None:
     with pytest.raises(RobotError, match="quat_xyzw"):
         arm(origin=origin)
 
@@ -55,12 +55,12 @@ INERTIA = "<inertia ixx='1' iyy='1' izz='1' ixy='0' ixz='0' iyz='0'/>"
 
 
 @pytest.mark.parametrize(("has", "lacks"), [("<mass value='1'/>", "inertia"), (INERTIA, "mass")])
-def test_one_of_mass_and_inertia_is_refused_with_the_link_that_lacks_the_other(has: str, lacks: str) -> None:
+def test_mass_without_inertia_or_inertia_without_mass_is_refused_with_the_link(has: str, lacks: str) -> None:
     with pytest.raises(RobotError, match=f"the <inertial> of link hand has no <{lacks}>; allowed: both"):
         arm(link=f"<inertial>{has}</inertial>")
 
 
-def test_an_empty_inertial_says_as_much_as_none() -> None:
+def test_an_empty_inertial_counts_as_no_inertial() -> None:
     assert arm(link="<inertial><origin/></inertial>").find("link[@name='hand']/inertial") is None
 
 
@@ -72,7 +72,7 @@ def test_an_empty_inertial_says_as_much_as_none() -> None:
         ({"speed": "180"}, "degrees"),
     ],
 )
-def test_limits_that_a_user_should_look_at_are_told_with_their_joint(parts: dict[str, str], said: str) -> None:
+def test_suspicious_limits_are_reported_with_their_joint(parts: dict[str, str], said: str) -> None:
     (note,) = notes_on(ET.fromstring(ARM.format(**(USUAL | parts))))
     assert note.startswith("turn ")
     assert said in note
@@ -83,7 +83,7 @@ def test_usual_limits_need_no_note(safety: str) -> None:
     assert notes_on(ET.fromstring(ARM.format(**(USUAL | {"safety": safety})))) == []
 
 
-def test_a_file_is_read_by_the_encoding_that_its_first_line_names(tmp_path: Path) -> None:
+def test_a_file_is_read_in_the_encoding_that_its_first_line_names(tmp_path: Path) -> None:
     text = '<?xml version="1.0" encoding="ISO-8859-1"?><!-- Gr\u00fc\u00dfe -->' + ARM.format(**USUAL)
     (tmp_path / "arm.urdf").write_bytes(text.encode("latin-1"))
     assert load_description(str(tmp_path / "arm.urdf")).name == "arm"

@@ -1,4 +1,4 @@
-"""Acceleration limits of joints: where a URDF has them, what a cell's YAML puts in their place, what is refused."""
+"""Acceleration limits of joints: their places in a URDF, their replacement by the cell's YAML, and refusals."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tests.robot.conftest import one_arm
 
 
 def rod(limit: str) -> str:
-    """A URDF of one joint with ``limit`` among its limits."""
+    """Return a URDF of one joint with ``limit`` among its limits."""
     return (
         '<robot name="rod" xmlns:drake="http://drake.mit.edu"><link name="base"/><link name="rod"/>'
         '<joint name="hinge" type="revolute"><parent link="base"/><child link="rod"/>'
@@ -30,7 +30,7 @@ def rod(limit: str) -> str:
         pytest.param('drake:acceleration="7.25"', 7.25, id="as Drake writes it"),
     ],
 )
-def test_a_joint_s_limit_is_the_least_that_its_model_says(limit: str, expected: float) -> None:
+def test_the_limit_of_a_joint_is_the_least_one_in_its_model(limit: str, expected: float) -> None:
     robot = Robot.from_urdf(rod(limit), {"left": "rod"}, unchecked_links=["rod"])
     assert robot.acceleration_limit.tolist() == [expected]
     assert robot.capped_acceleration(5.0).tolist() == [min(expected, 5.0)]
@@ -49,7 +49,7 @@ def test_a_joint_s_limit_is_the_least_that_its_model_says(limit: str, expected: 
         ('drake:acceleration="inf"', "acceleration = 'inf'; allowed: 1 finite number(s)"),
     ],
 )
-def test_a_limit_that_is_none_is_refused_in_one_line(limit: str, complaint: str) -> None:
+def test_an_invalid_limit_is_refused_in_one_line(limit: str, complaint: str) -> None:
     with pytest.raises(RobotError) as error:
         Robot.from_urdf(rod(limit), {"left": "rod"}, unchecked_links=["rod"])
     assert complaint in str(error.value)
@@ -62,7 +62,7 @@ def test_the_cell_s_file_replaces_the_limits_of_the_joints_that_it_names() -> No
 
 
 @pytest.mark.parametrize("name", ["A8", "left_A2", "flange", "finger_joint_1"])
-def test_a_joint_that_is_none_of_the_arm_is_named_with_those_that_are(name: str) -> None:
+def test_a_joint_that_does_not_belong_to_the_arm_is_named_with_those_that_do(name: str) -> None:
     cell = one_arm(tool={"model": "hand_e"}, acceleration_limit={name: 4.0})
     with pytest.raises(ConfigError) as error:
         Robot.from_config(cell)
