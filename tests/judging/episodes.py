@@ -1,4 +1,4 @@
-"""Episodes of which every number is chosen, without a recording."""
+"""Episodes in which every number is chosen, without a recording."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from q2r2_control.types import SIDES, Array, Flags, HandInputs, HandSample
 from tests.recording.runs import file_of, record, rewrite
 from tests.support.processes import cell
 
-DT = 0.002  # of the loop [s]
-EVERY = 5  # ticks, a frame
+DT = 0.002  # Period of the loop [s].
+EVERY = 5  # Number of ticks per frame.
 ARMS = ("left", "right")
 
 
@@ -44,7 +44,8 @@ def episode(
     config: Config | None = None,
     **ticks: Any,
 ) -> Episode:
-    """Both arms do the same, and are engaged all the time, at rest and with a pose every 10 ms unless said otherwise.
+    """Return an episode in which both arms are engaged at rest all the time, with a pose every 10 ms unless said
+    otherwise.
 
     ``path`` (m, 3) is that of the tools at the frames, ``hand_path`` (k, 3) of the hands at the times ``received``
     (k,), which ticks get ``delay`` [s] later. ``ticks`` replaces columns of :class:`Ticks`.
@@ -106,7 +107,7 @@ def frame_times(seconds: float = 4.0) -> Array:
     return np.asarray(DT * np.arange(1, round(seconds / DT) + 1)[::EVERY])
 
 
-RATE = 250.0  # [Hz], with longer substeps than by default, since most of a test's time goes by ticks
+RATE = 250.0  # Rate with longer substeps than by default, because ticks take most of a test's time [Hz].
 DURATION = 4.0  # [s]
 PRESS, START = 0.2, 0.5  # [s]
 _PRESSED = 0.1  # [s]
@@ -127,7 +128,7 @@ def eased(t: float, begin: float = START, over: float = 1.0) -> float:
 
 
 class Work:
-    """Reaches to and fro between points that are drawn at random, each hand its own; a stop at each."""
+    """Hands that reach to and fro between random points, each on its own, and stop at each."""
 
     def __init__(self, seed: int, begin: float = START, reaches: int = 20) -> None:
         random = np.random.default_rng(seed)
@@ -156,7 +157,7 @@ def press(hand: str, t: float) -> HandInputs:
 def operator(
     toggled: Sequence[float], discarded: float, marked: float | None = None, succeeded: float | None = None
 ) -> Callable[[str, float], HandInputs]:
-    """Controls of an operator whose left hand tells of episodes at these times [s], by :data:`EPISODES`."""
+    """Return controls of an operator whose left hand rates episodes at these times [s], by :data:`EPISODES`."""
 
     def held(hand: str, t: float, *begin: float | None) -> float:
         return float(hand == "left" and any(at <= t < at + _PRESSED for at in begin if at is not None))
@@ -178,7 +179,7 @@ class WithDropouts(HeadsetSampling):
 
 
 class Late(PlayedInput):
-    """The loop gets samples 80 ms after they were received."""
+    """A loop that gets samples 80 ms after they were received."""
 
     _waiting: Sequence[HandSample] = ()
 
@@ -196,7 +197,7 @@ def hands(
     sampling: type[HeadsetSampling] = HeadsetSampling,
     played: type[PlayedInput] = PlayedInput,
 ) -> PlayedInput:
-    """Hands of a headset that do random work unless a ``pose`` is given.
+    """Return hands of a headset that do random work unless a ``pose`` is given.
 
     Samples are uneven, with noise, and some of them lost; the hands tremble.
     """
@@ -205,7 +206,7 @@ def hands(
 
 
 def loop_of(source: PlayedInput, **changes: object) -> Pipeline:
-    """A pipeline at :data:`RATE` with a kinematic plant."""
+    """Return a pipeline at :data:`RATE` with a kinematic plant."""
     config = cell()
     control = config.control.model_copy(update={"max_substep": 1.0 / RATE})
     config = config.model_copy(update={"loop_rate_hz": RATE, "control": control, "cameras": {}, **changes})

@@ -43,7 +43,7 @@ class Contents:
         return cls(recording, about, found, numbers.reshape(-1).view(kind).copy())
 
     def write(self, target: Path) -> Path:
-        """Write them as a recording that was ended."""
+        """Write the contents as a recording that was ended."""
         rows = zip(self.messages[names.TICK], numbers_in(self.rows), strict=True)
         self.messages[names.TICK] = [message._replace(payload=array(numbers)) for message, numbers in rows]
         every = sorted((one for found in self.messages.values() for one in found), key=lambda one: one.time)
@@ -56,7 +56,7 @@ class Contents:
 
     @property
     def middle(self) -> slice:
-        """Ticks of the middle of the episode, while the arms move."""
+        """Return the ticks of the middle of the episode, in which the arms move."""
         return slice(len(self.rows) // 2, len(self.rows) // 2 + 100)
 
     @property
@@ -67,7 +67,7 @@ class Contents:
         return self.messages[picture_topic(camera)]
 
     def change_pictures(self, camera: str, change: Callable[[int, bytes], bytes]) -> None:
-        """Each picture becomes what ``change`` makes of its number and its JPEG."""
+        """Replace each picture by the result of ``change`` for its number and its JPEG."""
         changed = self.messages[picture_topic(camera)] = [
             one._replace(payload=picture(camera, one.time, change(number, jpeg_in(one))))
             for number, one in enumerate(self.pictures(camera))
@@ -92,7 +92,7 @@ def frozen(contents: Contents) -> None:
 
 
 def late_pictures(contents: Contents) -> None:
-    """Each picture shows the cell of 200 ms ago; stamps are as they should be."""
+    """Let each picture show the cell of 200 ms ago, with right stamps."""
     found = contents.pictures("left_wrist")
     seen = np.array([message.time for message in found])
     shown = [jpeg_in(found[max(int(np.searchsorted(seen, time - LATE * NANOSECONDS)) - 1, 0)]) for time in seen]
@@ -191,7 +191,7 @@ def one_spike(contents: Contents) -> None:
 
 
 def too_fast(contents: Contents) -> None:
-    """Measured positions go at several times the speed that the joint can have, and back, without a jump."""
+    """Let measured positions move at several times the possible speed of the joint, and back, without a jump."""
     ticks = np.arange(len(contents.rows))
     contents.rows["q"][:, 3] += 0.6 * np.exp(-0.5 * ((ticks - contents.middle.start) / (20.0)) ** 2)
 

@@ -1,4 +1,4 @@
-"""While a run goes on, each episode gets its verdict as soon as it has ended, by the same rules as after the run."""
+"""During a run, each episode gets its verdict as soon as it has ended, by the same rules as after the run."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ from tests.support.processes import alive, wait_until
 
 pytestmark = pytest.mark.slow
 
-# One at work, one that its operator discards, one in which nothing moves.
+# There is one episode with work, one that its operator discards, and one in which nothing moves.
 TOGGLED, GIVEN_UP = (1.0, 2.5, 3.0, 4.0, 6.0), 3.7
 VERDICTS_BY = {2.8: 1, 3.9: 1, 6.3: 2}  # [s]
 DURATION = 7.0
 FIRST = EpisodeSpan(1.0, 2.5, number=1)
 BEGINS, ENDS, DISCARDED = K.EPISODE_BEGINS, K.EPISODE_ENDS, K.EPISODE_DISCARDED
-RESTS = 3.6  # the hands, from then on [s]
+RESTS = 3.6  # From this time on, the hands rest [s].
 
 
 class PatientRun:
@@ -75,7 +75,7 @@ class PatientRun:
 
 
 def names_of(judged: list[Judged]) -> list[list[str]]:
-    """The names of each one's reasons."""
+    """Return the names of each episode's reasons."""
     return [[reason.name for reason in one.verdict.reasons] for one in judged]
 
 
@@ -84,16 +84,16 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> PatientRun:
     return PatientRun(tmp_path_factory.mktemp("verdicts"))
 
 
-def test_each_verdict_is_the_one_that_it_gets_after_the_run(run: PatientRun) -> None:
+def test_each_verdict_equals_the_one_after_the_run(run: PatientRun) -> None:
     after = judge(Recording(run.file))
     assert names_of(after) == [[], ["operator"], ["max_idle_share"]]
     assert run.told == [
         Reason.of(K.VERDICT, episode=number, keep=keep, line=after[number - 1].verdict.line)
         for number, keep in ((1, True), (3, False))
-    ]  # the operator knows the other one
+    ]  # The operator knows the other verdict.
 
 
-def test_both_hands_feel_it_and_the_run_is_replayed_with_it(run: PatientRun) -> None:
+def test_both_hands_feel_a_verdict_and_the_run_is_replayed_with_it(run: PatientRun) -> None:
     for pulse in (EPISODE_KEPT, EPISODE_REJECTED):
         felt = {one.hand for one in run.felt if (one.frequency, one.amplitude) == (pulse.frequency, pulse.amplitude)}
         assert felt == {"left", "right"}
@@ -102,7 +102,7 @@ def test_both_hands_feel_it_and_the_run_is_replayed_with_it(run: PatientRun) -> 
     assert not alive(run.pid), "its process ends with the run"
 
 
-def test_none_is_judged_before_all_of_it_is_written(run: PatientRun, tmp_path: Path) -> None:
+def test_no_episode_is_judged_before_it_is_completely_written(run: PatientRun, tmp_path: Path) -> None:
     written = killed(run.file, tmp_path / "part.mcap", round(2.45 * RATE))
     assert written_episode(Question(str(written), FIRST, timed=True)) is None
     whole = written_episode(Question(str(run.file), FIRST, timed=True))
@@ -110,7 +110,7 @@ def test_none_is_judged_before_all_of_it_is_written(run: PatientRun, tmp_path: P
     assert len(whole.ticks.t) == pytest.approx(1.5 * RATE, abs=2)
 
 
-def test_one_that_is_discarded_before_its_verdict_is_there_gets_none(run: PatientRun) -> None:
+def test_an_episode_that_is_discarded_before_its_verdict_gets_none(run: PatientRun) -> None:
     told: list[Reason] = []
     with EpisodeJudge(lambda: run.file, told.append) as judge_now:
         for t, kind in zip((1.0, 2.5, 2.6, 4.0, 6.0), (BEGINS, ENDS, DISCARDED, BEGINS, ENDS), strict=True):
@@ -125,9 +125,7 @@ def test_one_that_is_discarded_before_its_verdict_is_there_gets_none(run: Patien
     assert (verdict.detail["episode"], verdict.detail["keep"]) == (2, False)
 
 
-def test_one_whose_process_is_killed_says_so_once_and_the_run_goes_on(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_killed_judge_is_reported_once_and_the_run_goes_on(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     def kill(judge_now: EpisodeJudge) -> None:
         assert judge_now.pid is not None
         os.kill(judge_now.pid, signal.SIGKILL)
@@ -141,7 +139,7 @@ def test_one_whose_process_is_killed_says_so_once_and_the_run_goes_on(
     assert [one.verdict.keep for one in judge(Recording(run.file))] == [True, False, False]
 
 
-# Three episodes, 1 to 2.5, 3 to 4.5 and from 5 s on, of which the first succeeded and the second is discarded.
+# There are three episodes, 1 to 2.5, 3 to 4.5 and from 5 s on. The first succeeded and the second is discarded.
 PARTS, SUCCEEDED, DISCARDED_AT, MARKED = (1.0, 2.5, 3.0, 4.5, 5.0), 2.7, 4.7, 1.7
 PARTS_DURATION = 7.0
 CONTROLS = operator(PARTS, DISCARDED_AT, MARKED, SUCCEEDED)
@@ -157,7 +155,7 @@ def judged(file: Path) -> list[Judged]:
     return judge(Recording(file))
 
 
-def test_each_is_judged_by_what_is_in_it_alone(judged: list[Judged]) -> None:
+def test_each_episode_is_judged_only_by_its_own_content(judged: list[Judged]) -> None:
     assert [one.figures.part for one in judged] == [1, 2, 3]
     assert names_of(judged) == [[], ["operator"], []]
     assert [one.figures.success for one in judged] == [True, None, None]
@@ -166,11 +164,11 @@ def test_each_is_judged_by_what_is_in_it_alone(judged: list[Judged]) -> None:
     assert [one.figures.timing.lost_ticks for one in judged] == [0, 0, 0]
     assert [one.figures.hands["left"].pose_rate_hz for one in judged] == pytest.approx(3 * [75.0], rel=0.05)
     assert all(one.figures.idle_share is not None and one.figures.idle_share < 0.5 for one in judged)
-    # The gripper closes at 2 s, which is in the first one.
+    # The gripper closes at 2 s, which is in the first episode.
     assert [one.figures.arms["left"].gripper_changes for one in judged] == [1, 0, 0]
 
 
-def test_its_events_are_by_its_own_time_and_its_name_on_the_page_is_its_own(file: Path, judged: list[Judged]) -> None:
+def test_events_of_an_episode_have_its_own_time_and_name_on_the_page(file: Path, judged: list[Judged]) -> None:
     marks = [(event.t, event.kind) for event in judged[0].episode.events]
     assert marks == [
         (pytest.approx(0.0, abs=0.02), "episode_begins"),
@@ -181,7 +179,7 @@ def test_its_events_are_by_its_own_time_and_its_name_on_the_page_is_its_own(file
     assert all(f" {file.stem} #{number}</a>" in page for number in (1, 2, 3))
 
 
-def test_those_that_are_kept_become_episodes_of_a_dataset_with_frames_of_their_own(file: Path, tmp_path: Path) -> None:
+def test_kept_episodes_become_episodes_of_a_dataset_with_their_own_frames(file: Path, tmp_path: Path) -> None:
     made = keep_episodes([file], FrameSampling(fps=50), write_vectors, tmp_path)
     assert made.left_out == made.unreadable == []
     episodes = [load_vectors(kept) for kept in made.kept]
@@ -190,7 +188,7 @@ def test_those_that_are_kept_become_episodes_of_a_dataset_with_frames_of_their_o
     succeeded = [np.flatnonzero(episode.outcome()["next.success"]).tolist() for episode in episodes]
     assert succeeded == [[episodes[0].frames - 1], []]
     assert episodes[0].frames == pytest.approx(75, abs=2)
-    assert episodes[1].frames >= 100  # and until the arms are at rest
+    assert episodes[1].frames >= 100  # The episode lasts until the arms are at rest.
     whole = make_episode(file, FrameSampling(fps=250))
     for episode, began in zip(episodes, (1.0, 5.0), strict=True):
         state = episode.vectors["observation.state"]
@@ -198,7 +196,7 @@ def test_those_that_are_kept_become_episodes_of_a_dataset_with_frames_of_their_o
         assert np.abs(near - state[0]).max(axis=1).min() < 1e-9
 
 
-def test_where_nothing_is_recorded_the_controls_say_so() -> None:
+def test_without_a_recording_the_controls_say_so() -> None:
     loop = loop_of(hands(3, inputs=CONTROLS), teleop=EPISODES)
     summary = loop.run(1.5, realtime=False)
     assert [event.kind for event in summary.events].count(ReasonKind.NO_RECORDING) == 1

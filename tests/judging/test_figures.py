@@ -1,4 +1,4 @@
-"""Each number is what its definition says, of episodes of which everything is known."""
+"""Each number agrees with its definition, for episodes in which everything is known."""
 
 from __future__ import annotations
 
@@ -29,19 +29,19 @@ def hand(**what: Any) -> HandFigures:
 
 
 def without(begin: float, end: float) -> Array:
-    """Times of poses that are 10 ms apart, but for a gap."""
+    """Return times of poses that are 10 ms apart, with a gap."""
     t = np.arange(0.0, 4.0, 0.01)
     return t[(t <= begin + 1e-9) | (t >= end - 1e-9)]
 
 
 def engaged_until(first: int, again: int) -> Flags:
-    """Of 2000 ticks, all but those from ``first`` to ``again``."""
+    """Return all of 2000 ticks except those from ``first`` to ``again``."""
     at = np.arange(2000)
     return (at < first) | (at >= again)
 
 
 class TestHands:
-    def test_a_gap_is_as_long_as_it_is_and_its_share_is_of_the_time_engaged(self) -> None:
+    def test_the_length_of_a_gap_is_exact_and_its_share_refers_to_the_engaged_time(self) -> None:
         found = hand(received=without(1.0, 1.2), delay=0.03)
         assert (found.arm, found.dropouts) == ("left", 1)
         assert (found.sample_age_ms_p50, found.sample_age_ms_p99) == pytest.approx((30.0, 30.0))
@@ -49,18 +49,18 @@ class TestHands:
         assert found.dropout_share == pytest.approx(0.2 / 4.0, abs=2e-3)
         assert found.pose_rate_hz == pytest.approx(0.95 * 100.0, abs=1.0)
 
-    def test_poses_that_cease_are_a_gap_until_the_end(self) -> None:
+    def test_the_end_of_poses_is_a_gap_until_the_end(self) -> None:
         assert hand(received=np.arange(0.0, 3.0, 0.01)).longest_gap_s == pytest.approx(1.0, abs=0.02)
         found = hand(received=())
         assert (found.pose_rate_hz, found.dropouts, found.sample_age_ms_p99) == (0.0, 1, None)
 
-    def test_a_hand_is_not_missed_while_a_policy_moves_its_arm(self) -> None:
+    def test_a_hand_has_no_gap_while_a_policy_moves_its_arm(self) -> None:
         by_policy = np.zeros((2000, 2), dtype=bool)
         assert hand(received=(), by_policy=~by_policy).longest_gap_s is None
         by_policy[500:1500] = True
         assert hand(received=without(1.1, 2.9), by_policy=by_policy).dropouts == 0
 
-    def test_of_a_gap_only_the_time_counts_in_which_the_arm_is_engaged(self) -> None:
+    def test_only_the_engaged_part_of_a_gap_counts(self) -> None:
         found = hand(engaged=engaged_until(500, 1500), received=without(1.1, 2.9))
         assert (found.dropouts, found.dropout_share) == (0, 0.0)
         assert found.pose_rate_hz == pytest.approx(100.0, abs=1.0)
@@ -68,7 +68,7 @@ class TestHands:
         assert found.longest_gap_s == pytest.approx(1.9)
         assert found.dropout_share == pytest.approx(0.15 / 2.15, abs=2e-3)
 
-    def test_a_pose_or_a_stamp_that_is_no_number_is_none_that_came(self) -> None:
+    def test_a_pose_or_a_stamp_that_is_not_finite_does_not_count(self) -> None:
         places, stamps = np.zeros((400, 3)), np.arange(0.0, 4.0, 0.01)
         places[100:120] = math.nan
         found = hand(hand_path=places)
@@ -77,13 +77,13 @@ class TestHands:
         stamps[5], stamps[6] = math.nan, -math.inf
         assert hand(received=stamps).longest_gap_s == pytest.approx(0.03)
 
-    def test_a_gap_in_which_ticks_were_lost_is_none(self) -> None:
+    def test_a_gap_caused_by_lost_ticks_does_not_count_as_a_dropout(self) -> None:
         number = np.concatenate((np.arange(500), np.arange(600, 2100)))
         of = episode(4.2, received=without(1.0, 1.2))
         keep = {name: values[number] for name, values in vars(of.ticks).items()}
         lossy = replace(of, ticks=replace(of.ticks, **keep), frames=replace(of.frames, at=of.frames.at[:1]))
         assert hand_figures(of, "left", DROPOUT).dropouts == 2
-        assert hand_figures(lossy, "left", DROPOUT).dropouts == 1  # the one at the end
+        assert hand_figures(lossy, "left", DROPOUT).dropouts == 1  # The dropout is the one at the end.
 
     def test_a_hand_whose_arm_is_never_engaged_has_no_shares(self) -> None:
         found = hand(engaged=NEVER)
@@ -104,7 +104,7 @@ class TestDelays:
         assert found == pytest.approx((delay, delay), abs=1.5e-3)
 
     @pytest.mark.parametrize("stance", list(Stance))
-    def test_neither_axes_nor_stance_nor_scale_nor_rest_change_it(self, stance: Stance) -> None:
+    def test_axes_stance_scale_and_rest_do_not_change_the_delay(self, stance: Stance) -> None:
         config = cell()
         teleop = config.teleop.model_copy(update={"stance": stance, "axes": ("+z", "-x", "+y"), "position_scale": 2.0})
         config = config.model_copy(update={"teleop": teleop})
@@ -112,19 +112,19 @@ class TestDelays:
         tool = 2.0 * wander(np.clip(frame_times() - 0.06, 1.5, 3.0))
         if stance is Stance.MIRROR_REFLECTED:
             tool = tool * (1.0, -1.0, 1.0)
-        # World x is the hand's z, world y minus its x, world z its y.
+        # The world's x is the hand's z, its y is minus the hand's x, and its z is the hand's y.
         raw = np.stack((-moving[:, 1], moving[:, 2], moving[:, 0]), axis=1)
         found = delays(episode(path=tool, received=self.stamps, hand_path=raw, config=config), "left")
         assert found[1] == pytest.approx(0.06, abs=2e-3)
 
-    def test_a_hand_that_rests_a_tool_that_is_held_and_a_hand_of_one_pose_have_none(self) -> None:
+    def test_a_resting_hand_a_held_tool_and_a_hand_with_one_pose_have_no_delay(self) -> None:
         assert delays(episode(received=self.stamps, hand_path=wander(self.stamps)), "left") == [None, None]
         assert delays(episode(path=wander(frame_times())), "left") == [None, None]
         assert delays(episode(received=[1.0]), "left") == [None, None]
 
 
 class TestArms:
-    def test_errors_are_those_of_the_time_engaged(self) -> None:
+    def test_errors_are_those_of_the_engaged_time(self) -> None:
         path, target = np.zeros((400, 3)), np.zeros((400, 3))
         target[:100, 2], target[100:200, 2], target[200:, 2] = 0.01, 0.03, 1.0
         found = arm_figures(episode(engaged=engaged_until(1000, 2000), path=path, target_path=target), "left")
@@ -133,7 +133,7 @@ class TestArms:
         assert found.position_error_mm_p99 == pytest.approx(30.0)
         assert found.rotation_error_deg_rms == 0.0
 
-    def test_the_leash_counts_while_it_drags_and_a_new_anchor_takes_no_slip_back(self) -> None:
+    def test_the_leash_counts_while_it_drags_and_a_new_anchor_undoes_no_slip(self) -> None:
         slip = np.zeros((2000, 2))
         slip[500:1000, 0] = np.linspace(0.0, 0.2, 500)
         slip[1000:1500, 0], slip[1900:, 0] = 0.2, 0.05
@@ -158,7 +158,7 @@ class TestArms:
 
 
 class TestIdle:
-    def test_a_tool_that_stands_or_trembles_or_whose_arm_is_not_engaged_is_idle(self) -> None:
+    def test_a_tool_that_rests_or_trembles_or_is_not_engaged_is_idle(self) -> None:
         tremor = 4e-4 * np.sin(60.0 * frame_times())[:, None] * np.ones(3)
         path = np.linspace(0.0, 0.5, 400)[:, None] * np.ones(3)
         assert idle_share(episode(path=path)) == pytest.approx(0.0)
@@ -224,16 +224,16 @@ def to_and_fro(seconds: float, noise: float = 0.0) -> tuple[Array, Array]:
 
 
 def test_a_reach_of_minimum_jerk_has_the_value_of_the_definition() -> None:
-    # Of x(s) = 10 s^3 - 15 s^4 + 6 s^5 the integral of the squared jerk is 720, and the peak speed 15 / 8.
+    # For x(s) = 10 s^3 - 15 s^4 + 6 s^5, the integral of the squared jerk is 720, and the peak speed 15 / 8.
     assert ldlj(reach(), FRAME) == pytest.approx(-np.log(720.0 / (15.0 / 8.0) ** 2), abs=0.12)
-    # It does not depend on the size of a motion, but on whether that stops and goes.
+    # The value does not depend on the size of a motion, but on stops and starts.
     assert ldlj(reach(way=0.02), FRAME) == pytest.approx(ldlj(reach(way=0.5), FRAME), rel=1e-6)
     shorter = reach(0.25, 0.05)
     in_four = np.concatenate([shorter[:-1] + step * shorter[-1] for step in range(4)])
     assert ldlj(in_four, FRAME) < ldlj(reach(), FRAME) - 0.5
 
 
-def test_an_episode_twice_as_long_is_as_smooth_and_noise_shows() -> None:
+def test_an_episode_twice_as_long_is_as_smooth_but_noise_changes_the_value() -> None:
     short, long, noisy = (
         smoothness(*to_and_fro(seconds, noise), np.ones(int(seconds / FRAME), dtype=bool))
         for seconds, noise in ((4.0, 0.0), (8.0, 0.0), (4.0, 1e-3))
@@ -244,7 +244,7 @@ def test_an_episode_twice_as_long_is_as_smooth_and_noise_shows() -> None:
     assert noisy < short - 3.0
 
 
-def test_only_what_moves_while_engaged_counts() -> None:
+def test_only_motion_while_engaged_counts() -> None:
     t, place = to_and_fro(8.0)
     place[400:] = place[400]
     engaged = np.ones(800, dtype=bool)
@@ -253,7 +253,7 @@ def test_only_what_moves_while_engaged_counts() -> None:
     assert smoothness(t, place, engaged) is None
 
 
-def test_neither_a_hand_that_trembles_at_rest_nor_what_is_missing_in_the_file_is_a_motion() -> None:
+def test_neither_tremor_at_rest_nor_a_gap_in_the_file_counts_as_motion() -> None:
     t = np.arange(0.0, 4.0, FRAME)
     place = 2e-4 * np.sin(60.0 * t)[:, None] * np.array([1.0, 0.0, 0.0])
     assert smoothness(t, place, np.ones(len(t), dtype=bool)) is None

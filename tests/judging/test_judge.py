@@ -1,4 +1,4 @@
-"""Clean episodes are kept; each of those that were spoiled in one way is discarded, for that reason."""
+"""Clean episodes are kept. Each episode that was spoiled in one way is discarded for that reason."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_clean_work_is_kept(clean: Path) -> None:
     found = judged(clean)
     assert found.verdict.line == "keep"
     for arm in found.figures.arms.values():
-        # Filters of 35 ms, and a controller that lets a motion that begins lag.
+        # Filters of 35 ms, and a controller that lags at the start of a motion.
         assert arm.hand_to_target_ms == pytest.approx(33.0, abs=6.0)
         assert arm.hand_to_tool_ms == pytest.approx(49.0, abs=8.0)
         assert arm.gripper_changes == 1
@@ -116,9 +116,7 @@ def test_an_episode_that_is_spoiled_in_one_way_is_discarded_for_that_reason(what
     assert found.verdict.word == "discard"
 
 
-def test_ticks_that_were_lost_are_named_and_their_samples_are_not_taken_for_dropouts(
-    clean: Path, tmp_path: Path
-) -> None:
+def test_lost_ticks_are_named_and_their_samples_do_not_count_as_dropouts(clean: Path, tmp_path: Path) -> None:
     found = judged(without_ticks(clean, tmp_path / "lost.mcap", 500, 25))
     assert {reason.name for reason in found.verdict.reasons} == {"max_lost_share", "max_lost_gap"}
     assert found.figures.timing.lost_ticks == 25
@@ -126,7 +124,7 @@ def test_ticks_that_were_lost_are_named_and_their_samples_are_not_taken_for_drop
     assert found.figures.timing.missed_ticks == 0
 
 
-def test_a_recording_whose_process_was_killed_says_so_alone(clean: Path, tmp_path: Path) -> None:
+def test_a_recording_whose_process_was_killed_has_only_that_reason(clean: Path, tmp_path: Path) -> None:
     found = judged(killed(clean, tmp_path / "killed.mcap", 800))
     assert [reason.name for reason in found.verdict.reasons] == ["needs_end"]
     assert found.figures.timing.ticks == 800
@@ -134,10 +132,10 @@ def test_a_recording_whose_process_was_killed_says_so_alone(clean: Path, tmp_pat
     assert kept.verdict.keep
 
 
-def test_a_damaged_recording_is_judged_by_what_is_before_the_damage(clean: Path, tmp_path: Path) -> None:
+def test_a_damaged_recording_is_judged_by_the_part_before_the_damage(clean: Path, tmp_path: Path) -> None:
     damaged = rewrite(clean, tmp_path / "damaged.mcap", lambda _, message: message)
     data = bytearray(damaged.read_bytes())
-    chunk = data.rindex(b"\x28\xb5\x2f\xfd")  # of zstd
+    chunk = data.rindex(b"\x28\xb5\x2f\xfd")  # These bytes begin a chunk of zstd.
     data[chunk + 200] ^= 0xFF
     damaged.write_bytes(data)
     found = judged(damaged)
@@ -148,19 +146,19 @@ def test_a_damaged_recording_is_judged_by_what_is_before_the_damage(clean: Path,
     assert "needs_end" in {reason.name for reason in judged(tmp_path / "cut.mcap").verdict.reasons}
 
 
-def test_a_run_in_which_no_arm_was_engaged_says_only_that(tmp_path: Path) -> None:
+def test_a_run_in_which_no_arm_was_engaged_has_only_that_reason(tmp_path: Path) -> None:
     found = judged(record_episode(tmp_path, hands(SEED, inputs=lambda hand, t: HandInputs()), 0.5))
     assert [reason.name for reason in found.verdict.reasons] == ["never_engaged"]
 
 
 @pytest.mark.parametrize(("ticks", "says"), [(0, "no_ticks"), (1, "needs_end")])
-def test_one_tick_and_no_tick_are_no_episode(ticks: int, says: str, clean: Path, tmp_path: Path) -> None:
+def test_one_tick_and_no_tick_make_no_episode(ticks: int, says: str, clean: Path, tmp_path: Path) -> None:
     found = judged(killed(clean, tmp_path / "few.mcap", ticks))
     assert {reason.name for reason in found.verdict.reasons} == {says, "never_engaged"}
     json.dumps(found.as_json(), allow_nan=False)
 
 
-def test_a_verdict_is_kept_beside_the_file_with_all_that_it_was_made_of(clean: Path, tmp_path: Path) -> None:
+def test_a_verdict_is_kept_beside_the_file_with_all_of_its_numbers(clean: Path, tmp_path: Path) -> None:
     file = Path(shutil.copy(clean, tmp_path))
     written = keep_verdicts([judged(file)])
     assert written == tmp_path / VERDICT_FILE
@@ -218,7 +216,7 @@ def changed(of: str = "episode", **changes: Any) -> EpisodeFigures:
     return replace(FIGURES, **changes)
 
 
-# Threshold and its value; a figure at it and beyond it; what the reason says.
+# The columns are threshold and its value, a figure at it and one beyond it, and the text of the reason.
 CASES: list[tuple[str, float, str, str, Any, Any, str]] = [
     ("min_pose_rate", 30.0, "hand", "pose_rate_hz", 30.0, 29.0, "right hand: poses at 29.0 Hz (at least 30)"),
     ("max_dropout_share", 0.1, "hand", "dropout_share", 0.1, 0.2, "dropouts 20.0 % of the time (at most 10)"),
@@ -273,7 +271,7 @@ CASES: list[tuple[str, float, str, str, Any, Any, str]] = [
 @pytest.mark.parametrize(
     ("name", "limit", "of", "figure", "at_it", "beyond", "says"), CASES, ids=[case[0] for case in CASES]
 )
-def test_a_number_beyond_its_threshold_is_the_one_reason(
+def test_a_number_beyond_its_threshold_is_the_only_reason(
     name: str, limit: float, of: str, figure: str, at_it: Any, beyond: Any, says: str
 ) -> None:
     settings = JudgeSettings.model_validate({name: limit})
@@ -284,12 +282,12 @@ def test_a_number_beyond_its_threshold_is_the_one_reason(
     assert verdict_of(changed(of, **{figure: beyond}), JudgeSettings.model_validate({name: None})).keep
 
 
-def test_every_threshold_is_tried_here() -> None:
+def test_this_file_tests_every_threshold() -> None:
     tried = {case[0] for case in CASES}
     assert set(JudgeSettings.model_fields) - tried == {"dropout", "keep_failed", "needs_end", "needs_task"}
 
 
-def test_a_failure_is_discarded_unless_failures_are_kept_and_a_run_that_a_fault_ended_always() -> None:
+def test_a_failure_is_discarded_unless_failures_are_kept_but_a_run_that_ended_by_a_fault_always_is() -> None:
     assert verdict_of(changed(success=True), JudgeSettings()).keep
     failed = changed(success=False)
     assert [reason.name for reason in verdict_of(failed, JudgeSettings()).reasons] == ["keep_failed"]
@@ -298,7 +296,7 @@ def test_a_failure_is_discarded_unless_failures_are_kept_and_a_run_that_a_fault_
     assert [reason.name for reason in verdict_of(ended, JudgeSettings()).reasons] == ["ended_by"]
 
 
-def test_a_number_that_is_none_is_not_judged_and_one_that_is_no_number_is_discarded() -> None:
+def test_a_missing_number_is_not_judged_and_one_that_is_not_finite_is_discarded() -> None:
     assert verdict_of(changed("arm", ldlj=None, hand_to_tool_ms=None), JudgeSettings()).keep
     assert not verdict_of(changed("arm", ldlj=float("nan")), JudgeSettings()).keep
     assert not verdict_of(changed("arm", position_error_mm_rms=float("nan")), JudgeSettings()).keep

@@ -1,4 +1,4 @@
-"""The page needs nothing but itself, whatever recordings are called, and does not grow with their length."""
+"""The page needs no other files, accepts any names of recordings, and does not grow with their length."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class Page(HTMLParser):
 
 
 @pytest.mark.slow
-def test_nothing_is_fetched_from_elsewhere_and_each_episode_has_a_row_with_its_verdict_and_a_section() -> None:
+def test_the_page_fetches_nothing_and_each_episode_has_a_row_with_its_verdict_and_a_section() -> None:
     text = page_of([moving(), judged(episode())], "<script>alert(1)</script> & {braces}")
     page = Page(text)
     assert not page.all("link")
@@ -61,7 +61,8 @@ def test_nothing_is_fetched_from_elsewhere_and_each_episode_has_a_row_with_its_v
         assert set(re.findall(r'href="([^"]*)"', picture)) <= set(re.findall(r'href="(#[^"]*)"', picture))
         assert "url(http" not in picture
     assert "http" not in re.sub(r"base64,[^\"]*", "", text)
-    assert [badge["class"] for badge in page.all("b")] == 2 * ["keep", "discard"]  # in the table, and below
+    # The badges are in the table and below it.
+    assert [badge["class"] for badge in page.all("b")] == 2 * ["keep", "discard"]
     assert [section["id"] for section in page.all("section")] == ["episode-1", "episode-2"]
     assert [link["href"] for link in page.all("a")] == ["#episode-1", "#episode-2"]
     assert len(page.all("td")) == 2 * (1 + len(COLUMNS))

@@ -1,4 +1,4 @@
-"""A clean episode with cameras is kept; each copy of it that was spoiled in one way is discarded, for that reason."""
+"""A clean episode with cameras is kept. Each copy that was spoiled in one way is discarded for that reason."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ SMALL = {"width": 96, "height": 72}
 
 @pytest.fixture(scope="module")
 def clean(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An episode without pictures, so that the test needs no OpenGL."""
+    """Return an episode without pictures, so that the test needs no OpenGL."""
     return record_episode(tmp_path_factory.mktemp("clean"), hands(), DURATION)
 
 
 @pytest.fixture(scope="module")
 def filmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """One with the pictures of the shipped cell's three cameras, but small."""
+    """Return an episode with small pictures of the shipped cell's three cameras."""
     needs_opengl()
     cameras = {name: camera.model_copy(update=SMALL) for name, camera in cell().cameras.items()}
     config = loop_of(hands()).config.model_copy(update={"cameras": cameras})
@@ -46,11 +46,11 @@ def reasons(file: Path, settings: JudgeSettings | None = None) -> set[str]:
     return {reason.name for reason in found.verdict.reasons}
 
 
-def test_an_episode_is_kept_whose_copy_was_not_spoiled(clean: Path, tmp_path: Path) -> None:
+def test_an_unspoiled_episode_is_kept(clean: Path, tmp_path: Path) -> None:
     assert reasons(spoiled(clean, tmp_path / "same.mcap")) == set()
 
 
-def test_an_episode_with_pictures_is_kept_and_its_cameras_are_in_time(filmed: Path) -> None:
+def test_an_unspoiled_episode_with_pictures_is_kept_and_its_cameras_are_in_time(filmed: Path) -> None:
     (found,) = judge(Recording(filmed))
     assert found.verdict.line == "keep"
     assert {name: camera.arm for name, camera in found.figures.cameras.items()} == {
@@ -65,7 +65,7 @@ def test_an_episode_with_pictures_is_kept_and_its_cameras_are_in_time(filmed: Pa
 
 
 def test_a_smooth_circle_before_a_small_camera_is_kept(tmp_path: Path) -> None:
-    """Its speed hardly changes, so many lags explain its pictures nearly as well."""
+    """The speed hardly changes, so that many lags explain the pictures almost equally well."""
     needs_opengl()
     front = CameraConfig(position=(1.9, 0.0, 1.0), look_at=(0.4, 0.0, 0.3), width=64, height=48, rate=30.0)
     loop = pipeline("circle", "mujoco", cameras={"front": front})
@@ -107,17 +107,15 @@ HARMLESS: dict[str, Spoiler] = {
 
 
 @pytest.mark.parametrize("what", HARMLESS)
-def test_an_episode_is_kept_that_lacks_what_not_every_plant_or_operator_gives(
-    what: str, clean: Path, tmp_path: Path
-) -> None:
+def test_an_episode_without_optional_data_is_kept(what: str, clean: Path, tmp_path: Path) -> None:
     assert reasons(spoiled(clean, tmp_path / "harmless.mcap", HARMLESS[what])) == set()
 
 
-def test_one_lost_picture_is_no_reason(filmed: Path, tmp_path: Path) -> None:
+def test_one_lost_picture_is_not_a_reason(filmed: Path, tmp_path: Path) -> None:
     assert reasons(spoiled(filmed, tmp_path / "lost.mcap", one_picture_is_lost)) == set()
 
 
-def test_a_cell_may_ask_for_a_task(clean: Path, tmp_path: Path) -> None:
+def test_a_cell_may_require_a_task(clean: Path, tmp_path: Path) -> None:
     file = spoiled(clean, tmp_path / "untold.mcap", without_task)
     assert reasons(file, JudgeSettings(needs_task=True)) == {"needs_task"}
 
@@ -126,6 +124,6 @@ def test_a_topic_that_only_some_runs_have_may_be_empty(clean: Path, tmp_path: Pa
     assert reasons(spoiled(clean, tmp_path / "quiet.mcap", empty("/q2r2/external_torque"))) == set()
 
 
-def test_a_link_is_carried_by_the_arm_whose_joints_move_it() -> None:
+def test_a_link_belongs_to_the_arm_whose_joints_move_it() -> None:
     robot = Robot.from_config(cell())
     assert [arm_of_link(robot, link) for link in ("left_hand_e_base", "world", "nowhere")] == ["left", None, None]
