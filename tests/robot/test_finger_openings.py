@@ -1,6 +1,4 @@
-"""A finger's body at a known opening contains the finger, is not larger than necessary, and only shrinks with more
-knowledge.
-"""
+"""A finger's body at a known opening contains the finger tightly, and only shrinks with more knowledge."""
 
 from __future__ import annotations
 
