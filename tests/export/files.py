@@ -1,4 +1,4 @@
-"""Recordings for tests of the export, of which every number is known."""
+"""Recordings for tests of the export, in which every number is known."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def brightness(number: int) -> int:
 
 
 def plain_jpeg(camera: CameraConfig, value: int) -> bytes:
-    """A picture that is grey all over."""
+    """Return a picture that is grey everywhere."""
     packed = io.BytesIO()
     Image.new("RGB", (camera.width, camera.height), (value, value, value)).save(packed, "JPEG", quality=95)
     return packed.getvalue()
@@ -99,7 +99,7 @@ class Run:
 
 
 def step_of_the_hand(hand: str, t: float) -> pin.SE3:
-    """Rests, and is 1 cm to the left from :data:`STEP_AT` on."""
+    """Return a motion that rests, and is 1 cm to the left from :data:`STEP_AT` on."""
     return pin.SE3(np.eye(3), np.array([0.0, 0.01 if t >= STEP_AT else 0.0, 0.0]))
 
 
@@ -108,14 +108,17 @@ def press(hand: str, t: float) -> HandInputs:
 
 
 def record_step(folder: Path, duration: float = DURATION) -> Run:
-    """A run in which both arms are engaged and the hands step; the plant is where the reference was a tick before."""
+    """Record a run with both arms engaged and a step of the hands.
+
+    The plant is where the reference was a tick before.
+    """
     loop = pipeline(source=PlayedInput(step_of_the_hand, press, {side: EvenSampling(100.0) for side in SIDES}))
     watch = Watch(loop)
     return Run(file_of(record(folder, loop, duration)), watch.ticks)
 
 
 def record_two(folder: Path) -> Sequence[Path]:
-    """Files of two such runs of different lengths."""
+    """Return the files of two such runs of different lengths."""
     return [record_step(folder, duration).file for duration in (DURATION, 0.6)]
 
 
@@ -140,7 +143,7 @@ EPISODES = (episode(1, 40, "stack"), episode(2, 25, "circle"), episode(3, 60, "s
 
 @dataclass(frozen=True)
 class Waves:
-    """A smooth pattern, which an encoder of videos keeps, that moves from frame to frame."""
+    """A smooth moving pattern, which an encoder of videos preserves."""
 
     frames: int
     seed: int
@@ -159,7 +162,7 @@ def with_pictures(plain: EpisodeVectors, seed: int) -> EpisodeVectors:
 
 
 def write_vectors(episode: EpisodeVectors, path: Path) -> None:
-    """Keep an episode, as the formats do."""
+    """Keep an episode, like the formats do."""
     path.write_bytes(pickle.dumps(replace(episode, cameras={})))
 
 

@@ -1,4 +1,4 @@
-"""A recorded run becomes the episode that was lived, made once by however many processes."""
+"""A recorded run becomes an equal episode, which any number of processes make once."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from tests.support.pictures import needs_opengl
 
 pytestmark = pytest.mark.slow
 
-MOVED = 1e-4  # [m] and [rad]
-ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"  # begins the data of a chunk
+MOVED = 1e-4  # In [m] and [rad].
+ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"  # These bytes begin the data of a chunk.
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +32,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 
 def first_moved(joints: npt.NDArray[np.floating]) -> int:
-    """Index of the first row that is away from the first row, from which on all are."""
+    """Return the index of the first row from which on all rows differ from the first row."""
     moved = np.abs(joints - joints[0]).max(axis=1) > MOVED
     first = int(np.argmax(moved))
     assert 0 < first < len(joints) - 10
@@ -48,7 +48,7 @@ def test_a_step_of_the_hand_is_in_action_and_observation_at_the_stated_frames_of
     command = first_moved(np.array([tick.reference.q for tick in run.ticks]))
     closing = next(i for i, tick in enumerate(run.ticks) if tick.command.grippers["left"] < 1.0)
     assert engaged < target <= command
-    # At the loop's own rate each tick is a frame, and this plant is where the reference was a tick before.
+    # At the loop's own rate, each tick is a frame, and this plant is where the reference was a tick before.
     whole = make_episode(run.file, FrameSampling(fps=int(RATE)))
     y = whole.vectors["action.tool"][:, whole.names["action.tool"].index("left_y")]
     joints = [whole.names["action"].index(name) for name in whole.names["observation.velocity"]]
@@ -92,12 +92,12 @@ def test_actions_that_are_positions_come_as_many_frames_earlier_as_asked_for(run
 
 
 @pytest.mark.parametrize("fps", [0, -30, 1001])
-def test_a_rate_that_no_recording_has_is_refused(fps: int) -> None:
+def test_an_impossible_rate_is_refused(fps: int) -> None:
     with pytest.raises(ConfigError, match=rf"--fps {fps}: allowed: 1 \.\. 1000"):
         FrameSampling(fps=fps)
 
 
-def test_an_interrupted_export_goes_on_with_what_it_had(run: Run, tmp_path: Path) -> None:
+def test_an_interrupted_export_goes_on_with_its_finished_episodes(run: Run, tmp_path: Path) -> None:
     files = [run.file, Path(shutil.copy(run.file, tmp_path / "copy.mcap"))]
     kept = tmp_path / "kept"
     kept.mkdir()
@@ -112,7 +112,7 @@ def test_an_interrupted_export_goes_on_with_what_it_had(run: Run, tmp_path: Path
     made = keep_episodes(files, FrameSampling(), write_vectors, kept)
     assert made.kept[0] == first
     assert first.stat().st_mtime_ns == made_at
-    # An episode that was not finished, and other options, are made anew.
+    # An unfinished episode, or one with other options, is made again.
     first.rename(first.with_name(f"{first.name}.unfinished"))
     keep_episodes(files, FrameSampling(), write_vectors, kept)
     assert load_vectors(first).frames == load_vectors(made.kept[1]).frames
@@ -120,7 +120,7 @@ def test_an_interrupted_export_goes_on_with_what_it_had(run: Run, tmp_path: Path
     assert load_vectors(other.kept[0]).fps == 10
 
 
-def test_a_worker_that_is_killed_is_one_line_and_the_next_export_goes_on(run: Run, tmp_path: Path) -> None:
+def test_a_killed_worker_gives_one_line_and_the_next_export_goes_on(run: Run, tmp_path: Path) -> None:
     files = [run.file, *(Path(shutil.copy(run.file, tmp_path / f"copy-{number}.mcap")) for number in range(2))]
     kept = tmp_path / "kept"
     kept.mkdir()
@@ -129,7 +129,7 @@ def test_a_worker_that_is_killed_is_one_line_and_the_next_export_goes_on(run: Ru
     last.unlink()
     made_at = [other.stat().st_mtime_ns for other in others]
     unfinished = last.with_name(f"{last.name}.unfinished")
-    os.mkfifo(unfinished)  # nobody reads it, so a worker is in the middle of its episode for good
+    os.mkfifo(unfinished)  # No process reads it, so that a worker stays in the middle of its episode.
 
     def kill(done: int) -> None:
         if done == len(others):

@@ -1,4 +1,4 @@
-"""Formats of other packages are found by their names, and the zarr store of plugins/ is one of them."""
+"""Formats of other packages are found by their names. The zarr store of plugins/ is one of them."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ PLUGIN = ROOT / "plugins/q2r2_zarr"
 
 @pytest.fixture(autouse=True)
 def plugin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The package of plugins/, the one of the page, and one that declares what is no format."""
+    """Install the package of plugins/, the one of the page, and one that declares an object that is not a format."""
     group = tomllib.loads((PLUGIN / "pyproject.toml").read_text())["project"]["entry-points"]["q2r2_control.exports"]
     (declared,) = (block for block in blocks_of("docs/extending.md", "toml") if "q2r2_control.exports" in block)
     page = tomllib.loads(declared)["project"]["entry-points"]["q2r2_control.exports"]
@@ -48,7 +48,7 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> Sequence[Path]:
 
 
 def read_as_replay_buffer(folder: Path) -> tuple[dict[str, Any], list[int]]:
-    """The arrays and the ends of episodes, with the checks of diffusion_policy's ReplayBuffer."""
+    """Return the arrays and the ends of episodes, with the checks of diffusion_policy's ReplayBuffer."""
     assert (folder / ".zgroup").exists(), "its version of zarr reads the second layout only"
     root = zarr.open(str(folder), mode="r")
     ends = root["meta"]["episode_ends"][:]
@@ -101,7 +101,9 @@ def test_pictures_of_a_store_are_pixels_frame_by_frame(tmp_path: Path) -> None:
     ],
     ids=["a camera less", "other joints"],
 )
-def test_episodes_that_differ_are_not_joined_to_a_store(changes: dict[str, Any], told: str, tmp_path: Path) -> None:
+def test_episodes_with_different_numbers_are_not_joined_to_a_store(
+    changes: dict[str, Any], told: str, tmp_path: Path
+) -> None:
     store, files = format_named("zarr"), [tmp_path / "0", tmp_path / "1"]
     first, second = (with_pictures(plain, number) for number, plain in enumerate(EPISODES[:2]))
     store.write(first, files[0])
@@ -110,7 +112,7 @@ def test_episodes_that_differ_are_not_joined_to_a_store(changes: dict[str, Any],
         store.join(files, tmp_path / "store")
 
 
-def test_the_format_of_the_page_exports_as_it_stands_there(recordings: Sequence[Path], tmp_path: Path) -> None:
+def test_the_format_of_the_page_exports_unchanged(recordings: Sequence[Path], tmp_path: Path) -> None:
     out = tmp_path / "arrays"
     result = q2r2("export", "npz", str(recordings[0]), "--output", str(out), "--workers", "1")
     assert result.exit_code == 0, result.output
@@ -120,7 +122,7 @@ def test_the_format_of_the_page_exports_as_it_stands_there(recordings: Sequence[
         np.testing.assert_array_equal(arrays["action"], episode.vectors["action"])
 
 
-def test_a_name_that_no_package_has_is_answered_by_those_that_there_are() -> None:
+def test_an_unknown_name_is_refused_with_the_existing_ones() -> None:
     with pytest.raises(ConfigError, match=r"export zar: allowed: lerobot, .*csv, no_format, npz, zarr"):
         format_named("zar")
     with pytest.raises(ConfigError, match=r"export no_format is .*; allowed: an ExportFormat"):

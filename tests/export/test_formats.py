@@ -57,7 +57,7 @@ def test_each_recording_has_a_table_with_a_line_for_each_frame(tmp_path: Path) -
     assert [frame for frame, said in enumerate(succeeded) if said == "True"] == [EPISODES[0].frames - 1]
 
 
-def test_two_recordings_of_one_name_are_refused(tmp_path: Path) -> None:
+def test_two_recordings_with_one_name_are_refused(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match=r"run\.mcap: two recordings have this name"):
         export("csv", EPISODES, tmp_path, ["run", "run"])
 
@@ -78,7 +78,7 @@ EPISODES_FOR_ACT = [
 ]
 
 
-def test_each_episode_is_an_hdf5_file_of_what_act_asks_for(tmp_path: Path) -> None:
+def test_each_episode_is_an_hdf5_file_with_the_data_that_act_needs(tmp_path: Path) -> None:
     h5py = pytest.importorskip("h5py", reason="the extra export is not installed")
     made = export("hdf5", EPISODES_FOR_ACT, tmp_path, ["a", "b"])
     for number, episode in enumerate(EPISODES_FOR_ACT):

@@ -1,4 +1,4 @@
-"""A LeRobotDataset v2.1 has every number, picture and task where openpi and GR00T look for them.
+"""A LeRobotDataset v2.1 has every number, picture and task in the places where openpi and GR00T look for them.
 
 The loaders themselves read it in tests/lerobot.
 """
@@ -76,7 +76,7 @@ def test_every_episode_has_a_table_of_its_numbers_and_tasks_are_numbered_over_al
     assert set(table) == {name for name, feature in info["features"].items() if feature["dtype"] != "video"}
 
 
-def test_the_readme_says_the_unit_of_every_number(dataset: Path) -> None:
+def test_the_readme_names_the_unit_of_every_number(dataset: Path) -> None:
     card = (dataset / "README.md").read_text()
     joints = "left_A1, left_A2, right_A1, right_A2 [rad]; left_gripper, right_gripper [0 closed .. 1 open]"
     assert f"| `action` | {joints} |" in card
@@ -116,7 +116,7 @@ def test_every_frame_is_at_its_time_in_the_video_of_the_camera_under_openpis_nam
             assert np.abs(found.astype(float) - wanted).mean() < 6
 
 
-def test_parts_of_the_robot_are_the_numbers_that_gr00t_cuts_out(dataset: Path) -> None:
+def test_modality_json_cuts_state_and_action_into_the_parts_of_the_robot(dataset: Path) -> None:
     modality = json.loads((dataset / "meta/modality.json").read_text())
     for what in ("state", "action"):
         cut = {name: POSITIONS[part["start"] : part["end"]] for name, part in modality[what].items()}
@@ -164,7 +164,7 @@ def camera(**where: str) -> CameraConfig:
         ),
     ],
 )
-def test_a_camera_is_named_as_openpi_names_one_in_its_place(
+def test_a_camera_gets_the_name_that_openpi_uses_for_its_place(
     cameras: Mapping[str, CameraConfig], names: dict[str, str]
 ) -> None:
     assert openpi_names({name: Waves(1, 0, config=config) for name, config in cameras.items()}) == names  # type: ignore[misc]

@@ -1,4 +1,4 @@
-"""Frames are evenly spaced: observations are the newest that were known, commands the first that followed.
+"""Frames are evenly spaced. Observations are the newest known ones, and commands the first that followed.
 
 Their features have the numbers that their names say, and a frame has the newest picture at or before it.
 """
@@ -33,15 +33,15 @@ COUNT = 60
 
 
 def recording(path: Path, times: list[int], **what: Any) -> Recording:
-    """With ticks at ``times`` [ms] since its start; see :func:`write_recording`."""
+    """Return a recording with ticks at ``times`` [ms] since its start; see :func:`write_recording`."""
     return Recording(write_recording(path / "a.mcap", [MS * time for time in times], **what))
 
 
 @pytest.mark.parametrize("fps", [1, 24, 30, 60, 200, 1000])
-def test_observations_are_of_the_newest_tick_and_commands_of_the_first_that_is_not_before(
+def test_observations_are_those_of_the_newest_tick_and_commands_those_of_the_first_later_one(
     fps: int, tmp_path: Path
 ) -> None:
-    # Ticks about a millisecond apart, one of them 70 ms late.
+    # The ticks are about a millisecond apart, and one of them is 70 ms late.
     steps = np.random.default_rng(0).integers(MS // 2, 3 * MS // 2, 1500)
     steps[750] += 70 * MS
     times = [int(time) for time in np.cumsum(steps)]
@@ -60,7 +60,7 @@ def test_observations_are_of_the_newest_tick_and_commands_of_the_first_that_is_n
     assert {len(values) for values in frames.values()} == {k}
 
 
-def test_targets_are_the_operators_while_there_is_one_and_openings_are_of_their_arms(tmp_path: Path) -> None:
+def test_targets_are_the_operators_if_there_are_any_and_openings_belong_to_their_arms(tmp_path: Path) -> None:
     openings = {"wanted": (0.1, 0.4), "commanded": (0.2, 0.5), "opening": (0.3, 0.6)}
     frames = sample(recording(tmp_path, [*range(30)], engaged=range(5, 20), openings=openings), fps=1000)
     assert frames["target"][:, 0, 0].tolist() == [k + 1000 if 5 <= k < 20 else k for k in range(30)]
@@ -100,14 +100,14 @@ LOSSY = [*range(20), *range(45, 65)]
         pytest.param([], None, False, "no tick was recorded", id="no tick"),
     ],
 )
-def test_there_are_no_frames_of(
+def test_a_recording_without_usable_ticks_has_no_frames(
     times: list[int], numbers: list[int] | None, trim: bool, what: str, tmp_path: Path
 ) -> None:
     with pytest.raises(RecordingError, match=rf"a\.mcap: {what}"):
         sample(recording(tmp_path, times, numbers=numbers), fps=60, trim=trim)
 
 
-def test_ticks_that_were_lost_for_less_than_a_frame_are_no_error(tmp_path: Path) -> None:
+def test_ticks_that_were_lost_for_less_than_a_frame_are_not_an_error(tmp_path: Path) -> None:
     assert len(sample(recording(tmp_path, LOSSY, numbers=LOSSY), fps=30)["time"]) == 2
 
 
@@ -121,7 +121,7 @@ def poses(q: Array) -> list[Array]:
 
 
 def frames(seed: int = 0) -> dict[str, Array]:
-    """Joints that move through much of their range, with targets at tools elsewhere."""
+    """Return frames with joints that move through much of their range, and targets elsewhere than the tools."""
     random = np.random.default_rng(seed)
 
     def motion() -> Array:
@@ -169,7 +169,7 @@ def test_tools_are_where_the_measured_joints_put_them() -> None:
             assert np.linalg.norm(pin.log6(off).vector) < 1e-5
 
 
-def test_tool_deltas_lead_from_each_target_to_the_next_and_nowhere_from_the_last() -> None:
+def test_tool_deltas_lead_from_each_target_to_the_next_and_are_zero_at_the_last() -> None:
     vectors, names = features(frames(), robot())
     for arm in robot().arms:
         targets = vectors["action.tool"][:, [names["action.tool"].index(f"{arm}_{number}") for number in POSE_FIELDS]]
@@ -182,7 +182,7 @@ def test_tool_deltas_lead_from_each_target_to_the_next_and_nowhere_from_the_last
         assert not deltas[-1].any()
 
 
-def test_quaternions_do_not_jump_and_targets_are_on_the_side_of_the_tools() -> None:
+def test_quaternions_do_not_jump_and_targets_have_the_signs_of_the_tools() -> None:
     flipped = 0
     for seed in range(5):
         given = frames(seed)
@@ -196,7 +196,7 @@ def test_quaternions_do_not_jump_and_targets_are_on_the_side_of_the_tools() -> N
                 assert (np.sum(quaternions[1:] * quaternions[:-1], axis=1) > 0.0).all()
             assert np.dot(tools[0], targets[0]) >= 0.0
             assert tools[0][np.abs(tools[0]).argmax()] > 0.0
-    assert flipped  # without which this would show nothing
+    assert flipped  # Without this, the test would show nothing.
 
 
 def test_grippers_that_are_never_measured_are_left_out() -> None:
@@ -210,7 +210,7 @@ def test_grippers_that_are_never_measured_are_left_out() -> None:
         features(given, robot())
 
 
-def test_what_is_no_number_is_named_and_another_robot_is_refused() -> None:
+def test_a_number_that_is_not_finite_is_named_and_another_robot_is_refused() -> None:
     given = frames()
     given["effort"][7, 2] = np.nan
     with pytest.raises(RecordingError, match=rf"observation.effort\[{robot().joint_names[2]}\] .* at frame 7"):
@@ -221,7 +221,7 @@ def test_what_is_no_number_is_named_and_another_robot_is_refused() -> None:
 
 
 def shown(path: Path, taken: list[int], frames: list[int]) -> list[int]:
-    """The brightness of the picture of each frame; all times in [ms] since the start."""
+    """Return the brightness of the picture of each frame. All times are in [ms] since the start."""
     pictures = {"front": [MS * time for time in taken]}
     of = recording(path, [*range(1, 200)], cameras={"front": CAMERA}, pictures=pictures)
     stamps = [EPOCH + MS * time for time in frames]
@@ -241,14 +241,14 @@ def test_a_frame_has_the_newest_picture_at_or_before_it(tmp_path: Path) -> None:
         pytest.param([], [4], r"no picture yet at 0\.004 s", id="never taken"),
     ],
 )
-def test_a_frame_without_a_picture_of_its_time_is_refused(
+def test_a_frame_without_a_picture_from_its_time_is_refused(
     tmp_path: Path, taken: list[int], frames: list[int], what: str
 ) -> None:
     with pytest.raises(RecordingError, match=rf"a\.mcap: camera front has {what}; allowed: at most two of its periods"):
         shown(tmp_path, taken, frames)
 
 
-def test_a_picture_of_another_size_is_damage(tmp_path: Path) -> None:
+def test_a_picture_of_another_size_counts_as_damaged(tmp_path: Path) -> None:
     of = recording(tmp_path, [1], cameras={"front": CAMERA}, pictures={"front": [MS]})
     larger = CAMERA.model_copy(update={"width": 32})
     with pytest.raises(RecordingError, match=r"a\.mcap: damaged: a picture of camera front has a size"):
