@@ -29,10 +29,10 @@ from tests.support.processes import cell
 ROOT = Path(__file__).resolve().parents[2]
 ARMS = ("left", "right")
 JOINTS = tuple(f"{arm}_A{number}" for arm in ARMS for number in range(1, 8))
-RATE = 500.0  # [Hz], the lowest with one substep a tick, since most of a test's time goes by ticks
+RATE = 500.0  # This is the lowest rate with one substep per tick, because ticks take most of a test's time [Hz].
 
 
-# Reads a bag with rosbags alone, in a process that has nothing of this package.
+# The program reads a bag with rosbags alone, in a process without this package.
 READER = """
 import json, sys
 from pathlib import Path
@@ -71,7 +71,7 @@ def pipeline(
     source: Input | None = None,
     **changes: object,
 ) -> Pipeline:
-    """A pipeline at :data:`RATE`, without cameras unless they are given, since drawing takes long."""
+    """Return a pipeline at :data:`RATE`. It has cameras only if they are given, because drawing takes long."""
     config = cell().model_copy(update={"loop_rate_hz": RATE, "cameras": {}, **changes})
     hands = source or ScriptedInput(trajectory, human=human, seed=3, frequency_hz=0.5)
     return Pipeline.from_config(config, input=hands, plant=plant, mode=mode)
@@ -87,7 +87,7 @@ def record(
     waits: bool = True,
     during: Callable[[Recorder], None] = lambda recorder: None,
 ) -> RecordingSummary:
-    """Record a run, with its cameras where it has some; ``during`` gets the recorder when it has begun."""
+    """Record a run, with its cameras if it has some; ``during`` gets the recorder at the beginning."""
     cameras = loop.config.cameras
     with Recorder(folder, "test", waits=waits and not realtime, room=room, pictures=bool(cameras)) as recorder:
         if cameras:
@@ -107,7 +107,7 @@ def writer_of(recorder: Recorder) -> HelperProcess:
 
 
 def file_of(summary: RecordingSummary) -> Path:
-    """The file of a recording without a fault."""
+    """Return the file of a recording without a fault."""
     assert summary.fault is None
     assert summary.lost_ticks == 0
     assert summary.file is not None
@@ -115,7 +115,7 @@ def file_of(summary: RecordingSummary) -> Path:
 
 
 def rewrite(file: Path, target: Path, change: Callable[[str, Message], Message | None], *, whole: bool = True) -> Path:
-    """A copy in chunks of 200 ticks in which each message is what ``change`` makes of it and its topic, or is left out.
+    """Write a copy in chunks of 200 ticks. ``change`` replaces each message, by its topic, or leaves it out.
 
     Not ``whole``: it ends as where its writer was killed.
     """
@@ -137,7 +137,7 @@ def number_of(label: str) -> int:
 
 
 def ended_line(caplog: pytest.LogCaptureFixture) -> str:
-    """Why recording ended, of the one line that is logged."""
+    """Return the reason why a recording ended, from the only line that is logged."""
     (line,) = caplog.messages
     assert line.startswith("recording ended, the run goes on: ")
     return line.partition(": ")[2]

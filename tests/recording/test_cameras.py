@@ -1,4 +1,7 @@
-"""Pictures are recorded beside the loop: exact in simulated time, never in its way, and none is lost silently."""
+"""Pictures are recorded beside the loop.
+
+They are exact in simulated time, never delay the loop, and losses are counted.
+"""
 
 from __future__ import annotations
 
@@ -58,7 +61,7 @@ def test_in_simulated_time_there_is_a_picture_at_each_multiple_of_a_cameras_peri
     places = [plant.model.joint(name).qposadr[0] for name in loop.robot.joint_names]
 
     def observe(tick: Tick) -> None:
-        """Keep times, and check that copies for pictures are of the tick's own state."""
+        """Keep times, and check that copies for pictures are those of the tick's own state."""
         np.testing.assert_array_equal(plant.observed_qpos[places], tick.state.q)
         times.append(tick.t)
 
@@ -81,14 +84,14 @@ def test_in_simulated_time_there_is_a_picture_at_each_multiple_of_a_cameras_peri
     assert replay(file).difference is None
 
 
-def test_a_picture_shows_where_things_are(tmp_path: Path) -> None:
+def test_a_picture_shows_the_objects_at_their_places(tmp_path: Path) -> None:
     needs_opengl()
     loop = loop_with(front=FRONT)
     plant = loop.plant
     assert isinstance(plant, MujocoPlant)
 
     def moves_a_block(tick: Tick) -> None:
-        if tick.t >= 0.5 * DURATION:  # the block sleeps by then
+        if tick.t >= 0.5 * DURATION:  # MuJoCo lets the block sleep by then.
             plant.data.joint("blue_block_free").qpos[:3] = (0.4, 0.0, 0.7)
 
     loop.listeners.append(moves_a_block)
@@ -108,7 +111,7 @@ def test_pictures_that_are_not_taken_in_time_are_lost_and_counted(tmp_path: Path
     def stopped_for_a_while(recorder: Recorder) -> Iterator[None]:
         pid = cameras_of(recorder).process.pid
         os.kill(pid, signal.SIGSTOP)
-        while cameras_of(recorder).due < 600:  # more than there is room for
+        while cameras_of(recorder).due < 600:  # There are more pictures than the queue has room for.
             yield
         os.kill(pid, signal.SIGCONT)
         taken.append(cameras_of(recorder).due)
@@ -122,7 +125,7 @@ def test_pictures_that_are_not_taken_in_time_are_lost_and_counted(tmp_path: Path
     assert len(list(Recording(file_in(tmp_path)).pictures("front"))) == summary.pictures
 
 
-def test_when_the_process_that_takes_pictures_is_killed_the_recording_goes_on(
+def test_if_the_process_that_takes_pictures_is_killed_the_recording_goes_on(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     needs_opengl()

@@ -1,4 +1,4 @@
-"""Recordings whose file another program wrote once more, in chunks and an order of its own."""
+"""Recordings that another program has rewritten, with its own chunks and order."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from q2r2_control.recording.tick_rows import SAMPLE_FIELDS, tick_type
 from tests.recording.runs import ARMS, JOINTS, file_of, pipeline, record
 
 _One = tuple[Schema | None, Channel, McapMessage]
-DURATION = 0.7  # [s], more ticks than are put together at once
+DURATION = 0.7  # The number of ticks is larger than that of a packet [s].
 
 
 class Read(NamedTuple):
@@ -45,7 +45,7 @@ def ours(file: Path) -> Read:
 
 def read_of(path: Path) -> Read:
     chunks = list(Recording(path).chunks())
-    for chunk in chunks:  # ticks come with their samples and states
+    for chunk in chunks:  # Ticks come with their samples and states.
         numbers = chunk.numbers.tolist()
         assert chunk.samples[:, 0].tolist() == np.repeat(numbers, chunk.rows["samples"].astype(int)).tolist()
         assert chunk.states.keys() <= set(numbers)
@@ -57,7 +57,7 @@ def read_of(path: Path) -> Read:
 def written_again(
     file: Path, target: Path, messages: Iterable[_One], *, extras_first: bool = True, **settings: Any
 ) -> Path:
-    """The ``messages`` by the writer of the package ``mcap``, which declares each channel before its first message."""
+    """Write ``messages`` with the writer of ``mcap``, which declares each channel before its first message."""
     channels: dict[int, int] = {}
     with file.open("rb") as stream, target.open("wb") as out:
         reader, writer = make_reader(stream), Writer(out, **settings)
@@ -129,14 +129,14 @@ def test_a_file_reads_the_same_when_it_was_written_again_by_one(
 
 
 def test_ticks_without_the_samples_that_they_took_are_refused(file: Path, tmp_path: Path) -> None:
-    """One chunk after the other has one topic's messages: a replay would be another run."""
+    """Each chunk has messages of one topic only, so that a replay would be another run."""
     again = written_again(file, tmp_path / "again.mcap", by_topic(file), chunk_size=10_000)
     with pytest.raises(RecordingError, match="mcap sort puts them in order"):
         read_of(again)
 
 
 def test_a_file_of_another_writer_reads_up_to_where_it_is_cut(file: Path, ours: Read, tmp_path: Path) -> None:
-    """The tick in whose messages the last chunk ends is left out, and nothing else is."""
+    """Only the tick in whose messages the last chunk ends is left out."""
     again = written_again(file, tmp_path / "again.mcap", in_order(file), chunk_size=3_000)
     data, cut, lengths = again.read_bytes(), tmp_path / "cut.mcap", []
     for size in np.linspace(0.3, 0.95, 25) * len(data):
@@ -152,7 +152,7 @@ def test_a_file_of_another_writer_reads_up_to_where_it_is_cut(file: Path, ours: 
 
 
 def test_zeros_at_the_end_of_a_cut_file_are_its_end(file: Path, ours: Read, tmp_path: Path) -> None:
-    """A file system that loses its power may leave the length of a file and not its last data."""
+    """A file system that loses its power may keep the length of a file, but not its last data."""
     cut, data = tmp_path / "cut.mcap", file.read_bytes()
     first = min(summary_of(file).chunk_indexes, key=lambda index: index.chunk_start_offset)
     cut.write_bytes(data[: first.chunk_start_offset + first.chunk_length] + bytes(50_000))

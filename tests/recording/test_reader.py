@@ -1,4 +1,4 @@
-"""Paths that a user gives as files of recordings, and the episodes that an operator tells of in them."""
+"""Paths that a user gives as files of recordings, and the episodes in them that an operator rates."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def events(*told: tuple[float, K]) -> list[Event]:
 
 
 @pytest.mark.parametrize(("told", "expected"), CASES.values(), ids=CASES)
-def test_episodes_are_where_and_as_the_operator_says(
+def test_episodes_are_those_that_the_operator_began_and_rated(
     told: list[tuple[float, K]], expected: list[tuple[float, float, bool, bool | None]]
 ) -> None:
     spans = spans_of(events(*told))
@@ -64,12 +64,12 @@ def test_episodes_are_where_and_as_the_operator_says(
     assert [span.number for span in spans] == ([0] if math.isinf(spans[0].start) else [1, 2][: len(expected)])
 
 
-def test_of_the_whole_run_the_operator_knows_better_than_the_check_of_its_task() -> None:
+def test_for_a_whole_run_the_operators_rating_replaces_the_check_of_its_task() -> None:
     for told, success in (([], True), ([(1.0, FAILED)], False), ([(1.0, BEGINS)], None)):
         assert [span.success for span in spans_of(events(*told), run_succeeded=True)] == [success]
 
 
-def test_folders_are_searched_by_name_and_nothing_is_taken_twice(tmp_path: Path) -> None:
+def test_folders_are_searched_by_name_and_no_file_is_taken_twice(tmp_path: Path) -> None:
     for name in ("b", "a"):
         (tmp_path / name).mkdir()
         (tmp_path / name / f"{name}.mcap").touch()
@@ -83,7 +83,7 @@ def test_folders_are_searched_by_name_and_nothing_is_taken_twice(tmp_path: Path)
 
 
 def test_a_reader_that_is_slower_than_the_writer_ends(tmp_path: Path) -> None:
-    """A verdict is made of a file that goes on growing; what is written meanwhile is for the next reading."""
+    """A verdict is computed from a file that goes on growing. Later data are for the next reading."""
     about = About.of(pipeline(), realtime=True, notes={}, cameras=())
     topic = messages.Topic(1, messages.STATE, messages.TEXT)
     with BagWriter(tmp_path / "growing.mcap", [topic], about) as bag:
@@ -115,7 +115,7 @@ def test_a_file_that_ends_anywhere_is_read_as_far_as_it_goes_and_is_not_damaged(
             ends.append(whole.stat().st_size)
         bag.close(Conclusion())
     data = whole.read_bytes()
-    begin = data.index(b"\x28\xb5\x2f\xfd")  # of the first chunk's content
+    begin = data.index(b"\x28\xb5\x2f\xfd")  # These bytes begin the content of the first chunk.
     for size in (*range(0, begin, 97), *range(1, 40)):
         cut.write_bytes(data[:size])
         assert messages_or_fault(cut) in ([], "no metadata q2r2_control", "killed before it had written")
@@ -124,7 +124,7 @@ def test_a_file_that_ends_anywhere_is_read_as_far_as_it_goes_and_is_not_damaged(
         recording = Recording(cut)
         found = [message.number for several in recording.messages() for message in several]
         assert not recording.closed
-        # A chunk is followed by an index of its messages, which a reader does without.
+        # An index of its messages follows a chunk. A reader does not need it.
         assert found == [0, 1, 2][: len(found)]
         assert len(found) >= sum(end <= size for end in ends)
 
@@ -137,7 +137,7 @@ def messages_or_fault(file: Path) -> list[messages.Message] | str | None:
         return None if found is None else found.group(0)
 
 
-def test_a_length_that_leads_out_of_a_file_that_was_ended_is_damage(tmp_path: Path) -> None:
+def test_a_length_that_leads_out_of_a_completed_file_is_damage(tmp_path: Path) -> None:
     about = About.of(pipeline(), realtime=True, notes={}, cameras=())
     file = tmp_path / "file.mcap"
     with BagWriter(file, [messages.Topic(1, messages.STATE, messages.TEXT)], about) as bag:
@@ -146,7 +146,7 @@ def test_a_length_that_leads_out_of_a_file_that_was_ended_is_damage(tmp_path: Pa
     data, place = bytearray(file.read_bytes()), len(MCAP0_MAGIC)
     while data[place] != Opcode.CHUNK:
         place += 9 + int.from_bytes(data[place + 1 : place + 9], "little")
-    data[place + 4] = 0x7F  # of its length
+    data[place + 4] = 0x7F  # The byte is a part of its length.
     file.write_bytes(data)
     with pytest.raises(RecordingError, match="damaged"):
         list(Recording(file).messages())
@@ -180,7 +180,7 @@ def test_a_filled_template_is_the_message_that_rosbags_writes(kind: str, example
         assert message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == stamp
 
 
-def test_every_number_of_a_tick_has_a_name_of_its_own_and_its_place() -> None:
+def test_every_number_of_a_tick_has_its_own_name_and_place() -> None:
     labels, kind = tick_labels(ARMS, NAMES), tick_type(len(ARMS), len(NAMES))
     assert len(set(labels)) == len(labels) == kind.itemsize // 8
     rows = np.arange(2 * len(labels), dtype=np.float64).view(kind)
@@ -198,7 +198,7 @@ def test_every_number_of_a_tick_has_a_name_of_its_own_and_its_place() -> None:
         assert number == labels.index(label)
 
 
-def test_arrays_and_texts_are_read_as_they_were_written_and_no_others() -> None:
+def test_only_arrays_and_texts_in_the_written_form_are_read() -> None:
     numbers = np.array([[0.5, np.nan, -0.0], [1.0, np.inf, 2.0]])
     payloads = [messages.array(row) for row in numbers]
     assert messages.numbers_of(payloads, 3).tobytes() == numbers.tobytes()

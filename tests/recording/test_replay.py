@@ -1,4 +1,4 @@
-"""A replay does what was done, to the bit; and says what is different where something is."""
+"""A replay repeats a run to the bit, and names each difference."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ BOX = {"x": [0.3, 0.8], "y": [0.0, 0.6], "z": [0.1, 0.7]}
 
 @pytest.fixture(scope="module")
 def circle(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Both arms are engaged, and from 1.2 s on go round a circle for half a second."""
+    """Return hands that engage both arms, and from 1.2 s on move in circles for half a second."""
     return file_of(record(tmp_path_factory.mktemp("recordings"), pipeline(), 1.8))
 
 
@@ -61,10 +61,10 @@ def test_a_replay_of_a_run_in_simulated_time_is_identical(
     assert result.summary.at_rest
 
 
-def test_what_a_program_asked_of_the_run_is_asked_again(tmp_path: Path) -> None:
+def test_requests_of_a_program_are_repeated(tmp_path: Path) -> None:
     loop = pipeline("circle", "kinematic", control=cell().control.model_copy(update={"moving_obstacles": ("hand",)}))
     tool = loop.robot.tool_pose(loop.robot.home, "left").translation
-    place = tuple((tool + np.array([0.0, 0.6, 0.0])).tolist())  # so near that the arms slow down
+    place = tuple((tool + np.array([0.0, 0.6, 0.0])).tolist())  # The place is so near that the arms slow down.
     changes = {"position_scale": 0.3, "workspace": {"left": BOX}, "filter": {"smoothing_delay": 0.05}}
     other = TeleopSettings.model_validate(loop.config.teleop.model_dump() | changes)
     asks = {
@@ -100,7 +100,7 @@ def test_a_replay_of_a_run_by_the_computers_clock_is_identical(tmp_path: Path) -
     loop = pipeline("circle", "mujoco", "torque", human=True)
     file = file_of(record(tmp_path, loop, 1.2, realtime=True))
     result = replay(file)
-    # Whether the arms were engaged depends on the machine: a loop that stalls pauses them.
+    # The machine decides whether the arms were engaged, because a loop that stalls pauses them.
     assert (result.difference, result.ended_by) == (None, None)
     assert result.ticks > 10
     recording = Recording(file)
@@ -108,7 +108,7 @@ def test_a_replay_of_a_run_by_the_computers_clock_is_identical(tmp_path: Path) -
     assert 0 <= first - recording.about.epoch < 1_000_000_000, "times of day, whatever the loop's clock is"
 
 
-def test_what_a_gripper_holds_is_replayed(tmp_path: Path) -> None:
+def test_the_holding_of_a_gripper_is_replayed(tmp_path: Path) -> None:
     flat = {"box": (0.06, 0.04, 0.015), "at": (0.0, 0.0, 0.0085), "mass": 0.1}
     config = object_cell(None, flat)
     loop = pipeline("grasp", "mujoco", source=ScriptedInput("grasp"), arms=config.arms, mujoco=config.mujoco)
@@ -119,7 +119,7 @@ def test_what_a_gripper_holds_is_replayed(tmp_path: Path) -> None:
 
 
 class FaultyHands(ScriptedInput):
-    """Loses its connection, sends no poses, hands that nobody has, a fault of its left hand, and a pedal of its own."""
+    """Hands with a lost connection, missing poses, unknown hands, a fault of the left hand, and a pedal."""
 
     controls = DeviceControls((*QUEST_CONTROLS.buttons, "pedal"), QUEST_CONTROLS.axes)
 
@@ -141,7 +141,7 @@ class FaultyHands(ScriptedInput):
     _now = 0.0
 
 
-def test_lost_connections_numbers_that_are_none_and_faults_that_the_input_found_are_replayed(tmp_path: Path) -> None:
+def test_lost_connections_numbers_that_are_not_finite_and_faults_of_the_input_are_replayed(tmp_path: Path) -> None:
     teleop = TeleopSettings.model_validate({"bindings": {"device": {"pedal": "record_mark"}}})
     file = file_of(record(tmp_path, pipeline(source=FaultyHands("circle"), teleop=teleop), 1.3))
     result = replay(file)
@@ -160,7 +160,7 @@ class LosesItsSensors(KinematicPlant):
         return changed(state, q=np.full_like(state.q, np.nan)) if state.stamp > 1.0 else state
 
 
-def test_a_run_that_a_fault_ended_ends_by_the_same_fault(tmp_path: Path) -> None:
+def test_a_run_that_ended_by_a_fault_ends_by_the_same_fault_again(tmp_path: Path) -> None:
     plant = LosesItsSensors(Robot.from_config(cell()), cell())
     recorders: list[Recorder] = []
     with pytest.raises(PlantError) as fault:
@@ -175,7 +175,7 @@ def test_a_run_that_a_fault_ended_ends_by_the_same_fault(tmp_path: Path) -> None
 
 
 class SometimesLate:
-    """Has no solution at every seventh problem, as if it had taken too long."""
+    """A solver without a solution for every seventh problem, as if it had taken too long."""
 
     def __init__(self, solver: Solver) -> None:
         self._solver, self.count = solver, 0
@@ -186,7 +186,7 @@ class SometimesLate:
         return QpSolution(None, 1.0) if self.count % 7 == 0 else solution
 
 
-def test_solutions_that_came_too_late_are_too_late_again(tmp_path: Path) -> None:
+def test_late_solutions_are_late_again(tmp_path: Path) -> None:
     loop = pipeline(control=cell().control.model_copy(update={"solve_time_limit": None}))
     loop.controller._solver = SometimesLate(DaqpSolver(loop.robot.model.nv))
     file = file_of(record(tmp_path, loop, 1.2))
@@ -201,7 +201,7 @@ def test_solutions_that_came_too_late_are_too_late_again(tmp_path: Path) -> None
     [
         (SAMPLES, SAMPLE_FIELDS.index("x"), 1.0, "left.filtered_hand.x: recorded "),
         (TICK, number_of("dt"), 1.002, "step: recorded 0.002, replayed 0.00199"),
-        (STATE, 1, 1.4, "states: recorded {'left': 'dngaged', "),  # its first letter
+        (STATE, 1, 1.4, "states: recorded {'left': 'dngaged', "),  # The bit is in its first letter.
     ],
     ids=["a sample", "the time of a tick", "the state in words"],
 )
@@ -211,7 +211,7 @@ def test_a_flipped_bit_is_the_first_difference(
     flipped: list[int] = []
 
     def flip(name: str, message: Message) -> Message:
-        """A low bit of one number, in the first message of the topic after one second."""
+        """Flip a low bit of one number, in the first message of the topic after one second."""
         if name != topic or message.number < 1.0 * RATE or flipped:
             return message
         flipped.append(message.number)
@@ -226,10 +226,11 @@ def test_a_flipped_bit_is_the_first_difference(
     assert rest.startswith(said)
 
 
-def test_a_file_that_is_no_recording_or_of_another_cell_is_one_line(tmp_path: Path, circle: Path) -> None:
+def test_a_file_that_is_not_a_recording_or_belongs_to_another_cell_gives_one_line(tmp_path: Path, circle: Path) -> None:
     data = circle.read_bytes()
     damaged = bytearray(data)
-    damaged[data.rindex(b"zstd", 0, len(data) // 2) + 50] ^= 1  # in what a chunk packs, not in an index
+    # The byte is in the content of a chunk, not in an index.
+    damaged[data.rindex(b"zstd", 0, len(data) // 2) + 50] ^= 1
     contents = {
         "damaged": (bytes(damaged), "damaged: "),
         "text": (b"nothing of the kind", "not an MCAP file"),

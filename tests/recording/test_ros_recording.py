@@ -1,4 +1,4 @@
-"""Recordings of ROS nodes: what is in the file, and what judge, export and replay make of it."""
+"""Recordings of ROS nodes: the content of the file, and its use by judge, export and replay."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ from tests.recording.runs import read_elsewhere, rewrite
 from tests.support.external_cell import external
 from tests.support.processes import cell
 
-PERIOD = 4_000_000  # of ticks [ns]
-LATENCY = 100_000  # from a tick to the receipt of what it sends [ns]
+PERIOD = 4_000_000  # Period of ticks [ns].
+LATENCY = 100_000  # Time from a tick to the receipt of its messages [ns].
 
 
 class NodesOnFile:
-    """Messages of nodes at times since the recording began [ns]."""
+    """Messages of nodes at times since the begin of the recording [ns]."""
 
     def __init__(self, folder: Path, config: Config | None = None, room: int = ROOM) -> None:
         self.config = (config or cell()).model_copy(update={"loop_rate_hz": 250.0})
@@ -70,14 +70,14 @@ class NodesOnFile:
         self.recorder.record([names.Message(self.topics[topic].channel, self._number, time, time, payload)])
 
     def joint_states(self, at: int, q: Array) -> None:
-        """Joints in another order than the robot's, and one that is not its own."""
+        """Return joints in another order than the robot's, and one that is not its own."""
         order = [*reversed(self.joints), "left_finger_joint_1"]
         values = dict(zip(self.joints, q, strict=True))
         position = np.array([values.get(name, 0.5) for name in order])
         self.put(names.JOINT_STATES, at, names.joint_state(order, position, 0 * position, 0 * position))
 
     def tick(self, at: int, index: int, q: Array, v: Array | None = None, **values: float) -> None:
-        """A tick of the controller: its reference, and what it says of it."""
+        """Return a tick of the controller with its reference and its report."""
         now = (self.epoch + at) * 1e-9
         zero = np.zeros(len(self.joints))
         reference = names.joint_trajectory(list(self.joints), q, zero if v is None else v, zero, round(now * 1e9))
@@ -96,7 +96,7 @@ class NodesOnFile:
 
     def event(self, at: int, kind: ReasonKind, arm: str | None = "left") -> None:
         topic = names.RECORDER_EVENTS if arm is None else names.arm_events(arm)
-        event = Event(123.0, arm or "", "", "", Reason(kind))  # its sender's clock is not used
+        event = Event(123.0, arm or "", "", "", Reason(kind))  # The clock of its sender is not used.
         self.put(topic, at, names.make(names.TEXT, json.dumps(event.as_json())))
 
 
@@ -106,7 +106,7 @@ SECOND = 1_000_000_000  # [ns]
 
 
 def play(nodes: NodesOnFile, count: int = 250, first: int = 5, index: int = 1, engaged: range = range(0)) -> None:
-    """Ticks ``first`` .. of 4 ms, at which joint i of the reference is at home + 1 mrad a tick, measured one behind."""
+    """Play ticks ``first`` .. of 4 ms. Joint i of the reference is at home + 1 mrad a tick, measured a tick late."""
     home = np.array(nodes.robot.home)
     for place in range(first, first + count):
         at = place * PERIOD
@@ -128,7 +128,7 @@ def nodes(tmp_path: Path) -> NodesOnFile:
     return NodesOnFile(tmp_path)
 
 
-def test_each_message_is_in_the_file_as_it_came_and_in_the_order_of_receipt(nodes: NodesOnFile, tmp_path: Path) -> None:
+def test_each_message_is_in_the_file_unchanged_and_in_the_order_of_receipt(nodes: NodesOnFile, tmp_path: Path) -> None:
     play(nodes, 20)
     nodes.flags(5 * SECOND, "left", True)
     nodes.flags(4 * SECOND, "right", True)
@@ -140,7 +140,7 @@ def test_each_message_is_in_the_file_as_it_came_and_in_the_order_of_receipt(node
     assert found[names.arm_flags("right")]["last"] == nodes.epoch + 5 * SECOND
 
 
-def test_a_tick_has_the_reference_of_its_time_and_what_had_been_received_by_then(nodes: NodesOnFile) -> None:
+def test_a_tick_has_the_reference_of_its_time_and_the_messages_received_by_then(nodes: NodesOnFile) -> None:
     home = np.array(nodes.robot.home)
     play(nodes, 100, engaged=range(40, 60))
     (ticks,) = ticks_in(nodes.close())
@@ -156,7 +156,7 @@ def test_a_tick_has_the_reference_of_its_time_and_what_had_been_received_by_then
     assert ticks.samples[:, names.SAMPLE_FIELDS.index("x")].tolist() == list(range(40, 60))
 
 
-def test_a_target_that_ceased_is_none_of_a_later_tick(nodes: NodesOnFile) -> None:
+def test_a_target_that_ended_does_not_belong_to_later_ticks(nodes: NodesOnFile) -> None:
     play(nodes, 10, engaged=range(5, 15))
     later = 15 * PERIOD + round(STREAM_TIMEOUT * SECOND)
     nodes.flags(later - 1000, "left", True)
@@ -166,7 +166,7 @@ def test_a_target_that_ceased_is_none_of_a_later_tick(nodes: NodesOnFile) -> Non
     assert ticks.rows["arms"]["target"][:, 0].any(axis=1).tolist() == [True] * 10 + [False]
 
 
-def test_a_tick_whose_reference_was_lost_counts_as_lost_and_what_happened_in_it_does_not(nodes: NodesOnFile) -> None:
+def test_a_tick_whose_reference_was_lost_counts_as_lost_but_its_events_are_kept(nodes: NodesOnFile) -> None:
     play(nodes, 10)
     nodes.event(15 * PERIOD - 1000, K.MARK)
     lost = nodes.topics.pop(names.REFERENCE)
@@ -179,7 +179,7 @@ def test_a_tick_whose_reference_was_lost_counts_as_lost_and_what_happened_in_it_
     assert len(ticks.states) == 1
 
 
-def test_a_controller_that_was_started_again_begins_with_the_next_number_once_joints_and_flags_are_known(
+def test_a_restarted_controller_continues_the_numbers_after_joints_and_flags_are_known(
     nodes: NodesOnFile,
 ) -> None:
     nodes.tick(PERIOD, 499, np.array(nodes.robot.home))
@@ -190,7 +190,7 @@ def test_a_controller_that_was_started_again_begins_with_the_next_number_once_jo
 
 
 def test_no_tick_is_dropped_for_numbers_that_the_robot_does_not_measure(nodes: NodesOnFile) -> None:
-    """A position that is no number is in its tick too, for the judge to find."""
+    """A position that is not finite is in its tick too, so that the judge finds it."""
     play(nodes, 5)
     nothing, q = np.full(len(nodes.joints), np.nan), np.array(nodes.robot.home)
     for place, position in ((10, q), (11, nothing)):
@@ -204,7 +204,7 @@ def test_no_tick_is_dropped_for_numbers_that_the_robot_does_not_measure(nodes: N
     assert np.isnan(ticks.rows["q"]).all(axis=1).tolist() == [False] * 6 + [True]
 
 
-def test_episodes_are_those_that_arms_and_services_tell_of(nodes: NodesOnFile) -> None:
+def test_episodes_are_those_of_the_events_of_arms_and_services(nodes: NodesOnFile) -> None:
     for at, kind, arm in (
         *((20, K.EPISODE_BEGINS, "left"), (60, K.MARK, "right"), (80, K.EPISODE_ENDS, "right")),
         *((100, K.EPISODE_BEGINS, None), (120, K.EPISODE_DISCARDED, None)),
@@ -221,7 +221,7 @@ def test_episodes_are_those_that_arms_and_services_tell_of(nodes: NodesOnFile) -
     assert "operator" in [reason.name for reason in discarded.verdict.reasons]
 
 
-def test_episodes_are_found_where_no_controller_was_active(nodes: NodesOnFile) -> None:
+def test_episodes_are_found_even_if_no_controller_was_active(nodes: NodesOnFile) -> None:
     nodes.event(PERIOD, K.EPISODE_BEGINS)
     nodes.event(5 * PERIOD, K.EPISODE_ENDS, None)
     (span,) = read_spans(open_recording(nodes.close()))
@@ -259,7 +259,7 @@ def test_a_known_step_is_in_action_and_observation_at_the_frames_of_its_times(no
 
 
 @pytest.mark.parametrize("step", [5 * SECOND, -SECOND // 4], ids=["forward", "back"])
-def test_an_episode_in_which_the_clock_was_set_is_discarded_and_not_exported_and_others_are(
+def test_an_episode_with_a_changed_clock_is_discarded_and_not_exported_but_others_are(
     nodes: NodesOnFile, tmp_path: Path, step: int
 ) -> None:
     nodes.event(1, K.EPISODE_BEGINS)
@@ -284,7 +284,7 @@ def test_an_episode_in_which_the_clock_was_set_is_discarded_and_not_exported_and
     assert make_episode(recording.file, FrameSampling(fps=50), second).frames == 20
 
 
-def test_ticks_keep_their_references_when_the_clock_is_set_and_one_of_a_pair_is_lost(nodes: NodesOnFile) -> None:
+def test_ticks_keep_their_references_if_the_clock_is_changed_and_one_of_a_pair_is_lost(nodes: NodesOnFile) -> None:
     put = nodes.put
     for step, lost in ((5, names.REFERENCE), (-5, names.CONTROLLER_TICK), (5, names.CONTROLLER_TICK)):
         play(nodes, 20)
@@ -297,7 +297,7 @@ def test_ticks_keep_their_references_when_the_clock_is_set_and_one_of_a_pair_is_
     assert sum(len(chunk.rows) for chunk in chunks) == 3 * (20 + 20)
 
 
-def test_messages_without_room_are_lost_and_counted(tmp_path: Path) -> None:
+def test_messages_beyond_the_memory_are_lost_and_counted(tmp_path: Path) -> None:
     nodes = NodesOnFile(tmp_path, room=1 << 16)
     assert nodes.recorder.writer is not None
     os.kill(nodes.recorder.writer.pid, signal.SIGSTOP)
@@ -308,14 +308,14 @@ def test_messages_without_room_are_lost_and_counted(tmp_path: Path) -> None:
     assert nodes.recorder.written.messages == nodes.recorder.count - nodes.recorder.overflows
 
 
-def test_what_another_controller_moved_is_refused_in_one_line(tmp_path: Path) -> None:
+def test_a_recording_of_another_controller_is_refused_in_one_line(tmp_path: Path) -> None:
     nodes = NodesOnFile(tmp_path, parse_config(yaml.safe_dump(external()), "the cell"))
     play(nodes, 5)
     with pytest.raises(RecordingError, match="recorded with controller: external"):
         ticks_in(nodes.close())
 
 
-def test_pictures_that_are_not_compressed_cannot_be_exported_and_are_named(tmp_path: Path) -> None:
+def test_uncompressed_pictures_cannot_be_exported_and_are_named(tmp_path: Path) -> None:
     nodes = NodesOnFile(
         tmp_path, cell().model_copy(update={"cameras": {"front": CameraConfig(topic="/front/image_raw")}})
     )

@@ -1,4 +1,4 @@
-"""Faults of run, writer and disk: the others go on, and the file has what was written before."""
+"""Faults of run, writer and disk: the other parts go on, and the file keeps the earlier data."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ from tests.support.processes import alive, children, wait_until
 
 pytestmark = pytest.mark.slow
 
-WRITTEN_LATER = 60.0  # [s] of simulated time, which a listener ends
+WRITTEN_LATER = 60.0  # Simulated duration; a listener ends the run earlier [s].
 
 
 def script(loop: Pipeline, steps: Callable[[Recorder], Iterator[None]]) -> Callable[[Recorder], None]:
-    """Steps of a recorded run, which then ends: each lasts until it yields, and is resumed at the next tick."""
+    """Run the steps of a recorded run. Each step lasts until it yields, and is resumed at the next tick."""
 
     def begin(recorder: Recorder) -> None:
         left = steps(recorder)
@@ -43,7 +43,7 @@ def script(loop: Pipeline, steps: Callable[[Recorder], Iterator[None]]) -> Calla
     return begin
 
 
-def test_while_the_writer_is_stopped_the_loop_goes_on_and_what_is_lost_is_counted(tmp_path: Path) -> None:
+def test_while_the_writer_is_stopped_the_loop_goes_on_and_losses_are_counted(tmp_path: Path) -> None:
     recorders: list[Recorder] = []
 
     def stopped_for_a_while(recorder: Recorder) -> Iterator[None]:
@@ -79,7 +79,7 @@ def test_while_the_writer_is_stopped_the_loop_goes_on_and_what_is_lost_is_counte
 
 
 @pytest.mark.parametrize("what", ["the process that writes it was ended by SIGKILL", "File too large"])
-def test_a_writer_that_is_killed_or_whose_disk_is_full_ends_the_recording_alone_and_leaves_what_it_wrote(
+def test_a_killed_writer_or_a_full_disk_ends_only_the_recording_and_keeps_the_written_data(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, what: str
 ) -> None:
     felt: list[HapticFeedback] = []
@@ -112,7 +112,7 @@ def test_a_writer_that_is_killed_or_whose_disk_is_full_ends_the_recording_alone_
         assert read_elsewhere(file_in(tmp_path), tmp_path)["/q2r2/tick"]["count"] == summary.ticks
 
 
-def test_what_was_sent_is_read_before_it_is_written_so_that_a_kill_of_the_run_does_not_cost_it() -> None:
+def test_sent_data_are_read_before_they_are_written_so_that_a_killed_run_does_not_lose_them() -> None:
     taken: list[int] = []
     tick = PackedTick(bytes(1000), b"", "")
 
@@ -129,7 +129,7 @@ def test_what_was_sent_is_read_before_it_is_written_so_that_a_kill_of_the_run_do
     assert taken == list(range(20))
 
 
-def test_a_writer_that_hangs_at_the_end_is_not_waited_for_longer_than_that(
+def test_a_writer_that_hangs_at_the_end_is_killed_after_the_longest_wait(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("q2r2_control.recording.recorder.PATIENCE", 0.1)
@@ -183,7 +183,7 @@ def started(*command: str, cwd: Path = ROOT, env: Mapping[str, str] = PATH) -> I
 
 
 def has_ticks(folder: Path) -> bool:
-    """Whether a chunk of the recording in it is there already."""
+    """Return whether a chunk of the recording in this folder exists already."""
     try:
         return any(len(chunk.rows) for file in folder.glob("*/*.mcap") for chunk in Recording(file).chunks())
     except RecordingError:
@@ -191,7 +191,7 @@ def has_ticks(folder: Path) -> bool:
 
 
 @pytest.mark.parametrize("both", [False, True], ids=["the run alone", "the writer too"])
-def test_what_a_killed_run_leaves_opens_and_is_replayed(tmp_path: Path, both: bool) -> None:
+def test_the_file_of_a_killed_run_opens_and_is_replayed(tmp_path: Path, both: bool) -> None:
     with started("-c", RUN, str(tmp_path)) as running:
         assert running.stdout is not None
         while int(running.stdout.readline()) < 100:
@@ -199,7 +199,7 @@ def test_what_a_killed_run_leaves_opens_and_is_replayed(tmp_path: Path, both: bo
         wait_until(lambda: has_ticks(tmp_path))
         helpers = children(running.pid)
         assert len(helpers) == 2
-        if both:  # the writer first, which would notice the run's end
+        if both:  # The writer is killed first, because it would notice the run's end.
             for helper in helpers:
                 os.kill(helper, signal.SIGKILL)
         running.kill()
@@ -225,7 +225,7 @@ app()
 """
 
 
-def test_ctrl_c_ends_a_run_of_a_script_somewhere_else_and_the_recording_is_whole(tmp_path: Path) -> None:
+def test_ctrl_c_ends_a_run_from_another_folder_and_the_recording_is_complete(tmp_path: Path) -> None:
     cell = str(ROOT / "config/dual_iiwa7.yaml")
     options = ("run", cell, "--plant", "kinematic", "--headless", "--json", "--record", str(tmp_path / "recordings"))
     script, folder = tmp_path / "bin" / "q2r2", tmp_path / "folder"
