@@ -119,7 +119,7 @@ class HeldObjectConfig(StrictModel):
 
 
 class GripperConfig(StrictModel):
-    """How an opening of 0..1 becomes finger joint positions."""
+    """The finger joints of a gripper, and their positions when it is open and closed."""
 
     joints: tuple[str, ...] = Field((), description="finger joints of the tool, all driven alike")
     open_position: float = Field(

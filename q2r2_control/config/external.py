@@ -50,7 +50,7 @@ class GripperType(StrEnum):
 
 
 class GripperSettings(StrictModel):
-    """How a gripper is told to open and close."""
+    """The gripper of an arm, and the goals that open and close it."""
 
     action_type: GripperType = Field(
         GripperType.GRIPPER_COMMAND, description="GripperCommand, ParallelGripperCommand or Float64MultiArray"
@@ -80,7 +80,7 @@ class ExternalGripper(GripperSettings):
 
 
 class GuardLimits(StrictModel):
-    """How fast a target may move; null: as fast as the preset says."""
+    """Limits of the target's motion; null: the limit of the preset."""
 
     max_velocity: float | None = Field(None, gt=0, le=5, description="largest speed of the target's position [m/s]")
     max_acceleration: float | None = Field(

@@ -108,7 +108,7 @@ TOPIC_RATE = 100.0  # [Hz]
 
 
 class RecordingSettings(StrictModel):
-    """How much ``q2r2 run --record`` writes."""
+    """The amount of data that ``q2r2 run --record`` writes."""
 
     topic_rate: Annotated[float, Field(gt=0, le=1000)] | None = Field(
         TOPIC_RATE,

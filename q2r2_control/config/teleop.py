@@ -91,7 +91,7 @@ class GateSettings(StrictModel):
 
 
 class LeashSettings(StrictModel):
-    """How far a target may be from its tool. A target that would be farther follows the tool at this distance."""
+    """The largest distance of a target from its tool. A target that would be farther is held at this distance."""
 
     distance: float | None = Field(
         0.1, ge=0.02, le=2, description="largest distance of the positions [m]; null: no leash"
@@ -182,7 +182,7 @@ class TeleopSettings(StrictModel):
 
 
 class GuardSettings(StrictModel):
-    """How fast a target may move, whatever the hand does."""
+    """Limits of a target's motion, whatever the hand does."""
 
     max_velocity: float = Field(0.5, gt=0, le=5, description="largest speed of the target's position [m/s]")
     max_acceleration: float = Field(

@@ -132,9 +132,7 @@ class Kernel(CPUDispatcher):
                 Kernel._being_compiled -= 1
 
     def _part(self, arguments: Any, result: Any) -> Any:
-        """Return a separate part even if Python calls the kernel, because the rest of an optimised whole may lack
-        pieces.
-        """
+        """Return a separate part even if Python calls the kernel. The rest of an optimised whole may lack pieces."""
         known = self.parts.get(tuple(arguments))
         if known is None:
             details = {"dispatcher": self, "args": arguments, "return_type": result}

@@ -54,13 +54,13 @@ class KernelPointer:
     __slots__ = ("address", "memory", "numba_type", "value")
 
     def __init__(self, value: Any, memory: npt.NDArray[np.int64], numba_type: _Pointer) -> None:
-        self.value = value  # whose arrays have to stay
+        self.value = value  # The arrays of the value have to stay.
         self.memory = memory
         self.address = memory.ctypes.data
         self.numba_type = numba_type
 
     def __reduce__(self) -> Any:
-        return pointer_to, (self.value,)  # a copy has an address of its own
+        return pointer_to, (self.value,)  # A copy has its own address.
 
 
 class KernelPointers:
@@ -75,7 +75,7 @@ class KernelPointers:
         self.numba_type = _Pointers(pointers[0].numba_type.pointee)
 
     def __reduce__(self) -> Any:
-        return pointers_to, ([pointer.value for pointer in self.pointers],)  # a copy has addresses of its own
+        return pointers_to, ([pointer.value for pointer in self.pointers],)  # A copy has its own addresses.
 
 
 @extending.typeof_impl.register(KernelPointer)
@@ -185,7 +185,8 @@ def _form(value: Any) -> Any:
     return value.numba_type if isinstance(value, KernelPointer | KernelPointers) else type(value)
 
 
-_kinds: dict[Any, _Pointer] = {}  # by the form of the value, since a controller has hundreds of pointers
+# Pointer types by the form of the value, because a controller has hundreds of pointers.
+_kinds: dict[Any, _Pointer] = {}
 
 
 def _kind_of_pointer_to(value: Any, size: int) -> _Pointer:

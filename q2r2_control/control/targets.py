@@ -171,8 +171,7 @@ def _hold(targets: TaskTargets, i: int, q: Array, v: Array) -> None:
 
 @kernel
 def _update_pose(targets: TaskTargets, i: int, dt: float) -> bool:
-    """Make the offered homogeneous pose the target of arm ``i``. Return False without a change if it is not a finite
-    pose.
+    """Make the offered homogeneous pose the target of arm ``i``. Return False if it is not a finite pose.
 
     A target that moves has its twist smoothed over a time; one that was put elsewhere, faster than any tool, has none.
     """

@@ -130,9 +130,7 @@ _SHARE, _RECOVERY, _CORNERS = 0.9, 0.02, 4
 
 
 def let_objects_yield(spec: mujoco.MjSpec, config: Config) -> None:
-    """Set contacts of soft objects with obstacles in MuJoCo's terms, per mass and corner (see its documentation,
-    solref).
-    """
+    """Set contacts of soft objects with obstacles in MuJoCo's terms, per mass and corner (solref)."""
     for name, thing in config.mujoco.objects.items():
         if thing.stiffness is None:
             continue

@@ -125,8 +125,7 @@ class SimulatedCell:
     def command_positions(
         self, names: Sequence[str], q: Array, v: Array | None, now: float, delay: float = 0.0
     ) -> str | None:
-        """Follow positions [rad] and velocities [rad/s], if known, of the joints ``names``, which may include others'
-        joints.
+        """Follow positions [rad] and velocities [rad/s], if known, of joints ``names``; others' names are ignored.
 
         They came at ``now`` and are due ``delay`` later [s].
         """

@@ -94,7 +94,7 @@ def _lock_memory() -> str | None:
     """Lock the memory; returns why this is not possible, or None."""
     if sys.platform != "linux":
         return "memory is not locked: only done on Linux"
-    import resource  # not on every system
+    import resource  # Not every system has this module.
 
     # Under a limit, memory that is asked for later would be refused in mid-run instead of being left unlocked.
     unlimited = os.geteuid() == 0 or resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] == resource.RLIM_INFINITY
@@ -109,7 +109,7 @@ def _schedule_first(threads: Iterable[int], priority: int) -> str | None:
         return "no SCHED_FIFO: only asked for on Linux"
     try:
         for thread in threads:
-            with suppress(ProcessLookupError):  # it has ended meanwhile
+            with suppress(ProcessLookupError):  # The thread has ended meanwhile.
                 os.sched_setscheduler(thread, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
     except OSError as error:
         return f"no SCHED_FIFO: {error.strerror}"
@@ -136,7 +136,7 @@ def new_folder(parent: Path, name: str, what: str) -> Path:
             folder.mkdir(parents=True)
             return folder
         except OSError as error:
-            if not (isinstance(error, FileExistsError) and folder.exists()):  # a parent may be a file
+            if not (isinstance(error, FileExistsError) and folder.exists()):  # A parent may be a file.
                 raise ConfigError(f"{what} {folder}: {error.strerror}") from error
     raise ConfigError(f"{what} {parent / name}: exists, and so do 98 numbered ones")
 

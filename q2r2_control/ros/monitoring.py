@@ -171,7 +171,7 @@ class NodeStates:
         on_state: Callable[[str, dict[str, Any]], None] = lambda name, state: None,
         namespace: str = "/",
     ) -> None:
-        """Only nodes in ``namespace`` count."""
+        """Observe only the nodes in ``namespace``."""
         self._node, self._on_state, self._prefix = node, on_state, f"{namespace.rstrip('/')}/"
         self._heard: set[str] = set()  # The topics that are heard.
         self.newest: dict[str, tuple[dict[str, Any], float]] = {}  # By node, the state and the time of receipt [s].

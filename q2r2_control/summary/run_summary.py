@@ -153,7 +153,7 @@ class RunSummary:
 
     @property
     def broken(self) -> tuple[str, ...]:
-        """What was not as promised, in words: a run with any of it ends with exit code 1."""
+        """Broken promises in words. A run with any of them ends with exit code 1."""
         refusals = {event.arm: event.reason for event in self.events if event.kind is ReasonKind.NOT_ENGAGED}
         broken = []
         for name, arm in self.arms.items():

@@ -48,7 +48,7 @@ class WayHome(Protocol):
 
     @property
     def outcome(self) -> ReasonKind | None:
-        """How the way home ended, or None while it goes on."""
+        """The result of the way home; None while it goes on."""
 
     def step(self, q: Array, v: Array, dt: float) -> HomingStep:
         """Return the setpoints for the time ``dt`` [s] from now, with the reference at ``q``, ``v`` (nv,)."""

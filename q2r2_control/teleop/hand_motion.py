@@ -54,7 +54,7 @@ class HandMotion:
 
     @property
     def slip(self) -> tuple[float, float]:
-        """How far the target was held back since the anchor, by the leash and the workspace [m], [rad]."""
+        """Distance [m] and angle [rad] by which leash and workspace held the target back since the anchor."""
         return self._leash.position.slip + self._workspace.slip, self._leash.rotation.slip
 
     def forget(self) -> None:

@@ -1,6 +1,4 @@
-"""The distances that arms reach from table, floor, obstacles, each other and their own links, with the contract at
-every tick.
-"""
+"""The distances of arms from table, floor, obstacles, each other and themselves, with the contract at every tick."""
 
 from __future__ import annotations
 

@@ -44,8 +44,7 @@ def episode(
     config: Config | None = None,
     **ticks: Any,
 ) -> Episode:
-    """Return an episode in which both arms are engaged at rest all the time, with a pose every 10 ms unless said
-    otherwise.
+    """Return an episode with both arms engaged at rest and a pose every 10 ms, unless said otherwise.
 
     ``path`` (m, 3) is that of the tools at the frames, ``hand_path`` (k, 3) of the hands at the times ``received``
     (k,), which ticks get ``delay`` [s] later. ``ticks`` replaces columns of :class:`Ticks`.

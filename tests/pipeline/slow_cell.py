@@ -61,8 +61,7 @@ def slow_run(
     prepare: Callable[[PendantCabinets], None] = lambda cabinets: None,
     listener: Callable[[Moment], None] | None = None,
 ) -> SlowRun:
-    """Return a slow run of ``config``, whose arms are those of ``truth`` and of type ``arm``. ``prepare`` gets the
-    cabinets.
+    """Return a slow run of ``config`` with arms like ``truth`` of type ``arm``. ``prepare`` gets the cabinets.
 
     ``listener`` gets each tick's moment.
     """

@@ -1,6 +1,4 @@
-"""Grippers in the whole loop: they close and open, are monitored at their real width, and hold what they have closed
-on.
-"""
+"""Grippers in the whole loop: they close and open, are monitored at their real width, and hold objects."""
 
 from __future__ import annotations
 

@@ -49,9 +49,7 @@ def test_a_soft_object_yields_by_its_stiffness_where_it_stands(robot: Robot, con
 
 
 def depths(config: Config, speed: float, named: bool) -> Array:
-    """Return the depth in the table at each millisecond of a pad that :data:`LOAD` presses and that slides along it
-    [m].
-    """
+    """Return the depth in the table [m] at each millisecond of a pad that :data:`LOAD` presses and that slides."""
     spec = mujoco.MjSpec()
     spec.option.cone, spec.option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, 100.0
     spec.option.gravity = (0.0, 0.0, -LOAD / MASS)

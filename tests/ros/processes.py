@@ -133,9 +133,7 @@ class Processes:
         return self.started[-1]
 
     def start_node(self, name: str, *parameters: str, node: str = "") -> RosProcess:
-        """Start an executable with ``parameters``, each as ``name:=value``, and optionally another name for its
-        ``node``.
-        """
+        """Start an executable with ``parameters``, each as ``name:=value``; ``node`` is another name for its node."""
         remapping = ["-r", f"__node:={node}"] if node else []
         return self.start_module(EXECUTABLES, name, *as_arguments(*parameters), *remapping)
 

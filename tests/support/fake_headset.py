@@ -67,9 +67,7 @@ class FakeHeadset:
         return f"{self._slash}q2r_{hand}_hand_{suffix}"
 
     def registrations(self) -> bytes:
-        """Return the app's first messages after connecting: a keepalive, its topics, and a request for the server's
-        topics.
-        """
+        """Return the app's first messages after connecting: a keepalive, its topics, and a request for topics."""
         parts = [KEEPALIVE]
         for hand in SIDES:
             for suffix, kind in TOPICS.items():

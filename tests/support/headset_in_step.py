@@ -1,5 +1,4 @@
-"""An operator whose headset sends over TCP in simulated time. Everything that was sent by a tick has arrived at its
-poll.
+"""An operator whose headset sends over TCP in simulated time. All data of a tick have arrived at its poll.
 
 Outcomes then do not depend on how fast the machine is. A script is a generator that changes the operator and yields the
 times to wait [s]; the run ends with it.

@@ -35,9 +35,7 @@ def sample(
 
 @dataclass
 class Operator:
-    """An operator who feeds a :class:`Teleop` at 1 kHz with samples of both hands at about 77 Hz, and keeps its
-    results.
-    """
+    """An operator who feeds a :class:`Teleop` at 1 kHz with samples of both hands at about 77 Hz."""
 
     settings: TeleopSettings = field(default_factory=TeleopSettings)
     arms: tuple[str, ...] = SIDES

@@ -17,7 +17,7 @@ _TINY = 1e-12
 
 @inlined_kernel
 def dot(a: Array, b: Array) -> float:
-    """Scalar product of two vectors."""
+    """Return the scalar product of two vectors."""
     total = 0.0
     for k in range(a.shape[0]):
         total += a[k] * b[k]
@@ -47,7 +47,8 @@ def clamp(value: float, lower: float, upper: float) -> float:
 
 @kernel
 def segment_segment(a0: Array, a1: Array, b0: Array, b1: Array, on_a: Array, on_b: Array) -> float:
-    """Distance [m] of segments a0-a1 and b0-b1, each (3,); writes the closest points into ``on_a`` and ``on_b``.
+    """Return the distance [m] of segments a0-a1 and b0-b1, each (3,), and write the closest points ``on_a`` and
+    ``on_b``.
 
     Minimises the convex quadratic |a(s) - b(t)|^2 over the unit square. It takes the free minimum of s, then t for it,
     then s again for the clamped t (Ericson, Real-Time Collision Detection, 2005, section 5.1.9).
@@ -81,7 +82,7 @@ def segment_segment(a0: Array, a1: Array, b0: Array, b1: Array, on_a: Array, on_
 
 @kernel
 def products(a0: Array, a1: Array, b0: Array, b1: Array) -> tuple[float, float, float, float, float]:
-    """Scalar products u'u, w'w, u'w, u'r and w'r of u = a1 - a0, w = b1 - b0 and r = a0 - b0."""
+    """Return the scalar products u'u, w'w, u'w, u'r and w'r of u = a1 - a0, w = b1 - b0 and r = a0 - b0."""
     aa, bb, ab, ar, br = 0.0, 0.0, 0.0, 0.0, 0.0
     for k in range(3):
         u, w, r = a1[k] - a0[k], b1[k] - b0[k], a0[k] - b0[k]
@@ -102,7 +103,7 @@ def _middle_of_overlap(aa: float, ab: float, ar: float) -> float:
 
 @kernel
 def segment_box(a0: Array, a1: Array, half: Array, on_a: Array, on_box: Array, normal: Array) -> float:
-    """Signed distance [m] of a segment and a box of half sides ``half``, all in the box frame, (3,).
+    """Return the signed distance [m] of a segment and a box of half sides ``half``, all in the box frame, (3,).
 
     Writes the closest points and the unit normal from the segment to the box. The squared distance along the segment is
     convex and piecewise quadratic. The zero of its slope is therefore found exactly between two of the at most six
@@ -175,7 +176,7 @@ def _minimum_along(a0: Array, a1: Array, half: Array) -> float:
 
 @kernel
 def _push_out(a0: Array, a1: Array, half: Array, on_a: Array, on_box: Array, normal: Array) -> float:
-    """Least way out of the box for a segment that enters it.
+    """Return the shortest way out of the box for a segment that enters it.
 
     That is to the nearest face of their Minkowski difference (Cameron, ICRA 1997). The faces belong to the box's faces,
     and to each of its edges with the segment. Without these the depth would jump where a segment begins to cut an edge.

@@ -70,7 +70,7 @@ class Contact(NamedTuple):
 
     first: Array  # (3,) closest points [m]
     second: Array  # (3,)
-    normal: Array  # (3,) from the first to the second body
+    normal: Array  # (3,) Unit vector from the first to the second body.
     local: Array  # (3, 3) scratch
     kept: Array  # (2, 3) scratch: closest points that are needed after another part has been measured
 

@@ -32,7 +32,7 @@ from q2r2_control.types import Array
 
 @inlined_kernel
 def at_least(model: CollisionModel, data: CollisionData, p: int) -> float:
-    """Cheap lower bound on the distance of pair ``p``, from the balls around its bodies, or ball and box [m]."""
+    """Return a cheap lower bound on the distance of pair ``p`` [m], from balls around its bodies, or ball and box."""
     bodies, posed, first, second = model.bodies, data.posed, model.pairs.first[p], model.pairs.second[p]
     square = 0.0
     if bodies.box[second] == 1:
@@ -54,7 +54,7 @@ def at_least(model: CollisionModel, data: CollisionData, p: int) -> float:
 
 @kernel
 def measure(model: CollisionModel, data: CollisionData, p: int) -> float:
-    """Signed distance [m] of pair ``p``; fills ``data.contact``.
+    """Return the signed distance [m] of pair ``p``, and fill ``data.contact``.
 
     The points lie on the core segment, not on the capsule's surface: they differ by a multiple of the normal, which
     changes no rate of distance.
@@ -76,7 +76,7 @@ def measure_part(model: CollisionModel, data: CollisionData, p: int, start: Arra
 
 @kernel
 def _to_box(start: Array, end: Array, centre: Array, axes: Array, half: Array, contact: Contact) -> float:
-    """Signed distance [m] of a segment and a box, of which ``axes`` (3, 3) and ``half`` sides (3,) are given."""
+    """Return the signed distance [m] of a segment and a box with ``axes`` (3, 3) and ``half`` sides (3,)."""
     local = contact.local
     normal = local[2]
     _into_box_frame(start, end, centre, axes, local)
@@ -108,7 +108,7 @@ def _into_world(point: Array, centre: Array, axes: Array) -> None:
 
 @kernel
 def _to_segment(start: Array, end: Array, other_start: Array, other_end: Array, contact: Contact) -> float:
-    """Distance [m] of two segments."""
+    """Return the distance [m] of two segments."""
     distance = segment_segment(start, end, other_start, other_end, contact.first, contact.second)
     if distance > 1e-9:
         for k in range(3):
@@ -136,7 +136,7 @@ def _any_normal(a0: Array, a1: Array, b0: Array, b1: Array, normal: Array) -> No
 
 @kernel
 def distance_row(model: CollisionModel, data: CollisionData, p: int, row: Array) -> None:
-    """Gradient of pair ``p``'s distance with respect to q into ``row`` (nv,) [m/rad], as measured last."""
+    """Write the gradient of pair ``p``'s last distance with respect to q into ``row`` (nv,) [m/rad]."""
     chain, pairs, placements, contact = model.chain, model.pairs, data.placements, data.contact
     row[:] = 0.0
     nx, ny, nz = contact.normal[0], contact.normal[1], contact.normal[2]
@@ -165,7 +165,7 @@ def with_rounded_boxes(model: CollisionModel, depth: Array) -> CollisionModel:
     """
     bodies, pairs = model.bodies, model.pairs
     second = pairs.second.copy()
-    number: dict[tuple[int, float], int] = {}  # of the rounded box, by its source and skin
+    number: dict[tuple[int, float], int] = {}  # Numbers of rounded boxes, by their source and skin.
     for p in np.flatnonzero((depth > 0.0) & (bodies.box[second] == 1)):
         box = int(second[p])
         skin = min(float(depth[p]), _THICKEST_SKIN * float(bodies.half[box].min()))
@@ -182,7 +182,10 @@ def with_rounded_boxes(model: CollisionModel, depth: Array) -> CollisionModel:
 
 
 def deeper_at_corners(model: CollisionModel, kept: Array) -> Array:
-    """How much deeper than -``kept`` (p,) [m] pairs that may touch can get into a real corner (p,) [m]; else 0."""
+    """Return how much deeper than -``kept`` (p,) [m] pairs that may touch can get into a real corner (p,) [m]
+
+    else 0.
+    """
     boxed = (kept < 0.0) & (model.bodies.box[model.pairs.second] == 1)
     return np.where(boxed, (1.0 - 1.0 / np.sqrt(3.0)) * model.bodies.radius[model.pairs.first], 0.0)
 

@@ -207,9 +207,7 @@ def approach_speed(error: float, gain: float, deceleration: float) -> float:
 
 @kernel
 def wanted_twist(motion: Motion, data: TaskData, targets: TaskTargets, i: int) -> None:
-    """Write the twist of tool ``i`` towards its target into ``data.frame.twist``, and the part that comes from the
-    error.
-    """
+    """Write the twist of tool ``i`` towards its target into ``data.frame.twist``, and its part from the error."""
     twist, feedback, feed_forward = data.frame.twist[i], data.frame.feedback[i], targets.feed_forward[i]
     times_transposed(targets.rotation[i], data.rotation[i], data.frame.turn)
     for k in range(3):

@@ -240,9 +240,7 @@ class RelativePose:
 
 
 def _turn(of: Array, to: Array) -> Array:
-    """Return the shortest rotation vector (3,) [rad] from one unit vector to another, about any axis if they are
-    opposite.
-    """
+    """Return the shortest rotation vector (3,) [rad] between unit vectors, about any axis if they are opposite."""
     across = np.cross(of, to)
     sine = float(np.linalg.norm(across))
     if sine < _TINY:

@@ -19,7 +19,7 @@ class Priority(NamedTuple):
     no row is active nothing changes. An arm without a target holds its joints, and does not give way.
     """
 
-    arm: Array  # (n,) of an arm's costs while it follows a target: 1, less if it gives way
+    arm: Array  # (n,) Weight of an arm's costs while it follows a target: 1, or less if it gives way.
     joint: Array  # (nv,) the same for each joint
 
 

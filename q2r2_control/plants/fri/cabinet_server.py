@@ -181,8 +181,7 @@ class CabinetServer:
         network: Network,
         seed: int = 0,
     ) -> None:
-        """Bind ``origins``, address and port of each arm's cabinet (0: any free port); ``clients`` are those of its
-        client.
+        """Bind ``origins``, address and port (0: any free one) of each arm's cabinet; ``clients`` are their clients.
 
         Raises :class:`ConfigError` for an origin that cannot be bound, such as one that another program has.
         """

@@ -206,7 +206,7 @@ class BaseArmController(BaseNode):
             "arm": self.arm_name,
             "state": str(self.state),
             "engaged": self.engaged,
-            "ready": self._refusal is None and self.state not in (ArmState.STOPPED, ArmState.HOMING),  # to be engaged
+            "ready": self._refusal is None and self.state not in (ArmState.STOPPED, ArmState.HOMING),
             "hand": self.hand,
             "hand_age": _rounded(self.now - self.intake.stamps[0]),
             "inputs_age": _rounded(self.now - self.intake.stamps[1]),

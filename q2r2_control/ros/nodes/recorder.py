@@ -127,7 +127,7 @@ class RecorderNode(BaseNode):
             text = deserialize_message(payload, String).data
             try:
                 event = Event.from_json(json.loads(text))
-            except (ValueError, TypeError, KeyError):  # it is in the file, and tells of no episode
+            except (ValueError, TypeError, KeyError):  # The message is in the file, but belongs to no episode.
                 self.drop(topic.name, f"{text!r:.60}")
                 return
             self._marks.follow(event.kind)

@@ -129,7 +129,7 @@ class WebPage(BaseNode):
         self._waiting.append((topic.name, Message(topic.channel, 0, time.monotonic_ns(), 0, bytes(payload))))
 
     def _on_obstacle(self, marker: Marker) -> None:
-        with suppress(Q2R2Error):  # the controller's log tells
+        with suppress(Q2R2Error):  # The controller's log gives the reason.
             obstacle, now = obstacle_of(marker, self.now), self.now
             check_obstacle(marker.ns, obstacle, self._cell.control.moving_obstacles)
             self._obstacles.pop(marker.ns, None)
@@ -151,7 +151,7 @@ class WebPage(BaseNode):
         match request:
             case PageRequest.ENGAGE:
                 return [f"{arm}/engage" for arm in arms]
-            case PageRequest.PAUSE:  # the way home too
+            case PageRequest.PAUSE:  # The pause also ends the way home.
                 return [f"{self._controller}/hold", *(f"{arm}/pause" for arm in arms)]
             case PageRequest.RESET:
                 return [f"{self._controller}/reset", *(f"{arm}/reset" for arm in arms)]

@@ -131,9 +131,7 @@ def test_the_certificate_distinguishes_motions_that_end_just_inside_and_well_out
 
 
 def _swings(random: np.random.Generator, count: int, dip: float) -> Iterator[Motion]:
-    """Yield steps that bring the nearest pair closer by ``dip`` [m] and away again, with stops that keep all pairs
-    apart.
-    """
+    """Yield steps that bring the nearest pair closer by ``dip`` [m] and away again, with stops without near pairs."""
     name, found = "dual_iiwa7", 0
     for q in _starts_apart(name, random, True, 20 * count):
         apart = distances(cell(name), q[None])[0]

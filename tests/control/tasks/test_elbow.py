@@ -114,9 +114,7 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def moved_by(settings: ControllerSettings) -> float:
-    """Return the final angle of the left arm's third joint while both tools keep their pose, with the contract at every
-    tick.
-    """
+    """Return the final angle of the left arm's third joint, with fixed tools and the contract at every tick."""
     robot = cell("dual_iiwa7").robot
     controller = CartesianController(robot, settings)
     reference = Driven(controller).drive(2.0, lambda _, start: start)

@@ -20,9 +20,7 @@ DOWN = (0.0, 0.0, -1.0)  # The z axis of a tool at home points down, so that its
 
 
 def driven(tasks: dict[str, Any], moved: dict[str, pin.SE3] | None = None, **settings: Any) -> Driven:
-    """Drive for 5 s towards the tools at the start, or to those ``moved`` in the world, with the contract at every
-    tick.
-    """
+    """Drive for 5 s towards the tools at the start, or to ``moved`` ones, with the contract at every tick."""
     robot = cell("dual_iiwa7").robot
     run = Driven(CartesianController(robot, ControllerSettings(tasks=tasks, **settings)))
     goals = {

@@ -158,9 +158,7 @@ def _moves_both(robot: Robot, pair: int) -> bool:
 
 
 def _swing(t: float, frequency: float) -> tuple[Array, Array]:
-    """Return the offset of both tools at ``t`` [s]: a swing along the world's y whose amplitude grows in the first
-    second.
-    """
+    """Return the offset of both tools at ``t`` [s]: a swing along the world's y, which grows in the first second."""
     phase = 2.0 * math.pi * frequency * max(t - START, 0.0)
     share = min(max(t - START, 0.0), 1.0)
     return np.array([0.0, share * _AMPLITUDE * math.sin(phase), 0.0]), np.zeros(3)

@@ -29,9 +29,7 @@ _ALLOWANCE, _STILL = 0.05, 1e-3
 
 
 class Rest(NamedTuple):
-    """The promise for measured arms: times after the rest of the reference [s], and speeds of the fastest joint
-    [rad/s].
-    """
+    """The promise for measured arms: times after the reference rests [s], and speeds of the fastest joint [rad/s]."""
 
     slow_after: float
     slow: float
