@@ -102,7 +102,7 @@ class ImpedanceController:
         self._begin(robot.home)
 
     def reset(self, state: RobotState) -> None:
-        """Start anew at rest at the measured posture. The first torque is that of gravity there, without a jump.
+        """Start again at rest at the measured posture. The first torque is that of gravity there, without a jump.
 
         Changes of stiffness, damping or payload that are under way are completed at once.
 

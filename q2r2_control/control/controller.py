@@ -132,7 +132,7 @@ class CartesianController(WatchedPairs):
         self._solver.solve(problem)
 
     def reset(self, q: Array, v: Array | None = None) -> None:
-        """Start anew at joint positions ``q`` (nv,) [rad] and velocities ``v`` (nv,) [rad/s].
+        """Start again at joint positions ``q`` (nv,) [rad] and velocities ``v`` (nv,) [rad/s].
 
         Targets, openings and held objects are forgotten. Moving obstacles stay where they are. A start outside the
         limits or in penetration is allowed: the controller recovers from it.

@@ -37,7 +37,7 @@ def _cache_folder() -> Path:
     """Return the folder of this version's machine code. It becomes the newest, and all but the two newest are deleted.
 
     A folder that another process has loaded from may be deleted: its machine code is in memory, and what that process
-    still compiles is written anew. Where the cache cannot be written, what it holds is still used.
+    still compiles is written again. If the cache cannot be written, its content is still used.
     """
     digest = hashlib.sha256(b"".join(source.read_bytes() for source in compiled_sources())).hexdigest()[:16]
     try:

@@ -176,7 +176,7 @@ class LiveSettings:
         return None
 
     def restart(self) -> None:
-        """Begin anew before a reset, with the distances that do not depend on the posture."""
+        """Begin again before a reset, with the distances that do not depend on the posture."""
         self._due = 0.0
         self._write(np.minimum(self._goal, self._least))
         self._stops[:] = self.kept + stop_buffer(self.kept, self.settings)

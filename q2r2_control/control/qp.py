@@ -41,8 +41,8 @@ class QpProblem:
     controller's arrays, which hold until the next step; every other solver is handed copies.
 
     Attributes:
-        H: Of the cost (nv, nv), symmetric and positive definite.
-        g: Of the cost (nv,).
+        H: Matrix of the cost (nv, nv), symmetric and positive definite.
+        g: Vector of the cost (nv,).
         lower: Least next velocities (nv,) [rad/s]. They keep position, velocity and acceleration limits.
         upper: Greatest next velocities (nv,) [rad/s].
         rows: Left-hand sides (m, nv), of unit norm: separation first, then soft constraints, then hard ones.
@@ -67,7 +67,7 @@ class QpSolution:
 
     Attributes:
         v: Next joint velocities (nv,) [rad/s]; None if the solver found none.
-        solve_time: How long the solver says that it took [s]; 0 where it was not asked.
+        solve_time: Time that the solver reports [s]; 0 if it was not called.
     """
 
     v: Array | None

@@ -46,7 +46,7 @@ class Drive(ABC):
 
     @abstractmethod
     def reset(self, state: RobotState) -> None:
-        """Start anew, at rest at the measured ``state``; raises :class:`Q2R2Error` if that is not possible."""
+        """Start again, at rest at the measured ``state``; raises :class:`Q2R2Error` if that is not possible."""
 
     @abstractmethod
     def command(

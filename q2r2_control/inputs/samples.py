@@ -109,7 +109,7 @@ class HandsWatch:
         self.reset()
 
     def reset(self) -> None:
-        """Start anew for a new connection, whose poses do not continue the motion of the poses before."""
+        """Start again for a new connection, whose poses do not continue the motion of the poses before."""
         self._numbers: dict[str, bytes] = {}  # The numbers of each hand's newest pose.
         self._since: dict[str, float] = {}  # When these last changed [s].
         self._frame = MovedFrame(self._fault_time) if self._watches_frame else None

@@ -193,7 +193,7 @@ _NO_PRESS = (0.3, 0.6)  # Times before and after a press in which the hands do n
 def hurried(work: HandTrajectory, seed: int) -> HandTrajectory:
     """Return the same work by hasty hands: faster, with hesitation, and once lost by the headset for a second.
 
-    After the loss, the hands wait until the headset sees them again, engage both arms anew, and go on.
+    After the loss, the hands wait until the headset sees them again, engage both arms again, and go on.
     """
     assert work.duration is not None
     random, presses = np.random.default_rng([seed, len(SIDES)]), [*work.lower_presses, *work.grips]

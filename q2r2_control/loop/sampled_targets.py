@@ -34,14 +34,14 @@ class SampledTargets:
     """
 
     def __init__(self, controller: CartesianController, rate_hz: float) -> None:
-        """Targets for a controller.
+        """Make targets for a controller.
 
         Args:
-            controller: Whose tools the targets begin at.
-            rate_hz: Of the samples as a rule, 1 to 500 [Hz].
+            controller: The controller, at whose tools the targets begin.
+            rate_hz: Usual rate of the samples, 1 to 500 [Hz].
 
         Raises:
-            RobotError: For another rate, and for what is no controller.
+            RobotError: For another rate, and for an object that is not a controller.
         """
         check_kind("controller", controller, CartesianController, "a CartesianController", RobotError)
         if not is_number(rate_hz) or not _SLOWEST <= rate_hz <= _FASTEST:
@@ -56,15 +56,15 @@ class SampledTargets:
         The first one of an arm, also after :meth:`release`, begins a line at its tool.
 
         Args:
-            arm: Whose tool it is for.
-            pose: Of the tool in the world.
-            now: When it came, by the clock of :meth:`at` [s].
+            arm: The arm that the sample is for.
+            pose: Pose of the tool in the world.
+            now: Time of its arrival, on the clock of :meth:`at` [s].
 
         Returns:
             False if the pose is not finite or no rotation; the arm then goes on to its last one.
 
         Raises:
-            RobotError: For an arm that does not exist, what is no pose, and a time that is not finite.
+            RobotError: For an arm that does not exist, an object that is not a pose, and a time that is not finite.
         """
         check_kind("pose", pose, pin.SE3, "a pinocchio.SE3", RobotError)
         name, now = self._controller.robot.arm(arm).name, _time(now)

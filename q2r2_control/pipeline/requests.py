@@ -55,7 +55,7 @@ class RequestedRun:
     def mark(self, action: Action) -> None:
         """Begin, end or mark an episode of the recording, as an operator may; from any thread.
 
-        Raises :class:`ConfigError` for what is no action.
+        Raises :class:`ConfigError` for an unknown action.
         """
         if not isinstance(action, str) or action not in list(Action):
             raise ConfigError(f"action = {shown(action)}: allowed: {', '.join(Action)}")

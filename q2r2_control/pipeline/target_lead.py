@@ -33,7 +33,7 @@ class TargetLead:
         Args:
             targets: The present targets.
             dt: Time since the targets of the last call [s].
-            delay: Of the plant [s].
+            delay: Delay of the plant [s].
         """
         velocities, self._velocities = self._velocities, {}
         led: dict[str, pin.SE3 | None] = dict(targets)

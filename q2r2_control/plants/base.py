@@ -77,7 +77,7 @@ class SessionPlant(Protocol):
     """The additional methods of a plant whose arms follow only during sessions, with a timing of their own.
 
     The arms start where they stand. If the session of one arm ends, the run goes on: all arms brake, and are activated
-    anew where they rest, as soon as all of them are in a session again.
+    again where they rest, as soon as all of them are in a session again.
     """
 
     realtime_only: bool

@@ -177,7 +177,7 @@ class MujocoPlant:
         Args:
             arm: The arm.
             wrench: Force [N], then torque [Nm], in world axes at the origin of the tool frame (6,).
-            duration: Of the push [s].
+            duration: Duration of the push [s].
 
         Raises:
             PlantError: If an argument is not allowed.

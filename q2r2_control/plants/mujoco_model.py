@@ -211,7 +211,7 @@ def settle_mimics(model: mujoco.MjModel, data: mujoco.MjData) -> None:
 
 
 def _exclude_contacts(spec: mujoco.MjSpec, robot: Robot) -> None:
-    """Let pairs that the robot does not watch pass through each other: neighbours, what always or never meets."""
+    """Let pairs that are not monitored pass through each other: neighbours, and pairs that always or never meet."""
     watched = {frozenset((link_of(a), link_of(b))) for a, b in pair_names(robot.collision_model)}
     for first, second in combinations(sorted(frozenset().union(*watched)), 2):
         if frozenset((first, second)) not in watched:

@@ -49,7 +49,7 @@ def fair_server_notes(release: str, folder: Path) -> list[str]:
     The kernel halts real-time threads for it.
 
     Args:
-        release: Of the kernel.
+        release: Release of the kernel.
         folder: Has the share of each processor. Only root may read it.
     """
     major, minor, *_ = *map(int, re.findall(r"\d+", release)[:2]), 0, 0

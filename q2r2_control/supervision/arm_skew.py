@@ -3,7 +3,7 @@
 Each arm follows the reference with a lag of its own. The certificate (control/safety/arm_skew.py) keeps two arms apart
 as long as their lags differ by no more than its window. This watch keeps the difference within the window, for every
 loop. If one arm falls behind or stops sending, the reference follows its certified stop until the arms are together
-again. After 0.1 s of waiting the arms stop, and are activated anew from rest.
+again. After 0.1 s of waiting the arms stop, and are activated again from rest.
 """
 
 from __future__ import annotations

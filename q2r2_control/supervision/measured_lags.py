@@ -28,7 +28,7 @@ class MeasuredLags:
         self._past: deque[tuple[float, Array]] = deque()
 
     def restart(self) -> None:
-        """Forget the past, because the reference begins anew."""
+        """Forget the past, because the reference begins again."""
         self._past.clear()
 
     def note(self, q: Array, now: float) -> None:

@@ -29,7 +29,7 @@ WINDOW = 0.05  # W [s]
 _STANDS_BELOW = 0.1  # An arm stands still if it moves by less than this share of the commanded way.
 _FOLLOWS_ABOVE = 0.5  # An arm follows if it moves by more than this share of the commanded way.
 _LOOK_PERIOD = 0.0075  # Time between two looks; the loop may tick more often [s].
-_STATE_GAP = 0.045  # After a longer gap between two states the window begins anew [s].
+_STATE_GAP = 0.045  # After a longer gap between two states the window begins again [s].
 
 
 @dataclass(frozen=True, slots=True)

@@ -251,7 +251,7 @@ class Supervisor:
         """Deactivate the arms after the loop stood still for ``duration`` [s].
 
         The arms have come to rest without us, and may have been moved. The old reference could be a jump. They are
-        activated anew where they rest. Targets that waited meanwhile do not begin a new stream.
+        activated again where they rest. Targets that waited meanwhile do not begin a new stream.
         """
         if self.phase not in (Phase.ACTIVE, Phase.BRAKING):
             return
@@ -278,7 +278,7 @@ class Supervisor:
             self.phase = Phase.INACTIVE
 
     def start_over(self, fault: Reason, now: float) -> None:
-        """Brake because the arms do not follow the reference, and activate them anew where they come to rest."""
+        """Brake because the arms do not follow the reference, and activate them again where they come to rest."""
         if self.phase is Phase.ACTIVE:
             self._watch.observe(fault, now)
             self._brake(fault)

@@ -74,7 +74,7 @@ class TickClock:
     def at(self, now: float) -> float:
         """Return the even time of a tick that runs at ``now`` [s].
 
-        The even times begin anew after a gap of more than 0.1 s, and after a clock that was set back.
+        The even times begin again after a gap of more than 0.1 s, and after a clock that was set back.
         """
         off = now - self._last - self._period
         if not -2.0 * self._period < off < LONGEST_DT:

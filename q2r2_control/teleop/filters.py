@@ -26,7 +26,7 @@ class Interpolator:
     """Plays samples back ``delay`` seconds after their receipt, on straight lines from sample to sample.
 
     A headset measures at even times, and its samples arrive at uneven times. The jitter would look like speed. A
-    delay-locked loop (Adriaensen 2005) removes it. The loop starts anew when a sample is half a period early or late.
+    delay-locked loop (Adriaensen 2005) removes it. The loop starts again when a sample is half a period early or late.
     If no sample comes for longer than ``delay``, the output rests at the newest one, because nothing is extrapolated.
     The motion that was missed is then made up within a part of the gap, and not at once.
     """
@@ -35,8 +35,8 @@ class Interpolator:
         """Make an interpolator.
 
         Args:
-            delay: From the receipt of a sample until it is played back [s].
-            period: Of the samples, until it is measured [s].
+            delay: Delay from the receipt of a sample until it is played back [s].
+            period: First estimate of the samples' period [s].
         """
         self.delay, self._usual_period = delay, period
         self._knots: deque[tuple[float, Vector, Quaternion]] = deque()

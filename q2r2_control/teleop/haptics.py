@@ -152,7 +152,7 @@ class HapticPulses:
 
 
 class _Steps:
-    """Counts the steps by which a quantity grows. It may shrink by two steps before they are counted anew."""
+    """Counts the steps by which a quantity grows. It may shrink by two steps before they are counted again."""
 
     def __init__(self, step: float) -> None:
         self._step, self._counted = step, 0

@@ -106,14 +106,14 @@ class Leash:
         self._last = None
 
     def anchor_anew(self) -> None:
-        """Forget the last tick, because the hand was anchored anew where it is. The slip stays."""
+        """Forget the last tick, because the hand was anchored again where it is. The slip stays."""
         self._last = None
 
     def target(self, motion: RelativeMotion, hand: Pose, newest: Pose, tool: Pose, now: float) -> Pose:
         """Return the target for ``hand``, no farther from the tool than the leash reaches.
 
         Args:
-            motion: Maps the hand to its target. If the leash pulls, it is anchored anew, so that the hand moves the
+            motion: Maps the hand to its target. If the leash pulls, it is anchored again, so that the hand moves the
                 target from there.
             hand: The filtered pose of the hand.
             newest: The target for the unfiltered hand if nothing had ever slipped.

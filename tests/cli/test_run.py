@@ -114,7 +114,7 @@ def test_an_empty_task_is_refused(tmp_path: Path) -> None:
     assert "--task is empty; allowed: some words, or no --task" in result.stderr
 
 
-def test_rt_prints_one_line_about_what_the_system_refuses_and_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_with_rt_one_line_names_the_refusals_of_the_system_and_the_run_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
     refusal = "real time: no SCHED_FIFO: Operation not permitted; the run goes on without"
 
     @contextmanager

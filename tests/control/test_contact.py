@@ -59,7 +59,7 @@ def test_a_finger_that_may_touch_enters_by_the_depth_and_no_faster_than_allowed(
     assert speeds[heights > 0.05].max() > 2.0 * SPEED, "nothing is slowed that is far from contact"
 
 
-def test_what_is_not_named_keeps_its_distance_to_the_same_table() -> None:
+def test_a_body_that_is_not_named_keeps_its_distance_from_the_same_table() -> None:
     """The right fingers get the same targets as the left ones. The contract knows the distance of every pair."""
     controller = CartesianController(ROBOT, settings({"pair": ["left_*finger*", "table"], "depth": DEPTH}))
     goal = {arm: pin.SE3(DOWN, np.array([0.5, y, 0.1])) for arm, y in (("left", 0.25), ("right", -0.25))}

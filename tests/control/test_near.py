@@ -77,7 +77,7 @@ def test_hands_driven_at_each_other_end_at_the_distance_that_fingers_keep(contro
     assert all("finger" in name for name in report.closest_pair)
 
 
-def test_the_nearest_pair_and_the_tightest_one_are_told_apart(controller: CartesianController) -> None:
+def test_the_nearest_pair_and_the_tightest_pair_are_reported_separately(controller: CartesianController) -> None:
     """Fingers 12 mm above the table have a larger margin than wrists 22 mm from each other."""
     reference = driven(controller, down_to(TABLE + FRAME_TO_TIPS + 0.012, y=0.0), 6.0)
     report, robot = reference.report, controller.robot

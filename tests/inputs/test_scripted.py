@@ -162,7 +162,7 @@ def test_every_work_has_rising_times_and_ends_at_home_with_open_grippers(work: H
 
 
 @pytest.mark.parametrize("name", ["meet+grasp", "handover+stack"])
-def test_the_steps_of_works_are_told_in_order_and_by_the_name_of_the_work(name: str) -> None:
+def test_the_steps_of_works_come_in_order_and_with_the_name_of_the_work(name: str) -> None:
     trajectory = trajectory_named(name)
     begins, words = zip(*trajectory.steps, strict=True)
     assert begins == tuple(sorted(begins))

@@ -122,7 +122,7 @@ def test_the_folder_is_a_bag_of_version_nine_that_says_what_was_run(recorded: tu
     assert {"version", "machine", "libraries", "plant"} <= about.notes.keys() & bag["custom_data"].keys()
 
 
-def test_a_folder_that_cannot_be_written_is_one_line_and_the_run_goes_on(
+def test_a_folder_that_cannot_be_written_gives_one_line_and_the_run_goes_on(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     file = tmp_path / "file"
@@ -188,7 +188,7 @@ def test_a_file_whose_writer_was_killed_before_the_first_message_is_removed(tmp_
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_file_that_falls_behind_the_run_is_told_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_file_that_falls_behind_the_run_is_reported_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     loop = pipeline()
     with caplog.at_level(logging.WARNING), Recorder(tmp_path, "slow") as recorder:
         recorder.begin(About.of(loop, False, {}), loop.robot)

@@ -100,7 +100,7 @@ def _into_box_frame(start: Array, end: Array, centre: Array, axes: Array, local:
 
 @kernel
 def _into_world(point: Array, centre: Array, axes: Array) -> None:
-    """A point (3,) of the box frame, in place."""
+    """Transform a point (3,) of the box frame into the world frame, in place."""
     x, y, z = point[0], point[1], point[2]
     for row in range(3):
         point[row] = centre[row] + axes[row, 0] * x + axes[row, 1] * y + axes[row, 2] * z

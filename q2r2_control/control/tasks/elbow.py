@@ -41,9 +41,9 @@ class ElbowSwivel:
     task ``swivel``. Source: Kreutz-Delgado, Long, Seraji, Int. J. Robotics Research 11(5), 1992.
 
     Args:
-        robot: Whose arms they are.
+        robot: The robot with these arms.
         angles: Wanted angle psi* of each arm that has the task, 0: elbow up; None: as at home [rad].
-        joints: At shoulder, elbow and wrist, without the arm's prefix.
+        joints: Names of the joints at shoulder, elbow and wrist, without the arm's prefix.
         gain: k, swivel speed per angle [1/s].
         weight: w, against 1 of a tool's error in metres.
 

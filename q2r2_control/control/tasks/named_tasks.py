@@ -69,13 +69,13 @@ class JointTarget:
     A YAML names it ``joints``.
 
     Args:
-        robot: Whose joints they are.
+        robot: The robot with these joints.
         positions: Wanted position q* by the joint's name, such as ``{"left_A3": 0.3}`` [rad, or m of a sliding joint].
         gain: k, speed per distance [1/s].
         weight: w, against 1 of a tool's error in metres.
 
     Raises:
-        ConfigError: For a joint that does not exist, a position outside of its limits, and what is no number above 0.
+        ConfigError: For a joint that does not exist, a position outside its limits, and a number that is not above 0.
     """
 
     def __init__(self, robot: Robot, positions: Mapping[str, float], gain: float = 2.0, weight: float = 0.1) -> None:
@@ -109,7 +109,7 @@ class LookAt:
 
     Args:
         robot: Whose tools they are.
-        point: In the world (3,) [m].
+        point: The point in the world (3,) [m].
         arms: Names of the arms that have the task; None: all.
         axis: a in the tool's frame (3,), of any length.
         gain: k, angular speed per angle [1/s].
@@ -154,9 +154,9 @@ class Upright:
 
     Args:
         robot: Whose tools they are.
-        angle: Of the cone, from its middle to its edge, up to pi [rad].
+        angle: Angle from the middle of the cone to its edge, up to pi [rad].
         arms: Names of the arms that have the task; None: all.
-        axis: In the tool's frame (3,), of any length.
+        axis: The axis in the tool's frame (3,), of any length.
         up: The middle of the cone in the world (3,), of any length.
         gain: k, angular speed per angle [1/s].
         weight: w, against 0.09 of a tool's own rotation.
@@ -200,8 +200,8 @@ class RelativePose:
     metres. A YAML names the task ``relative``.
 
     Args:
-        robot: With the arms ``left`` and ``right``.
-        position: Of the right tool in the left tool's frame (3,) [m]; None: as at home.
+        robot: A robot with the arms ``left`` and ``right``.
+        position: Position of the right tool in the left tool's frame (3,) [m]; None: as at home.
         rpy: Its roll, pitch and yaw there (3,) [rad]; None: as at home.
         gain: k, speed per distance [1/s].
         weight: w, against 1 of a tool's error in metres.

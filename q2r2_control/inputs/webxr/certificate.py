@@ -35,9 +35,9 @@ def installation_token(folder: Path) -> str:
 
 
 def own_certificate(folder: Path, addresses: Sequence[str], now: datetime) -> tuple[Path, str | None]:
-    """Return a PEM file with certificate and key for a server at ``addresses``, and a line if it was made anew.
+    """Return a PEM file with certificate and key for a server at ``addresses``, and a line if it is a new one.
 
-    The file is made anew if there is none, if the certificate expires within a week, and for further addresses.
+    A new file is made if there is none, if the certificate expires within a week, and for further addresses.
 
     Raises:
         InputError: If the package cryptography is missing, or if the file cannot be written.

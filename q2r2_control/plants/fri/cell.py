@@ -53,7 +53,7 @@ class FriCell:
 
         Args:
             robot: The robot.
-            period: Of the loop [s].
+            period: Period of the loop [s].
             longest: The longest step of the reference with one acceleration [s].
             states: The state of each arm's session.
             grippers: The grippers, of the arms that have one.

@@ -27,7 +27,7 @@ from q2r2_control.types import Array
 # ticked by then.
 DELAY = 0.004
 _AT_REST = 1e-9  # [rad]
-_RESTARTED = 1000  # A counter that goes back by more shows that the session has begun anew.
+_RESTARTED = 1000  # A counter that goes back by more shows that the session has begun again.
 _COUNTERS = 1 << 32
 _MOST_AHEAD = 20  # Number of messages that may come at once after a gap.
 # Times after which a torque that is not updated is replaced [s]. A torque that nobody updates would push for ever. It
@@ -162,7 +162,7 @@ class ArmSession:
         if before is None or state.is_silent(now):
             passed = 0
             if before is not None and self._lasts(message, before):
-                self._brake()  # To begin anew here would stop the arm at once.
+                self._brake()  # A new beginning here would stop the arm at once.
             else:
                 self._begin_anew()
         else:
@@ -206,7 +206,7 @@ class ArmSession:
                 self.state.rest = joints_of(self.path.rest)
 
     def _begin_anew(self) -> None:
-        """Let the path begin anew, at the position that the next message of the cabinet has."""
+        """Let the path begin again, at the position that the next message of the cabinet has."""
         self._cease()
         self._begun = False
         self._times = None

@@ -18,7 +18,7 @@ from q2r2_control.viewer.web.figure import CapsuleFigure, ObstacleFigure, RobotF
 _TRAIL_COLOURS: tuple[Colour, ...] = ((60, 120, 216), (150, 80, 190))
 _TRAIL = 90  # Points of a trail.
 _TRAIL_PERIOD = 0.05  # Time between the points, in the run's time [s].
-_BREAK = 1.0  # After a longer gap than this, a trail begins anew [s].
+_BREAK = 1.0  # After a longer gap than this, a new trail begins [s].
 _AWAY = 0.01  # The ghost is shown if a joint is farther from its reference than this [rad].
 _SHORT = 0.01  # Lines up to this length are not drawn [m].
 _PER_NEWTON = 0.005  # Drawn length per force [m/N].
