@@ -175,8 +175,8 @@ CERTIFICATE = (
     Mutation(
         "fingers that grow are proven at the reference",
         "safety_filter.py",
-        "if data.distance[p] < model.min_distance[p]:  # no rounding",
-        "if False:  # no rounding",
+        "if data.distance[p] < model.min_distance[p]:  # No rounding",
+        "if False:  # No rounding",
     ),
     Mutation(
         "a distance that grows leaves the way of the stop",
