@@ -53,7 +53,6 @@ _BARELY = 0.003  # A pair that cannot get this much farther apart than its kept 
 
 Model = Annotated[str | None, Option(metavar="MODEL", help="URDF, xacro, MJCF, package:// or example-robot-data:NAME.")]
 Tip = Annotated[str | None, Option(metavar="LINK", help="Last link of that arm, where the model leaves a doubt.")]
-Metres = Annotated[float | None, Option(min=-3, max=5, help="[m]")]
 
 
 @dataclass
@@ -78,23 +77,27 @@ class _Draft:
 
 
 def new_cell(
-    name: Annotated[str, Argument(metavar="NAME", help="Of the cell; NAME.yaml is written here.")],
+    name: Annotated[str, Argument(metavar="NAME", help="Name of the cell. NAME.yaml is written here.")],
     left: Model = None,
     right: Model = None,
-    robot: Annotated[str | None, Option(metavar="MODEL", help="Instead: one model that holds both arms.")] = None,
+    robot: Annotated[
+        str | None, Option(metavar="MODEL", help="One model with both arms, instead of a model each.")
+    ] = None,
     xacro_arg: Annotated[
         list[str] | None, Option(metavar="NAME=VALUE", help="Argument of the xacro models; may be repeated.")
     ] = None,
     left_tip: Tip = None,
     right_tip: Tip = None,
-    distance: Annotated[float | None, Option(min=0, max=5, help="Between the bases of both arms [m].")] = None,
-    height: Annotated[float | None, Option(min=-3, max=5, help="Of the bases above the floor [m].")] = None,
+    distance: Annotated[float | None, Option(min=0, max=5, help="Distance between the bases of both arms [m].")] = None,
+    height: Annotated[float | None, Option(min=-3, max=5, help="Height of the bases above the floor [m].")] = None,
     velocity: Annotated[
         float | None,
-        Option(min=SPEEDS[0], max=SPEEDS[1], help="Of an MJCF's joints, at most: it has no limits of speed [rad/s]."),
+        Option(min=SPEEDS[0], max=SPEEDS[1], help="Speed limit of the joints of an MJCF, which has none [rad/s]."),
     ] = None,
-    samples: Annotated[int, Option(min=100, help="Random postures that pairs of links are looked at in.")] = 2000,
-    yes: Annotated[bool, Option("--yes", help="Ask nothing: take what was found.")] = False,
+    samples: Annotated[
+        int, Option(min=100, help="Number of random postures in which pairs of links are looked at.")
+    ] = 2000,
+    yes: Annotated[bool, Option("--yes", help="Take the proposed answers and ask nothing.")] = False,
     json: Json = False,
 ) -> None:
     """Write the YAML of a cell for models of your own: tips, grippers, mounts, a home, pairs of links, accelerations.

@@ -104,7 +104,7 @@ def _centre(mass: float, moment: Array) -> list[float]:
 
 
 def _tool_of(robot: Robot, arm: str) -> tuple[pin.SE3, pin.Inertia]:
-    """Where the flange is on the last joint, and the inertia in its frame of all links that are no arm's."""
+    """Return the pose of the flange on the last joint, and the inertia in its frame of all links that are no arm's."""
     frames, its = robot.model.frames, robot.arms[arm]
     carried = [
         frame

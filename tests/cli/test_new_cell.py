@@ -180,7 +180,7 @@ def test_an_mjcf_becomes_a_urdf_beside_the_cell_which_runs(tmp_path: Path) -> No
         (("--left", "iiwa7", "--xacro-arg", "fast=1"), "--xacro-arg: allowed with a model that ends in .xacro"),
     ],
 )
-def test_an_argument_of_xacro_that_is_none_is_refused(arguments: tuple[str, ...], says: str) -> None:
+def test_a_malformed_xacro_argument_is_refused(arguments: tuple[str, ...], says: str) -> None:
     assert says in q2r2("new-cell", "cell", *arguments, "--yes").stderr
 
 

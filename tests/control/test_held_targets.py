@@ -69,7 +69,7 @@ def test_a_target_that_was_changed_in_place_is_a_new_one() -> None:
 
 
 @pytest.mark.parametrize("other", [None, "no pose", pose(math.nan)], ids=["None", "a text", "not finite"])
-def test_what_is_no_target_is_passed_on_and_the_next_one_begins_anew(other: object) -> None:
+def test_an_invalid_target_is_passed_on_and_the_next_one_starts_a_new_line(other: object) -> None:
     held = HeldTargets()
     given: Any
     for given in (pose(0.0), pose(0.1), other):
