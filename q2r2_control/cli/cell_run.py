@@ -39,7 +39,6 @@ from q2r2_control.recording.recorder import Recorder, RecordingSummary
 from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.run_summary import RunSummary
 from q2r2_control.summary.tick import Tick
-from q2r2_control.supervision.homing import preflight_faults
 from q2r2_control.teleop.both_arms import EpisodeMarks
 from q2r2_control.viewer.headset_view import DisplayInput, HeadsetView
 from q2r2_control.viewer.live import LiveTable
@@ -179,7 +178,7 @@ def _run_cell(config: Config, options: RunOptions, recorder: Recorder | None, pa
             _open_window(plant)
         with notice_of_compiling():
             pipeline = Pipeline(config, robot, source, plant, options.mode)
-            faults = preflight_faults(robot, config.control.without_contact(), pipeline.controller)
+            faults = pipeline.preflight_faults()
         return _run_pipeline(pipeline, faults, options, recorder, page, console)
     finally:
         plant.close()  # Also if no run began: an open window would crash the process at its end.

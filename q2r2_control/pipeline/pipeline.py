@@ -36,6 +36,7 @@ from q2r2_control.robot.turns import TurnCounter
 from q2r2_control.robot.unchecked import check_watched
 from q2r2_control.summary.run_summary import RunSummary
 from q2r2_control.summary.tick import RunStart, Tick
+from q2r2_control.supervision.homing import preflight_faults
 from q2r2_control.supervision.joint_watch import watch_settings
 from q2r2_control.supervision.supervisor import Phase, Supervisor
 from q2r2_control.supervision.target_stream import StreamSettings
@@ -152,6 +153,13 @@ class Pipeline(RequestedRun):
     @property
     def supervisor(self) -> Supervisor:
         return self.loop.supervisor
+
+    def preflight_faults(self) -> tuple[str, ...]:
+        """Return one line for each reason why a run should not start at home; empty if it may, as ``q2r2 run`` checks.
+
+        The controller is reset to the home posture. See :func:`preflight_faults` of ``supervision``.
+        """
+        return preflight_faults(self.robot, self.config.control.without_contact(), self.controller)
 
     def stop(self) -> None:
         """Bring the arms to rest and end the run, or end the next run if none goes on.

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from ipaddress import ip_address
 from pathlib import Path
 
-from q2r2_control.config.cell import Config
+from q2r2_control.config.cell import Config, load_config
 from q2r2_control.config.control import LIVE
+from q2r2_control.config.resources import find_resource
+from q2r2_control.errors import ConfigError
 from q2r2_control.robot.compose import compose
 
 FIRST_SPEED = 0.1  # Share of the cell's speed that is allowed at first.
@@ -52,3 +55,24 @@ def not_commissioned(config: Config, cell: Path) -> str | None:
     except (OSError, ValueError, TypeError, KeyError) as error:
         return f"{file.name} cannot be read: {error!s:.80}"
     return None if its == fingerprint(config) else f"addresses, mounts, tools or limits were changed since {date}"
+
+
+def load_commissioned(path: str | os.PathLike[str], plant: str | None = None, *, full_speed: bool = False) -> Config:
+    """Read a cell whose real arms may be driven, by the rules of ``q2r2 run``.
+
+    A cell that drives no real cabinets is returned as :func:`load_config` returns it.
+
+    Args:
+        path: The cell's YAML, as of :func:`load_config`.
+        plant: The name of the plant that will move the arms; None for the one that the cell names.
+        full_speed: True to let real arms move as fast as the cell says. Otherwise their joints go at a tenth of it.
+
+    Raises:
+        ConfigError: If the file cannot be used, or if its real cabinets were not commissioned as they are now.
+    """
+    config = load_config(path)
+    if (plant or config.plant) != "fri":
+        return config
+    if why := not_commissioned(config, find_resource(path)):
+        raise ConfigError(f"{path}: {why}; q2r2 commission {path} commissions it")
+    return slowed(config) if has_real_cabinets(config) and not full_speed else config

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pytest
 
-from q2r2_control.config.cell import Config, parse_config
-from q2r2_control.robot.commissioned import fingerprint, not_commissioned, sign_off_file, slowed
+from q2r2_control.config.cell import Config, load_config, parse_config
+from q2r2_control.errors import ConfigError
+from q2r2_control.robot.commissioned import fingerprint, load_commissioned, not_commissioned, sign_off_file, slowed
 
 TEXT = Path("config/dual_iiwa7_fri.yaml").read_text(encoding="utf-8")
 REAL = TEXT.replace("127.0.0.2", "192.170.10.2")
@@ -70,3 +72,30 @@ def test_an_invalid_sign_off_is_reported(tmp_path: Path, text: str) -> None:
     file = tmp_path / "my_cell.yaml"
     sign_off_file(file).write_text(text)
     assert "my_cell.commissioned.json cannot be read" in (not_commissioned(cell(), file) or "")
+
+
+def write_real_cell(folder: Path, *, signed_off: bool) -> Path:
+    file = folder / "my_cell.yaml"
+    file.write_text(REAL)
+    if signed_off:
+        date_and_hash = {"fingerprint": fingerprint(load_config(file)), "date": "2026-01-02"}
+        sign_off_file(file).write_text(json.dumps(date_and_hash))
+    return file
+
+
+def test_a_real_cell_that_was_not_commissioned_is_refused_with_the_command_that_commissions_it(tmp_path: Path) -> None:
+    file = write_real_cell(tmp_path, signed_off=False)
+    why = f"{file}: there is no my_cell.commissioned.json; q2r2 commission {file} commissions it"
+    with pytest.raises(ConfigError, match=f"^{re.escape(why)}$"):
+        load_commissioned(file)
+    assert load_commissioned(file, "mujoco") == load_config(file)  # Nothing real moves.
+
+
+def test_a_commissioned_cell_goes_at_a_tenth_of_its_speed_unless_full_speed_is_asked_for(tmp_path: Path) -> None:
+    file = write_real_cell(tmp_path, signed_off=True)
+    assert load_commissioned(file) == slowed(load_config(file))
+    assert load_commissioned(file, full_speed=True) == load_config(file)
+
+
+def test_a_cell_of_simulated_cabinets_is_loaded_as_it_is() -> None:
+    assert load_commissioned("config/dual_iiwa7_fri.yaml") == load_config("config/dual_iiwa7_fri.yaml")
