@@ -5,9 +5,8 @@ import sys
 import tempfile
 from pathlib import Path
 
-from q2r2_control.config.recording import JudgeSettings
-from q2r2_control.judging.judge import Unreadable, judge_all
-from q2r2_control.recording.reader import recordings_in
+from q2r2_control.judging import JudgeSettings, Unreadable, judge_all
+from q2r2_control.recording import recordings_in
 
 
 def record(folder: str) -> Path:

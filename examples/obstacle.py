@@ -3,8 +3,7 @@
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control import CartesianController, Robot, load_config
-from q2r2_control.config.cell import ObstacleConfig
+from q2r2_control import CartesianController, ObstacleConfig, Robot, load_config
 
 config = load_config("config/dual_iiwa7.yaml")
 empty = Robot.from_config(config)

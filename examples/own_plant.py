@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from q2r2_control import Command, CommandMode, Pipeline, Robot, RobotState, load_config
-from q2r2_control.types import Array
+from q2r2_control import Array, Command, CommandMode, Pipeline, Robot, RobotState, load_config
 
 
 class LaggingPlant:

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from q2r2_control import CartesianController, Robot, load_config
-from q2r2_control.types import Array
+from q2r2_control import Array, CartesianController, Robot, load_config
 
 
 class ElbowTask:

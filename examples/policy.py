@@ -3,8 +3,7 @@
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control import Observation, Pipeline, PolicyInput, load_config
-from q2r2_control.types import Array
+from q2r2_control import Array, Observation, Pipeline, PolicyInput, load_config
 
 
 class Circles:

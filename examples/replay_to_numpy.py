@@ -5,8 +5,8 @@ import sys
 import tempfile
 from pathlib import Path
 
-from q2r2_control.export.episodes import FrameSampling, make_episode
-from q2r2_control.recording.reader import recordings_in
+from q2r2_control.export import FrameSampling, make_episode
+from q2r2_control.recording import recordings_in
 
 
 def record(folder: str) -> Path:

@@ -1,7 +1,9 @@
 """Bimanual VR teleoperation and Cartesian control with a safe QP controller.
 
-The names of this module are the fixed API. Everything else may move between versions. A name is imported when it is
-first used, so that a ROS node that only passes messages on need not wait for the solver and its compiled kernels.
+The names of this package are the fixed API, and so are those of the sub-packages that ``docs/api.md`` lists:
+``inputs``, ``plants``, ``recording``, ``export``, ``judging``, ``demo``, ``viewer``, ``gym`` and ``ros``. Everything
+else may move between versions. A name is imported when it is first used, so that a ROS node that only passes messages
+on need not wait for the solver and its compiled kernels.
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ from q2r2_control._lazy import lazy_exports
 
 if TYPE_CHECKING:  # The word "as" tells type checkers that a name is public.
     from q2r2_control.config.cell import Config as Config
+    from q2r2_control.config.cell import ObstacleConfig as ObstacleConfig
     from q2r2_control.config.cell import load_config as load_config
     from q2r2_control.config.control import ControllerSettings as ControllerSettings
     from q2r2_control.config.moving_obstacle import MovingObstacle as MovingObstacle
@@ -32,16 +35,25 @@ if TYPE_CHECKING:  # The word "as" tells type checkers that a name is public.
     from q2r2_control.errors import Q2R2Error as Q2R2Error
     from q2r2_control.errors import RecordingError as RecordingError
     from q2r2_control.errors import RobotError as RobotError
+    from q2r2_control.events import Event as Event
+    from q2r2_control.events import Reason as Reason
+    from q2r2_control.events import ReasonKind as ReasonKind
     from q2r2_control.export.episodes import EpisodeVectors as EpisodeVectors
     from q2r2_control.export.export_format import ExportFormat as ExportFormat
     from q2r2_control.inputs.base import Input as Input
+    from q2r2_control.inputs.policy import ActionSpace as ActionSpace
     from q2r2_control.inputs.policy import PolicyInput as PolicyInput
+    from q2r2_control.inputs.policy import action_names as action_names
     from q2r2_control.loop.sampled_targets import SampledTargets as SampledTargets
     from q2r2_control.pipeline.pipeline import Pipeline as Pipeline
     from q2r2_control.plants.base import Plant as Plant
+    from q2r2_control.robot.commissioned import load_commissioned as load_commissioned
     from q2r2_control.robot.robot import Robot as Robot
     from q2r2_control.summary.run_summary import RunSummary as RunSummary
+    from q2r2_control.summary.tick import Tick as Tick
     from q2r2_control.teleop.relative import RelativeMotion as RelativeMotion
+    from q2r2_control.types import QUEST_CONTROLS as QUEST_CONTROLS
+    from q2r2_control.types import Array as Array
     from q2r2_control.types import Command as Command
     from q2r2_control.types import CommandMode as CommandMode
     from q2r2_control.types import DeviceControls as DeviceControls
@@ -54,6 +66,8 @@ if TYPE_CHECKING:  # The word "as" tells type checkers that a name is public.
     from q2r2_control.types import StepReport as StepReport
 
 _MODULES = {
+    "ActionSpace": "inputs.policy",
+    "Array": "types",
     "CartesianController": "control.controller",
     "Command": "types",
     "CommandMode": "types",
@@ -65,6 +79,7 @@ _MODULES = {
     "DeviceWords": "device_words",
     "ElbowSwivel": "control.tasks.elbow",
     "EpisodeVectors": "export.episodes",
+    "Event": "events",
     "ExportFormat": "export.export_format",
     "HandInputs": "types",
     "HandSample": "types",
@@ -74,13 +89,17 @@ _MODULES = {
     "LookAt": "control.tasks.named_tasks",
     "MovingObstacle": "config.moving_obstacle",
     "Observation": "types",
+    "ObstacleConfig": "config.cell",
     "Pipeline": "pipeline.pipeline",
     "Plant": "plants.base",
     "PlantError": "errors",
     "PolicyInput": "inputs.policy",
     "Q2R2Error": "errors",
+    "QUEST_CONTROLS": "types",
     "QpProblem": "control.qp",
     "QpSolution": "control.qp",
+    "Reason": "events",
+    "ReasonKind": "events",
     "RecordingError": "errors",
     "Reference": "types",
     "RelativeMotion": "teleop.relative",
@@ -93,12 +112,11 @@ _MODULES = {
     "Solver": "control.qp",
     "StepReport": "types",
     "Task": "control.tasks.external",
+    "Tick": "summary.tick",
     "Upright": "control.tasks.named_tasks",
+    "action_names": "inputs.policy",
+    "load_commissioned": "robot.commissioned",
     "load_config": "config.cell",
 }
 __all__ = list(_MODULES)
-__getattr__ = lazy_exports(__name__, _MODULES)
-
-
-def __dir__() -> list[str]:
-    return sorted([*globals(), *_MODULES])
+__getattr__, __dir__ = lazy_exports(__name__, _MODULES)

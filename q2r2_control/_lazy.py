@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Mapping
 from importlib import import_module
 from typing import Any
 
 
-def lazy_exports(package: str, modules: Mapping[str, str]) -> Callable[[str], Any]:
-    """Return the ``__getattr__`` of a ``package``. ``modules`` maps each name to the package's module that has it."""
+def lazy_exports(package: str, modules: Mapping[str, str]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+    """Return the functions ``__getattr__`` and ``__dir__`` of a ``package``.
+
+    ``modules`` maps each name to the module that has it: "scripted" in the package, ".types" beside the package.
+    """
 
     def getattr_of_package(name: str) -> Any:
         if name not in modules:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        return getattr(import_module(f"{package}.{modules[name]}"), name)
+        return getattr(import_module(f".{modules[name]}", package), name)
 
-    return getattr_of_package
+    def dir_of_package() -> list[str]:
+        return sorted({*vars(sys.modules[package]), *modules})
+
+    return getattr_of_package, dir_of_package

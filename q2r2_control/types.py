@@ -23,6 +23,7 @@ from q2r2_control.events import Reason
 
 POSE_FIELDS = ("x", "y", "z", "qx", "qy", "qz", "qw")
 Array = npt.NDArray[np.float64]
+"""An array of numpy with 64-bit floats, as all vectors, matrices and joint values here are."""
 Flags = npt.NDArray[np.bool_]
 
 SIDES = ("left", "right")
@@ -94,6 +95,7 @@ QUEST_CONTROLS = DeviceControls(
     axes=("thumb_stick_horizontal", "thumb_stick_vertical", "press_index", "press_middle"),
     words=QUEST_WORDS,
 )
+"""The controls of each hand of a Quest: two buttons, both axes of a stick (-1 .. 1), and two triggers (0 .. 1)."""
 
 
 class HandFault(StrEnum):

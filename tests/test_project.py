@@ -13,7 +13,6 @@ import tomllib
 from collections.abc import Iterable, Iterator
 from functools import cache
 from graphlib import TopologicalSorter
-from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -131,15 +130,6 @@ def test_make_and_pip_refuse_the_same_versions_of_python() -> None:
     makefile = (ROOT / "Makefile").read_text()
     assert "not (3, {}) <= v[:2] < (3, {})".format(*bounds) in makefile
     assert f"needs Python 3.{bounds[0]} to 3.{int(bounds[1]) - 1}," in makefile
-
-
-@pytest.mark.parametrize("package", [PACKAGE, f"{PACKAGE}.ros"])
-def test_every_public_name_exists(package: str) -> None:
-    if package.endswith(".ros") and find_spec("rclpy") is None:
-        pytest.skip("rclpy is not installed")
-    found = import_module(package)
-    for name in found.__all__:
-        assert hasattr(found, name), name
 
 
 def test_the_configuration_reference_agrees_with_the_settings() -> None:

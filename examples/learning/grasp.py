@@ -25,18 +25,12 @@ from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.act.modeling_act import ACTPolicy
 from lerobot.policies.factory import make_pre_post_processors
 
-from q2r2_control import Pipeline, Robot, load_config
-from q2r2_control.config.cell import Config
-from q2r2_control.demo.assembly_tasks import TaskWatch, tasks_named
-from q2r2_control.export.dataset_card import SOURCES
-from q2r2_control.inputs.assembly import GRASP
-from q2r2_control.inputs.base import Input
-from q2r2_control.inputs.policy import ActionSpace, PolicyInput
-from q2r2_control.inputs.scripted import ScriptedInput, in_sequence
-from q2r2_control.plants.mujoco import MujocoPlant
-from q2r2_control.recording.about import About
-from q2r2_control.recording.recorder import Recorder
-from q2r2_control.types import Array, Observation
+from q2r2_control import ActionSpace, Array, Config, Input, Observation, Pipeline, PolicyInput, Robot, load_config
+from q2r2_control.demo import TaskWatch, tasks_named
+from q2r2_control.export import SOURCES
+from q2r2_control.inputs import ScriptedInput, trajectory_named
+from q2r2_control.plants import MujocoPlant
+from q2r2_control.recording import About, Recorder
 
 TASK = tasks_named(["grasp"])[0]
 BLOCK, SPREAD = "flat_block", 0.03  # how far from its place along x and y at most [m]
@@ -118,7 +112,7 @@ def record(cell: Config, episodes: int, folder: Path) -> None:
     failed = 0
     for seed in range(episodes):
         place = place_of(seed)
-        trajectory = in_sequence([("grasp", GRASP.moved(*place))])
+        trajectory = trajectory_named(TASK.name, (place[0], place[1]))
         hands = ScriptedInput(trajectory, human=True, seed=seed)
         with Recorder(folder, f"grasp-{seed:03}", waits=True) as recorder:
             failed += bool(attempt(cell, hands, place, recorder, trajectory.duration or 0.0))

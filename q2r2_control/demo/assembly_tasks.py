@@ -94,10 +94,16 @@ _TASK_CONTROLS = {"grip": Action.CARRY, "stick_up": Action.PRECISION}
 
 
 def tasks_named(names: Iterable[str]) -> tuple[AssemblyTask, ...]:
-    """Return the tasks with these names, or every task for ``all``.
+    """Return tasks of ``q2r2 demo``.
 
-    They are in the order of :data:`TASKS`, in which they can follow each other. Raises :class:`ConfigError` for an
-    unknown name.
+    Args:
+        names: The names of tasks, such as ``grasp``, or ``all``.
+
+    Returns:
+        The tasks, each once, in an order in which one can follow the other.
+
+    Raises:
+        ConfigError: If a name is unknown.
     """
     wanted = set(names)
     if unknown := sorted(wanted - {*TASKS, ALL_TASKS}):
@@ -146,9 +152,20 @@ def held_to_promises(results: Iterable[TaskResult], summary: RunSummary) -> tupl
 
 
 class TaskWatch:
-    """A listener of a run that judges tasks. Raises :class:`ConfigError` for a cell without a task's parts."""
+    """A listener of a run that judges tasks by the simulation's own state."""
 
     def __init__(self, tasks: Iterable[AssemblyTask], plant: MujocoPlant, robot: Robot, config: Config) -> None:
+        """Prepare to judge a run.
+
+        Args:
+            tasks: The tasks, as :func:`tasks_named` returns them.
+            plant: The simulation of the run.
+            robot: The robot of the run.
+            config: The cell of the run.
+
+        Raises:
+            ConfigError: If the cell has not all parts of the tasks.
+        """
         tasks = tuple(tasks)
         for task in tasks:
             if missing := [part for part in task.parts if part not in config.mujoco.objects]:

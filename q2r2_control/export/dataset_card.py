@@ -10,8 +10,10 @@ from typing import Any
 from q2r2_control.export.sampling import units_of
 
 CARD = "README.md"
-POSITION = ".pos"  # lerobot expects this end of the names of numbers in the state and the action.
-SOURCES = "meta/recordings.json"  # The recording of each episode. lerobot does not read this file.
+POSITION = ".pos"
+"""The end of the names of numbers in the state and the action of a LeRobotDataset, as lerobot expects it."""
+SOURCES = "meta/recordings.json"
+"""The file in a LeRobotDataset with the recording and the notes of each episode. lerobot does not read it."""
 
 
 def write_card(info: Mapping[str, Any], sources: Sequence[Mapping[str, Any]], folder: Path) -> None:

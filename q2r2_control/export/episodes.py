@@ -35,7 +35,11 @@ _FORMAT = 7  # The version of kept episodes. Episodes of another version are mad
 
 @dataclass(frozen=True)
 class FrameSampling:
-    """Settings for the frames that are made of the ticks, and for the data that is exported with them."""
+    """Settings for the frames that are made of the ticks, and for the data that is exported with them.
+
+    ``fps`` is the number of frames per second, and ``ahead`` the number of frames by which actions come earlier. Raises
+    :class:`ConfigError` unless ``fps`` is 1 to 1000 and ``ahead`` is 0 to ``fps``.
+    """
 
     fps: int = 30
     trim: bool = False  # Only the time in which arms are engaged or moving is exported.
@@ -82,7 +86,19 @@ class EpisodeVectors:
 
 
 def make_episode(file: Path, sampling: FrameSampling, span: EpisodeSpan | None = None) -> EpisodeVectors:
-    """Make an episode of a recording, or the whole recording. Raises :class:`RecordingError`, which names the file."""
+    """Make the vectors and pictures of an episode.
+
+    Args:
+        file: The recording.
+        sampling: The rate of the frames, and what they contain.
+        span: The part of the recording; None for the whole recording.
+
+    Returns:
+        The episode. ``vectors`` has an array (frames, size) for each feature of a dataset.
+
+    Raises:
+        RecordingError: If the recording cannot be read or has nothing to export. The error names the file.
+    """
     recording = open_recording(file)
     span = span or replace(WHOLE, success=recording.conclusion.success)
     frames = sample(recording, sampling.fps, sampling.trim, span)

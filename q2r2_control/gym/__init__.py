@@ -6,10 +6,19 @@ The import of this package registers the environments. The simulation is importe
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
+
+from q2r2_control._lazy import lazy_exports
+
+if TYPE_CHECKING:
+    from q2r2_control.gym.task_env import TaskEnv as TaskEnv
+
+_MODULES = {"TaskEnv": "task_env"}
+__all__ = ["TASKS", "make_env", *_MODULES]
+__getattr__, __dir__ = lazy_exports(__name__, _MODULES)
 
 TASKS = ("carry", "clash", "grasp", "handover", "meet", "peg", "stack", "wipe")
 _MOST_STEPS = 900  # Half a minute at 30 Hz.

@@ -7,3 +7,28 @@ sockets. ``listener`` accepts connections and decides which client drives, and `
 messages of both into samples. ``moved_frame`` and ``samples`` find poses that must not be followed, and queue the
 others. ``headset_check`` tells people which data arrive.
 """
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from q2r2_control._lazy import lazy_exports
+
+if TYPE_CHECKING:
+    from q2r2_control.inputs.base import adapted as adapted
+    from q2r2_control.inputs.base import make_input as make_input
+    from q2r2_control.inputs.scripted import HandTrajectory as HandTrajectory
+    from q2r2_control.inputs.scripted import ScriptedInput as ScriptedInput
+    from q2r2_control.inputs.scripted import trajectory_named as trajectory_named
+    from q2r2_control.inputs.web import WebInput as WebInput
+
+_MODULES = {
+    "HandTrajectory": "scripted",
+    "ScriptedInput": "scripted",
+    "WebInput": "web",
+    "adapted": "base",
+    "make_input": "base",
+    "trajectory_named": "scripted",
+}
+__all__ = list(_MODULES)
+__getattr__, __dir__ = lazy_exports(__name__, _MODULES)

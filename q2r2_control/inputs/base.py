@@ -114,16 +114,31 @@ def is_simulated(source: str) -> bool:
 
 
 def adapted(source: str, config: Config) -> Config:
-    """Return the cell with the settings that the input called ``source`` knows better."""
+    """Return a cell with the settings that an input knows better, such as its bindings, as ``q2r2 run`` does.
+
+    Args:
+        source: The name of an installed input.
+        config: The cell, which is not changed.
+
+    Raises:
+        ConfigError: If the name is unknown.
+    """
     adapt = getattr(load_class(INPUTS, source), "cell", None)
     return config if adapt is None else adapt(config)
 
 
 def make_input(source: Input | str, config: Config, **options: object) -> Input:
-    """Return ``source`` itself, or the input of that name, made with those of the ``options`` that it has.
+    """Return the input of a name, or ``source`` itself if it is an input. Nothing is received before its ``start``.
+
+    Args:
+        source: The name of an installed input, such as ``headset``, or an object with all methods of :class:`Input`.
+        config: The cell that the input moves.
+        options: Keyword arguments of the input's ``from_config``, such as ``trajectory="circle"``. The ones that the
+            input does not have are ignored.
 
     Raises:
-        ConfigError: If the name is unknown, or if ``source`` is neither a name nor an input.
+        ConfigError: If the name is unknown, if ``source`` is neither a name nor an input, or if the input refuses an
+            option.
     """
     if not isinstance(source, str):
         check_kind("input", source, Input, "the name of an input, or an object with all methods of Input")

@@ -45,7 +45,16 @@ class ActionSpace(StrEnum):
 
 
 def action_names(robot: Robot, space: ActionSpace) -> tuple[str, ...]:
-    """Return the names of an action's numbers, without those of grippers."""
+    """Return the names of an action's numbers in their order, as datasets have them.
+
+    Args:
+        robot: The robot that the action moves.
+        space: The space of the action.
+
+    Returns:
+        The joints' names for ``ActionSpace.JOINTS``; otherwise names such as ``left_x``, arm by arm. Openings of
+        grippers, which may follow as ``left_gripper`` and ``right_gripper``, are not among them.
+    """
     if space is ActionSpace.JOINTS:
         return tuple(robot.joint_names)
     fields = POSE_FIELDS if space is ActionSpace.TOOL else MOTION_FIELDS

@@ -34,7 +34,12 @@ Path = Callable[[float, float], tuple[Array, Array]]
 
 @dataclass(frozen=True)
 class HandTrajectory:
-    """The motion of both hands over time."""
+    """The motion of both hands over time.
+
+    ``left`` and ``right`` map a time [s] and a frequency [Hz] to the displacement (3,) [m] and the rotation vector (3,)
+    [rad] of a hand since its start. The axes are x forwards, y to the left, and z up. All times begin with the first
+    poll.
+    """
 
     left: Path
     right: Path | None = None  # None if the right hand mirrors the left one.

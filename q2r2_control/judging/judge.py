@@ -134,6 +134,8 @@ def part_of(episode: Episode, span: EpisodeSpan) -> Episode:
 
 @dataclass(frozen=True)
 class Judged:
+    """An episode with its numbers, the verdict, and the thresholds by which it was judged."""
+
     episode: Episode
     figures: EpisodeFigures
     verdict: Verdict
@@ -178,7 +180,15 @@ def judge_episode(episode: Episode, settings: JudgeSettings | None = None) -> Ju
 
 
 def judge_all(files: Sequence[Path], settings: JudgeSettings | None = None) -> Iterator[Judged | Unreadable]:
-    """Judge recordings, one after the other. A file that cannot be read gives an :class:`Unreadable`."""
+    """Judge recordings, one after the other, as ``q2r2 judge`` does.
+
+    Args:
+        files: The files of recordings, as ``recordings_in`` returns them.
+        settings: The thresholds; None for those of each recording's own cell.
+
+    Yields:
+        The verdict on each episode, in the order of the files. A file that cannot be read gives an :class:`Unreadable`.
+    """
     for file in files:
         try:
             yield from judge(open_recording(file), settings)

@@ -61,7 +61,15 @@ class CellPictures:
     """Takes pictures with the cameras of a model, in one thread only, because OpenGL belongs to a thread."""
 
     def __init__(self, model: mujoco.MjModel, cameras: Mapping[str, CameraConfig]) -> None:
-        """``model`` is changed; raises :class:`PlantError` of one line if OpenGL without a window is missing."""
+        """Prepare pictures of a simulated cell.
+
+        Args:
+            model: The model of a :class:`MujocoPlant`. Settings of its drawing are changed.
+            cameras: At least one of the cell's ``simulated_cameras``, by name.
+
+        Raises:
+            PlantError: If OpenGL without a window is missing.
+        """
         model.vis.quality.shadowsize, model.vis.quality.offsamples = _SHADOW_MAP, _SAMPLES
         model.vis.quality.numslices, model.vis.quality.numstacks = _ROUND
         model.vis.global_.offwidth = max(camera.width for camera in cameras.values())
@@ -80,7 +88,7 @@ class CellPictures:
         self._renderers = {name: renderers[size] for name, size in sizes.items()}
 
     def place(self, qpos: Array) -> None:
-        """Move the cell to ``qpos`` (model.nq,)."""
+        """Move the cell to ``qpos`` (model.nq,), as a plant has it in ``observed_qpos``."""
         self._data.qpos[:] = qpos
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_comPos(self._model, self._data)

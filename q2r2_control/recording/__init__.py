@@ -1,1 +1,22 @@
 """Recordings of runs, or of messages of ROS nodes, as MCAP files: a writer in its own process, readers, and replay."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from q2r2_control._lazy import lazy_exports
+
+if TYPE_CHECKING:
+    from q2r2_control.recording.about import About as About
+    from q2r2_control.recording.reader import recordings_in as recordings_in
+    from q2r2_control.recording.recorder import Recorder as Recorder
+    from q2r2_control.recording.recorder import RecordingSummary as RecordingSummary
+
+_MODULES = {
+    "About": "about",
+    "Recorder": "recorder",
+    "RecordingSummary": "recorder",
+    "recordings_in": "reader",
+}
+__all__ = list(_MODULES)
+__getattr__, __dir__ = lazy_exports(__name__, _MODULES)

@@ -48,9 +48,15 @@ class About:
 
     @classmethod
     def of(cls, pipeline: Pipeline, realtime: bool, notes: Mapping[str, str], cameras: Sequence[str] = ()) -> About:
-        """Describe a run that is about to begin; ``notes`` are added to the notes on program and machine.
+        """Describe a run that is about to begin.
 
         In real time the pipeline chooses its rate here, because a replay reads the rate from the recorded cell.
+
+        Args:
+            pipeline: The pipeline that is about to run.
+            realtime: Whether the run is in real time.
+            notes: Texts by name, such as ``task``, which are added to the notes on program and machine.
+            cameras: The names of the cameras whose pictures are recorded.
         """
         if realtime:
             pipeline.fit_rate()

@@ -166,9 +166,16 @@ class Recording:
 
 
 def recordings_in(paths: Sequence[Path]) -> list[Path]:
-    """Return files of recordings: those given, and all in given folders, by name, each once.
+    """Return files of recordings.
 
-    Raises :class:`RecordingError` for a path that does not exist and for a folder without a recording.
+    Args:
+        paths: Files, and folders in which recordings are looked for at any depth.
+
+    Returns:
+        The given files and those of the folders, each once. The files of one folder are in the order of their names.
+
+    Raises:
+        RecordingError: If a path does not exist, or if a folder has no recording.
     """
     files: dict[Path, Path] = {}
     for path in paths:

@@ -153,6 +153,8 @@ class MessageRecorder(BaseRecorder):
 
 @dataclass(frozen=True, slots=True)
 class RecordingSummary:
+    """The outcome of a recording."""
+
     file: str | None  # None if no file could be made.
     ticks: int  # The number of ticks that were written.
     lost_ticks: int  # The number of ticks that came while there was no room, or after the disk had failed.
@@ -167,7 +169,12 @@ class Recorder(BaseRecorder, AbstractContextManager["Recorder"]):
     """A listener of one run, as a context around it. It raises nothing: a failure is logged once, and the run goes on.
 
     The process starts in the constructor. Make the recorder before any long preparation, and call :meth:`begin` just
-    before the run begins.
+    before the run begins::
+
+        with Recorder(Path("recordings"), "reach", waits=True) as recorder:
+            recorder.begin(About.of(pipeline, False, {"task": "reach for the cup"}), pipeline.robot)
+            pipeline.listeners.append(recorder)
+            pipeline.run(5.0, realtime=False)
     """
 
     keeps_episodes = True  # The operator can mark where an episode begins and ends.
@@ -177,9 +184,13 @@ class Recorder(BaseRecorder, AbstractContextManager["Recorder"]):
     ) -> None:
         """Start the process of the writer.
 
-        If ``waits`` is True, ticks wait for ``room`` [bytes], as they may in simulated time. Otherwise ticks for which
-        there is no room are lost, and counted. With ``pictures`` there is one more process, which takes the pictures of
-        the cameras of :meth:`prepare`.
+        Args:
+            parent: The folder in which the recording gets a folder of its own.
+            name: The end of the names of that folder and of the file. They begin with the time of day.
+            waits: True if ticks wait for room, as they may in simulated time. Otherwise ticks for which there is no
+                room are lost, and counted.
+            room: The size of the data that may wait to be written [bytes].
+            pictures: True if one more process takes the pictures of the cameras of :meth:`prepare`.
         """
         self._waits = waits
         self._count = 0  # The number of ticks.
@@ -202,14 +213,26 @@ class Recorder(BaseRecorder, AbstractContextManager["Recorder"]):
                 self._check_cameras(reason_of(error))
 
     def prepare(self, plant: MujocoPlant, robot: Robot, cameras: Mapping[str, CameraConfig]) -> None:
-        """Prepare pictures of a run of ``plant``, just before :meth:`begin`; this takes at most some seconds."""
+        """Prepare pictures of a run of ``plant``, just before :meth:`begin`; this takes at most some seconds.
+
+        Args:
+            plant: The simulation that moves the arms.
+            robot: The robot of the run.
+            cameras: The cell's ``simulated_cameras``, by name.
+        """
         if self.cameras is not None:
             topics = run_topics(tuple(robot.arms), tuple(robot.joint_names), tuple(cameras))
             self.cameras.prepare(plant, cameras, topics, waits=self._waits)
             self._check_cameras()
 
     def begin(self, about: About, robot: Robot, topic_rate: float | None = TOPIC_RATE) -> None:
-        """Begin the file of a run of ``robot``, with standard topics at ``topic_rate`` [Hz]; None means every tick."""
+        """Begin the file of a run, which may then be called as a listener of the run's pipeline.
+
+        Args:
+            about: The facts that the run states at its beginning.
+            robot: The robot of the run.
+            topic_rate: The rate of the standard topics, which repeat numbers of the tick [Hz]; None for every tick.
+        """
         topics = about.topics()
         if self._open(about, RecordedRobot.of(robot), tuple(topics.values()), topic_rate):
             self._packer, self._epoch = TickPacker(about.arms, about.joints), about.epoch

@@ -13,11 +13,18 @@ from typing import TYPE_CHECKING
 from q2r2_control._lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from q2r2_control.ros.base_node import BaseNode, run_node
-    from q2r2_control.ros.nodes.base_arm_controller import BaseArmController
+    from q2r2_control.config.presets import Preset as Preset
+    from q2r2_control.config.teleop import GuardSettings as GuardSettings
+    from q2r2_control.ros.base_node import BaseNode as BaseNode
+    from q2r2_control.ros.base_node import run_node as run_node
+    from q2r2_control.ros.nodes.base_arm_controller import BaseArmController as BaseArmController
 
-__all__ = ["BaseArmController", "BaseNode", "run_node"]
-
-__getattr__ = lazy_exports(
-    __name__, {"BaseArmController": "nodes.base_arm_controller", "BaseNode": "base_node", "run_node": "base_node"}
-)
+_MODULES = {
+    "BaseArmController": "nodes.base_arm_controller",
+    "BaseNode": "base_node",
+    "GuardSettings": ".config.teleop",
+    "Preset": ".config.presets",
+    "run_node": "base_node",
+}
+__all__ = list(_MODULES)
+__getattr__, __dir__ = lazy_exports(__name__, _MODULES)

@@ -16,21 +16,19 @@ from lerobot.robots import Robot, RobotConfig
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 
 from lerobot_robot_q2r2.hands import HandsDoor
-from q2r2_control.config.cell import Config, load_config
-from q2r2_control.config.resources import find_resource
-from q2r2_control.errors import ConfigError, Q2R2Error
-from q2r2_control.export.dataset_card import POSITION
-from q2r2_control.inputs.policy import ActionSpace, PolicyInput, action_names
-from q2r2_control.pipeline.pipeline import Pipeline
-from q2r2_control.plants.base import make_plant
-from q2r2_control.plants.mujoco import MujocoPlant
-from q2r2_control.plants.mujoco_cameras import CellPictures
-from q2r2_control.recording.about import About
-from q2r2_control.recording.recorder import Recorder
-from q2r2_control.robot.commissioned import has_real_cabinets, not_commissioned, slowed
-from q2r2_control.robot.robot import Robot as CellRobot
-from q2r2_control.summary.tick import Tick
-from q2r2_control.supervision.homing import preflight_faults
+from q2r2_control import (
+    ActionSpace,
+    ConfigError,
+    Pipeline,
+    PolicyInput,
+    Q2R2Error,
+    Tick,
+    action_names,
+    load_commissioned,
+)
+from q2r2_control.export import POSITION
+from q2r2_control.plants import CellPictures, MujocoPlant
+from q2r2_control.recording import About, Recorder
 
 _logger = logging.getLogger(__name__)
 _BEGINS = 60.0  # how long the kernels of a new version take to compile at most, and more [s]
@@ -60,19 +58,18 @@ class Q2R2Cell(Robot):
     def __init__(self, config: Q2R2CellConfig) -> None:
         super().__init__(config)
         self.config = config
-        self._cell = cell = _allowed(config)
-        self._robot = CellRobot.from_config(cell)
-        self._plant = make_plant(config.plant or cell.plant, self._robot, cell)
+        self._cell = cell = load_commissioned(config.cell, config.plant, full_speed=config.full_speed)
+        self.hands = HandsDoor()
+        self._policy = PolicyInput(rate=config.rate, operator=self.hands)
+        self.pipeline = Pipeline.from_config(cell, input=self._policy, plant=config.plant)
+        if faults := self.pipeline.preflight_faults():
+            raise ConfigError(f"{cell.name}: {'; '.join(faults)}")
+        self._robot, self._plant = self.pipeline.robot, self.pipeline.plant
         self.cameras = cell.simulated_cameras if isinstance(self._plant, MujocoPlant) else {}
         joints = action_names(self._robot, ActionSpace.JOINTS)
         self._measured = tuple(arm for arm in self._robot.arms if arm in self._plant.gripper_openings())
         self._seen = (*joints, *(f"{arm}_gripper" for arm in self._measured))
         self._names = (*joints, *(f"{arm}_gripper" for arm in self._robot.arms))  # of an action
-        self.hands = HandsDoor()
-        self._policy = PolicyInput(rate=config.rate, operator=self.hands)
-        self.pipeline = Pipeline(cell, self._robot, self._policy, self._plant)
-        if faults := preflight_faults(self._robot, cell.control.without_contact(), self.pipeline.controller):
-            raise ConfigError(f"{cell.name}: {'; '.join(faults)}")
         self.pipeline.listeners.append(self._see)
         self._tick: Tick | None = None  # the newest one
         self._begun = Event()
@@ -207,13 +204,3 @@ def _features(names: tuple[str, ...]) -> dict[str, Any]:
 
 def _named(names: tuple[str, ...], values: tuple[float, ...]) -> dict[str, Any]:
     return {f"{name}{POSITION}": float(value) for name, value in zip(names, values, strict=True)}
-
-
-def _allowed(config: Q2R2CellConfig) -> Config:
-    """The cell. Raises :class:`ConfigError` for real arms that were not commissioned, as ``q2r2 run`` does."""
-    cell = load_config(config.cell)
-    if (config.plant or cell.plant) != "fri":
-        return cell
-    if why := not_commissioned(cell, find_resource(config.cell)):
-        raise ConfigError(f"{config.cell}: {why}; q2r2 commission {config.cell} commissions it")
-    return slowed(cell) if has_real_cabinets(cell) and not config.full_speed else cell

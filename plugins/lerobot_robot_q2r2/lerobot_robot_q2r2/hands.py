@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from q2r2_control.inputs.base import Input
-from q2r2_control.inputs.web import WebInput
-from q2r2_control.types import QUEST_CONTROLS, DeviceControls, HandSample, HapticFeedback
+from q2r2_control import QUEST_CONTROLS, DeviceControls, HandSample, HapticFeedback, Input
+from q2r2_control.inputs import WebInput
 
 
 class HandsDoor:

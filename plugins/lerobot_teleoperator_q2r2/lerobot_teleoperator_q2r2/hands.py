@@ -14,9 +14,8 @@ from lerobot.teleoperators import Teleoperator, TeleoperatorConfig
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 from lerobot_robot_q2r2 import Q2R2Cell
 
-from q2r2_control.inputs.base import make_input
-from q2r2_control.inputs.web import WebInput, web_cell
-from q2r2_control.viewer.web.view import PageView
+from q2r2_control.inputs import WebInput, adapted, make_input
+from q2r2_control.viewer import PageView
 
 _logger = logging.getLogger(__name__)
 
@@ -71,7 +70,7 @@ class Q2R2Hands(Teleoperator):
             door.operator = hands
             attached.callback(setattr, door, "operator", None)
             if isinstance(hands, WebInput):
-                pipeline.change_teleop(web_cell(pipeline.config).teleop)
+                pipeline.change_teleop(adapted(self.config.input, pipeline.config).teleop)
                 page = attached.enter_context(PageView(self.config.web_host, self.config.web_port))
                 page.begin(pipeline, self.name, recorded=False)
                 for line in page.lines:

@@ -43,7 +43,16 @@ class PageView(Page):
     """
 
     def __init__(self, host: str, port: int, certificate: Path | None = None) -> None:
-        """Start the process, which takes a second; raises :class:`ConfigError` if viser is not installed."""
+        """Start the process, which takes a second.
+
+        Args:
+            host: The address to bind; 0.0.0.0 stands for all addresses of this computer.
+            port: The port; 0 for any free one.
+            certificate: A PEM file with a certificate and its key, with which the page comes over https.
+
+        Raises:
+            ConfigError: If viser is not installed.
+        """
         self._due = 0.0  # Time of the next frame, by the monotonic clock [s].
         self._events: list[Event] = []
         self._binding: dict[ActiveLimit, None] = {}
@@ -59,7 +68,19 @@ class PageView(Page):
         super().__init__(host, port, self._do, certificate)
 
     def begin(self, pipeline: Pipeline, title: str, recorded: bool) -> str:
-        """Serve the page of a run before it begins, and return its URL; raises :class:`ConfigError`."""
+        """Serve the page of a run before it begins.
+
+        Args:
+            pipeline: The pipeline of the run, which gets this object as a listener.
+            title: The title of the page.
+            recorded: Whether the run is recorded, so that the page can mark episodes.
+
+        Returns:
+            The URL of the page. ``lines`` tells people where to find it.
+
+        Raises:
+            ConfigError: If the page cannot be served there.
+        """
         url = self.serve(pipeline, title, recorded=recorded)
         pipeline.listeners.append(self)
         return url
