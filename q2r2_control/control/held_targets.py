@@ -17,6 +17,8 @@ import pinocchio as pin
 
 LONGEST_HOLD = 0.11  # A target that was held for longer was not one of a stream [s].
 _SPARE = 1.25  # A target is reached in this many times the last hold, so that the next one may come late by a quarter.
+_FARTHEST = 1e3  # A target that is farther away is no place that an arm could reach [m].
+_ORTHONORMAL = 5e-4  # The largest error of a rotation matrix R R' of a target; half of that at which it is refused.
 _STEPS = 1.5  # A target that changes after fewer steps than this is new at every step, or nearly so.
 
 
@@ -31,7 +33,7 @@ class _Way:
 
     def begin(self, goal: pin.SE3, dt: float) -> None:
         """Begin a way to a new ``goal``, with steps of ``dt`` [s]. It has no length if the goals are no samples."""
-        if _STEPS * dt < self.held <= LONGEST_HOLD and _is_finite(self.goal) and _is_finite(goal):
+        if _STEPS * dt < self.held <= LONGEST_HOLD and _is_ordinary(self.goal) and _is_ordinary(goal):
             self.start, self.duration = self.now(), _SPARE * self.held
         else:
             self.duration = 0.0
@@ -84,5 +86,9 @@ class HeldTargets:
             self._ways = kept
 
 
-def _is_finite(pose: pin.SE3) -> bool:
-    return bool(np.isfinite(pose.homogeneous).all())
+def _is_ordinary(pose: pin.SE3) -> bool:
+    """Return whether what lies between this pose and another such pose is a pose, too."""
+    rotation = pose.rotation
+    error = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    near = np.abs(pose.translation).max() < _FARTHEST
+    return bool(near and error < _ORTHONORMAL and np.linalg.det(rotation) > 0.0)

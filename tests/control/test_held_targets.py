@@ -68,7 +68,14 @@ def test_a_target_that_was_changed_in_place_is_a_new_one() -> None:
     assert 0.0 < followed(held, mine).translation[0] < 0.1
 
 
-@pytest.mark.parametrize("other", [None, "no pose", pose(math.nan)], ids=["None", "a text", "not finite"])
+SCALED, MIRRORED = (pin.SE3(factor * np.eye(3), np.zeros(3)) for factor in (1.01, -1.0))
+
+
+@pytest.mark.parametrize(
+    "other",
+    [None, "no pose", pose(math.nan), pose(1e200), SCALED, MIRRORED],
+    ids=["None", "a text", "not finite", "far away", "scaled", "mirrored"],
+)
 def test_an_invalid_target_is_passed_on_and_the_next_one_starts_a_new_line(other: object) -> None:
     held = HeldTargets()
     given: Any
