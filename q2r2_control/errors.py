@@ -70,6 +70,10 @@ class PlantError(Q2R2Error):
     """A plant cannot be built or driven. The message says what is wrong and what is allowed."""
 
 
+class CameraError(Q2R2Error):
+    """A camera cannot be opened, or gives no more pictures. The message says which, why, and what is allowed."""
+
+
 class RecordingError(Q2R2Error):
     """A recording cannot be read or replayed. The message names the file, what is wrong, and what is allowed."""
 

@@ -50,6 +50,14 @@ class ReasonKind(StrEnum):
     EPISODE_DISCARDED = "episode_discarded", "episode discarded"
     MARK = "mark", "mark"
     VERDICT = "verdict", "verdict on episode {episode}: {line}"
+    # Cameras of a recording. No arm stops for them.
+    CAMERA_STOPPED = "camera_stopped", "camera {camera}: no picture for {age:.1f} s{why}"
+    CAMERA_SLOW = "camera_slow", "camera {camera}: {rate:.1f} pictures a second instead of {due:g}"
+    CAMERA_OTHER_SIZE = (
+        "camera_other_size",
+        "camera {camera}: pictures of {width}x{height}; allowed: {allowed_width}x{allowed_height}",
+    )
+    CAMERA_BACK = "camera_back", "camera {camera}: pictures again after {gap:.1f} s, {missing} missing"
     # Requests of a program.
     HOME_REQUESTED = "home_requested", "a program asks for the way home"
     ENGAGE_REQUESTED = "engage_requested", "a program presses for both hands"

@@ -30,6 +30,7 @@ IMPORTS = {
     **{"pin": "pinocchio", "example-robot-data-loaders": "example_robot_data", "PyYAML": "yaml", "pin-pink": "pink"},
     "pillow": "PIL",
     "protobuf": "google",
+    "opencv-python-headless": "cv2",
 }
 # These packages come with pin, mujoco, lerobot, pydantic, matplotlib and viser.
 WITH_OTHERS = {"coal", "glfw", "datasets", "pydantic_core", "packaging", "trimesh", "msgspec", "websockets"}
@@ -74,7 +75,7 @@ def imported(files: Iterable[Path]) -> set[str]:
 
 
 def test_every_dependency_is_imported_and_every_import_is_a_dependency() -> None:
-    optional = modules("bench", "xacro", "export", "gym", "lerobot", "modbus", "web")
+    optional = modules("bench", "xacro", "export", "gym", "lerobot", "modbus", "web", "cameras")
     assert modules() <= imported(OTHERS)
     assert imported(OTHERS) - modules() - optional - WITH_OTHERS == set()
     built = {file.parent.name for file in (ROS / "interfaces").glob("*/package.xml")}

@@ -34,6 +34,7 @@ _NEEDS_EXTRA = {
     "gym": "no environments of Gymnasium",
     "xacro": "no models that end in .xacro",
     "modbus": "no Robotiq grippers by Modbus",
+    "cameras": "no cameras with a device",
 }
 
 

@@ -208,7 +208,7 @@ class Config(StrictModel):
     cameras: dict[CameraName, CameraConfig] = Field(
         default_factory=dict,
         max_length=16,
-        description="cameras of the simulated cell, or cameras on ROS topics, by name",
+        description="cameras of the simulated cell, on ROS topics, or devices of this computer, by name",
     )
     recording: RecordingSettings = RecordingSettings()
     judge: JudgeSettings = JudgeSettings()
@@ -222,8 +222,13 @@ class Config(StrictModel):
 
     @property
     def simulated_cameras(self) -> dict[str, CameraConfig]:
-        """The cameras of the simulated cell, by name. The others are on ROS topics."""
-        return {name: camera for name, camera in self.cameras.items() if camera.topic is None}
+        """The cameras of the simulated cell, by name. The others are on ROS topics or devices."""
+        return {name: camera for name, camera in self.cameras.items() if camera.is_simulated}
+
+    @property
+    def device_cameras(self) -> dict[str, CameraConfig]:
+        """The real cameras that this computer opens itself, by name."""
+        return {name: camera for name, camera in self.cameras.items() if camera.device is not None}
 
     @property
     def nominal_rate_hz(self) -> float:

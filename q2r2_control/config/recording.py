@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field, StringConstraints, model_validator
 
-from q2r2_control.config.arms import Metres3, Radians3, Share
+from q2r2_control.config.arms import LocalPath, Metres3, Radians3, Share
 from q2r2_control.config.strict import StrictModel
 
 Seconds = Annotated[float, Field(ge=0, le=10)]
@@ -118,11 +118,15 @@ class RecordingSettings(StrictModel):
 
 # The name of a camera is a part of the names of its topic and of its feature in a dataset.
 CameraName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z][A-Za-z0-9_]*$", max_length=40)]
+DeviceNumber = Annotated[int, Field(ge=0, le=255)]
+DeviceText = Annotated[LocalPath, Field(min_length=1, max_length=500)]
 _LEAST_DISTANCE = 1e-6  # [m]
+_PLACE = ("position", "look_at", "rpy")
+_OF_A_DEVICE = ("exposure", "rotation", "delay", "repeat")
 
 
 class CameraConfig(StrictModel):
-    """A camera of the simulated cell, or one whose pictures come on a ROS topic.
+    """A camera of the simulated cell, one whose pictures come on a ROS topic, or a device that this computer opens.
 
     The simulated camera is fixed in the world or on a link. In its own frame, x is the direction of view, and z points
     up in the picture.
@@ -134,12 +138,14 @@ class CameraConfig(StrictModel):
         max_length=200,
         description="ROS topic of a real camera: CompressedImage if it ends with /compressed, else Image",
     )
+    device: DeviceNumber | DeviceText | None = Field(
+        None,
+        description="real camera without ROS: V4L2 number or path, rtsp:// or http:// address, or a video file",
+    )
     link: str | None = Field(
         None, description="link that carries the camera, such as left_hand_e_base; null: the world"
     )
-    position: Metres3 | None = Field(
-        None, description="position in the link's frame [m]; not for a camera with a topic"
-    )
+    position: Metres3 | None = Field(None, description="position of a simulated camera in the link's frame [m]")
     look_at: Metres3 | None = Field(None, description="point in the middle of the picture, in the link's frame [m]")
     rpy: Radians3 | None = Field(
         None, description="rotation of the camera in the link's frame, instead of look_at [rad]"
@@ -148,22 +154,65 @@ class CameraConfig(StrictModel):
         0.9, ge=0.05, le=2.8, description="angle from the lower to the upper edge of the picture [rad]"
     )
     # Width and height are even, because video formats need even numbers.
-    width: int = Field(640, ge=16, le=3840, multiple_of=2, description="width of the pictures [pixels]")
-    height: int = Field(480, ge=16, le=2160, multiple_of=2, description="height of the pictures [pixels]")
+    width: int = Field(
+        640, ge=16, le=3840, multiple_of=2, description="width of the pictures, after their rotation [pixels]"
+    )
+    height: int = Field(
+        480, ge=16, le=2160, multiple_of=2, description="height of the pictures, after their rotation [pixels]"
+    )
     rate: float = Field(30.0, gt=0, le=240, description="rate of the pictures [pictures/s]")
+    exposure: float | None = Field(
+        None, gt=0, le=1, description="time of exposure of a V4L2 device [s]; null: automatic"
+    )
+    rotation: Literal[0, 90, 180, 270] = Field(0, description="clockwise rotation of the pictures of a device [deg]")
+    delay: float = Field(
+        0.0,
+        ge=0,
+        le=2,
+        description="time from capture to receipt of a picture, for a device without stamps of its own [s]",
+    )
+    repeat: bool = Field(True, description="a video file begins again at its end; false: the camera stops there")
 
     @model_validator(mode="after")
-    def _looks_one_way(self) -> CameraConfig:
+    def _has_one_source(self) -> CameraConfig:
+        if self.topic is not None and self.device is not None:
+            raise ValueError("allowed: either topic or device")
+        if self.device is None:
+            self._refuse(_OF_A_DEVICE, "with device, which is of a real camera")
         if self.topic is not None:
-            if given := [name for name in ("link", "position", "look_at", "rpy") if getattr(self, name) is not None]:
-                raise ValueError(f"{', '.join(given)}: allowed: without topic, which is of a real camera")
-            return self
+            self._refuse(("link", *_PLACE), "without topic, which is of a real camera")
+        elif self.device is not None:
+            self._refuse(_PLACE, "without device, which is of a real camera")
+            if self.exposure is not None and self.device_kind != "v4l2":
+                raise ValueError("exposure: allowed: of a V4L2 device")
+        else:
+            self._check_place()
+        return self
+
+    def _refuse(self, names: tuple[str, ...], allowed: str) -> None:
+        default = {name: field.default for name, field in type(self).model_fields.items()}
+        if given := [name for name in names if getattr(self, name) != default[name]]:
+            raise ValueError(f"{', '.join(given)}: allowed: {allowed}")
+
+    def _check_place(self) -> None:
         if self.position is None:
-            raise ValueError("allowed: position, or topic of a real camera")
+            raise ValueError("allowed: position, or topic or device of a real camera")
         if (self.look_at is None) == (self.rpy is None):
             raise ValueError("allowed: either look_at or rpy")
         if self.look_at is not None:
             squares = sum((to - at) ** 2 for to, at in zip(self.look_at, self.position, strict=True))
             if squares < _LEAST_DISTANCE**2:
                 raise ValueError("look_at is where the camera is: allowed: another point")
-        return self
+
+    @property
+    def is_simulated(self) -> bool:
+        return self.topic is None and self.device is None
+
+    @property
+    def device_kind(self) -> Literal["v4l2", "address", "file"] | None:
+        """The kind of the device; None if the camera is no device."""
+        if self.device is None:
+            return None
+        if isinstance(self.device, int) or self.device.isdigit() or self.device.startswith("/dev/"):
+            return "v4l2"
+        return "address" if "://" in self.device else "file"

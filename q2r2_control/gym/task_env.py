@@ -77,7 +77,7 @@ class TaskEnv(gymnasium.Env):
         lacks a part of the task.
         """
         config = cell if isinstance(cell, Config) else load_config(cell)
-        if not config.cameras:
+        if not config.simulated_cameras:
             config = config.model_copy(update={"cameras": {"front": _FRONT}})
         if loop_rate is not None:
             config = _with_loop_rate(config, loop_rate)
@@ -130,7 +130,7 @@ class TaskEnv(gymnasium.Env):
 
     def render(self) -> npt.NDArray[np.uint8] | None:
         """Return the picture (height, width, 3) of the first camera; None without ``render_mode``."""
-        return None if self.render_mode is None else self._take([next(iter(self._config.cameras))])[0]
+        return None if self.render_mode is None else self._take([next(iter(self._config.simulated_cameras))])[0]
 
     def close(self) -> None:
         self._pipeline.end()
@@ -165,12 +165,12 @@ class TaskEnv(gymnasium.Env):
         }
         made: Observed = {name: values.astype(np.float32) for name, values in seen.items()}
         if self._pictures:
-            cameras = list(self._config.cameras)
+            cameras = list(self._config.simulated_cameras)
             made |= zip(map(video_key, cameras), self._take(cameras), strict=True)
         return made
 
     def _take(self, cameras: list[str]) -> list[npt.NDArray[np.uint8]]:
-        self._camera = self._camera or CellPictures(self._plant.model, self._config.cameras)
+        self._camera = self._camera or CellPictures(self._plant.model, self._config.simulated_cameras)
         self._camera.place(self._plant.observed_qpos)
         return [self._camera.take(camera) for camera in cameras]
 
@@ -196,7 +196,7 @@ class TaskEnv(gymnasium.Env):
         sizes = {"state": joints + grippers, "velocity": joints, "effort": joints, "tool": 7 * len(self._robot.arms)}
         spaces: dict[str, Box] = {f"observation.{name}": Box(-np.inf, np.inf, (size,)) for name, size in sizes.items()}
         if self._pictures:
-            shapes = {name: (camera.height, camera.width, 3) for name, camera in self._config.cameras.items()}
+            shapes = {name: (camera.height, camera.width, 3) for name, camera in self._config.simulated_cameras.items()}
             spaces |= {video_key(name): Box(0, 255, shape, np.uint8) for name, shape in shapes.items()}
         return Dict(spaces)
 

@@ -1,0 +1,106 @@
+"""The process that reads one camera. It waits for the camera alone, so a slow camera keeps nobody else waiting."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from typing import Any, NamedTuple
+
+from q2r2_control.cameras.device import CameraDevice, Pixels
+from q2r2_control.cameras.opening import open_device
+from q2r2_control.config.recording import CameraConfig
+from q2r2_control.errors import CameraError
+
+_NICENESS = 5  # The loop has priority. A picture that is received late would get a late time.
+_QUALITY = 90  # The quality of JPEG.
+_RETRY = 0.5  # Time between two attempts to open a camera that was lost [s].
+_EARLY = 0.4  # Share of a period by which a picture may come too early for its camera's rate.
+
+
+class CameraShot(NamedTuple):
+    """A picture of a camera."""
+
+    time: float  # Time of its capture, by the monotonic clock [s].
+    width: int  # [pixels]
+    height: int  # [pixels]
+    jpeg: bytes
+
+
+class CameraLost(NamedTuple):
+    """The camera gives no more pictures. Those that follow come from the camera opened anew."""
+
+    why: str
+
+
+class Thinning:
+    """Leaves out pictures of a camera that is faster than ``rate`` [Hz], evenly."""
+
+    def __init__(self, rate: float) -> None:
+        self._period = 1.0 / rate
+        self._due: float | None = None  # Time of the next picture [s].
+
+    def keeps(self, time: float) -> bool:
+        """Return whether the picture that was captured at ``time`` [s] is kept."""
+        due = time if self._due is None else self._due
+        if time < due - _EARLY * self._period:
+            return False
+        self._due = max(due, time - _EARLY * self._period) + self._period
+        return True
+
+
+def main(requests: Iterator[Any], answer: Callable[[CameraShot | CameraLost], None]) -> None:
+    """Answer each picture of the camera that is the first request, until the requests end.
+
+    Raises:
+        CameraError: If the camera cannot be opened at first. Later it is opened anew again and again.
+    """
+    camera = next(requests, None)
+    if not isinstance(camera, CameraConfig):
+        return
+    with suppress(OSError):
+        os.nice(_NICENESS)
+    threading.Thread(target=_end_with, args=(requests,), daemon=True).start()
+    device = open_device(camera)
+    while True:
+        try:
+            _pass_on(device, camera, answer)
+        except CameraError as error:
+            answer(CameraLost(str(error)))
+        device.close()
+        if camera.device_kind == "file":
+            threading.Event().wait()  # A video that has ended does not begin again.
+        device = _opened_anew(camera)
+
+
+def _end_with(requests: Iterator[Any]) -> None:
+    """End this process with the run, even while it waits for a camera."""
+    for _ in requests:
+        pass
+    os._exit(0)
+
+
+def _pass_on(device: CameraDevice, camera: CameraConfig, answer: Callable[[CameraShot], None]) -> None:
+    thinning = Thinning(camera.rate)
+    while True:
+        captured = device.read()
+        if thinning.keeps(captured.time):
+            height, width, _ = captured.pixels.shape
+            answer(CameraShot(captured.time, width, height, jpeg_of_bgr(captured.pixels)))
+
+
+def _opened_anew(camera: CameraConfig) -> CameraDevice:
+    while True:
+        time.sleep(_RETRY)
+        with suppress(CameraError):
+            return open_device(camera)
+
+
+def jpeg_of_bgr(pixels: Pixels) -> bytes:
+    """Return a picture (height, width, 3) b g r as JPEG."""
+    import cv2
+
+    _, packed = cv2.imencode(".jpg", pixels, (cv2.IMWRITE_JPEG_QUALITY, _QUALITY))
+    return bytes(packed.tobytes())

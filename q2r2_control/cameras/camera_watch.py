@@ -1,0 +1,113 @@
+"""Notices when a camera stops, slows down, changes the size of its pictures, or comes back; knows no clock."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any
+
+from q2r2_control.config.recording import CameraConfig
+from q2r2_control.events import Reason, ReasonKind
+
+_STOPPED_PERIODS, _STOPPED_AFTER = 5.0, 1.0  # A camera has stopped after both of these times, in periods and [s].
+_WINDOW = 2.0  # Time over which the rate of a camera is measured [s].
+_NEARLY, _FORGETS = 0.3, 0.9  # A share of a period; what remains of a delay after each picture.
+_SLOW, _FAST_ENOUGH = 0.8, 0.9  # Shares of the rate below which a camera is slow, and from which it no longer is.
+
+
+class MissingPictures:
+    """Counts the pictures of a camera that are missing, by the times of those that came.
+
+    Pictures of a real camera come unevenly, and not at exactly its rate. One counts as missing if the time that all
+    pictures together are late by is nearly a period, while small delays are forgotten within some ten pictures.
+    """
+
+    def __init__(self, begin: float, rate: float) -> None:
+        """Count from ``begin`` [s] on, for a camera of ``rate`` [Hz]."""
+        self.count = 0
+        self._rate, self._newest = rate, begin
+        self._late: float | None = None  # How late the newest picture is, in periods; None before the first one.
+
+    def add(self, time: float) -> int:
+        """Take the time of the next picture [s]; returns how many are missing just before it."""
+        periods, self._newest = (time - self._newest) * self._rate, time
+        # The first picture may come at any time within a period.
+        late = periods if self._late is None else max(_FORGETS * self._late, -1.0) + periods - 1.0
+        missing = max(int(late + (0.0 if self._late is None else _NEARLY)), 0)
+        self._late = 0.0 if self._late is None else late - missing
+        self.count += missing
+        return missing
+
+    def finish(self, end: float) -> None:
+        """Count the pictures that are missing after the newest one, up to ``end`` [s]."""
+        self.count += max(int((end - self._newest) * self._rate), 0)
+
+
+class CameraWatch:
+    """Watches one camera from the beginning of a run. Each fault is told once, until it is over."""
+
+    def __init__(self, name: str, camera: CameraConfig, begin: float) -> None:
+        """``begin`` is the time of the run's first tick, by the clock of the pictures [s]."""
+        self._name, self._camera = name, camera
+        self._received = begin  # Receipt of the newest picture, or the first tick [s].
+        self._missing = MissingPictures(begin, camera.rate)
+        self._times: deque[float] = deque()  # Times of the pictures in the window [s].
+        self._told: set[ReasonKind] = set()
+
+    @property
+    def stopped(self) -> bool:
+        """True if it was told that the camera has stopped, and no picture has come since."""
+        return ReasonKind.CAMERA_STOPPED in self._told
+
+    @property
+    def missing(self) -> int:
+        """Number of pictures that were due and did not come."""
+        return self._missing.count
+
+    def add(self, time: float, received: float, width: int, height: int) -> list[Reason]:
+        """Take a picture that was captured at ``time`` and ``received`` later [s]; returns what is to be told."""
+        missing = self._missing.add(time)
+        silence, self._received = received - self._received, received
+        found = []
+        if self.stopped:
+            self._told.discard(ReasonKind.CAMERA_STOPPED)
+            self._times.clear()
+            found.append(self._reason(ReasonKind.CAMERA_BACK, gap=silence, missing=missing))
+        wanted = self._camera.width, self._camera.height
+        detail = {"width": width, "height": height, "allowed_width": wanted[0], "allowed_height": wanted[1]}
+        found += self._tell(ReasonKind.CAMERA_OTHER_SIZE, (width, height) != wanted, **detail)
+        return found + self._rate_at(time)
+
+    def look(self, now: float, why: str | None = None) -> list[Reason]:
+        """Return what is to be told if no picture was received for a while up to ``now`` [s].
+
+        ``why`` is the camera's own reason, if it gives one.
+        """
+        age = now - self._received
+        if self.stopped or age < _STOPPED_AFTER or age * self._camera.rate < _STOPPED_PERIODS:
+            return []
+        return self._tell(ReasonKind.CAMERA_STOPPED, True, age=age, why=f": {why}" if why else "")
+
+    def finish(self, end: float) -> None:
+        """Count the pictures that are missing up to the last tick of the run, at ``end`` [s]."""
+        self._missing.finish(end)
+
+    def _rate_at(self, time: float) -> list[Reason]:
+        self._times.append(time)
+        span = time - self._times[0]
+        if span < _WINDOW:
+            return []
+        rate = (len(self._times) - 1) / span
+        self._times.popleft()
+        share = rate / self._camera.rate
+        if _SLOW <= share < _FAST_ENOUGH:  # Neither begins nor ends to be slow.
+            return []
+        return self._tell(ReasonKind.CAMERA_SLOW, share < _SLOW, rate=rate, due=self._camera.rate)
+
+    def _tell(self, kind: ReasonKind, is_so: bool, **detail: Any) -> list[Reason]:
+        """Return the reason if it ``is_so`` for the first time since it last was not."""
+        was_told = kind in self._told
+        (self._told.add if is_so else self._told.discard)(kind)
+        return [self._reason(kind, **detail)] if is_so and not was_told else []
+
+    def _reason(self, kind: ReasonKind, **detail: Any) -> Reason:
+        return Reason.of(kind, camera=self._name, **detail)

@@ -1,0 +1,22 @@
+"""Opens the camera of a cell by its kind."""
+
+from __future__ import annotations
+
+from q2r2_control.cameras.device import CameraDevice, check_installed
+from q2r2_control.config.recording import CameraConfig
+
+
+def open_device(camera: CameraConfig) -> CameraDevice:
+    """Open a camera, whose pictures have the size that the cell says once they are turned by ``camera.rotation``.
+
+    Raises:
+        CameraError: If it cannot be opened as the cell asks. The message says why, without the camera's name.
+    """
+    check_installed(camera)
+    if camera.device_kind == "file":
+        from q2r2_control.cameras.video_file import VideoFile  # OpenCV is imported in the process of a camera only.
+
+        return VideoFile(camera)
+    from q2r2_control.cameras.opencv_device import OpenCvDevice
+
+    return OpenCvDevice(camera)

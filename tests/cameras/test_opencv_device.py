@@ -1,0 +1,108 @@
+"""A live camera: when its pictures were captured, and a stream of the network."""
+
+from __future__ import annotations
+
+import io
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+import pytest
+from PIL import Image
+
+from q2r2_control.cameras.opening import open_device
+from q2r2_control.cameras.v4l2 import fault_of
+from q2r2_control.config.recording import CameraConfig
+from q2r2_control.errors import CameraError
+from tests.cameras.videos import HEIGHT, WIDTH, number_in, numbered
+
+pytest.importorskip("cv2")
+
+
+@pytest.mark.parametrize(
+    ("stamp_ms", "captured"),
+    [
+        pytest.param(99_960.0, 99.96, id="a stamp of the monotonic clock counts"),
+        pytest.param(100_000.0, 100.0, id="so does one of right now"),
+        pytest.param(0.0, 99.9, id="without a stamp it is the receipt less the delay"),
+        pytest.param(2_500.0, 99.9, id="a stamp since the stream began does not count"),
+        pytest.param(100_500.0, 99.9, id="a stamp of the future does not count"),
+    ],
+)
+def test_a_picture_was_captured_when_its_driver_says_if_that_can_be(stamp_ms: float, captured: float) -> None:
+    from q2r2_control.cameras.opencv_device import capture_time
+
+    assert capture_time(100.0, stamp_ms, 0.1) == pytest.approx(captured)
+
+
+class Stream(BaseHTTPRequestHandler):
+    """A network camera whose pictures show numbers, in Motion JPEG by HTTP."""
+
+    sent: dict[int, float]  # By number, the time just before it was sent [s].
+    paths: list[str]  # Of the requests.
+
+    def do_GET(self) -> None:
+        self.paths.append(self.path)
+        self.send_response(200)
+        self.send_header("Content-Type", "multipart/x-mixed-replace;boundary=picture")
+        self.end_headers()
+        with suppress(OSError):  # The client has enough.
+            for number in range(200):
+                packed = io.BytesIO()
+                Image.fromarray(numbered(number)).save(packed, "JPEG", quality=90)
+                jpeg = packed.getvalue()
+                self.sent[number] = time.monotonic()
+                head = f"--picture\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n"
+                self.wfile.write(head.encode() + jpeg + b"\r\n")
+                time.sleep(0.02)
+
+    def log_message(self, *_: object) -> None:
+        """Print nothing."""
+
+
+@pytest.fixture
+def address() -> Iterator[str]:
+    Stream.sent, Stream.paths = {}, []
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Stream)
+    server.daemon_threads = True
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    yield f"http://127.0.0.1:{server.server_port}/stream.mjpg"
+    server.shutdown()
+    server.server_close()
+
+
+def test_pictures_of_the_network_were_captured_a_delay_before_their_receipt(address: str) -> None:
+    delay = 1.5
+    device = open_device(CameraConfig(device=address, width=WIDTH, height=HEIGHT, delay=delay))
+    shots = [device.read() for _ in range(5)]
+    received = time.monotonic()
+    device.close()
+    numbers = [number_in(shot.pixels) for shot in shots]
+    assert numbers == sorted(set(numbers))
+    for number, shot in zip(numbers, shots, strict=True):
+        assert Stream.sent[number] - delay <= shot.time <= received - delay
+
+
+def test_a_network_camera_of_another_size_is_refused(address: str) -> None:
+    with pytest.raises(CameraError, match=f"allowed: width: {WIDTH}, height: {HEIGHT}"):
+        open_device(CameraConfig(device=address, width=WIDTH, height=2 * HEIGHT))
+
+
+def test_a_variable_of_the_environment_completes_an_address(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CAMERA_STREAM", "stream.mjpg")
+    secret = address.replace("stream.mjpg", "$CAMERA_STREAM")
+    open_device(CameraConfig(device=secret, width=WIDTH, height=HEIGHT)).close()
+    assert Stream.paths == ["/stream.mjpg"]
+
+
+def test_no_message_has_the_password_of_an_address() -> None:
+    with pytest.raises(CameraError, match=r"http://127\.0\.0\.1:9/stream: no stream of pictures") as error:
+        open_device(CameraConfig(device="http://me:secret@127.0.0.1:9/stream"))
+    assert "secret" not in str(error.value)
+
+
+def test_a_device_that_is_none_is_named_with_the_reason() -> None:
+    assert str(fault_of("/dev/video250")).startswith("no such device; allowed: ")
+    assert fault_of("/dev/null") == "no camera: it is no V4L2 device"
