@@ -9,6 +9,7 @@ from itertools import combinations
 import numpy as np
 from scipy.optimize import nnls
 
+from q2r2_control.cameras.camera_watch import MissingPictures
 from q2r2_control.judging.episode import Episode
 from q2r2_control.judging.pictures import Pictures
 from q2r2_control.robot.robot import Robot
@@ -46,6 +47,7 @@ class CameraFigures:
 
     arm: str | None  # The arm that carries the camera; None if none does.
     pictures: int
+    missing_pictures: int  # The number of pictures that were due and are missing.
     rate_share: float | None  # The number of pictures divided by the number that was due.
     longest_gap_periods: float | None  # The longest time without a picture, in the camera's periods.
     frozen_share: float | None  # The share of equal pictures among those between which the arms moved.
@@ -73,7 +75,7 @@ class _CameraLook:
         self._start, self._end = float(t[0]), float(t[-1])
         self._rate = min(camera.rate, episode.config.nominal_rate_hz)  # At most one picture in a tick.
         self._pictures = pictures.between(self._start, self._end, 0.0)
-        self.fixed = camera.topic is None and camera.link is None
+        self.fixed = camera.is_simulated and camera.link is None  # Of a real camera this is not known.
         self.arm = None if camera.link is None else arm_of_link(episode.robot, camera.link)
         measured = np.isfinite(episode.frames.q).all(axis=1)
         self._t, self._q = episode.frame_t[measured], episode.frames.q[measured]
@@ -90,6 +92,7 @@ class _CameraLook:
         return CameraFigures(
             arm=self.arm,
             pictures=len(found.t),
+            missing_pictures=self._missing(),
             rate_share=len(found.t) / due if due > 2.0 else None,
             longest_gap_periods=float(gaps.max() * self._rate) if due > 2.0 else None,
             frozen_share=self._frozen_share(),
@@ -98,6 +101,13 @@ class _CameraLook:
             lag_ms=None if lag is None else 1e3 * lag,
             swapped_with=swapped_with,
         )
+
+    def _missing(self) -> int:
+        missing = MissingPictures(self._start, self._rate)
+        for t in self._pictures.t:
+            missing.add(float(t))
+        missing.finish(self._end)
+        return missing.count
 
     def _frozen_share(self) -> float | None:
         """Return the share of equal pictures while the camera's own arm moves, or any arm if no arm carries it."""

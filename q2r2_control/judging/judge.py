@@ -15,6 +15,7 @@ import numpy as np
 
 from q2r2_control.config.recording import JudgeSettings
 from q2r2_control.errors import Q2R2Error, RecordingError
+from q2r2_control.judging.camera_figures import CameraFigures
 from q2r2_control.judging.contradictions import contradictions
 from q2r2_control.judging.episode import Episode, Hand, read_episode
 from q2r2_control.judging.figures import EpisodeFigures, figures_of
@@ -57,7 +58,7 @@ def verdict_of(figures: EpisodeFigures, settings: JudgeSettings) -> Verdict:
         "hand": {f"{name} hand: ": hand for name, hand in figures.hands.items()},
         "arm": {f"{name} arm: ": arm for name, arm in figures.arms.items()},
         "measured": {f"{name} arm: ": arm for name, arm in figures.measured.items()},
-        "camera": {f"camera {name}: ": camera for name, camera in figures.cameras.items()},
+        "camera": {_whose(name, camera): camera for name, camera in figures.cameras.items()},
         "episode": {"": figures},
         "timing": {"": figures.timing},
     }
@@ -72,6 +73,11 @@ def verdict_of(figures: EpisodeFigures, settings: JudgeSettings) -> Verdict:
         what = f"fault: {first.arm} arm at {first.t:.2f} s: {first.reason}{also} (at most {settings.max_faults})"
         reasons.append(Rejection("max_faults", what))
     return Verdict((*reasons, *contradictions(figures, settings)))
+
+
+def _whose(name: str, camera: CameraFigures) -> str:
+    missing = f", {camera.missing_pictures} of its pictures missing" if camera.missing_pictures else ""
+    return f"camera {name}{missing}: "
 
 
 def _unreadable(figures: EpisodeFigures, settings: JudgeSettings) -> Iterator[Rejection]:

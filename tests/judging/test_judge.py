@@ -198,7 +198,7 @@ def in_degrees(contents: Contents) -> None:
 
 
 FIGURES = replace(figures_of(episode(), 0.06), idle_share=0.0)
-CAMERA = CameraFigures(None, 60, 1.0, 1.0, 0.0, 0.0, 0, 0.0, None)
+CAMERA = CameraFigures(None, 60, 0, 1.0, 1.0, 0.0, 0.0, 0, 0.0, None)
 JUMP = Fault(1.0, "left", "hand_jumped", "a jump")
 
 
@@ -266,6 +266,12 @@ CASES: list[tuple[str, float, str, str, Any, Any, str]] = [
     ),
     ("max_faults", 1, "episode", "faults", [JUMP], 2 * [JUMP], "left arm at 1.00 s: a jump, and 1 more (at most 1)"),
 ]
+
+
+def test_a_reason_that_concerns_a_camera_says_how_many_of_its_pictures_are_missing() -> None:
+    figures = changed("camera", missing_pictures=12, longest_gap_periods=13.0)
+    says = "discard: camera above, 12 of its pictures missing: no picture for 13.0 of its periods (at most 2.5)"
+    assert verdict_of(figures, JudgeSettings()).line == says
 
 
 @pytest.mark.parametrize(
