@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -10,6 +10,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from q2r2_control.cameras.camera_streams import CameraStreams
 from q2r2_control.cli.output import (
     SCRIPTS_WAIT_S,
     as_json_text,
@@ -23,6 +24,7 @@ from q2r2_control.cli.output import (
 from q2r2_control.cli.summary_figures import summary_table, verdict_line
 from q2r2_control.config.cell import Config
 from q2r2_control.config.external import ControllerKind
+from q2r2_control.config.recording import CameraConfig
 from q2r2_control.demo.assembly_tasks import AssemblyTask, TaskResult, TaskWatch, held_to_promises, note_on_parts
 from q2r2_control.errors import ConfigError, PlantError, RecordingError
 from q2r2_control.inputs.base import is_simulated, make_input
@@ -31,18 +33,19 @@ from q2r2_control.judging.judge import Judged, judge, keep_verdicts
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.base import Plant, WaitingPlant, WindowedPlant, make_plant
 from q2r2_control.plants.mujoco import MujocoPlant
-from q2r2_control.plugins import PLANTS, load_class
+from q2r2_control.plugins import INPUTS, PLANTS, load_class
 from q2r2_control.process.scheduling import check_folder, real_time
 from q2r2_control.recording.about import About, anonymous
+from q2r2_control.recording.device_pictures import DevicePictures
 from q2r2_control.recording.reader import Recording
-from q2r2_control.recording.recorder import Recorder, RecordingSummary
+from q2r2_control.recording.recorder import ROOM, ROOM_WITH_PICTURES, Recorder, RecordingSummary
 from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.run_summary import RunSummary
 from q2r2_control.summary.tick import Tick
 from q2r2_control.teleop.both_arms import EpisodeMarks
 from q2r2_control.viewer.headset_view import DisplayInput, HeadsetView
 from q2r2_control.viewer.live import LiveTable
-from q2r2_control.viewer.live_pictures import LivePictures
+from q2r2_control.viewer.live_pictures import LivePictures, ShownPictures
 from q2r2_control.viewer.shown_robot import ShownRobot
 from q2r2_control.viewer.state_colours import obstacle_colour
 from q2r2_control.viewer.tables import print_table
@@ -145,28 +148,40 @@ def run_cell(config: Config, options: RunOptions) -> CellRun:
     if options.window:
         check_window(options.plant)
     # The processes start before the pipeline is built, because building it takes longer than their start.
-    if options.page is None:
-        return _run_recorded(config, options, None)
-    with PageView(*options.page) as page:
-        return _run_recorded(config, options, page)
+    with CameraStreams(_watched_devices(config, options)) as streams:
+        if options.page is None:
+            return _run_recorded(config, options, None, streams)
+        with PageView(*options.page) as page:
+            return _run_recorded(config, options, page, streams)
 
 
-def _run_recorded(config: Config, options: RunOptions, page: PageView | None) -> CellRun:
+def _watched_devices(config: Config, options: RunOptions) -> dict[str, CameraConfig]:
+    """Return the real cameras whose pictures are recorded or shown. Without anybody to see them they stay closed."""
+    displays = hasattr(load_class(INPUTS, options.input), DisplayInput.show_picture.__name__)
+    if options.fast or (options.record is None and options.page is None and not displays):
+        return {}
+    return config.device_cameras
+
+
+def _run_recorded(config: Config, options: RunOptions, page: PageView | None, streams: CameraStreams) -> CellRun:
     if options.record is None:
-        return _run_cell(config, options, None, page)
+        return _run_cell(config, options, None, page, streams)
     check_folder(options.record, "--record")
     pictures = bool(config.simulated_cameras) and issubclass(load_class(PLANTS, options.plant), MujocoPlant)
-    recorder = Recorder(options.record, options.name, waits=options.simulated_time, pictures=pictures)
+    room = ROOM_WITH_PICTURES if streams.streams else ROOM
+    recorder = Recorder(options.record, options.name, waits=options.simulated_time, room=room, pictures=pictures)
     try:
         with recorder:
-            run = _run_cell(config, options, recorder, page)
+            run = _run_cell(config, options, recorder, page, streams)
     except PlantError:
         _print_lines(Console(stderr=True), _recording_lines(recorder.summary))
         raise
     return replace(run, recording=recorder.summary)
 
 
-def _run_cell(config: Config, options: RunOptions, recorder: Recorder | None, page: PageView | None) -> CellRun:
+def _run_cell(
+    config: Config, options: RunOptions, recorder: Recorder | None, page: PageView | None, streams: CameraStreams
+) -> CellRun:
     console = Console(stderr=True)
     source = make_input(options.input, config, say=partial(say, console=console), **options.input_options)
     robot = Robot.from_config(config)
@@ -179,7 +194,7 @@ def _run_cell(config: Config, options: RunOptions, recorder: Recorder | None, pa
         with notice_of_compiling():
             pipeline = Pipeline(config, robot, source, plant, options.mode)
             faults = pipeline.preflight_faults()
-        return _run_pipeline(pipeline, faults, options, recorder, page, console)
+        return _run_pipeline(pipeline, faults, options, recorder, page, streams, console)
     finally:
         plant.close()  # Also if no run began: an open window would crash the process at its end.
 
@@ -198,6 +213,7 @@ def _run_pipeline(
     options: RunOptions,
     recorder: Recorder | None,
     page: PageView | None,
+    streams: CameraStreams,
     console: Console,
 ) -> CellRun:
     config, source = pipeline.config, pipeline.input
@@ -221,7 +237,7 @@ def _run_pipeline(
         page.begin(pipeline, options.name, recorder is not None)
         for line in page.lines:
             say(line, console)
-    summary = _run(pipeline, options, recorder, page, console)
+    summary = _run(pipeline, options, recorder, page, streams, console)
     results = () if watch is None else held_to_promises(watch.results(), summary)
     run = CellRun(summary, results, planned=options.duration)
     succeeded = all(task.succeeded for task in results)
@@ -285,7 +301,12 @@ def _judge_recording(recording: RecordingSummary | None) -> list[Judged]:
 
 
 def _run(
-    pipeline: Pipeline, options: RunOptions, recorder: Recorder | None, page: PageView | None, console: Console
+    pipeline: Pipeline,
+    options: RunOptions,
+    recorder: Recorder | None,
+    page: PageView | None,
+    streams: CameraStreams,
+    console: Console,
 ) -> RunSummary:
     """Run the pipeline with its table, window, pictures and recording."""
     with ExitStack() as stack:
@@ -298,10 +319,13 @@ def _run(
             table = LiveTable(title, words, options.steps, options.duration, simulated_time=simulated)
             pipeline.listeners.append(table)
             stack.enter_context(table.shown(console))
-        if isinstance(pipeline.plant, MujocoPlant):
-            for name, most, show, watched in _lookers(pipeline, page):
-                camera = pipeline.config.simulated_cameras[name]
-                pictures = LivePictures(pipeline.plant, name, camera, most, show, watched)
+        streams.wait_until_ready()
+        drawn = pipeline.config.simulated_cameras if isinstance(pipeline.plant, MujocoPlant) else {}
+        for name, most, show, watched in _lookers(pipeline, page, [*drawn, *streams.streams]):
+            if name in streams.streams:
+                streams.streams[name].hear(ShownPictures(most, show, watched))
+            elif isinstance(pipeline.plant, MujocoPlant):
+                pictures = LivePictures(pipeline.plant, name, drawn[name], most, show, watched)
                 pipeline.listeners.append(stack.enter_context(pictures))
         if options.real_time and (refused := stack.enter_context(real_time())):
             say(refused, console, "yellow")
@@ -313,6 +337,9 @@ def _run(
                 none = f"no pictures are recorded: the {options.plant} plant has none; allowed: --plant mujoco"
                 say(none, console, "yellow")
                 cameras = ()
+            cameras += tuple(streams.streams)
+            if options.fast and (real := ", ".join(pipeline.config.device_cameras)):
+                say(f"no pictures of {real}: real cameras keep real time; allowed: without --fast", console, "yellow")
             recorder.record_outcome = pipeline.record_outcome
             notes = {"cell": pipeline.config.name, "input": options.input, **options.notes}
             given = options.input_options.items()
@@ -323,18 +350,23 @@ def _run(
                 about = replace(about, notes=anonymous(about.notes))
             recorder.begin(about, pipeline.robot, pipeline.config.recording.topic_rate)
             pipeline.listeners.append(recorder)
+            if streams.streams:
+                devices = DevicePictures(streams, recorder, about, pipeline.record_outcome)
+                pipeline.listeners.append(stack.enter_context(devices))
             if any(map(pipeline.config.teleop.bindings.words_of, EpisodeMarks.actions)):
                 judge_now = EpisodeJudge(lambda: recorder.file, pipeline.record_outcome)
                 pipeline.listeners.append(stack.enter_context(judge_now))
-        simulated = options.simulated_time
-        return pipeline.run(options.duration, realtime=not simulated, paced=not options.fast)
+        return pipeline.run(options.duration, realtime=not options.simulated_time, paced=not options.fast)
 
 
 def _lookers(
-    pipeline: Pipeline, page: PageView | None
+    pipeline: Pipeline, page: PageView | None, names: Sequence[str]
 ) -> Iterator[tuple[str, float, Callable[[bytes], object], Callable[[], bool]]]:
-    """Yield each shown camera, its most pictures per second, where to show them, and whether somebody looks."""
-    names, source = list(pipeline.config.simulated_cameras), pipeline.input
+    """Yield each shown camera, its most pictures per second, where to show them, and whether somebody looks.
+
+    ``names`` are those of all cameras with pictures. A headset shows the first one.
+    """
+    source = pipeline.input
     if isinstance(source, DisplayInput):
         yield from ((name, _IN_HEADSET, source.show_picture, lambda: source.connected) for name in names[:1])
     if page is not None:

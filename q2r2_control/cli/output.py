@@ -187,7 +187,7 @@ def recording_line(recording: RecordingSummary) -> str:
     if recording.pictures or recording.lost_pictures or recording.pictures_fault:
         found.append(f"{recording.pictures} pictures")
     if recording.lost_pictures:
-        why = recording.pictures_fault or "they could not be taken fast enough"
+        why = recording.pictures_fault or "they did not come fast enough"
         found.append(f"[red]{recording.lost_pictures} lost[/]: {escape(why)}")
     return f"recording: {escape(str(recording.file))} ({', '.join(found)})"
 

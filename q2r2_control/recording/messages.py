@@ -179,6 +179,23 @@ class Message(NamedTuple):
         return len(self.payload)
 
 
+class JpegPicture(NamedTuple):
+    """A picture of a real camera, of which the writer makes a message."""
+
+    channel: int
+    number: int  # The number of the newest tick when it was captured.
+    time: int  # The time of day of its capture [ns].
+    camera: str
+    jpeg: bytes
+
+    @property
+    def size(self) -> int:
+        return len(self.jpeg)
+
+    def message(self) -> Message:
+        return Message(self.channel, self.number, self.time, self.time, picture(self.camera, self.time, self.jpeg))
+
+
 class MessageTemplate:
     """Makes many messages that differ only in float64 numbers and in the stamp of the header.
 

@@ -22,7 +22,7 @@ from q2r2_control.process.scheduling import new_folder
 from q2r2_control.recording.about import About, Conclusion
 from q2r2_control.recording.camera_recorder import CameraRecorder
 from q2r2_control.recording.mcap_file import McapFile
-from q2r2_control.recording.messages import Message, Topic, run_topics
+from q2r2_control.recording.messages import JpegPicture, Message, Topic, run_topics
 from q2r2_control.recording.reader import BROKEN
 from q2r2_control.recording.tick_rows import PackedTick, TickPacker
 from q2r2_control.recording.writer import FLUSH_PERIOD, RecordedRobot, RecordingSetup, Written
@@ -81,7 +81,7 @@ class BaseRecorder:
         self.writer.send(RecordingSetup(self.file.absolute(), about, topics, robot, topic_rate))
         return True
 
-    def _send(self, batch: list[PackedTick] | list[Message], *, wait: bool = False) -> bool:
+    def _send(self, batch: list[PackedTick] | list[Message] | list[JpegPicture], *, wait: bool = False) -> bool:
         """Send a batch to the writer; returns False if there is no room for it now. With ``wait`` it waits for room."""
         if self.writer is None or self.fault is not None:
             return False
@@ -205,6 +205,8 @@ class Recorder(BaseRecorder, AbstractContextManager["Recorder"]):
         self.success: bool | None = None
         self.cameras: CameraRecorder | None = None
         self._pictures_fault: str | None = None
+        # The number of pictures that real cameras gave, and of those that were due and did not come.
+        self.device_pictures = self.missing_pictures = 0
         super().__init__(parent, name, room)
         if pictures:
             try:
@@ -284,6 +286,11 @@ class Recorder(BaseRecorder, AbstractContextManager["Recorder"]):
         if self.writer is not None:
             self.writer.send([picture], picture.size, wait=True)
 
+    def record_picture(self, picture: JpegPicture) -> None:
+        """Send a picture of a real camera to the writer; it is lost, and counted, if there is no room for it."""
+        self.device_pictures += 1
+        self._send([picture])
+
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         self._send_batch()
         if self.cameras is not None:
@@ -294,13 +301,14 @@ class Recorder(BaseRecorder, AbstractContextManager["Recorder"]):
     @property
     def summary(self) -> RecordingSummary:
         pictures = self.written.messages
+        due = self.device_pictures + self.missing_pictures + (0 if self.cameras is None else self.cameras.due)
         return RecordingSummary(
             file=None if self.file is None else str(self.file),
             ticks=self.written.ticks,
             lost_ticks=self._count - self.written.ticks,
             fault=self.fault,
             pictures=pictures,
-            lost_pictures=0 if self.cameras is None else self.cameras.due - pictures,
+            lost_pictures=due - pictures,
             pictures_fault=self._pictures_fault,
             longest_backlog_s=self._longest_backlog,
         )

@@ -1,8 +1,9 @@
-"""Pictures of one camera of the simulated cell for spectators. A process of its own takes them."""
+"""Pictures of one camera for spectators: of the simulated cell, which a process of its own takes, or of a real one."""
 
 from __future__ import annotations
 
 import logging
+import math
 import os
 import pickle
 import time
@@ -12,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from q2r2_control.cameras.camera_process import CameraShot
 from q2r2_control.config.recording import CameraConfig
 from q2r2_control.plants.cell_pictures import ENVIRONMENT, jpeg_of, open_cameras
 from q2r2_control.plants.mujoco import MujocoPlant
@@ -81,3 +83,17 @@ class LivePictures(AbstractContextManager["LivePictures"]):
 
     def __exit__(self, *_: object) -> None:
         self._process.kill()
+
+
+class ShownPictures:
+    """Shows some of the pictures of a real camera, as a hearer of its :class:`CameraStream`."""
+
+    def __init__(self, most: float, show: Callable[[bytes], object], watched: Callable[[], bool]) -> None:
+        """``show`` gets up to ``most`` pictures a second, as long as ``watched`` returns True."""
+        self._period, self._show, self._watched = 1.0 / most, show, watched
+        self._due = -math.inf  # Time of the next picture, by the time of capture [s].
+
+    def __call__(self, shot: CameraShot) -> None:
+        if shot.time >= self._due and self._watched():
+            self._due = shot.time + self._period
+            self._show(shot.jpeg)

@@ -7,10 +7,11 @@ import io
 import pytest
 from PIL import Image
 
+from q2r2_control.cameras.camera_process import CameraShot
 from q2r2_control.config.recording import CameraConfig
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.mujoco import MujocoPlant
-from q2r2_control.viewer.live_pictures import LivePictures
+from q2r2_control.viewer.live_pictures import LivePictures, ShownPictures
 from tests.support.processes import cell, wait_until
 
 
@@ -41,3 +42,15 @@ def test_a_picture_of_the_cell_comes_and_a_lost_process_gives_one_line(caplog: p
     loop.end()
     assert Image.open(io.BytesIO(got[0])).size == (64, 48)
     assert len([record for record in caplog.records if "no more pictures are shown" in record.message]) == 1
+
+
+def test_of_a_real_camera_as_many_pictures_are_shown_as_are_asked_for_while_somebody_looks() -> None:
+    got: list[bytes] = []
+    looks = True
+    shown = ShownPictures(5.0, got.append, lambda: looks)
+    for number in range(30):
+        shown(CameraShot(10.0 + number / 30.0, 64, 48, bytes([number])))
+    assert [jpeg[0] for jpeg in got] == [0, 6, 12, 18, 24]
+    looks = False
+    shown(CameraShot(20.0, 64, 48, b"unseen"))
+    assert b"unseen" not in got

@@ -1,0 +1,185 @@
+"""Pictures of a real camera are recorded with the time of their capture, whatever the plant, and beside the loop."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from q2r2_control.cameras.camera_process import CameraShot
+from q2r2_control.cameras.camera_streams import CameraStreams
+from q2r2_control.config.recording import CameraConfig
+from q2r2_control.errors import CameraError
+from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.judging.camera_figures import camera_figures
+from q2r2_control.judging.episode import read_episode
+from q2r2_control.recording.about import About
+from q2r2_control.recording.device_pictures import DevicePictures, LoopTimes, TickTime
+from q2r2_control.recording.reader import Recording
+from q2r2_control.recording.recorder import ROOM_WITH_PICTURES, Recorder, RecordingSummary
+from q2r2_control.recording.replay import replay
+from q2r2_control.summary.tick import Tick
+from tests.cameras.videos import FPS, HEIGHT, WIDTH, number_of_jpeg, write_video
+from tests.recording.runs import file_of, pipeline
+from tests.support.processes import alive, wait_until
+
+pytest.importorskip("cv2")
+
+COUNT = 200  # Pictures of the video.
+ENOUGH = 15  # Pictures of a run.
+
+
+def front(path: Path, **changes: object) -> CameraConfig:
+    values = {"device": str(path), "width": WIDTH, "height": HEIGHT, "rate": FPS, **changes}
+    return CameraConfig.model_validate(values)
+
+
+class RecordedRun:
+    """A run in real time whose camera is a video file, until it has enough pictures or ``during`` returns True."""
+
+    def __init__(self, folder: Path, camera: CameraConfig, during: Callable[[RecordedRun], bool] | None = None) -> None:
+        self.loop = pipeline("circle", "kinematic", cameras={"front": camera})
+        self.shots: list[tuple[float, int]] = []  # The time of each capture [s], and the number in the picture.
+        self.start = 0.0  # Of the loop's clock [s].
+        self.reports: list[ReasonKind] = []
+        during = during or (lambda run: run.recorder.device_pictures >= ENOUGH)
+
+        def stop(tick: Tick) -> None:
+            self.start = tick.start.now
+            if during(self):
+                self.loop.stop()
+
+        with (
+            CameraStreams(self.loop.config.device_cameras) as self.streams,
+            Recorder(folder, "test", room=ROOM_WITH_PICTURES) as self.recorder,
+        ):
+            self.streams.wait_until_ready()
+            self.streams.streams["front"].hear(self._note)
+            about = About.of(self.loop, True, {}, ("front",))
+            self.recorder.begin(about, self.loop.robot)
+            with DevicePictures(self.streams, self.recorder, about, self._report) as devices:
+                self.loop.listeners += [self.recorder, devices, stop]
+                self.loop.run(realtime=True)
+
+    def _report(self, reason: Reason) -> None:
+        self.reports.append(reason.kind)
+        self.loop.record_outcome(reason)
+
+    def _note(self, shot: CameraShot) -> None:
+        self.shots.append((shot.time, number_of_jpeg(shot.jpeg)))
+
+    @property
+    def summary(self) -> RecordingSummary:
+        return self.recorder.summary
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> RecordedRun:
+    folder = tmp_path_factory.mktemp("run")
+    return RecordedRun(folder, front(write_video(folder / "front.avi", range(COUNT))))
+
+
+def test_each_picture_is_stamped_with_its_capture_on_the_loops_clock(run: RecordedRun) -> None:
+    recording = Recording(file_of(run.summary))
+    pictures = list(recording.pictures("front"))
+    assert len(pictures) == run.summary.pictures >= ENOUGH
+    numbers = np.array([number_of_jpeg(picture.jpeg) for picture in pictures])
+    stamps = np.array([picture.time - recording.about.epoch for picture in pictures]) * 1e-9
+    steps = np.arange(len(numbers))
+    np.testing.assert_array_equal(numbers, (numbers[0] + steps) % COUNT, "none is lost, and none comes twice")
+    np.testing.assert_allclose(stamps - stamps[0], steps / FPS, atol=1e-6)
+    captured = {round(time - run.start, 6): number for time, number in run.shots}
+    assert [captured[round(stamp, 6)] for stamp in stamps.tolist()] == numbers.tolist()
+    assert run.summary.lost_pictures == 0
+
+
+def test_the_tick_of_a_picture_is_the_last_one_before_its_capture(run: RecordedRun) -> None:
+    recording = Recording(file_of(run.summary))
+    ticks = np.concatenate([chunk.times for chunk in recording.chunks()])
+    before, *pictures = recording.pictures("front")
+    assert before.tick == 0
+    assert before.time < ticks[0], "the first frame of a dataset has a picture"
+    for picture in pictures:
+        assert ticks[picture.tick] <= picture.time
+        assert picture.tick + 1 == len(ticks) or picture.time < ticks[picture.tick + 1]
+
+
+def test_the_judge_reads_the_pictures_as_those_of_simulated_cameras(run: RecordedRun) -> None:
+    episode = read_episode(Recording(file_of(run.summary)))
+    assert len(episode.pictures["front"].t) == run.summary.pictures
+    assert 0 <= camera_figures(episode)["front"].missing_pictures <= 1
+    assert not episode.pictures["front"].damaged.any()
+    assert not episode.pictures["front"].other_size.any()
+
+
+def test_a_camera_that_ends_is_told_of_once_and_marks_the_episode_and_the_run_goes_on(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    after: list[int] = []
+
+    def two_ticks_later(run: RecordedRun) -> bool:
+        after.extend(len(run.reports) * [1])
+        return len(after) > 2
+
+    video = write_video(tmp_path / "short.avi", range(5))
+    with caplog.at_level(logging.WARNING):
+        done = RecordedRun(tmp_path, front(video, repeat=False), two_ticks_later)
+    assert done.reports == [ReasonKind.CAMERA_STOPPED]
+    (line,) = [text for text in caplog.messages if text.startswith("camera front: no picture for ")]
+    assert line.endswith(" s: the video has ended")
+    assert done.summary.lost_pictures >= 20, "a second without pictures, at least"
+    episode = read_episode(Recording(file_of(done.summary)))
+    assert {event.kind for event in episode.events} >= {ReasonKind.CAMERA_STOPPED}
+    assert replay(file_of(done.summary)).difference is None, "the mark too"
+    assert camera_figures(episode)["front"].missing_pictures == pytest.approx(done.summary.lost_pictures, abs=2)
+
+
+def test_when_the_process_of_a_camera_is_killed_the_run_goes_on(tmp_path: Path) -> None:
+    def killed(run: RecordedRun) -> bool:
+        process = run.streams.streams["front"].process
+        if run.recorder.device_pictures and alive(process.pid):
+            os.kill(process.pid, signal.SIGKILL)
+            wait_until(lambda: not process.alive)
+        return ReasonKind.CAMERA_STOPPED in run.reports
+
+    done = RecordedRun(tmp_path, front(write_video(tmp_path / "front.avi", range(COUNT))), killed)
+    assert done.streams.streams["front"].why_lost == "the process that reads camera front was ended by SIGKILL"
+    assert done.summary.fault is None
+
+
+def test_a_camera_that_cannot_be_opened_is_named_before_the_run(tmp_path: Path) -> None:
+    with (
+        CameraStreams({"front": front(tmp_path / "none.avi")}) as streams,
+        pytest.raises(CameraError, match=r"cameras\.front\.device: .*none\.avi: no such file"),
+    ):
+        streams.wait_until_ready()
+
+
+class TestTimesOfTheLoop:
+    TICKS = ((10.0, 10.0), (10.01, 10.01), (10.05, 10.05))  # By the computer's clock and by that of the loop [s].
+
+    def times(self, ticks: tuple[tuple[float, float], ...] = TICKS) -> LoopTimes:
+        times = LoopTimes()
+        for number, (computer, loop) in enumerate(ticks):
+            times.add(TickTime(computer, loop, number))
+        return times
+
+    @pytest.mark.parametrize(("at", "number"), [(10.0, 0), (10.004, 0), (10.03, 1), (10.05, 2), (10.2, 2)])
+    def test_in_real_time_they_are_those_of_the_computer(self, at: float, number: int) -> None:
+        assert self.times().at(at) == pytest.approx((at, at, number))
+
+    def test_before_the_first_tick_they_pass_as_those_of_the_computer(self) -> None:
+        assert self.times(((10.0, 0.5), (10.1, 0.6))).at(9.99) == pytest.approx((9.99, 0.49, 0))
+
+    def test_in_slow_motion_they_pass_as_slowly_as_the_ticks(self) -> None:
+        slow = self.times(((10.0, 0.0), (10.1, 0.001), (10.2, 0.002)))
+        assert [slow.at(time) for time in (10.0005, 10.05, 10.1004)] == [
+            pytest.approx((10.0005, 0.0005, 0)),
+            pytest.approx((10.05, 0.001, 0)),
+            pytest.approx((10.1004, 0.0014, 1)),
+        ]
