@@ -100,6 +100,13 @@ COMMANDS = (
         "q2r2 headset-check --host 0.0.0.0",
     ),
     ListedCommand(
+        "cameras",
+        "cameras:cameras",
+        "List the cameras of this computer, and take a picture with each one of a cell; exit 1 where one gives none.",
+        "Devices",
+        "q2r2 cameras my_cell.yaml --output pictures",
+    ),
+    ListedCommand(
         "fri-check",
         "fri_check:fri_check",
         "Listen to the cabinets of a cell and say what they send.",

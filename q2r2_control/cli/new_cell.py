@@ -24,30 +24,23 @@ from q2r2_control.config.cell import Config, load_config, parse_config
 from q2r2_control.errors import ConfigError, Q2R2Error
 from q2r2_control.robot.compose import compose
 from q2r2_control.robot.description import LinkTree, joint_limits, load_description
-from q2r2_control.robot.finger_motion import FingerMotion
 from q2r2_control.robot.floor import FLOOR
 from q2r2_control.robot.home_search import find_home, mirrored_home
 from q2r2_control.robot.kept_distances import kept_distances
-from q2r2_control.robot.model_survey import (
-    CapsuleFit,
-    capsule_fits,
-    check_arm,
-    gripper_of,
-    lacks_of,
-    tip_of,
-    tips_by_side,
-)
+from q2r2_control.robot.model_survey import CapsuleFit, capsule_fits, gripper_of, lacks_of, tip_of, tips_by_side
 from q2r2_control.robot.near_pairs import spreads_of
 from q2r2_control.robot.pairs import CLEARANCE, link_of, links_moved_by, pair_names
 from q2r2_control.robot.reachability import nearest_approaches, srdf_text
 from q2r2_control.robot.robot import Robot
 from q2r2_control.robot.stop_torque import stop_torques
 from q2r2_control.robot.unchecked import moving_links
+from q2r2_control.robot.urdf_parts import mimic_of
 from q2r2_control.types import Array
 from q2r2_control.viewer.tables import figure_table, print_table
 
 _ANSWERS = Path("new-cell.answers.json")  # In the folder of the new cell.
 _FITS = 8  # Number of capsules in the table.
+_LEAST_JOINTS = 3  # Least number of joints of an arm.
 _OFF_FLOOR = 0.03  # Distance from the floor that each link can reach in some posture [m].
 _BARELY = 0.003  # A pair that cannot get this much farther apart than its kept distance gets an exception [m].
 
@@ -166,17 +159,21 @@ def _survey(draft: _Draft, models: dict[str, str], tips: dict[str, str | None], 
         except Q2R2Error as error:
             raise ConfigError(f"--{'robot' if shared else side} {model!r:.120}: {error}") from error
     trees = {side: LinkTree(description.urdf, models[side]) for side, description in described.items()}
-    motions = {side: FingerMotion(described[side], tree) for side, tree in trees.items()}
-    given = {side for side, tip in tips.items() if tip}
     if shared is not None and not all(tips.values()):
-        tips |= tips_by_side(trees["left"], motions["left"], "--left-tip and --right-tip")
-    found = {side: tips[side] or tip_of(tree, motions[side], f"--{side}-tip") for side, tree in trees.items()}
+        tips |= tips_by_side(trees["left"], "--left-tip and --right-tip")
+    found = {side: tips[side] or tip_of(tree, f"--{side}-tip") for side, tree in trees.items()}
     chains, lacks = {}, []
     for side, tree in trees.items():
         if (tip := found[side]) not in (tree.root, *tree.joint_to):
             raise ConfigError(f"--{side}-tip {tip!r:.60}: no such link; links: {', '.join(tree.joint_to)}")
         chains[side] = tree.chain(tip)
-        check_arm(tree, tip, f"{models[side]!r:.120}", None if side in given else f"--{side}-tip")
+        if len(chains[side]) < _LEAST_JOINTS:
+            moves = f"joints that move {tip}: {len(chains[side])}"
+            mimics = [
+                f"{name} mimics {mimic[0]}" for name, joint in tree.movable().items() if (mimic := mimic_of(joint))
+            ]
+            but = f"; {', '.join(mimics):.200}, so that it ends the arm like a gripper's" if mimics else ""
+            raise ConfigError(f"{models[side]!r:.120}: {moves}; allowed: an arm, of {_LEAST_JOINTS} or more{but}")
         limits, masses = lacks_of(described[side], tree, tip)
         if limits:
             lacks.append(f"{models[side]}: {', '.join(limits)}")
@@ -195,9 +192,12 @@ def _survey(draft: _Draft, models: dict[str, str], tips: dict[str, str | None], 
         joints = [joint for joint in chains[side] if joint.get("name") not in names]
         arms[side] = {} if shared else draft.part(models[side])
         arms[side] |= {"tip": found[side], "home": [float(np.mean(joint_limits(joint))) for joint in joints]}
-        if (gripper := gripper_of(tree, motions[side], found[side])) is not None:
-            arms[side] |= {"gripper": gripper.settings} if gripper.settings else {}
-            draft.notes.append(f"{side} arm: {gripper.told(found[side])}, see arms.{side}.gripper")
+        if gripper := gripper_of(described[side], tree, found[side]):
+            arms[side]["gripper"] = gripper
+            driven, key = ", ".join(gripper["joints"]), f"arms.{side}.gripper"
+            draft.notes.append(
+                f"{side} arm: {driven} beyond its tip, {found[side]}, are taken for a gripper's joints, see {key}"
+            )
     # The shape of a finger covers its whole stroke. Finer shapes would hardly make it smaller.
     moved = {
         side: links_moved_by(tree, [joint.get("name", "") for joint in chains[side]])

@@ -2,9 +2,6 @@
 
 From the base, the arm follows the movable joints one by one, and ends before the joints of a gripper. Its tip is the
 outermost link that is fixed to the last joint. If a model can be read in more than one way, the user has to decide.
-
-A bar that follows a joint of the arm by a <mimic>, as in a parallelogram, is beside the arm and ends no chain. Whether
-the last joint moves a jaw is told by the shapes, if the caller measures them, and else by the joint's name.
 """
 
 from __future__ import annotations
@@ -18,8 +15,6 @@ import pinocchio as pin
 
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.description import LinkTree, joint_end
-from q2r2_control.robot.finger_motion import FingerMotion
-from q2r2_control.robot.followers import followers_of
 from q2r2_control.robot.pinocchio_models import joint_origin
 
 _GRIPPER_JOINT = re.compile(r"gripper|finger|jaw|thumb|knuckle", re.IGNORECASE)
@@ -35,23 +30,16 @@ _TOOL_FRAMES = [
 ]
 _SAME_PLACE = 1e-3  # [m]
 _LEAST_JOINTS = 4  # Least number of joints of an arm. Chains of wheels and heads have fewer.
-_BEFORE_JAW = 3  # Least number of joints before a jaw. Shapes beside shorter chains are not looked at.
 
 
-def default_tip(tree: LinkTree, gripper_joints: Collection[str], key: str, motion: FingerMotion | None = None) -> str:
+def default_tip(tree: LinkTree, gripper_joints: Collection[str], key: str) -> str:
     """Return the link at the end of the only chain of movable joints in ``tree``.
-
-    Args:
-        tree: The links and joints of the model.
-        gripper_joints: Joints that are known to be a gripper's.
-        key: Begins the text of an error.
-        motion: Tells jaws by their shapes; if it is None, or has no shapes, names tell.
 
     Raises:
         ConfigError: With a text that begins with ``key`` and names the candidates, if there are several chains.
     """
     link = tree.root
-    while onwards := _onwards(tree, link, gripper_joints, motion):
+    while onwards := _onwards(tree, link, gripper_joints):
         if len(onwards) > 1:
             names = ", ".join(joint.get("name", "") for joint in onwards)
             raise ConfigError(f"{key}: the model's chain branches at {link} into {names}: name the arm's last link")
@@ -59,92 +47,30 @@ def default_tip(tree: LinkTree, gripper_joints: Collection[str], key: str, motio
     return end_of(tree, link, key)
 
 
-def arm_ends(tree: LinkTree, motion: FingerMotion | None = None) -> list[str]:
-    """Return the last link of each chain that is long enough for an arm; ``motion`` as in :func:`default_tip`."""
+def arm_ends(tree: LinkTree) -> list[str]:
+    """Return the last link of each chain that is long enough for an arm."""
     ends, links = [], [tree.root]
     for link in links:  # The list grows in the loop.
-        onwards = [joint_end(joint, "child") for joint in _onwards(tree, link, (), motion)]
+        onwards = [joint_end(joint, "child") for joint in _onwards(tree, link, ())]
         links += onwards
         ends += [link] if not onwards and len(tree.chain(link)) >= _LEAST_JOINTS else []
     return ends
 
 
-def coupled_joint(tree: LinkTree, tip: str) -> tuple[str, str] | None:
-    """Return a joint beyond ``tip`` that carries more of the arm but follows a joint of its chain, and the latter.
-
-    Such a joint has no motor, so that the arm ends before it. None if there is no such joint.
-    """
-    chain, followers = tree.chain(tip), followers_of(tree.joint_to.values())
-    body = tree.fixed_to(tree.root if not chain else joint_end(chain[-1], "child"))
-    before = {joint.get("name", "") for joint in chain}
-    for name, joint in tree.movable().items():
-        leads = followers[name].driver if name in followers else ""
-        if leads in before and joint_end(joint, "parent") in body and _independent_beyond(tree, joint, followers):
-            return name, leads
-    return None
-
-
-def _onwards(
-    tree: LinkTree, link: str, gripper_joints: Collection[str], motion: FingerMotion | None
-) -> list[ET.Element]:
+def _onwards(tree: LinkTree, link: str, gripper_joints: Collection[str]) -> list[ET.Element]:
     """Return the joints that continue the chain from the links fixed to ``link``; none if a hand begins there."""
-    body, depth, followers = tree.fixed_to(link), len(tree.chain(link)), followers_of(tree.joint_to.values())
-    motion = motion if depth >= _BEFORE_JAW else None
-    carried = [
+    body, depth = tree.fixed_to(link), len(tree.chain(link))
+    onwards = [
         joint
         for name, joint in tree.movable().items()
-        if joint_end(joint, "parent") in body and name not in gripper_joints and name not in followers
+        if joint_end(joint, "parent") in body and name not in gripper_joints and not _is_gripper_joint(tree, joint)
     ]
-    arms = [
-        joint
-        for joint in carried
-        if not _leads_fingers(tree, joint, depth, followers, motion)
-        and not (motion is None and is_called_gripper(joint.get("name", "")))
-    ]
-    if arms and len(carried) > 1:
-        ends = {joint_end(joint, "child") for joint in arms}
+    if len(onwards) > 1:
+        ends = {joint_end(joint, "child") for joint in onwards}
         longest = max(len(tree.chain(end)) - depth for end in tree.joint_to if ends & set(tree.path(end)))
         if depth >= longest > 0:
             return []  # These are the fingers of a hand.
-    return [joint for joint in arms if motion is None or not _is_jaw(tree, joint, followers, motion)]
-
-
-def _leads_fingers(
-    tree: LinkTree,
-    joint: ET.Element,
-    depth: int,
-    followers: Collection[str],
-    motion: FingerMotion | None,
-) -> bool:
-    """Return whether others mimic ``joint`` as fingers do, and not as the bars beside an arm.
-
-    An arm goes on beyond such a joint: with more joints than there are before it, or with an end that is no jaw.
-    """
-    name = joint.get("name")
-    if not any(found.get("joint") == name for other in tree.joint_to.values() for found in other.findall("mimic")):
-        return False
-    beyond = _independent_beyond(tree, joint, followers)
-    return len(beyond) + 1 <= depth and not (beyond and motion is not None and motion.is_jaw(beyond[-1]) is False)
-
-
-def _is_jaw(tree: LinkTree, joint: ET.Element, followers: Collection[str], motion: FingerMotion) -> bool:
-    """Return whether shapes show that ``joint`` moves a jaw, or its name says so and they leave a doubt."""
-    is_called = is_called_gripper(joint.get("name", ""))
-    if _independent_beyond(tree, joint, followers) and not is_called:
-        return False  # It carries more than a jaw.
-    verdict = motion.is_jaw(joint.get("name", ""))
-    return is_called if verdict is None else verdict
-
-
-def _independent_beyond(tree: LinkTree, joint: ET.Element, followers: Collection[str]) -> list[str]:
-    """Return the joints that ``joint`` carries and that follow no other, from the inner to the outer ones."""
-    child = joint_end(joint, "child")
-    beyond = [
-        (len(tree.path(joint_end(other, "parent"))), name)
-        for name, other in tree.movable().items()
-        if name not in followers and child in tree.path(joint_end(other, "parent"))
-    ]
-    return [name for _, name in sorted(beyond, key=lambda one: one[0])]
+    return onwards
 
 
 def end_of(tree: LinkTree, link: str, key: str) -> str:
@@ -191,8 +117,11 @@ def named_joints(tree: LinkTree, tip: str, names: Sequence[str], key: str) -> li
     return [joint for joint in chain if not names or joint.get("name") in names]
 
 
-def is_called_gripper(name: str) -> bool:
-    """Return whether a joint has the name of a gripper's, and not of a wrist that turns one."""
+def _is_gripper_joint(tree: LinkTree, joint: ET.Element) -> bool:
+    name = joint.get("name", "")
+    mimicked = any(found.get("joint") == name for other in tree.joint_to.values() for found in other.findall("mimic"))
+    if mimicked or joint.find("mimic") is not None:
+        return True
     return _GRIPPER_JOINT.search(name) is not None and _WRIST_JOINT.search(name) is None
 
 

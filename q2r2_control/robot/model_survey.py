@@ -3,27 +3,28 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Sequence
+import xml.etree.ElementTree as ET
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import coal
 import numpy as np
+import pinocchio as pin
 from scipy.spatial import ConvexHull
 
 from q2r2_control.errors import ConfigError
-from q2r2_control.robot.arm_chain import arm_ends, coupled_joint, default_tip, end_of, is_called_gripper
+from q2r2_control.robot.arm_chain import arm_ends, default_tip, end_of
 from q2r2_control.robot.description import Description, LinkTree, joint_end, joint_limits
 from q2r2_control.robot.enclose import Capsule, capsules_around, enclose_shapes
-from q2r2_control.robot.finger_motion import HARDLY_MOVED, FingerMotion
-from q2r2_control.robot.followers import followers_of
-from q2r2_control.robot.pairs import link_of
+from q2r2_control.robot.followers import Follower, followers_of, with_followers
+from q2r2_control.robot.pairs import link_of, links_moved_by
 from q2r2_control.robot.pinocchio_models import read_models
+from q2r2_control.robot.urdf_parts import mimic_of
 from q2r2_control.types import Array
 
 _ARM_NAME = re.compile(r"arm|hand|grip|wrist|elbow|shoulder", re.IGNORECASE)
 _SIDE_NAMES = {side: re.compile(rf"{side}|(^|[_-]){side[0]}([_-]|$)", re.IGNORECASE) for side in ("left", "right")}
-_LEAST_JOINTS = 3  # Least number of joints of an arm.
 _ON_SPHERE = 400  # points of a capsule's ends that are compared with its mesh
 _IN_BOX = 20_000  # points that volumes of several capsules are measured by
 _SEVERAL = (2, 3)  # capsules that are tried
@@ -32,22 +33,22 @@ _CLEARLY_LESS, _EACH_SAVES = 0.8, 0.1
 _WIDEST, _STRONGEST, _FASTEST = 3.15, 500.0, 5.0  # that a cell's gripper may have
 
 
-def tip_of(tree: LinkTree, motion: FingerMotion, key: str) -> str:
+def tip_of(tree: LinkTree, key: str) -> str:
     """The last link of the model's arm: the one that leaves no doubt, or that of the only long chain.
 
     Raises :class:`ConfigError` that begins with ``key`` and names the candidates.
     """
     try:
-        return default_tip(tree, (), key, motion)
+        return default_tip(tree, (), key)
     except ConfigError:
-        if len(tips := _tips(tree, motion, key)) == 1:
+        if len(tips := _tips(tree, key)) == 1:
             return tips[0]
         raise
 
 
-def tips_by_side(tree: LinkTree, motion: FingerMotion, key: str) -> dict[str, str]:
+def tips_by_side(tree: LinkTree, key: str) -> dict[str, str]:
     """The last link of each arm of a model that holds both. Raises :class:`ConfigError` as :func:`tip_of` does."""
-    tips = _tips(tree, motion, key)
+    tips = _tips(tree, key)
     found = {
         side: [tip for tip in tips if any(map(name.search, tree.path(tip)[-3:]))] for side, name in _SIDE_NAMES.items()
     }
@@ -56,39 +57,11 @@ def tips_by_side(tree: LinkTree, motion: FingerMotion, key: str) -> dict[str, st
     return {side: ends[0] for side, ends in found.items()}
 
 
-def _tips(tree: LinkTree, motion: FingerMotion, key: str) -> list[str]:
+def _tips(tree: LinkTree, key: str) -> list[str]:
     """Ends of long chains; of arms only, where names tell arms from legs."""
-    ends = arm_ends(tree, motion)
+    ends = arm_ends(tree)
     named = [end for end in ends if any(map(_ARM_NAME.search, tree.path(end)))]
     return [end_of(tree, end, key) for end in named or ends]
-
-
-def check_arm(tree: LinkTree, tip: str, where: str, key: str | None) -> None:
-    """Check that enough joints carry ``tip``, and that nothing more of the arm is beyond it.
-
-    Args:
-        tree: The links and joints of the model.
-        tip: The last link of the arm.
-        where: Begins the text of an error.
-        key: The option by which a user names the tip; None if the user has named it, so that the arm may end there.
-
-    Raises:
-        ConfigError: If it is no arm, with the joints that mimic others, and with links that could be the tip.
-    """
-    followers = followers_of(tree.joint_to.values())
-    coupled = None if key is None else coupled_joint(tree, tip)
-    if (count := len(tree.chain(tip))) >= _LEAST_JOINTS and coupled is None:
-        return
-    but = ""
-    if mimics := ", ".join(f"{name} mimics {one.driver}" for name, one in followers.items()):
-        but = f"; {mimics:.200}, so that it ends the arm like a gripper's"
-    links = [joint_end(joint, "child") for name, joint in tree.movable().items() if name not in followers]
-    chains = {link: [joint.get("name", "") for joint in tree.chain(link)] for link in links}
-    longer = [link for link in links if len(chains[link]) >= _LEAST_JOINTS and not {*chains[link]} & {*followers}]
-    ends = [link for link in longer if not any(link in tree.path(other)[:-1] for other in longer)]
-    if key is not None and (ends := ends or ([tip] if count >= _LEAST_JOINTS else [])):
-        but += f"; {key} may be {', '.join(ends):.200}"
-    raise ConfigError(f"{where}: joints that move {tip}: {count}; allowed: an arm, of {_LEAST_JOINTS} or more{but}")
 
 
 def lacks_of(description: Description, tree: LinkTree, tip: str) -> tuple[list[str], list[str]]:
@@ -111,72 +84,66 @@ def lacks_of(description: Description, tree: LinkTree, tip: str) -> tuple[list[s
     return limits, masses
 
 
-@dataclass(frozen=True, slots=True)
-class FoundGripper:
-    """The joints beyond an arm that open and close a gripper, and how they were found."""
+def gripper_of(description: Description, tree: LinkTree, tip: str) -> dict[str, Any]:
+    """Settings of a gripper beyond the arm's last joint, empty where there is none.
 
-    settings: dict[str, Any]  # Of the cell's YAML; empty if no joints are taken.
-    why: str  # Why these joints, and these ends of their travel, are taken.
-    others: tuple[str, ...]  # Joints beyond the arm that stay where they are.
-
-    def told(self, tip: str) -> str:
-        """Return which joints beyond ``tip`` are taken for a gripper's, why, and which ones stay still."""
-        taken, others = (", ".join(joints) for joints in (self.settings.get("joints", ()), self.others))
-        kind, still = (
-            ("a gripper's", f"; {others:.200} stay still" if others else "") if taken else ("no gripper's", "")
-        )
-        return f"{taken or others:.200} beyond its tip, {tip}, are taken for {kind} joints: {self.why}{still}"
-
-
-def gripper_of(tree: LinkTree, motion: FingerMotion, tip: str) -> FoundGripper | None:
-    """Find the gripper beyond the last joint that carries ``tip``; None if that joint carries no other one.
-
-    A cell drives all joints of a gripper alike, and so these are joints of one travel. Those are taken that bring tips
-    nearest together. If no shape shows that, joints that others mimic, pairs, and names that say gripper are taken.
+    It is closed at the end of its travel where the fingers are nearer to the axis of the arm's last joint.
     """
     last = tree.chain(tip)[-1]
-    followers = followers_of(tree.joint_to.values())
     beyond = {
         name: joint
         for name, joint in tree.movable().items()
-        if name not in followers
-        and joint.get("type") in ("revolute", "prismatic")
-        and joint_end(last, "child") in tree.path(joint_end(joint, "parent"))
-        and joint is not last
+        if joint is not last and joint_end(last, "child") in tree.path(joint_end(joint, "parent"))
     }
-    alike: dict[tuple[str | None, float, float], list[str]] = {}
-    for name, joint in beyond.items():
-        if (travel := joint_limits(joint))[0] < travel[1]:
-            alike.setdefault((joint.get("type"), *travel), []).append(name)
-    if not alike:
-        return None
-    closings = [(joints, motion.closing(joints)) for joints in alike.values()]
-    joints, closing = min(closings, key=lambda one: (1.0 if one[1] is None else one[1].share, -len(one[0])))
-    why = str(closing)
-    if closing is None or closing.share > HARDLY_MOVED:
-        drivers = {one.driver for one in followers.values()}
-        hints = [
-            joints
-            for joints in alike.values()
-            if len(joints) > 1 or {*joints} & drivers or any(map(is_called_gripper, joints))
-        ]
-        if not hints:
-            return FoundGripper({}, "no shape that they move comes nearer to another", tuple(beyond))
-        joints = max(hints, key=len)
-        closing = motion.closing(joints)
-        why = "no shape shows it, but their names, or that they are a pair; see which end is open"
-    lower, upper = joint_limits(beyond[joints[0]])
-    closed, opened = (lower, upper) if closing is None else (closing.closed, closing.opened)
-    limit = beyond[joints[0]].find("limit")
+    driven = [name for name, joint in beyond.items() if mimic_of(joint) is None and joint.get("type") != "floating"]
+    if not driven:
+        return {}
+    # A cell drives all of them alike, so joints of one travel only: that of most.
+    travels = [joint_limits(beyond[name]) for name in driven]
+    ends = max(travels, key=travels.count)
+    driven = [name for name, travel in zip(driven, travels, strict=True) if travel == ends]
+    model, geometry = read_models(description.urdf, str(description.file))
+    enclose_shapes(geometry)
+    moved = links_moved_by(tree, driven)
+    shapes = [item for item in geometry.geometryObjects if link_of(item.name) in moved]
+    followers = followers_of(tree.joint_to.values(), driven)
+    spans = [_span(model, shapes, last.get("name", ""), beyond, driven, followers, end) for end in ends]
+    closed, opened = ends if spans[0] < spans[1] else ends[::-1]
+    limit = beyond[driven[0]].find("limit")
     speed, force = (0.0 if limit is None else float(limit.get(what, "0")) for what in ("velocity", "effort"))
-    settings = {
-        "joints": joints,
+    return {
+        "joints": driven,
         "open_position": float(np.clip(opened, -_WIDEST, _WIDEST)),
         "closed_position": float(np.clip(closed, -_WIDEST, _WIDEST)),
         **({"speed": min(speed, _FASTEST)} if speed > 0.0 else {}),
         **({"force": min(force, _STRONGEST)} if force > 0.0 else {}),
     }
-    return FoundGripper(settings, why, tuple(name for name in beyond if name not in joints))
+
+
+def _span(
+    model: pin.Model,
+    shapes: Sequence[pin.GeometryObject],
+    axis_joint: str,
+    beyond: dict[str, ET.Element],
+    driven: Sequence[str],
+    followers: Mapping[str, Follower],
+    end: float,
+) -> float:
+    """Mean distance of the fingers from the axis of the arm's last joint [m]."""
+    q, data = pin.neutral(model), model.createData()
+    places = with_followers(dict.fromkeys(driven, end), followers)
+    for name in beyond:
+        if name in places and model.joints[index := model.getJointId(name)].nq == 1:
+            q[model.joints[index].idx_q] = places[name]
+    pin.forwardKinematics(model, data, q)
+    last = model.getJointId(axis_joint)
+    along = pin.computeJointJacobian(model, data, q, last)[:, model.joints[last].idx_v][3:]
+    axis = data.oMi[last].rotation @ along
+    moved = {model.getJointId(name) for name in beyond}
+    points = [data.oMi[item.parentJoint].act(item.placement.translation) for item in shapes]
+    points = points or [data.oMi[joint].translation for joint in moved]
+    levers = [point - data.oMi[last].translation for point in points]
+    return float(np.mean([np.linalg.norm(lever - (lever @ axis) * axis) for lever in levers]))
 
 
 @dataclass(frozen=True, slots=True)

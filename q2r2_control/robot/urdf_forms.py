@@ -24,7 +24,7 @@ _UNIT_LENGTH = 1e-3  # that a quaternion's length may be off 1
 
 
 def unify(root: ET.Element, where: str) -> None:
-    """Bring origins by quaternion to roll, pitch and yaw, and mimicked joints to their full names, in place.
+    """Bring origins by quaternion to roll, pitch and yaw, in place.
 
     Raises :class:`RobotError` that begins with ``where`` for elements of xacro, which all readers skip, and for links
     with only one of mass and inertia, which Pinocchio leaves out with their shapes.
@@ -34,18 +34,11 @@ def unify(root: ET.Element, where: str) -> None:
         _unify_origin(origin, where)
     for link in root.findall("link"):
         _check_inertial(link, where)
-    for joint, full_name in _mimics_without_prefix(root):
-        for mimic in joint.findall("mimic"):
-            mimic.set("joint", full_name)
 
 
 def notes_on(root: ET.Element) -> list[str]:
     """A line for each joint of a model, as it was written, that a user should look at."""
     notes = []
-    if mended := _mimics_without_prefix(root):
-        followers = ", ".join(joint.get("name", "") for joint, _ in mended)
-        leaders = ", ".join(full_name for _, full_name in mended)
-        notes.append(f"{followers:.200} mimic joints that lack their prefix; {leaders:.200} are taken")
     for joint in root.findall("joint"):
         name, limit = joint.get("name", ""), joint.find("limit")
         if (soft := _soft_limits(joint)) is not None:
@@ -68,22 +61,6 @@ def scale_to_metres(root: ET.Element) -> None:
         if (unit := _unit_of(mesh.get("filename", ""))) != 1.0:
             scale = [unit * float(part) for part in mesh.get("scale", "1 1 1").split()]
             mesh.set("scale", " ".join(map(repr, scale)))
-
-
-def _mimics_without_prefix(root: ET.Element) -> list[tuple[ET.Element, str]]:
-    """Return joints whose <mimic> names no joint of the model, each with the joint that must be meant.
-
-    Some exporters put a prefix such as Left_ before the names of joints, but not before the names in <mimic>. With the
-    prefix of the joint that mimics, the name is that of exactly one joint.
-    """
-    names, found = {joint.get("name", "") for joint in root.findall("joint")}, []
-    for joint in root.findall("joint"):
-        own, mimic = joint.get("name", ""), joint.find("mimic")
-        if mimic is None or (leader := mimic.get("joint", "")) in names or not leader:
-            continue
-        meant = {own[:end] + leader for end in range(1, len(own))} & names - {own}
-        found += [(joint, name) for name in meant] if len(meant) == 1 else []
-    return found
 
 
 def _soft_limits(joint: ET.Element) -> tuple[float, float] | None:

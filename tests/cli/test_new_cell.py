@@ -54,37 +54,6 @@ def test_a_model_that_makes_no_cell_gets_one_line_and_no_file(text: str, argumen
     assert not Path("cell.yaml").exists()
 
 
-COUPLED = re.sub(r"(<joint name=\"A5\".*?)</joint>", r'\1<mimic joint="A3"/></joint>', IIWA, count=1, flags=re.DOTALL)
-
-
-def test_an_arm_with_a_joint_that_follows_another_is_refused_and_not_cut_short() -> None:
-    Path("arm.urdf").write_text(COUPLED)
-    result = q2r2("new-cell", "cell", "--left", "arm.urdf", "--yes")
-    assert result.exit_code == 2
-    assert "A5 mimics A3, so that it ends the arm like a gripper's; --left-tip may be link_4" in result.stderr
-    assert result.stderr.count("\n") == 1
-    assert not Path("cell.yaml").exists()
-
-
-JAW = """<joint name="A8" type="revolute"><parent link="link_ee"/><child link="part"/><origin xyz="-0.03 0 0.05"/>
-<axis xyz="0 1 0"/><limit lower="-1.2" upper="0.6" velocity="1" effort="9"/></joint>
-<link name="part"><inertial><mass value="0.05"/><inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/>
-</inertial><collision><origin xyz="0 0 0.05"/><geometry><box size="0.01 0.03 0.1"/></geometry></collision></link>
-<joint name="fixed_jaw" type="fixed"><parent link="link_ee"/><child link="fixed_jaw"/></joint><link name="fixed_jaw">
-<collision><origin xyz="0.03 0 0.1"/><geometry><box size="0.01 0.03 0.1"/></geometry></collision></link></robot>"""
-
-
-@pytest.mark.slow
-def test_a_gripper_is_found_by_what_it_closes_onto_and_told_with_the_reason(tmp_path: Path) -> None:
-    Path("arm.urdf").write_text(IIWA.replace("</robot>", JAW))
-    result = q2r2("new-cell", "cell", "--left", "arm.urdf", "--yes", "--samples", "100")
-    assert result.exit_code == 0, result.output
-    assert "NOTE left arm: A8 beyond its tip, " in result.stdout
-    assert "are taken for a gripper's joints: the tips that they move are" in result.stdout
-    gripper = load_config(tmp_path / "cell.yaml").arms["left"].gripper
-    assert (gripper.joints, gripper.open_position, gripper.closed_position) == (("A8",), -1.2, 0.6)
-
-
 def test_a_file_that_is_there_is_kept() -> None:
     Path("cell.yaml").write_text("mine")
     assert "cell.yaml: exists" in q2r2("new-cell", "cell", "--left", "iiwa7", "--yes").stderr

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import pytest
 
 from q2r2_control.errors import ConfigError
-from q2r2_control.robot.arm_chain import arm_ends, default_tip, end_of, named_joints
+from q2r2_control.robot.arm_chain import default_tip, end_of, named_joints
 from q2r2_control.robot.description import LinkTree, load_description
 
 
@@ -69,29 +69,6 @@ def test_a_joint_that_the_gripper_drives_or_that_others_mimic_ends_the_arm() -> 
     assert default_tip(model, ("drive",), "key") == "flange"
     model = tree(*ARM, "flange left revolute drive", "left far revolute more", "flange right revolute follower")
     ET.SubElement(model.joint_to["right"], "mimic", joint="drive")
-    assert default_tip(model, (), "key") == "flange"
-
-
-@pytest.mark.parametrize(
-    ("bar", "leader"),
-    [
-        pytest.param("one", "two", id="along the upper arm"),
-        pytest.param("two", "three", id="along the forearm"),
-        pytest.param("base", "one", id="beside the base"),
-    ],
-)
-def test_a_bar_that_follows_a_joint_of_the_arm_is_beside_the_chain(bar: str, leader: str) -> None:
-    longer = ("two three revolute", "three four revolute", "four five revolute", "five flange")
-    model = tree(*ARM[:2], *longer, f"{bar} bar revolute", "bar rod revolute")
-    for link, name in (("bar", leader), ("rod", "bar")):
-        ET.SubElement(model.joint_to[link], "mimic", joint=f"to_{name}")
-    assert default_tip(model, (), "key") == "flange"
-    assert arm_ends(model) == ["five"]
-
-
-def test_fingers_that_others_mimic_and_a_thumb_beside_them_are_one_hand() -> None:
-    model = tree(*ARM, "flange finger_1 revolute lead", "finger_1 finger_2 revolute", "flange thumb revolute turn")
-    ET.SubElement(model.joint_to["finger_2"], "mimic", joint="lead")
     assert default_tip(model, (), "key") == "flange"
 
 

@@ -83,38 +83,6 @@ def test_usual_limits_need_no_note(safety: str) -> None:
     assert notes_on(ET.fromstring(ARM.format(**(USUAL | {"safety": safety})))) == []
 
 
-def fingers(*names: str, leader: str) -> str:
-    joints = "".join(
-        f"""<joint name="{name}" type="revolute"><parent link="base"/><child link="{name}"/>
-        <limit lower="0" upper="1" velocity="1" effort="1"/></joint><link name="{name}"/>"""
-        for name in names
-    )
-    follower = joints.replace("</joint>", f'<mimic joint="{leader}"/></joint>', 1)
-    return f'<robot name="hand"><link name="base"/>{follower}</robot>'
-
-
-def test_a_mimic_that_lacks_the_prefix_of_its_joint_gets_it_and_is_told() -> None:
-    text = fingers("Left_tip", "Left_root", "Right_root", leader="root")
-    mimic = parse_urdf(text, "hand.urdf").find("joint/mimic")
-    assert mimic is not None
-    assert mimic.get("joint") == "Left_root"
-    (note,) = notes_on(ET.fromstring(text))
-    assert note == "Left_tip mimic joints that lack their prefix; Left_root are taken"
-
-
-@pytest.mark.parametrize(
-    ("names", "leader"),
-    [
-        pytest.param(("Left_tip", "Right_root"), "root", id="with another prefix only"),
-        pytest.param(("Left_tip", "Left_root", "Leftroot"), "root", id="with two prefixes"),
-        pytest.param(("Left_tip", "Left_root"), "tip", id="of itself"),
-    ],
-)
-def test_a_mimic_of_no_joint_stays_refused_where_it_could_mean_none_or_two(names: tuple[str, ...], leader: str) -> None:
-    with pytest.raises(RobotError, match=f"joint Left_tip mimics '{leader}'; allowed: a joint of the model"):
-        parse_urdf(fingers(*names, leader=leader), "hand.urdf")
-
-
 def test_a_file_is_read_in_the_encoding_that_its_first_line_names(tmp_path: Path) -> None:
     text = '<?xml version="1.0" encoding="ISO-8859-1"?><!-- Gr\u00fc\u00dfe -->' + ARM.format(**USUAL)
     (tmp_path / "arm.urdf").write_bytes(text.encode("latin-1"))

@@ -1,0 +1,82 @@
+"""``q2r2 cameras``, which takes a picture with each camera of a cell and says which give none, and why."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+from tests.cameras.videos import FPS, HEIGHT, WIDTH, number_of_jpeg, write_video
+from tests.cli.command import one_object, q2r2
+
+CELL = Path("config/dual_iiwa7.yaml")
+
+
+def cell_with(folder: Path, cameras: dict[str, object]) -> Path:
+    data = yaml.safe_load(CELL.read_text(encoding="utf-8"))
+    file = folder / "cell.yaml"
+    file.write_text(yaml.safe_dump({**data, "cameras": cameras}, sort_keys=False), encoding="utf-8")
+    return file
+
+
+def test_a_picture_of_each_camera_is_taken_and_each_fault_is_named(tmp_path: Path) -> None:
+    pytest.importorskip("cv2")
+    write_video(tmp_path / "front.avi", [165] * 100)
+    size = {"width": WIDTH, "height": HEIGHT, "rate": FPS}
+    cell = cell_with(
+        tmp_path,
+        {
+            "front": {"device": "front.avi", **size},
+            "side": {"device": "/dev/video250", **size},
+            "null": {"device": "/dev/null", **size},
+            "net": {"device": "http://user:secret@127.0.0.1:9/stream", **size},
+        },
+    )
+    result = q2r2("cameras", str(cell), "--output", str(tmp_path / "pictures"), "--json")
+    assert result.exit_code == 1
+    assert "secret" not in result.stdout
+    front, side, null, net = one_object(result.stdout)["cameras"]
+    assert (front["width"], front["height"], front["fault"]) == (WIDTH, HEIGHT, None)
+    assert front["rate"] == pytest.approx(FPS, abs=0.1)
+    assert number_of_jpeg((tmp_path / "pictures/front.jpg").read_bytes()) == 165
+    assert "/dev/video250: no such device; allowed: " in side["fault"]
+    assert null["fault"].endswith("/dev/null: no camera: it is no V4L2 device")
+    assert "http://127.0.0.1:9/stream: no stream of pictures" in net["fault"]
+
+
+@pytest.mark.slow
+def test_a_run_with_a_real_camera_is_judged_and_exported_without_a_simulator(tmp_path: Path) -> None:
+    pytest.importorskip("cv2")
+    write_video(tmp_path / "front.avi", range(250))
+    size = {"width": WIDTH, "height": HEIGHT, "rate": FPS}
+    cell = str(cell_with(tmp_path, {"front": {"device": "front.avi", **size}}))
+    options = ("--input", "scripted", "--plant", "kinematic", "--headless", "--duration", "1", "--json")
+    done = q2r2("run", cell, *options, "--record", str(tmp_path / "recordings"))
+    recording = one_object(done.stdout)["recording"]
+    assert (recording["fault"], recording["lost_pictures"], recording["pictures"] >= 25) == (None, 0, True)
+    fast = q2r2("run", cell, *options, "--fast", "--record", str(tmp_path / "fast"))
+    assert "no pictures of front: real cameras keep real time; allowed: without --fast\n" in fast.stderr
+    pytest.importorskip("h5py")
+    export = ("hdf5", str(tmp_path / "recordings"), "--output", str(tmp_path / "dataset"), "--fps", "10")
+    assert q2r2("export", *export, "--keep-discarded").exit_code == 0
+    import h5py
+
+    with h5py.File(tmp_path / "dataset/episode_0.hdf5") as episode:
+        assert episode["observations/images/front"].shape[1:] == (HEIGHT, WIDTH, 3)
+
+
+def test_without_a_cell_the_devices_of_this_computer_are_listed() -> None:
+    result = q2r2("cameras")
+    assert result.exit_code == 0
+    assert result.stdout.startswith(("/dev/video", "no V4L2 camera on this computer\n"))
+
+
+def test_opencv_is_imported_by_nothing_that_uses_no_camera() -> None:
+    code = (
+        "import sys, q2r2_control.cli.cell_run, q2r2_control.cli.cameras, q2r2_control.recording.writer;"
+        "sys.exit('cv2' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
