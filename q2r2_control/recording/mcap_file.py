@@ -6,6 +6,7 @@ the file from record to record. The rules of the format are in https://mcap.dev/
 
 from __future__ import annotations
 
+import errno
 import os
 import struct
 from collections.abc import Collection, Iterator
@@ -80,6 +81,10 @@ class McapFile:
                 return SeekingReader(stream, record_size_limit=_LARGEST).get_summary()
             except (StopIteration, McapError, ValueError, KeyError, struct.error, OverflowError, MemoryError):
                 return None
+            except OSError as error:
+                if error.errno != errno.EINVAL:
+                    raise
+                return None  # The last bytes of an unfinished file may look like an index at an impossible place.
 
     def messages(self, topics: Collection[str] | None = None, since: int = 0) -> Iterator[list[Message]]:
         """Yield all messages, or those of some ``topics``, as lists of a chunk or of some hundred messages.
