@@ -49,6 +49,7 @@ class ReasonKind(StrEnum):
     EPISODE_FAILED = "episode_failed", "episode failed"
     EPISODE_DISCARDED = "episode_discarded", "episode discarded"
     MARK = "mark", "mark"
+    SUBTASK_BEGINS = "subtask_begins", "begins: {name}"
     VERDICT = "verdict", "verdict on episode {episode}: {line}"
     # Cameras of a recording. No arm stops for them.
     CAMERA_STOPPED = "camera_stopped", "camera {camera}: no picture for {age:.1f} s{why}"
@@ -79,6 +80,8 @@ class ReasonKind(StrEnum):
     NO_RECORDING = "no_recording", "not recorded: this run has no recording"
     RECORDING_ENDED = "recording_ended", "not recorded any more: {text}"
     NO_EPISODE = "no_episode", "not discarded: no episode has begun"
+    NO_OPEN_EPISODE = "no_open_episode", "no next subtask: no episode goes on"
+    LAST_SUBTASK = "last_subtask", "no next subtask: {name} is the last one"
     # Faults of a hand and its data.
     POSE_SILENT = "pose_silent", "no pose for {timeout:g} s"
     POSE_GAP = "pose_gap", "no pose for {gap:.3f} s"
@@ -253,7 +256,8 @@ class ReasonKind(StrEnum):
 
 _K = ReasonKind
 _NOT_DONE = {_K.NOT_ENGAGED, _K.NOT_HOMING, _K.NOT_CARRIED, _K.NOT_CHANGED, _K.POLICY_REFUSED}
-REFUSALS = frozenset({*_NOT_DONE, _K.NO_RECORDING, _K.RECORDING_ENDED, _K.NO_EPISODE})
+_NOT_RECORDED = {_K.NO_RECORDING, _K.RECORDING_ENDED, _K.NO_EPISODE, _K.NO_OPEN_EPISODE, _K.LAST_SUBTASK}
+REFUSALS = frozenset({*_NOT_DONE, *_NOT_RECORDED})
 _WAY_HOME = {_K.HOMING, _K.HOMING_ARRIVED, _K.HOMING_HELD_UP, _K.HOMING_NO_WAY, _K.HOMING_INTERRUPTED, _K.HOMING_ENDED}
 ROUTINE = frozenset({_K.ACTIVATED, _K.HOMING_ARRIVED, _K.NODE_ENDS})  # Kinds that tell of no fault.
 # Requests to hold, and the results of a way home.

@@ -43,6 +43,7 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.run_summary import RunSummary
 from q2r2_control.summary.tick import Tick
 from q2r2_control.teleop.both_arms import EpisodeMarks
+from q2r2_control.viewer.episode_words import EpisodeWords
 from q2r2_control.viewer.headset_view import DisplayInput, HeadsetView
 from q2r2_control.viewer.live import LiveTable
 from q2r2_control.viewer.live_pictures import LivePictures, ShownPictures
@@ -316,7 +317,10 @@ def _run(
             title = f"{options.name}: Ctrl-C brings the arms to rest and ends"
             shown, simulated = ShownRobot.of(pipeline.robot, pipeline.config), options.simulated_time
             words = shown.words(pipeline.input.controls.words)
-            table = LiveTable(title, words, options.steps, options.duration, simulated_time=simulated)
+            episodes = EpisodeWords(pipeline.config.recording.subtasks) if recorder is not None else None
+            table = LiveTable(
+                title, words, options.steps, options.duration, simulated_time=simulated, episodes=episodes
+            )
             pipeline.listeners.append(table)
             stack.enter_context(table.shown(console))
         streams.wait_until_ready()

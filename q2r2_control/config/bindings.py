@@ -28,6 +28,7 @@ class Action(StrEnum):
     RECORD_SUCCESS = "record_success"
     RECORD_FAILURE = "record_failure"
     RECORD_MARK = "record_mark"
+    NEXT_SUBTASK = "next_subtask"
     # These actions last for as long as a trigger or stick is held.
     DEAD_MAN = "dead_man"
     PRECISION = "precision"
@@ -61,6 +62,7 @@ MEANINGS: dict[str, str] = {
     Action.RECORD_SUCCESS: "says that the episode, or the last one, succeeded, and ends it",
     Action.RECORD_FAILURE: "says that the episode, or the last one, failed, and ends it",
     Action.RECORD_MARK: "marks this moment in the recording",
+    Action.NEXT_SUBTASK: "begins the next subtask of the episode",
     Action.DEAD_MAN: "held: the arm follows; let go: it pauses",
     Action.PRECISION: "held: motion is scaled by precision_scale",
     Action.ROTATION_LOCK: "held: the tool keeps its orientation",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated, Literal
 
 from pydantic import Field, StringConstraints, model_validator
@@ -12,6 +13,7 @@ from q2r2_control.config.strict import StrictModel
 Seconds = Annotated[float, Field(ge=0, le=10)]
 Metres = Annotated[float, Field(ge=0, le=2)]
 Radians = Annotated[float, Field(ge=0, le=3.15)]
+SubtaskSeconds = Annotated[float, Field(ge=0, le=3600)]
 
 
 class JudgeSettings(StrictModel):
@@ -99,21 +101,46 @@ class JudgeSettings(StrictModel):
         0.5, description="largest share of ticks that the loop missed because it was late"
     )
     max_tick_gap: Seconds | None = Field(0.1, description="longest time between two ticks of the loop [s]")
+    min_subtask_time: SubtaskSeconds | None = Field(None, description="shortest time of a subtask of the episode [s]")
+    max_subtask_time: SubtaskSeconds | None = Field(None, description="longest time of a subtask of the episode [s]")
+    needs_subtasks: bool = Field(
+        True, description="episodes without some of the subtasks that recording.subtasks names are discarded"
+    )
     keep_failed: bool = Field(False, description="episodes that failed, by their operator or task, are kept")
     needs_task: bool = Field(False, description="episodes without a task in words are discarded")
     needs_end: bool = Field(True, description="files without an end, as after a killed process, are discarded")
 
 
 TOPIC_RATE = 100.0  # [Hz]
+SubtaskName = Annotated[str, StringConstraints(pattern=r"^\S(.*\S)?$", max_length=200)]
 
 
 class RecordingSettings(StrictModel):
-    """The amount of data that ``q2r2 run --record`` writes."""
+    """The amount of data that ``q2r2 run --record`` writes, and the subtasks of an episode."""
 
     topic_rate: Annotated[float, Field(gt=0, le=1000)] | None = Field(
         TOPIC_RATE,
         description="rate of the standard topics, which repeat numbers of the tick [Hz]; null: every tick",
     )
+    subtasks: tuple[SubtaskName, ...] = Field(
+        (),
+        max_length=100,
+        description="names of an episode's subtasks, in their order; the first one begins with the episode, and each "
+        "next_subtask of the operator begins another; none: they have numbers, and there may be any number of them",
+    )
+
+
+def subtask_name(names: Sequence[str], number: int) -> str:
+    """Return the name of subtask ``number``, from 1 on; ``names`` are those of ``recording.subtasks``."""
+    return names[number - 1] if number <= len(names) else f"subtask {number}"
+
+
+def subtask_names(names: Sequence[str], presses: int) -> tuple[str, ...]:
+    """Return the names of the subtasks that an episode has begun, or nothing if nobody told of subtasks.
+
+    ``names`` are those of ``recording.subtasks``, and ``presses`` is how often the operator began another subtask.
+    """
+    return tuple(subtask_name(names, number) for number in range(1, presses + 2)) if names or presses else ()
 
 
 # The name of a camera is a part of the names of its topic and of its feature in a dataset.

@@ -18,19 +18,22 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from q2r2_control.config.recording import subtask_names
 from q2r2_control.errors import ConfigError, RecordingError
 from q2r2_control.export.sampling import CameraFrames, Names, Vectors, features, sample, units_of
 from q2r2_control.inputs.policy import ActionSpace
 from q2r2_control.process.helper_process import reason_of
 from q2r2_control.process.pools import pool_of
 from q2r2_control.recording.about import anonymous
+from q2r2_control.recording.messages import NANOSECONDS
 from q2r2_control.recording.reader import BROKEN, WHOLE, EpisodeSpan, read_spans
 from q2r2_control.recording.recorded_ticks import cell_and_robot_of
 from q2r2_control.recording.ros_recording import open_recording
 
 FASTEST = 1000  # The highest rate of frames [Hz].
 _OUTPUT = "allowed: a new folder where you may write"
-_FORMAT = 7  # The version of kept episodes. Episodes of another version are made again.
+SUBTASK = "subtask_index"  # The name of the column with the index of a frame's subtask, as lerobot names it.
+_FORMAT = 8  # The version of kept episodes. Episodes of another version are made again.
 
 
 @dataclass(frozen=True)
@@ -69,6 +72,8 @@ class EpisodeVectors:
     ahead: int = 0  # Row k has the actions that are positions of frame k + ahead.
     part: int = 0  # The number of the episode in the file, from 1 on; 0 for the whole file.
     cameras: Mapping[str, CameraFrames] = field(default_factory=dict)  # By camera, one picture for each frame.
+    subtasks: tuple[str, ...] = ()  # The names of its subtasks, in their order; empty if nobody told of any.
+    subtask: tuple[int, ...] = ()  # The index in ``subtasks`` of each frame; empty if there are no subtasks.
 
     @property
     def units(self) -> Names:
@@ -113,6 +118,10 @@ def make_episode(file: Path, sampling: FrameSampling, span: EpisodeSpan | None =
     notes = anonymous(notes) if sampling.anonymous else notes
     task = notes.pop("task", "")
     cameras, stamps = recording.about.cameras if sampling.pictures else (), frames["stamp"].tolist()
+    # The same limits of times as those of the judge, which are since the run began.
+    passed = (frames["stamp"] - recording.about.epoch) / NANOSECONDS
+    subtasks = subtask_names(cell.recording.subtasks, len(span.subtask_starts))
+    number = np.searchsorted(np.array(span.subtask_starts), passed, side="right")
     return EpisodeVectors(
         recording=recording.file.name,
         cell=cell.name,
@@ -125,6 +134,8 @@ def make_episode(file: Path, sampling: FrameSampling, span: EpisodeSpan | None =
         ahead=sampling.ahead,
         part=span.number,
         cameras={name: CameraFrames(recording, name, cell.cameras[name], stamps) for name in cameras},
+        subtasks=subtasks,
+        subtask=tuple(number.tolist()) if subtasks else (),
     )
 
 

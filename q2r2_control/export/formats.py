@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from q2r2_control.errors import ConfigError, RecordingError, shown
-from q2r2_control.export.episodes import EpisodeVectors
+from q2r2_control.export.episodes import SUBTASK, EpisodeVectors
 from q2r2_control.export.export_format import ExportFormat
 from q2r2_control.export.lerobot import join_shards, require_lerobot, write_shard
 from q2r2_control.export.lerobot_v21 import join_v21, openpi_config, require_v21, write_v21
@@ -49,11 +49,14 @@ def write_table(episode: EpisodeVectors, path: Path) -> None:
     }
     columns |= episode.outcome()
     columns |= {"timestamp": (frames / episode.fps).astype(np.float32), "frame_index": frames}
+    columns["task"] = np.full(episode.frames, episode.task, dtype=object)
+    if episode.subtasks:
+        columns[SUBTASK] = np.array(episode.subtask)
+        columns["subtask"] = np.array(episode.subtasks, dtype=object)[columns[SUBTASK]]
     with path.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow([*columns, "task"])
-        rows = zip(*(column.tolist() for column in columns.values()), strict=True)
-        writer.writerows([*row, episode.task] for row in rows)
+        writer.writerow(columns)
+        writer.writerows(zip(*(column.tolist() for column in columns.values()), strict=True))
 
 
 def gather_tables(files: Sequence[Path], folder: Path) -> None:
@@ -97,6 +100,8 @@ def write_hdf5(episode: EpisodeVectors, path: Path) -> None:
             data.attrs["units"] = list(episode.units[feature])
         for name, flags in zip(("dones", "rewards"), episode.outcome().values(), strict=True):
             file.create_dataset(name, data=flags.astype(np.float32))
+        if episode.subtasks:
+            file.create_dataset(SUBTASK, data=np.array(episode.subtask)).attrs["names"] = list(episode.subtasks)
         images = file.create_group("observations/images")
         for camera, pictures in episode.cameras.items():
             # Each picture is compressed by itself, so that one can be read without the others.

@@ -18,6 +18,7 @@ from typing import Any
 from q2r2_control.errors import ConfigError, RecordingError
 from q2r2_control.export.dataset_card import POSITION, SOURCES, write_card
 from q2r2_control.export.episodes import EpisodeVectors
+from q2r2_control.export.lerobot_subtasks import add_subtasks, read_subtasks, write_subtasks
 from q2r2_control.extras import install_line
 from q2r2_control.inputs.policy import ActionSpace
 
@@ -76,6 +77,7 @@ def write_shard(episode: EpisodeVectors, folder: Path) -> None:
     dataset.save_episode(parallel_encoding=False)  # The export already uses several processes.
     dataset.finalize()
     (folder / SOURCES).write_text(json.dumps([source_of(episode)]), encoding="utf-8")
+    write_subtasks(episode, folder)
 
 
 def _as_lerobot(feature: str, labels: Sequence[str]) -> list[str]:
@@ -99,6 +101,7 @@ def join_shards(shards: Sequence[Path], folder: Path) -> None:
     finally:
         shutil.rmtree(datasets.config.HF_DATASETS_CACHE, ignore_errors=True)
         datasets.config.HF_DATASETS_CACHE = cache
+    add_subtasks(read_subtasks(shards), folder)
     write_sources(sources, folder)
     write_card(infos[0], sources, folder)
 

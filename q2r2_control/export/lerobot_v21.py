@@ -24,7 +24,9 @@ from q2r2_control.export.sampling import CameraFrames, Names
 from q2r2_control.extras import install_line
 
 DESCRIPTION = "annotation.human.action.task_description"  # GR00T's name of the column with the number of the task.
+SUBTASK_DESCRIPTION = "annotation.human.action.subtask_description"  # The same of the subtask, which is a task too.
 OPENPI_CAMERAS = ("cam_high", "cam_left_wrist", "cam_right_wrist")
+_ANNOTATION = "annotation."
 _CHUNK = 1000  # The number of episodes in a folder.
 _DATA = "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
 _VIDEO = "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4"
@@ -86,6 +88,8 @@ def write_v21(episode: EpisodeVectors, folder: Path) -> None:
         "stats": stats,
         "modality": _modality(episode.names, [names[camera] for camera in episode.cameras]),
         "source": source_of(episode),
+        "subtasks": episode.subtasks,
+        "subtask": episode.subtask,
     }
     (folder / _ABOUT).write_text(json.dumps(about), encoding="utf-8")
 
@@ -98,13 +102,19 @@ def join_v21(shards: Sequence[Path], folder: Path) -> None:
     about = [json.loads((shard / _ABOUT).read_text(encoding="utf-8")) for shard in shards]
     sources = [one["source"] for one in about]
     check_alike(about, sources)
-    tasks = list(dict.fromkeys(one["task"] for one in about))
+    # Subtasks are tasks too, after the others.
+    tasks = list(dict.fromkeys([*(one["task"] for one in about), *(name for one in about for name in one["subtasks"])]))
+    counted = (*_COUNTED, SUBTASK_DESCRIPTION) if any(one["subtasks"] for one in about) else _COUNTED
+    modality = about[0]["modality"] | {"annotation": {_annotation(name): {} for name in counted if _annotation(name)}}
     videos = [name for name, feature in about[0]["features"].items() if feature["dtype"] == "video"]
     episodes, stats, total = [], [], 0
     for number, (shard, one) in enumerate(zip(shards, about, strict=True)):
         frames, task, at = np.arange(one["frames"]), tasks.index(one["task"]), np.ones(one["frames"], dtype=np.int64)
         columns: dict[str, npt.NDArray[Any]] = {"timestamp": (frames / one["fps"]).astype(np.float32)}
         columns |= zip(_COUNTED, (frames, number * at, total + frames, task * at, task * at), strict=True)
+        if SUBTASK_DESCRIPTION in counted:  # Without any subtask, the whole episode is one with the task's name.
+            told = [tasks.index(one["subtasks"][index]) for index in one["subtask"]]
+            columns[SUBTASK_DESCRIPTION] = np.array(told) if told else task * at
         table = parquet.read_table(shard / _PACKED)
         for name, values in columns.items():
             table = table.append_column(name, pa.array(values))
@@ -113,8 +123,8 @@ def join_v21(shards: Sequence[Path], folder: Path) -> None:
         for key in videos:
             shutil.copyfile(shard / f"{key}.mp4", _made(folder / _VIDEO.format(video_key=key, **place)))
         episodes.append({"episode_index": number, "tasks": [one["task"]], "length": one["frames"]})
-        counted = {name: _stats(values[:, None]) for name, values in columns.items()}
-        stats.append({"episode_index": number, "stats": one["stats"] | counted})
+        of_columns = {name: _stats(values[:, None]) for name, values in columns.items()}
+        stats.append({"episode_index": number, "stats": one["stats"] | of_columns})
         total += one["frames"]
     info = {
         "codebase_version": "v2.1",
@@ -131,10 +141,10 @@ def join_v21(shards: Sequence[Path], folder: Path) -> None:
         "video_path": _VIDEO if videos else None,
         "features": about[0]["features"]
         | {"timestamp": _scalar("float32")}
-        | {name: _scalar("int64") for name in _COUNTED},
+        | {name: _scalar("int64") for name in counted},
     }
     meta = folder / "meta"
-    for name, content in (("info.json", info), ("modality.json", about[0]["modality"])):
+    for name, content in (("info.json", info), ("modality.json", modality)):
         _made(meta / name).write_text(json.dumps(content, indent=4), encoding="utf-8")
     numbered = [{"task_index": number, "task": task} for number, task in enumerate(tasks)]
     for name, lines in (("tasks", numbered), ("episodes", episodes), ("episodes_stats", stats)):
@@ -171,6 +181,11 @@ data = SimpleDataConfig(
         outputs=[_transforms.AbsoluteActions(mask)],
     ),
 )"""
+
+
+def _annotation(column: str) -> str:
+    """Return the name that GR00T gives to a column of annotations; empty for another column."""
+    return column.removeprefix(_ANNOTATION) if column.startswith(_ANNOTATION) else ""
 
 
 def _made(path: Path) -> Path:
@@ -216,7 +231,7 @@ def _modality(names: Names, cameras: Sequence[str]) -> dict[str, dict[str, Any]]
         for what, feature in (("state", "observation.state"), ("action", "action"))
     }
     shown = {camera: {"original_key": video_key(camera)} for camera in cameras}
-    return {**parts, "video": shown, "annotation": {DESCRIPTION.removeprefix("annotation."): {}}}
+    return {**parts, "video": shown}
 
 
 def _video_feature(size: tuple[int, int, int], fps: int) -> dict[str, Any]:

@@ -92,6 +92,7 @@ class Episode:
     part: int | None = None  # The number of the episode, from 1 on; None for the whole recording.
     discarded: bool = False  # The operator discarded it.
     ended_by_operator: bool = False  # The operator ended it while the run went on.
+    subtask_starts: tuple[float, ...] = ()  # When the operator began another subtask.
 
     @property
     def arms(self) -> tuple[str, ...]:

@@ -30,7 +30,7 @@ _BEFORE = 1_000_000_000  # Reading begins this long before the episode [ns].
 _TICKS_BETWEEN_LOOKS = 64  # The number of ticks between two checks for a verdict.
 _OF_EPISODES = {
     *(ReasonKind.EPISODE_BEGINS, ReasonKind.EPISODE_ENDS, ReasonKind.EPISODE_DISCARDED),
-    *(ReasonKind.EPISODE_SUCCEEDED, ReasonKind.EPISODE_FAILED),
+    *(ReasonKind.EPISODE_SUCCEEDED, ReasonKind.EPISODE_FAILED, ReasonKind.SUBTASK_BEGINS),
 }
 
 _logger = logging.getLogger(__name__)

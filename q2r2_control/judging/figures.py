@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from q2r2_control.config.recording import subtask_names
 from q2r2_control.events import ReasonKind
 from q2r2_control.judging.camera_figures import CameraFigures, camera_figures
 from q2r2_control.judging.episode import Episode
@@ -114,6 +115,26 @@ class TimingFigures:
 
 
 @dataclass(frozen=True, slots=True)
+class SubtaskFigures:
+    """One subtask of an episode, from its press to the next one, or to the end of the episode."""
+
+    name: str
+    start_s: float  # Time since the episode began.
+    duration_s: float
+
+
+def subtask_figures(episode: Episode, duration: float) -> list[SubtaskFigures]:
+    """Return the subtasks of an episode of this ``duration`` [s]; no subtask if nobody told of any."""
+    names = subtask_names(episode.config.recording.subtasks, len(episode.subtask_starts))
+    ends = (*episode.subtask_starts, duration)
+    starts = (0.0, *episode.subtask_starts)
+    return [
+        SubtaskFigures(name, start, max(end - start, 0.0))
+        for name, start, end in zip(names, starts, ends, strict=False)
+    ]
+
+
+@dataclass(frozen=True, slots=True)
 class EpisodeFigures:
     """The numbers of one episode. Shares are from 0 to 1. None means that a number cannot be computed."""
 
@@ -140,6 +161,8 @@ class EpisodeFigures:
     ended_by: str | None  # The fault that ended the run.
     discarded: bool  # The operator discarded the episode.
     success: bool | None  # The success by the task's own check or the operator; None if it is not known.
+    subtasks: list[SubtaskFigures]  # In their order; empty if nobody told of subtasks.
+    missing_subtasks: list[str]  # The names of the cell's subtasks that the operator did not begin.
 
     @property
     def name(self) -> str:
@@ -150,11 +173,13 @@ def figures_of(episode: Episode, dropout: float) -> EpisodeFigures:
     """Return the numbers of an episode. A time between a hand's poses above ``dropout`` [s] is a dropout."""
     ticks, following, count = episode.ticks, episode.ticks.following, len(episode.ticks.t)
     engaged = ticks.engaged.any(axis=1) & following
+    duration = float(ticks.t[following][-1]) if following.any() else 0.0
+    subtasks = subtask_figures(episode, duration)
     return EpisodeFigures(
         file=str(episode.recording.file),
         part=episode.part,
         task=episode.recording.about.notes.get("task"),
-        duration_s=float(ticks.t[following][-1]) if following.any() else 0.0,
+        duration_s=duration,
         engaged_s=float(ticks.dt[engaged].sum()),
         idle_share=idle_share(episode),
         hands={hand: hand_figures(episode, hand, dropout) for hand in episode.hands},
@@ -179,6 +204,8 @@ def figures_of(episode: Episode, dropout: float) -> EpisodeFigures:
         ended_by=episode.ended_by,
         discarded=episode.discarded,
         success=episode.success,
+        subtasks=subtasks,
+        missing_subtasks=list(episode.config.recording.subtasks[len(subtasks) :]),
     )
 
 

@@ -59,6 +59,7 @@ def verdict_of(figures: EpisodeFigures, settings: JudgeSettings) -> Verdict:
         "arm": {f"{name} arm: ": arm for name, arm in figures.arms.items()},
         "measured": {f"{name} arm: ": arm for name, arm in figures.measured.items()},
         "camera": {_whose(name, camera): camera for name, camera in figures.cameras.items()},
+        "subtask": {f"subtask {number}, {one.name}: ": one for number, one in enumerate(figures.subtasks, 1)},
         "episode": {"": figures},
         "timing": {"": figures.timing},
     }
@@ -85,6 +86,8 @@ def _unreadable(figures: EpisodeFigures, settings: JudgeSettings) -> Iterator[Re
         yield Rejection("operator", "its operator discarded it")
     if figures.success is False and not settings.keep_failed:
         yield Rejection("keep_failed", "it failed, as its operator or task says")
+    if figures.missing_subtasks and settings.needs_subtasks:
+        yield Rejection("needs_subtasks", f"it has no {', '.join(figures.missing_subtasks)}")
     if figures.ended_by is not None:
         yield Rejection("ended_by", f"a fault ended the run: {figures.ended_by}")
     if figures.damage is not None:
@@ -98,7 +101,9 @@ def _unreadable(figures: EpisodeFigures, settings: JudgeSettings) -> Iterator[Re
 def parts_of(episode: Episode) -> list[Episode]:
     """Return the episodes of a recording in their order, or the whole recording if the operator marked none."""
     spans = spans_of(episode.events, episode.success)
-    return [part_of(episode, span) if span.number else replace(episode, success=span.success) for span in spans]
+    if not spans[0].number:
+        return [replace(episode, success=spans[0].success, subtask_starts=spans[0].subtask_starts)]
+    return [part_of(episode, span) for span in spans]
 
 
 def part_of(episode: Episode, span: EpisodeSpan) -> Episode:
@@ -135,6 +140,7 @@ def part_of(episode: Episode, span: EpisodeSpan) -> Episode:
         part=span.number,
         discarded=span.discarded,
         ended_by_operator=told,
+        subtask_starts=tuple(start - began for start in span.subtask_starts),
     )
 
 

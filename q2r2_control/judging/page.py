@@ -63,6 +63,7 @@ COLUMNS = (
     FigureColumn("success", "", 0, lambda of: None if of.success is None else "yes" if of.success else "no"),
     FigureColumn("time", "s", 1, lambda of: of.duration_s),
     FigureColumn("engaged", "s", 1, lambda of: of.engaged_s),
+    FigureColumn("subtasks", "", 0, lambda of: float(len(of.subtasks)) if of.subtasks else None),
     FigureColumn("idle", "%", 0, lambda of: _percent(of.idle_share)),
     FigureColumn("poses", "Hz", 0, lambda of: _worst([hand.pose_rate_hz for hand in of.hands.values()], min)),
     FigureColumn("gap", "s", 3, lambda of: _worst([hand.longest_gap_s for hand in of.hands.values()])),

@@ -22,10 +22,10 @@ class _Unit(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Threshold:
-    """A limit of a number of an episode, or of each of its hands, arms or cameras."""
+    """A limit of a number of an episode, or of each of its hands, arms, cameras or subtasks."""
 
     name: str  # min_... is a lower limit, and max_... is an upper limit.
-    of: Literal["episode", "hand", "arm", "measured", "camera", "timing"]
+    of: Literal["episode", "hand", "arm", "measured", "camera", "subtask", "timing"]
     figure: str
     words: str
     unit: _Unit
@@ -45,7 +45,7 @@ class Threshold:
         return Rejection(self.name, f"{shown} ({'at least' if at_least else 'at most'} {scale * limit:.4g})")
 
 
-_MM, _MS, _DEGREES = _Unit("mm", 1e3), _Unit("ms", 1e3), _Unit("deg", math.degrees(1.0))
+_SECONDS, _MM, _MS, _DEGREES = _Unit("s"), _Unit("mm", 1e3), _Unit("ms", 1e3), _Unit("deg", math.degrees(1.0))
 _PERCENT, _OF_TIME, _OF_TICKS = (_Unit(f"%{of}", 1e2) for of in ("", " of the time", " of the ticks"))
 _OF_DUE, _OF_PICTURES = (_Unit(f"% of the pictures{which}", 1e2) for which in (" that were due", ""))
 _TICKS, _PICTURES, _PERIODS = (_Unit(of) for of in ("ticks", "pictures", "of its periods"))
@@ -82,6 +82,8 @@ THRESHOLDS = (
     Threshold("max_black_share", "camera", "black_share", "black or of one colour", _OF_PICTURES),
     Threshold("max_bad_pictures", "camera", "bad_pictures", "damaged, or of another size than the cell's:", _PICTURES),
     Threshold("max_picture_lag", "camera", "lag_ms", "pictures are later than the arms by", _MS, True, size_only=True),
+    Threshold("min_subtask_time", "subtask", "duration_s", "takes", _SECONDS),
+    Threshold("max_subtask_time", "subtask", "duration_s", "takes", _SECONDS),
     Threshold("max_idle_share", "episode", "idle_share", "idle: no engaged arm moves", _PERCENT),
     Threshold("max_fallback_share", "episode", "fallback_share", "certified stops executed", _OF_TICKS),
     Threshold("max_uncertified_share", "episode", "uncertified_share", "without a certified stop", _OF_TICKS),

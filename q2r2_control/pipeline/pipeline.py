@@ -329,6 +329,7 @@ class Pipeline(RequestedRun):
             self.teleop, self.input, self.supervisor, self.controller, self.requests, self.impedance
         )
         self.teleop.marks.recorded = self._recorder.keeps_episodes
+        self.teleop.marks.subtasks = self.config.recording.subtasks
 
     def _run_until(self, duration: float) -> RunSummary:
         """Tick until ``duration`` [s] is over or a stop is asked for, and then until the arms are at rest."""

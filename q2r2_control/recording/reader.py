@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import struct
 from collections.abc import Collection, Iterable, Iterator, Sequence
@@ -21,9 +22,8 @@ from q2r2_control.events import Event, ReasonKind
 from q2r2_control.process.helper_process import reason_of
 from q2r2_control.recording.about import ABOUT, CELL, CONCLUSION, LOOP, ROBOT, About, Conclusion
 from q2r2_control.recording.mcap_file import McapFile
-from q2r2_control.recording.messages import PICTURE, Message, Topic, data_of, picture_topic
+from q2r2_control.recording.messages import PICTURE, STATE, TEXT, Message, Topic, data_of, picture_topic
 from q2r2_control.recording.tick_chunks import TickAssembly, TickChunk
-from q2r2_control.teleop.both_arms import EpisodeMarks
 
 # Errors that readers raise for a file that is damaged or of another program.
 BROKEN = (
@@ -201,6 +201,12 @@ class EpisodeSpan:
     discarded: bool = False  # The operator discarded it.
     success: bool | None = None  # None if it is not known.
     number: int = 0  # The number of the episode, from 1 on; 0 is the whole run.
+    # When the operator began another subtask. The first subtask begins with the episode.
+    subtask_starts: tuple[float, ...] = ()
+
+    def with_subtask(self, start: float) -> EpisodeSpan:
+        """Return the episode with one more subtask, which begins at ``start`` [s]."""
+        return replace(self, subtask_starts=(*self.subtask_starts, start))
 
 
 WHOLE = EpisodeSpan()
@@ -220,6 +226,10 @@ def spans_of(events: Iterable[Event], run_succeeded: bool | None = None) -> list
             spans.append(EpisodeSpan(event.t))
         elif event.kind is ReasonKind.EPISODE_ENDS and is_open:
             spans[-1] = replace(spans[-1], end=event.t)
+        elif event.kind is ReasonKind.SUBTASK_BEGINS and is_open:
+            spans[-1] = spans[-1].with_subtask(event.t)
+        elif event.kind is ReasonKind.SUBTASK_BEGINS and not spans:
+            whole = whole.with_subtask(event.t)
         elif event.kind is ReasonKind.EPISODE_DISCARDED and spans:
             spans[-1] = replace(spans[-1], end=min(spans[-1].end, event.t), discarded=True)
         elif event.kind in (ReasonKind.EPISODE_SUCCEEDED, ReasonKind.EPISODE_FAILED):
@@ -233,12 +243,19 @@ def spans_of(events: Iterable[Event], run_succeeded: bool | None = None) -> list
 
 def read_spans(recording: Recording) -> list[EpisodeSpan]:
     """Return the episodes of a recording. Raises :class:`RecordingError` if it is damaged."""
-    about, success = recording.about, recording.conclusion.success
-    if about.source == LOOP and not any(action in about.cell for action in EpisodeMarks.actions):
-        # No control of the cell marks episodes, so the ticks need not be read. With ROS nodes a service marks them too.
-        return spans_of((), success)
     try:
-        told = (events for chunk in recording.chunks() for events in chunk.events().values())
-        return spans_of((event for events in told for event in events), success)
+        return spans_of(_events_of(recording), recording.conclusion.success)
     except (ValueError, KeyError, TypeError) as error:
         raise RecordingError(f"{recording.file}: damaged: {error!r:.200}") from error
+
+
+def _events_of(recording: Recording) -> Iterator[Event]:
+    """Yield all events. A loop has them in one topic, so the numbers of its ticks need not be read."""
+    if recording.about.source == LOOP:
+        states = (str(data_of(one.payload, TEXT)) for messages in recording.messages({STATE}) for one in messages)
+        for state in states:
+            yield from map(Event.from_json, json.loads(state).get("events", ()))
+        return
+    for chunk in recording.chunks():
+        for events in chunk.events().values():
+            yield from events

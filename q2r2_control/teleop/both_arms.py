@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from typing import Any
 
 import pinocchio as pin
 
 from q2r2_control.config.bindings import Action, Gesture
+from q2r2_control.config.recording import subtask_name
 from q2r2_control.config.teleop import Stance, TeleopSettings
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.quaternions import floats_of, se3_of
@@ -21,38 +23,79 @@ _OUTCOMES = {Action.RECORD_FAILURE: ReasonKind.EPISODE_FAILED, Action.RECORD_SUC
 
 
 class EpisodeMarks:
-    """Turns presses that mark episodes into events. The recording has these events, as it has all events."""
+    """Turns presses that mark episodes into events. The recording has these events, as it has all events.
 
-    actions = (Action.RECORD_DISCARD, *_OUTCOMES, Action.RECORD_TOGGLE, Action.RECORD_MARK)
+    An episode begins with its first subtask. A run in which no episode ever begins is one episode itself.
+    """
+
+    actions = (
+        *(Action.RECORD_DISCARD, *_OUTCOMES, Action.RECORD_TOGGLE, Action.RECORD_MARK),
+        Action.NEXT_SUBTASK,
+    )
 
     def __init__(self) -> None:
         self.recorded = False  # Whether the run is recorded.
         self.open = False  # Whether an episode has begun and not ended.
         self.any = False  # Whether there is an episode that could be discarded.
+        self.begun = False  # Whether an episode has ever begun, so that the run itself is no episode.
+        self.subtask = 1  # The number of the subtask that goes on.
+        self.subtasks: Sequence[str] = ()  # The names of all subtasks, in their order; empty if they have none.
 
-    def apply(self, action: Action) -> ReasonKind:
-        """Take a press of the operator; returns the kind of the event. Success and failure end the episode."""
+    def apply(self, action: Action) -> Reason:
+        """Take a press of the operator; returns the reason of the event. Success and failure end the episode."""
         if not self.recorded:
-            return ReasonKind.NO_RECORDING
+            return Reason(ReasonKind.NO_RECORDING)
         if action is Action.RECORD_MARK:
-            return ReasonKind.MARK
+            return Reason(ReasonKind.MARK)
+        if action is Action.NEXT_SUBTASK:
+            return self._next_subtask()
         if action is Action.RECORD_DISCARD:
             self.open = False
             any_episode, self.any = self.any, False
-            return ReasonKind.EPISODE_DISCARDED if any_episode else ReasonKind.NO_EPISODE
+            return Reason(ReasonKind.EPISODE_DISCARDED if any_episode else ReasonKind.NO_EPISODE)
         if action in _OUTCOMES:
             self.open = False
-            return _OUTCOMES[action]
-        self.open = not self.open
-        self.any = True
-        return ReasonKind.EPISODE_BEGINS if self.open else ReasonKind.EPISODE_ENDS
+            return Reason(_OUTCOMES[action])
+        kind = ReasonKind.EPISODE_ENDS if self.open else ReasonKind.EPISODE_BEGINS
+        self.follow(kind)
+        return Reason(kind)
+
+    def _next_subtask(self) -> Reason:
+        if self.begun and not self.open:
+            return Reason(ReasonKind.NO_OPEN_EPISODE)
+        if self.subtasks and self.subtask >= len(self.subtasks):
+            return Reason.of(ReasonKind.LAST_SUBTASK, name=subtask_name(self.subtasks, self.subtask))
+        self.subtask += 1
+        name = subtask_name(self.subtasks, self.subtask)
+        return Reason.of(ReasonKind.SUBTASK_BEGINS, number=self.subtask, name=name)
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the state as data for ``json.dumps``."""
+        return {
+            "records": self.recorded,
+            "episode_open": self.open,
+            "any_episode": self.any,
+            "episode_begun": self.begun,
+            "subtask": self.subtask,
+            "subtasks": list(self.subtasks),
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Take a state of :meth:`as_json`; raises KeyError for other data."""
+        self.recorded, self.open, self.any = state["records"], state["episode_open"], state["any_episode"]
+        self.begun, self.subtask, self.subtasks = state["episode_begun"], state["subtask"], state["subtasks"]
 
     def follow(self, kind: ReasonKind) -> None:
         """Take an event that somebody else has recorded."""
         if kind in _OUTCOMES.values():
             self.open = False
+        elif kind is ReasonKind.SUBTASK_BEGINS:
+            self.subtask += 1
         elif kind in (ReasonKind.EPISODE_BEGINS, ReasonKind.EPISODE_ENDS, ReasonKind.EPISODE_DISCARDED):
             self.open, self.any = kind is ReasonKind.EPISODE_BEGINS, kind is not ReasonKind.EPISODE_DISCARDED
+            self.begun = True
+            if self.open:
+                self.subtask = 1
 
 
 _Poses = Mapping[str, pin.SE3]
@@ -135,7 +178,7 @@ class BothArms:
             return presses
         for action in self.marks.actions:
             if (name := self._asked(presses, action)) is not None:
-                self.arms[name].record_event(now, Reason(self.marks.apply(action)))
+                self.arms[name].record_event(now, self.marks.apply(action))
         if self._asked(presses, Action.STOP) is not None:
             cause = Cause.GO_ON if self.all_in({ArmState.STOPPED}) else Cause.STOP
             self.change(cause, now, self._reason(Action.STOP))

@@ -34,7 +34,7 @@ PAUSED = Pulse(0.3, 0.3, 0.08, "paused, by its control or the alignment chord; h
 EPISODE_ENDS = Pulse(0.35, 0.35, 0.15, "an episode of the recording ends, or succeeded")
 ENGAGED = Pulse(0.5, 0.4, 0.08, "engaged; both arms carry")
 EPISODE_KEPT = Pulse(0.75, 0.42, 0.4, "the verdict on an episode: keep")
-EPISODE_BEGINS = Pulse(0.6, 0.45, 0.15, "an episode of the recording begins; a mark")
+EPISODE_BEGINS = Pulse(0.6, 0.45, 0.15, "an episode of the recording begins, or a subtask of it; a mark")
 GRASP = Pulse(0.7, 0.5, 0.12, "the gripper has closed on something")
 HOMING = Pulse(0.4, 0.55, 0.2, "on the way home")
 EPISODE_DISCARDED = Pulse(0.2, 0.65, 0.25, "an episode is discarded, or failed")
@@ -57,6 +57,7 @@ _WHILE_STATE_STAYS = {
     ReasonKind.CARRY_BEGAN: ENGAGED,
     ReasonKind.EPISODE_BEGINS: EPISODE_BEGINS,
     ReasonKind.MARK: EPISODE_BEGINS,
+    ReasonKind.SUBTASK_BEGINS: EPISODE_BEGINS,
     ReasonKind.EPISODE_ENDS: EPISODE_ENDS,
     ReasonKind.EPISODE_SUCCEEDED: EPISODE_ENDS,
     ReasonKind.EPISODE_FAILED: EPISODE_DISCARDED,

@@ -194,7 +194,7 @@ class Teleop:
 
     def mark(self, now: float, action: Action) -> None:
         """Mark the recording for a program, as a hand may do; see :class:`EpisodeMarks`."""
-        next(iter(self._arms.values())).record_event(now, Reason(self.marks.apply(action)))
+        next(iter(self._arms.values())).record_event(now, self.marks.apply(action))
 
     def reset(self, now: float, arm: str, reason: Reason) -> None:
         """Let an arm hold, forget everything that came from its hand, and end a stop of all arms."""

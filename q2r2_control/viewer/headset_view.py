@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol, runtime_checkable
 
-from q2r2_control.events import ReasonKind
 from q2r2_control.inputs.base import Input
 from q2r2_control.inputs.webxr.exchange import Display
 from q2r2_control.inputs.webxr.page_messages import HeadsetRequest
@@ -15,17 +14,12 @@ from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.summary.tick import Tick
 from q2r2_control.types import ActiveLimit
 from q2r2_control.viewer.arm_words import Told, told_after
+from q2r2_control.viewer.episode_words import EpisodeWords
 from q2r2_control.viewer.headset_display import RunDisplay, ShownTick
 from q2r2_control.viewer.loose_parts import places_of_parts
 from q2r2_control.viewer.shown_robot import ShownRobot
 
 _PERIOD = 1.0 / 30.0  # Time between messages [s].
-_EPISODE_OVER = (
-    ReasonKind.EPISODE_ENDS,
-    ReasonKind.EPISODE_SUCCEEDED,
-    ReasonKind.EPISODE_FAILED,
-    ReasonKind.EPISODE_DISCARDED,
-)
 
 
 @runtime_checkable
@@ -46,11 +40,11 @@ class HeadsetView:
     """A listener of one run. Each tick stores references, and the input's process gets them 30 times a second."""
 
     def __init__(self, source: DisplayInput, pipeline: Pipeline, recorded: bool) -> None:
-        self._source, self._recorded = source, recorded
+        self._source = source
         self._due = 0.0  # Time of the next message, by the monotonic clock [s].
         self._binding: dict[ActiveLimit, None] = {}
         self._told: dict[str, Told] = {}
-        self._episodes, self._open = 0, False
+        self._episodes = EpisodeWords(pipeline.config.recording.subtasks) if recorded else None
         self._hand_of = pipeline.teleop.hand_of
         self._plant = pipeline.plant if isinstance(pipeline.plant, MujocoPlant) else None
         robot, parts = pipeline.robot, places_of_parts(pipeline.plant, pipeline.config)
@@ -61,11 +55,8 @@ class HeadsetView:
     def __call__(self, tick: Tick) -> None:
         if tick.events:
             self._told = told_after(self._told, tick.events)
-        for event in tick.events:
-            if event.kind is ReasonKind.EPISODE_BEGINS:
-                self._episodes, self._open = self._episodes + (not self._open), True
-            elif event.kind in _EPISODE_OVER:
-                self._open = False
+            if self._episodes is not None:
+                self._episodes.follow(tick.events)
         if tick.reference.report.binding:
             self._binding.update(dict.fromkeys(tick.reference.report.binding))
         now = time.monotonic()
@@ -73,11 +64,7 @@ class HeadsetView:
             return
         hands = {arm: self._hand_of(arm) for arm in tick.tools}
         moved = None if self._plant is None else self._plant.observed_qpos
-        if self._source.show(ShownTick(tick, tuple(self._binding), self._told, hands, moved, self._recording())):
+        recording = "" if self._episodes is None else self._episodes.text
+        if self._source.show(ShownTick(tick, tuple(self._binding), self._told, hands, moved, recording)):
             self._due = now + _PERIOD
             self._binding = {}
-
-    def _recording(self) -> str:
-        if not self._recorded:
-            return ""
-        return f"records episode {self._episodes}" if self._open else f"records; {self._episodes} episodes so far"

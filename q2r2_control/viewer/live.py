@@ -16,6 +16,7 @@ from rich.table import Table
 from q2r2_control.summary.tick import Tick
 from q2r2_control.types import ActiveLimit
 from q2r2_control.viewer.arm_words import ArmWords
+from q2r2_control.viewer.episode_words import EpisodeWords
 from q2r2_control.wording import limit_name
 
 _REFRESH_RATE = 6.0  # [Hz]
@@ -36,11 +37,13 @@ class LiveTable:
         duration: float | None = None,
         *,
         simulated_time: bool = False,
+        episodes: EpisodeWords | None = None,
     ) -> None:
         """Prepare the table; ``words`` makes the sentences about the run's arms.
 
         ``steps`` are the steps of the work, each with its begin [s] and its name, for a run with a known ``duration``
-        [s]. If ``simulated_time`` is True, the table compares the speed of the run with real time.
+        [s]. If ``simulated_time`` is True, the table compares the speed of the run with real time. ``episodes`` makes
+        the words about episodes of a recorded run.
         """
         self._title, self._words = title, words
         self._steps, self._duration = steps, duration
@@ -48,7 +51,7 @@ class LiveTable:
         self._count = 0
         self._binding: dict[ActiveLimit, None] = {}
         self._repelled: dict[str, None] = {}
-        self._simulated_time = simulated_time
+        self._simulated_time, self._episodes = simulated_time, episodes
         self._drawn = (time.monotonic(), 0, 0.0)  # The last drawing: time [s], count of ticks, and time of the run [s].
 
     def __call__(self, tick: Tick) -> None:
@@ -59,6 +62,8 @@ class LiveTable:
         if tick.impedance is not None:
             self._repelled.update(dict.fromkeys(tick.impedance.repelled))
         self._words.follow(tick.events)
+        if self._episodes is not None:
+            self._episodes.follow(tick.events)
 
     @contextmanager
     def shown(self, console: Console) -> Iterator[None]:
@@ -138,6 +143,8 @@ class LiveTable:
             rows[f"{arm} gripper"] = ("[yellow]held[/]", " | ".join(pair))
         for name, (first, second) in rows.items():
             table.add_row(name, first, second)
+        if self._episodes is not None:
+            table.add_row("recording", "", escape(self._episodes.text))
         return table
 
 

@@ -157,6 +157,21 @@ class Waves:
             yield (128 + 100 * np.stack(waves, axis=-1)).astype(np.uint8)
 
 
+def with_subtasks(plain: EpisodeVectors, *lengths: tuple[str, int]) -> EpisodeVectors:
+    """An episode that has subtasks with these names and numbers of frames; the last one goes on to its end."""
+    index = [number for number, (_, frames) in enumerate(lengths) for _ in range(frames)]
+    index += [len(lengths) - 1] * (plain.frames - len(index))
+    return replace(plain, subtasks=tuple(name for name, _ in lengths), subtask=tuple(index))
+
+
+# Two episodes with a subtask in common, and one of which nobody told any.
+TOLD = (
+    with_subtasks(EPISODES[0], ("reach", 15), ("grasp the cube", 25)),
+    with_subtasks(EPISODES[1], ("grasp the cube", 10), ("place", 15)),
+    EPISODES[2],
+)
+
+
 def with_pictures(plain: EpisodeVectors, seed: int) -> EpisodeVectors:
     return replace(plain, cameras={CAMERA: Waves(plain.frames, seed)})  # type: ignore[dict-item]
 

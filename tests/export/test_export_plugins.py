@@ -17,7 +17,7 @@ from q2r2_control.export.episodes import FrameSampling, make_episode
 from q2r2_control.export.export_format import ExportFormat
 from q2r2_control.export.formats import format_named
 from tests.cli.command import q2r2
-from tests.export.files import CAMERA, EPISODES, HEIGHT, WIDTH, record_two, with_pictures
+from tests.export.files import CAMERA, EPISODES, HEIGHT, TOLD, WIDTH, record_two, with_pictures
 from tests.support.modules import ROOT, blocks_of, install
 
 zarr = pytest.importorskip("zarr", reason="the store of plugins/q2r2_zarr needs it")
@@ -91,6 +91,17 @@ def test_pictures_of_a_store_are_pixels_frame_by_frame(tmp_path: Path) -> None:
     assert arrays[CAMERA].dtype == np.uint8
     np.testing.assert_array_equal(arrays[CAMERA][: ends[0]], list(episodes[0].cameras[CAMERA]))
     np.testing.assert_array_equal(arrays[CAMERA][ends[0] :], list(episodes[1].cameras[CAMERA]))
+
+
+def test_a_store_has_the_subtask_of_each_frame_and_the_names_by_episode(tmp_path: Path) -> None:
+    store, files = format_named("zarr"), [tmp_path / "0", tmp_path / "1"]
+    for episode, file in zip(TOLD, files, strict=False):
+        store.write(episode, file)
+    store.join(files, tmp_path / "store")
+    arrays, _ = read_as_replay_buffer(tmp_path / "store")
+    assert arrays["subtask_index"].tolist() == [0] * 15 + [1] * 25 + [0] * 10 + [1] * 15
+    about = zarr.open(str(tmp_path / "store"), mode="r").attrs["episodes"]
+    assert [tuple(one["subtasks"]) for one in about] == [TOLD[0].subtasks, TOLD[1].subtasks]
 
 
 @pytest.mark.parametrize(

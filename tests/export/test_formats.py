@@ -20,7 +20,7 @@ from q2r2_control.export.formats import FORMATS, ROBOMIMIC
 from q2r2_control.export.lerobot import join_shards, video_key
 from q2r2_control.extras import install_line
 from tests.cli.command import q2r2
-from tests.export.files import CAMERA, EPISODES, HEIGHT, NAMES, WIDTH, with_pictures
+from tests.export.files import CAMERA, EPISODES, HEIGHT, NAMES, TOLD, WIDTH, with_pictures
 
 HEAD = [
     *(f"{feature}.{name}" for feature, names in NAMES.items() for name in names),
@@ -62,6 +62,16 @@ def test_two_recordings_with_one_name_are_refused(tmp_path: Path) -> None:
         export("csv", EPISODES, tmp_path, ["run", "run"])
 
 
+def test_a_table_has_the_subtask_of_each_line(tmp_path: Path) -> None:
+    made = export("csv", TOLD, tmp_path, ["run-1", "run-2", "run-3"])
+    with (made / "run-2.csv").open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert list(rows[0]) == [*HEAD, "subtask_index", "subtask"]
+    found = [(int(row["subtask_index"]), row["subtask"]) for row in rows]
+    assert found == [(0, "grasp the cube")] * 10 + [(1, "place")] * 15
+    assert len(read(made / "run-3.csv")) == TOLD[2].frames  # As it was without subtasks.
+
+
 POSITIONS = ("left_A1", "left_gripper")
 NAMES_FOR_ACT = {"observation.state": POSITIONS, "observation.velocity": POSITIONS[:1], "action": POSITIONS}
 EPISODES_FOR_ACT = [
@@ -96,6 +106,18 @@ def test_each_episode_is_an_hdf5_file_with_the_data_that_act_needs(tmp_path: Pat
             assert (about["fps"], about["task"], about["cell"]) == (30, episode.task, "two_arms")
             assert (about["recording"], about["note_operator"]) == (f"run-{number + 1}.mcap", "Ada")
             assert (about["sim"], about["action_ahead_frames"], about.get("success")) == (1, 2, episode.success)
+
+
+def test_an_hdf5_file_has_the_subtask_of_each_frame_and_their_names(tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py", reason="the extra export is not installed")
+    told = [
+        replace(plain, subtasks=with_them.subtasks, subtask=with_them.subtask)
+        for plain, with_them in zip(EPISODES_FOR_ACT, TOLD, strict=False)
+    ]
+    made = export("hdf5", told, tmp_path, ["a", "b"])
+    with h5py.File(made / "episode_1.hdf5") as file:
+        assert file["subtask_index"][:].tolist() == [0] * 10 + [1] * 15
+        assert list(file["subtask_index"].attrs["names"]) == ["grasp the cube", "place"]
 
 
 def test_robomimic_finds_the_same_numbers_in_one_file_of_links(tmp_path: Path) -> None:

@@ -18,10 +18,10 @@ import pytest
 from q2r2_control.config.recording import CameraConfig
 from q2r2_control.export import lerobot_v21
 from q2r2_control.export.dataset_card import CARD, write_card
-from q2r2_control.export.lerobot_v21 import DESCRIPTION, openpi_config, openpi_names
+from q2r2_control.export.lerobot_v21 import DESCRIPTION, SUBTASK_DESCRIPTION, openpi_config, openpi_names
 from q2r2_control.extras import install_line
 from tests.cli.command import q2r2
-from tests.export.files import EPISODES, HEIGHT, WIDTH, Waves
+from tests.export.files import EPISODES, HEIGHT, TOLD, WIDTH, Waves
 from tests.export.test_formats import export
 from tests.support.modules import load_script
 
@@ -74,6 +74,27 @@ def test_every_episode_has_a_table_of_its_numbers_and_tasks_are_numbered_over_al
     info = json.loads((dataset / "meta/info.json").read_text())
     assert (info["codebase_version"], info["total_frames"], info["total_videos"]) == ("v2.1", 125, 6)
     assert set(table) == {name for name, feature in info["features"].items() if feature["dtype"] != "video"}
+
+
+def test_subtasks_are_an_annotation_of_gr00t_and_tasks_by_number(tmp_path: Path) -> None:
+    told = [
+        replace(seen, cameras={}, subtasks=of.subtasks, subtask=of.subtask) for seen, of in zip(SEEN, TOLD, strict=True)
+    ]
+    made = export("lerobot-v2.1", told, tmp_path, ["1", "2", "3"])
+    tasks = {line["task_index"]: line["task"] for line in lines(made / "meta/tasks.jsonl")}
+    assert list(tasks.values()) == ["stack", "circle", "reach", "grasp the cube", "place"]
+    named = []
+    for number in range(3):
+        table = parquet.read_table(made / f"data/chunk-000/episode_{number:06d}.parquet").to_pydict()
+        named.append([tasks[index] for index in table[SUBTASK_DESCRIPTION]])
+        assert {tasks[index] for index in table[DESCRIPTION]} == {told[number].task}
+    assert named[0] == ["reach"] * 15 + ["grasp the cube"] * 25
+    assert named[1] == ["grasp the cube"] * 10 + ["place"] * 15
+    assert set(named[2]) == {"stack"}, "an episode without subtasks is one with the name of its task"
+    annotations = json.loads((made / "meta/modality.json").read_text())["annotation"]
+    assert list(annotations) == ["human.action.task_description", "human.action.subtask_description"]
+    features = json.loads((made / "meta/info.json").read_text())["features"]
+    assert features[SUBTASK_DESCRIPTION] == {"dtype": "int64", "shape": [1], "names": None}
 
 
 def test_the_readme_names_the_unit_of_every_number(dataset: Path) -> None:

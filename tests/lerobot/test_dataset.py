@@ -10,6 +10,7 @@ import os
 import subprocess
 import sys
 import threading
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from q2r2_control.export.dataset_card import CARD, SOURCES
 from q2r2_control.export.lerobot import join_shards, video_key, write_shard
 from q2r2_control.export.sampling import Pixels
-from tests.export.files import CAMERA, EPISODES, HEIGHT, NAMES, WIDTH, contents, record_two, with_pictures
+from tests.export.files import CAMERA, EPISODES, HEIGHT, NAMES, TOLD, WIDTH, contents, record_two, with_pictures
 from tests.export.test_formats import export
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -94,6 +95,25 @@ def test_the_loader_reads_every_frame_its_neighbours_the_ends_and_the_successes(
     np.testing.assert_array_equal(found, np.concatenate([one.vectors["observation.state"] for one in EPISODES]))
     assert [index for index, item in enumerate(items) if item["next.done"]] == [39, 64, 124]
     assert [index for index, item in enumerate(items) if item["next.success"]] == [39]
+
+
+def test_the_loader_tells_the_subtask_of_every_frame(tmp_path: Path) -> None:
+    made = export("lerobot", TOLD, tmp_path, ["1", "2", "3"])
+    names = pyarrow.parquet.read_table(made / "meta/subtasks.parquet").to_pydict()
+    assert names == {"subtask_index": [0, 1, 2, 3], "subtask": ["reach", "grasp the cube", "place", ""]}
+    loaded = LeRobotDataset("q2r2/test", root=made)
+    expected = [0] * 15 + [1] * 35 + [2] * 15 + [3] * 60
+    assert [int(loaded[index]["subtask_index"]) for index in range(125)] == expected
+    if find_spec("lerobot.datasets.language_render") is None:  # It tells them by their table up to lerobot 0.5.
+        assert [loaded[index]["subtask"] for index in (0, 15, 40, 50)] == [names["subtask"][at] for at in (0, 1, 1, 2)]
+        return
+    from lerobot.datasets.language_render import active_at
+
+    for index in (0, 14, 15, 39, 40, 49, 50, 64):
+        frame = loaded[index]
+        row = active_at(float(frame["timestamp"]), persistent=frame["language_persistent"], style="subtask")
+        assert row["content"] == names["subtask"][expected[index]]
+    assert (loaded[70]["language_persistent"], loaded[0]["language_events"]) == ([], [])
 
 
 def test_the_loader_gives_every_frame_its_picture(film: Path) -> None:

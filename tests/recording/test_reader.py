@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -205,3 +206,15 @@ def test_only_arrays_and_texts_in_the_written_form_are_read() -> None:
     with pytest.raises(ValueError, match="has not 4 numbers"):
         messages.numbers_of(payloads, 4)
     assert messages.data_of(messages.text("grüezi"), messages.TEXT) == "grüezi"
+
+
+def test_an_unfinished_file_may_end_with_bytes_that_look_like_an_index_far_away(tmp_path: Path) -> None:
+    about, file = About.of(pipeline(), realtime=True, notes={}, cameras=()), tmp_path / "cut.mcap"
+    with BagWriter(file, [messages.Topic(1, messages.STATE, messages.TEXT)], about) as bag:
+        bag.write([messages.Message(1, 0, about.epoch, 0, messages.text("state"))])
+        bag.flush()
+        unfinished = file.read_bytes()
+        bag.close(Conclusion())
+    footer = struct.pack("<BQQQI", 2, 20, 2**62, 0, 0)
+    file.write_bytes(unfinished + footer + file.read_bytes()[-8:])
+    assert not Recording(file).closed

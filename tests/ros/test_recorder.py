@@ -124,15 +124,21 @@ def test_messages_are_in_the_file_to_the_byte_without_ros(recorder: RunningRecor
     assert Recording(folder).closed
 
 
-def test_hand_and_services_know_each_others_episodes(node: Any, processes: Processes, tmp_path: Path) -> None:
-    rig = ArmRig(node)
-    rig.start(processes, {"teleop.bindings.grip": "record_toggle"})
+def late_recorder(rig: ArmRig, node: Any, processes: Processes, folder: Path) -> RunningRecorder:
+    """Press before there is a recorder, which is refused, and return one that the arm's node has heard of."""
     squeeze(rig)
     rig.wait(lambda: rig.state["last_event_kind"] == ReasonKind.NO_RECORDING, "without a recorder nothing is recorded")
-    recorder = RunningRecorder(node, processes, tmp_path / "recordings")
+    recorder = RunningRecorder(node, processes, folder / "recordings")
     wait_until(lambda: node.count_subscribers("/recorder/state") > 1, "the arm's node listens to the recorder")
     for _ in range(3):
         recorder.state()
+    return recorder
+
+
+def test_hand_and_services_know_each_others_episodes(node: Any, processes: Processes, tmp_path: Path) -> None:
+    rig = ArmRig(node)
+    rig.start(processes, {"teleop.bindings.grip": "record_toggle"})
+    recorder = late_recorder(rig, node, processes, tmp_path)
     squeeze(rig)
     recorder.wait("episode_open", True)
     felt(rig, EPISODE_BEGINS)
@@ -148,6 +154,25 @@ def test_hand_and_services_know_each_others_episodes(node: Any, processes: Proce
     wait_until(lambda: recorder.discarded()[-1:] == [True], "the discard is in the file")
     kept, discarded = read_spans(open_recording(recorder.end()))
     assert (kept.discarded, discarded.discarded) == (False, True)
+
+
+def test_hand_and_service_begin_subtasks_of_one_count(node: Any, processes: Processes, tmp_path: Path) -> None:
+    rig = ArmRig(node)
+    rig.start(processes, {"teleop.bindings.grip": "next_subtask"})
+    recorder = late_recorder(rig, node, processes, tmp_path)
+    assert call(node, "/recorder/start").success
+    recorder.wait("episode_open", True)
+    squeeze(rig)
+    recorder.wait("subtask", 2)
+    answered = call(node, "/recorder/next_subtask")
+    assert (answered.success, answered.message) == (True, "begins: subtask 3")
+    felt(rig, EPISODE_BEGINS)
+    assert call(node, "/recorder/stop").success
+    refused = call(node, "/recorder/next_subtask")
+    assert (refused.success, refused.message) == (False, "no next subtask: no episode goes on")
+    (span,) = read_spans(open_recording(recorder.end()))
+    assert len(span.subtask_starts) == 2
+    assert list(span.subtask_starts) == sorted(span.subtask_starts)
 
 
 def squeeze(rig: ArmRig) -> None:

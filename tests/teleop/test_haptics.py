@@ -36,6 +36,7 @@ EVENTS = {
     "both arms carry, for the other one": (event("paused", "carried", K.CARRIED_BY), pulses.ENGAGED),
     "the end of carrying": (event("carried", "paused", K.PRESSED), pulses.PAUSED),
     "an episode that begins": (event("lost", "lost", K.EPISODE_BEGINS), pulses.EPISODE_BEGINS),
+    "a subtask that begins": (event("paused", "paused", K.SUBTASK_BEGINS), pulses.EPISODE_BEGINS),
     "an episode that is kept": (event("paused", "paused", verdict(True)), pulses.EPISODE_KEPT),
     "one that is not": (event("lost", "lost", verdict(False)), pulses.EPISODE_REJECTED),
     "an episode that ends": (event("engaged", "engaged", K.EPISODE_ENDS), pulses.EPISODE_ENDS),

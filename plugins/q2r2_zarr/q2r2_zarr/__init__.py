@@ -33,6 +33,7 @@ def write_episode(episode: EpisodeVectors, path: Path) -> None:
             **{name: getattr(episode, name) for name in ("cell", "task", "fps", "recording", "success")},
             "action_ahead_frames": episode.ahead,
             "notes": dict(episode.notes),
+            "subtasks": list(episode.subtasks),
         }
     )
     data = root.create_group("data")
@@ -40,6 +41,8 @@ def write_episode(episode: EpisodeVectors, path: Path) -> None:
         made = _create(data, array_name(feature), rows[0])
         made.attrs.update({"names": list(episode.names[feature]), "units": list(episode.units[feature])})
         made.append(rows)
+    if episode.subtasks:
+        _create(data, "subtask_index", np.array(episode.subtask)[0]).append(np.array(episode.subtask))
     for camera, pictures in episode.cameras.items():
         made = _create(data, camera, np.empty(pictures.size, dtype=np.uint8))
         for pixels in pictures:
@@ -73,7 +76,7 @@ def join_episodes(files: Sequence[Path], folder: Path) -> None:
 
 def _create(group: Any, name: str, row: Any) -> Any:
     """An array without rows yet, of the shape and type of ``row``."""
-    rows = _ROWS if row.ndim == 1 else 1
+    rows = _ROWS if row.ndim < 2 else 1
     return group.create_array(name, shape=(0, *row.shape), chunks=(rows, *row.shape), dtype=row.dtype)
 
 

@@ -108,7 +108,7 @@ class RecorderLink:
 
     def __init__(self, node: BaseNode) -> None:
         self._node = node
-        self._state: tuple[bool, bool, bool] | None = None  # The newest marks that have not been used.
+        self._state: dict[str, Any] | None = None  # The newest report that has not been used.
         self._heard = 0.0  # Steady time of the newest report [s].
         self._served: int | None = None  # Number of service calls that the node has answered.
         self._reasons: list[Reason] = []
@@ -118,7 +118,8 @@ class RecorderLink:
     def update(self, marks: EpisodeMarks) -> list[Reason]:
         """Update the marks before the teleoperation of a tick; returns the reasons of new events of its services."""
         if self._state is not None:
-            (marks.recorded, marks.open, marks.any), self._state = self._state, None
+            marks.restore(self._state)
+            self._state = None
         if marks.recorded and time.monotonic() - self._heard > _PATIENCE:
             marks.recorded = False
         reasons, self._reasons = self._reasons, []
@@ -127,7 +128,7 @@ class RecorderLink:
     def _on_state(self, message: String) -> None:
         try:
             state = json.loads(message.data)
-            self._state = state["records"], state["episode_open"], state["any_episode"]
+            self._state = {name: state[name] for name in EpisodeMarks().as_json()}
             if self._served is not None and state["served"] != self._served:
                 self._reasons.append(Reason.from_json(state["served_last"]))
             self._served, self._heard = state["served"], time.monotonic()

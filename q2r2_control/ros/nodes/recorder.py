@@ -22,9 +22,10 @@ from rclpy.serialization import deserialize_message
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
+from q2r2_control.config.bindings import Action
 from q2r2_control.config.cell import load_config
 from q2r2_control.errors import NOT_RECORDED, ConfigError
-from q2r2_control.events import Event, Reason, ReasonKind
+from q2r2_control.events import REFUSALS, Event, Reason, ReasonKind
 from q2r2_control.judging.episode_judge import EpisodeJudge
 from q2r2_control.recording.about import ROS, About, anonymous, as_yaml, program
 from q2r2_control.recording.messages import (
@@ -51,6 +52,7 @@ _SERVICES = {
     "success": ReasonKind.EPISODE_SUCCEEDED,
     "failure": ReasonKind.EPISODE_FAILED,
     "mark": ReasonKind.MARK,
+    Action.NEXT_SUBTASK: ReasonKind.SUBTASK_BEGINS,
 }
 HANDOVER_PERIOD = 0.02  # Time between two looks at new messages. A message waits for two of them at most [s].
 _STREAM_QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -79,6 +81,7 @@ class RecorderNode(BaseNode):
         self._judge = EpisodeJudge(lambda: self._recorder.file, self._tell, timed=False)
         robot = Robot.from_config(config)
         self._marks = EpisodeMarks()
+        self._marks.subtasks = config.recording.subtasks
         self._served = 0
         self._served_last: Reason | None = None
         self._waiting: list[Message] = []
@@ -155,9 +158,13 @@ class RecorderNode(BaseNode):
 
     def _serve(self, kind: ReasonKind, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         refusal, reason = self._refusal(kind), Reason(kind)
+        if refusal is None and kind is ReasonKind.SUBTASK_BEGINS:
+            reason = self._marks.apply(Action.NEXT_SUBTASK)
+            refusal = sentence(reason) if reason.kind in REFUSALS else None
+        elif refusal is None:
+            self._marks.follow(kind)
         response.success, response.message = refusal is None, refusal or sentence(reason)
         if refusal is None:
-            self._marks.follow(kind)
             self._judge.record_event(self._event(reason))
             self._tell(reason)
         return response
@@ -183,12 +190,10 @@ class RecorderNode(BaseNode):
     def health(self) -> tuple[bytes, str, Mapping[str, Any]]:
         recorder = self._recorder
         values = {
-            "records": self._marks.recorded,
             "file": "" if recorder.file is None else str(recorder.file),
             "messages": recorder.count,
             "lost_messages": recorder.overflows,
-            "episode_open": self._marks.open,
-            "any_episode": self._marks.any,
+            **self._marks.as_json(),
             "served": self._served,
             "served_last": None if self._served_last is None else self._served_last.as_json(),
         }

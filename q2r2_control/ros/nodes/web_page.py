@@ -59,6 +59,7 @@ _PERIOD = 1.0 / 30.0  # Time between two frames [s].
 _LOOK_PERIOD = 0.5  # Time between two looks for nodes [s].
 _STREAM_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)  # Deep enough for the ticks of a frame.
 _PICTURE_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+_OF_RECORDER = PageRequest.RECORD, PageRequest.MARK, PageRequest.SUBTASK
 _PICTURE_PERIOD = 0.2  # Time between two pictures of a camera [s].
 _UNREADABLE = SerdeError, ValueError, KeyError, IndexError, TypeError
 
@@ -94,7 +95,7 @@ class WebPage(BaseNode):
         self._controller, self._recorder = self.name_in_set("cartesian_controller"), self.name_in_set(RECORDER)
         self._trigger_clients: dict[str, Any] = {}
         requests = [PageRequest.STOP, PageRequest.RESET, PageRequest.ENGAGE, PageRequest.PAUSE, PageRequest.HOME]
-        self._requests = (*requests, *((PageRequest.RECORD, PageRequest.MARK) if recorded else ()))
+        self._requests = (*requests, *(_OF_RECORDER if recorded else ()))
         self._page.open(self._robot, self._cell, config.name, self._requests)
         shown = self._ticks.topics - {hand_pose(hand) for hand in SIDES}
         for topic in ros_topics(tuple(self._robot.arms), {}):
@@ -159,8 +160,8 @@ class WebPage(BaseNode):
                 # The node's state comes twice a second, later than what the page shows of an episode.
                 told = self._marks.open if self._marks.any else states.get(self._recorder, {}).get("episode_open")
                 return [f"{self._recorder}/{'stop' if told else 'start'}"]
-            case PageRequest.MARK:
-                return [f"{self._recorder}/mark"]
+            case PageRequest.MARK | PageRequest.SUBTASK:
+                return [f"{self._recorder}/{request}"]
         return [f"{self._controller}/{request}"]
 
     def _serve(self, request: PageRequest) -> None:

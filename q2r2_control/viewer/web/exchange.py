@@ -119,3 +119,4 @@ class PageRequest(StrEnum):
     HOME = "home"
     RECORD = "record"
     MARK = "mark"
+    SUBTASK = "next_subtask"

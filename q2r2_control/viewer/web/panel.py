@@ -45,7 +45,7 @@ _NEAR_LIMIT = 0.05  # Share of a joint's range that counts as near a limit.
 _EPISODES = 12  # Lines about episodes that are shown.
 _OF_EPISODES = (
     *(ReasonKind.EPISODE_BEGINS, ReasonKind.EPISODE_ENDS, ReasonKind.EPISODE_SUCCEEDED, ReasonKind.EPISODE_FAILED),
-    *(ReasonKind.EPISODE_DISCARDED, ReasonKind.MARK, ReasonKind.VERDICT),
+    *(ReasonKind.EPISODE_DISCARDED, ReasonKind.MARK, ReasonKind.SUBTASK_BEGINS, ReasonKind.VERDICT),
 )
 _BUTTONS = {
     PageRequest.STOP: ("Stop: rest, and end the run", "red"),
@@ -55,6 +55,7 @@ _BUTTONS = {
     PageRequest.HOME: ("Bring both arms home", "blue"),
     PageRequest.RECORD: ("Begin or end an episode", "gray"),
     PageRequest.MARK: ("Mark this moment", "gray"),
+    PageRequest.SUBTASK: ("Begin the next subtask", "gray"),
 }
 
 

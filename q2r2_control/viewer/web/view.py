@@ -111,12 +111,13 @@ class PageView(Page):
             PageRequest.HOME: pipeline.go_home,
             PageRequest.RECORD: partial(pipeline.mark, Action.RECORD_TOGGLE),
             PageRequest.MARK: partial(pipeline.mark, Action.RECORD_MARK),
+            PageRequest.SUBTASK: partial(pipeline.mark, Action.NEXT_SUBTASK),
         }
         self._changes, self._hand_of = _changes_of(pipeline), lambda arm: pipeline.teleop.hand_of(arm)
         by_press = any(one.action is Action.PAUSE_TOGGLE for one in config.teleop.bindings.bound())
         hidden = {
             *([] if by_press else [PageRequest.ENGAGE]),
-            *([] if recorded else [PageRequest.RECORD, PageRequest.MARK]),
+            *([] if recorded else [PageRequest.RECORD, PageRequest.MARK, PageRequest.SUBTASK]),
             *([] if pipeline.drive.yields else [PageSetting.STIFFNESS, PageSetting.DAMPING]),
             *([] if self._input is None else [PageSetting.SCALE]),
         }

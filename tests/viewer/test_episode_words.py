@@ -1,0 +1,32 @@
+"""Words for the episode and the subtask that go on."""
+
+from __future__ import annotations
+
+import pytest
+
+from q2r2_control.events import Event, Reason
+from q2r2_control.events import ReasonKind as K
+from q2r2_control.viewer.episode_words import EpisodeWords
+
+SECOND = Reason.of(K.SUBTASK_BEGINS, number=2, name="grasp")
+BEGINS, ENDS, DISCARDED = Reason(K.EPISODE_BEGINS), Reason(K.EPISODE_ENDS), Reason(K.EPISODE_DISCARDED)
+
+
+@pytest.mark.parametrize(
+    ("names", "told", "text"),
+    [
+        ((), [], "records; 0 episodes so far"),
+        ((), [BEGINS], "records episode 1"),
+        ((), [BEGINS, ENDS], "records; 1 episodes so far"),
+        (("reach", "grasp"), [], "records, subtask 1: reach"),
+        (("reach", "grasp"), [SECOND], "records, subtask 2: grasp"),
+        (("reach", "grasp"), [BEGINS, SECOND], "records episode 1, subtask 2: grasp"),
+        (("reach", "grasp"), [BEGINS, SECOND, ENDS, BEGINS], "records episode 2, subtask 1: reach"),
+        (("reach", "grasp"), [BEGINS, SECOND, DISCARDED], "records; 1 episodes so far"),
+        ((), [BEGINS, SECOND], "records episode 1, subtask 2"),
+    ],
+)
+def test_the_words_follow_what_the_operator_tells(names: tuple[str, ...], told: list[Reason], text: str) -> None:
+    words = EpisodeWords(names)
+    words.follow(Event(0.0, "left", "paused", "paused", reason) for reason in told)
+    assert words.text == text
