@@ -71,6 +71,11 @@ class ReasonKind(StrEnum):
     OBSTACLE_IN_THE_WAY = "obstacle_in_the_way", "{name} is in the way: {pair}"
     SETTINGS_CHANGED = "settings_changed", "settings changed"
     CONTROL_CHANGED = "control_changed", "control changed"
+    # A warning, which stops nothing.
+    HANDS_CROSSED = (
+        "hands_crossed",
+        "the left hand has been to the right of the right hand for {time:g} s: are the two controllers swapped?",
+    )
     # Refusals: nothing changed. Those of the first group have a cause.
     NOT_ENGAGED = "not_engaged", "not engaged: {cause}"
     NOT_HOMING = "not_homing", "not homing: {cause}"

@@ -15,7 +15,9 @@ from q2r2_control.config.teleop import Stance, axes_matrix
 from q2r2_control.inputs.listener import ONLY_THIS_MACHINE, app_settings, written
 from q2r2_control.inputs.messages import MessageType
 from q2r2_control.inputs.session import HAND_TOPICS, HeadsetStatistics
+from q2r2_control.teleop.crossed_hands import CROSSED, CrossedHands
 from q2r2_control.types import SIDES, Array, HandSample
+from q2r2_control.wording import sentence
 
 SILENCE = 2.0  # Time without data before advice is given [s].
 _PERIOD = 0.05  # [s]
@@ -74,7 +76,8 @@ class HeadsetCheck:
     positions: dict[str, Array | None]  # Position by hand, in the world [m].
     heard: bool  # Whether data came at some time.
     missing: tuple[str, ...]  # Topics that a run needs and that never came.
-    advice: tuple[str, ...]  # Lines of advice. They are empty while all topics come that a run needs.
+    crossed: bool  # Whether the controllers seem to be swapped.
+    advice: tuple[str, ...]  # Lines of advice. They are empty if nothing is wrong.
 
     def as_json(self) -> dict[str, Any]:
         return {
@@ -87,6 +90,7 @@ class HeadsetCheck:
             "hands": {hand: {"direction": self.directions[hand], "position_m": self.positions[hand]} for hand in SIDES},
             "heard": self.heard,
             "missing": self.missing,
+            "hands_crossed": self.crossed,
             "advice": self.advice,
         }
 
@@ -99,7 +103,7 @@ def watch_headset(
     stopping: Callable[[], bool],
 ) -> HeadsetCheck:
     """Watch a started server for ``duration`` [s] or until ``stopping``. Show each state, and return the last one."""
-    hands = {hand: HandMovement(config.teleop.axes) for hand in SIDES}
+    hands, crossed = {hand: HandMovement(config.teleop.axes) for hand in SIDES}, CrossedHands(config.teleop.axes)
     start, heard = time.monotonic(), False
     last_data = dict.fromkeys(needed_topics(config), start)
     missing = tuple(last_data)
@@ -108,6 +112,7 @@ def watch_headset(
         ends = stopping() or (duration is not None and now - start >= duration)  # Decided before the last poll.
         for sample in server.poll(now):
             hands[sample.hand].add(sample)
+            crossed.add(sample)
             heard = True
         statistics = server.statistics
         for name in statistics.topics.keys() & last_data.keys():
@@ -123,7 +128,8 @@ def watch_headset(
             positions={hand: movement.position for hand, movement in hands.items()},
             heard=heard,
             missing=missing,
-            advice=advice(statistics, server.url) if nothing_comes else advice_on_some(silent),
+            crossed=crossed.crossed(now),
+            advice=advice(statistics, server.url) if nothing_comes else advice_on_some(silent, crossed.crossed(now)),
         )
         show(check)
         if ends:
@@ -139,9 +145,12 @@ def needed_topics(config: Config) -> tuple[str, ...]:
     return tuple(name for name, topic in HAND_TOPICS.items() if topic.hand in hands and topic.kind in needed)
 
 
-def advice_on_some(silent: tuple[str, ...]) -> tuple[str, ...]:
-    """Return advice if some topics come and others are ``silent``, with one line for each hand."""
-    lines = []
+def advice_on_some(silent: tuple[str, ...], crossed: bool = False) -> tuple[str, ...]:
+    """Return advice if some topics come and others are ``silent``, with one line for each hand.
+
+    One more line says that the hands are ``crossed``.
+    """
+    lines = [sentence(CROSSED)] if crossed else []
     for hand in SIDES:
         kinds = {HAND_TOPICS[name].kind: name for name in silent if HAND_TOPICS[name].hand == hand}
         if len(kinds) == 2:

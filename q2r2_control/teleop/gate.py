@@ -59,7 +59,7 @@ class PoseGate:
         if stamp < self.stamp or stamp == -math.inf:
             return False, None
         self._problem = None if sample.fault is None else Reason(ReasonKind(sample.fault.value))
-        pose = _pose_of(sample) if self._problem is None else None
+        pose = pose_of(sample) if self._problem is None else None
         previous, gap = self.pose, stamp - self.stamp
         self.pose, self.stamp = pose, stamp
         if pose is None:
@@ -100,7 +100,7 @@ class PoseGate:
         return None
 
 
-def _pose_of(sample: HandSample) -> Pose | None:
+def pose_of(sample: HandSample) -> Pose | None:
     """Return the sample's pose with a unit quaternion, or None if it is not usable."""
     position, quaternion = _numbers(sample.position, 3), _numbers(sample.quaternion, 4)
     if position is None or quaternion is None or max(map(abs, position)) > _MAX_COORDINATE:

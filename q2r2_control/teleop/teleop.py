@@ -14,6 +14,7 @@ from q2r2_control.quaternions import se3_of
 from q2r2_control.teleop.arm import of_controls
 from q2r2_control.teleop.arm_states import AT_REST, FOLLOWING, HOLDING, ArmState, Cause
 from q2r2_control.teleop.both_arms import BothArms
+from q2r2_control.teleop.crossed_hands import CROSSED, CrossedHands
 from q2r2_control.teleop.hand_motion import ArmMeasurements
 from q2r2_control.teleop.policy_side import PolicySide
 from q2r2_control.types import ActionChunk, ArmTarget, HandSample
@@ -49,6 +50,7 @@ class Teleop:
     def _use(self, settings: TeleopSettings) -> None:
         self.settings, self.delay = settings, settings.filter.delay
         self._linked, self._stall = settings.linked, settings.gate.timeout
+        self._crossed = CrossedHands(settings.axes)
 
     def change(self, settings: TeleopSettings, now: float) -> Reason | None:
         """Use other settings from now on, without a jump; returns why that is not possible now, or None.
@@ -137,6 +139,7 @@ class Teleop:
         now, clock_fault = self._clock(now)
         faults: dict[str, Reason] = {}
         for sample in samples:
+            self._crossed.add(sample)
             name = self._pair.arm_of_hand.get(sample.hand)
             if name is not None and (fault := self._arms[name].receive(sample, now)):
                 faults[name] = fault
@@ -146,10 +149,14 @@ class Teleop:
         if faults:
             self._disengage(faults, now)
         around = ArmMeasurements(tools, self._commanded, commanded, obstacles or {}, in_step)
+        engaged = [name for name, arm in self._arms.items() if arm.state is ArmState.ENGAGED]
         presses = self._pair.act(around, now)
         chord = self.aligning
         for name, arm in self._arms.items():
             arm.act(presses[name], around, now, chord)
+        new = [arm for name, arm in self._arms.items() if arm.state is ArmState.ENGAGED and name not in engaged]
+        if new and self._crossed.crossed(now):
+            new[0].record_event(now, CROSSED)
         self._policy.update(chunks, around, now, clock_fault)
         return self._targets(now, around)
 

@@ -11,7 +11,14 @@ import pytest
 from q2r2_control.config.cell import Config, load_config
 from q2r2_control.config.teleop import Stance
 from q2r2_control.inputs.headset import HeadsetServer
-from q2r2_control.inputs.headset_check import HandMovement, HeadsetCheck, advice, needed_topics, watch_headset
+from q2r2_control.inputs.headset_check import (
+    HandMovement,
+    HeadsetCheck,
+    advice,
+    advice_on_some,
+    needed_topics,
+    watch_headset,
+)
 from q2r2_control.inputs.session import HeadsetStatistics
 from q2r2_control.types import HandSample
 from tests.support.fake_headset import FakeHeadset
@@ -125,3 +132,28 @@ def test_the_report_names_messages_that_a_run_needs_and_that_did_not_come(
     assert says in "\n".join(check.advice)
     assert bool(check.advice) == bool(missing)
     assert "firewall" not in "\n".join(check.advice)
+
+
+class TwoHands:
+    """A server whose hands are where the test says, 75 times a second of its own clock."""
+
+    url = None
+    statistics = NOBODY
+
+    def __init__(self, left_y: float) -> None:
+        self._left_y = left_y
+
+    def poll(self, now: float) -> list[HandSample]:
+        places = (("left", self._left_y), ("right", -self._left_y))
+        stamps = np.arange(now - 4.0, now, 0.0125)  # All at once, as if the server had collected them.
+        made = [(hand, y, t) for t in stamps.tolist() for hand, y in places]
+        return [HandSample(hand, np.array([0.3, y, 1.0]), np.array([0, 0, 0, 1.0]), t) for hand, y, t in made]
+
+
+@pytest.mark.parametrize(("left_y", "crossed"), [(0.2, False), (-0.2, True)])
+def test_swapped_controllers_are_named(left_y: float, crossed: bool, cell: Config) -> None:
+    seen: list[HeadsetCheck] = []
+    check = watch_headset(TwoHands(left_y), cell, None, seen.append, lambda: True)
+    assert check.crossed is crossed
+    assert check.as_json()["hands_crossed"] is crossed
+    assert ("swapped" in " ".join(advice_on_some((), check.crossed))) is crossed

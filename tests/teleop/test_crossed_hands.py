@@ -1,0 +1,109 @@
+"""Swapped controllers are noticed and said, and hands that cross while they work are not."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from q2r2_control.events import ReasonKind
+from q2r2_control.teleop.crossed_hands import CrossedHands
+from q2r2_control.types import SIDES, HandSample
+from tests.teleop.hands import ENGAGED, Operator, pose, sample
+
+WORLD, UNITY = ("+x", "+y", "+z"), ("+z", "-x", "+y")
+Places = Callable[[float], dict[str, pin.SE3]]
+
+
+def after(places: Places, seconds: float = 5.0, axes: tuple[str, str, str] = WORLD, spoil: float = math.inf) -> bool:
+    """Whether hands at these ``places`` are crossed at the end; the left one is not usable at the time ``spoil``."""
+    hands = CrossedHands(axes)
+    for t in np.arange(0.0, seconds, 0.0125):
+        for hand in SIDES:
+            one = sample(hand, places(t)[hand], float(t))
+            hands.add(replace(one, position=np.full(3, np.nan)) if hand == "left" and abs(t - spoil) < 0.01 else one)
+    return hands.crossed(seconds)
+
+
+def swapped(by: float = 0.4, heading: float = 0.0, turns: float = 0.0) -> Places:
+    """Hands ``by`` [m] on the wrong sides of an operator who faces ``heading``, and ``turns`` each outward [rad]."""
+    left = np.array([math.sin(heading), -math.cos(heading), 0.0]) * by / 2.0
+    room = pin.rpy.rpyToMatrix(0.0, 0.0, heading)
+    made = {
+        hand: pin.SE3(room @ pin.rpy.rpyToMatrix(0.1, -0.3, sign * turns), sign * left + np.array([0.3, 0.1, 1.0]))
+        for hand, sign in (("left", 1.0), ("right", -1.0))
+    }
+    return lambda t: made
+
+
+@pytest.mark.parametrize("heading", [0.0, 1.5, math.pi, -2.0])
+def test_swapped_controllers_are_noticed_wherever_the_operator_faces(heading: float) -> None:
+    assert after(swapped(heading=heading))
+    assert not after(swapped(by=-0.4, heading=heading))
+
+
+def test_the_axes_of_the_input_count() -> None:
+    made = {hand: pose(*place) for hand, place in (("left", (0.2, 1.0, 0.3)), ("right", (-0.2, 1.0, 0.3)))}
+    assert after(lambda t: made, axes=UNITY), "right is +x in the frame of Unity"
+    assert not after(lambda t: {"left": made["right"], "right": made["left"]}, axes=UNITY)
+
+
+@pytest.mark.parametrize(
+    "places",
+    [
+        swapped(by=0.08),
+        swapped(turns=1.3),
+        lambda t: swapped(by=0.4 * math.cos(t))(t),
+        lambda t: swapped(by=0.4 if t > 2.5 else -0.4)(t),
+    ],
+    ids=["less than 10 cm", "controllers turned apart", "to and fro", "for 2.5 s only"],
+)
+def test_hands_that_cross_in_ordinary_work_are_not_crossed(places: Places) -> None:
+    assert not after(places)
+
+
+def test_hands_of_which_one_was_not_tracked_meanwhile_are_not_crossed_yet() -> None:
+    assert not after(swapped(), spoil=3.0)
+    assert after(swapped(), spoil=1.0)
+
+
+def test_one_hand_and_old_poses_say_nothing() -> None:
+    hands = CrossedHands(WORLD)
+    for t in np.arange(0.0, 5.0, 0.0125):
+        hands.add(sample("left", swapped()(t)["left"], float(t)))
+    assert not hands.crossed(5.0)
+    for t in np.arange(5.0, 10.0, 0.0125):
+        for hand in SIDES:
+            hands.add(sample(hand, swapped()(t)[hand], float(t)))
+    assert hands.crossed(10.0)
+    assert not hands.crossed(11.0)
+
+
+def crossed_operator(spoil: Callable[[HandSample], HandSample] = lambda one: one) -> Operator:
+    driver = Operator(alter=spoil)
+    driver.hands = {"left": pose(0.3, -0.2, 1.0), "right": pose(0.3, 0.2, 1.0)}
+    return driver
+
+
+def test_at_engaging_one_line_says_so_and_the_arms_follow_all_the_same() -> None:
+    driver = crossed_operator()
+    driver.run(3.5)
+    driver.press(*SIDES)
+    assert driver.states == ENGAGED
+    said = [event for event in driver.events if event.kind is ReasonKind.HANDS_CROSSED]
+    assert len(said) == 1
+    assert said[0].source == said[0].destination
+    driver.run(1.0)
+    assert driver.states == ENGAGED
+
+
+def test_an_operator_with_each_controller_in_its_hand_is_told_nothing() -> None:
+    driver = Operator()
+    driver.run(3.5)
+    driver.press(*SIDES)
+    assert driver.states == ENGAGED
+    assert ReasonKind.HANDS_CROSSED not in {event.kind for event in driver.events}
