@@ -174,7 +174,7 @@ class ReasonKind(StrEnum):
     NOT_ACKNOWLEDGED = "not_acknowledged", "messages on {topic} are not acknowledged for {age:.2f} s"
     NOT_FOLLOWED = "not_followed", "{topic} says that targets are not followed"
     FOLLOWED_NO_MORE = "followed_no_more", "{topic} says that targets are not followed any more"
-    NO_POSE_COMMANDS = "no_pose_commands", "{service} has not agreed to poses yet"
+    NO_POSE_COMMANDS = "no_pose_commands", "{service} has not agreed to this type of targets yet"
     HAND_SILENT = "hand_silent", "no {data} of the {hand} hand{source} for {age:.2f} s"
     HAND_UNKNOWN = "hand_unknown", "no {data} of the {hand} hand{source} yet"
     GRIPPER_FAILED = "gripper_failed", "{text}"

@@ -151,7 +151,7 @@ class ExternalConfig(StrictModel):
             raise ValueError(str(error)) from error
         if self.rate is not None and self.rate < preset.lowest_rate:
             raise ValueError(f"rate = {self.rate:g}: preset {preset.name} needs at least {preset.lowest_rate:g} Hz")
-        if not preset.takes_poses and (given := [key for key, value in self.limits if value is not None]):
+        if not preset.takes_targets and (given := [key for key, value in self.limits if value is not None]):
             gets = "gets joint positions within the limits of the block control"
             raise ValueError(f"limits.{given[0]}: is for targets; preset {preset.name} {gets}")
         return self
@@ -202,7 +202,7 @@ def describe(external: ExternalConfig) -> dict[str, str]:
     source = "what the built-in controller makes of the hand's target" if external.filtered else "the hand's target"
     lines: dict[str, str] = {}
     for arm, made in external.arms.items():
-        message = preset.message.rpartition("/")[2] + (f" in {made.base_frame}" if preset.takes_poses else "")
+        message = preset.message.rpartition("/")[2] + (f" in {made.base_frame}" if preset.takes_targets else "")
         rate = external.rate or preset.rate
         lines[arm] = f"{preset.name}: {message} on {external.topic(arm)} at {rate:g} Hz, {source}"
         lines[arm] += f"; it takes: {preset.activation.format(ctrl=made.ctrl_prefix)}"

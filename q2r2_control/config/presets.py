@@ -15,7 +15,7 @@ from q2r2_control.errors import ConfigError
 from q2r2_control.plugins import PRESETS as ENTRY_POINTS
 from q2r2_control.plugins import load_class, names_of
 
-POSE = "geometry_msgs/msg/PoseStamped"
+POSE, TWIST = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/TwistStamped"
 
 
 class Hold(StrEnum):
@@ -47,12 +47,12 @@ class Preset:
     guard: GuardSettings = _CAREFUL
     output: str = "none"  # The kind of joint commands that cartesian_controller sends itself in mode filtered, if any.
     zero_wrench: str | None = None  # Topic for a zero wrench. Without this message, the controller may push.
-    command_type: str | None = None  # Service that sets the type of targets to poses. It is called at each start.
+    command_type: str | None = None  # Service that sets the type of targets. It is called at each start.
 
     @property
-    def takes_poses(self) -> bool:
-        """Whether the controller takes tool poses. Other presets take joint positions."""
-        return self.message == POSE
+    def takes_targets(self) -> bool:
+        """Whether the controller takes poses or velocities of the tool. Other presets take joint positions."""
+        return self.message in (POSE, TWIST)
 
     def topic_of(self, ctrl_prefix: str) -> str:
         """Return the topic on which the controller with this name takes its targets."""
@@ -83,6 +83,16 @@ _ALL = (
         rate=50.0,
         lowest_rate=10.0,
         hold=Hold.SILENCE,
+        command_type="{ctrl}/switch_command_type",
+    ),
+    # Both get zero velocity while the arm is paused. The tool may drift from the target, whose velocity alone is sent.
+    Preset("twist", "it stops the arm by itself when no velocity comes", topic="{ctrl}/teleop_twist", message=TWIST),
+    Preset(
+        "moveit_servo_twist",
+        "{ctrl}/switch_command_type called with 1, which is twist",
+        topic="{ctrl}/delta_twist_cmds",
+        message=TWIST,
+        lowest_rate=20.0,
         command_type="{ctrl}/switch_command_type",
     ),
     Preset(
@@ -163,7 +173,7 @@ def preset_of(name: str, mode: str) -> tuple[Preset, Mode]:
     preset = preset_called(name)
     if mode not in list(Mode):
         raise ConfigError(f"mode = {mode!r:.60}: allowed are {', '.join(Mode)}")
-    if mode == Mode.RAW and not preset.takes_poses:
+    if mode == Mode.RAW and not preset.takes_targets:
         takes = "it takes joint positions, which the built-in controller has to make of the hand's target"
         raise ConfigError(f"preset = {name!r} with mode = '{Mode.RAW}': {takes}; allowed is mode {Mode.FILTERED}")
     return preset, Mode(mode)

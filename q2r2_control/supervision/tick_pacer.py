@@ -128,6 +128,11 @@ class PoseRateLimiter:
         """Whether the pose stands still; True if there is no pose."""
         return self.pose is None or (self._linear.speed < _REST and self._angular.speed < _REST)
 
+    @property
+    def velocity(self) -> tuple[Array, Array]:
+        """The velocity of the pose's position (3,) [m/s] and of its rotation (3,) [rad/s], in the axes of the poses."""
+        return self._linear.velocity, self._angular.velocity
+
     def reset(self, pose: pin.SE3 | None, now: float) -> None:
         """Rest at ``pose`` from ``now`` [s] on; None if there is no pose yet."""
         self.pose, self._target, self._now = pose, None, now

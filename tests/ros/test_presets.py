@@ -51,6 +51,7 @@ LONGEST_GAP = 0.3  # Longest gap in a stream, on a machine with other load [s].
 NAMES = {
     **dict.fromkeys(("builtin", "kuka_lbr_clik", "kuka_lbr_impedance", "fzi"), "target_frame"),
     **{"mayr": "reference_pose", "crisp": "target_pose", "moveit_servo": "pose_target_cmds"},
+    **{"twist": "teleop_twist", "moveit_servo_twist": "delta_twist_cmds"},
     **{"forward_position": "commands", "jtc": "joint_trajectory"},
 }
 JOINTS = ("lbr_position", "lbr_torque", "forward_position", "jtc")
@@ -211,7 +212,7 @@ def test_moveit_servo_is_switched_to_poses_after_each_of_its_starts(node: Any, m
 @pytest.mark.parametrize("name", ["fzi", "mayr", "crisp", "kuka_lbr_clik"])
 def test_a_preset_that_is_not_run_differs_from_the_tested_one_only_in_names_and_requests(name: str) -> None:
     preset, run = PRESETS[name], PRESETS[PRESET]
-    assert (preset.hold, preset.guard, preset.takes_poses) == (run.hold, run.guard, run.takes_poses)
+    assert (preset.hold, preset.guard, preset.takes_targets) == (run.hold, run.guard, run.takes_targets)
     assert preset.command_type is None
 
 
@@ -222,11 +223,11 @@ def test_the_presets_have_the_topics_of_their_controllers() -> None:
     assert lbr("/lbr_joint_position_command_controller") == "/command/lbr_joint_position_command"
     assert lbr("/{arm}/lbr_joint_position_command_controller") == f"/{KINDS['lbr_position'].topic}"
     assert PRESETS.keys() == {*NAMES, "lbr_position", "lbr_torque"}
-    assert {name for name, preset in PRESETS.items() if not preset.takes_poses} == set(JOINTS)
+    assert {name for name, preset in PRESETS.items() if not preset.takes_targets} == set(JOINTS)
     for name, preset in PRESETS.items():
         if name in NAMES:
             assert preset.topic_of("/robot/left_ctrl") == f"/robot/left_ctrl/{NAMES[name]}"
         assert preset.rate >= preset.lowest_rate
         assert (preset.zero_wrench is not None) == (name == "kuka_lbr_impedance")
-        assert (preset.command_type is not None) == (name == "moveit_servo")
+        assert (preset.command_type is not None) == (name in ("moveit_servo", "moveit_servo_twist"))
     assert PRESETS["builtin"] is BUILTIN

@@ -11,7 +11,7 @@ from typing import Any
 import pinocchio as pin
 from std_msgs.msg import Bool, String
 
-from q2r2_control.config.presets import BUILTIN, Mode
+from q2r2_control.config.presets import BUILTIN, POSE, TWIST, Mode
 from q2r2_control.config.teleop import GuardSettings
 from q2r2_control.errors import ConfigError
 from q2r2_control.events import Reason, ReasonKind
@@ -25,7 +25,7 @@ from q2r2_control.supervision.target_stream import apart
 from q2r2_control.teleop.arm_states import ArmState
 from q2r2_control.teleop.hand_motion import MAX_OFFSET
 
-_POSE = 2  # The constant POSE of moveit_msgs/srv/ServoCommandType.
+_COMMAND_TYPES = {TWIST: 1, POSE: 2}  # The constants of moveit_msgs/srv/ServoCommandType.
 # States in which the built-in controller reports that an arm accepts a stream of targets.
 _READY = ("holding", "following", "homing")
 _ANSWER = 0.2  # After this time the controller has reported the end of all earlier streams [s].
@@ -52,7 +52,7 @@ class ArmOutputs:
             self.first = TargetOutput(
                 node, values, BUILTIN, values.builtin_node, topic, values.world_frame, BUILTIN.guard
             )
-        if not self._filtered or (preset.takes_poses and preset is not BUILTIN):
+        if not self._filtered or (preset.takes_targets and preset is not BUILTIN):
             terms = values.controller, values.target_topic, values.base_frame, values.guard
             theirs = TargetOutput(node, values, preset, *terms)
             if self._filtered:
@@ -68,7 +68,9 @@ class ArmOutputs:
             # The timeout is twice the usual one, because the targets have to arrive first, and then the answer.
             self._follows = FollowWatch(node, values.builtin_node, arm, 2.0 * values.listener_timeout)
         service = preset.command_type
-        self._command_type = None if service is None else CommandType(node, service.format(ctrl=values.prefix))
+        self._command_type = (
+            None if service is None else CommandType(node, service.format(ctrl=values.prefix), preset.message)
+        )
         self._safe_problem: Reason | None = self._safe_target.problem  # Why the relay cannot begin now.
         self._relaying = False
         raw = not self._filtered and preset is not BUILTIN
@@ -274,13 +276,18 @@ class FollowWatch:
 
 
 class CommandType:
-    """Sets MoveIt Servo to poses after each of its starts; raises :class:`ConfigError` without moveit_msgs."""
+    """Sets MoveIt Servo to its type of targets after each of its starts.
 
-    def __init__(self, node: BaseNode, service: str) -> None:
+    Raises :class:`ConfigError` without moveit_msgs.
+    """
+
+    def __init__(self, node: BaseNode, service: str, message: str = POSE) -> None:
+        """``message`` is the type of the targets, :data:`POSE` or :data:`TWIST`."""
         try:
             self._kind: Any = import_module("moveit_msgs.srv").ServoCommandType
         except ImportError as error:
             raise ConfigError(f"{service} is a service of moveit_msgs, which cannot be imported: {error}") from None
+        self._type = _COMMAND_TYPES[message]
         self._service, self._client = service, node.create_client(self._kind, service)
         self._starts, self._agreed, self._asked = -1, False, -math.inf
         self._answer: Any = None  # The future of the last call.
@@ -297,7 +304,7 @@ class CommandType:
             self._agreed, self._answer = bool(self._answer.result().success), None
         if not self._agreed and now - self._asked > _RETRY and self._client.service_is_ready():
             self._asked = now
-            self._answer = self._client.call_async(self._kind.Request(command_type=_POSE))
+            self._answer = self._client.call_async(self._kind.Request(command_type=self._type))
 
 
 def _refused(why: Reason | None) -> Reason | None:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Pose, PoseStamped, Twist, Vector3
+from geometry_msgs.msg import Pose, PoseStamped, Twist, TwistStamped, Vector3
 from quest2ros.msg import OVR2ROSInputs
 from sensor_msgs.msg import JointState
 
@@ -59,6 +59,15 @@ def time_message(t: float) -> Time:
 def stamped_pose(pose: pin.SE3, frame: str, t: float) -> PoseStamped:
     """Return the message of a pose in ``frame`` at ``t`` [s], with a unit quaternion x y z w."""
     return _stamped(pose.translation, pin.Quaternion(pose.rotation).normalized().coeffs(), frame, t)
+
+
+def twist_stamped(linear: Array, angular: Array, frame: str, t: float) -> TwistStamped:
+    """Return the message of a velocity ``linear`` (3,) [m/s] and ``angular`` (3,) [rad/s] in the axes of ``frame``."""
+    message = TwistStamped()
+    message.header.frame_id, message.header.stamp = frame, time_message(t)
+    for vector, values in ((message.twist.linear, linear), (message.twist.angular, angular)):
+        vector.x, vector.y, vector.z = values.tolist()
+    return message
 
 
 def _stamped(position: Array, quaternion: Array, frame: str, t: float) -> PoseStamped:

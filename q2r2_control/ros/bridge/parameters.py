@@ -127,7 +127,7 @@ def _of_cell(given: ArmDefaults, path: str) -> ArmDefaults:
     if cell.external is None:
         return given
     external, theirs = cell.external, cell.external.arm(side)
-    takes_poses = external.terms.takes_poses  # If not, rate and topic belong to joint commands.
+    takes_targets = external.terms.takes_targets  # If not, rate and topic belong to joint commands.
     return replace(
         given,
         preset=external.preset,
@@ -139,8 +139,8 @@ def _of_cell(given: ArmDefaults, path: str) -> ArmDefaults:
         gripper_action_topic=theirs.gripper.topic or given.gripper_action_topic,
         gripper=theirs.gripper.settings(),
         limits=external.limits,
-        rate=external.rate if takes_poses else None,
-        target_topic=(theirs.target_topic or "") if takes_poses else "",
+        rate=external.rate if takes_targets else None,
+        target_topic=(theirs.target_topic or "") if takes_targets else "",
     )
 
 

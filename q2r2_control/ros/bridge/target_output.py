@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import math
+import time
+from typing import Any
 
+import numpy as np
 import pinocchio as pin
-from geometry_msgs.msg import PoseStamped, WrenchStamped
+from geometry_msgs.msg import PoseStamped, TwistStamped, WrenchStamped
 from std_msgs.msg import Empty
 
-from q2r2_control.config.presets import BUILTIN, POSE, Hold, Preset
+from q2r2_control.config.presets import BUILTIN, TWIST, Hold, Preset
 from q2r2_control.config.teleop import GuardSettings
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.ros.base_node import LATCHED_QOS, SENT_COMMAND_QOS, BaseNode
-from q2r2_control.ros.bridge.messages import ended_topic, fill_pose, pose_template, time_message
+from q2r2_control.ros.bridge.messages import ended_topic, fill_pose, pose_template, time_message, twist_stamped
 from q2r2_control.ros.bridge.parameters import ArmParameters
 from q2r2_control.ros.commanders import OnePublisher
 from q2r2_control.ros.monitoring import WatchedPublisher, node_of
@@ -32,7 +35,7 @@ _HELD = 0.15, 0.6  # [m, rad]
 
 
 class TargetOutput:
-    """Publishes one arm's target to one controller, through a :class:`PoseRateLimiter`.
+    """Publishes one arm's target, or its velocity, to one controller, through a :class:`PoseRateLimiter`.
 
     The limiter starts at the tool, so that engaging moves nothing. When the target ends, the limiter brakes, and the
     preset says whether the last pose is repeated then. The pose is never repeated if the tool is elsewhere, nor to a
@@ -53,7 +56,10 @@ class TargetOutput:
         self.guard = PoseRateLimiter(guard, 1.0 / values.rate)
         self._node, self._controller, self._frame = node, controller, frame
         self._template = pose_template(frame)
-        self._publisher = WatchedPublisher(node, PoseStamped, topic, values.listener_timeout)
+        # The controller takes the velocity of the guarded pose instead of the pose.
+        self._is_twist = preset.message == TWIST
+        kind = TwistStamped if self._is_twist else PoseStamped
+        self._publisher = WatchedPublisher(node, kind, topic, values.listener_timeout)
         self.topic = self._publisher.topic_name  # The full name.
         self._one = OnePublisher(node, [self.topic])
         self._unknown_node = Reason.of(ReasonKind.SUBSCRIBER_UNKNOWN, topic=self.topic)
@@ -85,7 +91,7 @@ class TargetOutput:
     def unready(self) -> Reason | None:
         """A reason if the topic has no subscriber, or one whose node is not known yet."""
         if self._publisher.listeners == 0:
-            return Reason.of(ReasonKind.NO_SUBSCRIBER, topic=f"{self.topic} ({POSE})")
+            return Reason.of(ReasonKind.NO_SUBSCRIBER, topic=f"{self.topic} ({self.preset.message})")
         return self._unknown_node if self._unknown and not self.following else None
 
     def take_fault(self, now: float) -> Reason | None:
@@ -131,7 +137,9 @@ class TargetOutput:
             state: The state of the arm. In PAUSING the stream continues, because the press may become another gesture.
                 In PAUSED it ends in order. If it stops in another way, the built-in controller also holds linked arms.
         """
-        if self._unknown or self._present() > self._listeners:
+        if self._unknown or self._present() > self._listeners or (self._is_twist and base is None):
+            if self._is_twist:  # The controller would go on at the last velocity, so it is told to stop.
+                self.forget(now)
             return None
         idle = not self.following and self.guard.at_rest
         self.following = target is not None
@@ -146,9 +154,15 @@ class TargetOutput:
             return None
         if self.following and self._publisher.waits():
             return pose
-        if self._publisher.publish(fill_pose(self._template, base.actInv(pose), now), decided):
+        if self._publisher.publish(self._message(pose, base, now), decided):
             self.last_sent, self._sent_at = pose, now
         return pose
+
+    def _message(self, pose: pin.SE3, base: pin.SE3, now: float) -> Any:
+        """Return the message of a guarded ``pose`` in the world frame, or of its velocity in the axes of ``base``."""
+        if not self._is_twist:
+            return fill_pose(self._template, base.actInv(pose), now)
+        return twist_stamped(*(base.rotation.T @ part for part in self.guard.velocity), self._frame, now)
 
     def _end_stream(self, state: ArmState, now: float) -> None:
         """Publish that the stream ends if the operator paused the arm. A stream that stops otherwise is not ended."""
@@ -159,7 +173,10 @@ class TargetOutput:
             self._ends.publish(Empty())
 
     def forget(self, now: float) -> None:
-        """Drop the held target. The next target begins a new stream."""
+        """Drop the held target. The next target begins a new stream. A controller of velocities is told to stop."""
+        if self._is_twist and self.last_sent is not None:
+            still = twist_stamped(np.zeros(3), np.zeros(3), self._frame, now)
+            self._publisher.publish(still, time.monotonic())
         self.following, self.last_sent, self._sent_at = False, None, -math.inf
         self.guard.reset(None, now)
 

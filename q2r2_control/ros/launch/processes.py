@@ -122,12 +122,12 @@ def _relayed(external: ExternalConfig) -> dict[str, str | float]:
     """Return the parameters of the built-in controller in mode filtered, for safe targets or joint commands."""
     preset = external.terms
     parameters: dict[str, str | float] = {"output": preset.output}
-    if not preset.takes_poses:
+    if not preset.takes_targets:
         parameters["rate"] = float(external.rate or preset.rate)
     for arm, theirs in external.arms.items():
         parameters[f"{arm}.target_frame_id"] = external.world_frame or theirs.base_frame
         parameters[f"{arm}.joint_states_topic"] = theirs.joint_states_topic
-        if not preset.takes_poses:
+        if not preset.takes_targets:
             parameters[f"{arm}.output_topic"] = external.topic(arm)
     return parameters
 
