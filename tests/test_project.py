@@ -33,7 +33,7 @@ IMPORTS = {
     "opencv-python-headless": "cv2",
 }
 # These packages come with pin, mujoco, lerobot, pydantic, matplotlib and viser.
-WITH_OTHERS = {"coal", "glfw", "datasets", "pydantic_core", "packaging", "trimesh", "msgspec", "websockets"}
+WITH_OTHERS = {"coal", "glfw", "datasets", "pandas", "pydantic_core", "packaging", "trimesh", "msgspec", "websockets"}
 NODES = set(ROS.rglob("*.py"))
 OTHERS = set((ROOT / PACKAGE).rglob("*.py")) - NODES
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"), *ROOT.glob("[qb]*/**/*.md")])

@@ -162,7 +162,8 @@ class TargetOutput:
         """Return the message of a guarded ``pose`` in the world frame, or of its velocity in the axes of ``base``."""
         if not self._is_twist:
             return fill_pose(self._template, base.actInv(pose), now)
-        return twist_stamped(*(base.rotation.T @ part for part in self.guard.velocity), self._frame, now)
+        linear, angular = self.guard.velocity
+        return twist_stamped(base.rotation.T @ linear, base.rotation.T @ angular, self._frame, now)
 
     def _end_stream(self, state: ArmState, now: float) -> None:
         """Publish that the stream ends if the operator paused the arm. A stream that stops otherwise is not ended."""
