@@ -61,6 +61,7 @@ from q2r2_control.plants.mujoco_cameras import window_fault
 from q2r2_control.plugins import PLANTS, load_class
 from q2r2_control.process.scheduling import StopRequest, stop_on_signals
 from q2r2_control.robot.commissioned import has_real_cabinets, not_commissioned, slowed
+from q2r2_control.teleop.crossed_hands import CrossedHands
 from q2r2_control.types import CommandMode
 from q2r2_control.viewer.headset_table import headset_display, headset_table
 
@@ -358,7 +359,8 @@ def headset_check(
         server.start()
         try:
             with headset_display(console) as show:
-                check = watch_headset(server, cell, duration, show, lambda: stop.asked)
+                watch = CrossedHands(cell.teleop.axes)
+                check = watch_headset(server, cell, duration, show, lambda: stop.asked, watch)
         finally:
             server.close()
     print_report(check.as_json(), (headset_table(check),), json)

@@ -15,9 +15,7 @@ from q2r2_control.config.teleop import Stance, axes_matrix
 from q2r2_control.inputs.listener import ONLY_THIS_MACHINE, app_settings, written
 from q2r2_control.inputs.messages import MessageType
 from q2r2_control.inputs.session import HAND_TOPICS, HeadsetStatistics
-from q2r2_control.teleop.crossed_hands import CROSSED, CrossedHands
 from q2r2_control.types import SIDES, Array, HandSample
-from q2r2_control.wording import sentence
 
 SILENCE = 2.0  # Time without data before advice is given [s].
 _PERIOD = 0.05  # [s]
@@ -69,6 +67,14 @@ class CheckedServer(Protocol):
     def poll(self, now: float) -> list[HandSample]: ...
 
 
+class HandWatch(Protocol):
+    """Watches the places of both hands, as :class:`CrossedHands` of the teleoperation does."""
+
+    def add(self, sample: HandSample) -> None: ...
+
+    def warning(self, now: float) -> str | None: ...
+
+
 @dataclass(frozen=True, slots=True)
 class HeadsetCheck:
     statistics: HeadsetStatistics
@@ -101,9 +107,10 @@ def watch_headset(
     duration: float | None,
     show: Callable[[HeadsetCheck], None],
     stopping: Callable[[], bool],
+    watch: HandWatch,
 ) -> HeadsetCheck:
     """Watch a started server for ``duration`` [s] or until ``stopping``. Show each state, and return the last one."""
-    hands, crossed = {hand: HandMovement(config.teleop.axes) for hand in SIDES}, CrossedHands(config.teleop.axes)
+    hands = {hand: HandMovement(config.teleop.axes) for hand in SIDES}
     start, heard = time.monotonic(), False
     last_data = dict.fromkeys(needed_topics(config), start)
     missing = tuple(last_data)
@@ -112,7 +119,7 @@ def watch_headset(
         ends = stopping() or (duration is not None and now - start >= duration)  # Decided before the last poll.
         for sample in server.poll(now):
             hands[sample.hand].add(sample)
-            crossed.add(sample)
+            watch.add(sample)
             heard = True
         statistics = server.statistics
         for name in statistics.topics.keys() & last_data.keys():
@@ -122,14 +129,15 @@ def watch_headset(
         if ends and not silent:
             silent = missing  # There is no time left to wait for these topics.
         nothing_comes = len(silent) == len(last_data)
+        warning = watch.warning(now)
         check = HeadsetCheck(
             statistics=statistics,
             directions={hand: movement.in_words(now) for hand, movement in hands.items()},
             positions={hand: movement.position for hand, movement in hands.items()},
             heard=heard,
             missing=missing,
-            crossed=crossed.crossed(now),
-            advice=advice(statistics, server.url) if nothing_comes else advice_on_some(silent, crossed.crossed(now)),
+            crossed=warning is not None,
+            advice=advice(statistics, server.url) if nothing_comes else advice_on_some(silent, warning),
         )
         show(check)
         if ends:
@@ -145,12 +153,12 @@ def needed_topics(config: Config) -> tuple[str, ...]:
     return tuple(name for name, topic in HAND_TOPICS.items() if topic.hand in hands and topic.kind in needed)
 
 
-def advice_on_some(silent: tuple[str, ...], crossed: bool = False) -> tuple[str, ...]:
+def advice_on_some(silent: tuple[str, ...], warning: str | None = None) -> tuple[str, ...]:
     """Return advice if some topics come and others are ``silent``, with one line for each hand.
 
-    One more line says that the hands are ``crossed``.
+    The ``warning`` about the places of both hands, if there is one, comes first.
     """
-    lines = [sentence(CROSSED)] if crossed else []
+    lines = [] if warning is None else [warning]
     for hand in SIDES:
         kinds = {HAND_TOPICS[name].kind: name for name in silent if HAND_TOPICS[name].hand == hand}
         if len(kinds) == 2:

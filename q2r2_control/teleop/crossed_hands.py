@@ -12,6 +12,7 @@ from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.quaternions import se3_of
 from q2r2_control.teleop.gate import pose_of
 from q2r2_control.types import SIDES, Array, HandSample
+from q2r2_control.wording import sentence
 
 CROSSED_FOR = 3.0  # The hands count as crossed after this time without a moment in which they were not [s].
 CROSSED = Reason.of(ReasonKind.HANDS_CROSSED, time=CROSSED_FOR)
@@ -58,6 +59,10 @@ class CrossedHands:
     def crossed(self, now: float) -> bool:
         """Return whether the hands have been crossed for :data:`CROSSED_FOR` until ``now`` [s]."""
         return now - self._at <= _NEWEST and self._at - self._since >= CROSSED_FOR
+
+    def warning(self, now: float) -> str | None:
+        """Return the sentence about crossed hands at ``now`` [s], or None if they are not crossed."""
+        return sentence(CROSSED) if self.crossed(now) else None
 
     def _judge(self, stamp: float) -> None:
         (left_at, left, left_points), (right_at, right, right_points) = (self._hands[hand] for hand in SIDES)

@@ -15,6 +15,7 @@ from websockets.exceptions import ConnectionClosed
 from q2r2_control.inputs.headset_check import watch_headset
 from q2r2_control.inputs.webxr.page_messages import LONGEST
 from q2r2_control.inputs.webxr.webxr import WebXrInput
+from q2r2_control.teleop.crossed_hands import CrossedHands
 from q2r2_control.types import HandFault, HapticFeedback
 from tests.support.processes import cell, wait_until
 from tests.web.browser import PATIENCE
@@ -187,13 +188,13 @@ def test_the_newest_picture_reaches_the_page_that_drives(listen: Listen) -> None
 
 def test_headset_check_shows_messages_of_the_page_and_its_address(listen: Listen) -> None:
     source, config = listen(silence=PATIENCE), WebXrInput.cell(cell())
-    alone = watch_headset(source, config, 0.0, lambda check: None, lambda: False)
+    alone = watch_headset(source, config, 0.0, lambda check: None, lambda: False, CrossedHands(config.teleop.axes))
     assert f"open {source.url} in the headset's browser" in alone.advice
     assert len(alone.missing) == 4
     with closing(Page(source)) as page:
         page.send(left=hand(0.0), right=hand(0.5))
         page.send(left=hand(0.1), right=hand(0.5))
         wait_until(lambda: len(source.statistics.topics) == 4 and source.statistics.topics["q2r_left_hand_pose"].count)
-        check = watch_headset(source, config, 0.0, lambda check: None, lambda: False)
+        check = watch_headset(source, config, 0.0, lambda check: None, lambda: False, CrossedHands(config.teleop.axes))
     assert (check.missing, check.advice) == ((), ())
     assert set(check.directions) == {"left", "right"}
