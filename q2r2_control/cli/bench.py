@@ -17,8 +17,10 @@ from q2r2_control.benchmark.solver_run import INSTALL, SOLVERS, SolverReport, ru
 from q2r2_control.benchmark.work_motions import TIMED_MOTIONS, WORK_MOTIONS, motions_named
 from q2r2_control.cli.output import (
     DEMO_CONFIG,
+    ClusterAddress,
     Json,
     Solver,
+    Workers,
     notice_of_compiling,
     print_progress,
     print_report,
@@ -26,10 +28,12 @@ from q2r2_control.cli.output import (
 )
 from q2r2_control.config.cell import load_config
 from q2r2_control.errors import ConfigError
+from q2r2_control.process.places import HERE, chosen_place
 from q2r2_control.verification.fault_injection import FINGERS, with_contact
 from q2r2_control.verification.policy_soak import COUNTED as POLICY_COUNTED
 from q2r2_control.verification.policy_soak import PolicySoak
 from q2r2_control.verification.soak import COUNTED, MEMORY_ALLOWED, SoakReport, run_soak
+from q2r2_control.verification.soaks import run_soaks
 from q2r2_control.viewer.tables import Cell, figure_table
 
 _ROUNDS = 3
@@ -148,6 +152,9 @@ def soak(
         bool, Option("--policy", help="Send hostile actions of a policy through the whole pipeline.")
     ] = False,
     seed: Annotated[int, Option(min=0, help="Seed of all random numbers.")] = 0,
+    seeds: Annotated[int, Option(min=1, help="Number of soaks, with the seeds from --seed on and --ticks each.")] = 1,
+    workers: Workers = 1,
+    cluster: ClusterAddress = None,
     solver: Solver = None,
     json: Json = False,
 ) -> None:
@@ -158,13 +165,17 @@ def soak(
     """
     config = with_solver(load_config(DEMO_CONFIG), solver)
     config = with_contact(config, FINGERS) if contact else config
+    place = chosen_place(workers, cluster)
     with notice_of_compiling():
-        if policy:
+        if seeds > 1 or place is not HERE:
+            report = run_soaks(config, ticks, range(seed, seed + seeds), place, policy=policy, progress=print_progress)
+        elif policy:
             report = PolicySoak(config, seed).run(ticks, print_progress)
         else:
             report = run_soak(config, ticks, seed, print_progress)
     table = figure_table(
-        f"{report.cell}: {report.ticks} hostile ticks, {report.simulated_s:.0f} s, seed {report.seed}, {report.solver}",
+        f"{report.cell}: {report.ticks} hostile ticks, {report.simulated_s:.0f} s, {_seeds_of(report)}, "
+        f"{report.solver}",
         ("promise", "worst", "allowed", "checked", "broken"),
         _soak_rows(report),
         list(
@@ -176,6 +187,11 @@ def soak(
     )
     print_report(report.as_json(), (table,), json)
     raise Exit(0 if report.passed else 1)
+
+
+def _seeds_of(report: SoakReport) -> str:
+    first, last = report.seed, report.seed + report.seeds - 1
+    return f"seed {first}" if first == last else f"seeds {first} to {last}"
 
 
 def _soak_rows(report: SoakReport) -> Iterator[tuple[Cell, ...]]:
@@ -196,7 +212,8 @@ def _soak_notes(report: SoakReport, options: str) -> Iterator[str]:
     for found in report.broken:
         error = f": {found.error}" if found.error else ""
         where = f"tick {found.since_segment} of: {found.segment}; dt {found.dt}"
-        yield f"first broken at tick {found.tick}: {found.promise}{error} [{where}]"
+        seed = f" of seed {found.seed}" if report.seeds > 1 else ""
+        yield f"first broken at tick {found.tick}{seed}: {found.promise}{error} [{where}]"
     if report.broken:
-        again = f"{options}--seed {report.seed} --ticks {report.broken[0].tick + 1}"
+        again = f"{options}--seed {report.broken[0].seed} --ticks {report.broken[0].tick + 1}"
         yield f"to see the first again: q2r2 soak {again}"

@@ -86,6 +86,13 @@ COMMANDS = (
         "q2r2 export lerobot recordings --output datasets/circle --fps 30",
     ),
     ListedCommand(
+        "evaluate",
+        "evaluate:evaluate",
+        "Let a policy try each task with many seeds in simulated time, and count successes.",
+        "Data to learn from",
+        "q2r2 evaluate examples.policy:Circles grasp stack --seeds 50",
+    ),
+    ListedCommand(
         "doctor",
         "doctor:doctor",
         "Say what this computer lacks to run a cell, and the cure of each fault.",

@@ -32,6 +32,7 @@ _NEEDS_EXTRA = {
     "export": "no q2r2 export hdf5 and lerobot-v2.1",
     "lerobot": "no q2r2 export lerobot",
     "gym": "no environments of Gymnasium",
+    "cluster": "no --cluster",
     "xacro": "no models that end in .xacro",
     "modbus": "no Robotiq grippers by Modbus",
     "cameras": "no cameras with a device",

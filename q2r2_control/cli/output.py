@@ -53,6 +53,15 @@ Solver = Annotated[
 Anonymous = Annotated[
     bool, Option("--anonymous", help="Leave out the names of the operator and of the recording computer.")
 ]
+Workers = Annotated[int, Option(min=1, help="Number of processes. It does not change the result.")]
+ClusterAddress = Annotated[
+    str | None,
+    Option(
+        "--cluster",
+        metavar="ADDRESS",
+        help="Address or file of a dask scheduler, whose workers do the work; needs the extra `cluster`.",
+    ),
+]
 Operator = Annotated[str | None, Option(help="With --record: the operator's name, which the recording keeps.")]
 
 

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import ExitStack
-from dataclasses import dataclass
+from contextlib import ExitStack, closing
+from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TypeVar
 
 from rich.console import Console
 from rich.markup import escape
@@ -15,10 +15,12 @@ from typer import Argument, Exit, Option
 from q2r2_control.cli.cell_run import check_window, show_window
 from q2r2_control.cli.output import (
     Anonymous,
+    ClusterAddress,
     Json,
     Verbose,
     WebHost,
     WebPort,
+    Workers,
     as_json_text,
     counted,
     counting,
@@ -28,12 +30,14 @@ from q2r2_control.cli.output import (
 )
 from q2r2_control.cli.summary_figures import summary_table, verdict_line
 from q2r2_control.config.cell import load_config
+from q2r2_control.config.recording import JudgeSettings
 from q2r2_control.errors import ConfigError, RecordingError
 from q2r2_control.export.episodes import FASTEST, FrameSampling, Output, keep_episodes
 from q2r2_control.export.formats import FORMATS, format_named
-from q2r2_control.judging.judge import Judged, Unreadable, discarded_episodes, judge_all
+from q2r2_control.judging.judge import Judged, Judgement, Unreadable, discarded_episodes, judge_all, judgements_of
 from q2r2_control.judging.page import COLUMNS, page_of
 from q2r2_control.pipeline.pipeline import Pipeline
+from q2r2_control.process.places import chosen_place
 from q2r2_control.recording.reader import recordings_in
 from q2r2_control.recording.replay import replay as replay_recording
 from q2r2_control.viewer.tables import figure_table
@@ -42,6 +46,8 @@ from q2r2_control.viewer.web.view import PageView
 
 # The columns that fit into a terminal. The page has all columns.
 _SHOWN = ("success", "time", "idle", "gap", "delay", "error", "LDLJ")
+
+_Judgement = TypeVar("_Judgement", bound=Judgement)
 
 Recordings = Annotated[list[Path], Argument(metavar="DIR_OR_FILES...", help="Recordings, or folders with recordings.")]
 Thresholds = Annotated[
@@ -116,34 +122,48 @@ def replay(
         raise Exit(1)
 
 
-def judge(recordings: Recordings, config: Thresholds = None, json: Json = False) -> None:
+def judge(
+    recordings: Recordings,
+    config: Thresholds = None,
+    workers: Workers = 1,
+    cluster: ClusterAddress = None,
+    json: Json = False,
+) -> None:
     """Say whether to keep or to discard each recorded episode, with reasons and numbers.
 
     The thresholds are those of the recorded cell, in its block `judge`. Exit code 2 if a file cannot be read.
     """
-    found = _judged(recordings, config)
+    place, settings, files = chosen_place(workers, cluster), _thresholds(config), recordings_in(recordings)
+    found: list[Judgement | Unreadable] = []
+    with counting("recordings") as progress:
+        work = partial(judgements_of, settings)
+        with closing(place.results(work, files, lambda file: file)) as results:
+            for done, its in enumerate(results, start=1):
+                found += its
+                progress(f"recordings{place.where}", done, len(files))
+    judged, unreadable = _split(found)
     if json:
-        print(as_json_text({"episodes": [one.as_json() for one in found.all]}))
+        print(as_json_text({"episodes": [one.as_json() for one in found]}))
     else:
-        _print_verdicts(found)
-    if found.unreadable:
+        _print_verdicts(judged, unreadable)
+    if unreadable:
         raise Exit(2)
 
 
-def _print_verdicts(found: _Judgements) -> None:
+def _print_verdicts(judged: Sequence[Judgement], unreadable: Sequence[Unreadable]) -> None:
     # A column shows the worst number of several hands or arms.
     columns = [column for column in COLUMNS if column.name in _SHOWN]
-    judged, console = found.judged, Console()
+    console = Console()
     kept = sum(one.verdict.keep for one in judged)
     rows = [(one.figures.name, one.verdict.word, *(column.text(one.figures) for column in columns)) for one in judged]
-    rows += [(one.file.stem, "discard", *("-" for _ in columns)) for one in found.unreadable]
+    rows += [(one.file.stem, "discard", *("-" for _ in columns)) for one in unreadable]
     title = f"episodes: {kept} kept, {len(rows) - kept} discarded"
     console.print(figure_table(title, ("episode", "verdict", *(column.heading for column in columns)), rows))
     for one in judged:
         if not one.verdict.keep:
             name = one.figures.file + ("" if one.figures.part is None else f" #{one.figures.part}")
             console.print(f"{escape(name)}: {verdict_markup(one.verdict)}", soft_wrap=True, highlight=False)
-    for bad in found.unreadable:
+    for bad in unreadable:
         console.print(f"{escape(str(bad.file))}: [red]{escape(bad.line)}[/]", soft_wrap=True, highlight=False)
 
 
@@ -158,15 +178,20 @@ def report(
     """
     if output.is_dir() or not output.parent.is_dir():
         raise ConfigError(f"--output {output}: allowed: a file in a folder that exists")
-    found, names = _judged(recordings, config), ", ".join(map(str, recordings))
-    judged, unreadable = found.judged, found.unreadable
+    settings, files, found = _thresholds(config), recordings_in(recordings), list[Judged | Unreadable]()
+    with counting("recordings") as progress:
+        for one in judge_all(files, settings):
+            found.append(one)
+            progress("", len(found), max(len(found), len(files)))
+    judged, unreadable = _split(found)
+    names = ", ".join(map(str, recordings))
     with counting("plots") as progress:
         page = page_of(judged, f"Recordings: {names}", lambda done: progress("", done, len(judged)), unreadable)
     try:
         output.write_text(page, encoding="utf-8")
     except OSError as error:
         raise ConfigError(f"--output {output}: {error.strerror}; allowed: a file that you may write") from error
-    kept, count = sum(one.verdict.keep for one in judged), len(found.all)
+    kept, count = sum(one.verdict.keep for one in judged), len(found)
     print(f"{output}: {counted(count, 'episode')}, {kept} kept, {count - kept} discarded")
     for bad in unreadable:
         say(f"{bad.file}: {bad.line}", style="yellow")
@@ -174,27 +199,15 @@ def report(
         raise Exit(2)
 
 
-@dataclass(frozen=True)
-class _Judgements:
-    all: list[Judged | Unreadable]  # In the order of the files.
-
-    @property
-    def judged(self) -> list[Judged]:
-        return [one for one in self.all if isinstance(one, Judged)]
-
-    @property
-    def unreadable(self) -> list[Unreadable]:
-        return [one for one in self.all if isinstance(one, Unreadable)]
+def _thresholds(config: str | None) -> JudgeSettings | None:
+    """Return the thresholds of the cell ``config``; None for those of each recorded cell."""
+    return None if config is None else load_config(config).judge
 
 
-def _judged(recordings: Sequence[Path], config: str | None) -> _Judgements:
-    settings = None if config is None else load_config(config).judge
-    files, judged = recordings_in(recordings), list[Judged | Unreadable]()
-    with counting("recordings") as progress:
-        for one in judge_all(files, settings):
-            judged.append(one)
-            progress("", len(judged), max(len(judged), len(files)))
-    return _Judgements(judged)
+def _split(found: Sequence[_Judgement | Unreadable]) -> tuple[list[_Judgement], list[Unreadable]]:
+    """Return the judgements, and the files that cannot be read, each in the order of the files."""
+    bad = [one for one in found if isinstance(one, Unreadable)]
+    return [one for one in found if not isinstance(one, Unreadable)], bad
 
 
 def export(
@@ -205,7 +218,8 @@ def export(
     output: Annotated[Path, Option(metavar="OUT", help="Folder to write, which must not exist yet.")],
     fps: Annotated[int, Option(help=f"Frames per second: 1 .. {FASTEST}.")] = 30,
     trim: Annotated[bool, Option("--trim", help="Leave out the time before and after all motion.")] = False,
-    workers: Annotated[int, Option(min=1, help="Number of processes. It does not change the result.")] = 1,
+    workers: Workers = 1,
+    cluster: ClusterAddress = None,
     keep_discarded: Annotated[
         bool, Option("--keep-discarded", help="Export also the episodes that q2r2 judge discards.")
     ] = False,
@@ -235,6 +249,7 @@ def export(
     sampling = FrameSampling(
         fps, trim, pictures=not no_pictures, anonymous=anonymous, ahead=chosen.ahead if ahead is None else ahead
     )
+    place = chosen_place(workers, cluster)
     target, files = Output(output), recordings_in(recordings)
     try:
         with counting("recordings") as progress:
@@ -243,9 +258,9 @@ def export(
                 sampling,
                 chosen.write,
                 target.episodes(),
-                workers=workers,
+                place=place,
                 verdicts=None if keep_discarded else discarded_episodes,
-                progress=lambda done: progress("", done, max(done, len(files))),
+                progress=lambda done: progress(f"recordings{place.where}", done, max(done, len(files))),
             )
     finally:
         target.tidy()

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from dataclasses import replace
 from functools import partial
@@ -16,10 +17,12 @@ from rich.console import Console
 from typer import Argument, Exit, Option
 
 from q2r2_control.cli.cell_run import RunOptions, print_summary, run_cell
+from q2r2_control.cli.evaluate import print_trials
 from q2r2_control.cli.fri import rehearsal
 from q2r2_control.cli.output import (
     DEMO_CONFIG,
     Anonymous,
+    ClusterAddress,
     ConfigFile,
     Json,
     Operator,
@@ -30,7 +33,6 @@ from q2r2_control.cli.output import (
     Wait,
     WebHost,
     WebPort,
-    as_json_text,
     longest_wait,
     notes_of,
     notice_of_compiling,
@@ -51,7 +53,7 @@ from q2r2_control.demo.assembly_tasks import (
     with_controls,
     with_parts_at,
 )
-from q2r2_control.demo.trials import try_tasks
+from q2r2_control.demo.trials import try_task, try_tasks
 from q2r2_control.errors import NOT_RECORDED, ConfigError
 from q2r2_control.extras import install_line
 from q2r2_control.inputs.base import adapted, make_input, options_of
@@ -59,6 +61,7 @@ from q2r2_control.inputs.headset_check import watch_headset
 from q2r2_control.inputs.scripted import TRAJECTORIES, hurried, place_of, trajectory_named
 from q2r2_control.plants.mujoco_cameras import window_fault
 from q2r2_control.plugins import PLANTS, load_class
+from q2r2_control.process.places import JobPlace, Processes, chosen_place
 from q2r2_control.process.scheduling import StopRequest, stop_on_signals
 from q2r2_control.robot.commissioned import has_real_cabinets, not_commissioned, slowed
 from q2r2_control.teleop.crossed_hands import CrossedHands
@@ -220,6 +223,7 @@ def demo(
         int | None,
         Option(min=1, help="Try each task this many times with --human in simulated time, and count successes."),
     ] = None,
+    cluster: ClusterAddress = None,
     spread: Annotated[
         float, Option(min=0, max=LARGEST_SPREAD, help="Largest displacement of the parts, which --seed draws [m].")
     ] = 0.0,
@@ -252,8 +256,11 @@ def demo(
         unfit |= {"--duration": duration is not None, "--seed": seed != 0, "--spread": spread != 0.0}
         if refused := [option for option, given in unfit.items() if given]:
             raise ConfigError(f"{refused[0]} cannot be used with --seeds")
-        _try_tasks(chosen, mode, seeds, shaky, solver, json)
+        trials_at = Processes(os.cpu_count() or 1) if cluster is None else chosen_place(1, cluster)
+        _try_tasks(chosen, mode, seeds, trials_at, shaky, solver, json)
         return
+    if cluster is not None:
+        raise ConfigError("--cluster needs --seeds")
     if spread and plant == "fri":
         raise ConfigError("--spread cannot be used with --plant fri, whose parts lie where its cell has them")
     trajectory, place = "+".join(task.name for task in chosen), place_of(seed, spread)
@@ -301,16 +308,18 @@ def demo(
 
 
 def _try_tasks(
-    tasks: tuple[AssemblyTask, ...], mode: CommandMode, seeds: int, shaky: bool, solver: str | None, json: bool
+    tasks: tuple[AssemblyTask, ...],
+    mode: CommandMode,
+    seeds: int,
+    place: JobPlace,
+    shaky: bool,
+    solver: str | None,
+    json: bool,
 ) -> None:
     with notice_of_compiling():
         config = with_solver(load_config(DEMO_CONFIG), solver)
-        reports = try_tasks(config, tasks, mode, seeds, shaky, print_progress)
-    if json:
-        print(as_json_text(reports))
-    for report in () if json else reports:
-        reasons = "".join(f"; seed {seed}: {reason}" for seed, reason in report.failures.items())
-        print(f"{report.task}: {report.succeeded} of {report.trials}{reasons}")
+        reports = try_tasks(tasks, partial(try_task, config, mode, shaky), seeds, place, print_progress)
+    print_trials(reports, json)
     if not all(report.is_reliable for report in reports):
         raise Exit(1)
 

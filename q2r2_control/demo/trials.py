@@ -1,23 +1,33 @@
-"""Repeats tasks many times in simulated time. The hands tremble differently in each trial."""
+"""Repeats tasks many times in simulated time, with scripted hands that tremble differently, or with a policy."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass
-from functools import partial
-from multiprocessing import active_children
+from pathlib import Path
 
 from q2r2_control.config.cell import Config
-from q2r2_control.demo.assembly_tasks import AssemblyTask, TaskWatch, held_to_promises, tasks_named, with_controls
+from q2r2_control.demo.assembly_tasks import (
+    AssemblyTask,
+    TaskWatch,
+    held_to_promises,
+    tasks_named,
+    with_controls,
+    with_parts_at,
+)
 from q2r2_control.errors import PlantError
-from q2r2_control.inputs.scripted import ScriptedInput, hurried, trajectory_named
+from q2r2_control.inputs.base import Input
+from q2r2_control.inputs.policy import PolicyInput
+from q2r2_control.inputs.scripted import ScriptedInput, hurried, place_of, trajectory_named
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.mujoco import MujocoPlant
-from q2r2_control.process.pools import pool_of
+from q2r2_control.process.places import JobPlace
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import CommandMode
 
+# Makes one trial with the name of a task and a seed, and returns why it failed, or ""; importable by processes.
+Trial = Callable[[tuple[str, int]], str]
 _WANTED = 0.95  # The share of trials that have to succeed.
 
 
@@ -40,42 +50,55 @@ class TrialReport:
 
 
 def try_tasks(
-    config: Config,
     tasks: Sequence[AssemblyTask],
-    mode: CommandMode,
+    trial: Trial,
     seeds: int,
-    shaky: bool = False,
+    place: JobPlace,
     progress: Callable[[str], None] = lambda line: None,
+    reads: Path | None = None,
 ) -> list[TrialReport]:
-    """Try each task by itself ``seeds`` times, in as many processes as there are processors."""
+    """Make a ``trial`` of each task by itself with each of ``seeds`` seeds. The reports are the same at any ``place``.
+
+    ``reads`` is a file that trials read, if any.
+    """
     jobs = [(task.name, seed) for task in tasks for seed in range(seeds)]
     failures: dict[str, dict[int, str]] = {task.name: {} for task in tasks}
-    pool = pool_of(min(os.cpu_count() or 1, len(jobs)))
-    try:
-        for (task, seed), failure in zip(jobs, pool.map(partial(try_task, config, mode, shaky), jobs), strict=True):
+    with closing(place.results(trial, jobs, None if reads is None else lambda job: reads)) as results:
+        for (task, seed), failure in zip(jobs, results, strict=True):
             if failure:
                 failures[task][seed] = failure
-            progress(f"{task}, seed {seed}: {failure or 'succeeded'}")
-    except KeyboardInterrupt:
-        for worker in active_children():  # A trial takes long and has nothing to close, so it is killed.
-            worker.kill()
-        raise
-    finally:
-        pool.shutdown(cancel_futures=True)
+            progress(f"{task}, seed {seed}: {failure or 'succeeded'}{place.where}")
     return [TrialReport(task, seeds, failed) for task, failed in failures.items()]
 
 
 def try_task(config: Config, mode: CommandMode, shaky: bool, job: tuple[str, int]) -> str:
-    """Try the task with the name and the seed of ``job``; returns why it failed, or an empty text after success."""
+    """Let scripted hands try the task and the seed of ``job``; returns why it failed, or "" after success."""
     name, seed = job
-    config, work = with_controls(config), trajectory_named(name)
+    work = trajectory_named(name)
     work = hurried(work, seed) if shaky else work
+    hands = ScriptedInput(name, human=True, seed=seed, shaky=shaky)
+    return _failure_of(with_controls(config), hands, mode, name, work.duration)
+
+
+def try_policy(config: Config, mode: CommandMode, policy: str, spread: float, job: tuple[str, int]) -> str:
+    """Let the ``policy`` MODULE:NAME try the task and the seed of ``job``, in the time that scripted hands take.
+
+    The seed lays the parts up to ``spread`` [m] from their places along x and y. Returns why it failed, or "".
+    """
+    name, seed = job
+    config = with_parts_at(config, tasks_named([name]), place_of(seed, spread))
+    source = PolicyInput.from_config(config, policy)
+    return _failure_of(config, source, mode, name, trajectory_named(name).duration)
+
+
+def _failure_of(config: Config, source: Input, mode: CommandMode, task: str, duration: float | None) -> str:
+    """Return why a task fails if ``source`` drives the arms for ``duration`` [s], or "" if it succeeds."""
     robot = Robot.from_config(config)
     plant = MujocoPlant(robot, config)
-    pipeline = Pipeline(config, robot, ScriptedInput(name, human=True, seed=seed, shaky=shaky), plant, mode)
-    pipeline.listeners.append(watch := TaskWatch(tasks_named([name]), plant, robot, config))
+    pipeline = Pipeline(config, robot, source, plant, mode)
+    pipeline.listeners.append(watch := TaskWatch(tasks_named([task]), plant, robot, config))
     try:
-        summary = pipeline.run(work.duration, realtime=False)
+        summary = pipeline.run(duration, realtime=False)
     except PlantError as error:
         return str(error)
     return held_to_promises(watch.results(), summary)[0].reason

@@ -1,6 +1,6 @@
 """Converts episodes of recordings to vectors and pictures at a fixed rate.
 
-Several processes do the work. Finished episodes are kept until all are finished.
+Several processes or machines do the work. Finished episodes are kept until all are finished.
 """
 
 from __future__ import annotations
@@ -8,11 +8,12 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import platform
 import shutil
-from collections.abc import Callable, Generator, Mapping, Sequence
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import asdict, dataclass, field, replace
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,7 @@ from q2r2_control.errors import ConfigError, RecordingError
 from q2r2_control.export.sampling import CameraFrames, Names, Vectors, features, sample, units_of
 from q2r2_control.inputs.policy import ActionSpace
 from q2r2_control.process.helper_process import reason_of
-from q2r2_control.process.pools import pool_of
+from q2r2_control.process.places import HERE, JobPlace
 from q2r2_control.recording.about import anonymous
 from q2r2_control.recording.messages import NANOSECONDS
 from q2r2_control.recording.reader import BROKEN, WHOLE, EpisodeSpan, read_spans
@@ -186,15 +187,15 @@ def keep_episodes(
     write: Write,
     folder: Path,
     *,
-    workers: int = 1,
+    place: JobPlace = HERE,
     verdicts: Verdicts | None = None,
     progress: Callable[[int], None] = lambda done: None,
 ) -> Exported:
     """Call ``write`` for each episode of recordings, into ``folder``; episodes that exist are not made again.
 
     Episodes that ``verdicts`` discards are left out, and so are recordings that cannot be read. The result is the same
-    for any number of ``workers``. ``progress`` is called with the number of finished episodes. Raises
-    :class:`ConfigError` if nothing can be written or if a worker was killed.
+    at any ``place``. ``progress`` is called with the number of finished episodes. Raises :class:`ConfigError` if
+    nothing can be written, or if a worker of this computer was killed.
     """
     jobs = [
         _Job(file, sampling, span, write, folder / _name(file, sampling, span, write, verdicts), verdicts)
@@ -202,7 +203,7 @@ def keep_episodes(
         for span in spans_to_export(file)
     ]
     exported = Exported([], [], [])
-    with closing(_results(jobs, min(workers, len(jobs)))) as results:
+    with closing(place.results(_keep, jobs, attrgetter("file"), folder)) as results:
         for done, (job, (verdict, fault)) in enumerate(zip(jobs, results, strict=True), start=1):
             if fault is not None:
                 exported.unreadable.append(f"{job.name}: discard: unreadable, {fault}")
@@ -212,22 +213,6 @@ def keep_episodes(
                 exported.kept.append(job.target)
             progress(done)
     return exported
-
-
-def _results(jobs: Sequence[_Job], workers: int) -> Generator[tuple[str | None, str | None]]:
-    """Yield the results of :func:`_keep` for all jobs, in their order."""
-    if workers <= 1:
-        yield from map(_keep, jobs)
-        return
-    pool = pool_of(workers)
-    try:
-        yield from pool.map(_keep, jobs)
-    except (BrokenProcessPool, OSError) as error:  # A pool raises OSError if it breaks while it gets its jobs.
-        raise ConfigError(
-            "a process of --workers was killed, as for want of memory; the same command goes on with what is made"
-        ) from error
-    finally:
-        pool.shutdown(cancel_futures=True)
 
 
 def _keep(job: _Job) -> tuple[str | None, str | None]:
@@ -245,14 +230,16 @@ def _keep(job: _Job) -> tuple[str | None, str | None]:
         episode = make_episode(job.file, job.sampling, job.span)
     except (RecordingError, *BROKEN) as error:
         return None, _reason(error, job)
-    unfinished = target.with_name(f"{target.name}.unfinished")
+    # A worker that lost its scheduler may still write the episode that another machine was then given.
+    unfinished = target.with_name(f"{target.name}.unfinished-{platform.node()}-{os.getpid()}")
     try:
         job.write(episode, unfinished)
         for path in (unfinished, *unfinished.rglob("*")):
             if path.is_file():
                 with path.open("rb") as stream:
                     os.fsync(stream.fileno())  # Thus a power failure leaves no incomplete episode.
-        unfinished.replace(target)
+        if not target.exists():
+            unfinished.replace(target)
     except RecordingError as error:  # Pictures are read from the recording only while they are written to the dataset.
         return None, _reason(error, job)
     except OSError as error:

@@ -145,19 +145,25 @@ def part_of(episode: Episode, span: EpisodeSpan) -> Episode:
 
 
 @dataclass(frozen=True)
-class Judged:
-    """An episode with its numbers, the verdict, and the thresholds by which it was judged."""
+class Judgement:
+    """The verdict on an episode, and the numbers that it follows from. Machines send it to each other."""
 
-    episode: Episode
     figures: EpisodeFigures
     verdict: Verdict
-    settings: JudgeSettings
 
     def as_json(self) -> dict[str, Any]:
         """Return plain data; numbers that are not finite become None."""
         reasons = [asdict(reason) for reason in self.verdict.reasons]
         data = {"verdict": self.verdict.word, "reasons": reasons, "figures": asdict(self.figures)}
         return dict(json.loads(json.dumps(data), parse_constant=lambda name: None))
+
+
+@dataclass(frozen=True)
+class Judged(Judgement):
+    """A judgement with the episode itself, of which plots are made, and the thresholds by which it was judged."""
+
+    episode: Episode
+    settings: JudgeSettings
 
 
 @dataclass(frozen=True)
@@ -188,7 +194,7 @@ def judge_episode(episode: Episode, settings: JudgeSettings | None = None) -> Ju
     """Judge one episode; see :func:`judge`."""
     settings = settings or episode.config.judge
     figures = figures_of(episode, settings.dropout)
-    return Judged(episode, figures, verdict_of(figures, settings), settings)
+    return Judged(figures, verdict_of(figures, settings), episode, settings)
 
 
 def judge_all(files: Sequence[Path], settings: JudgeSettings | None = None) -> Iterator[Judged | Unreadable]:
@@ -208,11 +214,26 @@ def judge_all(files: Sequence[Path], settings: JudgeSettings | None = None) -> I
             yield Unreadable(file, reason_of(error).removeprefix(f"{file}: ")[:_LONGEST_REASON])
 
 
-@lru_cache(maxsize=1)  # The episodes of one file are requested one after the other.
+def judgements_of(settings: JudgeSettings | None, file: Path) -> list[Judgement | Unreadable]:
+    """Judge one recording as :func:`judge_all` does, without its episodes. Other processes and machines call it."""
+    found = judge_all([file], settings)
+    return [Judgement(one.figures, one.verdict) if isinstance(one, Judged) else one for one in found]
+
+
 def discarded_episodes(file: Path, pictures: bool) -> dict[int, str]:
     """Return why episodes of a recording are discarded, by their number; 0 is the whole recording.
 
     The pictures are judged if ``pictures`` is True. Raises :class:`RecordingError`.
+    """
+    changed = open_recording(file).file.stat().st_mtime_ns
+    return _discarded(file, pictures, file.absolute(), changed)
+
+
+@lru_cache(maxsize=1)  # The episodes of one file are requested one after the other.
+def _discarded(file: Path, pictures: bool, absolute: Path, changed: int) -> dict[int, str]:
+    """Return the result of :func:`discarded_episodes`.
+
+    A worker of a cluster lives on, so ``absolute`` and the time ``changed`` tell apart files with the same name.
     """
     judged = judge(open_recording(file), pictures=pictures)
     return {one.figures.part or 0: one.verdict.line for one in judged if not one.verdict.keep}

@@ -224,7 +224,8 @@ class PolicySoak:
         targets = {} if self._last is None else self._last.targets
         poses = {arm: target.pose.homogeneous for arm, target in targets.items() if target.pose is not None}
         dt = f"{self._period:g}"
-        found = Violation(margin.name, self._ticks, str(self._segment), self._since, q, v, poses, dt, error)
+        segment = str(self._segment)
+        found = Violation(margin.name, self._seed, self._ticks, segment, self._since, q, v, poses, dt, error)
         self._broken.setdefault(key, found)
 
     def _send(self, tick: Tick) -> None:

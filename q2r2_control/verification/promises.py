@@ -71,10 +71,20 @@ class Margin:
         self.checked += 1
         sign = 1.0 if self.sense == "<=" else -1.0
         kept = sign * value <= sign * self.allowed
-        if not (sign * value <= sign * self.worst or math.isnan(self.worst)):
-            self.worst, self.tick = value, tick
+        self._keep_worst(value, tick)
         self.violations += not kept
         return kept
+
+    def add(self, other: Margin) -> None:
+        """Add what another run has checked of the same promise. ``tick`` is that of the run with the worst value."""
+        self.checked += other.checked
+        self.violations += other.violations
+        self._keep_worst(other.worst, other.tick)
+
+    def _keep_worst(self, value: float, tick: int | None) -> None:
+        sign = 1.0 if self.sense == "<=" else -1.0
+        if not (sign * value <= sign * self.worst or math.isnan(self.worst)):
+            self.worst, self.tick = value, tick
 
     def described(self, value: float) -> str:
         """Return a text with one value of this promise and the allowed bound."""

@@ -57,6 +57,7 @@ class Violation:
     """The first break of a promise, with the request at that tick."""
 
     promise: str
+    seed: int
     tick: int
     segment: str
     since_segment: int  # Ticks since the segment began.
@@ -80,6 +81,7 @@ class SoakReport:
     margins: list[Margin]
     memory_growth_mb: float | None  # See steady_growth; None if not measured.
     broken: list[Violation]  # The first violation of each promise, in the order of their ticks.
+    seeds: int = 1  # The number of soaks, with the seeds from ``seed`` on. Ticks, times and counts are of all together.
 
     @property
     def passed(self) -> bool:
@@ -217,7 +219,7 @@ class Soak:
         }
         for key in broken:
             name = self._contract.margins[key].name
-            found = Violation(name, tick, str(segment), since, self._q, self._v, poses, repr(dt), error)
+            found = Violation(name, self._seed, tick, str(segment), since, self._q, self._v, poses, repr(dt), error)
             self._broken.setdefault(key, found)
 
 

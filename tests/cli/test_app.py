@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import nullcontext
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -146,8 +147,8 @@ def test_a_run_uses_the_solver_of_its_option(command: tuple[str, ...], monkeypat
 def test_trials_of_a_demo_use_the_solver_of_its_option(monkeypatch: pytest.MonkeyPatch) -> None:
     chosen: list[str] = []
 
-    def try_tasks(config: Config, *given: Any) -> list[Any]:
-        chosen.append(config.control.solver)
+    def try_tasks(tasks: Any, trial: partial[str], *given: Any) -> list[Any]:
+        chosen.append(trial.args[0].control.solver)
         return []
 
     monkeypatch.setattr("q2r2_control.cli.run.try_tasks", try_tasks)

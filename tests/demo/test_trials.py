@@ -15,6 +15,7 @@ import pytest
 
 from q2r2_control.demo.assembly_tasks import tasks_named
 from q2r2_control.demo.trials import TrialReport, try_task, try_tasks
+from q2r2_control.process.places import Processes
 from q2r2_control.types import CommandMode
 from tests.demo.test_assembly_tasks import coarse
 from tests.support.processes import alive, children, wait_until
@@ -23,7 +24,8 @@ from tests.support.processes import alive, children, wait_until
 @pytest.mark.slow
 def test_every_seed_is_tried_and_failed_seeds_have_reasons() -> None:
     config = coarse()
-    (report,) = try_tasks(config, tasks_named(["grasp"]), CommandMode.POSITION, 2)
+    trial = partial(try_task, config, CommandMode.POSITION, False)
+    (report,) = try_tasks(tasks_named(["grasp"]), trial, 2, Processes(2))
     assert report == TrialReport("grasp", 2, {})
     block = config.mujoco.objects["flat_block"]
     elsewhere = block.model_copy(update={"position": (0.45, -0.40, block.position[2])})

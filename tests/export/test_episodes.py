@@ -14,8 +14,9 @@ import pytest
 
 from q2r2_control.config.recording import CameraConfig
 from q2r2_control.errors import ConfigError
-from q2r2_control.export.episodes import FrameSampling, Output, keep_episodes, make_episode
+from q2r2_control.export.episodes import EpisodeVectors, FrameSampling, Output, keep_episodes, make_episode
 from q2r2_control.export.lerobot import source_of
+from q2r2_control.process.places import Processes, chosen_place
 from tests.export.files import CAMERA, HEIGHT, WIDTH, Run, contents, load_vectors, record_step, write_vectors
 from tests.recording.runs import RATE, file_of, pipeline, record
 from tests.support.pictures import needs_opengl
@@ -120,27 +121,34 @@ def test_an_interrupted_export_goes_on_with_its_finished_episodes(run: Run, tmp_
     assert load_vectors(other.kept[0]).fps == 10
 
 
+def write_at_open_gate(episode: EpisodeVectors, path: Path) -> None:
+    """Wait for a reader of the pipe that may be beside the folder, and keep the episode."""
+    if (gate := path.parent.with_name("gate")).exists():
+        gate.write_bytes(b"")
+    write_vectors(episode, path)
+
+
 def test_a_killed_worker_gives_one_line_and_the_next_export_goes_on(run: Run, tmp_path: Path) -> None:
     files = [run.file, *(Path(shutil.copy(run.file, tmp_path / f"copy-{number}.mcap")) for number in range(2))]
     kept = tmp_path / "kept"
     kept.mkdir()
-    *others, last = keep_episodes(files, FrameSampling(), write_vectors, kept).kept
+    *others, last = keep_episodes(files, FrameSampling(), write_at_open_gate, kept).kept
     by_one_process = contents(kept)
     last.unlink()
     made_at = [other.stat().st_mtime_ns for other in others]
-    unfinished = last.with_name(f"{last.name}.unfinished")
-    os.mkfifo(unfinished)  # No process reads it, so that a worker stays in the middle of its episode.
+    gate = tmp_path / "gate"
+    os.mkfifo(gate)  # No process reads it, so that a worker stays in the middle of its episode.
 
     def kill(done: int) -> None:
         if done == len(others):
             for process in active_children():
                 process.kill()
 
-    with pytest.raises(ConfigError, match="a process of --workers was killed") as fault:
-        keep_episodes(files, FrameSampling(), write_vectors, kept, workers=2, progress=kill)
+    with pytest.raises(ConfigError, match="a process that did the work was killed") as fault:
+        keep_episodes(files, FrameSampling(), write_at_open_gate, kept, place=Processes(2), progress=kill)
     assert "\n" not in str(fault.value)
-    unfinished.unlink()
-    assert keep_episodes(files, FrameSampling(), write_vectors, kept, workers=2).kept == [*others, last]
+    gate.unlink()
+    assert keep_episodes(files, FrameSampling(), write_at_open_gate, kept, place=Processes(2)).kept == [*others, last]
     assert [other.stat().st_mtime_ns for other in others] == made_at
     assert contents(kept) == by_one_process
 
@@ -165,7 +173,9 @@ def test_a_bad_recording_and_a_discarded_one_are_named_and_the_others_are_kept(
     damaged.write_bytes(data)
     (tmp_path / "empty.mcap").touch()
     files = [damaged, copy, tmp_path / "empty.mcap", run.file]
-    made = keep_episodes(files, FrameSampling(), write_vectors, tmp_path, workers=workers, verdicts=by_name)
+    made = keep_episodes(
+        files, FrameSampling(), write_vectors, tmp_path, place=chosen_place(workers, None), verdicts=by_name
+    )
     assert [kept.stem for kept in made.kept] == [run.file.stem]
     assert made.left_out == [f"{copy}: discard: by its name"]
     assert [line.partition(": ")[0] for line in made.unreadable] == [str(damaged), str(tmp_path / "empty.mcap")]

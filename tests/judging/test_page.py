@@ -22,7 +22,7 @@ from tests.judging.test_figures import wander
 def judged(of: Episode) -> Judged:
     settings = JudgeSettings()
     figures = figures_of(of, settings.dropout)
-    return Judged(of, figures, verdict_of(figures, settings), settings)
+    return Judged(figures, verdict_of(figures, settings), of, settings)
 
 
 def moving() -> Judged:
