@@ -86,9 +86,8 @@ class OperatorSide:
         """Return and log the events of the arms since the last call, with times since ``start`` [s]."""
         events = [replace(event, t=event.t - start) for event in self._teleop.take_events()]
         for event in events:
-            if event.kind is ReasonKind.HANDS_CROSSED or (
-                is_fault(event) and event.kind is not ReasonKind.RECORDING_ENDED
-            ):  # The recorder has logged this fault.
+            stopped = is_fault(event) and event.kind is not ReasonKind.RECORDING_ENDED  # The recorder has logged that.
+            if stopped or event.kind is ReasonKind.HANDS_CROSSED:
                 _logger.warning("%s arm: %s", event.arm, sentence(event.reason))
             elif _logger.isEnabledFor(logging.DEBUG):
                 _logger.debug("%s arm: %s -> %s", event.arm, event.source, event_line(event))
