@@ -89,6 +89,6 @@ class HeldTargets:
 def _is_ordinary(pose: pin.SE3) -> bool:
     """Return whether what lies between this pose and another such pose is a pose, too."""
     rotation = pose.rotation
-    error = np.abs(rotation @ rotation.T - np.eye(3)).max()
-    near = np.abs(pose.translation).max() < _FARTHEST
-    return bool(near and error < _ORTHONORMAL and np.linalg.det(rotation) > 0.0)
+    if not (np.abs(rotation).max() < 2.0 and np.abs(pose.translation).max() < _FARTHEST):  # Neither NaN nor infinite.
+        return False
+    return bool(np.abs(rotation @ rotation.T - np.eye(3)).max() < _ORTHONORMAL and np.linalg.det(rotation) > 0.0)

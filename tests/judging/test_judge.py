@@ -288,9 +288,11 @@ def test_a_number_beyond_its_threshold_is_the_only_reason(
     assert verdict_of(changed(of, **{figure: beyond}), JudgeSettings.model_validate({name: None})).keep
 
 
-def test_this_file_tests_every_threshold() -> None:
+def test_this_file_tests_every_threshold_of_episodes() -> None:
     tried = {case[0] for case in CASES}
-    assert set(JudgeSettings.model_fields) - tried == {"dropout", "keep_failed", "needs_end", "needs_task"}
+    of_subtasks = {"min_subtask_time", "max_subtask_time", "needs_subtasks"}  # See tests/recording/test_subtasks.py.
+    others = {"dropout", "keep_failed", "needs_end", "needs_task"}
+    assert set(JudgeSettings.model_fields) - tried == others | of_subtasks
 
 
 def test_a_failure_is_discarded_unless_failures_are_kept_but_a_run_that_ended_by_a_fault_always_is() -> None:
