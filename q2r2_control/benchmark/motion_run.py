@@ -112,7 +112,7 @@ class MotionFigures:
 
 @dataclass(frozen=True, slots=True)
 class MotionRun:
-    """The ticks of a run. Those of the approach come first."""
+    """The recorded ticks of a run. The ticks of the approach come first."""
 
     times: Array  # (n,) [s]
     q: Array  # (n, nv) [rad]

@@ -194,7 +194,7 @@ app.command(epilog="Example: q2r2 ros doctor config/dual_iiwa7.yaml")(doctor)
 
 
 class RobotSource(StrEnum):
-    """The source of the robot that the nodes drive."""
+    """Which robot starts: MuJoCo's, none because the user's own one runs already, or the one that the cell needs."""
 
     AUTO = "auto"
     MUJOCO = "mujoco"

@@ -20,9 +20,9 @@ _SLOWEST, _FASTEST = 1.0, 500.0  # [Hz]
 class SampledTargets:
     """Tool targets at every step, on straight lines from each sample to the next.
 
-    A target that is held until its next sample stands still in most steps and jumps in one of them. The controller
-    follows such a target with a joint at its limit of acceleration in most steps, at 90 samples a second. Here
-    each sample is reached :attr:`delay` after it was set, and the steps in between get what is in between::
+    The controller itself bridges targets that are held for some steps, by the time for which the last one was held.
+    This class knows the rate of the samples instead, so it is smoother where they come unevenly, or less than nine
+    times a second. Each sample is reached :attr:`delay` after it was set, and steps in between get poses in between::
 
         targets = SampledTargets(controller, rate_hz=90)
         while True:

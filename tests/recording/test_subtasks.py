@@ -1,4 +1,4 @@
-"""Presses that begin subtasks: they are recorded, and found again by judge and export."""
+"""A recording keeps the presses that begin subtasks, and judge and export find the subtasks in it."""
 
 from __future__ import annotations
 

@@ -88,7 +88,7 @@ class Operator:
             self.wait_until_read()
 
     def lose(self, end: Callable[[FakeHeadset], None]) -> None:
-        """End the connection. After that, the server has noticed it."""
+        """End the connection, and wait until the server has noticed it."""
         assert self.headset is not None
         end(self.headset)
         self.headset = None

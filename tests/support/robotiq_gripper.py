@@ -13,7 +13,7 @@ from pymodbus.server import ModbusTcpServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 
 UNIT = 9
-_STEP = 25  # Step of its position.
+_STEP = 25  # Change of the gripper's position between two of its steps [of 255].
 
 
 class SimulatedGripper:

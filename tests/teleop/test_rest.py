@@ -23,7 +23,7 @@ AXIS = np.array([0.6, 0.0, 0.8])  # Axis about which the hand turns.
 
 
 class Filtered:
-    """A filter with and without the mean at rest, which gets a hand that moves along x and turns."""
+    """A hand filter with or without its mean at rest. The samples are of a hand that moves along x and turns."""
 
     def __init__(self, noise: float = NOISE) -> None:
         self._random, self._noise = np.random.default_rng(4), noise / NOISE
