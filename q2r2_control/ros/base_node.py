@@ -286,6 +286,7 @@ def run_node(*makes: Callable[[], BaseNode]) -> int:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.ask())
     nodes: list[BaseNode] = []
+    executor: SingleThreadedExecutor | None = None
     try:
         for make in makes:
             nodes.append(make())
@@ -314,6 +315,8 @@ def run_node(*makes: Callable[[], BaseNode]) -> int:
         global _deadline
         _deadline = max(asked + LONGEST_END, time.monotonic() + _LEAST_END)
         end_in_time()
+        if executor is not None:
+            executor.shutdown()  # Otherwise Python destroys its parts in any order, and rclpy prints a traceback.
         for node in reversed(nodes):
             node.destroy_node()
         rclpy.try_shutdown()

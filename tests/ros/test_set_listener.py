@@ -57,6 +57,26 @@ def test_rates_are_those_of_the_senders_and_only_states_are_listened_to(node: An
     node.destroy_publisher(sender)
 
 
+def test_a_watch_leaves_no_executor_for_the_end_of_python(node: Any, processes: Processes) -> None:
+    # Python destroys in any order what is left then. rclpy prints a traceback if an executor comes after its parts.
+    code = f"""
+import gc
+from rclpy.executors import Executor
+from q2r2_control import load_config
+from q2r2_control.ros.watching.set_listener import watch_set
+gc.disable()
+seen = []
+watch_set(load_config({CONFIG!r}), None, lambda view: seen.extend(view.nodes), lambda: bool(seen))
+print("left:", sum(isinstance(one, Executor) for one in gc.get_objects()))
+"""
+    state = node.create_publisher(String, "/test/state", 10)
+    message = String(data=json.dumps({"level": "ok", "message": "here"}))
+    timer = node.create_timer(0.01, lambda: state.publish(message))  # The last spin then ends with a message.
+    watch = processes.start(sys.executable, "-c", code, name="watch")
+    assert watch.wait_for("left:") == "left: 0"
+    node.destroy_timer(timer)
+
+
 def test_the_command_watches_nodes_and_subscribes_to_no_command_and_no_hand(node: Any, processes: Processes) -> None:
     processes.start_node("left_arm_controller")
     processes.start_node("SimulationInput")

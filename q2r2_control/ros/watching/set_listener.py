@@ -124,17 +124,21 @@ def watch_set(
     try:
         node = Node(f"q2r2_watch_{os.getpid()}", enable_rosout=False, start_parameter_services=False)
         listener, executor = SetListener(node, cell, drivers), SingleThreadedExecutor()
-        executor.add_node(node)
-        begin = looked = time.monotonic()
-        listener.look()
-        while not stop() and (duration is None or time.monotonic() - begin < duration):
-            executor.spin_once(timeout_sec=0.1)
-            if time.monotonic() - looked >= _LOOK_PERIOD:
-                looked = time.monotonic()
-                listener.look()
-                show(listener.view())
-        listener.look()
-        return listener.view()
+        try:
+            executor.add_node(node)
+            begin = looked = time.monotonic()
+            listener.look()
+            while not stop() and (duration is None or time.monotonic() - begin < duration):
+                executor.spin_once(timeout_sec=0.1)
+                if time.monotonic() - looked >= _LOOK_PERIOD:
+                    looked = time.monotonic()
+                    listener.look()
+                    show(listener.view())
+            listener.look()
+            return listener.view()
+        finally:
+            executor.shutdown()  # Otherwise Python destroys its parts in any order, and rclpy prints a traceback.
+            node.destroy_node()
     finally:
         rclpy.try_shutdown()
 
