@@ -210,7 +210,7 @@ WATCHES = (
     Mutation(
         "a reset waits until the arms rest",
         SUPERVISION + "supervisor.py",
-        "if self.phase is Phase.BRAKING:\n            return Reason(ReasonKind.ARMS_BRAKING)",
+        "if self.phase is Phase.BRAKING:\n            return Reason(SupervisionReason.ARMS_BRAKING)",
         "",
     ),
     Mutation(

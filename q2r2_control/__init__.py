@@ -35,6 +35,7 @@ if TYPE_CHECKING:  # The word "as" tells type checkers that a name is public.
     from q2r2_control.errors import Q2R2Error as Q2R2Error
     from q2r2_control.errors import RecordingError as RecordingError
     from q2r2_control.errors import RobotError as RobotError
+    from q2r2_control.events import CommonReason as CommonReason
     from q2r2_control.events import Event as Event
     from q2r2_control.events import Reason as Reason
     from q2r2_control.events import ReasonKind as ReasonKind
@@ -51,6 +52,8 @@ if TYPE_CHECKING:  # The word "as" tells type checkers that a name is public.
     from q2r2_control.robot.robot import Robot as Robot
     from q2r2_control.summary.run_summary import RunSummary as RunSummary
     from q2r2_control.summary.tick import Tick as Tick
+    from q2r2_control.supervision.reasons import SupervisionReason as SupervisionReason
+    from q2r2_control.teleop.reasons import TeleopReason as TeleopReason
     from q2r2_control.teleop.relative import RelativeMotion as RelativeMotion
     from q2r2_control.types import QUEST_CONTROLS as QUEST_CONTROLS
     from q2r2_control.types import Array as Array
@@ -71,6 +74,7 @@ _MODULES = {
     "CartesianController": "control.controller",
     "Command": "types",
     "CommandMode": "types",
+    "CommonReason": "events",
     "Config": "config.cell",
     "ConfigError": "errors",
     "Constraint": "control.constraints",
@@ -111,7 +115,9 @@ _MODULES = {
     "SampledTargets": "loop.sampled_targets",
     "Solver": "control.qp",
     "StepReport": "types",
+    "SupervisionReason": "supervision.reasons",
     "Task": "control.tasks.external",
+    "TeleopReason": "teleop.reasons",
     "Tick": "summary.tick",
     "Upright": "control.tasks.named_tasks",
     "action_names": "inputs.policy",

@@ -1,4 +1,6 @@
-"""Find inputs, plants, presets and formats of exports by name. They are entry points of any installed package.
+"""Find inputs, plants, presets, formats of exports and kinds of reasons by name.
+
+They are entry points of any installed package:
 
 [project.entry-points."q2r2_control.inputs"]
 gamepad = "my_package.gamepad:Gamepad"
@@ -15,6 +17,7 @@ INPUTS = "q2r2_control.inputs"
 PLANTS = "q2r2_control.plants"
 PRESETS = "q2r2_control.presets"
 EXPORTS = "q2r2_control.exports"
+REASONS = "q2r2_control.reasons"
 
 
 def names_of(group: str) -> tuple[str, ...]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from typing import Any
 
+from q2r2_control.cameras.reasons import CameraReason
 from q2r2_control.config.recording import CameraConfig
 from q2r2_control.events import Reason, ReasonKind
 
@@ -56,7 +57,7 @@ class CameraWatch:
     @property
     def stopped(self) -> bool:
         """True if it was told that the camera has stopped, and no picture has come since."""
-        return ReasonKind.CAMERA_STOPPED in self._told
+        return CameraReason.CAMERA_STOPPED in self._told
 
     @property
     def missing(self) -> int:
@@ -69,12 +70,12 @@ class CameraWatch:
         silence, self._received = received - self._received, received
         found = []
         if self.stopped:
-            self._told.discard(ReasonKind.CAMERA_STOPPED)
+            self._told.discard(CameraReason.CAMERA_STOPPED)
             self._times.clear()
-            found.append(self._reason(ReasonKind.CAMERA_BACK, gap=silence, missing=missing))
+            found.append(self._reason(CameraReason.CAMERA_BACK, gap=silence, missing=missing))
         wanted = self._camera.width, self._camera.height
         detail = {"width": width, "height": height, "allowed_width": wanted[0], "allowed_height": wanted[1]}
-        found += self._tell(ReasonKind.CAMERA_OTHER_SIZE, (width, height) != wanted, **detail)
+        found += self._tell(CameraReason.CAMERA_OTHER_SIZE, (width, height) != wanted, **detail)
         return found + self._rate_at(time)
 
     def look(self, now: float, why: str | None = None) -> list[Reason]:
@@ -85,7 +86,7 @@ class CameraWatch:
         age = now - self._received
         if self.stopped or age < _STOPPED_AFTER or age * self._camera.rate < _STOPPED_PERIODS:
             return []
-        return self._tell(ReasonKind.CAMERA_STOPPED, True, age=age, why=f": {why}" if why else "")
+        return self._tell(CameraReason.CAMERA_STOPPED, True, age=age, why=f": {why}" if why else "")
 
     def finish(self, end: float) -> None:
         """Count the pictures that are missing up to the last tick of the run, at ``end`` [s]."""
@@ -101,7 +102,7 @@ class CameraWatch:
         share = rate / self._camera.rate
         if _SLOW <= share < _FAST_ENOUGH:  # Neither begins nor ends to be slow.
             return []
-        return self._tell(ReasonKind.CAMERA_SLOW, share < _SLOW, rate=rate, due=self._camera.rate)
+        return self._tell(CameraReason.CAMERA_SLOW, share < _SLOW, rate=rate, due=self._camera.rate)
 
     def _tell(self, kind: ReasonKind, is_so: bool, **detail: Any) -> list[Reason]:
         """Return the reason if it ``is_so`` for the first time since it last was not."""

@@ -8,9 +8,10 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from q2r2_control.events import Event, ReasonKind
+from q2r2_control.events import Event
 from q2r2_control.summary.run_summary import ArmSummary, Percentiles, RunSummary, TorqueSummary
 from q2r2_control.teleop.arm_states import ArmState, is_fault
+from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.viewer.tables import figure_table
 from q2r2_control.wording import sentence
 
@@ -74,7 +75,7 @@ def _result(summary: RunSummary) -> Iterator[tuple[str, str]]:
     if summary.missed_ticks:
         yield "ticks missed", f"{summary.missed_ticks}, which made the motion {summary.stretched_s:.2f} s late in all"
     for name, event in _last_faults(summary).items():
-        label = f"{name} arm" if event.kind is ReasonKind.NOT_ENGAGED else f"{name} arm paused by"
+        label = f"{name} arm" if event.kind is TeleopReason.NOT_ENGAGED else f"{name} arm paused by"
         yield label, f"[yellow]{escape(sentence(event.reason))}[/], at {event.t:.2f} s"
     yield "arms at the end", "at rest" if summary.at_rest else "[red]moving[/]"
 

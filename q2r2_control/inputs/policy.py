@@ -22,7 +22,7 @@ import pinocchio as pin
 
 from q2r2_control.config.cell import Config
 from q2r2_control.errors import ConfigError, check_kind, shown
-from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.events import CommonReason, Reason
 from q2r2_control.inputs.base import Input, make_input
 from q2r2_control.inputs.policy_checks import PolicyErrors, UnusableError, check_finite, check_names, numbers_of
 from q2r2_control.robot.robot import Robot
@@ -221,7 +221,7 @@ class PolicyInput:
         self._due = observation.time + max(count // 2, 1) * self.period - 1e-9
 
     def _fault(self, text: str) -> ActionChunk:
-        reason = Reason.of(ReasonKind.POLICY_UNUSABLE, text=" ".join(text.split())[:200])
+        reason = Reason.of(CommonReason.POLICY_UNUSABLE, text=" ".join(text.split())[:200])
         return ActionChunk(np.zeros(0), self.period, fault=reason)
 
     def _checked(self, actions: npt.ArrayLike, times: npt.ArrayLike | None, names: Sequence[str]) -> ActionChunk:

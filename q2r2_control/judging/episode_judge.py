@@ -13,13 +13,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from q2r2_control.errors import Q2R2Error, RecordingError
-from q2r2_control.events import Event, Reason, ReasonKind
+from q2r2_control.events import Event, Reason
 from q2r2_control.judging.episode import Episode, read_episode
 from q2r2_control.judging.judge import judge_episode, part_of, parts_of
 from q2r2_control.process.helper_process import HelperProcess, reason_of
 from q2r2_control.recording.reader import EpisodeSpan, spans_of
 from q2r2_control.recording.ros_recording import open_recording
 from q2r2_control.summary.tick import Tick
+from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.wording import sentence
 
 LONGEST_LINE = 300  # The longest text of a verdict [characters].
@@ -29,8 +30,8 @@ _PATIENCE = 30.0  # Time to wait for a recorder that is behind [s].
 _BEFORE = 1_000_000_000  # Reading begins this long before the episode [ns].
 _TICKS_BETWEEN_LOOKS = 64  # The number of ticks between two checks for a verdict.
 _OF_EPISODES = {
-    *(ReasonKind.EPISODE_BEGINS, ReasonKind.EPISODE_ENDS, ReasonKind.EPISODE_DISCARDED),
-    *(ReasonKind.EPISODE_SUCCEEDED, ReasonKind.EPISODE_FAILED, ReasonKind.SUBTASK_BEGINS),
+    *(TeleopReason.EPISODE_BEGINS, TeleopReason.EPISODE_ENDS, TeleopReason.EPISODE_DISCARDED),
+    *(TeleopReason.EPISODE_SUCCEEDED, TeleopReason.EPISODE_FAILED, TeleopReason.SUBTASK_BEGINS),
 }
 
 _logger = logging.getLogger(__name__)
@@ -56,7 +57,7 @@ def main(requests: Iterator[Question], answer: Callable[[Reason], None]) -> None
         except (Q2R2Error, OSError) as error:
             keep, line = None, f"not judged: {reason_of(error)}"
         number = question.span.number
-        answer(Reason.of(ReasonKind.VERDICT, episode=number, keep=keep, line=line[:LONGEST_LINE]))
+        answer(Reason.of(TeleopReason.VERDICT, episode=number, keep=keep, line=line[:LONGEST_LINE]))
 
 
 def _verdict(question: Question, run: int) -> tuple[bool | None, str]:

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 
 from q2r2_control.config.recording import subtask_names
-from q2r2_control.events import ReasonKind
 from q2r2_control.judging.camera_figures import CameraFigures, camera_figures
 from q2r2_control.judging.episode import Episode
 from q2r2_control.judging.measured import MeasuredFigures, measured_figures
@@ -17,6 +16,7 @@ from q2r2_control.recording.about import LOOP
 from q2r2_control.recording.clock_steps import clock_steps
 from q2r2_control.recording.messages import hand_pose, loop_topics, target
 from q2r2_control.teleop.arm_states import is_fault, is_refusal
+from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.types import Array, Flags
 from q2r2_control.wording import sentence
 
@@ -191,7 +191,7 @@ def figures_of(episode: Episode, dropout: float) -> EpisodeFigures:
         faults=[
             Fault(event.t, event.arm, str(event.reason.root.kind), sentence(event.reason))
             for event in episode.events
-            if is_fault(event) and not is_refusal(event) and event.kind is not ReasonKind.LINKED
+            if is_fault(event) and not is_refusal(event) and event.kind is not TeleopReason.LINKED
         ],
         fallback_ticks=int(ticks.fallback.sum()),
         fallback_share=float(ticks.fallback.mean()) if count else None,

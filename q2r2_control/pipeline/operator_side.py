@@ -17,7 +17,7 @@ from q2r2_control.config.control import LIVE_IMPEDANCE
 from q2r2_control.config.moving_obstacle import MovingObstacle
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.control.controller import CartesianController
-from q2r2_control.events import Event, Reason, ReasonKind
+from q2r2_control.events import CommonReason, Event, Reason, ReasonKind
 from q2r2_control.inputs.base import Input, PolicySource, check_samples
 from q2r2_control.loop.control_loop import ArmConditions
 from q2r2_control.pipeline.requests import change_of, changed
@@ -26,6 +26,7 @@ from q2r2_control.supervision.gripper_limiter import Grip
 from q2r2_control.supervision.supervisor import Phase, Supervisor
 from q2r2_control.teleop.arm_states import is_fault
 from q2r2_control.teleop.haptics import HapticPulses
+from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.teleop.teleop import Teleop
 from q2r2_control.types import ActionChunk, ArmTarget, HandSample, Observation
 from q2r2_control.wording import event_line, sentence
@@ -86,8 +87,10 @@ class OperatorSide:
         """Return and log the events of the arms since the last call, with times since ``start`` [s]."""
         events = [replace(event, t=event.t - start) for event in self._teleop.take_events()]
         for event in events:
-            stopped = is_fault(event) and event.kind is not ReasonKind.RECORDING_ENDED  # The recorder has logged that.
-            if stopped or event.kind is ReasonKind.HANDS_CROSSED:
+            stopped = (
+                is_fault(event) and event.kind is not TeleopReason.RECORDING_ENDED
+            )  # The recorder has logged that.
+            if stopped or event.kind is TeleopReason.HANDS_CROSSED:
                 _logger.warning("%s arm: %s", event.arm, sentence(event.reason))
             elif _logger.isEnabledFor(logging.DEBUG):
                 _logger.debug("%s arm: %s -> %s", event.arm, event.source, event_line(event))
@@ -130,41 +133,41 @@ class OperatorSide:
     def _do(self, request: Reason, now: float) -> None:
         """Do what a program asks for. The outcome of a recording is only an event."""
         match request.kind:
-            case ReasonKind.HOME_REQUESTED:
+            case TeleopReason.HOME_REQUESTED:
                 self._teleop.home(now)
-            case ReasonKind.PAUSE_REQUESTED:
+            case TeleopReason.PAUSE_REQUESTED:
                 self._teleop.pause(now, request)
-            case ReasonKind.POLICY_REQUESTED:
+            case TeleopReason.POLICY_REQUESTED:
                 self._teleop.give_back(now)
-            case ReasonKind.ENGAGE_REQUESTED:
+            case TeleopReason.ENGAGE_REQUESTED:
                 self._teleop.press_to_engage()
-            case ReasonKind.RECORDING_REQUESTED:
+            case TeleopReason.RECORDING_REQUESTED:
                 self._teleop.mark(now, Action(request.detail["action"]))
-            case ReasonKind.SETTINGS_REQUESTED:
+            case TeleopReason.SETTINGS_REQUESTED:
                 settings = changed(self._teleop.settings, request.detail["changes"])
                 problem = self._teleop.change(settings, now)
-                self._record_change(ReasonKind.SETTINGS_CHANGED, problem, now)
+                self._record_change(TeleopReason.SETTINGS_CHANGED, problem, now)
                 for pulses in self._pulses.values() if problem is None else ():
                     pulses.strength = settings.haptics.strength
-            case ReasonKind.CONTROL_REQUESTED:
+            case TeleopReason.CONTROL_REQUESTED:
                 values = request.detail["changes"]
                 springs = {name: value for name, value in values.items() if name in LIVE_IMPEDANCE}
                 if springs and self._impedance is not None:
                     self._impedance.change(springs)
                 refused = self._controller.change({k: v for k, v in values.items() if k not in springs})
-                problem = None if refused is None else Reason.of(ReasonKind.CONTROL_REFUSED, text=refused)
-                self._record_change(ReasonKind.CONTROL_CHANGED, problem, now)
+                problem = None if refused is None else Reason.of(TeleopReason.CONTROL_REFUSED, text=refused)
+                self._record_change(TeleopReason.CONTROL_CHANGED, problem, now)
 
-            case ReasonKind.OBSTACLE_REPORTED:
+            case TeleopReason.OBSTACLE_REPORTED:
                 name, given = request.detail["name"], request.detail["obstacle"]
                 pair = self._controller.move_obstacle(name, None if given is None else MovingObstacle(**given))
                 if pair is not None and name not in self._in_the_way:
-                    reason = Reason.of(ReasonKind.OBSTACLE_IN_THE_WAY, name=name, pair=" | ".join(pair))
+                    reason = Reason.of(TeleopReason.OBSTACLE_IN_THE_WAY, name=name, pair=" | ".join(pair))
                     self._teleop.record_event(now, reason)
                 self._in_the_way = self._in_the_way - {name} if pair is None else self._in_the_way | {name}
 
     def _record_change(self, changed: ReasonKind, problem: Reason | None, now: float) -> None:
-        outcome = Reason(changed) if problem is None else Reason(ReasonKind.NOT_CHANGED, cause=problem)
+        outcome = Reason(changed) if problem is None else Reason(TeleopReason.NOT_CHANGED, cause=problem)
         self._teleop.record_event(now, outcome)
 
     def _go_home(self, now: float) -> None:
@@ -173,11 +176,11 @@ class OperatorSide:
         if asked and not self._homing:
             refusal = self._supervisor.go_home()
             if refusal is not None:
-                self._teleop.end_homing(now, Reason(ReasonKind.NOT_HOMING, cause=refusal))
+                self._teleop.end_homing(now, Reason(TeleopReason.NOT_HOMING, cause=refusal))
             self._homing = refusal is None
         elif self._homing and not asked:
             self._homing = False
             homing.end()
         elif self._homing and not homing.active:
             self._homing = False
-            self._teleop.end_homing(now, homing.outcome or Reason(ReasonKind.HOMING_ENDED))
+            self._teleop.end_homing(now, homing.outcome or Reason(CommonReason.HOMING_ENDED))

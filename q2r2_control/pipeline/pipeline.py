@@ -20,7 +20,7 @@ from q2r2_control.control.qp import Solver
 from q2r2_control.control.tasks.external import Task
 from q2r2_control.drives.base import make_drive, permitted
 from q2r2_control.errors import ConfigError, PlantError, check_kind, shown
-from q2r2_control.events import ROUTINE, Reason, ReasonKind
+from q2r2_control.events import Reason
 from q2r2_control.inputs.base import Input, PolicySource, make_input
 from q2r2_control.loop.control_loop import ControlLoop, LoopStep
 from q2r2_control.pipeline.loop_clock import LoopClock, PlantClock, WallPace
@@ -38,6 +38,7 @@ from q2r2_control.summary.run_summary import RunSummary
 from q2r2_control.summary.tick import RunStart, Tick
 from q2r2_control.supervision.homing import preflight_faults
 from q2r2_control.supervision.joint_watch import watch_settings
+from q2r2_control.supervision.reasons import ROUTINE, SupervisionReason
 from q2r2_control.supervision.supervisor import Phase, Supervisor
 from q2r2_control.supervision.target_stream import StreamSettings
 from q2r2_control.teleop.arm import OPEN
@@ -352,7 +353,7 @@ class Pipeline(RequestedRun):
         """Tick without input and targets until all arms stand still. No fault of an input can prevent it."""
         self._following = False
         self._targets = {arm: ArmTarget(None, target.gripper) for arm, target in self._targets.items()}
-        self.supervisor.stop(Reason(ReasonKind.RUN_ENDED))
+        self.supervisor.stop(Reason(SupervisionReason.RUN_ENDED))
         self.supervisor.events.clear()
         try:
             velocity = np.abs(self.tick().reference.v)

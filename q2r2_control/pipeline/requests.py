@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Mapping
 from typing import Any
 
+from q2r2_control.cameras.reasons import CameraReason
 from q2r2_control.compliance.impedance import ImpedanceController, check_springs
 from q2r2_control.config.bindings import Action
 from q2r2_control.config.cell import Config
@@ -14,8 +15,9 @@ from q2r2_control.config.moving_obstacle import MovingObstacle, check_obstacle
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.drives.base import Drive, TorqueDrive
 from q2r2_control.errors import ConfigError, check_kind, shown
-from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.events import Reason
 from q2r2_control.inputs.base import Input
+from q2r2_control.teleop.reasons import TeleopReason
 
 
 class RequestedRun:
@@ -38,19 +40,19 @@ class RequestedRun:
 
         from any thread. Any press ends it, and events report the result.
         """
-        self.requests.append(Reason(ReasonKind.HOME_REQUESTED))
+        self.requests.append(Reason(TeleopReason.HOME_REQUESTED))
 
     def pause(self) -> None:
         """Let both arms hold until a new press; from any thread."""
-        self.requests.append(Reason(ReasonKind.PAUSE_REQUESTED))
+        self.requests.append(Reason(TeleopReason.PAUSE_REQUESTED))
 
     def engage(self) -> None:
         """Press for both hands the controls that engage their arms, with all conditions of a press; from any thread."""
-        self.requests.append(Reason(ReasonKind.ENGAGE_REQUESTED))
+        self.requests.append(Reason(TeleopReason.ENGAGE_REQUESTED))
 
     def give_back(self) -> None:
         """Take the arms from the hands and give them to the policy, which goes on where they are; from any thread."""
-        self.requests.append(Reason(ReasonKind.POLICY_REQUESTED))
+        self.requests.append(Reason(TeleopReason.POLICY_REQUESTED))
 
     def mark(self, action: Action) -> None:
         """Begin, end or mark an episode of the recording, as an operator may; from any thread.
@@ -59,7 +61,7 @@ class RequestedRun:
         """
         if not isinstance(action, str) or action not in list(Action):
             raise ConfigError(f"action = {shown(action)}: allowed: {', '.join(Action)}")
-        self.requests.append(Reason.of(ReasonKind.RECORDING_REQUESTED, action=str(action)))
+        self.requests.append(Reason.of(TeleopReason.RECORDING_REQUESTED, action=str(action)))
 
     def change_teleop(self, settings: TeleopSettings) -> None:
         """Change settings of the operator for the rest of this run, without a jump; from any thread.
@@ -82,7 +84,7 @@ class RequestedRun:
         springs = {} if self.impedance is None else {k: v for k, v in values.items() if k in LIVE_IMPEDANCE}
         check_springs(springs)
         self.config.control.changed({name: value for name, value in values.items() if name not in springs})
-        self.requests.append(Reason.of(ReasonKind.CONTROL_REQUESTED, changes=dict(values)))
+        self.requests.append(Reason.of(TeleopReason.CONTROL_REQUESTED, changes=dict(values)))
 
     def move_obstacle(self, name: str, obstacle: MovingObstacle | None) -> None:
         """Report where a moving obstacle is now, or that it is gone; from any thread.
@@ -92,7 +94,7 @@ class RequestedRun:
         """
         check_obstacle(name, obstacle, self.config.control.moving_obstacles)
         given = None if obstacle is None else obstacle.model_dump(mode="json")
-        self.requests.append(Reason.of(ReasonKind.OBSTACLE_REPORTED, name=name, obstacle=given))
+        self.requests.append(Reason.of(TeleopReason.OBSTACLE_REPORTED, name=name, obstacle=given))
 
     def record_outcome(self, reason: Reason) -> None:
         """Report the outcome of the recording, or of an episode in it, to the operator; from any thread."""
@@ -102,17 +104,27 @@ class RequestedRun:
 
 # Kinds of requests that a replay repeats. The end of a recording is not repeated.
 REPEATED = {
-    *(ReasonKind.HOME_REQUESTED, ReasonKind.PAUSE_REQUESTED, ReasonKind.POLICY_REQUESTED, ReasonKind.ENGAGE_REQUESTED),
-    ReasonKind.OBSTACLE_REPORTED,
-    *(ReasonKind.RECORDING_REQUESTED, ReasonKind.SETTINGS_REQUESTED, ReasonKind.CONTROL_REQUESTED, ReasonKind.VERDICT),
-    *(ReasonKind.CAMERA_STOPPED, ReasonKind.CAMERA_SLOW, ReasonKind.CAMERA_OTHER_SIZE, ReasonKind.CAMERA_BACK),
+    *(
+        TeleopReason.HOME_REQUESTED,
+        TeleopReason.PAUSE_REQUESTED,
+        TeleopReason.POLICY_REQUESTED,
+        TeleopReason.ENGAGE_REQUESTED,
+    ),
+    TeleopReason.OBSTACLE_REPORTED,
+    *(
+        TeleopReason.RECORDING_REQUESTED,
+        TeleopReason.SETTINGS_REQUESTED,
+        TeleopReason.CONTROL_REQUESTED,
+        TeleopReason.VERDICT,
+    ),
+    *(CameraReason.CAMERA_STOPPED, CameraReason.CAMERA_SLOW, CameraReason.CAMERA_OTHER_SIZE, CameraReason.CAMERA_BACK),
 }
 
 
 def change_of(old: TeleopSettings, new: TeleopSettings) -> Reason:
     """Return the request for other settings, with the values that differ from the ``old`` ones."""
     changes = _difference(old.model_dump(mode="json"), new.model_dump(mode="json"))
-    return Reason.of(ReasonKind.SETTINGS_REQUESTED, changes=changes)
+    return Reason.of(TeleopReason.SETTINGS_REQUESTED, changes=changes)
 
 
 def changed(settings: TeleopSettings, changes: Mapping[str, Any]) -> TeleopSettings:

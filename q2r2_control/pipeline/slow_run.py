@@ -21,7 +21,7 @@ from q2r2_control.config.bindings import Action, BindingSettings
 from q2r2_control.config.cell import Config
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.errors import PlantError
-from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.events import CommonReason, Reason
 from q2r2_control.inputs.played import EvenSampling, PlayedInput
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.base import Plant
@@ -143,9 +143,9 @@ class SlowRun:
         self._wait(lambda: self._goal is None and not homing.active)
         outcome = self._pipeline.supervisor.homing.outcome
         kind = None if outcome is None else outcome.kind
-        if kind is ReasonKind.HOMING_NO_WAY:
+        if kind is CommonReason.HOMING_NO_WAY:
             return None
-        if kind is not ReasonKind.HOMING_ARRIVED:
+        if kind is not CommonReason.HOMING_ARRIVED:
             self._fail("the way there was ended" if outcome is None else sentence(outcome))
         return self._end()
 

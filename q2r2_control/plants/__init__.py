@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from q2r2_control.plants.base import SessionPlant as SessionPlant
     from q2r2_control.plants.base import WaitingPlant as WaitingPlant
     from q2r2_control.plants.base import WindowedPlant as WindowedPlant
+    from q2r2_control.plants.fri.reasons import FriReason as FriReason
     from q2r2_control.plants.mujoco import MujocoPlant as MujocoPlant
     from q2r2_control.plants.mujoco_cameras import CellPictures as CellPictures
     from q2r2_control.types import ArmTiming as ArmTiming
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 _MODULES = {
     "ArmTiming": ".types",
     "CellPictures": "mujoco_cameras",
+    "FriReason": "fri.reasons",
     "MujocoPlant": "mujoco",
     "SessionPlant": "base",
     "WaitingPlant": "base",

@@ -13,7 +13,8 @@ from typing import NamedTuple
 from q2r2_control.cameras.camera_process import CameraShot
 from q2r2_control.cameras.camera_streams import CameraStreams
 from q2r2_control.cameras.camera_watch import CameraWatch
-from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.cameras.reasons import CameraReason
+from q2r2_control.events import Reason
 from q2r2_control.recording.about import About
 from q2r2_control.recording.messages import NANOSECONDS, JpegPicture, picture_topic
 from q2r2_control.recording.recorder import Recorder
@@ -120,5 +121,5 @@ class DevicePictures(AbstractContextManager["DevicePictures"]):
 
     def _tell(self, reasons: list[Reason]) -> None:
         for reason in reasons:
-            _logger.log(logging.INFO if reason.kind is ReasonKind.CAMERA_BACK else logging.WARNING, sentence(reason))
+            _logger.log(logging.INFO if reason.kind is CameraReason.CAMERA_BACK else logging.WARNING, sentence(reason))
             self._report(reason)

@@ -18,12 +18,13 @@ from rosbags.serde import SerdeError
 from zstandard import ZstdError
 
 from q2r2_control.errors import RecordingError
-from q2r2_control.events import Event, ReasonKind
+from q2r2_control.events import Event
 from q2r2_control.process.helper_process import reason_of
 from q2r2_control.recording.about import ABOUT, CELL, CONCLUSION, LOOP, ROBOT, About, Conclusion
 from q2r2_control.recording.mcap_file import McapFile
 from q2r2_control.recording.messages import PICTURE, STATE, TEXT, Message, Topic, data_of, picture_topic
 from q2r2_control.recording.tick_chunks import TickAssembly, TickChunk
+from q2r2_control.teleop.reasons import TeleopReason
 
 # Errors that readers raise for a file that is damaged or of another program.
 BROKEN = (
@@ -222,18 +223,18 @@ def spans_of(events: Iterable[Event], run_succeeded: bool | None = None) -> list
     spans: list[EpisodeSpan] = []
     for event in events:
         is_open = bool(spans) and spans[-1].end == math.inf
-        if event.kind is ReasonKind.EPISODE_BEGINS and not is_open:
+        if event.kind is TeleopReason.EPISODE_BEGINS and not is_open:
             spans.append(EpisodeSpan(event.t))
-        elif event.kind is ReasonKind.EPISODE_ENDS and is_open:
+        elif event.kind is TeleopReason.EPISODE_ENDS and is_open:
             spans[-1] = replace(spans[-1], end=event.t)
-        elif event.kind is ReasonKind.SUBTASK_BEGINS and is_open:
+        elif event.kind is TeleopReason.SUBTASK_BEGINS and is_open:
             spans[-1] = spans[-1].with_subtask(event.t)
-        elif event.kind is ReasonKind.SUBTASK_BEGINS and not spans:
+        elif event.kind is TeleopReason.SUBTASK_BEGINS and not spans:
             whole = whole.with_subtask(event.t)
-        elif event.kind is ReasonKind.EPISODE_DISCARDED and spans:
+        elif event.kind is TeleopReason.EPISODE_DISCARDED and spans:
             spans[-1] = replace(spans[-1], end=min(spans[-1].end, event.t), discarded=True)
-        elif event.kind in (ReasonKind.EPISODE_SUCCEEDED, ReasonKind.EPISODE_FAILED):
-            success = event.kind is ReasonKind.EPISODE_SUCCEEDED
+        elif event.kind in (TeleopReason.EPISODE_SUCCEEDED, TeleopReason.EPISODE_FAILED):
+            success = event.kind is TeleopReason.EPISODE_SUCCEEDED
             if spans:
                 spans[-1] = replace(spans[-1], end=min(spans[-1].end, event.t), success=success)
             else:

@@ -16,7 +16,7 @@ from mcap.exceptions import EndOfFile
 
 from q2r2_control.config.recording import TOPIC_RATE, CameraConfig
 from q2r2_control.errors import ConfigError
-from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.events import Reason
 from q2r2_control.process.helper_process import HelperProcess, reason_of
 from q2r2_control.process.scheduling import new_folder
 from q2r2_control.recording.about import About, Conclusion
@@ -28,6 +28,7 @@ from q2r2_control.recording.tick_rows import PackedTick, TickPacker
 from q2r2_control.recording.writer import FLUSH_PERIOD, RecordedRobot, RecordingSetup, Written
 from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.tick import Tick
+from q2r2_control.teleop.reasons import TeleopReason
 
 if TYPE_CHECKING:  # The ROS node does not import MuJoCo.
     from q2r2_control.plants.mujoco import MujocoPlant
@@ -109,7 +110,7 @@ class BaseRecorder:
         if fault is not None and self.fault is None:
             self.fault = f"{self.file}: {fault}" if self.file is not None else fault
             _logger.warning("recording ended, the run goes on: %s", self.fault)
-            self.record_outcome(Reason.of(ReasonKind.RECORDING_ENDED, text=self.fault))
+            self.record_outcome(Reason.of(TeleopReason.RECORDING_ENDED, text=self.fault))
 
 
 def is_empty(file: Path) -> bool:

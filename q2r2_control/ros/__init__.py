@@ -18,12 +18,14 @@ if TYPE_CHECKING:
     from q2r2_control.ros.base_node import BaseNode as BaseNode
     from q2r2_control.ros.base_node import run_node as run_node
     from q2r2_control.ros.nodes.base_arm_controller import BaseArmController as BaseArmController
+    from q2r2_control.ros.reasons import RosReason as RosReason
 
 _MODULES = {
     "BaseArmController": "nodes.base_arm_controller",
     "BaseNode": "base_node",
     "GuardSettings": ".config.teleop",
     "Preset": ".config.presets",
+    "RosReason": "reasons",
     "run_node": "base_node",
 }
 __all__ = list(_MODULES)

@@ -29,7 +29,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import String
 
 from q2r2_control.errors import ConfigError, Q2R2Error
-from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.events import Reason
 from q2r2_control.process.scheduling import (
     LONGEST_END,
     StopRequest,
@@ -38,6 +38,7 @@ from q2r2_control.process.scheduling import (
 )
 from q2r2_control.ros.executor import TickExecutor, TickGroup
 from q2r2_control.ros.launch.middleware import set_up_middleware
+from q2r2_control.ros.reasons import RosReason
 from q2r2_control.wording import sentence
 
 # Processor time after which Linux ends a real-time process that never sleeps [s]. It would leave nothing to others.
@@ -165,7 +166,7 @@ class BaseNode(Node):
         """Warn once for each topic that messages of others cannot be read, with ``text`` as an example."""
         if topic not in self._dropped:
             self._dropped.add(topic)
-            self.get_logger().warning(sentence(Reason.of(ReasonKind.MESSAGE_UNREADABLE, topic=topic, text=text)))
+            self.get_logger().warning(sentence(Reason.of(RosReason.MESSAGE_UNREADABLE, topic=topic, text=text)))
 
     def report_health(self) -> None:
         """Publish :meth:`health` now. A timer does so twice a second. Call it after an urgent change."""
@@ -199,8 +200,8 @@ class BaseNode(Node):
         if not clock.ros_time_is_active:
             return None
         if now == 0.0:
-            return Reason(ReasonKind.NO_CLOCK)
-        return Reason(ReasonKind.CLOCK_STANDS) if wall - self._ros_time[1] >= timeout else None
+            return Reason(RosReason.NO_CLOCK)
+        return Reason(RosReason.CLOCK_STANDS) if wall - self._ros_time[1] >= timeout else None
 
 
 class ManagedNode(LifecycleNodeMixin, BaseNode):

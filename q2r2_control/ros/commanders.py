@@ -12,9 +12,10 @@ from collections.abc import Iterable
 from functools import partial
 from typing import Any
 
-from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.events import Reason
 from q2r2_control.ros.base_node import STREAM_QOS, BaseNode
 from q2r2_control.ros.monitoring import WatchedPublisher, node_of
+from q2r2_control.ros.reasons import RosReason
 
 _DISCOVERY = 1.0  # A publisher that a new node discovers within this time was there before it [s].
 _GRAPH_PERIOD = 0.04  # Time between two queries of the graph [s].
@@ -53,7 +54,7 @@ class OnePublisher:
         if (count := self._node.handle.get_count_publishers(topic)) <= 1:
             return None
         named = f"{topic} ({publishers_of(self._node, topic)})"
-        return Reason.of(ReasonKind.SEVERAL_PUBLISHERS, count=count, topic=named)
+        return Reason.of(RosReason.SEVERAL_PUBLISHERS, count=count, topic=named)
 
 
 class CommandWatch:
@@ -121,7 +122,7 @@ class CommandWatch:
 
     def named(self, reason: Reason) -> Reason:
         """Return the same reason with the names of nodes that are known by now."""
-        if reason.kind is not ReasonKind.OTHER_COMMANDER or _UNKNOWN not in reason.detail["nodes"]:
+        if reason.kind is not RosReason.OTHER_COMMANDER or _UNKNOWN not in reason.detail["nodes"]:
             return reason
         return self._reason(reason.detail["topic"])
 
@@ -130,7 +131,7 @@ class CommandWatch:
         self._known = None
 
     def _reason(self, topic: str) -> Reason:
-        return Reason.of(ReasonKind.OTHER_COMMANDER, nodes=publishers_of(self._node, topic, own=False), topic=topic)
+        return Reason.of(RosReason.OTHER_COMMANDER, nodes=publishers_of(self._node, topic, own=False), topic=topic)
 
     def _on_command(self, topic: str, message: bytes) -> None:
         if not self._publishers[topic].is_own(bytes(message)):

@@ -15,8 +15,10 @@ from rclpy.node import Node
 from rclpy.serialization import serialize_message
 from std_msgs.msg import String
 
-from q2r2_control.events import HOLD_REQUESTS, Reason, ReasonKind
+from q2r2_control.events import Reason
 from q2r2_control.ros.base_node import SENT_COMMAND_QOS, STEADY, STREAM_QOS
+from q2r2_control.ros.reasons import RosReason
+from q2r2_control.teleop.reasons import HOLD_REQUESTS
 
 _MAX_AGE = 0.1  # Age of the graph's answer at which it is asked again [s].
 _PERIOD = 2.0  # Time between two queries of the graph, if no other code asks [s].
@@ -159,7 +161,7 @@ class WatchedPublisher:
             self._acknowledged = now
         if self._acknowledged is None or now - self._acknowledged <= self._timeout:
             return None
-        return Reason.of(ReasonKind.NOT_ACKNOWLEDGED, topic=self.topic_name, age=now - self._acknowledged)
+        return Reason.of(RosReason.NOT_ACKNOWLEDGED, topic=self.topic_name, age=now - self._acknowledged)
 
 
 class NodeStates:

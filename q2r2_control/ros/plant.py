@@ -21,7 +21,7 @@ from q2r2_control.config.cell import Config
 from q2r2_control.config.external import GripperSettings
 from q2r2_control.config.strict import STREAM_TIMEOUT
 from q2r2_control.errors import PlantError
-from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.events import Reason
 from q2r2_control.plants.base import check_command
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.base_node import BaseNode
@@ -33,6 +33,8 @@ from q2r2_control.ros.commanders import CommandWatch
 from q2r2_control.ros.executor import TickExecutor
 from q2r2_control.ros.launch.middleware import set_up_middleware
 from q2r2_control.ros.monitoring import WatchedPublisher
+from q2r2_control.ros.reasons import RosReason
+from q2r2_control.supervision.reasons import SupervisionReason
 from q2r2_control.supervision.standstill import JOINTS
 from q2r2_control.types import ArmTiming, Array, Command, CommandMode, RobotState
 from q2r2_control.wording import sentence
@@ -112,9 +114,9 @@ class RosPlant:
 
     def _problem(self) -> Reason | None:
         if self._joints.state is None:
-            return self._bad or Reason.of(ReasonKind.NO_STATES_YET, source=_CURE)
+            return self._bad or Reason.of(SupervisionReason.NO_STATES_YET, source=_CURE)
         if not self._publisher.listeners:
-            return Reason.of(ReasonKind.NO_SUBSCRIBER, topic=self._publisher.topic_name)
+            return Reason.of(RosReason.NO_SUBSCRIBER, topic=self._publisher.topic_name)
         return self._bad
 
     def _take_state(self, state: RobotState | Reason, now: float) -> None:
@@ -132,7 +134,7 @@ class RosPlant:
         if self._begins:
             self._others.rest()
         other = self._others.commander() if self._begins else self._others.intruder()
-        self._fault = Reason(ReasonKind.NEW_RECEIVER) if new else other or self._problem()
+        self._fault = Reason(RosReason.NEW_RECEIVER) if new else other or self._problem()
         return 0.0, min(gap, 2.0 * self._period)
 
     def _is_away(self, command: Command) -> bool:

@@ -13,9 +13,10 @@ import numpy as np
 from q2r2_control.compliance.impedance import ImpedanceReport
 from q2r2_control.compliance.repulsion import WallReport
 from q2r2_control.config.control import ControllerSettings
-from q2r2_control.events import Event, ReasonKind
+from q2r2_control.events import Event
 from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.tick import Tick
+from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.types import ArmTarget, HandSample
 from q2r2_control.wording import sentence
 
@@ -154,7 +155,7 @@ class RunSummary:
     @property
     def broken(self) -> tuple[str, ...]:
         """Broken promises in words. A run with any of them ends with exit code 1."""
-        refusals = {event.arm: event.reason for event in self.events if event.kind is ReasonKind.NOT_ENGAGED}
+        refusals = {event.arm: event.reason for event in self.events if event.kind is TeleopReason.NOT_ENGAGED}
         broken = []
         for name, arm in self.arms.items():
             if not arm.followed:
@@ -248,7 +249,7 @@ class RunStatistics:
         self._duration += tick.dt
         self._compute_times.add(tick.compute_time)
         # Reports of obstacles come many times a second, and would fill the list.
-        self.events.extend(event for event in tick.events if event.kind is not ReasonKind.OBSTACLE_REPORTED)
+        self.events.extend(event for event in tick.events if event.kind is not TeleopReason.OBSTACLE_REPORTED)
         # Numbers that are not finite do not count.
         np.fmax(self._speed, np.abs(reference.v), out=self._speed)
         np.fmax(self._acceleration, np.abs(reference.a), out=self._acceleration)

@@ -11,7 +11,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.events import Reason
+from q2r2_control.supervision.reasons import SupervisionReason
 from q2r2_control.types import ArmTiming
 
 _TIMING_NOISE_S = 0.001
@@ -69,4 +70,6 @@ class SkewWatch:
         """Return a reason if the arms have waited for each other for too long at time ``now`` [s], else None."""
         if not self.holds or now - self._last_together_s <= _MAX_WAIT_S:
             return None
-        return Reason.of(ReasonKind.ARMS_APART, arm=self._last, skew=1e3 * self._skew, allowed=1e3 * self._allowed)
+        return Reason.of(
+            SupervisionReason.ARMS_APART, arm=self._last, skew=1e3 * self._skew, allowed=1e3 * self._allowed
+        )

@@ -13,7 +13,7 @@ import pinocchio as pin
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.control.watched_pairs import PairsAhead
-from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.events import CommonReason, Reason, ReasonKind
 from q2r2_control.robot.kept_distances import kept_distances, too_close_at_home
 from q2r2_control.robot.robot import Robot
 from q2r2_control.robot.stop_torque import joints_that_cannot_hold
@@ -89,7 +89,7 @@ class JointHoming:
             found = (way for way in islice(self._search, _SAMPLES_A_TICK) if way is not None)
             self._points = next(found, None)
             if self._points == []:
-                self.outcome = ReasonKind.HOMING_NO_WAY
+                self.outcome = CommonReason.HOMING_NO_WAY
         elif self._points:
             self._go(self._points, q, dt)
         return HomingStep(self._at, {})
@@ -110,9 +110,9 @@ class JointHoming:
             points.pop(0)
             self._leg, self._share = goal, 0.0
             self._least_left, self._waited = np.inf, 0.0
-            self.outcome = ReasonKind.HOMING_ARRIVED if last else None
+            self.outcome = CommonReason.HOMING_ARRIVED if last else None
         elif self._waited > _LONGEST_WAIT:
-            self.outcome = ReasonKind.HOMING_HELD_UP
+            self.outcome = CommonReason.HOMING_HELD_UP
 
     def _ways(self, start: Array) -> Iterator[list[Array] | None]:
         """Check one way after the other.
@@ -191,8 +191,8 @@ class ToolHoming:
             return None
         errors = [apart(self._tool_pose(arm), home) for arm, home in self._home.items()]
         if all(way <= _ARRIVED and turn <= _TURNED for way, turn in errors):
-            return ReasonKind.HOMING_ARRIVED
-        return ReasonKind.HOMING_HELD_UP if self._time > self._duration + _PATIENCE else None
+            return CommonReason.HOMING_ARRIVED
+        return CommonReason.HOMING_HELD_UP if self._time > self._duration + _PATIENCE else None
 
 
 class Homing:
@@ -239,7 +239,7 @@ class Homing:
         if kind is None:
             return None
         self.end()
-        by = {"by": " | ".join(reference.report.tightest_pair)} if kind is ReasonKind.HOMING_HELD_UP else {}
+        by = {"by": " | ".join(reference.report.tightest_pair)} if kind is CommonReason.HOMING_HELD_UP else {}
         self.outcome = Reason(kind, by)
         return self.outcome
 
@@ -253,7 +253,7 @@ class Homing:
         """End the way home, with ``outcome`` as the record. Returns None, because this is always possible."""
         if self.active:
             self.end()
-            self.outcome = Reason(ReasonKind.HOMING_INTERRUPTED)
+            self.outcome = Reason(CommonReason.HOMING_INTERRUPTED)
         return None
 
 

@@ -13,10 +13,11 @@ import pinocchio as pin
 from q2r2_control.config.cell import Config
 from q2r2_control.config.control import SupervisionSettings
 from q2r2_control.control.controller import CartesianController
-from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.events import Reason
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.pairs import pair_names
 from q2r2_control.robot.robot import Robot
+from q2r2_control.supervision.reasons import SupervisionReason
 from q2r2_control.supervision.target_stream import StreamSettings, apart
 from q2r2_control.types import Array, Reference, RobotState
 
@@ -67,7 +68,7 @@ class JointWatch:
         self._names, self._velocity_limit, self._settings = names, velocity_limit, settings
         self._source = source  # Text for messages that names the sender, such as " from /node", or "".
         self.state: RobotState | None = None  # The newest state that was good.
-        self.fault: Reason | None = Reason.of(ReasonKind.NO_STATES_YET, source="")
+        self.fault: Reason | None = Reason.of(SupervisionReason.NO_STATES_YET, source="")
         self._lost = False  # True if the fault is a lost session, and all states since then were good.
         self._q: list[float] = []  # Joint positions of ``state`` [rad].
         self._still_since, self._still_at = math.inf, self._q
@@ -125,7 +126,7 @@ class JointWatch:
         # After a clock was set back, the newest state seems to come from the future, and would look fresh for long.
         timeout, age = self._settings.timeout, now - self._stamp
         if not -timeout <= age <= timeout:
-            self._fail(Reason.of(ReasonKind.STATES_SILENT, age=age, timeout=timeout, source=self._source()))
+            self._fail(Reason.of(SupervisionReason.STATES_SILENT, age=age, timeout=timeout, source=self._source()))
         return self.fault
 
     def deviates(self, reference: Array, now: float) -> Reason | None:
@@ -140,7 +141,7 @@ class JointWatch:
             return None
         worst = int(deviation.argmax())
         return Reason.of(
-            ReasonKind.OFF_REFERENCE,
+            SupervisionReason.OFF_REFERENCE,
             joint=self._names[worst],
             deviation=float(deviation[worst]),
             time=now - self._near_at,
@@ -163,7 +164,7 @@ class JointWatch:
         return -math.inf if self.state is None else self.state.stamp
 
     def _unusable(self, state: RobotState, external: Array) -> Reason | None:
-        kind, bridged = ReasonKind.STATE_NOT_FINITE, 1e3 * self._settings.unusable_time
+        kind, bridged = SupervisionReason.STATE_NOT_FINITE, 1e3 * self._settings.unusable_time
         for what, values in (("position", state.q), ("velocity", state.v), ("external torque", external)):
             for name, value in zip(self._names, values, strict=True):
                 if not math.isfinite(value):
@@ -177,7 +178,7 @@ class JointWatch:
         if not (moved > reach).any():
             return None
         worst = int((moved - reach).argmax())
-        return Reason.of(ReasonKind.STATE_JUMPED, joint=self._names[worst], distance=float(moved[worst]))
+        return Reason.of(SupervisionReason.STATE_JUMPED, joint=self._names[worst], distance=float(moved[worst]))
 
     def _fail(self, fault: Reason) -> None:
         self._still_since, self._lost = math.inf, False
@@ -270,7 +271,7 @@ class ExternalArms:
             if near or arm not in holding or arm not in self._near_at:
                 self._near_at[arm] = now
             elif now - self._near_at[arm] > self._watch.deviation_time:
-                return Reason.of(ReasonKind.LEFT_BEHIND, arm=arm, distance=way, angle=turn)
+                return Reason.of(SupervisionReason.LEFT_BEHIND, arm=arm, distance=way, angle=turn)
         return None
 
     def too_close(self, state: RobotState) -> Reason | None:
@@ -281,7 +282,7 @@ class ExternalArms:
         tightest = int(np.argmin(distances - kept))
         least, tolerance = kept[tightest], self._settings.tolerance
         return Reason.of(
-            ReasonKind.TOO_CLOSE,
+            SupervisionReason.TOO_CLOSE,
             pair="|".join(pair_names(self._robot.collision_model)[tightest]),
             distance=float(distances[tightest]),
             allowed=float(least - tolerance),

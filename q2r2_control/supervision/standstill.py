@@ -21,8 +21,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.events import Reason
 from q2r2_control.robot.robot import Robot
+from q2r2_control.supervision.reasons import SupervisionReason
 from q2r2_control.types import Array, RobotState
 
 WINDOW = 0.05  # W [s]
@@ -124,7 +125,7 @@ class StandingArms:
 
 def standing(arm: str, takers: str, way: float, unit: str) -> Reason:
     """Return the reason for an arm that stood still while it was asked to move by ``way`` within the window."""
-    kind = ReasonKind.CONTROLLER_STANDS
+    kind = SupervisionReason.CONTROLLER_STANDS
     return Reason.of(kind, None, arm=arm, takers=takers, way=way, unit=unit, time=WINDOW)
 
 

@@ -18,12 +18,13 @@ import numpy as np
 import pinocchio as pin
 
 from q2r2_control.control.controller import CartesianController
-from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.events import CommonReason, Reason
 from q2r2_control.robot.robot import Robot
 from q2r2_control.robot.stop_torque import joints_that_cannot_hold
 from q2r2_control.supervision.arm_skew import SkewWatch
 from q2r2_control.supervision.homing import Homing
 from q2r2_control.supervision.joint_watch import ExternalArms, JointWatch, WatchSettings
+from q2r2_control.supervision.reasons import SupervisionReason
 from q2r2_control.supervision.standstill import StandingArms, StandstillLimits
 from q2r2_control.supervision.target_stream import Origins, StreamSettings
 from q2r2_control.supervision.targets import TargetStreams
@@ -87,7 +88,7 @@ class Supervisor:
     def fault(self) -> Reason | None:
         """Why nothing is commanded, or why the arms brake."""
         fault = self._stopped or self._watch.fault
-        if fault is not None and fault.kind is ReasonKind.NO_STATES_YET:
+        if fault is not None and fault.kind is SupervisionReason.NO_STATES_YET:
             return Reason.of(fault.kind, source=self._origins.joint_states())
         return fault
 
@@ -140,7 +141,7 @@ class Supervisor:
             self._watch.lose(lost)
         fault = self._watch.fault
         if self.phase is Phase.INACTIVE and fault is not None and fault != before:
-            self.events.append(Reason(ReasonKind.JOINT_STATES, cause=fault))
+            self.events.append(Reason(SupervisionReason.JOINT_STATES, cause=fault))
 
     def update_target(
         self, arm: str, pose: pin.SE3 | None, now: float, number: int | None = None, due: float | None = None
@@ -165,10 +166,10 @@ class Supervisor:
     def no_targets(self) -> Reason | None:
         """Why no arm may follow targets now, or None."""
         if self.phase is not Phase.ACTIVE:
-            return Reason.of(ReasonKind.CONTROLLER_PHASE, phase=str(self.phase))
+            return Reason.of(SupervisionReason.CONTROLLER_PHASE, phase=str(self.phase))
         if self.paused:
-            return Reason(ReasonKind.CONTROLLER_PAUSED)
-        return Reason(ReasonKind.ARMS_HOMING) if self.homing.active else None
+            return Reason(SupervisionReason.CONTROLLER_PAUSED)
+        return Reason(SupervisionReason.ARMS_HOMING) if self.homing.active else None
 
     def tick(self, now: float, dt: float, posture: Array | None = None) -> Reference | None:
         """Advance by one tick.
@@ -190,7 +191,7 @@ class Supervisor:
         if self.phase is Phase.STOPPED:
             return None
         if self.phase is Phase.ACTIVE and fault is not None:
-            self._brake(Reason(ReasonKind.JOINT_STATES, cause=fault))
+            self._brake(Reason(SupervisionReason.JOINT_STATES, cause=fault))
         elif apart := self.skew.fault(now):
             self.start_over(apart, now)
         self.events += self.targets.expire(now)
@@ -199,7 +200,7 @@ class Supervisor:
         if self.phase is Phase.ACTIVE:
             self._compare(reference, now)
             if outcome := self.homing.check(reference):
-                self.events.append(Reason(ReasonKind.HOMING_OUTCOME, cause=outcome))
+                self.events.append(Reason(SupervisionReason.HOMING_OUTCOME, cause=outcome))
         elif float(np.abs(reference.v).max()) <= _REST:
             self.phase = Phase.INACTIVE if self._stopped is None else Phase.STOPPED
         return reference
@@ -240,7 +241,7 @@ class Supervisor:
         if torques is None:
             return away
         needed, limit = torques
-        return Reason.of(ReasonKind.TOO_HEAVY, **away.detail, needed=needed, limit=limit)
+        return Reason.of(SupervisionReason.TOO_HEAVY, **away.detail, needed=needed, limit=limit)
 
     def pause(self, paused: bool) -> None:
         """Hold all arms where they come to rest, or allow new streams of targets."""
@@ -255,7 +256,7 @@ class Supervisor:
         """
         if self.phase not in (Phase.ACTIVE, Phase.BRAKING):
             return
-        fault = Reason.of(ReasonKind.LOOP_STALLED, duration=duration)
+        fault = Reason.of(CommonReason.LOOP_STALLED, duration=duration)
         self._watch.observe(fault, now)
         self._brake(fault)
         self.phase = Phase.INACTIVE if self._stopped is None else Phase.STOPPED
@@ -293,7 +294,7 @@ class Supervisor:
     def reset(self) -> Reason | None:
         """Clear faults, stop, pause and all targets. Returns the reason if that is not possible now, else None."""
         if self.phase is Phase.BRAKING:
-            return Reason(ReasonKind.ARMS_BRAKING)
+            return Reason(SupervisionReason.ARMS_BRAKING)
         self._stopped, self.paused = None, False
         self.targets.reset()
         self.homing.end()
@@ -308,9 +309,9 @@ class Supervisor:
             goal: See :meth:`Homing.begin`.
         """
         if self.paused:
-            return Reason(ReasonKind.CONTROLLER_PAUSED)
+            return Reason(SupervisionReason.CONTROLLER_PAUSED)
         if self.phase is not Phase.ACTIVE:
-            return Reason.of(ReasonKind.CONTROLLER_PHASE, phase=str(self.phase))
+            return Reason.of(SupervisionReason.CONTROLLER_PHASE, phase=str(self.phase))
         self._forget_targets()
         self.homing.begin(goal)
         return None
@@ -336,7 +337,7 @@ class Supervisor:
         self._watch.accept()
         self._last = None
         self.phase = Phase.ACTIVE
-        self.events.append(Reason(ReasonKind.ACTIVATED))
+        self.events.append(Reason(SupervisionReason.ACTIVATED))
 
     def _brake(self, why: Reason) -> None:
         self._forget_targets()

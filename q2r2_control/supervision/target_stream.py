@@ -17,8 +17,9 @@ from dataclasses import dataclass
 import pinocchio as pin
 
 from q2r2_control.config.strict import STREAM_TIMEOUT
-from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.events import Reason
 from q2r2_control.quaternions import Vector, floats_of, inverse, product, rotation_of, rotation_vector, se3_of
+from q2r2_control.supervision.reasons import SupervisionReason
 from q2r2_control.types import Pose
 
 # A new stream begins with a jump that no hand makes between two messages [m], [rad].
@@ -105,7 +106,7 @@ class TargetStream:
             self.pose = pose
             return None
         return Reason.of(
-            ReasonKind.STREAM_AWAY,
+            SupervisionReason.STREAM_AWAY,
             distance=distance,
             angle=angle,
             engage_distance=self._settings.engage_distance,

@@ -9,6 +9,7 @@ from collections.abc import Iterable, Sequence
 import pinocchio as pin
 
 from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.supervision.reasons import SupervisionReason
 from q2r2_control.supervision.target_stream import Origins, StreamSettings, TargetExtrapolator, TargetStream
 
 # The usual delay may grow by this per second. The clocks of two hosts drift apart more slowly, and the delay of a
@@ -138,7 +139,9 @@ class TargetStreams:
             self._lines[arm].reset()
         refusal = None if pose is None else stream.offer(pose, tools, now)
         if breaks:
-            others = self._reason(ReasonKind.PUBLISHER_CHANGED if breaks == 1 else ReasonKind.TWO_PUBLISHERS, arm)
+            others = self._reason(
+                SupervisionReason.PUBLISHER_CHANGED if breaks == 1 else SupervisionReason.TWO_PUBLISHERS, arm
+            )
             if stream.following:
                 self._hold_linked(arm, others)
             stream.drop()
@@ -183,7 +186,7 @@ class TargetStreams:
     def _expire(self, arm: str, now: float) -> None:
         """End the arm's stream if its targets have ceased."""
         if self._streams[arm].expire(now):
-            self._record_end(arm, self._reason(ReasonKind.TARGETS_CEASED, arm))
+            self._record_end(arm, self._reason(SupervisionReason.TARGETS_CEASED, arm))
             self._hold_linked(arm, self.ended[arm])
 
     def _hold_linked(self, ended: str, why: Reason) -> None:
@@ -191,7 +194,7 @@ class TargetStreams:
         for arm, stream in self._streams.items():
             if self._settings.linked and arm != ended and stream.following:
                 stream.drop()
-                self._record_end(arm, Reason.of(ReasonKind.TARGETS_LINKED, cause=why, arm=arm, other=ended))
+                self._record_end(arm, Reason.of(SupervisionReason.TARGETS_LINKED, cause=why, arm=arm, other=ended))
 
     def _record_end(self, arm: str, reason: Reason) -> None:
         self.ended[arm] = reason

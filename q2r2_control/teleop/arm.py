@@ -10,12 +10,13 @@ import pinocchio as pin
 
 from q2r2_control.config.bindings import BUTTONS, Action, BindingSettings, Gesture
 from q2r2_control.config.teleop import TeleopSettings
-from q2r2_control.events import Event, Reason, ReasonKind
+from q2r2_control.events import Event, Reason
 from q2r2_control.quaternions import floats_of
 from q2r2_control.teleop.arm_states import ArmState, Cause, next_state
 from q2r2_control.teleop.gate import PoseGate
 from q2r2_control.teleop.gestures import GestureRecognizer, HeldControls, Press, travel
 from q2r2_control.teleop.hand_motion import ArmMeasurements, HandMotion, Shares
+from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.types import Array, HandInputs, HandSample, Pose
 
 # All three are shares of a trigger's whole way.
@@ -135,9 +136,9 @@ class ArmTeleop:
         """Return a fault if poses or readings of the controls have ceased, else None."""
         timeout = self._settings.gate.timeout
         if self._gate.stale(now):
-            return Reason.of(ReasonKind.POSE_SILENT, timeout=timeout)
+            return Reason.of(TeleopReason.POSE_SILENT, timeout=timeout)
         if now - self._inputs_stamp > timeout:  # The operator could not stop the arm by a button.
-            return Reason.of(ReasonKind.INPUTS_SILENT, timeout=timeout)
+            return Reason.of(TeleopReason.INPUTS_SILENT, timeout=timeout)
         return None
 
     def change(self, cause: Cause, now: float, reason: Reason) -> None:
@@ -157,7 +158,7 @@ class ArmTeleop:
         """Return the gestures since the last call. The caller passes them to :meth:`act`, or drops them."""
         presses, self._presses = self._presses + self._gestures.due(now), []
         if (stuck := self._gestures.take_stuck(now)) is not None:
-            self.record_event(now, Reason(ReasonKind.NOT_ENGAGED, cause=stuck))
+            self.record_event(now, Reason(TeleopReason.NOT_ENGAGED, cause=stuck))
         return presses
 
     def press_to_engage(self) -> None:
@@ -186,16 +187,16 @@ class ArmTeleop:
             chord: Whether either hand holds the alignment chord.
         """
         if self.gripped is False:
-            self.go(Cause.LET_GO, now, Reason(ReasonKind.DEAD_MAN_RELEASED))
+            self.go(Cause.LET_GO, now, Reason(TeleopReason.DEAD_MAN_RELEASED))
         if chord:
             self._aligned_at = now
             # A press of this hand that is still undecided is not decided by the other hand's chord.
             if self.state is not ArmState.PAUSING or self.chord:
-                self.go(Cause.CHORD, now, Reason(ReasonKind.ALIGNMENT_CHORD))
+                self.go(Cause.CHORD, now, Reason(TeleopReason.ALIGNMENT_CHORD))
         elif self.state is ArmState.ALIGNING and self._gate.pose is not None and self._gate.stamp >= self._aligned_at:
-            self._engage(Cause.ALIGNED, around, now, Reason(ReasonKind.ALIGNED))
+            self._engage(Cause.ALIGNED, around, now, Reason(TeleopReason.ALIGNED))
         elif self.gripped:
-            self._engage(Cause.ENGAGE, around, now, Reason(ReasonKind.DEAD_MAN_HELD))
+            self._engage(Cause.ENGAGE, around, now, Reason(TeleopReason.DEAD_MAN_HELD))
         self.gripped = None
         for press in presses:
             self._press(press, around, now)
@@ -234,11 +235,11 @@ class ArmTeleop:
         if self._gate.pose is None:
             obstacle = obstacle or self._gate.problem
         elif anchor is None or not np.isfinite(anchor.tool.homogeneous).all():
-            obstacle = obstacle or Reason(ReasonKind.TOOL_UNKNOWN)
+            obstacle = obstacle or Reason(TeleopReason.TOOL_UNKNOWN)
         else:
             self.offset = anchor.offset
             self.motion.anchor(self._gate.pose, floats_of(anchor.tool), self._shares(), now)
-        refusal = Reason(ReasonKind.NOT_ENGAGED, cause=obstacle)
+        refusal = Reason(TeleopReason.NOT_ENGAGED, cause=obstacle)
         if obstacle is None:
             self.go(cause, now, reason)
         elif self.state is ArmState.ALIGNING:
@@ -260,7 +261,7 @@ class ArmTeleop:
 
 
 def pressed(control: str) -> Reason:
-    return Reason.of(ReasonKind.PRESSED, control=f"{control} button" if control in BUTTONS else control)
+    return Reason.of(TeleopReason.PRESSED, control=f"{control} button" if control in BUTTONS else control)
 
 
 def of_controls(settings: TeleopSettings) -> tuple[object, ...]:

@@ -5,7 +5,8 @@ from __future__ import annotations
 from enum import StrEnum
 from typing import NamedTuple
 
-from q2r2_control.events import REFUSALS, Event
+from q2r2_control.events import Event
+from q2r2_control.teleop.reasons import REFUSALS
 
 
 class ArmState(StrEnum):

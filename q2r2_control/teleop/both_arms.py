@@ -11,15 +11,16 @@ import pinocchio as pin
 from q2r2_control.config.bindings import Action, Gesture
 from q2r2_control.config.recording import subtask_name
 from q2r2_control.config.teleop import Stance, TeleopSettings
-from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.events import CommonReason, Reason, ReasonKind
 from q2r2_control.quaternions import floats_of, se3_of
 from q2r2_control.teleop.arm import ArmTeleop, pressed
 from q2r2_control.teleop.arm_states import AT_REST, ArmState, Cause
 from q2r2_control.teleop.carry import CarriedTools, RelationKeeper
 from q2r2_control.teleop.gestures import Press
 from q2r2_control.teleop.hand_motion import Anchor, ArmMeasurements
+from q2r2_control.teleop.reasons import TeleopReason
 
-_OUTCOMES = {Action.RECORD_FAILURE: ReasonKind.EPISODE_FAILED, Action.RECORD_SUCCESS: ReasonKind.EPISODE_SUCCEEDED}
+_OUTCOMES = {Action.RECORD_FAILURE: TeleopReason.EPISODE_FAILED, Action.RECORD_SUCCESS: TeleopReason.EPISODE_SUCCEEDED}
 
 
 class EpisodeMarks:
@@ -44,30 +45,30 @@ class EpisodeMarks:
     def apply(self, action: Action) -> Reason:
         """Take a press of the operator; returns the reason of the event. Success and failure end the episode."""
         if not self.recorded:
-            return Reason(ReasonKind.NO_RECORDING)
+            return Reason(TeleopReason.NO_RECORDING)
         if action is Action.RECORD_MARK:
-            return Reason(ReasonKind.MARK)
+            return Reason(TeleopReason.MARK)
         if action is Action.NEXT_SUBTASK:
             return self._next_subtask()
         if action is Action.RECORD_DISCARD:
             self.open = False
             any_episode, self.any = self.any, False
-            return Reason(ReasonKind.EPISODE_DISCARDED if any_episode else ReasonKind.NO_EPISODE)
+            return Reason(TeleopReason.EPISODE_DISCARDED if any_episode else TeleopReason.NO_EPISODE)
         if action in _OUTCOMES:
             self.open = False
             return Reason(_OUTCOMES[action])
-        kind = ReasonKind.EPISODE_ENDS if self.open else ReasonKind.EPISODE_BEGINS
+        kind = TeleopReason.EPISODE_ENDS if self.open else TeleopReason.EPISODE_BEGINS
         self.follow(kind)
         return Reason(kind)
 
     def _next_subtask(self) -> Reason:
         if self.begun and not self.open:
-            return Reason(ReasonKind.NO_OPEN_EPISODE)
+            return Reason(TeleopReason.NO_OPEN_EPISODE)
         if self.subtasks and self.subtask >= len(self.subtasks):
-            return Reason.of(ReasonKind.LAST_SUBTASK, name=subtask_name(self.subtasks, self.subtask))
+            return Reason.of(TeleopReason.LAST_SUBTASK, name=subtask_name(self.subtasks, self.subtask))
         self.subtask += 1
         name = subtask_name(self.subtasks, self.subtask)
-        return Reason.of(ReasonKind.SUBTASK_BEGINS, number=self.subtask, name=name)
+        return Reason.of(TeleopReason.SUBTASK_BEGINS, number=self.subtask, name=name)
 
     def as_json(self) -> dict[str, Any]:
         """Return the state as data for ``json.dumps``."""
@@ -89,10 +90,10 @@ class EpisodeMarks:
         """Take an event that somebody else has recorded."""
         if kind in _OUTCOMES.values():
             self.open = False
-        elif kind is ReasonKind.SUBTASK_BEGINS:
+        elif kind is TeleopReason.SUBTASK_BEGINS:
             self.subtask += 1
-        elif kind in (ReasonKind.EPISODE_BEGINS, ReasonKind.EPISODE_ENDS, ReasonKind.EPISODE_DISCARDED):
-            self.open, self.any = kind is ReasonKind.EPISODE_BEGINS, kind is not ReasonKind.EPISODE_DISCARDED
+        elif kind in (TeleopReason.EPISODE_BEGINS, TeleopReason.EPISODE_ENDS, TeleopReason.EPISODE_DISCARDED):
+            self.open, self.any = kind is TeleopReason.EPISODE_BEGINS, kind is not TeleopReason.EPISODE_DISCARDED
             self.begun = True
             if self.open:
                 self.subtask = 1
@@ -110,9 +111,9 @@ class CarryMode:
         self._tools = CarriedTools(tools)
         self._keeper = RelationKeeper()
         self._box = follower.motion.workspace()
-        follower.change(Cause.CARRY, now, Reason.of(ReasonKind.CARRIED_BY, arm=leader.arm))
+        follower.change(Cause.CARRY, now, Reason.of(TeleopReason.CARRIED_BY, arm=leader.arm))
         leader.motion.carry(self._tools, follower.arm, self._box, now)
-        leader.record_event(now, Reason(ReasonKind.CARRY_BEGAN))
+        leader.record_event(now, Reason(TeleopReason.CARRY_BEGAN))
 
     @property
     def lasts(self) -> bool:
@@ -186,10 +187,10 @@ class BothArms:
             for name, listed in presses.items():
                 wanted = {self._bindings.action_of(*press) for press in listed if press.gesture is not Gesture.DOWN}
                 if wanted - set(self.marks.actions):
-                    self.arms[name].record_event(now, Reason(ReasonKind.NOT_ENGAGED, cause=self._stopped()))
+                    self.arms[name].record_event(now, Reason(TeleopReason.NOT_ENGAGED, cause=self._stopped()))
         elif self.any_in(ArmState.HOMING):
             if grips or any(press.gesture is Gesture.DOWN for listed in presses.values() for press in listed):
-                self.change(Cause.PRESS, now, Reason(ReasonKind.HOMING_INTERRUPTED))
+                self.change(Cause.PRESS, now, Reason(CommonReason.HOMING_INTERRUPTED))
         elif (asked_by := self._asked(presses, Action.HOME)) is not None:
             self.home(now, asked_by, around.obstacles.get(asked_by))
         elif self.carry is not None and (reason := self._ends_carry(presses)) is not None:
@@ -209,19 +210,19 @@ class BothArms:
             problem: Why the arms may not go home, if the caller knows a reason.
         """
         if self.any_in(ArmState.ALIGNING):
-            problem = problem or Reason(ReasonKind.ALIGNING)
+            problem = problem or Reason(TeleopReason.ALIGNING)
         if self.any_in(ArmState.STOPPED):
             problem = problem or self._stopped()
         if self.carry is not None:
-            problem = problem or Reason(ReasonKind.CARRYING)
+            problem = problem or Reason(TeleopReason.CARRYING)
         if problem is None and asked_by is not None:
             problem = self.arms[asked_by].watchdog(now)
         self.asks_home = asked_by
         if problem is None:
-            self.change(Cause.HOME, now, Reason(ReasonKind.HOMING) if asked_by is None else self._reason(Action.HOME))
+            self.change(Cause.HOME, now, Reason(CommonReason.HOMING) if asked_by is None else self._reason(Action.HOME))
             return
         for arm in self.arms.values():
-            arm.record_event(now, Reason(ReasonKind.NOT_HOMING, cause=problem))
+            arm.record_event(now, Reason(TeleopReason.NOT_HOMING, cause=problem))
 
     def end_carry(self, now: float, reason: Reason) -> None:
         """End carrying, if two arms carry. Both arms hold then."""
@@ -233,12 +234,12 @@ class BothArms:
         """Return the tool's pose at which an arm begins to carry, or the reason why it may not."""
         if arm.state is not ArmState.ENGAGED:
             if arm.state not in AT_REST:
-                return Reason.of(ReasonKind.OTHER_ARM_BUSY, state=str(arm.state))
-            return around.obstacles.get(arm.arm) or around.anchor(arm.arm) or Reason(ReasonKind.TOOL_UNKNOWN)
+                return Reason.of(TeleopReason.OTHER_ARM_BUSY, state=str(arm.state))
+            return around.obstacles.get(arm.arm) or around.anchor(arm.arm) or Reason(TeleopReason.TOOL_UNKNOWN)
         if around.lag(arm.arm, arm.offset) >= (self._leash.distance or math.inf):
-            return Reason(ReasonKind.TOOL_HELD_UP)
+            return Reason(TeleopReason.TOOL_HELD_UP)
         target = around.targets.get(arm.arm)
-        return Reason(ReasonKind.TOOL_UNKNOWN) if target is None else Anchor(target, arm.offset)
+        return Reason(TeleopReason.TOOL_UNKNOWN) if target is None else Anchor(target, arm.offset)
 
     def _begin_carry(self, name: str, around: ArmMeasurements, now: float) -> None:
         leader = self.arms[name]
@@ -246,11 +247,11 @@ class BothArms:
         taken = {arm.arm: self._take_up(arm, around) for arm in (leader, other) if arm is not None}
         problem = next((found for found in taken.values() if isinstance(found, Reason)), None)
         if leader.state is not ArmState.ENGAGED:
-            problem = Reason(ReasonKind.ENGAGE_FIRST)
+            problem = Reason(TeleopReason.ENGAGE_FIRST)
         elif other is None and problem is None:
-            problem = Reason(ReasonKind.ONE_ARM)
+            problem = Reason(TeleopReason.ONE_ARM)
         if problem is not None:
-            leader.record_event(now, Reason(ReasonKind.NOT_CARRIED, cause=problem))
+            leader.record_event(now, Reason(TeleopReason.NOT_CARRIED, cause=problem))
         elif other is not None:
             anchors = {arm: found for arm, found in taken.items() if isinstance(found, Anchor)}
             other.offset = anchors[other.arm].offset
@@ -258,7 +259,7 @@ class BothArms:
 
     def _ends_carry(self, presses: Mapping[str, Sequence[Press]]) -> Reason | None:
         if any(arm.chord for arm in self.arms.values()):
-            return Reason(ReasonKind.ALIGNMENT_CHORD)
+            return Reason(TeleopReason.ALIGNMENT_CHORD)
         for control, gesture in (press for listed in presses.values() for press in listed):
             pauses = self._bindings.action_of(control, Gesture.TAP) is Action.PAUSE_TOGGLE
             if (pauses and gesture is Gesture.DOWN) or self._bindings.action_of(control, gesture) is Action.CARRY:
@@ -273,7 +274,7 @@ class BothArms:
         return None
 
     def _reason(self, action: Action) -> Reason:
-        return Reason.of(ReasonKind.COMMANDED, action=str(action), control=self._bindings.words_of(action))
+        return Reason.of(TeleopReason.COMMANDED, action=str(action), control=self._bindings.words_of(action))
 
     def _stopped(self) -> Reason:
-        return Reason.of(ReasonKind.STOPPED, control=self._bindings.words_of(Action.STOP))
+        return Reason.of(TeleopReason.STOPPED, control=self._bindings.words_of(Action.STOP))

@@ -8,14 +8,15 @@ from collections.abc import Sequence
 import numpy as np
 
 from q2r2_control.config.teleop import axes_matrix
-from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.events import Reason
 from q2r2_control.quaternions import se3_of
 from q2r2_control.teleop.gate import pose_of
+from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.types import SIDES, Array, HandSample
 from q2r2_control.wording import sentence
 
 CROSSED_FOR = 3.0  # The hands count as crossed after this time without a moment in which they were not [s].
-CROSSED = Reason.of(ReasonKind.HANDS_CROSSED, time=CROSSED_FOR)
+CROSSED = Reason.of(TeleopReason.HANDS_CROSSED, time=CROSSED_FOR)
 _BY = 0.1  # Distance to the wrong side from which on a moment counts [m].
 _AGREES = 0.5  # Least cosine between the pointing direction of each controller and that of both together.
 _NEWEST = 0.2  # A pose that is older does not count [s].

@@ -9,8 +9,9 @@ from operator import mul
 import numpy as np
 
 from q2r2_control.config.teleop import GateSettings
-from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.events import Reason
 from q2r2_control.quaternions import Quaternion
+from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.types import HandSample, Pose
 
 _MAX_COORDINATE = 1e6  # No tracking system reaches as far [m].
@@ -40,7 +41,7 @@ class PoseGate:
     @property
     def problem(self) -> Reason | None:
         """Why no arm may be anchored to the newest pose; None if one may."""
-        return None if self.pose is not None else self._problem or Reason(ReasonKind.NO_POSE)
+        return None if self.pose is not None else self._problem or Reason(TeleopReason.NO_POSE)
 
     def stale(self, now: float) -> bool:
         """Return whether no pose was received for longer than ``timeout``."""
@@ -55,16 +56,16 @@ class PoseGate:
         """
         stamp = min(float(sample.pose_stamp), now)
         if math.isnan(stamp):
-            return False, Reason(ReasonKind.POSE_WITHOUT_STAMP)
+            return False, Reason(TeleopReason.POSE_WITHOUT_STAMP)
         if stamp < self.stamp or stamp == -math.inf:
             return False, None
-        self._problem = None if sample.fault is None else Reason(ReasonKind(sample.fault.value))
+        self._problem = None if sample.fault is None else Reason(TeleopReason(sample.fault.value))
         pose = pose_of(sample) if self._problem is None else None
         previous, gap = self.pose, stamp - self.stamp
         self.pose, self.stamp = pose, stamp
         if pose is None:
             self._way.clear()
-            return False, self._problem or Reason(ReasonKind.POSE_UNUSABLE)
+            return False, self._problem or Reason(TeleopReason.POSE_UNUSABLE)
         if jump := None if previous is None else self._jump(previous, pose, gap):
             self._way.clear()  # No speed is measured across the jump.
         return True, jump or self._speed(pose, stamp)
@@ -72,13 +73,13 @@ class PoseGate:
     def _jump(self, previous: Pose, pose: Pose, gap: float) -> Reason | None:
         limits = self.settings
         if gap > limits.timeout:
-            return Reason.of(ReasonKind.POSE_GAP, gap=gap)
+            return Reason.of(TeleopReason.POSE_GAP, gap=gap)
         distance = math.dist(pose[0], previous[0])
         if distance > limits.max_jump:
-            return Reason.of(ReasonKind.HAND_JUMPED, distance=distance)
+            return Reason.of(TeleopReason.HAND_JUMPED, distance=distance)
         angle = _angle(previous[1], pose[1])
         if angle > limits.max_rotation_jump:
-            return Reason.of(ReasonKind.HAND_ROTATION_JUMPED, angle=angle)
+            return Reason.of(TeleopReason.HAND_ROTATION_JUMPED, angle=angle)
         return None
 
     def _speed(self, pose: Pose, stamp: float) -> Reason | None:
@@ -93,10 +94,10 @@ class PoseGate:
             return None
         speed = math.dist(pose[0], start[0]) / time
         if speed > self.settings.max_speed:
-            return Reason.of(ReasonKind.HAND_TOO_FAST, speed=speed)
+            return Reason.of(TeleopReason.HAND_TOO_FAST, speed=speed)
         angular_speed = _angle(start[1], pose[1]) / time
         if angular_speed > self.settings.max_angular_speed:
-            return Reason.of(ReasonKind.HAND_TURNS_TOO_FAST, speed=angular_speed)
+            return Reason.of(TeleopReason.HAND_TURNS_TOO_FAST, speed=angular_speed)
         return None
 
 

@@ -7,7 +7,8 @@ from typing import NamedTuple
 
 from q2r2_control.config.bindings import BUTTONS, DEVICE_NAMES, LASTING, Action, BindingSettings, Gesture
 from q2r2_control.config.teleop import TeleopSettings
-from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.events import Reason
+from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.types import HandInputs
 
 _STUCK_AFTER = 1.0  # Delay before the operator is told of a control that was held from the first reading on [s].
@@ -139,7 +140,7 @@ class GestureRecognizer:
             return None
         stuck = [name for name, control in self._controls.items() if control.down and not control.seen_up]
         self._told_stuck = True
-        return Reason.of(ReasonKind.CONTROLS_HELD, controls=stuck) if stuck else None
+        return Reason.of(TeleopReason.CONTROLS_HELD, controls=stuck) if stuck else None
 
     def due(self, now: float) -> list[Press]:
         """Return the gestures that are complete because enough time has passed at ``now`` [s]."""

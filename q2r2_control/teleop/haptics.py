@@ -8,6 +8,7 @@ from typing import NamedTuple
 from q2r2_control.config.teleop import HapticSettings
 from q2r2_control.events import Event, ReasonKind
 from q2r2_control.teleop.arm_states import ArmState, is_fault
+from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.types import HapticFeedback
 
 
@@ -53,15 +54,15 @@ _BEGINS: dict[str, Pulse] = {
     ArmState.HOMING: HOMING,
     ArmState.STOPPED: STOPPED,
 }
-_WHILE_STATE_STAYS = {
-    ReasonKind.CARRY_BEGAN: ENGAGED,
-    ReasonKind.EPISODE_BEGINS: EPISODE_BEGINS,
-    ReasonKind.MARK: EPISODE_BEGINS,
-    ReasonKind.SUBTASK_BEGINS: EPISODE_BEGINS,
-    ReasonKind.EPISODE_ENDS: EPISODE_ENDS,
-    ReasonKind.EPISODE_SUCCEEDED: EPISODE_ENDS,
-    ReasonKind.EPISODE_FAILED: EPISODE_DISCARDED,
-    ReasonKind.EPISODE_DISCARDED: EPISODE_DISCARDED,
+_WHILE_STATE_STAYS: dict[ReasonKind, Pulse] = {
+    TeleopReason.CARRY_BEGAN: ENGAGED,
+    TeleopReason.EPISODE_BEGINS: EPISODE_BEGINS,
+    TeleopReason.MARK: EPISODE_BEGINS,
+    TeleopReason.SUBTASK_BEGINS: EPISODE_BEGINS,
+    TeleopReason.EPISODE_ENDS: EPISODE_ENDS,
+    TeleopReason.EPISODE_SUCCEEDED: EPISODE_ENDS,
+    TeleopReason.EPISODE_FAILED: EPISODE_DISCARDED,
+    TeleopReason.EPISODE_DISCARDED: EPISODE_DISCARDED,
 }
 
 _SLIP_STEP = 0.02  # Slip of the target's position from pulse to pulse [m].
@@ -103,7 +104,7 @@ class HapticPulses:
         elif event.source == event.destination:
             if (pulse := _WHILE_STATE_STAYS.get(event.kind)) is not None:
                 self._want(pulse)
-            elif event.kind is ReasonKind.VERDICT and (keep := event.reason.detail["keep"]) is not None:
+            elif event.kind is TeleopReason.VERDICT and (keep := event.reason.detail["keep"]) is not None:
                 self._want(EPISODE_KEPT if keep else EPISODE_REJECTED)
         elif event.destination in _BEGINS:
             self._want(_BEGINS[event.destination])

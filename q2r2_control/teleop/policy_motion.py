@@ -18,9 +18,10 @@ import numpy as np
 import pinocchio as pin
 
 from q2r2_control.config.teleop import TeleopSettings
-from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.events import CommonReason, Reason
 from q2r2_control.quaternions import Vector, floats_of, normalized, rotation_of, se3_of, turn_between, turned_by
 from q2r2_control.teleop.leash import Leash, Workspace
+from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.types import ActionChunk, Array, Pose
 
 SILENT = 0.5  # Time without a new action, after which an arm rests [s].
@@ -77,7 +78,7 @@ class PolicyMotion:
         farthest = max(times[0] - now, times[-1] - now, key=abs)
         if abs(farthest) > _AHEAD:
             text = f"a time is {farthest:.3g} s from now; allowed: {_AHEAD:g} s at most, on the loop's clock"
-            return Reason.of(ReasonKind.POLICY_UNUSABLE, text=text)
+            return Reason.of(CommonReason.POLICY_UNUSABLE, text=text)
         if self._arm in chunk.tools:
             poses = [_pose(numbers) for numbers in chunk.tools[self._arm].tolist()]
         else:
@@ -135,7 +136,7 @@ class PolicyMotion:
             if jump := self._change(plan, places, now):
                 return jump
         if self._plan is None or now >= self._plan.end:
-            return Reason.of(ReasonKind.POLICY_SILENT, timeout=SILENT)
+            return Reason.of(TeleopReason.POLICY_SILENT, timeout=SILENT)
         return None
 
     def _change(self, plan: _Plan, places: list[Pose], now: float) -> Reason | None:
@@ -198,7 +199,7 @@ class PolicyMotion:
 
 def _jumped(distance: float, angle: float, what: str, allowed: float, allowed_angle: float) -> Reason:
     detail = {"distance": distance, "angle": angle, "what": what, "allowed": allowed, "allowed_angle": allowed_angle}
-    return Reason(ReasonKind.POLICY_JUMPED, detail)
+    return Reason(TeleopReason.POLICY_JUMPED, detail)
 
 
 def _pose(numbers: list[float]) -> Pose:

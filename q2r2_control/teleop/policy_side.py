@@ -13,6 +13,7 @@ from q2r2_control.teleop.arm import ArmTeleop
 from q2r2_control.teleop.arm_states import AT_REST, ArmState, Cause
 from q2r2_control.teleop.hand_motion import ArmMeasurements
 from q2r2_control.teleop.policy_motion import PolicyMotion
+from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.types import ActionChunk, Array
 
 
@@ -83,14 +84,14 @@ class PolicySide:
                 self._arms[name].change(Cause.FAULT, now, fault)
             elif self._told.get(name) is not fault.kind:
                 self._told[name] = fault.kind
-                self._arms[name].record_event(now, Reason(ReasonKind.POLICY_REFUSED, cause=fault))
+                self._arms[name].record_event(now, Reason(TeleopReason.POLICY_REFUSED, cause=fault))
         first, fault = next(iter(faults.items()))
         if self._linked and not faults.keys().isdisjoint(following):
             self._stopped.update(following)
             for name in following:
                 if name not in faults:
                     self._motions[name].forget()
-                    self._arms[name].change(Cause.FAULT, now, Reason.of(ReasonKind.LINKED, cause=fault, arm=first))
+                    self._arms[name].change(Cause.FAULT, now, Reason.of(TeleopReason.LINKED, cause=fault, arm=first))
 
     def _may_begin(self, name: str, around: ArmMeasurements) -> bool:
         arm = self._arms[name]
@@ -115,7 +116,7 @@ class PolicySide:
             elif name not in faults:
                 self._told.pop(name, None)
                 self._arms[name].offset = None  # Actions are targets for the controller, without an offset.
-                self._arms[name].go(Cause.POLICY_ACTS, now, Reason(ReasonKind.POLICY_ACTS))
+                self._arms[name].go(Cause.POLICY_ACTS, now, Reason(TeleopReason.POLICY_ACTS))
 
     def _wanted(self) -> set[str]:
         """Return the linked arms that have to begin together, because nobody moves them now."""

@@ -9,7 +9,7 @@ import pinocchio as pin
 
 from q2r2_control.config.bindings import Action
 from q2r2_control.config.teleop import TeleopSettings
-from q2r2_control.events import Event, Reason, ReasonKind
+from q2r2_control.events import CommonReason, Event, Reason
 from q2r2_control.quaternions import se3_of
 from q2r2_control.teleop.arm import of_controls
 from q2r2_control.teleop.arm_states import AT_REST, FOLLOWING, HOLDING, ArmState, Cause
@@ -17,6 +17,7 @@ from q2r2_control.teleop.both_arms import BothArms
 from q2r2_control.teleop.crossed_hands import CROSSED, CrossedHands
 from q2r2_control.teleop.hand_motion import ArmMeasurements
 from q2r2_control.teleop.policy_side import PolicySide
+from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.types import ActionChunk, ArmTarget, HandSample
 
 _BY_HANDS = ArmState.ENGAGED, ArmState.CARRIED
@@ -61,9 +62,9 @@ class Teleop:
         before = self.settings
         turned = (before.stance, before.axes) != (settings.stance, settings.axes)
         if self._pair.carry is not None:
-            return Reason(ReasonKind.CARRYING)
+            return Reason(TeleopReason.CARRYING)
         if (turned or of_controls(before) != of_controls(settings)) and not self._pair.all_in(HOLDING):
-            return Reason(ReasonKind.ARMS_MUST_HOLD)
+            return Reason(TeleopReason.ARMS_MUST_HOLD)
         self._use(settings)
         self._pair.use(settings)
         self._policy.configure(settings)
@@ -163,7 +164,7 @@ class Teleop:
     def _targets(self, now: float, around: ArmMeasurements) -> dict[str, ArmTarget]:
         carry, carried = self._pair.carry, {}
         if carry is not None and not carry.lasts:
-            self._pair.end_carry(now, Reason(ReasonKind.CARRY_ENDED))
+            self._pair.end_carry(now, Reason(TeleopReason.CARRY_ENDED))
             carry = None
         if carry is not None:
             poses = {name: around.expected(name, arm.offset) for name, arm in self._arms.items()}
@@ -191,7 +192,7 @@ class Teleop:
 
     def end_homing(self, now: float, outcome: Reason) -> None:
         """End the way home with an ``outcome``: the arms have arrived, cannot go on, or have stopped by a fault."""
-        fault = outcome.kind in (ReasonKind.HOMING_FAULT, ReasonKind.NOT_HOMING)
+        fault = outcome.kind in (CommonReason.HOMING_FAULT, TeleopReason.NOT_HOMING)
         self._pair.change(Cause.FAULT if fault else Cause.HOMED, now, outcome)
 
     def record_event(self, now: float, reason: Reason) -> None:
@@ -219,7 +220,7 @@ class Teleop:
         """Stop every arm that a hand drives, and forget everything received, because the input is lost."""
         now, _ = self._clock(now)
         if not self.homing or self._pair.asks_home is not None:
-            self._pair.change(Cause.FAULT, now, Reason(ReasonKind.CONNECTION_LOST))
+            self._pair.change(Cause.FAULT, now, Reason(TeleopReason.CONNECTION_LOST))
         for arm in self._arms.values():
             arm.forget()
 
@@ -243,7 +244,7 @@ class Teleop:
     def give_back(self, now: float) -> None:
         """Let the policy go on, because no hand drives an arm any more, until a hand sends again."""
         now, _ = self._clock(now)
-        reason = Reason(ReasonKind.POLICY_REQUESTED)
+        reason = Reason(TeleopReason.POLICY_REQUESTED)
         self._pair.end_carry(now, reason)
         self._pair.change(Cause.GIVE_BACK, now, reason)
         for arm in self._arms.values():
@@ -253,23 +254,23 @@ class Teleop:
         """Return the time that counts, which does not go back, and a fault if the clock went back by too much."""
         last = self._now
         if not math.isfinite(now):
-            return last or 0.0, Reason(ReasonKind.CLOCK_NOT_FINITE)
+            return last or 0.0, Reason(TeleopReason.CLOCK_NOT_FINITE)
         if last is not None and last - self._stall <= now <= last:
             return last, None
         self._now = now
         if last is None or 0.0 < now - last <= self._stall:
             return now, None
         if now > last:
-            return now, Reason.of(ReasonKind.LOOP_STALLED, duration=now - last)
+            return now, Reason.of(CommonReason.LOOP_STALLED, duration=now - last)
         for arm in self._arms.values():
             arm.forget()
-        return now, Reason.of(ReasonKind.CLOCK_WENT_BACK, duration=last - now)
+        return now, Reason.of(TeleopReason.CLOCK_WENT_BACK, duration=last - now)
 
     def _disengage(self, faults: Mapping[str, Reason], now: float) -> None:
         """Stop the arms whose hand has a fault. A fault has no effect if the arm holds anyway."""
         if self.homing:
             if (fault := faults.get(self._pair.asks_home or "")) is not None:
-                self._pair.change(Cause.FAULT, now, Reason(ReasonKind.HOMING_FAULT, cause=fault))
+                self._pair.change(Cause.FAULT, now, Reason(CommonReason.HOMING_FAULT, cause=fault))
             return
         if active := {name: fault for name, fault in faults.items() if self._arms[name].state in _LED}:
             self._stop(active, now)
@@ -280,4 +281,4 @@ class Teleop:
         first, fault = next(iter(faults.items()))
         for name, arm in self._arms.items():
             if self._linked and name not in faults:
-                arm.change(Cause.FAULT, now, Reason.of(ReasonKind.LINKED, cause=fault, arm=first))
+                arm.change(Cause.FAULT, now, Reason.of(TeleopReason.LINKED, cause=fault, arm=first))

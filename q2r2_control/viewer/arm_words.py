@@ -9,9 +9,10 @@ import numpy as np
 
 from q2r2_control.config.bindings import MEANINGS, Action, BindingSettings
 from q2r2_control.device_words import NO_WORDS, DeviceWords
-from q2r2_control.events import Event, Reason, ReasonKind
+from q2r2_control.events import Event, Reason
 from q2r2_control.summary.tick import Tick
 from q2r2_control.teleop.arm_states import ArmState, is_refusal
+from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.types import ActiveLimit, LimitKind
 from q2r2_control.wording import sentence
 
@@ -83,7 +84,7 @@ class ArmWords:
         return held_by or ("catches up" if np.isfinite(distance) else "holds")
 
     def _sentence(self, reason: Reason) -> str:
-        if reason.kind is ReasonKind.DEAD_MAN_RELEASED and (control := self._bindings.words_of(Action.DEAD_MAN)):
+        if reason.kind is TeleopReason.DEAD_MAN_RELEASED and (control := self._bindings.words_of(Action.DEAD_MAN)):
             return f"{self._device.noun(control)} let go"
         return sentence(reason, self._device)
 

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 from q2r2_control.config.recording import subtask_name
-from q2r2_control.events import Event, ReasonKind
+from q2r2_control.events import Event
+from q2r2_control.teleop.reasons import TeleopReason
 
 _EPISODE_OVER = (
-    ReasonKind.EPISODE_ENDS,
-    ReasonKind.EPISODE_SUCCEEDED,
-    ReasonKind.EPISODE_FAILED,
-    ReasonKind.EPISODE_DISCARDED,
+    TeleopReason.EPISODE_ENDS,
+    TeleopReason.EPISODE_SUCCEEDED,
+    TeleopReason.EPISODE_FAILED,
+    TeleopReason.EPISODE_DISCARDED,
 )
 
 
@@ -25,11 +26,11 @@ class EpisodeWords:
 
     def follow(self, events: Iterable[Event]) -> None:
         for event in events:
-            if event.kind is ReasonKind.EPISODE_BEGINS:
+            if event.kind is TeleopReason.EPISODE_BEGINS:
                 self._episodes, self._open, self._subtask = self._episodes + (not self._open), True, 1
             elif event.kind in _EPISODE_OVER:
                 self._open = False
-            elif event.kind is ReasonKind.SUBTASK_BEGINS:
+            elif event.kind is TeleopReason.SUBTASK_BEGINS:
                 self._subtask, self._shows_subtask = event.reason.detail["number"], True
 
     @property

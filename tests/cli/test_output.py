@@ -14,8 +14,9 @@ from q2r2_control.cli.cell_run import CellRun, print_summary
 from q2r2_control.cli.output import late_line
 from q2r2_control.cli.summary_figures import summary_table, verdict_line
 from q2r2_control.demo.assembly_tasks import TaskResult, held_to_promises
-from q2r2_control.events import Event, Reason, ReasonKind
+from q2r2_control.events import CommonReason, Event, Reason
 from q2r2_control.summary.run_summary import Percentiles, TorqueSummary
+from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.viewer.tables import figure_table, print_table
 from q2r2_control.wording import sentence
 from tests.support.hands_input import HandsInput
@@ -71,7 +72,7 @@ def test_the_verdict_names_the_faults_or_says_that_there_are_none(summary: RunSu
     assert verdict_line(good) == "[green]as it should be[/]: left followed, every tick certified, at rest at the end"
     assert verdict_line(good, ["task stack failed"]) == "[red]not as it should be[/]: task stack failed"
     assert verdict_line(replace(good, arms=still)).startswith("[yellow]no arm was engaged[/]")
-    reason = Reason.of(ReasonKind.LOOP_STALLED, duration=0.4)
+    reason = Reason.of(CommonReason.LOOP_STALLED, duration=0.4)
     stopped = verdict_line(replace(good, events=[Event(0.3, "left", "engaged", "lost", reason)]))
     assert stopped == f"[yellow]an arm was stopped or refused[/]: left arm {sentence(reason)}"
     off = good.arms | {"right": replace(good.arms["right"], end_error_mm=130.0)}
@@ -84,7 +85,7 @@ def test_the_verdict_names_the_faults_or_says_that_there_are_none(summary: RunSu
 
 def test_an_arm_that_refused_every_press_is_a_fault(summary: RunSummary) -> None:
     refused = Event(
-        6.0, "left", "paused", "paused", Reason(ReasonKind.NOT_ENGAGED, cause=Reason(ReasonKind.TOOL_UNKNOWN))
+        6.0, "left", "paused", "paused", Reason(TeleopReason.NOT_ENGAGED, cause=Reason(TeleopReason.TOOL_UNKNOWN))
     )
     arms = {name: replace(arm, engaged_s=0.0) for name, arm in summary.arms.items()}
     never = replace(summary, events=[refused], arms=arms)
@@ -135,7 +136,7 @@ def test_the_summary_is_short_without_verbose_but_never_hides_faults(summary: Ru
 def test_an_arm_that_was_not_paused_by_its_button_is_named_with_the_reason(
     summary: RunSummary,
 ) -> None:
-    reason, press = Reason.of(ReasonKind.LOOP_STALLED, duration=0.4), Reason.of(ReasonKind.PRESSED, control="lower")
+    reason, press = Reason.of(CommonReason.LOOP_STALLED, duration=0.4), Reason.of(TeleopReason.PRESSED, control="lower")
     paused = Event(4.07, "left", "engaged", "lost", reason)
     pressed = Event(4.5, "right", "pausing", "paused", press)
     text = text_of(replace(summary, events=[*summary.events, paused, pressed]))
@@ -144,7 +145,7 @@ def test_an_arm_that_was_not_paused_by_its_button_is_named_with_the_reason(
     assert "right arm paused by" not in text
     again = Event(5.0, "left", "paused", "engaged", press)
     assert "paused by" not in text_of(replace(summary, events=[paused, again]))
-    refusal = Reason(ReasonKind.NOT_ENGAGED, cause=Reason(ReasonKind.TOOL_UNKNOWN))
+    refusal = Reason(TeleopReason.NOT_ENGAGED, cause=Reason(TeleopReason.TOOL_UNKNOWN))
     refused = Event(6.0, "left", "paused", "paused", refusal)
     text = text_of(replace(summary, events=[again, refused]))
     assert f"{sentence(refusal)}, at 6.00 s" in text

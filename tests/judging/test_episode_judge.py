@@ -12,8 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from q2r2_control.events import Event, Reason, ReasonKind
-from q2r2_control.events import ReasonKind as K
+from q2r2_control.events import Event, Reason
 from q2r2_control.export.episodes import FrameSampling, keep_episodes, make_episode
 from q2r2_control.judging.episode_judge import EpisodeJudge, Question, written_episode
 from q2r2_control.judging.judge import Judged, judge
@@ -24,6 +23,7 @@ from q2r2_control.recording.recorder import Recorder
 from q2r2_control.recording.replay import replay
 from q2r2_control.summary.tick import Tick
 from q2r2_control.teleop.haptics import EPISODE_KEPT, EPISODE_REJECTED
+from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.types import HapticFeedback
 from tests.export.files import load_vectors, write_vectors
 from tests.judging.episodes import EPISODES, RATE, Work, hands, killed, loop_of, operator, record_episode
@@ -36,7 +36,7 @@ TOGGLED, GIVEN_UP = (1.0, 2.5, 3.0, 4.0, 6.0), 3.7
 VERDICTS_BY = {2.8: 1, 3.9: 1, 6.3: 2}  # [s]
 DURATION = 7.0
 FIRST = EpisodeSpan(1.0, 2.5, number=1)
-BEGINS, ENDS, DISCARDED = K.EPISODE_BEGINS, K.EPISODE_ENDS, K.EPISODE_DISCARDED
+BEGINS, ENDS, DISCARDED = TeleopReason.EPISODE_BEGINS, TeleopReason.EPISODE_ENDS, TeleopReason.EPISODE_DISCARDED
 RESTS = 3.6  # From this time on, the hands rest [s].
 
 
@@ -88,7 +88,7 @@ def test_each_verdict_equals_the_one_after_the_run(run: PatientRun) -> None:
     after = judge(Recording(run.file))
     assert names_of(after) == [[], ["operator"], ["max_idle_share"]]
     assert run.told == [
-        Reason.of(K.VERDICT, episode=number, keep=keep, line=after[number - 1].verdict.line)
+        Reason.of(TeleopReason.VERDICT, episode=number, keep=keep, line=after[number - 1].verdict.line)
         for number, keep in ((1, True), (3, False))
     ]  # The operator knows the other verdict.
 
@@ -199,4 +199,4 @@ def test_kept_episodes_become_episodes_of_a_dataset_with_their_own_frames(file: 
 def test_without_a_recording_the_controls_say_so() -> None:
     loop = loop_of(hands(3, inputs=CONTROLS), teleop=EPISODES)
     summary = loop.run(1.5, realtime=False)
-    assert [event.kind for event in summary.events].count(ReasonKind.NO_RECORDING) == 1
+    assert [event.kind for event in summary.events].count(TeleopReason.NO_RECORDING) == 1

@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 
 from q2r2_control.config.teleop import Stance
-from q2r2_control.events import Event, Reason, ReasonKind
+from q2r2_control.events import Event, Reason
 from q2r2_control.inputs.way_points import minimum_jerk
 from q2r2_control.judging.episode import FRAME
 from q2r2_control.judging.figures import HandFigures, figures_of, hand_figures, timing_figures
 from q2r2_control.judging.motion import arm_figures, delays, idle_share, ldlj, smoothness
+from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.types import Array, Flags
 from q2r2_control.wording import sentence
 from tests.judging.episodes import DT, episode, frame_times
@@ -193,12 +194,12 @@ class TestTiming:
 
 
 def test_faults_are_pauses_that_no_operator_asked_for_each_once() -> None:
-    jumped = Reason.of(ReasonKind.HAND_JUMPED, distance=0.3)
-    pressed, refused = Reason.of(ReasonKind.PRESSED, control="lower button"), Reason(ReasonKind.NOT_ENGAGED)
+    jumped = Reason.of(TeleopReason.HAND_JUMPED, distance=0.3)
+    pressed, refused = Reason.of(TeleopReason.PRESSED, control="lower button"), Reason(TeleopReason.NOT_ENGAGED)
     events = [
         Event(0.5, "left", "paused", "engaged", pressed),
         Event(1.0, "left", "engaged", "lost", jumped),
-        Event(1.0, "right", "engaged", "lost", Reason.of(ReasonKind.LINKED, cause=jumped, arm="left")),
+        Event(1.0, "right", "engaged", "lost", Reason.of(TeleopReason.LINKED, cause=jumped, arm="left")),
         Event(2.0, "left", "paused", "paused", refused),
         Event(3.0, "right", "pausing", "paused", pressed),
     ]

@@ -9,9 +9,11 @@ import pytest
 from q2r2_control.config.moving_obstacle import MovingObstacle
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.drives.base import make_drive
-from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.events import Reason
 from q2r2_control.loop.control_loop import ControlLoop, LoopStep, without_proof
+from q2r2_control.plants.fri.reasons import FriReason
 from q2r2_control.robot.robot import Robot
+from q2r2_control.ros.reasons import RosReason
 from q2r2_control.supervision.joint_watch import watch_settings
 from q2r2_control.supervision.supervisor import Phase
 from q2r2_control.supervision.target_stream import StreamSettings
@@ -49,7 +51,7 @@ def test_arms_of_another_program_are_commanded_after_they_rested_and_not_after_a
     while arms.loop.supervisor.phase is not Phase.ACTIVE:
         assert arms.tick().command is None
     assert arms.tick().command is not None
-    arms.loop.supervisor.stop(Reason(ReasonKind.STOP_SERVICE))
+    arms.loop.supervisor.stop(Reason(RosReason.STOP_SERVICE))
     for _ in range(10):
         step = arms.tick()
     assert arms.loop.supervisor.arm_state("left") == "stopped"
@@ -59,7 +61,7 @@ def test_arms_of_another_program_are_commanded_after_they_rested_and_not_after_a
 def test_the_loops_own_plant_gets_commands_while_the_arms_are_stopped() -> None:
     arms = Arms(owns_plant=True)
     arms.loop.activate(arms.state, arms.now)
-    arms.loop.supervisor.stop(Reason(ReasonKind.STOP_SERVICE))
+    arms.loop.supervisor.stop(Reason(RosReason.STOP_SERVICE))
     for _ in range(10):
         step = arms.tick()
     assert arms.loop.supervisor.phase is Phase.STOPPED
@@ -93,7 +95,7 @@ def test_an_untrusted_state_is_not_used_for_the_push() -> None:
 def test_arms_that_lost_their_session_brake_by_their_state_also_after_its_return() -> None:
     arms = Arms(owns_plant=True)
     arms.loop.activate(arms.state, arms.now)
-    arms.loop.observe(arms.state, arms.now, DT, lost=Reason.of(ReasonKind.FRI_DROPPED, arm="left"))
+    arms.loop.observe(arms.state, arms.now, DT, lost=Reason.of(FriReason.FRI_DROPPED, arm="left"))
     assert arms.tick().trusted
     assert arms.loop.supervisor.state_fault is not None
     arms.home = arms.home + 0.5  # No arm can be at this posture.
@@ -147,5 +149,5 @@ def test_the_age_of_a_hands_report_grows_while_arms_of_another_program_are_not_c
     first = arms.now + DT
     for _ in range(500):
         arms.tick()
-        arms.loop.supervisor.stop(Reason(ReasonKind.STOP_SERVICE))
+        arms.loop.supervisor.stop(Reason(RosReason.STOP_SERVICE))
     assert arms.now - first - 1e-9 <= arms.age <= arms.now - first + DT + 1e-5

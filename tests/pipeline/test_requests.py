@@ -12,9 +12,9 @@ from q2r2_control.config.moving_obstacle import MovingObstacle
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.drives.base import TorqueDrive
 from q2r2_control.errors import ConfigError
-from q2r2_control.events import ReasonKind
 from q2r2_control.robot.obstacle_bodies import distances_with
 from q2r2_control.summary.tick import Tick
+from q2r2_control.teleop.reasons import TeleopReason
 from tests.pipeline.loops import pipeline, when_moving
 from tests.support.processes import cell, changes
 
@@ -107,10 +107,12 @@ def test_a_reported_hand_in_front_of_an_arm_is_named_once_and_brakes_the_arm() -
     loop.listeners.append(report)
     summary = loop.run(3.0, realtime=False)
     assert max(np.abs(tick.reference.v).max() for tick in ticks if tick.t < 2.0) > 0.1
-    named = [event for event in summary.events if event.kind is ReasonKind.OBSTACLE_IN_THE_WAY and event.arm == "left"]
+    named = [
+        event for event in summary.events if event.kind is TeleopReason.OBSTACLE_IN_THE_WAY and event.arm == "left"
+    ]
     assert 1 <= len(named) < 20
     assert "hand_0" in named[0].reason.detail["pair"]
-    assert ReasonKind.OBSTACLE_REPORTED not in {event.kind for event in summary.events}
+    assert TeleopReason.OBSTACLE_REPORTED not in {event.kind for event in summary.events}
     assert min(tick.reference.report.margin for tick in ticks) < 0.0
     with pytest.raises(ConfigError, match="foot"):
         loop.move_obstacle("foot", None)
@@ -146,4 +148,4 @@ def test_a_mark_without_a_recording_is_refused() -> None:
     loop = pipeline()
     loop.listeners.append(when_moving(lambda: loop.mark(Action.RECORD_MARK)))
     kinds = [event.kind for event in loop.run(2.5, realtime=False).events if event.arm == "left"]
-    assert kinds[-2:] == [ReasonKind.RECORDING_REQUESTED, ReasonKind.NO_RECORDING]
+    assert kinds[-2:] == [TeleopReason.RECORDING_REQUESTED, TeleopReason.NO_RECORDING]

@@ -13,6 +13,7 @@ import pytest
 
 from q2r2_control.cameras.camera_process import CameraShot
 from q2r2_control.cameras.camera_streams import CameraStreams
+from q2r2_control.cameras.reasons import CameraReason
 from q2r2_control.config.recording import CameraConfig
 from q2r2_control.errors import CameraError
 from q2r2_control.events import Reason, ReasonKind
@@ -129,12 +130,12 @@ def test_a_camera_that_ends_is_told_of_once_and_marks_the_episode_and_the_run_go
     video = write_video(tmp_path / "short.avi", range(5))
     with caplog.at_level(logging.WARNING):
         done = RecordedRun(tmp_path, front(video, repeat=False), two_ticks_later)
-    assert done.reports == [ReasonKind.CAMERA_STOPPED]
+    assert done.reports == [CameraReason.CAMERA_STOPPED]
     (line,) = [text for text in caplog.messages if text.startswith("camera front: no picture for ")]
     assert line.endswith(" s: the video has ended")
     assert done.summary.lost_pictures >= 20, "a second without pictures, at least"
     episode = read_episode(Recording(file_of(done.summary)))
-    assert {event.kind for event in episode.events} >= {ReasonKind.CAMERA_STOPPED}
+    assert {event.kind for event in episode.events} >= {CameraReason.CAMERA_STOPPED}
     assert replay(file_of(done.summary)).difference is None, "the mark too"
     assert camera_figures(episode)["front"].missing_pictures == pytest.approx(done.summary.lost_pictures, abs=2)
 
@@ -145,7 +146,7 @@ def test_when_the_process_of_a_camera_is_killed_the_run_goes_on(tmp_path: Path) 
         if run.recorder.device_pictures and alive(process.pid):
             os.kill(process.pid, signal.SIGKILL)
             wait_until(lambda: not process.alive)
-        return ReasonKind.CAMERA_STOPPED in run.reports
+        return CameraReason.CAMERA_STOPPED in run.reports
 
     done = RecordedRun(tmp_path, front(write_video(tmp_path / "front.avi", range(COUNT))), killed)
     assert done.streams.streams["front"].why_lost == "the process that reads camera front was ended by SIGKILL"

@@ -14,17 +14,17 @@ from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
 
 from q2r2_control.errors import RecordingError
-from q2r2_control.events import Event, Reason
-from q2r2_control.events import ReasonKind as K
+from q2r2_control.events import Event, Reason, ReasonKind
 from q2r2_control.recording import messages
 from q2r2_control.recording.about import About, Conclusion
 from q2r2_control.recording.bag import BagWriter
 from q2r2_control.recording.reader import Recording, recordings_in, spans_of
 from q2r2_control.recording.tick_rows import numbers_in, tick_labels, tick_type
+from q2r2_control.teleop.reasons import TeleopReason
 from tests.recording.runs import pipeline
 
-BEGINS, ENDS, DISCARDED = K.EPISODE_BEGINS, K.EPISODE_ENDS, K.EPISODE_DISCARDED
-SUCCEEDED, FAILED = K.EPISODE_SUCCEEDED, K.EPISODE_FAILED
+BEGINS, ENDS, DISCARDED = TeleopReason.EPISODE_BEGINS, TeleopReason.EPISODE_ENDS, TeleopReason.EPISODE_DISCARDED
+SUCCEEDED, FAILED = TeleopReason.EPISODE_SUCCEEDED, TeleopReason.EPISODE_FAILED
 
 CASES = {
     "none at all: the whole run": ([], [(-math.inf, math.inf, False, None)]),
@@ -38,7 +38,10 @@ CASES = {
         [(1.0, BEGINS), (2.0, ENDS), (2.5, DISCARDED), (3.0, BEGINS), (4.0, ENDS)],
         [(1.0, 2.0, True, None), (3.0, 4.0, False, None)],
     ),
-    "other events": ([(0.5, K.MARK), (1.0, BEGINS), (1.5, K.POSE_SILENT)], [(1.0, math.inf, False, None)]),
+    "other events": (
+        [(0.5, TeleopReason.MARK), (1.0, BEGINS), (1.5, TeleopReason.POSE_SILENT)],
+        [(1.0, math.inf, False, None)],
+    ),
     "success and failure of the one that goes on, which they end": (
         [(1.0, BEGINS), (2.0, SUCCEEDED), (3.0, BEGINS), (4.0, FAILED)],
         [(1.0, 2.0, False, True), (3.0, 4.0, False, False)],
@@ -52,13 +55,13 @@ CASES = {
 }
 
 
-def events(*told: tuple[float, K]) -> list[Event]:
+def events(*told: tuple[float, ReasonKind]) -> list[Event]:
     return [Event(t, "left", "engaged", "engaged", Reason(kind)) for t, kind in told]
 
 
 @pytest.mark.parametrize(("told", "expected"), CASES.values(), ids=CASES)
 def test_episodes_are_those_that_the_operator_began_and_rated(
-    told: list[tuple[float, K]], expected: list[tuple[float, float, bool, bool | None]]
+    told: list[tuple[float, ReasonKind]], expected: list[tuple[float, float, bool, bool | None]]
 ) -> None:
     spans = spans_of(events(*told))
     assert [(span.start, span.end, span.discarded, span.success) for span in spans] == expected

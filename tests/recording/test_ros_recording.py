@@ -19,7 +19,6 @@ from q2r2_control.config.recording import CameraConfig
 from q2r2_control.config.strict import STREAM_TIMEOUT
 from q2r2_control.errors import RecordingError
 from q2r2_control.events import Event, Reason, ReasonKind
-from q2r2_control.events import ReasonKind as K
 from q2r2_control.export.episodes import FrameSampling, make_episode
 from q2r2_control.judging.judge import judge
 from q2r2_control.recording import messages as names
@@ -29,6 +28,7 @@ from q2r2_control.recording.recorder import ROOM, MessageRecorder
 from q2r2_control.recording.replay import replay
 from q2r2_control.recording.ros_recording import open_recording
 from q2r2_control.recording.tick_chunks import TickChunk
+from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.types import Array
 from tests.recording.runs import read_elsewhere, rewrite
 from tests.support.external_cell import external
@@ -168,7 +168,7 @@ def test_a_target_that_ended_does_not_belong_to_later_ticks(nodes: NodesOnFile) 
 
 def test_a_tick_whose_reference_was_lost_counts_as_lost_but_its_events_are_kept(nodes: NodesOnFile) -> None:
     play(nodes, 10)
-    nodes.event(15 * PERIOD - 1000, K.MARK)
+    nodes.event(15 * PERIOD - 1000, TeleopReason.MARK)
     lost = nodes.topics.pop(names.REFERENCE)
     with pytest.raises(KeyError):
         nodes.tick(15 * PERIOD, 11, np.array(nodes.robot.home))
@@ -206,8 +206,12 @@ def test_no_tick_is_dropped_for_numbers_that_the_robot_does_not_measure(nodes: N
 
 def test_episodes_are_those_of_the_events_of_arms_and_services(nodes: NodesOnFile) -> None:
     for at, kind, arm in (
-        *((20, K.EPISODE_BEGINS, "left"), (60, K.MARK, "right"), (80, K.EPISODE_ENDS, "right")),
-        *((100, K.EPISODE_BEGINS, None), (120, K.EPISODE_DISCARDED, None)),
+        *(
+            (20, TeleopReason.EPISODE_BEGINS, "left"),
+            (60, TeleopReason.MARK, "right"),
+            (80, TeleopReason.EPISODE_ENDS, "right"),
+        ),
+        *((100, TeleopReason.EPISODE_BEGINS, None), (120, TeleopReason.EPISODE_DISCARDED, None)),
     ):
         play(nodes, 15, first=at - 15, index=at)
         nodes.event(at * PERIOD, kind, arm)
@@ -222,8 +226,8 @@ def test_episodes_are_those_of_the_events_of_arms_and_services(nodes: NodesOnFil
 
 
 def test_episodes_are_found_even_if_no_controller_was_active(nodes: NodesOnFile) -> None:
-    nodes.event(PERIOD, K.EPISODE_BEGINS)
-    nodes.event(5 * PERIOD, K.EPISODE_ENDS, None)
+    nodes.event(PERIOD, TeleopReason.EPISODE_BEGINS)
+    nodes.event(5 * PERIOD, TeleopReason.EPISODE_ENDS, None)
     (span,) = read_spans(open_recording(nodes.close()))
     assert (span.start, span.end) == (pytest.approx(0.004), pytest.approx(0.02))
 
@@ -262,10 +266,10 @@ def test_a_known_step_is_in_action_and_observation_at_the_frames_of_its_times(no
 def test_an_episode_with_a_changed_clock_is_discarded_and_not_exported_but_others_are(
     nodes: NodesOnFile, tmp_path: Path, step: int
 ) -> None:
-    nodes.event(1, K.EPISODE_BEGINS)
+    nodes.event(1, TeleopReason.EPISODE_BEGINS)
     play(nodes, 200, engaged=range(5, 205))
-    nodes.event(205 * PERIOD, K.EPISODE_ENDS)
-    nodes.event(206 * PERIOD, K.EPISODE_BEGINS)
+    nodes.event(205 * PERIOD, TeleopReason.EPISODE_ENDS)
+    nodes.event(206 * PERIOD, TeleopReason.EPISODE_BEGINS)
     play(nodes, 100, first=207, index=201, engaged=range(207, 300))
     border = nodes.epoch + 104 * PERIOD
 

@@ -12,13 +12,14 @@ import pytest
 from q2r2_control.config.bindings import Action
 from q2r2_control.config.recording import JudgeSettings, RecordingSettings
 from q2r2_control.config.teleop import TeleopSettings
-from q2r2_control.events import ReasonKind as K
+from q2r2_control.events import ReasonKind
 from q2r2_control.export.episodes import FrameSampling, make_episode, spans_to_export
 from q2r2_control.inputs.played import EvenSampling, PlayedInput
 from q2r2_control.judging.judge import Judged, judge
 from q2r2_control.recording.reader import Recording, read_spans
 from q2r2_control.recording.replay import replay
 from q2r2_control.summary.tick import Tick
+from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.types import SIDES, HandInputs
 from tests.export.files import step_of_the_hand
 from tests.recording.runs import file_of, pipeline, record
@@ -53,28 +54,40 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return recorded(tmp_path_factory.mktemp("subtasks"), TOGGLED, NEXT)
 
 
-def told_in(file: Path) -> list[tuple[K, dict[str, object]]]:
+def told_in(file: Path) -> list[tuple[ReasonKind, dict[str, object]]]:
     events = [event for chunk in Recording(file).chunks() for told in chunk.events().values() for event in told]
-    wanted = {K.SUBTASK_BEGINS, K.EPISODE_BEGINS, K.EPISODE_ENDS, K.LAST_SUBTASK, K.NO_OPEN_EPISODE}
+    wanted = {
+        TeleopReason.SUBTASK_BEGINS,
+        TeleopReason.EPISODE_BEGINS,
+        TeleopReason.EPISODE_ENDS,
+        TeleopReason.LAST_SUBTASK,
+        TeleopReason.NO_OPEN_EPISODE,
+    }
     return [(event.kind, dict(event.reason.detail)) for event in events if event.kind in wanted]
 
 
 def test_number_and_name_of_each_subtask_are_in_the_file(file: Path) -> None:
     assert told_in(file) == [
-        (K.SUBTASK_BEGINS, {"number": 2, "name": "grasp the cube"}),  # The run may be one episode until here.
-        (K.EPISODE_BEGINS, {}),
-        (K.SUBTASK_BEGINS, {"number": 2, "name": "grasp the cube"}),
-        (K.SUBTASK_BEGINS, {"number": 3, "name": "place"}),
-        (K.EPISODE_ENDS, {}),
-        (K.NO_OPEN_EPISODE, {}),
-        (K.EPISODE_BEGINS, {}),
-        (K.SUBTASK_BEGINS, {"number": 2, "name": "grasp the cube"}),
+        (
+            TeleopReason.SUBTASK_BEGINS,
+            {"number": 2, "name": "grasp the cube"},
+        ),  # The run may be one episode until here.
+        (TeleopReason.EPISODE_BEGINS, {}),
+        (TeleopReason.SUBTASK_BEGINS, {"number": 2, "name": "grasp the cube"}),
+        (TeleopReason.SUBTASK_BEGINS, {"number": 3, "name": "place"}),
+        (TeleopReason.EPISODE_ENDS, {}),
+        (TeleopReason.NO_OPEN_EPISODE, {}),
+        (TeleopReason.EPISODE_BEGINS, {}),
+        (TeleopReason.SUBTASK_BEGINS, {"number": 2, "name": "grasp the cube"}),
     ]
     assert replay(file).difference is None
 
 
 def test_a_press_in_the_last_subtask_is_refused_with_its_name(tmp_path: Path) -> None:
-    assert told_in(recorded(tmp_path, (), (0.4, 0.8), NAMES[:2]))[-1] == (K.LAST_SUBTASK, {"name": "grasp the cube"})
+    assert told_in(recorded(tmp_path, (), (0.4, 0.8), NAMES[:2]))[-1] == (
+        TeleopReason.LAST_SUBTASK,
+        {"name": "grasp the cube"},
+    )
 
 
 def test_each_episode_has_the_subtasks_that_were_begun_in_it(file: Path) -> None:

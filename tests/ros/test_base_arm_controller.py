@@ -26,9 +26,9 @@ from rosgraph_msgs.msg import Clock
 from std_msgs.msg import String
 
 from q2r2_control.errors import ConfigError
-from q2r2_control.events import ReasonKind
 from q2r2_control.ros.bridge.messages import time_message
 from q2r2_control.ros.nodes.arm_controllers import LeftArmController
+from q2r2_control.ros.reasons import RosReason
 from q2r2_control.teleop.haptics import GRASP, NEAR
 from tests.ros.arm_rig import TOOL, ArmRig, assert_same, offset, patient, steps, target_of
 from tests.ros.programs.stalling_arm import STALL
@@ -94,9 +94,9 @@ def test_a_silent_hand_pauses_the_arm_and_its_return_moves_nothing(rig: ArmRig, 
     rig.move((0.1, 0.0, 0.0), 0.2)
     rig.sends_hand = False
     rig.wait(lambda: rig.state["state"] == "lost", "the watchdog pauses the arm")
-    assert rig.state["last_event_kind"] == ReasonKind.HAND_SILENT
+    assert rig.state["last_event_kind"] == RosReason.HAND_SILENT
     assert "/test" in rig.state["last_event"]
-    rig.wait(lambda: rig.state.get("kind") == ReasonKind.HAND_SILENT, "diagnostics say so")
+    rig.wait(lambda: rig.state.get("kind") == RosReason.HAND_SILENT, "diagnostics say so")
     assert "/test" in rig.state["message"]
     assert rig.state["level"] == "warn"
     held = rig.wait_for_rest()
@@ -122,7 +122,7 @@ def test_a_node_that_stood_still_in_a_tick_sends_no_target_of_the_past(rig: ArmR
     time.sleep(0.5 * STALL)
     before, held = len(rig.targets), rig.newest()
     assert held.translation[0] > TOOL.translation[0] + 0.05  # The arm was moving.
-    rig.wait(lambda: rig.state["last_event_kind"] == ReasonKind.NODE_STALLED, "it has gone on")
+    rig.wait(lambda: rig.state["last_event_kind"] == RosReason.NODE_STALLED, "it has gone on")
     mover.join()
     assert len(rig.targets) == before
     rig.engage()
@@ -134,20 +134,20 @@ def test_an_arm_needs_the_pose_of_its_tool_and_a_gripper_needs_its_server(rig: A
     rig.sends_tool = False
     rig.start(processes)
     rig.press()
-    rig.wait(lambda: rig.state["last_event_kind"] == ReasonKind.NO_TRANSFORM, "the press is refused")
-    assert (rig.state["level"], rig.state["kind"]) == ("warn", ReasonKind.NO_TOOL_POSE)
+    rig.wait(lambda: rig.state["last_event_kind"] == RosReason.NO_TRANSFORM, "the press is refused")
+    assert (rig.state["level"], rig.state["kind"]) == ("warn", RosReason.NO_TOOL_POSE)
     assert "left_tool_frame" in rig.state["message"]
     rig.sends_tool = True
     rig.engage()
     rig.wait(lambda: rig.targets, "targets come")
     rig.sends_tool = False
     rig.wait(lambda: rig.state["state"] == "lost", "an arm whose tool is not seen any more is paused")
-    assert rig.state["last_event_kind"] == ReasonKind.TRANSFORM_OLD
+    assert rig.state["last_event_kind"] == RosReason.TRANSFORM_OLD
     assert "/test" in rig.state["last_event"]
 
     rig.sends_tool = True
     rig.press("upper")
-    rig.wait(lambda: rig.state.get("kind") == ReasonKind.GRIPPER_FAILED, "it is reported")
+    rig.wait(lambda: rig.state.get("kind") == RosReason.GRIPPER_FAILED, "it is reported")
     assert "/q2r2/left_gripper/gripper_cmd" in rig.state["message"]
     assert rig.state["gripper"] == "open"
 
@@ -162,7 +162,7 @@ def test_services_and_a_second_publisher_of_targets_pause_the_arm(rig: ArmRig, n
     rig.engage()
     second = node.create_publisher(PoseStamped, "/q2r2/left/target_frame", 1)
     rig.wait(lambda: rig.state["level"] == "error", "the second publisher is reported")
-    assert rig.state["kind"] == ReasonKind.SEVERAL_PUBLISHERS
+    assert rig.state["kind"] == RosReason.SEVERAL_PUBLISHERS
     assert "/q2r2/left/target_frame" in rig.state["message"]
     assert rig.state["state"] == "lost"
     rig.press()
@@ -179,7 +179,7 @@ def test_a_second_publisher_of_the_same_hand_pauses_the_arm_and_is_named(
     rig.engage()
     with spun_node(domain, "another_headset") as other:
         other.create_publisher(PoseStamped if topic.endswith("pose") else OVR2ROSInputs, topic, 1)
-        rig.wait(lambda: rig.state.get("kind") == ReasonKind.SEVERAL_PUBLISHERS, "the second publisher is reported")
+        rig.wait(lambda: rig.state.get("kind") == RosReason.SEVERAL_PUBLISHERS, "the second publisher is reported")
         assert rig.state["level"] == "error"
         rig.wait(lambda: f"/{topic} (/another_headset and /test)" in rig.state["message"], "both are named")
         assert rig.state["state"] == "lost"
@@ -225,7 +225,7 @@ def test_a_gripper_is_closed_when_its_result_says_so(kind: str, rig: ArmRig, pro
         rig.press("upper")
         command = goals.get(timeout=PATIENCE)
         assert (command.position[0] if joint else command.position) == 0.04
-        rig.wait(lambda: rig.state.get("kind") == ReasonKind.GRIPPER_FAILED, "the failure is reported")
+        rig.wait(lambda: rig.state.get("kind") == RosReason.GRIPPER_FAILED, "the failure is reported")
         assert rig.state["gripper"] == "closed"
 
 
@@ -250,7 +250,7 @@ def test_without_time_an_arm_is_neither_engaged_nor_paused(rig: ArmRig, node: An
     diagnostics: list[DiagnosticStatus] = []
     node.create_subscription(DiagnosticArray, "/diagnostics", lambda message: diagnostics.extend(message.status), 10)
     rig.start(processes, {"use_sim_time": True})
-    rig.wait(lambda: rig.state.get("clock_problem") == {"kind": ReasonKind.NO_CLOCK}, "it says so")
+    rig.wait(lambda: rig.state.get("clock_problem") == {"kind": RosReason.NO_CLOCK}, "it says so")
     rig.wait(lambda: diagnostics and "clock_problem" in {one.key for one in diagnostics[-1].values}, "diagnostics too")
     assert (diagnostics[-1].name, diagnostics[-1].level) == ("/left_q2r2_arm_controller", DiagnosticStatus.ERROR)
     rig.press()
@@ -264,7 +264,7 @@ def test_without_time_an_arm_is_neither_engaged_nor_paused(rig: ArmRig, node: An
     rig.engage()
     node.destroy_timer(timer)
     # On a machine with other load, another fault may have paused it before. Therefore its present reason is asked for.
-    rig.wait(lambda: rig.state.get("clock_problem") == {"kind": ReasonKind.CLOCK_STANDS}, "it says that time stops")
+    rig.wait(lambda: rig.state.get("clock_problem") == {"kind": RosReason.CLOCK_STANDS}, "it says that time stops")
     rig.wait(lambda: not rig.state["engaged"] and not rig.state["ready"], "it is paused")
     rig.press()
     node.create_timer(0.01, send_time)

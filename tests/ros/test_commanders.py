@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from q2r2_control import Robot
+from q2r2_control.ros.reasons import RosReason
 from tests.ros.conftest import need_ros
 from tests.ros.processes import Processes
 
@@ -59,7 +60,7 @@ def test_a_second_publisher_of_commands_stops_both_arms_and_is_named(driven: Dri
     long = 3.0 * NODE_RATE  # This is a number of commands. After it, earlier publishers are discovered.
     wait_until(lambda: driven.state("sent")[TOPIC] > long, "it has driven for some seconds")
     second = driven.node.create_publisher(JointTrajectory, TOPIC, 1)
-    assert "/test commands the arms on /joint_trajectory" in driven.wait_for_fault(ReasonKind.OTHER_COMMANDER)
+    assert "/test commands the arms on /joint_trajectory" in driven.wait_for_fault(RosReason.OTHER_COMMANDER)
     assert {driven.state(f"{arm}_state") for arm in driven.robot.arms} == {"stopped"}
     driven.end_streams()
 
@@ -68,7 +69,7 @@ def test_a_second_publisher_of_commands_stops_both_arms_and_is_named(driven: Dri
     wait_until(lambda: driven.state("phase") == "active", "it is active again", lambda: driven.states)
     driven.engage("left", "right")
     second.publish(here(driven))
-    assert "/test commands the arms" in driven.wait_for_fault(ReasonKind.OTHER_COMMANDER)
+    assert "/test commands the arms" in driven.wait_for_fault(RosReason.OTHER_COMMANDER)
     driven.end_streams()
 
     timer = driven.node.create_timer(0.02, lambda: second.publish(here(driven)))

@@ -11,13 +11,14 @@ from typing import Any
 import pytest
 
 from q2r2_control import Robot
+from q2r2_control.ros.reasons import RosReason
 from tests.ros.conftest import need_ros
 from tests.ros.processes import Processes
 
 need_ros()
 pytestmark = pytest.mark.alone
 
-from q2r2_control.events import ReasonKind
+
 from tests.ros.cell import JointRecorder
 from tests.ros.cockpit import ARMS, CONTROLLER, Cockpit
 from tests.ros.processes import wait_until
@@ -88,7 +89,7 @@ def test_a_frozen_node_stops_both_arms_and_moves_none_when_it_continues(moving: 
     joints = stopped(moving, "arms frozen", fault)
     time.sleep(max(fault + FROZEN - time.monotonic(), 0.0))
     moving.signal(ARMS, signal.SIGCONT)
-    moving.rigs.wait(lambda rig: rig.state["last_event_kind"] == ReasonKind.NODE_STALLED, "the pause is reported")
+    moving.rigs.wait(lambda rig: rig.state["last_event_kind"] == RosReason.NODE_STALLED, "the pause is reported")
     assert_only_a_press_moves(moving, joints)
 
 

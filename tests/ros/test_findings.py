@@ -10,7 +10,8 @@ from typing import Any
 import pytest
 
 from q2r2_control import load_config
-from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.events import Reason
+from q2r2_control.ros.reasons import RosReason
 from q2r2_control.ros.watching.findings import PACKAGES, Finding, examine_environment, examine_set
 from q2r2_control.ros.watching.set_view import NodeView, SetView, TopicView, arm_views
 from q2r2_control.wording import sentence
@@ -67,7 +68,7 @@ def test_there_are_no_findings_in_a_good_set_or_without_a_set() -> None:
 
 OTHER = node("/other", phase="active", left_state="holding")
 STOPPED = "/c is stopped: by hand; call /c/reset"
-NO_CLOCK = Reason(ReasonKind.NO_CLOCK)
+NO_CLOCK = Reason(RosReason.NO_CLOCK)
 NO_SUBSCRIBER = "/left/target has no subscriber"
 STOPPING = {
     "two publishers of a target": (

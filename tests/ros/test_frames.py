@@ -19,9 +19,10 @@ from geometry_msgs.msg import TransformStamped
 from rclpy.serialization import serialize_message
 from tf2_msgs.msg import TFMessage
 
-from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.events import Reason
 from q2r2_control.ros.base_node import LATCHED_QOS
 from q2r2_control.ros.bridge.frames import FrameListener, FrameTree, ReadTransform, read_transforms
+from q2r2_control.ros.reasons import RosReason
 from tests.ros.arm_rig import stamped_transform
 from tests.ros.processes import wait_until
 
@@ -104,7 +105,7 @@ def test_two_publishers_of_a_frame_block_it_if_they_disagree(
 ) -> None:
     node.now = 0.0  # Nodes of the package have this attribute.
     listener = FrameListener(node)
-    disputed = Reason.of(ReasonKind.FRAME_DISPUTED, frame="mount", publishers="/another and /test")
+    disputed = Reason.of(RosReason.FRAME_DISPUTED, frame="mount", publishers="/another and /test")
     timers = [send_from(node, "mount", A, 300), send_from(node, "elsewhere", B, 0)]
     wait_until(lambda: listener.tree.find("mount", "world") is not None, "one publisher is heard")
     assert listener.conflict("mount") is None

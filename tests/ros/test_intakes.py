@@ -16,6 +16,9 @@ from q2r2_control import Robot
 from q2r2_control.config.cell import load_config
 from q2r2_control.errors import ConfigError
 from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.ros.reasons import RosReason
+from q2r2_control.supervision.reasons import SupervisionReason
+from q2r2_control.teleop.reasons import TeleopReason
 from tests.ros.conftest import need_ros
 
 need_ros()
@@ -72,7 +75,7 @@ def test_a_late_target_is_passed_on_as_none_and_reported(context: Any, robot: Ro
         targets.arrive(stamped_pose(pin.SE3.Identity(), "world", 0.0), took)
         if took == LATE:
             (refusal,) = intake.faults().values()
-            assert (refusal.kind, refusal.detail["late"]) == (ReasonKind.TARGET_LATE, pytest.approx(1.0, abs=0.01))
+            assert (refusal.kind, refusal.detail["late"]) == (RosReason.TARGET_LATE, pytest.approx(1.0, abs=0.01))
     assert taken == [True, True, False, True]
     assert intake.rejected["left"] == 1
     assert intake.faults() == {}
@@ -101,13 +104,13 @@ def test_a_target_from_before_the_standstill_of_its_sender_is_late_by_its_stamp(
 def test_a_target_that_is_not_used_is_reported_once_for_each_reason(context: Any, robot: Robot) -> None:
     node, reports = BaseNode("intake", context=context), []
     intake = TargetIntake(node, robot, lambda: reports.append(intake.faults()["left"]))
-    away = Reason.of(ReasonKind.STREAM_AWAY, distance=0.1, angle=0.0, engage_distance=0.03, engage_angle=0.3)
+    away = Reason.of(SupervisionReason.STREAM_AWAY, distance=0.1, angle=0.0, engage_distance=0.03, engage_angle=0.3)
     intake.subscribe(lambda arm, pose, *_: None if pose is None else away, lambda arm: None)
     targets = Arrivals(node, "/q2r2/left/target_frame")
     for frame in ("elsewhere", "world"):
         for _ in range(5):
             targets.arrive(stamped_pose(pin.SE3.Identity(), frame, 0.0), USUAL)
-    assert reports == [Reason.of(ReasonKind.TARGET_FRAME, frame="elsewhere", allowed="world"), away]
+    assert reports == [Reason.of(RosReason.TARGET_FRAME, frame="elsewhere", allowed="world"), away]
     assert intake.rejected["left"] == 10
     node.destroy_node()
 
@@ -200,7 +203,7 @@ def test_publishers_on_one_topic_are_merged_by_joint_and_a_missing_joint_is_name
         Arrivals(node, "/joint_states").arrive(message)
 
     send(0, 5)
-    assert taken == [Reason.of(ReasonKind.BAD_JOINT_STATES, text=f"no joint {names[5]} and 8 more")]
+    assert taken == [Reason.of(RosReason.BAD_JOINT_STATES, text=f"no joint {names[5]} and 8 more")]
     send(5, 14)
     np.testing.assert_allclose(taken[-1].q, q)
     q += 0.1
@@ -253,7 +256,7 @@ def test_an_admittance_has_no_good_state_without_external_torques(context: Any, 
     names, torques = list(robot.joint_names), np.arange(len(robot.home), dtype=float)
     states, felt = Arrivals(node, "/joint_states"), Arrivals(node, "/felt")
     states.arrive(JointState(name=names, position=robot.home.tolist()))
-    assert taken[-1] == Reason.of(ReasonKind.NO_EXTERNAL_TORQUES, topic="/felt")
+    assert taken[-1] == Reason.of(RosReason.NO_EXTERNAL_TORQUES, topic="/felt")
     felt.arrive(JointState(name=names[::-1], effort=torques[::-1].tolist()))
     states.arrive(JointState(name=names, position=robot.home.tolist()))
     assert isinstance(taken[-1], RobotState)
@@ -272,16 +275,16 @@ def test_an_arm_pauses_when_its_controller_does_not_follow_but_not_on_its_way_ho
     following, states = Arrivals(node, "/controller/following/left"), Arrivals(node, "/controller/state")
     topic = "/controller/following/left"
     assert watch.refusal(True, 0.0) is None
-    assert watch.refusal(True, 9.0) == Reason.of(ReasonKind.NOT_FOLLOWED, topic=topic), "one that says nothing"
+    assert watch.refusal(True, 9.0) == Reason.of(RosReason.NOT_FOLLOWED, topic=topic), "one that says nothing"
     following.arrive(Bool(data=False))
     assert watch.refusal(False, 10.0) is None
     assert watch.refusal(True, 10.1) is None
-    assert watch.refusal(True, 10.5) == Reason.of(ReasonKind.NOT_FOLLOWED, topic=topic)
+    assert watch.refusal(True, 10.5) == Reason.of(RosReason.NOT_FOLLOWED, topic=topic)
     following.arrive(Bool(data=True))
     assert watch.refusal(True, 11.0) is None
     assert watch.refusal(True, 11.5) is None
     following.arrive(Bool(data=False))
-    assert watch.refusal(True, 11.6) == Reason.of(ReasonKind.FOLLOWED_NO_MORE, topic=topic)
+    assert watch.refusal(True, 11.6) == Reason.of(RosReason.FOLLOWED_NO_MORE, topic=topic)
     states.arrive(String(data=controller_state("homing", None)))
     for text in ("no JSON", "[]", "{}"):
         states.arrive(String(data=text))
@@ -297,12 +300,12 @@ def controller_state(arm: str, fault: Reason | None, outcome: Reason | None = No
 @pytest.mark.parametrize(
     ("arm", "fault", "unready"),
     [
-        ("following", Reason(ReasonKind.STOP_SERVICE), None),  # The arm's state decides.
+        ("following", Reason(RosReason.STOP_SERVICE), None),  # The arm's state decides.
         ("paused", None, "controller_on_pause"),
         ("inactive", None, "controller_phase"),
-        ("inactive", Reason(ReasonKind.CLOCK_NOT_FINITE), "controller_fault"),
-        ("stopped", Reason(ReasonKind.STOP_SERVICE), "controller_stopped"),
-        ("deactivated", Reason.of(ReasonKind.CONTROLLER_DEACTIVATED, controller="/c"), "controller_deactivated"),
+        ("inactive", Reason(TeleopReason.CLOCK_NOT_FINITE), "controller_fault"),
+        ("stopped", Reason(RosReason.STOP_SERVICE), "controller_stopped"),
+        ("deactivated", Reason.of(RosReason.CONTROLLER_DEACTIVATED, controller="/c"), "controller_deactivated"),
     ],
 )
 def test_the_reason_why_a_controller_does_not_follow_is_read_from_its_state(
@@ -327,12 +330,12 @@ def test_an_arm_is_not_ready_before_each_controller_has_reported_its_joint_state
         return None if (unready := arm.outputs.unready) is None else unready.root.kind
 
     for _ in range(2):
-        wait_until(lambda: obstacle() is ReasonKind.NO_SUBSCRIBER, "no controller is there")
+        wait_until(lambda: obstacle() is RosReason.NO_SUBSCRIBER, "no controller is there")
         controller = BaseNode("cartesian_controller", context=context)
         controller.create_subscription(PoseStamped, arm.outputs.first.topic, lambda message: None, 1)
-        wait_until(lambda: obstacle() is ReasonKind.TOPIC_EMPTY, "a controller is there that has not reported")
-        no_states = Reason.of(ReasonKind.NO_STATES_YET, source="")
-        for said, kind in ((("inactive", no_states), ReasonKind.NO_STATES_YET), (("holding", None), None)):
+        wait_until(lambda: obstacle() is RosReason.TOPIC_EMPTY, "a controller is there that has not reported")
+        no_states = Reason.of(SupervisionReason.NO_STATES_YET, source="")
+        for said, kind in ((("inactive", no_states), SupervisionReason.NO_STATES_YET), (("holding", None), None)):
             states.arrive(String(data=controller_state(*said)))
             assert obstacle() is kind
         controller.destroy_node()
@@ -350,17 +353,17 @@ def test_a_subclass_without_a_preset_is_not_ready_for_another_projects_controlle
         arm.outputs.take_fault(arm.now)
         return arm.outputs.unready
 
-    wait_until(lambda: (why := unready()) and why.root.kind is not ReasonKind.NO_SUBSCRIBER, "it has a subscriber")
+    wait_until(lambda: (why := unready()) and why.root.kind is not RosReason.NO_SUBSCRIBER, "it has a subscriber")
     absent = unready()
     assert absent is not None
-    assert absent.root.kind is ReasonKind.CONTROLLER_ABSENT
+    assert absent.root.kind is RosReason.CONTROLLER_ABSENT
     assert "nobody publishes /cartesian_controller/state (std_msgs/msg/String)" in sentence(absent)
     controller = BaseNode("cartesian_controller", context=context)
-    wait_until(lambda: (why := unready()) and why.root.kind is ReasonKind.TOPIC_EMPTY, "the built-in controller begins")
+    wait_until(lambda: (why := unready()) and why.root.kind is RosReason.TOPIC_EMPTY, "the built-in controller begins")
     Arrivals(arm, "/cartesian_controller/state").arrive(String(data=controller_state("holding", None)))
     assert unready() is None
     controller.destroy_node()
-    wait_until(lambda: (why := unready()) and why.root.kind is ReasonKind.CONTROLLER_ABSENT, "it has ended")
+    wait_until(lambda: (why := unready()) and why.root.kind is RosReason.CONTROLLER_ABSENT, "it has ended")
     for node in (theirs, arm):
         node.destroy_node()
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from q2r2_control import Robot
+from q2r2_control.ros.reasons import RosReason
 from tests.ros.conftest import need_ros, spun_node
 from tests.ros.processes import Processes
 
@@ -21,7 +22,7 @@ from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.events import Reason
 from q2r2_control.ros.base_node import STREAM_QOS
 from q2r2_control.wording import sentence
 from tests.ros.cell import PATIENT, SOFT, Cell, changed_cell, shifted, start_controller, start_robot
@@ -106,7 +107,7 @@ def test_the_controller_takes_over_where_another_silent_node_has_left_the_arms(c
     assert np.abs(cell.q - goal).max() < 0.02
     assert not cell.ask(Transition.TRANSITION_ACTIVATE)
     assert cell.lifecycle() == "inactive"
-    why = sentence(Reason.of(ReasonKind.OTHER_COMMANDER, nodes="/test", topic="/joint_trajectory"))
+    why = sentence(Reason.of(RosReason.OTHER_COMMANDER, nodes="/test", topic="/joint_trajectory"))
     wait_until(lambda: why in cell.processes[1].output, "the log says why")
     cell.node.destroy_timer(timer)
     time.sleep(0.5)

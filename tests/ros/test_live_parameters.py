@@ -24,12 +24,13 @@ from q2r2_control import CartesianController, Robot
 from q2r2_control.compliance.impedance import ImpedanceController
 from q2r2_control.config.control import ImpedanceSettings
 from q2r2_control.errors import ConfigError
-from q2r2_control.events import ReasonKind
 from q2r2_control.ros import BaseArmController
 from q2r2_control.ros.base_node import BaseNode
 from q2r2_control.ros.bridge.live_parameters import make_control_live, make_impedance_live
 from q2r2_control.ros.bridge.messages import stamped_pose
 from q2r2_control.ros.nodes.arm_controllers import LeftArmController, RightArmController
+from q2r2_control.ros.reasons import RosReason
+from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.types import RobotState
 from tests.ros.arm_rig import TOOL, ArmRig, assert_same, offset, steps, target_of
 
@@ -54,7 +55,7 @@ def test_scale_and_guard_that_are_set_during_motion_apply_without_a_jump(node: A
     before = rig.wait_for_rest()
     assert set_to({"teleop.position_scale": 0.5, "teleop.filter.smoothing_delay": 0.05}).successful
     refused = set_to({"teleop.position_scale": 1.0, "teleop.chord_window": 0.2})
-    assert ReasonKind.ARMS_MUST_HOLD.template in refused.reason
+    assert TeleopReason.ARMS_MUST_HOLD.template in refused.reason
     rig.move((0.1, 0.0, 0.0))
     assert_same(rig.wait_for_rest(), offset(before, (0.05, 0.0, 0.0)), 1e-3)
     assert rig.state["engaged"]
@@ -180,7 +181,7 @@ def test_an_arm_whose_tool_is_on_a_topic_pauses_when_that_topic_ends(
     assert_same(rig.wait_for_rest(), offset(TOOL, (0.05, 0.0, 0.0)), 1e-3)
     node.destroy_timer(timer)
     rig.wait(lambda: rig.state["state"] == "lost", "an arm without tool poses is paused")
-    assert rig.state["last_event_kind"] == ReasonKind.TOPIC_SILENT
+    assert rig.state["last_event_kind"] == RosReason.TOPIC_SILENT
     assert "/left/current_pose from /test" in rig.state["last_event"]
 
 
@@ -194,9 +195,9 @@ def test_an_arm_waits_while_the_tool_of_its_controller_is_elsewhere(
     timer = node.create_timer(0.01, lambda: publisher.publish(stamped_pose(safe, "world", 0.0)))
     node.create_subscription(PoseStamped, "/theirs/target_frame", lambda _: None, 10)
     process = rig.start(processes, {"mode": "filtered", "preset": preset, "target_topic": "/theirs/target_frame"})
-    rig.wait(lambda: rig.state.get("kind") == ReasonKind.CONTROLLER_REFUSES, "the arm is not ready")
+    rig.wait(lambda: rig.state.get("kind") == RosReason.CONTROLLER_REFUSES, "the arm is not ready")
     rig.press()
-    rig.wait(lambda: rig.state["last_event_kind"] == ReasonKind.SAFE_TARGET_AWAY, "the press is refused")
+    rig.wait(lambda: rig.state["last_event_kind"] == RosReason.SAFE_TARGET_AWAY, "the press is refused")
     says = "safe_target/left is 0.150 m and 0.00 rad from left_tool_frame: the arm moves, or left_tool_frame is not the"
     assert says in rig.state["last_event"]
     # The line does not come again at each tick.

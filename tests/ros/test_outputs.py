@@ -16,8 +16,9 @@ import pinocchio as pin
 import pytest
 
 from q2r2_control import CartesianController, Robot
-from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.events import Reason
 from q2r2_control.loop.control_loop import ArmConditions
+from q2r2_control.ros.reasons import RosReason
 from q2r2_control.types import SIDES, ActiveLimit, LimitKind, RobotState
 from tests.ros.conftest import need_ros
 from tests.ros.processes import CONFIG, Processes, RosProcess, as_arguments, subscribed, wait_until
@@ -109,7 +110,7 @@ def test_a_new_receiver_is_noticed_while_arms_are_off_their_reference(
     assert commands.send(0.2, off_reference=False) is None
     commands.listen()
     fault = commands.send(0.2, off_reference)
-    assert (fault is not None and fault.kind is ReasonKind.NEW_RECEIVER) == (positions and off_reference)
+    assert (fault is not None and fault.kind is RosReason.NEW_RECEIVER) == (positions and off_reference)
 
 
 def test_arms_with_separate_topics_get_their_own_joints_there(node: Any, robot: Robot, context: Any) -> None:
@@ -235,7 +236,7 @@ def test_only_a_frozen_listener_is_reported(rate: float, acknowledged: bool, nod
     os.kill(listener.pid, signal.SIGSTOP)
     silence = stream.run(10.0 * TIMEOUT)
     assert silence is not None
-    assert (silence.kind, silence.detail["topic"]) == (ReasonKind.NOT_ACKNOWLEDGED, "/watched")
+    assert (silence.kind, silence.detail["topic"]) == (RosReason.NOT_ACKNOWLEDGED, "/watched")
     assert TIMEOUT < silence.detail["age"] < 1.0
     os.kill(listener.pid, signal.SIGCONT)
     wait_until(lambda: publisher.silence() is None, "it is there again")

@@ -25,7 +25,7 @@ from q2r2_control import Robot
 from q2r2_control.config.presets import BUILTIN, PRESETS
 from q2r2_control.config.resources import find_resource
 from q2r2_control.errors import ConfigError
-from q2r2_control.events import ReasonKind
+from q2r2_control.supervision.reasons import SupervisionReason
 from tests.ros.conftest import need_ros, spun_node
 from tests.ros.processes import CONFIG, Processes
 
@@ -76,7 +76,7 @@ class Theirs:
         topics = [f"{arm}.target_topic:=/robot/{arm}_ctrl/target_frame" for arm in self.robot.arms]
         frames = [f"{arm}.target_frame_id:={arm}_link_0" for arm in self.robot.arms]
         self.process = start_controller(self._processes, *PATIENT, *topics, *frames, node="theirs")
-        self.process.wait_for(ReasonKind.ACTIVATED.template)
+        self.process.wait_for(SupervisionReason.ACTIVATED.template)
 
     def _take(self, arm: str, message: PoseStamped) -> None:
         self.targets[arm].append((message, self.cell.joints.tool(arm)))

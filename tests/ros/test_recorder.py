@@ -15,7 +15,8 @@ from typing import Any
 import pytest
 
 from q2r2_control.errors import NOT_RECORDED
-from q2r2_control.events import Event, ReasonKind
+from q2r2_control.events import Event
+from q2r2_control.teleop.reasons import TeleopReason
 from tests.ros.conftest import need_ros
 from tests.ros.processes import CONFIG, Processes
 
@@ -127,7 +128,9 @@ def test_messages_are_in_the_file_to_the_byte_without_ros(recorder: RunningRecor
 def late_recorder(rig: ArmRig, node: Any, processes: Processes, folder: Path) -> RunningRecorder:
     """Press before there is a recorder, which is refused, and return one that the arm's node has heard of."""
     squeeze(rig)
-    rig.wait(lambda: rig.state["last_event_kind"] == ReasonKind.NO_RECORDING, "without a recorder nothing is recorded")
+    rig.wait(
+        lambda: rig.state["last_event_kind"] == TeleopReason.NO_RECORDING, "without a recorder nothing is recorded"
+    )
     recorder = RunningRecorder(node, processes, folder / "recordings")
     wait_until(lambda: node.count_subscribers("/recorder/state") > 1, "the arm's node listens to the recorder")
     for _ in range(3):
@@ -255,7 +258,7 @@ def test_a_whole_set_is_recorded_and_judged_and_ends_at_ctrl_c(node: Any, proces
     others = [pid for pid in children(process.pid) if "recorder" not in Path(f"/proc/{pid}/cmdline").read_text()]
     for pid in others:
         os.kill(pid, signal.SIGSTOP)
-    wait_until(lambda: any(event.kind is ReasonKind.VERDICT for event in told), "the verdict is told", patience=600.0)
+    wait_until(lambda: any(event.kind is TeleopReason.VERDICT for event in told), "the verdict is told", patience=600.0)
     for pid in others:
         os.kill(pid, signal.SIGCONT)
     assert process.interrupt(600.0) == 0

@@ -14,9 +14,11 @@ from geometry_msgs.msg import PoseStamped
 from std_msgs.msg import String
 
 from q2r2_control import load_config
-from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.events import Reason
+from q2r2_control.ros.reasons import RosReason
 from q2r2_control.ros.watching.set_listener import SetListener
 from q2r2_control.ros.watching.set_view import NodeView, arm_views
+from q2r2_control.supervision.reasons import SupervisionReason
 from tests.ros.conftest import need_ros, spun_node
 from tests.ros.processes import CONFIG, PATIENCE, Processes, States, wait_until
 
@@ -27,7 +29,7 @@ need_ros()
 LONG = 4.0 * PATIENCE
 COMMAND = (sys.executable, "-m", "q2r2_control", "ros")
 CELL = load_config(CONFIG)
-NO_TOOL_POSE = ReasonKind.NO_TOOL_POSE.template.format(cause="")
+NO_TOOL_POSE = RosReason.NO_TOOL_POSE.template.format(cause="")
 
 
 def test_rates_are_those_of_the_senders_and_only_states_are_listened_to(node: Any, domain: int) -> None:
@@ -153,10 +155,10 @@ def arm(message: str = "running", age: float = 0.1, **values: Any) -> NodeView:
 CONTROLLER = node(
     "/controller", phase="active", left_state="following", closest_distance_m=0.0213, closest_pair="a_0|b_1"
 )
-REFUSED = Reason.of(ReasonKind.TWO_PUBLISHERS, arm="left", source="").as_json()
+REFUSED = Reason.of(SupervisionReason.TWO_PUBLISHERS, arm="left", source="").as_json()
 REFUSING = node("/controller", "a target of one not used", "warn", phase="active", left_target_refusal=REFUSED)
 OTHER_REFUSED = node("/controller", "left out of this", "warn", phase="active", right_target_refusal=REFUSED)
-FAULT = node("/controller", "wrong", "error", phase="braking", fault=Reason(ReasonKind.STOP_SERVICE).as_json())
+FAULT = node("/controller", "wrong", "error", phase="braking", fault=Reason(RosReason.STOP_SERVICE).as_json())
 
 ENGAGED = arm(state="engaged")
 HELD_UP = arm(state="engaged", slip=0.012), CONTROLLER
@@ -171,9 +173,9 @@ WHY: dict[str, tuple[tuple[NodeView, ...], str]] = {
     "engaged": ((ENGAGED, CONTROLLER), "follows the hand"),
     "no hand": ((arm(state="engaged", hand_age=3.4),), "no pose of the left hand for 3 s"),
     "held up": (HELD_UP, "12 mm short of the hand; nearest pair a_0 | b_1, 21 mm"),
-    "refused": ((ENGAGED, REFUSING), f"/controller: {ReasonKind.TWO_PUBLISHERS.template.format(source='')}"),
+    "refused": ((ENGAGED, REFUSING), f"/controller: {SupervisionReason.TWO_PUBLISHERS.template.format(source='')}"),
     "another arm's refused": ((ENGAGED, OTHER_REFUSED), "follows the hand"),
-    "stopped": ((ENGAGED, FAULT), f"/controller: {ReasonKind.STOP_SERVICE.template}"),
+    "stopped": ((ENGAGED, FAULT), f"/controller: {RosReason.STOP_SERVICE.template}"),
     "strange values": ((arm(state="engaged", hand_age="old", slip=None),), "follows the hand"),
 }
 

@@ -19,9 +19,10 @@ from rclpy.parameter import Parameter
 
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.errors import ConfigError
-from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.events import CommonReason, Reason
 from q2r2_control.ros.bridge.teleop_loop import HomeClient
 from q2r2_control.ros.nodes.arm_controllers import LeftArmController, RightArmController
+from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.teleop.teleop import Teleop
 
 
@@ -43,9 +44,9 @@ class WayHome:
 @pytest.mark.parametrize(
     ("outcome", "event"),
     [
-        (Reason(ReasonKind.HOMING_ARRIVED), "paused: homing_arrived"),
-        (Reason.of(ReasonKind.HOMING_HELD_UP, by="a | b"), "paused: homing_held_up"),
-        (Reason(ReasonKind.HOMING_NO_WAY), "paused: homing_no_way"),
+        (Reason(CommonReason.HOMING_ARRIVED), "paused: homing_arrived"),
+        (Reason.of(CommonReason.HOMING_HELD_UP, by="a | b"), "paused: homing_held_up"),
+        (Reason(CommonReason.HOMING_NO_WAY), "paused: homing_no_way"),
         (None, "lost: homing_fault: homing_ended"),
     ],
 )
@@ -81,7 +82,7 @@ def test_a_way_home_that_the_controller_does_not_begin_ends(answer: tuple[bool, 
 def test_a_pause_on_the_way_home_makes_the_controller_hold() -> None:
     way = WayHome()
     way.update(0.0, goes=True)
-    way.teleop.pause(0.5, Reason(ReasonKind.PAUSE_SERVICE))
+    way.teleop.pause(0.5, Reason(TeleopReason.PAUSE_SERVICE))
     way.update(0.5, goes=True)
     way.services["hold"].call_async.assert_called_once()
 

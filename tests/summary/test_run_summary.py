@@ -13,7 +13,7 @@ import pytest
 
 from q2r2_control.compliance.impedance import ImpedanceReport
 from q2r2_control.compliance.repulsion import WallReport
-from q2r2_control.events import Event, Reason, ReasonKind
+from q2r2_control.events import CommonReason, Event, Reason
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.robot.robot import Robot
@@ -163,7 +163,7 @@ def test_the_summary_says_whether_the_run_ended_at_rest(statistics: RunStatistic
 
 def test_a_broken_button_cannot_fill_the_memory(statistics: RunStatistics) -> None:
     statistics.events.extend(
-        Event(float(i), "left", "a", "b", Reason(ReasonKind.OTHER)) for i in range(EVENTS_KEPT + 10)
+        Event(float(i), "left", "a", "b", Reason(CommonReason.OTHER)) for i in range(EVENTS_KEPT + 10)
     )
     events = statistics.summary(1.0).events
     assert len(events) == EVENTS_KEPT

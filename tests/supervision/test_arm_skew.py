@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from q2r2_control import CartesianController, Robot
-from q2r2_control.events import ReasonKind
 from q2r2_control.supervision.arm_skew import SkewWatch, allowed_skew, skew_window
+from q2r2_control.supervision.reasons import SupervisionReason
 from q2r2_control.types import ArmTiming
 from tests.supervision.test_supervisor import DT, World, raised
 
@@ -58,7 +58,7 @@ def test_after_a_long_difference_of_lags_the_arm_that_is_behind_is_named() -> No
     watch.observe(timings(right=4.0), 0.11)
     fault = watch.fault(0.11)
     assert fault is not None
-    assert (fault.kind, fault.detail["arm"]) == (ReasonKind.ARMS_APART, "right")
+    assert (fault.kind, fault.detail["arm"]) == (SupervisionReason.ARMS_APART, "right")
 
 
 def test_both_arms_brake_while_one_is_behind_and_go_on_when_it_is_not(
@@ -91,5 +91,5 @@ def test_arms_that_stay_apart_are_activated_again_from_rest(robot: Robot, contro
     for _ in range(60):
         world.supervisor.skew.observe(timings(left=3.0), world.now)
         world.run(DT, raised(left, 0.05), right=raised(right, 0.05))
-    assert ReasonKind.ARMS_APART in {event.root.kind for event in world.supervisor.events}
+    assert SupervisionReason.ARMS_APART in {event.root.kind for event in world.supervisor.events}
     assert world.states != ["following"] * 2

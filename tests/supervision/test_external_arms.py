@@ -12,13 +12,13 @@ import yaml
 from q2r2_control import CartesianController, Robot, load_config
 from q2r2_control.config.cell import Config
 from q2r2_control.config.resources import find_resource
-from q2r2_control.events import ReasonKind
 from q2r2_control.supervision.joint_watch import (
     ExternalArms,
     ExternalSettings,
     settings_for_external_arms,
     watch_settings,
 )
+from q2r2_control.supervision.reasons import SupervisionReason
 from q2r2_control.supervision.supervisor import Phase, Supervisor
 from q2r2_control.supervision.target_stream import StreamSettings
 from q2r2_control.types import Array, Reference, RobotState
@@ -104,7 +104,7 @@ def test_elbows_may_swing_while_the_tools_rest_but_not_too_close_to_other_bodies
     world.show(postures[far:] + postures[-1:] * round(0.5 / DT))
     assert world.supervisor.arm_state("left") == "stopped"
     (event,) = world.supervisor.events
-    assert event.kind is ReasonKind.TOO_CLOSE
+    assert event.kind is SupervisionReason.TOO_CLOSE
     assert event.detail["pair"].startswith("left_link_")
     assert event.detail["pair"].endswith("|post_0")
     # The first state that is too close counts. The next one is nearer only by the elbow's motion in between.

@@ -14,9 +14,11 @@ import pytest
 
 from q2r2_control import CartesianController, ControllerSettings, Robot, load_config
 from q2r2_control.config.moving_obstacle import MovingObstacle
-from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.events import CommonReason, Reason
 from q2r2_control.robot.kept_distances import kept_distances
+from q2r2_control.ros.reasons import RosReason
 from q2r2_control.supervision.homing import JointHoming, preflight_faults
+from q2r2_control.supervision.reasons import SupervisionReason
 from q2r2_control.supervision.supervisor import Supervisor
 from q2r2_control.supervision.target_stream import StreamSettings
 from q2r2_control.types import Array, Reference, RobotState
@@ -62,7 +64,7 @@ class World:
         assert self.supervisor.go_home() is None
         while self.now < LONGEST and self.supervisor.homing.active:
             self.tick()
-        ended = [event for event in self.supervisor.events if event.kind is ReasonKind.HOMING_OUTCOME]
+        ended = [event for event in self.supervisor.events if event.kind is SupervisionReason.HOMING_OUTCOME]
         return kinds(ended[0].cause) if ended else "it goes on"
 
 
@@ -110,7 +112,7 @@ def test_a_motion_is_braked_before_the_way_home_begins(robot: Robot, controller:
 
 
 @pytest.mark.parametrize(
-    ("how", "arguments"), [("pause", (True,)), ("stop", (Reason(ReasonKind.STOP_SERVICE),)), ("reset", ())]
+    ("how", "arguments"), [("pause", (True,)), ("stop", (Reason(RosReason.STOP_SERVICE),)), ("reset", ())]
 )
 def test_the_way_home_can_be_interrupted_and_the_arms_come_to_rest_where_they_are(
     robot: Robot, controller: CartesianController, how: str, arguments: tuple[object, ...]
@@ -143,7 +145,7 @@ def test_while_no_way_is_known_the_arms_rest_and_a_tick_examines_at_most_two_sam
         assert np.array_equal(at, q)
         assert distances.call_count - before <= 3  # One more call computes the margin at the begin of the way.
         ticks += 1
-    assert homing.outcome is ReasonKind.HOMING_NO_WAY
+    assert homing.outcome is CommonReason.HOMING_NO_WAY
     assert ticks > 100
 
 
@@ -154,7 +156,7 @@ def test_if_only_the_straight_way_is_allowed_no_other_way_is_taken(robot: Robot)
     homing = JointHoming(searched, lambda: (free, np.full(3, 0.02)), robot.home, straight=True)
     for _ in range(2):
         homing.step(robot.home + 0.5, np.zeros_like(robot.home), DT)
-    assert homing.outcome is ReasonKind.HOMING_NO_WAY
+    assert homing.outcome is CommonReason.HOMING_NO_WAY
 
 
 def test_the_way_home_waits_for_an_arm_that_is_held_up_and_then_reports_it(robot: Robot) -> None:
@@ -169,7 +171,7 @@ def test_the_way_home_waits_for_an_arm_that_is_held_up_and_then_reports_it(robot
         farthest = max(farthest, float(np.abs(at - q).max()))
         if homing.outcome is not None:
             break
-    assert homing.outcome is ReasonKind.HOMING_HELD_UP
+    assert homing.outcome is CommonReason.HOMING_HELD_UP
     assert 0.05 < farthest < 0.13  # Otherwise, the arm would start fast when it is free again.
 
 

@@ -7,8 +7,10 @@ import pytest
 
 from q2r2_control import load_config
 from q2r2_control.config.control import SupervisionSettings
-from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.events import CommonReason, Reason, ReasonKind
+from q2r2_control.ros.reasons import RosReason
 from q2r2_control.supervision.joint_watch import JointWatch, settings_for_external_arms, watch_settings
+from q2r2_control.supervision.reasons import SupervisionReason
 from q2r2_control.types import RobotState
 from tests.supervision.conftest import CONFIG
 
@@ -58,7 +60,7 @@ def test_the_end_of_states_is_a_fault_after_the_timeout(joints: Joints) -> None:
     joints.now += SETTINGS.state_timeout - 1e-6
     assert joints.fault() is None
     joints.now += 2e-6
-    assert joints.fault() is ReasonKind.STATES_SILENT
+    assert joints.fault() is SupervisionReason.STATES_SILENT
     assert not joints.watch.believed
     assert " from /arm" in str(joints.watch.check(joints.now))
 
@@ -67,13 +69,13 @@ def test_a_clock_that_was_set_back_by_more_than_the_timeout_is_a_fault(joints: J
     joints.now -= SETTINGS.state_timeout - 1e-6
     assert joints.fault() is None
     joints.now -= 2e-6
-    assert joints.fault() is ReasonKind.STATES_SILENT
+    assert joints.fault() is SupervisionReason.STATES_SILENT
 
 
 def test_the_first_fault_stays_until_states_are_accepted_again(joints: Joints) -> None:
-    joints.watch.observe(Reason.of(ReasonKind.BAD_JOINT_STATES, text="elbow is missing"), joints.now)
-    joints.watch.observe(Reason.of(ReasonKind.LOOP_STALLED, duration=1.0), joints.now)
-    assert joints.fault() is ReasonKind.BAD_JOINT_STATES
+    joints.watch.observe(Reason.of(RosReason.BAD_JOINT_STATES, text="elbow is missing"), joints.now)
+    joints.watch.observe(Reason.of(CommonReason.LOOP_STALLED, duration=1.0), joints.now)
+    assert joints.fault() is RosReason.BAD_JOINT_STATES
     joints.rest(SETTINGS.settle_time + 2.0 * PERIOD)
     assert joints.watch.settled(joints.now)
     joints.watch.accept()
@@ -98,14 +100,18 @@ def test_a_number_that_is_not_finite_is_bridged_for_a_while_and_then_named(joint
     joints.watch.observe(bad(joints.now), joints.now)
     fault = joints.watch.fault
     assert fault is not None
-    assert (fault.kind, fault.detail["quantity"], fault.detail["joint"]) == (ReasonKind.STATE_NOT_FINITE, what, "elbow")
+    assert (fault.kind, fault.detail["quantity"], fault.detail["joint"]) == (
+        SupervisionReason.STATE_NOT_FINITE,
+        what,
+        "elbow",
+    )
 
 
 @pytest.mark.parametrize("gap", [PERIOD, 0.05])
 def test_a_joint_that_moves_farther_than_its_speed_allows_is_a_fault(gap: float) -> None:
     """The elbow may move at 2 rad/s during the gap and for 20 ms more, plus 50 mrad."""
     allowed = 2.0 * (gap + 0.02) + 0.05
-    for distance, expected in ((allowed - 1e-6, None), (allowed + 1e-6, ReasonKind.STATE_JUMPED)):
+    for distance, expected in ((allowed - 1e-6, None), (allowed + 1e-6, SupervisionReason.STATE_JUMPED)):
         joints = Joints()
         joints.now += gap
         joints.watch.observe(state(distance, joints.now), joints.now)
@@ -133,8 +139,8 @@ def test_arms_that_creep_are_not_settled_and_resting_arms_are_after_the_settle_t
 
 
 def test_arms_whose_session_is_lost_may_brake_by_states_that_still_come(joints: Joints) -> None:
-    joints.watch.lose(Reason.of(ReasonKind.LOOP_STALLED, duration=1.0))
-    assert joints.fault() is ReasonKind.LOOP_STALLED
+    joints.watch.lose(Reason.of(CommonReason.LOOP_STALLED, duration=1.0))
+    assert joints.fault() is CommonReason.LOOP_STALLED
     assert joints.watch.believed
     joints.now += PERIOD
     joints.watch.observe(state(np.pi, joints.now), joints.now)
@@ -144,8 +150,8 @@ def test_arms_whose_session_is_lost_may_brake_by_states_that_still_come(joints: 
 
 
 def test_arms_that_lose_their_session_during_another_fault_may_not_brake_by_their_states(joints: Joints) -> None:
-    joints.watch.observe(Reason.of(ReasonKind.BAD_JOINT_STATES, text="elbow is missing"), joints.now)
-    joints.watch.lose(Reason.of(ReasonKind.LOOP_STALLED, duration=1.0))
+    joints.watch.observe(Reason.of(RosReason.BAD_JOINT_STATES, text="elbow is missing"), joints.now)
+    joints.watch.lose(Reason.of(CommonReason.LOOP_STALLED, duration=1.0))
     assert not joints.watch.believed
 
 
@@ -157,7 +163,7 @@ def test_a_joint_away_from_its_reference_is_named_after_the_deviation_time(joint
     assert joints.watch.deviates(far, began + SETTINGS.deviation_time) is None
     reason = joints.watch.deviates(far, began + SETTINGS.deviation_time + 1e-6)
     assert reason is not None
-    assert (reason.kind, reason.detail["joint"]) == (ReasonKind.OFF_REFERENCE, "elbow")
+    assert (reason.kind, reason.detail["joint"]) == (SupervisionReason.OFF_REFERENCE, "elbow")
     assert joints.watch.deviates(near, began + 1.0) is None, "it is near again"
     assert joints.watch.deviates(far, began + 1.0 + SETTINGS.deviation_time) is None
 

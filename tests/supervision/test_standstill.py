@@ -9,7 +9,7 @@ import pinocchio as pin
 import pytest
 
 from q2r2_control import CartesianController, Robot
-from q2r2_control.events import ReasonKind
+from q2r2_control.supervision.reasons import SupervisionReason
 from q2r2_control.supervision.standstill import (
     JOINTS,
     LAGGING_JOINTS,
@@ -184,7 +184,7 @@ def test_both_arms_are_stopped_if_the_driver_of_one_stands_still(robot: Robot, c
     fault = cell.supervisor.fault
     assert fault is not None
     assert (fault.kind, fault.detail["arm"], fault.detail["takers"]) == (
-        ReasonKind.CONTROLLER_STANDS,
+        SupervisionReason.CONTROLLER_STANDS,
         "left",
         " /left_jtc",
     )

@@ -9,7 +9,8 @@ import pinocchio as pin
 import pytest
 
 from q2r2_control import CartesianController, Robot
-from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.events import CommonReason, Reason
+from q2r2_control.supervision.reasons import SupervisionReason
 from q2r2_control.supervision.supervisor import Supervisor
 from q2r2_control.supervision.target_stream import StreamSettings, TargetStream
 from q2r2_control.types import Array, RobotState
@@ -140,7 +141,7 @@ def test_a_loop_that_stood_still_commands_nothing_and_follows_no_old_target(worl
     waited = world.tool("left")
     world.now += 1.0
     world.supervisor.stalled(1.0, world.now)
-    assert world.supervisor.fault == Reason.of(ReasonKind.LOOP_STALLED, duration=1.0)
+    assert world.supervisor.fault == Reason.of(CommonReason.LOOP_STALLED, duration=1.0)
     world.run(0.05, raised(waited, 0.01))
     assert world.commanded[before:] == [None] * (len(world.commanded) - before)
     world.run(1.0, raised(waited, 0.01))
@@ -208,7 +209,7 @@ def test_a_stream_goes_on_anywhere_but_after_a_silence_only_from_the_tool() -> N
     assert stream.pose == raised(TOOL, 0.2)
     refusal = stream.offer(raised(TOOL, 0.2), [TOOL], 0.5)
     assert refusal is not None
-    assert (refusal.kind, refusal.detail["distance"]) == (ReasonKind.STREAM_AWAY, pytest.approx(0.2))
+    assert (refusal.kind, refusal.detail["distance"]) == (SupervisionReason.STREAM_AWAY, pytest.approx(0.2))
     assert not stream.following
 
 
@@ -249,7 +250,7 @@ def test_arms_that_nothing_moves_are_noticed_and_a_new_receiver_gets_no_jump(wor
     assert last is not None
     assert 0.05 < np.abs(last - world.q).max() < 0.15
     assert world.supervisor.off_reference
-    world.supervisor.let_go(Reason(ReasonKind.OTHER), world.now)
+    world.supervisor.let_go(Reason(CommonReason.OTHER), world.now)
     assert world.states == ["inactive"] * 2
     began = len(world.commanded)
     world.run(0.5, raised(tool, 0.06))
@@ -259,9 +260,9 @@ def test_arms_that_nothing_moves_are_noticed_and_a_new_receiver_gets_no_jump(wor
 
 def test_braking_arms_go_on_braking_when_their_receiver_is_gone(world: World) -> None:
     world.engage(by=0.1)
-    world.supervisor.stop(Reason(ReasonKind.OTHER))
-    world.supervisor.let_go(Reason(ReasonKind.OTHER), world.now)
-    world.supervisor.start_over(Reason(ReasonKind.OTHER), world.now)
+    world.supervisor.stop(Reason(CommonReason.OTHER))
+    world.supervisor.let_go(Reason(CommonReason.OTHER), world.now)
+    world.supervisor.start_over(Reason(CommonReason.OTHER), world.now)
     assert kinds(world.supervisor.reset()) == "arms_braking"
     world.run(DT)
     assert world.commanded[-1] is not None
@@ -291,7 +292,7 @@ def test_arms_that_brake_near_each_other_rest_at_the_end_of_their_stop_and_do_no
     begun = world.q.copy()
     velocity = np.array([*np.zeros(7), 0.49, 0.22, -0.14, 0.16, 0.42, 0.34, -0.01])
     controller.reset(begun, velocity)
-    world.supervisor.stop(Reason(ReasonKind.OTHER))
+    world.supervisor.stop(Reason(CommonReason.OTHER))
     world.run(float(np.abs(velocity).max()) / controller.settings.acceleration_limit + 0.05)
     assert np.abs(world.v).max() < 1e-9
     np.testing.assert_array_equal(world.q[:7], begun[:7])

@@ -7,8 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.events import CommonReason, Reason
 from q2r2_control.teleop.arm_states import is_fault
+from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.types import SIDES, HandInputs
 from tests.support.reasons import kinds
 from tests.teleop import hands
@@ -62,14 +63,14 @@ class TestAStop:
     def test_a_stop_is_over_for_both_arms_when_one_is_reset(self) -> None:
         driver = engaged()
         driver.push("grip")
-        driver.teleop.reset(driver.now, "left", Reason(ReasonKind.RESET_SERVICE))
+        driver.teleop.reset(driver.now, "left", Reason(TeleopReason.RESET_SERVICE))
         assert driver.states == PAUSED
 
     def test_a_stop_for_which_a_button_is_held_is_not_lost_by_a_fault(self) -> None:
         driver = engaged(upper_hold="stop")
         driver.upper = {"left"}
         driver.run(0.3)
-        driver.teleop.pause(driver.now, Reason(ReasonKind.TOOL_UNKNOWN))
+        driver.teleop.pause(driver.now, Reason(TeleopReason.TOOL_UNKNOWN))
         assert driver.states == LOST
         driver.run(0.5)
         assert driver.states == STOPPED
@@ -83,10 +84,10 @@ class TestTheWayHome:
         assert driver.states == HOMING
         assert driver.teleop.homing
         driver.assert_holds()  # The hands lead no arm.
-        driver.teleop.end_homing(driver.now, Reason(ReasonKind.HOMING_ARRIVED))
+        driver.teleop.end_homing(driver.now, Reason(CommonReason.HOMING_ARRIVED))
         driver.run(0.1)
         assert driver.states == PAUSED
-        assert {event.kind for event in driver.events[-2:]} == {ReasonKind.HOMING_ARRIVED}
+        assert {event.kind for event in driver.events[-2:]} == {CommonReason.HOMING_ARRIVED}
         assert not any(map(is_fault, driver.events))
         driver.press(*SIDES)
         assert driver.states == ENGAGED
@@ -95,7 +96,7 @@ class TestTheWayHome:
         for blocked, states in (("left", PAUSED), ("right", HOMING)):
             driver = engaged()
             driver.press(*SIDES)
-            driver.obstacles = {blocked: Reason(ReasonKind.TOOL_UNKNOWN)}
+            driver.obstacles = {blocked: Reason(TeleopReason.TOOL_UNKNOWN)}
             driver.push("stick_down", "left")
             assert driver.states == states
 

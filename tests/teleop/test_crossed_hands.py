@@ -10,8 +10,8 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from q2r2_control.events import ReasonKind
 from q2r2_control.teleop.crossed_hands import CrossedHands
+from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.types import SIDES, HandSample
 from tests.teleop.hands import ENGAGED, Operator, pose, sample
 
@@ -94,7 +94,7 @@ def test_at_engaging_one_line_says_so_and_the_arms_follow_all_the_same() -> None
     driver.run(3.5)
     driver.press(*SIDES)
     assert driver.states == ENGAGED
-    said = [event for event in driver.events if event.kind is ReasonKind.HANDS_CROSSED]
+    said = [event for event in driver.events if event.kind is TeleopReason.HANDS_CROSSED]
     assert len(said) == 1
     assert said[0].source == said[0].destination
     driver.run(1.0)
@@ -106,4 +106,4 @@ def test_an_operator_with_each_controller_in_its_hand_is_told_nothing() -> None:
     driver.run(3.5)
     driver.press(*SIDES)
     assert driver.states == ENGAGED
-    assert ReasonKind.HANDS_CROSSED not in {event.kind for event in driver.events}
+    assert TeleopReason.HANDS_CROSSED not in {event.kind for event in driver.events}

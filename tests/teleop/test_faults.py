@@ -12,7 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.events import Reason
+from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.types import SIDES, HandSample
 from tests.support.reasons import kinds
 from tests.teleop.hands import (
@@ -59,21 +60,21 @@ def test_a_fault_of_the_left_hand_disengages(reason: str, linked: bool) -> None:
 @pytest.mark.parametrize("linked", [True, False], ids=["linked", "each for itself"])
 def test_a_stop_of_one_arm_by_other_code_stops_the_linked_one_once(linked: bool) -> None:
     driver = engaged(linked=linked)
-    driver.teleop.pause(driver.now, Reason(ReasonKind.TOOL_UNKNOWN), "left")
+    driver.teleop.pause(driver.now, Reason(TeleopReason.TOOL_UNKNOWN), "left")
     assert driver.states == (LOST if linked else {"left": "lost", "right": "engaged"})
     driver.run(0.1)
     if linked:
         driver.press("right")
-        driver.teleop.pause(driver.now, Reason(ReasonKind.TOOL_UNKNOWN), "left")
+        driver.teleop.pause(driver.now, Reason(TeleopReason.TOOL_UNKNOWN), "left")
         assert driver.states == {"left": "lost", "right": "engaged"}
 
 
 def test_a_reset_arm_holds_until_a_press_after_a_new_sample_of_its_hand() -> None:
     driver = engaged(linked=False)
-    driver.teleop.reset(driver.now, "left", Reason(ReasonKind.RESET_SERVICE))
+    driver.teleop.reset(driver.now, "left", Reason(TeleopReason.RESET_SERVICE))
     assert driver.states == {"left": "lost", "right": "engaged"}
     driver.teleop.take_events()
-    driver.teleop.reset(driver.now, "left", Reason(ReasonKind.RESET_SERVICE))
+    driver.teleop.reset(driver.now, "left", Reason(TeleopReason.RESET_SERVICE))
     # The event is reported although the arm already holds.
     assert [event.kind for event in driver.teleop.take_events()] == ["reset_service"]
     driver.silent = {"left"}

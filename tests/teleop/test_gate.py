@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from q2r2_control.config.teleop import GateSettings
-from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.events import Reason
 from q2r2_control.quaternions import se3_of
 from q2r2_control.teleop.gate import PoseGate
+from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.types import HandFault
 from tests.support.reasons import kinds
 from tests.teleop.hands import pose, sample
@@ -149,8 +150,8 @@ def test_a_jump_is_a_fault_of_its_own_and_gives_no_speed() -> None:
 def test_a_fault_that_the_input_found_is_passed_on_and_leaves_no_pose(fault: HandFault) -> None:
     passed = gate()
     assert passed.problem is None
-    assert passed.receive(replace(GOOD, pose_stamp=1.01, fault=fault), 1.01) == (False, Reason(ReasonKind(fault)))
-    assert (passed.pose, passed.problem) == (None, Reason(ReasonKind(fault)))
+    assert passed.receive(replace(GOOD, pose_stamp=1.01, fault=fault), 1.01) == (False, Reason(TeleopReason(fault)))
+    assert (passed.pose, passed.problem) == (None, Reason(TeleopReason(fault)))
     assert not passed.stale(1.1)
     assert passed.receive(replace(GOOD, pose_stamp=1.02), 1.02) == (True, None)
     assert passed.problem is None

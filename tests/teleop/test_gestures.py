@@ -6,8 +6,9 @@ import pytest
 
 from q2r2_control.config.bindings import HELD, Gesture
 from q2r2_control.config.teleop import TeleopSettings
-from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.events import Reason
 from q2r2_control.teleop.gestures import GestureRecognizer, Press
+from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.types import HandInputs
 from tests.teleop.hands import PUSHED
 
@@ -77,7 +78,7 @@ def test_controls_that_are_held_from_the_first_reading_on_are_reported_once_afte
         now = 0.1 * step
         found.receive(HandInputs(button_lower=True), now)
         told = found.take_stuck(now)
-        assert told == (Reason.of(ReasonKind.CONTROLS_HELD, controls=["lower"]) if step == 11 else None), now
+        assert told == (Reason.of(TeleopReason.CONTROLS_HELD, controls=["lower"]) if step == 11 else None), now
     found.forget()
     found.receive(HandInputs(), 3.0)
     found.receive(HandInputs(button_lower=True), 3.1)

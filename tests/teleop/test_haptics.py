@@ -7,41 +7,44 @@ import re
 import pytest
 
 from q2r2_control.config.teleop import HapticSettings
-from q2r2_control.events import Event, Reason
-from q2r2_control.events import ReasonKind as K
+from q2r2_control.events import CommonReason, Event, Reason, ReasonKind
 from q2r2_control.teleop import haptics as pulses
 from q2r2_control.teleop.haptics import VOCABULARY, ArmCondition, HapticPulses, Pulse
+from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.types import HapticFeedback
 from tests.support.docs import table_rows
 
 
-def event(source: str, destination: str, reason: Reason | K) -> Event:
+def event(source: str, destination: str, reason: Reason | ReasonKind) -> Event:
     return Event(1.0, "left", source, destination, reason if isinstance(reason, Reason) else Reason(reason))
 
 
 def verdict(keep: bool) -> Reason:
-    return Reason.of(K.VERDICT, episode=2, keep=keep, line="")
+    return Reason.of(TeleopReason.VERDICT, episode=2, keep=keep, line="")
 
 
-JUMPED = event("engaged", "lost", K.HAND_JUMPED)
+JUMPED = event("engaged", "lost", TeleopReason.HAND_JUMPED)
 EVENTS = {
-    "engaging": (event("paused", "engaged", K.PRESSED), pulses.ENGAGED),
-    "pausing": (event("engaged", "pausing", K.PRESSED), pulses.PAUSED),
-    "a fault": (event("engaged", "lost", K.POSE_SILENT), pulses.FAULT),
-    "a refused press": (event("paused", "paused", K.NOT_ENGAGED), pulses.FAULT),
-    "an alignment that ends unengaged": (event("aligning", "lost", K.NOT_ENGAGED), pulses.FAULT),
-    "the way home": (event("paused", "homing", K.COMMANDED), pulses.HOMING),
-    "the end of the way home": (event("homing", "paused", K.HOMING_ARRIVED), pulses.PAUSED),
-    "both arms carry, for the one that leads": (event("engaged", "engaged", K.CARRY_BEGAN), pulses.ENGAGED),
-    "both arms carry, for the other one": (event("paused", "carried", K.CARRIED_BY), pulses.ENGAGED),
-    "the end of carrying": (event("carried", "paused", K.PRESSED), pulses.PAUSED),
-    "an episode that begins": (event("lost", "lost", K.EPISODE_BEGINS), pulses.EPISODE_BEGINS),
-    "a subtask that begins": (event("paused", "paused", K.SUBTASK_BEGINS), pulses.EPISODE_BEGINS),
+    "engaging": (event("paused", "engaged", TeleopReason.PRESSED), pulses.ENGAGED),
+    "pausing": (event("engaged", "pausing", TeleopReason.PRESSED), pulses.PAUSED),
+    "a fault": (event("engaged", "lost", TeleopReason.POSE_SILENT), pulses.FAULT),
+    "a refused press": (event("paused", "paused", TeleopReason.NOT_ENGAGED), pulses.FAULT),
+    "an alignment that ends unengaged": (event("aligning", "lost", TeleopReason.NOT_ENGAGED), pulses.FAULT),
+    "the way home": (event("paused", "homing", TeleopReason.COMMANDED), pulses.HOMING),
+    "the end of the way home": (event("homing", "paused", CommonReason.HOMING_ARRIVED), pulses.PAUSED),
+    "both arms carry, for the one that leads": (event("engaged", "engaged", TeleopReason.CARRY_BEGAN), pulses.ENGAGED),
+    "both arms carry, for the other one": (event("paused", "carried", TeleopReason.CARRIED_BY), pulses.ENGAGED),
+    "the end of carrying": (event("carried", "paused", TeleopReason.PRESSED), pulses.PAUSED),
+    "an episode that begins": (event("lost", "lost", TeleopReason.EPISODE_BEGINS), pulses.EPISODE_BEGINS),
+    "a subtask that begins": (event("paused", "paused", TeleopReason.SUBTASK_BEGINS), pulses.EPISODE_BEGINS),
     "an episode that is kept": (event("paused", "paused", verdict(True)), pulses.EPISODE_KEPT),
     "one that is not": (event("lost", "lost", verdict(False)), pulses.EPISODE_REJECTED),
-    "an episode that ends": (event("engaged", "engaged", K.EPISODE_ENDS), pulses.EPISODE_ENDS),
-    "an episode that is discarded": (event("paused", "paused", K.EPISODE_DISCARDED), pulses.EPISODE_DISCARDED),
-    "a stop": (event("engaged", "stopped", K.COMMANDED), pulses.STOPPED),
+    "an episode that ends": (event("engaged", "engaged", TeleopReason.EPISODE_ENDS), pulses.EPISODE_ENDS),
+    "an episode that is discarded": (
+        event("paused", "paused", TeleopReason.EPISODE_DISCARDED),
+        pulses.EPISODE_DISCARDED,
+    ),
+    "a stop": (event("engaged", "stopped", TeleopReason.COMMANDED), pulses.STOPPED),
 }
 
 
@@ -61,7 +64,7 @@ def test_an_event_is_felt_once_and_ends(happens: Event, pulse: Pulse) -> None:
 
 def test_a_pause_that_is_complete_is_not_felt_again() -> None:
     haptics = HapticPulses()
-    haptics.start_pulse(event("pausing", "paused", K.PRESSED))
+    haptics.start_pulse(event("pausing", "paused", TeleopReason.PRESSED))
     assert haptics.at(1.0, "left") is None
 
 
@@ -134,7 +137,7 @@ def test_a_joint_limit_and_a_grasp_are_each_felt_once_while_they_last() -> None:
 
 def test_two_vibrations_are_felt_as_two_and_a_fault_does_not_wait() -> None:
     haptics = HapticPulses()
-    haptics.start_pulse(event("paused", "engaged", K.PRESSED))
+    haptics.start_pulse(event("paused", "engaged", TeleopReason.PRESSED))
     first = felt(haptics, 1.0, 1.0 + pulses.ENGAGED.duration + 0.002)
     assert [one.amplitude for one in first] == [pulses.ENGAGED.amplitude, 0.0]
     haptics.notice(condition(limits=("left_A4",)))

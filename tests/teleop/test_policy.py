@@ -8,7 +8,7 @@ import pinocchio as pin
 import pytest
 
 from q2r2_control.config.teleop import TeleopSettings
-from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.events import CommonReason, Reason
 from q2r2_control.quaternions import floats_of
 from q2r2_control.teleop.policy_motion import SILENT
 from q2r2_control.teleop.teleop import Teleop
@@ -184,7 +184,7 @@ def test_an_arm_that_is_not_linked_goes_on_alone() -> None:
 
 def test_an_unusable_action_is_reported_once_while_nothing_moves() -> None:
     run = Run()
-    fault = ActionChunk(np.zeros(0), PERIOD, fault=Reason.of(ReasonKind.POLICY_UNUSABLE, text="no numbers"))
+    fault = ActionChunk(np.zeros(0), PERIOD, fault=Reason.of(CommonReason.POLICY_UNUSABLE, text="no numbers"))
     for _ in range(10):
         run.tick(fault)
     assert run.states() == {"idle"}

@@ -13,6 +13,7 @@ from q2r2_control.events import Event, Reason, ReasonKind
 from q2r2_control.inputs.web import WebInput, web_cell
 from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.tick import Tick
+from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.types import ActiveLimit, ArmTarget, LimitKind
 from q2r2_control.viewer.arm_words import ArmWords
 from tests.support.processes import cell
@@ -59,9 +60,9 @@ def test_an_arm_at_its_target_follows_whatever_limits_are_at_work(robot: Robot) 
 @pytest.mark.parametrize(
     ("source", "destination", "kind", "expected"),
     [
-        ("engaged", "lost", ReasonKind.CONNECTION_LOST, "connection lost"),
-        ("aligning", "engaged", ReasonKind.ALIGNED, "aligned anew"),
-        ("paused", "paused", ReasonKind.NO_RECORDING, ReasonKind.NO_RECORDING.template),
+        ("engaged", "lost", TeleopReason.CONNECTION_LOST, "connection lost"),
+        ("aligning", "engaged", TeleopReason.ALIGNED, "aligned anew"),
+        ("paused", "paused", TeleopReason.NO_RECORDING, TeleopReason.NO_RECORDING.template),
     ],
 )
 def test_an_arm_that_is_not_engaged_names_the_reason_of_its_stop(
@@ -75,7 +76,7 @@ def test_the_sentence_before_the_first_event_and_while_aligning_says_so(robot: R
     paused = tick_at(robot, 1.0, engaged=False)
     assert words(paused) == "not engaged yet"
     aligning = replace(paused, states={"left": "aligning", "right": "aligning"})
-    chord = Event(0.5, "left", "engaged", "aligning", Reason(ReasonKind.ALIGNMENT_CHORD))
+    chord = Event(0.5, "left", "engaged", "aligning", Reason(TeleopReason.ALIGNMENT_CHORD))
     assert words(aligning, told=(chord,)) == "aligning"
     assert words(replace(paused, following=False)) == "the run ends"
     assert press(aligning) == "release both buttons to go on"
@@ -83,10 +84,10 @@ def test_the_sentence_before_the_first_event_and_while_aligning_says_so(robot: R
 
 def test_a_reason_stays_until_the_state_changes_with_a_refusal_beside_it(robot: Robot) -> None:
     lost = replace(tick_at(robot, 1.0, engaged=False), states={"left": "lost", "right": "lost"})
-    silent = Event(0.5, "left", "engaged", "lost", Reason.of(ReasonKind.POSE_SILENT, timeout=0.15))
-    changed = Event(0.6, "left", "lost", "lost", Reason(ReasonKind.CONTROL_CHANGED))
-    refused = Event(0.7, "left", "lost", "lost", Reason(ReasonKind.NOT_ENGAGED, cause=Reason(ReasonKind.NO_POSE)))
-    paused = Event(0.8, "left", "lost", "paused", Reason(ReasonKind.PAUSE_REQUESTED))
+    silent = Event(0.5, "left", "engaged", "lost", Reason.of(TeleopReason.POSE_SILENT, timeout=0.15))
+    changed = Event(0.6, "left", "lost", "lost", Reason(TeleopReason.CONTROL_CHANGED))
+    refused = Event(0.7, "left", "lost", "lost", Reason(TeleopReason.NOT_ENGAGED, cause=Reason(TeleopReason.NO_POSE)))
+    paused = Event(0.8, "left", "lost", "paused", Reason(TeleopReason.PAUSE_REQUESTED))
     assert words(lost, told=(silent, changed)) == "no pose for 0.15 s"
     both = "no pose for 0.15 s; not engaged: the newest pose is not usable"
     assert words(lost, told=(silent, changed, refused)) == both
@@ -95,7 +96,7 @@ def test_a_reason_stays_until_the_state_changes_with_a_refusal_beside_it(robot: 
 
 def test_a_reason_uses_the_operators_name_of_a_control(robot: Robot) -> None:
     paused = tick_at(robot, 1.0, engaged=False)
-    pressed = Event(0.5, "left", "pausing", "paused", Reason.of(ReasonKind.PRESSED, control="lower button"))
+    pressed = Event(0.5, "left", "pausing", "paused", Reason.of(TeleopReason.PRESSED, control="lower button"))
     assert words(paused, told=(pressed,)) == "A or X"
 
 
@@ -125,7 +126,7 @@ def test_the_handles_of_a_page_are_its_device_even_before_they_are_dragged(robot
     made = ArmWords(JOINTS, web_cell(cell()).teleop.bindings, WebInput.controls.words)
     assert made.next_press(waits, "left").startswith("drag a tool's arrows or rings to engage")
     assert made.next_press(tick_at(robot, 1.0), "left").startswith("let go of a tool's arrows or rings to pause")
-    made.follow([Event(0.5, "left", "engaged", "paused", Reason(ReasonKind.DEAD_MAN_RELEASED))])
+    made.follow([Event(0.5, "left", "engaged", "paused", Reason(TeleopReason.DEAD_MAN_RELEASED))])
     assert made.why(waits, "left", ()) == "a tool's arrows or rings let go"
     assert "lower" not in str(made.controls())
 

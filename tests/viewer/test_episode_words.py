@@ -5,11 +5,15 @@ from __future__ import annotations
 import pytest
 
 from q2r2_control.events import Event, Reason
-from q2r2_control.events import ReasonKind as K
+from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.viewer.episode_words import EpisodeWords
 
-SECOND = Reason.of(K.SUBTASK_BEGINS, number=2, name="grasp")
-BEGINS, ENDS, DISCARDED = Reason(K.EPISODE_BEGINS), Reason(K.EPISODE_ENDS), Reason(K.EPISODE_DISCARDED)
+SECOND = Reason.of(TeleopReason.SUBTASK_BEGINS, number=2, name="grasp")
+BEGINS, ENDS, DISCARDED = (
+    Reason(TeleopReason.EPISODE_BEGINS),
+    Reason(TeleopReason.EPISODE_ENDS),
+    Reason(TeleopReason.EPISODE_DISCARDED),
+)
 
 
 @pytest.mark.parametrize(

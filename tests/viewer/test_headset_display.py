@@ -14,10 +14,11 @@ from pydantic import TypeAdapter
 pytest.importorskip("trimesh")
 
 from q2r2_control.device_words import DeviceWords
-from q2r2_control.events import Event, Reason, ReasonKind
+from q2r2_control.events import Event, Reason
 from q2r2_control.inputs.webxr.shown import ShownScene, ShownState
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot
+from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.viewer.arm_words import Told
 from q2r2_control.viewer.headset_display import RunDisplay, ShownTick
 from q2r2_control.viewer.loose_parts import places_of_parts
@@ -57,7 +58,7 @@ def test_a_moment_has_parts_at_their_places_leashes_and_the_tightest_pair(
 ) -> None:
     display.scene()
     tick = tick_at(robot, 1.0, engaged=False)
-    pressed = Told(Event(0.5, "left", "pausing", "paused", Reason.of(ReasonKind.PRESSED, control="lower button")))
+    pressed = Told(Event(0.5, "left", "pausing", "paused", Reason.of(TeleopReason.PRESSED, control="lower button")))
     shown = ShownTick(tick, (), {"left": pressed}, HANDS, plant.observed_qpos, "")
     state = TypeAdapter(ShownState).validate_python(display.message(shown))
     for name, part in cell().mujoco.objects.items():

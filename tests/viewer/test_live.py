@@ -14,8 +14,9 @@ import pytest
 from rich.console import Console
 
 from q2r2_control.config.bindings import BindingSettings
-from q2r2_control.events import Event, Reason, ReasonKind
+from q2r2_control.events import Event, Reason
 from q2r2_control.robot.robot import Robot
+from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.types import ActiveLimit, LimitKind
 from q2r2_control.viewer.arm_words import ArmWords
 from q2r2_control.viewer.episode_words import EpisodeWords
@@ -42,7 +43,7 @@ def test_it_shows_states_errors_distances_and_grippers_of_the_newest_tick(robot:
 def test_it_shows_the_episode_and_the_subtask_that_are_recorded(robot: Robot) -> None:
     words = ArmWords(JOINTS, BindingSettings())
     table = LiveTable("demo", words, episodes=EpisodeWords(("reach", "grasp [the] cube")))
-    begun = (Reason(ReasonKind.EPISODE_BEGINS), Reason.of(ReasonKind.SUBTASK_BEGINS, number=2, name="grasp"))
+    begun = (Reason(TeleopReason.EPISODE_BEGINS), Reason.of(TeleopReason.SUBTASK_BEGINS, number=2, name="grasp"))
     told = [Event(1.0, "left", "paused", "paused", reason) for reason in begun]
     table(replace(tick_at(robot, 1.0), events=told))
     assert "records episode 1, subtask 2: grasp [the] cube" in printed(table.render(), 160)

@@ -17,7 +17,8 @@ import numpy as np
 import pinocchio as pin
 
 from q2r2_control.config.fri import GripperIoConfig
-from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.events import Reason
+from q2r2_control.plants.fri.reasons import FriReason
 from q2r2_control.plants.fri.session import DELAY
 from q2r2_control.plants.fri.session_state import ArmCommand, SessionState
 from q2r2_control.plants.fri.wire import JOINTS, CommandKind, Monitoring, joints_of
@@ -138,11 +139,11 @@ class FriCell:
         told, self._told = self._told, self._ends()
         for arm, state in self.states.items():
             dropped = self._told[arm] > told[arm]
-            fault = state.fault(self._now) or (Reason.of(ReasonKind.FRI_DROPPED, arm=arm) if dropped else None)
+            fault = state.fault(self._now) or (Reason.of(FriReason.FRI_DROPPED, arm=arm) if dropped else None)
             if fault is not None:
                 return fault
         late = self._withdraws and self._now - self._in_time > _NO_COMMANDS
-        return Reason(ReasonKind.FRI_OVERTAKEN) if late else None
+        return Reason(FriReason.FRI_OVERTAKEN) if late else None
 
     def _ends(self) -> dict[str, int]:
         return {arm: state.ended for arm, state in self.states.items()}

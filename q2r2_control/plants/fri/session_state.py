@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.events import Reason
 from q2r2_control.plants.fri.answers import CATCH_UP
+from q2r2_control.plants.fri.reasons import FriReason
 from q2r2_control.plants.fri.wire import JOINTS, CommandKind, IoValue, Joints, Monitoring, Safety, Session, in_words
 from q2r2_control.types import ArmTiming
 
@@ -79,23 +80,23 @@ class SessionState:
         newest = self.newest
         if newest is None or self.is_silent(now):
             if self.problem is not None:
-                return Reason.of(ReasonKind.FRI_UNREADABLE, arm=self.arm, source=self.source, text=self.problem)
-            return Reason.of(ReasonKind.FRI_SILENT, arm=self.arm, source=self.source)
+                return Reason.of(FriReason.FRI_UNREADABLE, arm=self.arm, source=self.source, text=self.problem)
+            return Reason.of(FriReason.FRI_SILENT, arm=self.arm, source=self.source)
         if self.is_too_slow:
             period, allowed = 1e3 * self.period, 1e3 * TORQUE_PERIOD
-            return Reason.of(ReasonKind.FRI_TOO_SELDOM, arm=self.arm, period=period, allowed=allowed)
+            return Reason.of(FriReason.FRI_TOO_SELDOM, arm=self.arm, period=period, allowed=allowed)
         # After some stops of the safety controller the session goes on for a while. Our own stop has to begin at once.
         if newest.session is not Session.COMMANDING_ACTIVE or newest.safety is not Safety.NORMAL:
             states = newest.session, newest.quality, newest.safety, newest.drives
             doing, quality, safety, drives = map(in_words, states)
             return Reason.of(
-                ReasonKind.FRI_SESSION, arm=self.arm, session=doing, quality=quality, safety=safety, drives=drives
+                FriReason.FRI_SESSION, arm=self.arm, session=doing, quality=quality, safety=safety, drives=drives
             )
         if self.following and self.lag > _LONGEST_LAG:
-            return Reason.of(ReasonKind.FRI_BEHIND, arm=self.arm, period=1e3 * newest.period, lag=self.lag)
+            return Reason.of(FriReason.FRI_BEHIND, arm=self.arm, period=1e3 * newest.period, lag=self.lag)
         if newest.command is not self.wanted:
             asked, wanted = newest.command.name.lower(), self.wanted.name.lower()
-            return Reason.of(ReasonKind.FRI_COMMAND_MODE, arm=self.arm, asked=asked, wanted=wanted)
+            return Reason.of(FriReason.FRI_COMMAND_MODE, arm=self.arm, asked=asked, wanted=wanted)
         return None
 
 

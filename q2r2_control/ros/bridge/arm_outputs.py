@@ -14,12 +14,14 @@ from std_msgs.msg import Bool, String
 from q2r2_control.config.presets import BUILTIN, POSE, TWIST, Mode
 from q2r2_control.config.teleop import GuardSettings
 from q2r2_control.errors import ConfigError
-from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.events import Reason
 from q2r2_control.ros.base_node import LATCHED_QOS, BaseNode
 from q2r2_control.ros.bridge.frames import PoseTopic
 from q2r2_control.ros.bridge.parameters import ArmParameters
 from q2r2_control.ros.bridge.target_output import TargetOutput
 from q2r2_control.ros.commanders import takers_of
+from q2r2_control.ros.reasons import RosReason
+from q2r2_control.supervision.reasons import SupervisionReason
 from q2r2_control.supervision.standstill import LAGGING_TOOL, StandstillWatch, standing
 from q2r2_control.supervision.target_stream import apart
 from q2r2_control.teleop.arm_states import ArmState
@@ -179,7 +181,7 @@ class ArmOutputs:
         distance, angle = apart(safe, tool)
         if distance <= MAX_OFFSET[0] and angle <= MAX_OFFSET[1]:
             return None
-        kind, topic, frame = ReasonKind.SAFE_TARGET_AWAY, self._safe_target.topic, self._tool_frame
+        kind, topic, frame = RosReason.SAFE_TARGET_AWAY, self._safe_target.topic, self._tool_frame
         return Reason.of(kind, topic=topic, frame=frame, distance=distance, angle=angle)
 
     def forget(self, now: float) -> None:
@@ -218,13 +220,13 @@ class FollowWatch:
         if (now := time.monotonic()) - self._looked > _LOOK_PERIOD:
             self._looked, self._is_there = now, bool(self._node.count_publishers(self._state_topic))
         if not self._is_there:
-            kind, topic = ReasonKind.CONTROLLER_ABSENT, self._state_topic
+            kind, topic = RosReason.CONTROLLER_ABSENT, self._state_topic
             return Reason.of(kind, controller=self.controller, topic=topic, type=_STATE_TYPE)
         if (age := now - self._reported_at) <= _SILENT:
             return self._unready
         if age == math.inf:
-            return Reason.of(ReasonKind.TOPIC_EMPTY, topic=self._state_topic)
-        return Reason.of(ReasonKind.TOPIC_SILENT, topic=self._state_topic, source="", age=age)
+            return Reason.of(RosReason.TOPIC_EMPTY, topic=self._state_topic)
+        return Reason.of(RosReason.TOPIC_SILENT, topic=self._state_topic, source="", age=age)
 
     def notice(self, starts: int) -> None:
         """Forget the reports of an earlier controller; ``starts`` counts how often a controller has appeared."""
@@ -245,7 +247,7 @@ class FollowWatch:
         self._since, self._followed_since = min(self._since, now), math.inf
         if not (dropped or now - self._since > self._timeout):
             return None
-        return Reason.of(ReasonKind.FOLLOWED_NO_MORE if dropped else ReasonKind.NOT_FOLLOWED, topic=self._topic)
+        return Reason.of(RosReason.FOLLOWED_NO_MORE if dropped else RosReason.NOT_FOLLOWED, topic=self._topic)
 
     def _on_following(self, message: Bool) -> None:
         self._follows = bool(message.data)
@@ -266,12 +268,12 @@ class FollowWatch:
         if state in _READY:
             return None
         if state == "paused":
-            return Reason.of(ReasonKind.CONTROLLER_ON_PAUSE, controller=self.controller)
+            return Reason.of(RosReason.CONTROLLER_ON_PAUSE, controller=self.controller)
         if fault is None:
-            return Reason.of(ReasonKind.CONTROLLER_PHASE, phase=state)
-        if fault.kind is ReasonKind.CONTROLLER_DEACTIVATED:
+            return Reason.of(SupervisionReason.CONTROLLER_PHASE, phase=state)
+        if fault.kind is RosReason.CONTROLLER_DEACTIVATED:
             return fault
-        kind = ReasonKind.CONTROLLER_STOPPED if state == "stopped" else ReasonKind.CONTROLLER_FAULT
+        kind = RosReason.CONTROLLER_STOPPED if state == "stopped" else RosReason.CONTROLLER_FAULT
         return Reason.of(kind, fault, controller=self.controller, phase=state)
 
 
@@ -294,7 +296,7 @@ class CommandType:
 
     @property
     def unready(self) -> Reason | None:
-        return None if self._agreed else Reason.of(ReasonKind.NO_POSE_COMMANDS, service=self._service)
+        return None if self._agreed else Reason.of(RosReason.NO_POSE_COMMANDS, service=self._service)
 
     def step(self, starts: int, now: float) -> None:
         """Call the service if a call is due; ``starts`` counts how often the controller has appeared."""
@@ -308,4 +310,4 @@ class CommandType:
 
 
 def _refused(why: Reason | None) -> Reason | None:
-    return None if why is None else Reason(ReasonKind.CONTROLLER_REFUSES, cause=why)
+    return None if why is None else Reason(RosReason.CONTROLLER_REFUSES, cause=why)

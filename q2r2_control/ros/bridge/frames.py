@@ -16,11 +16,12 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosbags.serde import SerdeError
 from tf2_msgs.msg import TFMessage
 
-from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.events import Reason
 from q2r2_control.ros.base_node import STREAM_QOS, BaseNode
 from q2r2_control.ros.bridge.messages import is_pose, pose_of_numbers
 from q2r2_control.ros.bridge.wire import TransformNumbers, read_pose, transforms_reader
 from q2r2_control.ros.monitoring import Publishers
+from q2r2_control.ros.reasons import RosReason
 from q2r2_control.supervision.target_stream import apart
 from q2r2_control.supervision.targets import SequenceWatch
 
@@ -145,7 +146,7 @@ class FrameListener:
         now = time.monotonic()
         for name, _ in self.tree.upwards(frame):
             if now - self._disagree.get(name, -math.inf) <= _REMEMBERED:
-                return Reason.of(ReasonKind.FRAME_DISPUTED, frame=name, publishers=self._publishers.of(_TF))
+                return Reason.of(RosReason.FRAME_DISPUTED, frame=name, publishers=self._publishers.of(_TF))
         return None
 
     def _take(self, message: bytes, info: Mapping[str, int | None]) -> None:
@@ -191,10 +192,10 @@ class ToolFrame:
         if placement is not None:
             self.received = placement.received
         if placement is None:
-            self.problem = Reason.of(ReasonKind.NO_TRANSFORM, frame=self._frame, world=self._world)
+            self.problem = Reason.of(RosReason.NO_TRANSFORM, frame=self._frame, world=self._world)
         elif (age := now - placement.received) > self._timeout:
             source = self._publishers.source(_TF)
-            self.problem = Reason.of(ReasonKind.TRANSFORM_OLD, frame=self._frame, source=source, age=age)
+            self.problem = Reason.of(RosReason.TRANSFORM_OLD, frame=self._frame, source=source, age=age)
         else:
             self.problem = None
             return placement.pose
@@ -216,18 +217,18 @@ class PoseTopic:
 
     def at(self, now: float) -> pin.SE3 | None:
         if self._newest is None:
-            self.problem = Reason.of(ReasonKind.TOPIC_EMPTY, topic=self.topic)
+            self.problem = Reason.of(RosReason.TOPIC_EMPTY, topic=self.topic)
             return None
         frame, _, received = self._newest
         if now - received > self._timeout:
             source = self._publishers.source(self.topic)
-            self.problem = Reason.of(ReasonKind.TOPIC_SILENT, topic=self.topic, source=source, age=now - received)
+            self.problem = Reason.of(RosReason.TOPIC_SILENT, topic=self.topic, source=source, age=now - received)
             return None
         placement = self._tree.find(frame, self._world) if frame else Placement(pin.SE3.Identity(), math.inf)
         if self._pose is None:
-            self.problem = Reason.of(ReasonKind.TOPIC_NOT_A_POSE, topic=self.topic)
+            self.problem = Reason.of(RosReason.TOPIC_NOT_A_POSE, topic=self.topic)
         elif placement is None:
-            self.problem = Reason.of(ReasonKind.NO_TRANSFORM, frame=f"{frame} of {self.topic}", world=self._world)
+            self.problem = Reason.of(RosReason.NO_TRANSFORM, frame=f"{frame} of {self.topic}", world=self._world)
         else:
             self.problem = None
             return placement.pose * self._pose

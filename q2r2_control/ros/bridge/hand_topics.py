@@ -13,7 +13,7 @@ from rclpy.node import Node
 from rclpy.serialization import serialize_message
 from rosbags.serde import SerdeError
 
-from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.events import Reason
 from q2r2_control.inputs.messages import HandMessage, HandPose, HandTwist, MessageType
 from q2r2_control.inputs.samples import SampleQueue
 from q2r2_control.inputs.session import HAND_TOPICS, HAPTIC_TOPICS
@@ -22,6 +22,7 @@ from q2r2_control.ros.base_node import COMMAND_QOS, STREAM_QOS, BaseNode
 from q2r2_control.ros.bridge import messages as convert
 from q2r2_control.ros.commanders import OnePublisher
 from q2r2_control.ros.monitoring import Publishers, node_of
+from q2r2_control.ros.reasons import RosReason
 from q2r2_control.types import SIDES, HandInputs, HandSample, HapticFeedback
 
 _DEPTH = 10  # Queue length of publishers, which are reliable, so that any subscriber matches.
@@ -188,8 +189,8 @@ class HandIntake:
         what = "data" if len(missing) == len(ages) else "pose" if first == "pose" else "button data"
         source = self._publishers[self.hand].source(_topic(self.hand, first))
         if (age := min(missing.values())) == math.inf:
-            return Reason.of(ReasonKind.HAND_UNKNOWN, data=what, hand=self.hand, source=source)
-        return Reason.of(ReasonKind.HAND_SILENT, data=what, hand=self.hand, source=source, age=age)
+            return Reason.of(RosReason.HAND_UNKNOWN, data=what, hand=self.hand, source=source)
+        return Reason.of(RosReason.HAND_SILENT, data=what, hand=self.hand, source=source, age=age)
 
     @property
     def conflict(self) -> Reason | None:

@@ -18,7 +18,7 @@ from std_msgs.msg import Empty
 from q2r2_control.config.cell import Config
 from q2r2_control.config.strict import STREAM_TIMEOUT
 from q2r2_control.errors import ConfigError
-from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.events import Reason
 from q2r2_control.robot.compose import WORLD
 from q2r2_control.robot.robot import Robot
 from q2r2_control.robot.turns import TurnCounter
@@ -35,6 +35,7 @@ from q2r2_control.ros.bridge.messages import (
 )
 from q2r2_control.ros.bridge.wire import JointNumbers, joint_state_reader, read_pose
 from q2r2_control.ros.monitoring import Publishers
+from q2r2_control.ros.reasons import RosReason
 from q2r2_control.supervision.targets import DelayWatch
 from q2r2_control.types import ArmTiming, Array, RobotState
 from q2r2_control.wording import sentence
@@ -116,11 +117,11 @@ class TargetIntake:
         if refusal is not None:
             self._refuse(arm, refusal)
         elif late:
-            self._refuse(arm, Reason.of(ReasonKind.TARGET_LATE, late=late))
+            self._refuse(arm, Reason.of(RosReason.TARGET_LATE, late=late))
         elif frame_id != frame.name:
-            self._refuse(arm, Reason.of(ReasonKind.TARGET_FRAME, frame=frame_id[:40], allowed=frame.name))
+            self._refuse(arm, Reason.of(RosReason.TARGET_FRAME, frame=frame_id[:40], allowed=frame.name))
         elif pose is None:
-            self._refuse(arm, Reason(ReasonKind.TARGET_NOT_A_POSE))
+            self._refuse(arm, Reason(RosReason.TARGET_NOT_A_POSE))
         else:
             self._refused.pop(arm, None)
 
@@ -253,7 +254,7 @@ class JointIntake:
         now = self._node.now
         part = robot_state(message, names, now)
         if isinstance(part, str):
-            take(Reason.of(ReasonKind.BAD_JOINT_STATES, text=self._on_topic(topic, part)), now)
+            take(Reason.of(RosReason.BAD_JOINT_STATES, text=self._on_topic(topic, part)), now)
             return
         passed = min(now - float(self._stamps[joints].min()), _LONGEST_PERIOD)
         self._periods[topic] += _PERIOD_SHARE * (passed - self._periods[topic])
@@ -261,7 +262,7 @@ class JointIntake:
         self._values[:, joints] = part.q, part.v, part.tau
         if missing := [name for name in self._names[topic] if self._stamps[self._joint_names.index(name)] == -math.inf]:
             text = f"no joint {missing[0]}" + (f" and {len(missing) - 1} more" if len(missing) > 1 else "")
-            take(Reason.of(ReasonKind.BAD_JOINT_STATES, text=self._on_topic(topic, text)), now)
+            take(Reason.of(RosReason.BAD_JOINT_STATES, text=self._on_topic(topic, text)), now)
             return
         oldest = float(self._stamps.min())
         if oldest == -math.inf:
@@ -272,7 +273,7 @@ class JointIntake:
         external = None if silent else self._external
         self.state = RobotState(q=q, v=v, tau=tau, tau_external=external, stamp=oldest, held=self.driver_held(q))
         if silent and self._needs_external_torque:
-            take(Reason.of(ReasonKind.NO_EXTERNAL_TORQUES, topic=self._external_topic), now)
+            take(Reason.of(RosReason.NO_EXTERNAL_TORQUES, topic=self._external_topic), now)
         else:
             take(self.driver_fault() or self.state, now)
 

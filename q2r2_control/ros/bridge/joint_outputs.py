@@ -21,13 +21,14 @@ from q2r2_control.config.cell import Config
 from q2r2_control.config.strict import STREAM_TIMEOUT
 from q2r2_control.drives.base import Drive, make_drive
 from q2r2_control.errors import ConfigError
-from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.events import Reason
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.base_node import BaseNode
 from q2r2_control.ros.bridge.messages import joint_state_message
 from q2r2_control.ros.bridge.wire import Template
 from q2r2_control.ros.commanders import CommandWatch, takers_of
 from q2r2_control.ros.monitoring import WatchedPublisher
+from q2r2_control.ros.reasons import RosReason
 from q2r2_control.types import Command, CommandMode, RobotState
 
 NONE = "none"
@@ -250,7 +251,7 @@ class JointOutput:
                 publisher.begin(acknowledged=True)
             return None
         if self._listeners > before:
-            return Reason(ReasonKind.NEW_RECEIVER)
+            return Reason(RosReason.NEW_RECEIVER)
         return next((silence for publisher in publishers if (silence := publisher.silence())), None)
 
 

@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.events import Reason
+from q2r2_control.plants.fri.reasons import FriReason
 from q2r2_control.plants.fri.wire import CommandKind, Drives, Quality, Safety, Session, in_words
 from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.base_node import STREAM_QOS, BaseNode
@@ -60,10 +61,10 @@ class LbrDrivers:
             if arm not in self._newest:
                 topics = " or ".join(f"{namespace}/{name}" for name in STATE_TOPICS)
                 source = f"its driver on {topics}; to start it: {load_controller('lbr_state_broadcaster', namespace)}"
-                return Reason.of(ReasonKind.FRI_SILENT, arm=arm, source=source)
+                return Reason.of(FriReason.FRI_SILENT, arm=arm, source=source)
             state, heard = self._newest[arm]
             if not -_SILENT <= now - heard <= _SILENT:
-                return Reason.of(ReasonKind.FRI_SILENT, arm=arm, source=f"the driver in {namespace}")
+                return Reason.of(FriReason.FRI_SILENT, arm=arm, source=f"the driver in {namespace}")
             if (fault := session_fault(arm, state, self._mode)) is not None:
                 return fault
         return None
@@ -130,7 +131,7 @@ def session_fault(arm: str, state: Any, mode: CommandMode) -> Reason | None:
     """Return why an arm in this state does not follow commands of this mode, or None."""
     if state.session_state != Session.COMMANDING_ACTIVE:
         return Reason.of(
-            ReasonKind.FRI_SESSION,
+            FriReason.FRI_SESSION,
             arm=arm,
             session=_word(Session, state.session_state),
             quality=_word(Quality, state.connection_quality),
@@ -139,7 +140,7 @@ def session_fault(arm: str, state: Any, mode: CommandMode) -> Reason | None:
         )
     if state.client_command_mode != _WANTED[mode]:
         asked, wanted = _word(CommandKind, state.client_command_mode), _word(CommandKind, _WANTED[mode])
-        return Reason.of(ReasonKind.FRI_COMMAND_MODE, arm=arm, asked=asked, wanted=wanted)
+        return Reason.of(FriReason.FRI_COMMAND_MODE, arm=arm, asked=asked, wanted=wanted)
     return None
 
 

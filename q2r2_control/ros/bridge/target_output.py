@@ -13,12 +13,13 @@ from std_msgs.msg import Empty
 
 from q2r2_control.config.presets import BUILTIN, TWIST, Hold, Preset
 from q2r2_control.config.teleop import GuardSettings
-from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.events import Reason
 from q2r2_control.ros.base_node import LATCHED_QOS, SENT_COMMAND_QOS, BaseNode
 from q2r2_control.ros.bridge.messages import ended_topic, fill_pose, pose_template, time_message, twist_stamped
 from q2r2_control.ros.bridge.parameters import ArmParameters
 from q2r2_control.ros.commanders import OnePublisher
 from q2r2_control.ros.monitoring import WatchedPublisher, node_of
+from q2r2_control.ros.reasons import RosReason
 from q2r2_control.supervision.target_stream import apart
 from q2r2_control.supervision.tick_pacer import PoseRateLimiter
 from q2r2_control.teleop.arm_states import ArmState
@@ -62,7 +63,7 @@ class TargetOutput:
         self._publisher = WatchedPublisher(node, kind, topic, values.listener_timeout)
         self.topic = self._publisher.topic_name  # The full name.
         self._one = OnePublisher(node, [self.topic])
-        self._unknown_node = Reason.of(ReasonKind.SUBSCRIBER_UNKNOWN, topic=self.topic)
+        self._unknown_node = Reason.of(RosReason.SUBSCRIBER_UNKNOWN, topic=self.topic)
         self._wrench = None
         if preset.zero_wrench is not None:
             wrench = preset.zero_wrench.format(ctrl=values.prefix)
@@ -91,7 +92,7 @@ class TargetOutput:
     def unready(self) -> Reason | None:
         """A reason if the topic has no subscriber, or one whose node is not known yet."""
         if self._publisher.listeners == 0:
-            return Reason.of(ReasonKind.NO_SUBSCRIBER, topic=f"{self.topic} ({self.preset.message})")
+            return Reason.of(RosReason.NO_SUBSCRIBER, topic=f"{self.topic} ({self.preset.message})")
         return self._unknown_node if self._unknown and not self.following else None
 
     def take_fault(self, now: float) -> Reason | None:
@@ -112,7 +113,7 @@ class TargetOutput:
         fault, self._fault = self._fault, None
         if fault is None and self.following and (silence := self._publisher.silence()) is not None:
             self.forget(now)  # The successor of the controller must not get an old target.
-            return Reason.of(ReasonKind.CONTROLLER_SILENT, silence, controller=self._controller)
+            return Reason.of(RosReason.CONTROLLER_SILENT, silence, controller=self._controller)
         return fault
 
     def step(
@@ -204,7 +205,7 @@ class TargetOutput:
         endpoints = {bytes(info.endpoint_gid) for name, info in found if name == self._controller}
         appeared, gone = endpoints - self._endpoints, self._endpoints and not endpoints
         if self.following and (appeared or gone):
-            kind = ReasonKind.CONTROLLER_RESTARTED if appeared else ReasonKind.CONTROLLER_ENDED
+            kind = RosReason.CONTROLLER_RESTARTED if appeared else RosReason.CONTROLLER_ENDED
             self._fault = Reason.of(kind, controller=self._controller)
         if appeared or gone:
             self.forget(now)

@@ -14,11 +14,13 @@ from std_srvs.srv import Trigger
 from q2r2_control.config.presets import BUILTIN, RAW_WARNING, Mode
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.errors import ConfigError
-from q2r2_control.events import Event, Reason, ReasonKind
+from q2r2_control.events import CommonReason, Event, Reason
 from q2r2_control.recording.messages import RECORDER
 from q2r2_control.ros.base_node import STEADY, BaseNode
+from q2r2_control.ros.reasons import RosReason
 from q2r2_control.teleop.arm_states import HOLDING
 from q2r2_control.teleop.both_arms import EpisodeMarks
+from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.teleop.teleop import Teleop
 
 if TYPE_CHECKING:
@@ -73,22 +75,22 @@ class HomeClient:
         if self._seen:
             if not self._said:
                 self._end(
-                    teleop, now, outcome or Reason(ReasonKind.HOMING_FAULT, cause=Reason(ReasonKind.HOMING_ENDED))
+                    teleop, now, outcome or Reason(CommonReason.HOMING_FAULT, cause=Reason(CommonReason.HOMING_ENDED))
                 )
         elif accepted and late:
-            self._end(teleop, now, outcome or Reason.of(ReasonKind.HOMING_NOT_BEGUN, controller=self._name))
+            self._end(teleop, now, outcome or Reason.of(RosReason.HOMING_NOT_BEGUN, controller=self._name))
         elif not accepted and self._answer.done():
             self._end(teleop, now, Reason.in_words(self._answer.result().message))
         elif late:
             self._home.remove_pending_request(self._answer)
-            self._end(teleop, now, Reason.of(ReasonKind.NO_ANSWER, service=f"{self._name}/home"))
+            self._end(teleop, now, Reason.of(RosReason.NO_ANSWER, service=f"{self._name}/home"))
 
     def _call_home(self, teleop: Teleop, now: float) -> None:
         self._seen = False
         if self._home is None:
-            self._end(teleop, now, Reason(ReasonKind.NO_WAY_HOME))
+            self._end(teleop, now, Reason(RosReason.NO_WAY_HOME))
         elif not self._home.service_is_ready():
-            self._end(teleop, now, Reason.of(ReasonKind.NO_SERVICE, service=f"{self._name}/home"))
+            self._end(teleop, now, Reason.of(RosReason.NO_SERVICE, service=f"{self._name}/home"))
         else:
             self._since, self._answer = now, self._home.call_async(Trigger.Request())
 
@@ -99,7 +101,7 @@ class HomeClient:
     def _end(self, teleop: Teleop, now: float, outcome: Reason) -> None:
         self._since = self._answer = None
         if not self._seen:
-            outcome = Reason(ReasonKind.NOT_HOMING, cause=outcome)
+            outcome = Reason(TeleopReason.NOT_HOMING, cause=outcome)
         teleop.end_homing(now, outcome)
 
 
@@ -188,7 +190,7 @@ class TeleopLoop:
         # tick. A gap in the node's own ticks is looked at first, because it makes others look silent.
         gap, self._ticked = nodes[0].now - self._ticked, now
         if gap > teleop.settings.gate.timeout:
-            self._pause(now, Reason.of(ReasonKind.NODE_STALLED, duration=gap))
+            self._pause(now, Reason.of(RosReason.NODE_STALLED, duration=gap))
         for arm, fault in faults.items():
             if fault is not None:
                 teleop.pause(now, fault, arm)

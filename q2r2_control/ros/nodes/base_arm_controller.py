@@ -17,7 +17,7 @@ from q2r2_control.config.bindings import Action
 from q2r2_control.config.presets import BUILTIN
 from q2r2_control.config.teleop import GuardSettings, TeleopSettings
 from q2r2_control.errors import ConfigError
-from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.events import Reason
 from q2r2_control.ros.base_node import ERROR, OK, WARN, BaseNode
 from q2r2_control.ros.bridge.arm_feedback import ArmFeedback, listen_to_condition
 from q2r2_control.ros.bridge.arm_outputs import ArmOutputs
@@ -28,9 +28,11 @@ from q2r2_control.ros.bridge.live_parameters import LiveArmParameters, is_of_tel
 from q2r2_control.ros.bridge.parameters import ArmDefaults, ArmParameters, arm_parameters, teleop_defaults
 from q2r2_control.ros.bridge.target_output import near
 from q2r2_control.ros.bridge.teleop_loop import TeleopLoop, TickInputs
+from q2r2_control.ros.reasons import RosReason
 from q2r2_control.teleop.arm import OPEN
 from q2r2_control.teleop.arm_states import AT_REST, HOLDING, ArmState
 from q2r2_control.teleop.hand_motion import MAX_OFFSET
+from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.types import SIDES, ArmTarget
 from q2r2_control.wording import sentence
 
@@ -102,7 +104,7 @@ class BaseArmController(BaseNode):
         self._has_analog_gripper = self.parameters.teleop.bindings.words_of(Action.GRIPPER_ANALOG) is not None
         self._target = ArmTarget(None, OPEN)
         # These values count until the first tick, which never comes if time stands still.
-        not_begun = Reason(ReasonKind.NO_TOOL_POSE, cause=Reason(ReasonKind.NODE_BEGINS))
+        not_begun = Reason(RosReason.NO_TOOL_POSE, cause=Reason(RosReason.NODE_BEGINS))
         self._refusal: tuple[bytes, Reason] | None = WARN, not_begun
         self.inputs = TickInputs(None, None, None, None)
 
@@ -226,7 +228,7 @@ class BaseArmController(BaseNode):
             level, reason = self._refusal
             return level, sentence(reason), values | {"kind": str(reason.kind)}
         if self.gripper.problem is not None:
-            return WARN, self.gripper.problem, values | {"kind": str(ReasonKind.GRIPPER_FAILED)}
+            return WARN, self.gripper.problem, values | {"kind": str(RosReason.GRIPPER_FAILED)}
         if (held := self.outputs.gripper_held) is not None:
             return WARN, held, values
         if self.state in AT_REST:
@@ -247,14 +249,14 @@ class BaseArmController(BaseNode):
         if (conflict := self._conflict()) is not None:
             return ERROR, conflict
         if tool is None:
-            why = self._tool.problem or Reason(ReasonKind.NO_CURRENT_POSE)
-            return WARN, Reason(ReasonKind.NO_TOOL_POSE, cause=why)
+            why = self._tool.problem or Reason(RosReason.NO_CURRENT_POSE)
+            return WARN, Reason(RosReason.NO_TOOL_POSE, cause=why)
         if base is None:
-            return WARN, Reason.of(ReasonKind.NO_TRANSFORM, frame=values.base_frame, world=values.world_frame)
+            return WARN, Reason.of(RosReason.NO_TRANSFORM, frame=values.base_frame, world=values.world_frame)
         unready = self.outputs.unready
         # An arm that follows may lag. An arm that holds would be engaged and lost at every press.
         if self.outputs.builtin and self.state in HOLDING and (away := self.outputs.away(controlled, tool)):
-            unready = unready or Reason(ReasonKind.CONTROLLER_REFUSES, cause=away)
+            unready = unready or Reason(RosReason.CONTROLLER_REFUSES, cause=away)
             if self.state is ArmState.IDLE:
                 self.get_logger().warning(sentence(away), once=True)
         return None if unready is None else (WARN, unready)
@@ -295,13 +297,13 @@ class BaseArmController(BaseNode):
         return response
 
     def _on_pause(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        self.loop.teleop.hold(self.now, Reason(ReasonKind.PAUSE_SERVICE), self.arm_name)
+        self.loop.teleop.hold(self.now, Reason(TeleopReason.PAUSE_SERVICE), self.arm_name)
         response.success, response.message = True, f"{self.arm_name} is paused"
         return response
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Forget everything received, the held target and a stop of the operator. A press engages the arm again."""
-        self.loop.teleop.reset(self.now, self.arm_name, Reason(ReasonKind.RESET_SERVICE))
+        self.loop.teleop.reset(self.now, self.arm_name, Reason(TeleopReason.RESET_SERVICE))
         self.outputs.forget(self.now)
         response.success, response.message = True, f"{self.arm_name} is reset"
         return response

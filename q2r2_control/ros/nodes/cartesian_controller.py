@@ -19,7 +19,7 @@ from std_srvs.srv import SetBool, Trigger
 from q2r2_control.config.cell import load_config
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.drives.base import TorqueDrive, permitted
-from q2r2_control.events import ROUTINE, Reason, ReasonKind
+from q2r2_control.events import Reason
 from q2r2_control.loop.control_loop import ControlLoop
 from q2r2_control.robot.robot import Robot
 from q2r2_control.robot.unchecked import check_watched
@@ -31,12 +31,14 @@ from q2r2_control.ros.bridge.lbr_driver import LbrDrivers
 from q2r2_control.ros.bridge.live_parameters import make_control_live, make_impedance_live, make_watching_live
 from q2r2_control.ros.bridge.obstacle_intake import ObstacleIntake
 from q2r2_control.ros.executor import TickExecutor
+from q2r2_control.ros.reasons import RosReason
 from q2r2_control.supervision.joint_watch import (
     ExternalArms,
     ExternalSettings,
     settings_for_external_arms,
     watch_settings,
 )
+from q2r2_control.supervision.reasons import ROUTINE
 from q2r2_control.supervision.standstill import JOINTS, LAGGING_JOINTS, StandstillLimits
 from q2r2_control.supervision.supervisor import Phase
 from q2r2_control.supervision.target_stream import Origins, StreamSettings
@@ -114,7 +116,7 @@ class CartesianControllerNode(ManagedNode):
         every = 1 if self._only_leads else max(round(_SAFE_TARGET_PERIOD * rate), 1)
         self._feedback = ControllerFeedback(self, self._controller, self._targets, every)
         self._last_tick = self.now
-        self._deactivated = Reason.of(ReasonKind.CONTROLLER_DEACTIVATED, controller=self.get_fully_qualified_name())
+        self._deactivated = Reason.of(RosReason.CONTROLLER_DEACTIVATED, controller=self.get_fully_qualified_name())
         self._others = self._output.watch(self)
         self._other: Reason | None = None  # Another node that commands the arms.
         self._connect()
@@ -187,7 +189,7 @@ class CartesianControllerNode(ManagedNode):
         if events := self._supervisor.events:
             log = self.get_logger()
             for event in events:
-                if event.root.kind in ROUTINE:
+                if event.root.kind in ROUTINE | {RosReason.NODE_ENDS}:
                     log.info(sentence(event))
                 else:
                     log.warning(sentence(event))
@@ -208,7 +210,7 @@ class CartesianControllerNode(ManagedNode):
         return _answer(response, refusal)
 
     def _stop(self) -> Reason | None:
-        self._supervisor.stop(Reason(ReasonKind.STOP_SERVICE))
+        self._supervisor.stop(Reason(RosReason.STOP_SERVICE))
         return None
 
     def health(self) -> tuple[bytes, str, Mapping[str, Any]]:
@@ -262,7 +264,7 @@ class CartesianControllerNode(ManagedNode):
             return sentence(refusal)
         settle = float(self.get_parameter("settle_time").value)
         active = self._tick_until(lambda: self._supervisor.phase is Phase.ACTIVE, settle + _LONGEST_ACTIVATION)
-        problem = None if active else self._supervisor.fault or Reason(ReasonKind.ARMS_MOVE)
+        problem = None if active else self._supervisor.fault or Reason(RosReason.ARMS_MOVE)
         # Commands begin with the next tick.
         if (problem := self._others.commander(_QUIET) or problem) is not None:
             self._supervisor.let_go(problem, self.now)
@@ -284,7 +286,7 @@ class CartesianControllerNode(ManagedNode):
             if self.executor is not None:
                 self.executor.spin_once(timeout_sec=self._period)
 
-        self._come_to_rest(Reason(ReasonKind.NODE_ENDS), spin)
+        self._come_to_rest(Reason(RosReason.NODE_ENDS), spin)
 
     def _come_to_rest(self, why: Reason, go_on: Callable[[], None]) -> None:
         self._supervisor.stop(why)

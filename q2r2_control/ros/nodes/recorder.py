@@ -25,7 +25,7 @@ from std_srvs.srv import Trigger
 from q2r2_control.config.bindings import Action
 from q2r2_control.config.cell import load_config
 from q2r2_control.errors import NOT_RECORDED, ConfigError
-from q2r2_control.events import REFUSALS, Event, Reason, ReasonKind
+from q2r2_control.events import Event, Reason, ReasonKind
 from q2r2_control.judging.episode_judge import EpisodeJudge
 from q2r2_control.recording.about import ROS, About, anonymous, as_yaml, program
 from q2r2_control.recording.messages import (
@@ -43,16 +43,17 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.base_node import ERROR, LATCHED_QOS, OK, RECORDED_QOS, STEADY, WARN, BaseNode
 from q2r2_control.ros.bridge.messages import age
 from q2r2_control.teleop.both_arms import EpisodeMarks
+from q2r2_control.teleop.reasons import REFUSALS, TeleopReason
 from q2r2_control.wording import sentence
 
 _SERVICES = {
-    "start": ReasonKind.EPISODE_BEGINS,
-    "stop": ReasonKind.EPISODE_ENDS,
-    "discard": ReasonKind.EPISODE_DISCARDED,
-    "success": ReasonKind.EPISODE_SUCCEEDED,
-    "failure": ReasonKind.EPISODE_FAILED,
-    "mark": ReasonKind.MARK,
-    Action.NEXT_SUBTASK: ReasonKind.SUBTASK_BEGINS,
+    "start": TeleopReason.EPISODE_BEGINS,
+    "stop": TeleopReason.EPISODE_ENDS,
+    "discard": TeleopReason.EPISODE_DISCARDED,
+    "success": TeleopReason.EPISODE_SUCCEEDED,
+    "failure": TeleopReason.EPISODE_FAILED,
+    "mark": TeleopReason.MARK,
+    Action.NEXT_SUBTASK: TeleopReason.SUBTASK_BEGINS,
 }
 HANDOVER_PERIOD = 0.02  # Time between two looks at new messages. A message waits for two of them at most [s].
 _STREAM_QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -154,11 +155,11 @@ class RecorderNode(BaseNode):
         if self._marks.recorded and self._recorder.fault is not None:
             self._marks.recorded = False
             self.get_logger().error(f"nothing is recorded any more: {self._recorder.fault}")
-            self._tell(Reason.of(ReasonKind.RECORDING_ENDED, text=self._recorder.fault))
+            self._tell(Reason.of(TeleopReason.RECORDING_ENDED, text=self._recorder.fault))
 
     def _serve(self, kind: ReasonKind, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         refusal, reason = self._refusal(kind), Reason(kind)
-        if refusal is None and kind is ReasonKind.SUBTASK_BEGINS:
+        if refusal is None and kind is TeleopReason.SUBTASK_BEGINS:
             reason = self._marks.apply(Action.NEXT_SUBTASK)
             refusal = sentence(reason) if reason.kind in REFUSALS else None
         elif refusal is None:
@@ -180,11 +181,11 @@ class RecorderNode(BaseNode):
 
     def _refusal(self, kind: ReasonKind) -> str | None:
         if not self._marks.recorded:
-            return f"{sentence(Reason(ReasonKind.NO_RECORDING))}: {self._recorder.fault}"
-        if kind is ReasonKind.EPISODE_BEGINS and self._marks.open:
+            return f"{sentence(Reason(TeleopReason.NO_RECORDING))}: {self._recorder.fault}"
+        if kind is TeleopReason.EPISODE_BEGINS and self._marks.open:
             return "an episode has begun and not ended"
-        none_open = kind is ReasonKind.EPISODE_ENDS and not self._marks.open
-        none_begun = kind is ReasonKind.EPISODE_DISCARDED and not self._marks.any
+        none_open = kind is TeleopReason.EPISODE_ENDS and not self._marks.open
+        none_begun = kind is TeleopReason.EPISODE_DISCARDED and not self._marks.any
         return "no episode has begun" if none_open or none_begun else None
 
     def health(self) -> tuple[bytes, str, Mapping[str, Any]]:

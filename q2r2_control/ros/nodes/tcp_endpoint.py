@@ -13,7 +13,7 @@ from rich.live import Live
 from q2r2_control.config.cell import HeadsetConfig, load_config
 from q2r2_control.config.strict import network_of
 from q2r2_control.errors import ConfigError
-from q2r2_control.events import Reason, ReasonKind
+from q2r2_control.events import Reason
 from q2r2_control.inputs.headset import HeadsetServer, watch_of
 from q2r2_control.inputs.headset_check import SILENCE
 from q2r2_control.inputs.listener import access_lines, written
@@ -22,6 +22,7 @@ from q2r2_control.inputs.samples import HandsWatch, Watched
 from q2r2_control.inputs.session import HAND_TOPICS, TopicRecorder, TopicStatistics
 from q2r2_control.ros.base_node import ERROR, OK, STEADY, WARN, BaseNode
 from q2r2_control.ros.bridge.hand_topics import HandPublishers, subscribe_to_hands, subscribe_to_haptics
+from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.types import SIDES, HandFault
 from q2r2_control.viewer.headset_table import topic_line, topic_table
 from q2r2_control.wording import sentence
@@ -98,7 +99,7 @@ class TcpEndpoint(BaseNode):
             before, self._faults[reception.hand] = self._faults[reception.hand], watched.fault
             if watched.fault is not None:
                 if before is not watched.fault:
-                    why = sentence(Reason(ReasonKind(watched.fault)))
+                    why = sentence(Reason(TeleopReason(watched.fault)))
                     self.get_logger().warning(f"{reception.hand} hand: {why}; its poses are left out")
                 return
         frame = self._frames[reception.hand] or (message.frame_id if isinstance(message, HandPose) else "")

@@ -16,9 +16,12 @@ from typing import Any
 
 from q2r2_control.events import ReasonKind
 from q2r2_control.extras import install_line
+from q2r2_control.plants.fri.reasons import FriReason
 from q2r2_control.ros.launch.build import interface_packages
 from q2r2_control.ros.launch.middleware import set_up_middleware
+from q2r2_control.ros.reasons import RosReason
 from q2r2_control.ros.watching.set_view import SILENT, NodeView, SetView
+from q2r2_control.supervision.reasons import SupervisionReason
 from q2r2_control.teleop.arm_states import ArmState
 
 _ONE = "end all but one (a killed one counts for some seconds)"
@@ -27,26 +30,31 @@ _START_HANDS = "start tcp_endpoint and connect the headset, or SimulationInput"
 # The driver's controllers keep their last command, and its hardware cannot be activated again.
 FRI_CURE = "start the application on the pendant, and the driver's launch file anew: it ends with each session"
 _BAD_STATES = (
-    *(ReasonKind.NO_STATES_YET, ReasonKind.STATES_SILENT, ReasonKind.STATE_NOT_FINITE, ReasonKind.STATE_JUMPED),
-    *(ReasonKind.BAD_JOINT_STATES, ReasonKind.NO_EXTERNAL_TORQUES),
+    *(
+        SupervisionReason.NO_STATES_YET,
+        SupervisionReason.STATES_SILENT,
+        SupervisionReason.STATE_NOT_FINITE,
+        SupervisionReason.STATE_JUMPED,
+    ),
+    *(RosReason.BAD_JOINT_STATES, RosReason.NO_EXTERNAL_TORQUES),
 )
 # The cure, by the kind of the fault.
-_CURES = {
+_CURES: dict[ReasonKind, str] = {
     **dict.fromkeys(
-        (ReasonKind.NO_SUBSCRIBER, ReasonKind.SUBSCRIBER_UNKNOWN, ReasonKind.CONTROLLER_ABSENT), _START_CONTROLLER
+        (RosReason.NO_SUBSCRIBER, RosReason.SUBSCRIBER_UNKNOWN, RosReason.CONTROLLER_ABSENT), _START_CONTROLLER
     ),
-    ReasonKind.NO_TOOL_POSE: (
+    RosReason.NO_TOOL_POSE: (
         "start the robot or robot_state_publisher, or look whether its transforms have stopped; parameters "
         "end_effector_link_name, world_frame_id"
     ),
-    ReasonKind.NO_TRANSFORM: "start what publishes that frame; parameters base_frame_id, world_frame_id",
-    **dict.fromkeys((ReasonKind.HAND_SILENT, ReasonKind.HAND_UNKNOWN), _START_HANDS),
-    **dict.fromkeys((ReasonKind.SEVERAL_PUBLISHERS, ReasonKind.FRAME_DISPUTED), _ONE),
-    **dict.fromkeys((ReasonKind.FRI_SESSION, ReasonKind.FRI_SILENT, ReasonKind.FRI_COMMAND_MODE), FRI_CURE),
+    RosReason.NO_TRANSFORM: "start what publishes that frame; parameters base_frame_id, world_frame_id",
+    **dict.fromkeys((RosReason.HAND_SILENT, RosReason.HAND_UNKNOWN), _START_HANDS),
+    **dict.fromkeys((RosReason.SEVERAL_PUBLISHERS, RosReason.FRAME_DISPUTED), _ONE),
+    **dict.fromkeys((FriReason.FRI_SESSION, FriReason.FRI_SILENT, FriReason.FRI_COMMAND_MODE), FRI_CURE),
     **dict.fromkeys(_BAD_STATES, "look at the robot's driver, and at joint_states_topic of cartesian_controller"),
 }
 # Kinds of faults whose sentences already name the cure, as the sentences of a stopped arm do.
-_CURE_IN_SENTENCE = {ReasonKind.CONTROLLER_REFUSES, ReasonKind.CONTROLLER_DEACTIVATED}
+_CURE_IN_SENTENCE = {RosReason.CONTROLLER_REFUSES, RosReason.CONTROLLER_DEACTIVATED}
 _SEE = "docs/ros.md, What moves an arm, and what stops it"
 
 

@@ -13,8 +13,8 @@ import numpy as np
 import pinocchio as pin
 import viser
 
-from q2r2_control.events import ReasonKind
 from q2r2_control.summary.tick import Tick
+from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.types import ActiveLimit
 from q2r2_control.viewer.state_colours import AMBER, GREEN, RED, state_colour
 from q2r2_control.viewer.web.driving import Driving
@@ -44,8 +44,13 @@ _PERIOD = 0.2  # Period at which the table is drawn [s].
 _NEAR_LIMIT = 0.05  # Share of a joint's range that counts as near a limit.
 _EPISODES = 12  # Lines about episodes that are shown.
 _OF_EPISODES = (
-    *(ReasonKind.EPISODE_BEGINS, ReasonKind.EPISODE_ENDS, ReasonKind.EPISODE_SUCCEEDED, ReasonKind.EPISODE_FAILED),
-    *(ReasonKind.EPISODE_DISCARDED, ReasonKind.MARK, ReasonKind.SUBTASK_BEGINS, ReasonKind.VERDICT),
+    *(
+        TeleopReason.EPISODE_BEGINS,
+        TeleopReason.EPISODE_ENDS,
+        TeleopReason.EPISODE_SUCCEEDED,
+        TeleopReason.EPISODE_FAILED,
+    ),
+    *(TeleopReason.EPISODE_DISCARDED, TeleopReason.MARK, TeleopReason.SUBTASK_BEGINS, TeleopReason.VERDICT),
 )
 _BUTTONS = {
     PageRequest.STOP: ("Stop: rest, and end the run", "red"),

@@ -11,17 +11,19 @@ import pytest
 from q2r2_control.config.cell import Config
 from q2r2_control.config.fri import GripperIoConfig
 from q2r2_control.control.controller import CartesianController
-from q2r2_control.events import ReasonKind
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.fri.answers import ReferencePath
 from q2r2_control.plants.fri.cabinet import Cabinet, Trip
 from q2r2_control.plants.fri.cabinet_server import SimulatedArm, SimulatedArms
+from q2r2_control.plants.fri.reasons import FriReason
 from q2r2_control.plants.fri.wire import Joints, Session, joints_of
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.run_summary import RunSummary
 from q2r2_control.summary.tick import Tick
+from q2r2_control.supervision.reasons import SupervisionReason
+from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.types import SIDES, CommandMode
 from tests.pipeline.loops import FreezingLoop
 from tests.plants.fri.soak import ACCELERATION, Soak, make_loop
@@ -62,8 +64,8 @@ def test_a_run_waits_for_the_cabinets_and_refuses_presses_until_then(config: Con
     events = summary.events
     assert summary.broken
     assert told == dict.fromkeys(SIDES, "monitoring ready, connection excellent, drives off")
-    assert {event.reason.root.kind for event in events} == {ReasonKind.FRI_SESSION}
-    assert {event.kind for event in events} == {ReasonKind.NOT_ENGAGED}
+    assert {event.reason.root.kind for event in events} == {FriReason.FRI_SESSION}
+    assert {event.kind for event in events} == {TeleopReason.NOT_ENGAGED}
 
 
 @pytest.mark.slow
@@ -72,7 +74,7 @@ def test_an_activation_is_reported_without_a_warning(config: Config, caplog: pyt
     pipeline = make_loop(config)
     started(pipeline)
     pipeline.run(1.0, realtime=False)
-    told = [entry.levelname for entry in caplog.records if entry.getMessage() == ReasonKind.ACTIVATED.template]
+    told = [entry.levelname for entry in caplog.records if entry.getMessage() == SupervisionReason.ACTIVATED.template]
     assert told == ["INFO"]
 
 
@@ -206,7 +208,7 @@ def test_arms_go_on_even_if_each_tick_takes_longer_than_the_loop_expects(config:
     pipeline.listeners.append(think)
     summary = pipeline.run(2.5, realtime=False)
     assert trips(plant) == []
-    assert ReasonKind.FRI_OVERTAKEN not in {event.reason.root.kind for event in summary.events}
+    assert FriReason.FRI_OVERTAKEN not in {event.reason.root.kind for event in summary.events}
     for arm in SIDES:
         assert summary.arms[arm].engaged_s > 1.5
 
@@ -260,7 +262,7 @@ def test_a_loop_that_is_always_too_late_gets_a_message(config: Config) -> None:
     pipeline.listeners.append(think)
     events = pipeline.run(3.0, realtime=False).events
     assert trips(plant) == []
-    assert ReasonKind.FRI_OVERTAKEN in {event.reason.root.kind for event in events}
+    assert FriReason.FRI_OVERTAKEN in {event.reason.root.kind for event in events}
 
 
 @pytest.mark.slow

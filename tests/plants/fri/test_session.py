@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from q2r2_control.events import ReasonKind
 from q2r2_control.plants.fri.answers import CATCH_UP, CATCH_UP_RAMP
+from q2r2_control.plants.fri.reasons import FriReason
 from q2r2_control.plants.fri.session import ArmSession, follow
 from q2r2_control.plants.fri.session_state import ArmCommand
 from q2r2_control.plants.fri.wire import CommandKind, FriCommand, Joints, Monitoring, Safety, Session, write_monitoring
@@ -160,7 +160,7 @@ def test_a_dropped_session_is_reported_and_the_arm_follows_no_more() -> None:
     assert not cabinet.session.state.following
     fault = cabinet.session.state.fault(cabinet.now)
     assert fault is not None
-    assert fault.kind is ReasonKind.FRI_SESSION
+    assert fault.kind is FriReason.FRI_SESSION
     assert fault.detail["session"] == "monitoring ready"
 
 
@@ -260,9 +260,9 @@ def test_a_cabinet_that_is_silent_or_asks_for_other_commands_is_a_fault() -> Non
         kinds.append(None if fault is None else fault.kind)
         cabinet.ask(replace(ACTIVE, command=CommandKind.TORQUE))
     fault = cabinet.session.state.fault(cabinet.now)
-    assert kinds == [ReasonKind.FRI_SILENT, ReasonKind.FRI_SILENT]
+    assert kinds == [FriReason.FRI_SILENT, FriReason.FRI_SILENT]
     assert fault is not None
-    assert fault.kind is ReasonKind.FRI_COMMAND_MODE
+    assert fault.kind is FriReason.FRI_COMMAND_MODE
 
 
 @pytest.mark.parametrize("stop", [Safety.STOP_0_OR_1, Safety.STOP_1_ON_PATH, Safety.STOP_2])
@@ -274,7 +274,7 @@ def test_a_stop_of_the_safety_controller_is_a_fault_while_the_session_goes_on(st
     cabinet.ask(replace(ACTIVE, safety=stop))
     fault = cabinet.session.state.fault(cabinet.now)
     assert fault is not None
-    assert fault.kind is ReasonKind.FRI_SESSION
+    assert fault.kind is FriReason.FRI_SESSION
 
 
 def test_an_older_message_is_not_answered_and_lost_ones_are_counted() -> None:

@@ -1,0 +1,67 @@
+"""The kinds of reasons that supervision gives."""
+
+from __future__ import annotations
+
+from q2r2_control.events import CommonReason, ReasonKind
+
+
+class SupervisionReason(ReasonKind):
+    """What supervision finds, what stops the arms, and which targets it does not follow."""
+
+    # Obstacles that ROS nodes find. Those of the first group have a cause.
+    CONTROLLER_STANDS = (
+        "controller_stands",
+        "the {arm} arm's controller{takers} stands still: the arm is measured, and does not go the {way:.3f} {unit} "
+        "that it was asked to in {time:g} s",
+    )
+    # Findings of supervision.
+    NO_STATES_YET = "no_states_yet", "no joint states yet{source}"
+    STATES_SILENT = "states_silent", "no joint states{source} for {age:.3f} s; allowed: {timeout:g}"
+    STATE_NOT_FINITE = (
+        "state_not_finite",
+        "measured {quantity} of {joint} = {value} for more than {bridged:g} ms; allowed: finite numbers",
+    )
+    STATE_JUMPED = "state_jumped", "{joint} jumped by {distance:.3f} rad"
+    JOINT_STATES = "joint_states", "joint states: {cause}"
+    OFF_REFERENCE = (
+        "off_reference",
+        "{joint} is {deviation:.3f} rad from its reference for {time:.1f} s; "
+        "allowed: {allowed:g} rad for {allowed_time:g} s",
+    )
+    TOO_HEAVY = (
+        "too_heavy",
+        "{joint} is {deviation:.3f} rad from its reference for {time:.1f} s, "
+        "and gravity alone asks it for {needed:.1f} Nm; "
+        "allowed: {allowed:g} rad for {allowed_time:g} s, and its torque limit, {limit:g} Nm",
+    )
+    TOO_CLOSE = (
+        "too_close",
+        "measured: {pair} are {distance:.4f} m apart; "
+        "allowed: {allowed:.4f}, {key} {kept:g} less distance_tolerance {tolerance:g}",
+    )
+    LEFT_BEHIND = (
+        "left_behind",
+        "{arm}: the tool is {distance:.3f} m and {angle:.2f} rad from where it was led; begins anew where it is",
+    )
+    # Cabinets of KUKA's.
+    ARMS_APART = "arms_apart", "{arm}: {skew:.0f} ms behind the other arm; allowed: {allowed:.0f} ms"
+    RUN_ENDED = "run_ended", "the run has ended"
+    ACTIVATED = "activated", "active: the reference starts at the measured posture"
+    HOMING_OUTCOME = "homing_outcome", "homing ended: {cause}"
+    CONTROLLER_PHASE = "controller_phase", "the controller is {phase}"  # It follows no targets in this phase.
+    CONTROLLER_PAUSED = "controller_paused", "the controller is paused"
+    ARMS_HOMING = "arms_homing", "the arms are on their way home"
+    ARMS_BRAKING = "arms_braking", "the arms are braking"
+    STREAM_AWAY = (
+        "stream_away",
+        "the stream is {distance:.3f} m and {angle:.2f} rad from the tool; to be followed it has to begin anew "
+        "within {engage_distance:g} m and {engage_angle:g} rad",
+    )
+    PUBLISHER_CHANGED = "publisher_changed", "another publisher took over{source}; the targets have to begin anew"
+    TWO_PUBLISHERS = "two_publishers", "two publishers at a time{source}; allowed: one"
+    TARGETS_CEASED = "targets_ceased", "{arm}: targets{source} have ceased, the arm holds"
+    TARGETS_LINKED = "targets_linked", "{arm}: the arm holds because it is linked to {other}: {cause}"
+
+
+# Kinds that tell of no fault.
+ROUTINE: frozenset[ReasonKind] = frozenset({SupervisionReason.ACTIVATED, CommonReason.HOMING_ARRIVED})
