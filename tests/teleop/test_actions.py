@@ -195,3 +195,12 @@ class TestAGripperThatFollowsATrigger:
         driver.alter = lambda received: spoilt(received, inputs=HandInputs(press_index=math.nan))
         driver.run(0.2)
         assert driver.targets["left"].gripper == pytest.approx(0.5)
+
+    def test_the_last_bit_to_both_ends_is_not_lost_to_the_hysteresis(self) -> None:
+        driver = self.driver()
+        for nearly, pressed, opening in ((0.94, 0.96, 0.0), (0.06, 0.04, 1.0)):
+            driver.held = {"trigger": nearly}
+            driver.run(1.0)
+            driver.held = {"trigger": pressed}
+            driver.run(0.1)
+            assert driver.targets["left"].gripper == opening

@@ -11,7 +11,7 @@ import pytest
 
 from q2r2_control.config.teleop import FilterSettings
 from q2r2_control.quaternions import floats_of, se3_of
-from q2r2_control.teleop.filters import PoseFilter
+from q2r2_control.teleop.filters import OneEuro, PoseFilter
 from tests.teleop.hands import pose
 
 Path = Callable[[float], pin.SE3]
@@ -124,6 +124,17 @@ def test_jitter_of_receipt_hardly_changes_the_speed() -> None:
 def test_motion_that_was_missed_in_a_gap_is_caught_up_at_a_bounded_speed() -> None:
     arrivals = [(n / 75, n / 75) for n in range(300) if not 1.5 < n / 75 < 1.6]
     assert speeds(arrivals, 0.5, 1.0).max() < 3.5 * 0.5
+
+
+def test_a_slow_motion_comes_through_with_the_time_constant_of_the_least_cutoff() -> None:
+    # Without beta, the filter is of first order: share = dt / (tau + dt), and the input is ahead by (tau - delay) v.
+    dt, tau, derivative_tau = 0.002, 1.0 / (2.0 * math.pi * 1.5), 1.0 / (2.0 * math.pi * 4.0)
+    one_euro = OneEuro(min_cutoff=1.5, beta=0.0, derivative_cutoff=4.0, delay=0.03)
+    share = dt / (tau + dt)
+    assert one_euro.correction((0.01, 0.0, 0.0), (0.0, 0.0, 0.0), dt) == pytest.approx((0.01 * share, 0.0, 0.0))
+    velocity = 0.001 / (derivative_tau + dt)
+    expected = share * (0.01 + (tau - 0.03) * velocity)
+    assert one_euro.correction((0.01, 0.0, 0.0), (0.001, 0.0, 0.0), dt) == pytest.approx((expected, 0.0, 0.0))
 
 
 def test_a_rotation_stays_a_rotation_after_long_filtering() -> None:

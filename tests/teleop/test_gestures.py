@@ -85,6 +85,14 @@ def test_controls_that_are_held_from_the_first_reading_on_are_reported_once_afte
     assert found.take_stuck(9.0) is None, "it was pressed"
 
 
+def test_a_press_of_exactly_the_hold_time_is_a_hold() -> None:
+    settings = {"chord_window": WINDOW, "hold_time": 0.5, "bindings": HOLDS}
+    gestures = GestureRecognizer(TeleopSettings.model_validate(settings))
+    for stamp, held in ((-1.0, False), (0.0, True), (0.5, False)):
+        reported = gestures.receive(HandInputs(button_lower=held), stamp)
+    assert reported == [HELD_FOR]
+
+
 def test_cancelling_drops_everything_except_a_stop_that_has_begun() -> None:
     gestures = recognizer(upper_hold="stop", lower_hold="home")
     gestures.receive(HandInputs(), 0.0)

@@ -80,6 +80,16 @@ def test_slipping_is_felt_at_every_further_distance_and_again_after_engaging() -
     assert haptics.at(20.0, "left") == feedback(pulses.SLIP)
 
 
+def test_a_slip_is_felt_again_only_after_it_has_shrunk_by_two_steps() -> None:
+    haptics = HapticPulses()
+    felt = []
+    for number, steps in enumerate((3.1, 1.5, 3.1, 1.0, 3.1, 1.0, 0.0, 1.0)):
+        haptics.slip(steps * 0.02, 0.0)
+        felt.append(haptics.at(10.0 * number, "left") == feedback(pulses.SLIP))
+        haptics.at(10.0 * number + 5.0, "left")  # The pulse ends.
+    assert felt == [True, False, False, False, True, False, False, True]
+
+
 def test_a_weaker_vibration_does_not_interrupt_a_stronger_one() -> None:
     haptics = HapticPulses()
     haptics.start_pulse(JUMPED)

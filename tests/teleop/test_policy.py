@@ -207,6 +207,46 @@ def test_grippers_change_at_the_time_of_the_action() -> None:
     assert run.targets["right"].gripper == 1.0
 
 
+def test_actions_that_curve_in_all_directions_are_followed_between_their_times_too() -> None:
+    run = Run()
+    run.now = 0.0
+    way, times = np.array([0.1, -0.2, 0.3]), TICK + PERIOD * np.arange(8)
+
+    def place(t: float) -> Array:
+        return TOOLS["left"].translation + way * (t - times[0]) ** 2
+
+    actions = np.array([(*place(t), *floats_of(TOOLS["left"])[1]) for t in times])
+    run.tick(ActionChunk(times, PERIOD, tools={"left": actions}))
+    while run.now < times[-2]:
+        run.tick()
+        # The velocity at the first action is that of the first segment, since nothing is known of the time before.
+        allowed = 2e-4 if run.now < times[1] else 1e-9
+        np.testing.assert_allclose(run.tools["left"].translation, place(run.now), atol=allowed)
+
+
+def test_a_tap_takes_an_arm_from_the_policy_and_the_next_one_closes_a_gripper_that_it_opened() -> None:
+    run = Run()
+
+    def hands(lower: bool = False, upper: bool = False) -> tuple[HandSample, ...]:
+        return tuple(sample(hand, pose(), run.now + TICK, lower=lower, upper=upper) for hand in SIDES)
+
+    for _ in range(50):
+        run.tick(samples=hands())
+    openings = {side: np.array([0.5, 1.0]) for side in SIDES}
+    still = chunk(run.now + PERIOD * np.arange(2), np.zeros(2), grippers=openings)
+    run.tick(still, samples=hands())
+    for _ in range(60):
+        run.tick(samples=hands())
+    assert run.states() == {"policy"}
+    for tick in range(300):
+        run.tick(samples=hands(lower=tick < 100))
+    assert run.states() == {"engaged"}
+    assert [run.targets[arm].gripper for arm in SIDES] == [1.0, 1.0]
+    for tick in range(200):
+        run.tick(samples=hands(upper=tick < 100))
+    assert [run.targets[arm].gripper for arm in SIDES] == [0.0, 0.0]
+
+
 def test_the_leash_holds_the_target_near_a_blocked_tool() -> None:
     run = Run()
     run.blocked = True

@@ -14,7 +14,7 @@ from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.teleop.teleop import Teleop
 from q2r2_control.types import SIDES
-from tests.teleop.hands import ENGAGED, assert_smooth, engaged, first_target, operator, pose, sample, waving
+from tests.teleop.hands import ENGAGED, assert_smooth, engaged, first_target, operator, pose, sample, spoilt, waving
 
 
 def test_all_arms_start_idle_and_the_first_press_of_a_lower_button_engages_only_that_arm() -> None:
@@ -144,6 +144,21 @@ def test_a_chord_moves_no_gripper_stops_both_arms_and_sets_new_anchors_when_rele
         assert history[-1][arm].gripper == 1.0
         np.testing.assert_allclose(first_target(history, arm).translation, driver.tools[arm].translation, atol=1e-9)
     assert_smooth(history)
+
+
+def test_an_alignment_ends_only_with_a_pose_that_came_after_the_buttons_were_released() -> None:
+    driver = engaged()
+    driver.lower, driver.upper = set(SIDES), set(SIDES)
+    driver.run(0.05)
+    assert driver.states == {"left": "aligning", "right": "aligning"}
+    before = driver.now - 0.02
+    driver.alter = lambda received: spoilt(received, pose_stamp=before)
+    driver.lower, driver.upper = set(), set()
+    driver.tick(driver.samples())
+    assert driver.states == {"left": "aligning", "right": "aligning"}
+    driver.alter = lambda received: received
+    driver.tick(driver.samples())
+    assert driver.states == ENGAGED
 
 
 DT = 0.002
