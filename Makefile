@@ -14,7 +14,7 @@ setup: $(VENV)/.installed-dev
 # Reinstalled when the dependencies change; the package itself is editable, so code changes need nothing.
 $(VENV)/.installed: pyproject.toml setup.py
 	@$(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(not (3, 11) <= v[:2] < (3, 15) and f"q2r2_control needs Python 3.11 to 3.14, and this is {v[0]}.{v[1]}: make PYTHON=python3.12 ...")'
-	@echo 'installing packages into $(VENV) ...'
+	@echo 'installing packages into $(VENV), some 700 MB: this takes minutes ...'
 	@$(PYTHON) -m venv $(VENV)
 	@$(PIP) --editable .
 	@touch $@

@@ -276,7 +276,7 @@ class StepReport:
     tightest_pair: tuple[str, str] = ("", "")  # Names of the geometries of the pair with the least margin.
     margin: float = math.inf  # Distance of that pair less the distance that it keeps [m].
     unsolved: int = 0  # Bit i is set if the QP of substep i had no solution in time, so that the stop was executed.
-    faults: tuple[str, ...] = ()  # Why answers of the user's own tasks and constraints were not used.
+    faults: tuple[str, ...] = ()  # Why targets, or answers of the user's tasks, constraints and solver, were not used.
 
 
 @dataclass(slots=True)

@@ -28,7 +28,7 @@ from q2r2_control.robot.pairs import link_of
 from q2r2_control.robot.robot import PairDistance, Robot
 from q2r2_control.robot.stop_torque import StopTorque, stop_torques
 from q2r2_control.robot.unchecked import unchecked_notes
-from q2r2_control.supervision.homing import preflight_faults
+from q2r2_control.supervision.preflight import preflight_faults
 from q2r2_control.types import DeviceControls
 
 _NEAREST = 8

@@ -323,6 +323,9 @@ def _run(
             )
             pipeline.listeners.append(table)
             stack.enter_context(table.shown(console))
+        elif options.simulated_time and options.duration is not None:
+            # On a slow computer the motion may take minutes, in which nothing else is printed.
+            say(f"{options.name}: begins, {options.duration:.0f} s of simulated time", console)
         streams.wait_until_ready()
         drawn = pipeline.config.simulated_cameras if isinstance(pipeline.plant, MujocoPlant) else {}
         for name, most, show, watched in _lookers(pipeline, page, [*drawn, *streams.streams]):

@@ -67,7 +67,7 @@ def check(
 ) -> None:
     """Validate a cell and print its arms, limits, obstacles and distances at home.
 
-    Exit code 1 if home is unsafe.
+    Exit code 1 if the cell cannot run, 2 if it cannot be read.
     """
     if pairs is not None:
         cell = load_config(config)

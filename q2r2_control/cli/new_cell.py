@@ -19,7 +19,7 @@ from q2r2_control.cli.answers import RememberedAnswers
 from q2r2_control.cli.cell_report import check_cell
 from q2r2_control.cli.cell_yaml import commented_yaml
 from q2r2_control.cli.model_arguments import SPEEDS, named_values, without_mjcf
-from q2r2_control.cli.output import Json, as_json_text, counting, say
+from q2r2_control.cli.output import Json, as_json_text, counted, counting, say
 from q2r2_control.config.cell import Config, load_config, parse_config
 from q2r2_control.errors import ConfigError, Q2R2Error
 from q2r2_control.robot.compose import compose
@@ -195,9 +195,8 @@ def _survey(draft: _Draft, models: dict[str, str], tips: dict[str, str | None], 
         if gripper := gripper_of(described[side], tree, found[side]):
             arms[side]["gripper"] = gripper
             driven, key = ", ".join(gripper["joints"]), f"arms.{side}.gripper"
-            draft.notes.append(
-                f"{side} arm: {driven} beyond its tip, {found[side]}, are taken for a gripper's joints, see {key}"
-            )
+            taken = "are taken for joints" if len(gripper["joints"]) > 1 else "is taken for the joint"
+            draft.notes.append(f"{side} arm: {driven} beyond its tip, {found[side]}, {taken} of a gripper, see {key}")
     # The shape of a finger covers its whole stroke. Finer shapes would hardly make it smaller.
     moved = {
         side: links_moved_by(tree, [joint.get("name", "") for joint in chains[side]])
@@ -332,7 +331,8 @@ def _print(draft: _Draft, notes: list[str], faults: list[str]) -> None:
         sizes = ("radius [mm]", "length [mm]", "beyond the mesh [mm]")
         columns = ("link", *sizes, "empty [%]", "better", "then empty [%]")
         if fits:
-            title = f"{model}: capsules around {len(fits)} meshes, which none sticks out of; the worst first"
+            meshes = counted(len(fits), "mesh", "meshes")
+            title = f"{model}: capsules around {meshes}, each with the whole mesh inside; the worst first"
             print_table(figure_table(title, columns, rows), console)
     for note in notes:
         say(f"NOTE {note}", console)

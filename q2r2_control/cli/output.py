@@ -94,9 +94,23 @@ def say(line: str, console: Console | None = None, style: str = "") -> None:
 
 @contextmanager
 def counting(what: str = "") -> Iterator[Callable[[str, int, int], None]]:
-    """Show the progress of long work if stderr is a terminal. The yielded function takes a text, done and total."""
+    """Show the progress of long work: a bar if stderr is a terminal, or else a line every few seconds.
+
+    The yielded function takes a text, done and total.
+    """
     console = Console(stderr=True)
-    with Progress(console=console, disable=not console.is_terminal, transient=True) as progress:
+    if not console.is_terminal:
+        due = time.monotonic() + _BETWEEN_LINES_S
+
+        def tell(of: str, done: int, total: int) -> None:
+            nonlocal due
+            if time.monotonic() >= due:
+                due = time.monotonic() + _BETWEEN_LINES_S
+                say(f"{of or what}: {done} of {total}", console)
+
+        yield tell
+        return
+    with Progress(console=console, transient=True) as progress:
         task = progress.add_task(what, total=None)
         yield lambda of, done, total: progress.update(task, description=of or what, completed=done, total=total)
 
@@ -147,9 +161,9 @@ def notes_of(task: str | None, operator: str | None, record: object, anonymous: 
     return notes
 
 
-def counted(number: int, noun: str) -> str:
-    """Return ``number`` and ``noun``, which gets an s unless the number is one."""
-    return f"{number} {noun}{'s' * (number != 1)}"
+def counted(number: int, noun: str, plural: str | None = None) -> str:
+    """Return ``number`` and ``noun``, or its ``plural`` unless the number is one. None adds an s."""
+    return f"{number} {noun if number == 1 else plural or noun + 's'}"
 
 
 def positive(option: str, value: float | None) -> float | None:

@@ -40,7 +40,7 @@ from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.process.places import chosen_place
 from q2r2_control.recording.reader import recordings_in
 from q2r2_control.recording.replay import replay as replay_recording
-from q2r2_control.viewer.tables import figure_table
+from q2r2_control.viewer.tables import figure_table, print_table
 from q2r2_control.viewer.web.playback import Playback
 from q2r2_control.viewer.web.view import PageView
 
@@ -114,7 +114,7 @@ def replay(
         elif result.summary is not None:
             console = Console()
             console.print(verdict_line(result.summary), soft_wrap=True, highlight=False)
-            console.print(summary_table(result.summary, verbose))
+            print_table(summary_table(result.summary, verbose), console)
         for name, arm in result.arms.items():
             off = f"{arm.position_mm_rms:.3f} mm RMS, {arm.position_mm_max:.3f} mm and {arm.rotation_deg_max:.3f} deg"
             print(f"{name} arm: tool {off} at most from where it was when recorded")
@@ -158,7 +158,8 @@ def _print_verdicts(judged: Sequence[Judgement], unreadable: Sequence[Unreadable
     rows = [(one.figures.name, one.verdict.word, *(column.text(one.figures) for column in columns)) for one in judged]
     rows += [(one.file.stem, "discard", *("-" for _ in columns)) for one in unreadable]
     title = f"episodes: {kept} kept, {len(rows) - kept} discarded"
-    console.print(figure_table(title, ("episode", "verdict", *(column.heading for column in columns)), rows))
+    if judged:
+        print_table(figure_table(title, ("episode", "verdict", *(column.heading for column in columns)), rows), console)
     for one in judged:
         if not one.verdict.keep:
             name = one.figures.file + ("" if one.figures.part is None else f" #{one.figures.part}")

@@ -12,7 +12,7 @@ from q2r2_control.events import Event
 from q2r2_control.summary.run_summary import ArmSummary, Percentiles, RunSummary, TorqueSummary
 from q2r2_control.teleop.arm_states import ArmState, is_fault
 from q2r2_control.teleop.reasons import TeleopReason
-from q2r2_control.viewer.tables import figure_table
+from q2r2_control.viewer.tables import figure_table, times_real_time
 from q2r2_control.wording import sentence
 
 
@@ -54,7 +54,7 @@ def summary_table(summary: RunSummary, verbose: bool = False) -> Table:
 
 def _result(summary: RunSummary) -> Iterator[tuple[str, str]]:
     factor = summary.real_time_factor
-    pace = f"{summary.loop_rate_hz:.0f} Hz" if factor is None else f"{factor:.1f} x real time"
+    pace = f"{summary.loop_rate_hz:.0f} Hz" if factor is None else times_real_time(factor)
     yield "duration", f"{summary.duration_s:.2f} s, {summary.ticks} ticks, {pace}"
     for name, arm in summary.arms.items():
         yield f"{name} arm", ", ".join(_arm_figures(arm))
@@ -73,7 +73,8 @@ def _result(summary: RunSummary) -> Iterator[tuple[str, str]]:
     if summary.min_distance_mm is not None and summary.closest_pair is not None:
         yield "nearest pair", f"{summary.min_distance_mm:.1f} mm, {' | '.join(summary.closest_pair)}"
     if summary.missed_ticks:
-        yield "ticks missed", f"{summary.missed_ticks}, which made the motion {summary.stretched_s:.2f} s late in all"
+        late = f"the loop was late by {summary.stretched_s:.2f} s in all, by which every motion waited"
+        yield "ticks missed", f"{summary.missed_ticks} of {summary.missed_ticks + summary.ticks}; {late}"
     for name, event in _last_faults(summary).items():
         label = f"{name} arm" if event.kind is TeleopReason.NOT_ENGAGED else f"{name} arm paused by"
         yield label, f"[yellow]{escape(sentence(event.reason))}[/], at {event.t:.2f} s"

@@ -289,6 +289,8 @@ def parse_config(text: str, path: str | os.PathLike[str], folder: Path | None = 
     Raises:
         ConfigError: As in :func:`load_config`.
     """
+    if text.lstrip().startswith("<"):
+        raise ConfigError(f"{path}: is XML, such as a URDF; allowed: a cell's YAML; q2r2 new-cell makes one of a URDF")
     try:
         data = yaml.load(text, Loader=_Loader)
     # Values such as dates and huge integers, and too deep nesting, raise Python's own exceptions.

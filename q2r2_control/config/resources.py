@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sysconfig
+from difflib import get_close_matches
 from pathlib import Path
 
 from q2r2_control.errors import ConfigError, shown
@@ -37,14 +38,19 @@ def find_resource(path: str | os.PathLike[str]) -> Path:
     except (OSError, ValueError, RuntimeError) as error:
         # The name is too long, a folder may not be entered, or the user of a home folder is not known.
         raise ConfigError(f"{path!s:.120}: cannot be looked up: {error!s:.120}") from error
-    raise ConfigError(f"{path}: no such file here, nor among the shipped ones ({_shipped(wanted)})")
+    raise ConfigError(f"{path}: no such file here, nor among the shipped ones{_shipped(wanted)}")
 
 
 def _shipped(wanted: Path) -> str:
+    """Return the shipped files of this kind, or the name that was probably meant."""
     names = {
         f"{folder}/{file.name}"
         for root in resource_roots()
         for folder in ("config", "robots")
-        for file in (root / folder).glob(f"*{wanted.suffix or '.yaml'}")
+        for file in (root / folder).glob("*.*")
+        if file.is_file()
     }
-    return ", ".join(sorted(names)) or "none found"
+    if meant := get_close_matches(str(wanted), names, n=1, cutoff=0.85):
+        return f"; did you mean {meant[0]}?"
+    of_kind = sorted(name for name in names if name.endswith(wanted.suffix or ".yaml"))
+    return f" ({', '.join(of_kind)})" if of_kind else ""

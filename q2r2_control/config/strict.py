@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from difflib import get_close_matches
 from ipaddress import IPv4Network, IPv6Network, ip_network
 from typing import Any, Self, TypeVar, get_args
 
@@ -113,7 +114,9 @@ def _line(key: str, fault: ErrorDetails, model: type[BaseModel]) -> str:
     if (words := _ALLOWED.get(fault["type"])) is not None:
         allowed = f"allowed: {words.format(**fault.get('ctx', {}))}"
     if fault["type"] == "extra_forbidden":
-        allowed = f"unknown key; allowed here: {', '.join(_keys_at(fault['loc'][:-1], model))}"
+        keys = _keys_at(fault["loc"][:-1], model)
+        meant = get_close_matches(str(fault["loc"][-1]), keys, n=1)
+        allowed = f"unknown key; allowed here: {', '.join(keys)}" + (f"; did you mean {meant[0]}?" if meant else "")
     # For a whole block, the text itself names the keys that do not fit together.
     is_block = fault["type"] == "value_error" and isinstance(fault["input"], dict)
     value = "" if is_block else f" = {shown(fault['input'])}"

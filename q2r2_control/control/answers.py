@@ -16,13 +16,14 @@ Answer = tuple[Array, Array]
 _MAX_LENGTH = 120  # Of the line.
 
 
-def answer_of(ask: Callable[[Array, Array], object], q: Array, v: Array) -> Answer | str:
+def answer_of(ask: Callable[[Array, Array], object], q: Array, v: Array, shapes: str = "") -> Answer | str:
     """Ask for a matrix and a vector at a state.
 
     Args:
         ask: Gets copies of ``q`` and ``v``, and may do anything.
         q: Joint positions (nv,) [rad].
         v: Joint velocities (nv,) [rad/s].
+        shapes: The allowed shapes for a person; "" if they are (k, nv) and (k,).
 
     Returns:
         A finite matrix (k, nv) and vector (k,), or one line that says why there are none.
@@ -36,7 +37,7 @@ def answer_of(ask: Callable[[Array, Array], object], q: Array, v: Array) -> Answ
         return f"raised {raised(error, _MAX_LENGTH)}"
     nv = len(q)
     if matrix.ndim != 2 or matrix.shape[1] != nv or vector.shape != matrix.shape[:1]:
-        return f"returned shapes {matrix.shape} and {vector.shape}; allowed: (k, {nv}) and (k,)"
+        return f"returned shapes {matrix.shape} and {vector.shape}; allowed: {shapes or f'(k, {nv}) and (k,)'}"
     if not (np.isfinite(matrix).all() and np.isfinite(vector).all()):
         return "returned a number that is not finite"
     return matrix, vector

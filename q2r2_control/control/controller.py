@@ -81,7 +81,7 @@ class CartesianController(WatchedPairs):
         check_kind("settings", settings, ControllerSettings, "ControllerSettings, which a Config has as config.control")
         if isinstance(solver, str):
             settings = settings.with_solver(solver)
-        elif solver is not None and not callable(getattr(solver, "solve", None)):
+        elif solver is not None and (isinstance(solver, type) or not callable(getattr(solver, "solve", None))):
             raise ConfigError(f"solver = {shown(solver)}: allowed: a solver's name, a Solver, or None: control.solver")
         super().__init__(robot, settings)
         self._nv = robot.model.nv
@@ -265,6 +265,10 @@ class CartesianController(WatchedPairs):
         else:  # The targets are taken, and nothing moves.
             self._qp.take_targets(summary)
         rejected = () if known and summary.targets_usable else self._targets.rejected(targets)
+        if rejected:
+            summary.faults += self._targets.why_rejected(targets, rejected)
+        if summary.unsolved and (why := self.solver_failure) is not None:
+            summary.faults += (f"solver: {why}",)
         return self._reference(summary, usable and dt <= LONGEST_DT, rejected)
 
     def _parts_of(self, time: float) -> int:

@@ -64,7 +64,7 @@ class StepSummary:
     unsolved: int = 0  # One bit for each substep without a solution.
     slack: float = 0.0
     solve_time: float = 0.0
-    faults: tuple[str, ...] = ()  # Faults of the user's own tasks and constraints.
+    faults: tuple[str, ...] = ()  # As in StepReport.
     constraints: tuple[ActiveLimit, ...] = ()  # The user's own constraints that are active in the last substep.
 
     def status(self, apart: bool, dt_usable: bool, rejected: tuple[str, ...]) -> StepStatus:

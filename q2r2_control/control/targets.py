@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +16,7 @@ from q2r2_control.control.jit import kernel
 from q2r2_control.control.kernel_pointers import pointer_to
 from q2r2_control.control.tasks.built_in import TaskModel
 from q2r2_control.control.tasks.frame import rotation_vector, times_transposed
+from q2r2_control.errors import shown
 from q2r2_control.types import Array
 
 # The distance is larger than any cell, so that squares of larger ones stay finite.
@@ -132,6 +133,19 @@ class TargetTracker:
         """Return the names whose offered target is not usable, including unknown names."""
         rejected = [arm for arm, offered in zip(self._arms, self._offered, strict=True) if offered == _NO_POSE]
         return (*rejected, *(str(name) for name in targets if name not in self._arms))
+
+    def why_rejected(self, targets: Mapping[str, Any], rejected: tuple[str, ...]) -> tuple[str, ...]:
+        """Return one line for each name that :meth:`rejected` returns, with what is allowed."""
+        lines = []
+        for name in rejected:
+            if name not in self._arms:
+                lines.append(f"target of {shown(name)}: no such arm; allowed: {', '.join(self._arms)}")
+            elif isinstance(targets.get(name), pin.SE3):
+                lines.append(f"target of {name}: allowed: finite numbers and a rotation")
+            else:
+                kind = type(targets.get(name)).__name__
+                lines.append(f"target of {name} is of the type {kind}; allowed: a pinocchio.SE3, or None")
+        return tuple(lines)
 
 
 @kernel

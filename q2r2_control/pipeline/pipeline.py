@@ -36,8 +36,8 @@ from q2r2_control.robot.turns import TurnCounter
 from q2r2_control.robot.unchecked import check_watched
 from q2r2_control.summary.run_summary import RunSummary
 from q2r2_control.summary.tick import RunStart, Tick
-from q2r2_control.supervision.homing import preflight_faults
 from q2r2_control.supervision.joint_watch import watch_settings
+from q2r2_control.supervision.preflight import preflight_faults
 from q2r2_control.supervision.reasons import ROUTINE, SupervisionReason
 from q2r2_control.supervision.supervisor import Phase, Supervisor
 from q2r2_control.supervision.target_stream import StreamSettings
@@ -51,10 +51,9 @@ _STOP_ALLOWANCE_S = 1.0  # Time after full braking for an arm that still recover
 _REST = 1e-6  # The reference is at rest if no joint is faster [rad/s].
 _ROUNDING_S = 1e-9
 _MAX_TORQUE_HOLD_S = 0.005  # A torque that a late tick held for 0.1 s would drive the arms into each other.
-_LATE_LOOP = (
-    "the loop falls behind: of its %.0f ticks a second more than a tenth come late; close other programs, give it "
-    "priority with --rt, or set a lower loop_rate_hz in the cell"
-)
+_LATE_LOOP = "the loop falls behind: of its %.0f ticks a second more than a tenth come late; %s"
+_CURES = "close other programs, give it priority with --rt, or set a lower loop_rate_hz in the cell"
+_CURES_AT_LOWEST_RATE = "close other programs, or give it priority with --rt"
 _logger = logging.getLogger(__name__)
 
 
@@ -372,7 +371,8 @@ class Pipeline(RequestedRun):
         now = self._clock.now
         if self._clock.falls_behind() and not self._told_late:
             self._told_late = True
-            _logger.warning(_LATE_LOOP, 1.0 / self._clock.period)
+            rate = 1.0 / self._clock.period
+            _logger.warning(_LATE_LOOP, rate, _CURES if rate > min(FITTING_RATES_HZ) else _CURES_AT_LOWEST_RATE)
         braked, dt = (0.0, self.loop.pace(gap)) if self._sessions is None else self._sessions.due(now)
         began = time.perf_counter()
         samples = self._operator.poll(now) if self._following else []

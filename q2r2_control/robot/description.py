@@ -263,7 +263,9 @@ def _check_joint(joint: ET.Element, links: set[str], where: str) -> None:
         raise RobotError(f"{where}: joint {name} has type {kind!r}; allowed: {', '.join(_JOINT_TYPES)}")
     for end in ("parent", "child"):
         if joint_end(joint, end) not in links:
-            raise RobotError(f"{where}: joint {name} has no {end} link among the model's links")
+            raise RobotError(
+                f"{where}: joint {name} has no {end} link among the model's links: {joint_end(joint, end)!r:.60}"
+            )
     axis = joint.find("axis")
     direction = [float(part) for part in ("" if axis is None else axis.get("xyz", "")).split()]
     if kind != "fixed" and direction and math.hypot(*direction) < _SHORTEST_AXIS:

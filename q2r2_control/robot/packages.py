@@ -9,7 +9,7 @@ from pathlib import Path
 from q2r2_control.errors import ConfigError, RobotError
 from q2r2_control.extras import install_line
 
-_PLACES = "the key packages, AMENT_PREFIX_PATH or ROS_PACKAGE_PATH"
+_PLACES = "`packages` of the YAML, AMENT_PREFIX_PATH or ROS_PACKAGE_PATH"
 
 
 def package_file(url: str, near: Path | None, packages: Mapping[str, str]) -> Path:
@@ -23,7 +23,8 @@ def package_file(url: str, near: Path | None, packages: Mapping[str, str]) -> Pa
         for folder in _folders(name, near, packages):
             if (file := folder / path).is_file():
                 return file.resolve()
-    raise ConfigError(f"{url}: not found in {_PLACES}, nor beside the file that names it")
+    help = f"; export ROS_PACKAGE_PATH=FOLDER names the folder that holds {name}" if name and path else ""
+    raise ConfigError(f"{url}: not found in {_PLACES}, nor in a folder above the file that names it{help}")
 
 
 def package_folder(name: str, near: Path | None, packages: Mapping[str, str]) -> Path:

@@ -17,6 +17,7 @@ from q2r2_control.summary.tick import Tick
 from q2r2_control.types import ActiveLimit
 from q2r2_control.viewer.arm_words import ArmWords
 from q2r2_control.viewer.episode_words import EpisodeWords
+from q2r2_control.viewer.tables import times_real_time
 from q2r2_control.wording import limit_name
 
 _REFRESH_RATE = 6.0  # [Hz]
@@ -105,7 +106,7 @@ class LiveTable:
         passed = max(now - then, 1e-9)
         loop = f"{(self._drawn[1] - counted) / passed:.0f} Hz"
         if self._simulated_time:
-            loop += f", {(self._drawn[2] - reached) / passed:.1f} x real time"
+            loop += f", {times_real_time((self._drawn[2] - reached) / passed)}"
         table = Table(title=self._title, title_justify="left", min_width=76)
         table.add_column("", style="dim")
         if tick is None:

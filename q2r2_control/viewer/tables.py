@@ -53,7 +53,9 @@ def figure_table(
 def print_table(table: Table, console: Console) -> None:
     """Print a table without cutting figures off. Its lines may be longer than those of the console."""
     of_title, table.min_width = table.min_width, None
-    needed = Measurement.get(console, console.options.update(max_width=_WIDEST), table).minimum
+    widths = Measurement.get(console, console.options.update(max_width=_WIDEST), table)
+    # A file or another program gets whole cells. On a terminal, a folded cell is easier to read than a wrapped line.
+    needed = widths.minimum if console.is_terminal else widths.maximum
     table.min_width, table.width = of_title, needed if needed > console.width else None
     console.print(table, soft_wrap=False, crop=False)
 
@@ -69,6 +71,11 @@ def record_table(title: str, records: Sequence[Any], notes: Sequence[str] = ()) 
         [field.replace("_", " "), *(_several(getattr(record, field)) for record in records)] for field in others
     ]
     return figure_table(title, columns, rows, notes)
+
+
+def times_real_time(factor: float) -> str:
+    """Return the speed of simulated time, with two digits where it is slow."""
+    return f"{factor:.1f} x real time" if factor >= 0.995 else f"{factor:.2g} x real time"
 
 
 def short_figure(value: float | None) -> str:

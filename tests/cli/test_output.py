@@ -25,8 +25,8 @@ from tests.support.processes import cell
 LINK = "left_arm_left_gripper_left_finger_joint_with_a_long_name_indeed"
 
 
-def printed(table: Table, width: int = 80) -> str:
-    console = Console(file=io.StringIO(), width=width)
+def printed(table: Table, width: int = 80, terminal: bool = True) -> str:
+    console = Console(file=io.StringIO(), width=width, force_terminal=terminal, color_system=None)
     print_table(table, console)
     assert isinstance(console.file, io.StringIO)
     return console.file.getvalue()
@@ -54,6 +54,13 @@ def test_no_figure_is_cut_however_narrow_the_console_is() -> None:
         assert line[-len(figures) :] == list(figures)
         assert line[0].startswith(("q2r2", "another"))
     assert text.count("-2.967") == 2
+
+
+def test_another_program_gets_cells_that_no_line_break_divides() -> None:
+    pair = "left_hand_e_base | right_hand_e_base"
+    table = figure_table("pairs", ("pair", "why", "other pair"), [(pair, "keep", pair)])
+    assert pair not in printed(table, 50)
+    assert printed(table, 50, terminal=False).count(pair) == 2
 
 
 @pytest.fixture(scope="module")
@@ -157,7 +164,7 @@ def test_late_and_missed_ticks_and_the_pair_that_held_a_gripper_are_printed(summ
     held = replace(summary.arms["left"], gripper_held_s=1.25, gripper_held_by=("left_finger_0", "block_0"))
     late = replace(summary, lateness_us=Percentiles(60.0, 310.0, 1204.0), overruns=3, missed_ticks=7, stretched_s=0.123)
     text = text_of(replace(late, arms=summary.arms | {"left": held}))
-    assert "7, which made the motion 0.12 s late in all" in text
+    assert f"7 of {summary.ticks + 7}; the loop was late by 0.12 s in all, by which every motion waited" in text
     assert "median 60 us, p99 310, max 1204; 3 by more than a period" in text
     (row,) = (line for line in text.splitlines() if "left gripper held for" in line)
     assert "1.25 s, by left_finger_0 | block_0" in row

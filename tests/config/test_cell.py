@@ -37,7 +37,7 @@ def test_an_unknown_key_is_named_with_those_allowed_there(tmp_path: Path, path: 
     data: Any = cell()
     for parent in path.split(".")[:-1]:
         data = data.get(parent, {})
-    allowed = message.partition("allowed here: ")[2].partition(" (and")[0].split(", ")
+    allowed = message.partition("allowed here: ")[2].partition(" (and")[0].partition("; did")[0].split(", ")
     assert set(data) <= set(allowed)
     assert allowed
 
@@ -74,6 +74,7 @@ def test_a_gripper_by_modbus_has_a_host_or_a_serial_device(tmp_path: Path) -> No
 def test_a_misspelt_key_is_named_before_the_missing_one(tmp_path: Path) -> None:
     message = fault(tmp_path, CELL.read_text().replace("shape: box", "shapes: box"))
     assert message.startswith("obstacles.table.shapes = 'box': unknown key; allowed here: colour, ")
+    assert "; did you mean shape?" in message
 
 
 @pytest.mark.parametrize(

@@ -242,6 +242,67 @@ def test_a_task_that_raises_in_a_step_changes_nothing_and_is_named(robot: Robot)
     assert broken.report.faults == ("tasks[0] BrokenTask: cost raised ZeroDivisionError: ",)
 
 
+class Heavy:
+    """A task whose matrix is changed after it was accepted at home."""
+
+    def __init__(self, matrix: Callable[[int], Array]) -> None:
+        self.matrix, self.asked = matrix, False
+
+    def cost(self, q: Array, v: Array) -> tuple[Array, Array]:
+        n = len(q)
+        return (self.matrix(n) if self.asked else np.eye(n)), np.zeros(n)
+
+
+@pytest.mark.parametrize(
+    ("matrix", "told"),
+    [
+        (lambda n: -np.eye(n), "returned a matrix that is not positive semidefinite"),
+        (lambda n: np.eye(n) + np.triu(np.full((n, n), 0.01), 1), "returned a matrix that is not symmetric"),
+    ],
+    ids=["negative", "not symmetric"],
+)
+def test_a_task_whose_cost_has_no_minimum_is_not_used_and_named(
+    robot: Robot, matrix: Callable[[int], Array], told: str
+) -> None:
+    task = Heavy(matrix)
+    controller = CartesianController(robot, tasks=[task])
+    task.asked = True
+    assert controller.step(crossing(robot), DT).report.faults == (f"tasks[0] Heavy: cost {told}",)
+    with pytest.raises(ConfigError, match=told):
+        CartesianController(robot, tasks=[task])
+
+
+class NoSolver:
+    """A solver whose answer is not a QpSolution."""
+
+    def solve(self, problem: QpProblem) -> Any:
+        return np.zeros(len(problem.g))
+
+
+def test_a_solver_with_an_invalid_answer_is_named_in_the_report_and_a_class_is_refused(robot: Robot) -> None:
+    controller = CartesianController(robot, solver=NoSolver())
+    report = controller.step(crossing(robot), DT).report
+    assert report.unsolved
+    (fault,) = report.faults
+    assert fault.startswith("solver: AttributeError")
+    with pytest.raises(ConfigError, match=r"solver = <class .*NoSolver'>: allowed: a solver's name, a Solver"):
+        CartesianController(robot, solver=NoSolver)  # type: ignore[arg-type]
+
+
+def test_targets_that_cannot_be_used_are_named_with_what_is_allowed(robot: Robot) -> None:
+    controller = CartesianController(robot)
+    pose = controller.tool_pose("left")
+    beyond = pin.SE3(pose.rotation, np.array([np.nan, 0.0, 0.0]))
+    wrong: Any = {"left": pose.homogeneous, "right": beyond, "lefft": pose}
+    report = controller.step(wrong, DT).report
+    assert report.rejected == ("left", "right", "lefft")
+    assert report.faults == (
+        "target of left is of the type ndarray; allowed: a pinocchio.SE3, or None",
+        "target of right: allowed: finite numbers and a rotation",
+        "target of 'lefft': no such arm; allowed: left, right",
+    )
+
+
 @pytest.mark.parametrize(
     ("parts", "told"),
     [

@@ -10,7 +10,7 @@ import pytest
 from q2r2_control.config.cell import load_config
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.pipeline.pipeline import Pipeline
-from q2r2_control.supervision.homing import preflight_faults
+from q2r2_control.supervision.preflight import preflight_faults
 from tests.config.cell_files import SHIPPED
 from tests.control.scenarios import into_the_table, overhead
 from tests.support.driven import Driven

@@ -12,7 +12,7 @@ import pytest
 from q2r2_control import CartesianController, ControllerSettings, Robot
 from q2r2_control.errors import RobotError
 from q2r2_control.robot.description import load_description
-from q2r2_control.supervision.homing import preflight_faults
+from q2r2_control.supervision.preflight import preflight_faults
 
 NEVER = '<disable_collisions link1="wrist_1_link" link2="wrist_3_link" reason="Never"/>'
 KEPT = ControllerSettings.model_validate({"pairs": [{"pair": ("wrist_1_link", "wrist_3_link"), "distance": 0.003}]})

@@ -76,7 +76,7 @@ def test_arguments_have_the_defaults_of_the_file_and_an_srdf_beside_it_belongs_t
         ("arm.urdf.xacro", "</robot>", "", "arm.urdf.xacro: xacro cannot expand it: no element found"),
         ("hinge.xacro", "${reach}", "${reech}", "name 'reech' is not defined"),
         ("hinge.xacro", "</robot>", "", "hinge.xacro)"),
-        ("arm.urdf.xacro", "my_arm", "your_arm", "package 'your_arm': not found in the key packages"),
+        ("arm.urdf.xacro", "my_arm", "your_arm", "package 'your_arm': not found in `packages` of the YAML"),
         ("arm.urdf.xacro", "$(arg with_tip)", "$(arg tip)", "Undefined substitution argument tip"),
         ("hinge.xacro", 'lower="-1"', 'lower="${reach}m"', "<limit> has lower = '0.30000000000000004m'"),
     ],

@@ -16,7 +16,7 @@ from q2r2_control.robot.description import load_description
 from q2r2_control.robot.pairs import link_of, pair_names
 from q2r2_control.robot.robot import Robot
 from q2r2_control.robot.unchecked import check_watched, unchecked_faults, unchecked_notes
-from q2r2_control.supervision.homing import preflight_faults
+from q2r2_control.supervision.preflight import preflight_faults
 from tests.robot.conftest import one_arm
 
 BALL = '<collision><geometry><sphere radius="0.1"/></geometry></collision>'

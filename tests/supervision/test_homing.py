@@ -9,15 +9,14 @@ from unittest.mock import Mock
 
 import coal
 import numpy as np
-import pinocchio as pin
 import pytest
 
-from q2r2_control import CartesianController, ControllerSettings, Robot, load_config
+from q2r2_control import CartesianController, Robot, load_config
 from q2r2_control.config.moving_obstacle import MovingObstacle
 from q2r2_control.events import CommonReason, Reason
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.ros.reasons import RosReason
-from q2r2_control.supervision.homing import JointHoming, preflight_faults
+from q2r2_control.supervision.homing import JointHoming
 from q2r2_control.supervision.reasons import SupervisionReason
 from q2r2_control.supervision.supervisor import Supervisor
 from q2r2_control.supervision.target_stream import StreamSettings
@@ -234,38 +233,3 @@ def test_a_moving_obstacle_that_enters_the_way_home_holds_the_arms_up_until_the_
     assert world.go_home() == "homing_held_up"
     assert np.abs(world.state.v).max() < 0.02
     assert np.abs(world.state.q - turned).max() > 0.1
-
-
-SETTINGS = ControllerSettings()
-
-
-def test_a_home_that_a_joint_cannot_hold_against_gravity_is_a_fault(
-    robot: Robot, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    gravity = np.abs(pin.computeGeneralizedGravity(robot.model, robot.model.createData(), robot.home))
-    limits = robot.torque_limit.copy()
-    limits[1] = gravity[1] - 0.2
-    monkeypatch.setattr(robot, "torque_limit", limits)
-    (fault,) = preflight_faults(robot, SETTINGS, None)
-    assert fault.startswith(f"home: left_A2 needs {gravity[1]:.1f} Nm against gravity alone; allowed: its torque limit")
-
-
-def test_every_pair_closer_than_min_distance_is_named_once_with_the_nearest_first(robot: Robot) -> None:
-    nearest = sorted(pair.distance for pair in robot.distances(robot.home))
-    between = ControllerSettings(min_distance=float(np.mean(nearest[1:3])))
-    faults = preflight_faults(robot, between, CartesianController(robot, between))
-    assert len(faults) == 2
-    assert f"are {1e3 * nearest[0]:.1f} mm apart" in faults[0]
-    assert f"are {1e3 * nearest[1]:.1f} mm apart" in faults[1]
-    assert "allowed: at least min_distance" in faults[0]
-
-
-def test_a_home_without_a_certified_stop_is_a_fault(robot: Robot, controller: CartesianController) -> None:
-    nearest = min(pair.distance for pair in robot.distances(robot.home))
-    asking_for_more = CartesianController(robot, ControllerSettings(min_distance=nearest + 0.01))
-    (fault,) = preflight_faults(robot, SETTINGS, asking_for_more)
-    assert "no certified stop" in fault
-    controller.reset(robot.home + 0.05)
-    assert preflight_faults(robot, SETTINGS, controller) == ()
-
-    np.testing.assert_allclose(controller.step({}, 1e-3).q, robot.home, atol=1e-12)

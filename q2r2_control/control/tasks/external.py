@@ -21,6 +21,7 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
 GROUP = "q2r2_control.tasks"
+_ROUNDING = 1e-9  # Allowed error of a matrix by rounding, as a share of its greatest entry.
 
 
 class Task(Protocol):
@@ -42,8 +43,9 @@ class Task(Protocol):
             v: Joint velocities of the reference (nv,) [rad/s].
 
         Returns:
-            H (nv, nv), symmetric and positive semidefinite, and g (nv,). An answer that has another shape or a number
-            that is not finite is not used, and neither is an exception. The step's report says so in ``faults``.
+            H (nv, nv), symmetric and positive semidefinite, and g (nv,). The controller's constructor raises
+            ConfigError if the answer at home is anything else. Later, such an answer or an exception is not used, and
+            the step's report says so in ``faults``.
         """
 
 
@@ -115,7 +117,18 @@ class ExternalTasks:
 
 
 def _cost_of(task: Task, q: Array, v: Array) -> Answer | str:
-    cost = answer_of(task.cost, q, v)
-    if not isinstance(cost, str) and len(cost[1]) != len(q):
-        return f"returned shapes {cost[0].shape} and {cost[1].shape}; allowed: {(len(q), len(q))} and {(len(q),)}"
+    nv = len(q)
+    cost = answer_of(task.cost, q, v, f"{(nv, nv)} and {(nv,)}")
+    if isinstance(cost, str):
+        return cost
+    H, g = cost
+    if len(g) != nv:
+        return f"returned shapes {H.shape} and {g.shape}; allowed: {(nv, nv)} and {(nv,)}"
+    rounding = _ROUNDING * (1.0 + float(np.abs(H).max()))
+    try:
+        np.linalg.cholesky(H + rounding * np.eye(nv))
+    except np.linalg.LinAlgError:
+        return "returned a matrix that is not positive semidefinite"
+    if np.abs(H - H.T).max() > rounding:
+        return "returned a matrix that is not symmetric"
     return cost

@@ -1,0 +1,58 @@
+"""A cell is checked at home before its arms move. Each reason against a start is one line."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from q2r2_control import CartesianController, ControllerSettings, Robot
+from q2r2_control.supervision.preflight import preflight_faults
+
+SETTINGS = ControllerSettings()
+
+
+def test_a_home_that_a_joint_cannot_hold_against_gravity_is_a_fault(
+    robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gravity = np.abs(pin.computeGeneralizedGravity(robot.model, robot.model.createData(), robot.home))
+    limits = robot.torque_limit.copy()
+    limits[1] = gravity[1] - 0.2
+    monkeypatch.setattr(robot, "torque_limit", limits)
+    (fault,) = preflight_faults(robot, SETTINGS, None)
+    assert fault.startswith(f"home: left_A2 needs {gravity[1]:.1f} Nm against gravity alone; allowed: its torque limit")
+
+
+def test_every_pair_closer_than_min_distance_is_named_once_with_the_nearest_first(robot: Robot) -> None:
+    nearest = sorted(pair.distance for pair in robot.distances(robot.home))
+    between = ControllerSettings(min_distance=float(np.mean(nearest[1:3])))
+    faults = preflight_faults(robot, between, CartesianController(robot, between))
+    assert len(faults) == 2
+    assert f"are {1e3 * nearest[0]:.1f} mm apart" in faults[0]
+    assert f"are {1e3 * nearest[1]:.1f} mm apart" in faults[1]
+    assert "allowed: at least min_distance" in faults[0]
+
+
+def test_a_home_without_a_certified_stop_is_a_fault(robot: Robot, controller: CartesianController) -> None:
+    nearest = min(pair.distance for pair in robot.distances(robot.home))
+    asking_for_more = CartesianController(robot, ControllerSettings(min_distance=nearest + 0.01))
+    (fault,) = preflight_faults(robot, SETTINGS, asking_for_more)
+    assert "no certified stop" in fault
+    controller.reset(robot.home + 0.05)
+    assert preflight_faults(robot, SETTINGS, controller) == ()
+
+    np.testing.assert_allclose(controller.step({}, 1e-3).q, robot.home, atol=1e-12)
+
+
+def test_limits_in_degrees_are_a_fault_and_a_joint_of_many_turns_is_none(
+    robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lower, upper, fastest = robot.position_lower.copy(), robot.position_upper.copy(), robot.velocity_limit.copy()
+    for limits in (lower, upper, fastest):
+        limits[2] = np.rad2deg(limits[2])
+    upper[3], fastest[4] = 100.0, 60.0  # One of both alone may be right.
+    for name, limits in (("position_lower", lower), ("position_upper", upper), ("velocity_limit", fastest)):
+        monkeypatch.setattr(robot, name, limits)
+    (fault,) = preflight_faults(robot, SETTINGS, None)
+    assert fault.startswith("left_A3: limits such as -170 .. 170 rad and")
+    assert fault.endswith("are degrees; allowed in a URDF: radians and radians per second")
