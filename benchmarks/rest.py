@@ -1,7 +1,7 @@
-"""Do the arms come to rest at constant targets that they cannot reach or get in each other's way at, and how smoothly?
+"""Do the arms come to rest, and how smoothly, at constant targets that they cannot reach or that bring them together?
 
-Each tool is asked for a place drawn at random, near where both work or on the other arm's side, until the end. Most of
-these cannot be reached with every distance kept: the arms slide along each other, for seconds, until they rest.
+Each tool gets a constant target at random, near the place where both arms work or on the other arm's side. Most targets
+cannot be reached with every distance kept. The arms then slide along each other for seconds until they rest.
 """
 
 from __future__ import annotations
@@ -20,42 +20,46 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 from q2r2_control.viewer.tables import record_table
 
-RUNS = 50  # of each kind
-DURATION = 30.0  # [s]
-DT = 0.001  # [s]
-AT_REST = 0.1  # RMS of the acceleration over the last 0.5 s, norm over the joints [rad/s^2]
-STARTED = 2.0  # when a slide has begun, and what the targets' jump did is over [s]
+RUNS = 50  # Number of runs of each kind.
+DURATION = 30.0  # Duration of a run [s].
+DT = 0.001  # Period of a tick [s].
+# Largest acceleration of arms at rest: RMS over the last 0.5 s of the norm over the joints [rad/s^2].
+AT_REST = 0.1
+STARTED = 2.0  # Time after which the jump of the targets no longer has an effect, and slides have begun [s].
 NOTES = (
-    f"targets stay where they are for {DURATION:g} s; most cannot be reached with every distance kept",
-    f"at rest: acceleration, norm over the joints, RMS over the last 0.5 s, below {AT_REST:g} rad/s^2",
-    f"jolts: ticks of a run after {STARTED:g} s in which a joint's acceleration changes by more than {JOLT:g} rad/s^2",
-    "fallback ticks: in which the certified stop was executed, in all runs",
+    f"Targets stay constant for {DURATION:g} s. Most of them cannot be reached with every distance kept.",
+    f"at rest: Number of runs that end with an acceleration below {AT_REST:g} rad/s^2.",
+    "acceleration: RMS over the last 0.5 s of the norm over the joints [rad/s^2].",
+    f"jolts: Number of ticks of a run after {STARTED:g} s in which a joint's acceleration changes by more than",
+    f"    {JOLT:g} rad/s^2.",
+    "fallback ticks: Number of ticks of all runs in which the certified stop was executed.",
 )
 
-# From the middle between both tools at home, for the left tool; of the right one the second is the other way [m].
+# Range of the left tool's target, measured from the middle between both tools at home [m]. For the right tool, y has
+# the opposite sign.
 KINDS: dict[str, tuple[Array, Array]] = {
     "anywhere": (np.array([-0.25, -0.35, -0.3]), np.array([0.25, 0.35, 0.3])),
     "other side": (np.array([-0.2, -0.35, -0.15]), np.array([0.2, 0.0, 0.3])),
 }
-_TURN = 0.4  # standard deviation of each component of the rotation from home [rad]
+_TURN = 0.4  # Standard deviation of each component of the rotation from home [rad].
 
 
 @dataclass(frozen=True, slots=True)
 class RestFigures:
-    """All runs of one kind."""
+    """The figures of all runs of one kind."""
 
     kind: str
     runs: int
-    at_rest: int  # of these, at the end
-    median_acceleration: float  # RMS over the last 0.5 s, norm over the joints [rad/s^2]
-    worst_acceleration: float
-    jolts: float  # ticks from STARTED on in which a joint's acceleration changes by more than JOLT, in a run
-    most_jolts: int
-    fallback_ticks: int  # of all runs
+    at_rest: int  # Number of runs whose arms rest at the end.
+    median_acceleration: float  # Median of the runs' RMS over the last 0.5 s of the norm over the joints [rad/s^2].
+    worst_acceleration: float  # Largest of these accelerations [rad/s^2].
+    jolts: float  # Mean number of ticks of a run after STARTED in which an acceleration changes by more than JOLT.
+    most_jolts: int  # Largest number of such ticks in one run.
+    fallback_ticks: int  # Number of ticks of all runs in which the certified stop was executed.
 
 
 def run_rest(config: Config, seed: int, runs: int = RUNS) -> list[RestFigures]:
-    """Ask for ``runs`` pairs of targets of each kind; the same ones for the same ``seed``."""
+    """Run with ``runs`` pairs of targets of each kind. The same ``seed`` gives the same targets."""
     robot = Robot.from_config(config)
     controller = OwnController(robot, config)
     figures = []
@@ -87,7 +91,7 @@ def run_rest(config: Config, seed: int, runs: int = RUNS) -> list[RestFigures]:
 
 
 def draw_targets(robot: Robot, kind: str, random: np.random.Generator) -> dict[str, pin.SE3]:
-    """A pose for each tool, turned a little from how it is at home."""
+    """Return a random target for each tool, turned a little from its rotation at home."""
     home = {arm: robot.tool_pose(robot.home, arm) for arm in robot.arms}
     middle = np.mean([pose.translation for pose in home.values()], axis=0)
     targets = {}
@@ -100,14 +104,14 @@ def draw_targets(robot: Robot, kind: str, random: np.random.Generator) -> dict[s
 
 
 def main(
-    seed: Annotated[int, typer.Option(min=0, help="Of the targets.")] = 0,
-    runs: Annotated[int, typer.Option(min=1, help="Of each kind of targets.")] = RUNS,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the targets.")] = 0,
+    runs: Annotated[int, typer.Option(min=1, help="Number of runs for each kind of targets.")] = RUNS,
     json: Json = False,
 ) -> None:
-    """Ask for constant targets drawn at random, and print how quiet the arms are at the end."""
+    """Move the arms to constant random targets, and print how quiet the arms are at the end."""
     config = load_config(DEMO_CONFIG)
     figures = run_rest(config, seed, runs)
-    table = record_table(f"{config.name}: constant targets, seed {seed}", figures, NOTES)
+    table = record_table(f"{config.name}: Constant targets, seed {seed}", figures, NOTES)
     print_report({"cell": config.name, "seed": seed, "kinds": figures}, (table,), json)
 
 
