@@ -38,8 +38,8 @@ NOTES = (
     "of 50: Number of successes. The environment's own judge decides, and a success ends the episode.",
     "after: Median time until success.",
     "contact: A geom of one arm touches a geom of the other arm in MuJoCo.",
-    "nearest: Least distance between the same geoms, or 50 mm if they were never nearer. It includes geoms that",
-    "    MuJoCo lets pass through each other, such as robosuite's links.",
+    "nearest: Least distance between the same geoms, or 50 mm if they were never nearer. It includes geoms that "
+    "MuJoCo lets pass through each other, such as robosuite's links.",
     "beyond a limit: Number of episodes in which a joint exceeded its limit in any step of the physics.",
     "by, velocity / limit: The largest values of all episodes.",
     "The hands of both controllers know the objects' true places and ask for the same poses.",

@@ -70,22 +70,22 @@ _SIDEWARDS, _UP = 1, 2  # Indices of axes.
 _CYCLE = 0.6  # Time from one engagement to the next. The arm is engaged for half of it [s].
 _A_TICK = 0.05  # Longest period of a tick [s].
 NOTES = (
-    f"pauses: Distance between the tool's places before and after {PAUSES} pauses, for a hand at rest whose samples",
-    f"    have a noise of {RESTING_NOISES} mm.",
-    "All figures are from the hand to the measured tool of an arm in MuJoCo, in position mode. Samples come at 72 to",
-    "    76 Hz.",
+    f"pauses: Distance between the tool's places before and after {PAUSES} pauses, for a hand at rest whose samples "
+    f"have a noise of {RESTING_NOISES} mm.",
+    "All figures are from the hand to the measured tool of an arm in MuJoCo, in position mode. Samples come at 72 to "
+    "76 Hz.",
     "filter delay: Delay of the filter alone, from its settings.",
     "delays, gains: Figures for hand motions of "
     + ", ".join(f"{frequency:g} Hz, {1e3 * amplitude:g} mm" for frequency, amplitude in MOTIONS)
     + ".",
-    f"tremors: Gains at {TREMORS} Hz for a tremor of {1e3 * TREMOR:g} mm, of a hand that moves at {1e3 * SLOWLY:g}",
-    "    mm/s.",
+    f"tremors: Gains at {TREMORS} Hz for a tremor of {1e3 * TREMOR:g} mm, of a hand that moves at {1e3 * SLOWLY:g} "
+    "mm/s.",
     "reaches: Delay for minimum-jerk motions of 0.1 to 0.4 m in 0.6 to 1.2 s, by correlation of velocities.",
-    f"band: Gain for a flat tremor of {BAND[0]:g} to {BAND[1]:g} Hz and {1e3 * BAND_RMS:g} mm RMS. All motion of the",
-    "    tool counts.",
+    f"band: Gain for a flat tremor of {BAND[0]:g} to {BAND[1]:g} Hz and {1e3 * BAND_RMS:g} mm RMS. All motion of the "
+    "tool counts.",
     f"noise: RMS of the tool's motion if each sample has a noise of {1e6 * NOISE:g} um.",
-    f"stop: A hand at {STOP_SPEED:g} m/s stops in {STOP_TIME:g} s. The delay ends when the tool stays within 2 mm of",
-    "    its rest.",
+    f"stop: A hand at {STOP_SPEED:g} m/s stops in {STOP_TIME:g} s. The delay ends when the tool stays within 2 mm of "
+    "its rest.",
 )
 
 

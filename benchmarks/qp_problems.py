@@ -173,8 +173,8 @@ def table_of(results: qpbenchmark.Results, ticks: int, solved: int) -> Table:
         ("solver", "default [%]", "1e-3 [%]", "1e-6 [%]", "1e-9 [%]", "median [us]"),
         [(solver, *(float(rates.at[solver, name]) for name in order), float(median[solver])) for solver in rates.index],
         (
-            "default, 1e-3, 1e-6, 1e-9: Share of problems whose primal and dual residuals and duality gap are below",
-            "    this tolerance. The tolerance of default is 1.",
+            "default, 1e-3, 1e-6, 1e-9: Share of problems whose primal and dual residuals and duality gap are below "
+            "this tolerance. The tolerance of default is 1.",
             "median: Median time of a solve with default settings.",
         ),
     )

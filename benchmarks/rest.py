@@ -30,8 +30,8 @@ NOTES = (
     f"Targets stay constant for {DURATION:g} s. Most of them cannot be reached with every distance kept.",
     f"at rest: Number of runs that end with an acceleration below {AT_REST:g} rad/s^2.",
     "acceleration: RMS over the last 0.5 s of the norm over the joints [rad/s^2].",
-    f"jolts: Number of ticks of a run after {STARTED:g} s in which a joint's acceleration changes by more than",
-    f"    {JOLT:g} rad/s^2.",
+    f"jolts: Number of ticks of a run after {STARTED:g} s in which a joint's acceleration changes by more than "
+    f"{JOLT:g} rad/s^2.",
     "fallback ticks: Number of ticks of all runs in which the certified stop was executed.",
 )
 

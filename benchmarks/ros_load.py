@@ -209,8 +209,8 @@ def main(
         ((row.node, row.idle, row.moving) for row in (*report.rows, report.total)),
         (
             "moving: Both hands go round circles, with samples that are up to "
-            f"{1e3 * report.jitter:g} ms late. There are {report.commands_hz:.0f} joint commands per second,",
-            f"    and their speeds have a ripple of {100.0 * report.speed_ripple:.1f} % RMS.",
+            f"{1e3 * report.jitter:g} ms late. There are {report.commands_hz:.0f} joint commands per second, "
+            f"and their speeds have a ripple of {100.0 * report.speed_ripple:.1f} % RMS.",
         ),
     )
     print_report(asdict(report) | {"total": asdict(report.total)}, (table,), json)

@@ -268,8 +268,8 @@ def main(
     """Print the times after a press: the longest tick of the arm's node, the first target, and the first motion."""
     report = measure_presses(DEMO_CONFIG, starts)
     notes = (
-        f"tick: Longest tick of the arm's node within {WATCHED:g} s after the press. The median of all ticks is",
-        f"    {report.period_ms:.1f} ms.",
+        f"tick: Longest tick of the arm's node within {WATCHED:g} s after the press. The median of all ticks is "
+        f"{report.period_ms:.1f} ms.",
         "target: Time from the press until the first target.",
         "motion: Time from the press until the first joint command that moves.",
     )
