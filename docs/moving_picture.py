@@ -1,4 +1,4 @@
-"""Draw docs/demo.webp, the README's moving picture: three tasks of the demo as MuJoCo simulates them."""
+"""Draw docs/demo.webp, the README's moving picture. It shows three tasks of the demo as MuJoCo simulates them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from q2r2_control.summary.tick import Tick
 ROOT = Path(__file__).resolve().parents[1]
 TASKS = "handover+stack+peg"
 WIDTH, HEIGHT = 960, 540
-SPEED, RATE = 4.0, 10.0  # of the playback, in pictures a second
+SPEED, RATE = 4.0, 10.0  # Speed of the playback as a multiple of real time, and pictures per second [Hz].
 
 
 def camera() -> mujoco.MjvCamera:
@@ -30,7 +30,7 @@ def main() -> None:
     )
     plant = pipeline.plant
     assert isinstance(plant, MujocoPlant)
-    plant.model.vis.quality.shadowsize = 2048  # of 8192, which takes long without a graphics card
+    plant.model.vis.quality.shadowsize = 2048  # The default of 8192 takes long without a graphics card.
     renderer, view = mujoco.Renderer(plant.model, HEIGHT, WIDTH), camera()
     pictures: list[Image.Image] = []
 
