@@ -24,7 +24,7 @@ from q2r2_control.cli.output import Json, print_progress, print_report
 from q2r2_control.viewer.tables import figure_table
 
 SEEDS = 50
-LONGEST = 15.0  # Longest duration of an episode [s].
+MAX_EPISODE_S = 15.0  # Longest duration of an episode [s].
 COLUMNS = (
     *("task", "arms moved by", "of 50", "after [s]", "episodes with contact", "contacts", "nearest [mm]"),
     *("beyond a position limit", "by [rad]", "beyond a velocity limit", "velocity / limit"),
@@ -91,11 +91,11 @@ def cells() -> Iterator[tuple[str, str, Callable[[], Cell]]]:
 
 
 def play(cell: Cell, seed: int) -> Episode:
-    """Play one episode until it succeeds, the hands are done, or :data:`LONGEST` is over."""
+    """Play one episode until it succeeds, the hands are done, or :data:`MAX_EPISODE_S` is over."""
     cell.reset(seed)
     hands = ScriptedHands(cell.asks(), cell.tools())
     after, steps = None, 0
-    while after is None and not hands.done and steps * cell.PERIOD < LONGEST:
+    while after is None and not hands.done and steps * cell.PERIOD < MAX_EPISODE_S:
         before = dict(hands.targets)
         hands.advance(cell.tools(), cell.PERIOD)
         cell.step(before, hands.targets, hands.closed)

@@ -13,13 +13,13 @@ import pinocchio as pin
 from arena_robot import ArmModel, corners_of, geoms_of
 from q2r2_control.types import Array
 
-SPEED, TURN = 0.3, 1.5  # Speed [m/s] and angular speed [rad/s] of the targets.
-NEAR = 0.01  # A tool that is nearer than this to its target has arrived [m].
-PATIENCE = 0.5  # Longest time that a target at its goal waits for its tool to arrive [s].
-_LOOKED_FAR = 0.05  # Distances between the arms are measured only below this [m].
-_EACH = 20  # Number of physics steps from one measurement of the distance to the next.
+TARGET_SPEED, TARGET_TURN_SPEED = 0.3, 1.5  # Speed [m/s] and angular speed [rad/s] of the targets.
+ARRIVAL_DISTANCE_M = 0.01  # A tool that is nearer than this to its target has arrived [m].
+ARRIVAL_TIMEOUT_S = 0.5  # Longest time that a target at its goal waits for its tool to arrive [s].
+_MAX_MEASURED_DISTANCE_M = 0.05  # Distances between the arms are measured only below this [m].
+_STEPS_PER_MEASUREMENT = 20  # Number of physics steps from one measurement of the distance to the next.
 # Largest excess over a limit that counts as rounding, [rad] for positions and a share of the limit for velocities.
-_ROUNDING = 1e-3
+_LIMIT_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Ask:
 
 
 class ScriptedHands:
-    """Targets that move from one ask to the next in straight lines at :data:`SPEED`.
+    """Targets that move from one ask to the next in straight lines at :data:`TARGET_SPEED`.
 
     Each of the ``asks`` is computed when it is due, so it may depend on the state of the simulation at that time.
     """
@@ -59,7 +59,7 @@ class ScriptedHands:
         if all(_moved(self.targets[arm], goals[arm], dt) == 1.0 for arm in goals):
             off = max(float(np.linalg.norm(goals[arm].translation - tools[arm].translation)) for arm in goals)
             self._waited += dt
-            if off < NEAR or self._waited > PATIENCE:
+            if off < ARRIVAL_DISTANCE_M or self._waited > ARRIVAL_TIMEOUT_S:
                 self._paused += dt
             if self._paused > self._ask.pause:
                 self._ask, self._waited, self._paused = next(self._asks, None), 0.0, 0.0
@@ -72,8 +72,8 @@ def _moved(start: pin.SE3, goal: pin.SE3, dt: float) -> float:
     """Return the share of the way to ``goal`` that a target moves in ``dt`` [s]."""
     difference = start.actInv(goal)
     time = max(
-        float(np.linalg.norm(difference.translation)) / SPEED,
-        float(np.linalg.norm(pin.log3(difference.rotation))) / TURN,
+        float(np.linalg.norm(difference.translation)) / TARGET_SPEED,
+        float(np.linalg.norm(pin.log3(difference.rotation))) / TARGET_TURN_SPEED,
     )
     return min(1.0, dt / max(time, 1e-9))
 
@@ -105,7 +105,7 @@ class Judge:
     model: mujoco.MjModel
     arms: Mapping[str, ArmModel]
     contacts: int = 0  # Number of times that the arms began to touch each other.
-    nearest: float = _LOOKED_FAR  # Least distance between the arms. Larger distances are not measured [m].
+    nearest: float = _MAX_MEASURED_DISTANCE_M  # Least distance between the arms. Larger distances are not measured [m].
     beyond_position: float = 0.0  # Largest excess over a position limit [rad].
     velocity_ratio: float = 0.0  # Largest velocity of a joint, divided by its limit.
     _touching: bool = field(default=False, init=False)
@@ -134,7 +134,7 @@ class Judge:
         q, v = data.qpos[self._q], data.qvel[self._v]
         self.beyond_position = max(self.beyond_position, float(np.maximum(self._lower - q, q - self._upper).max()))
         self.velocity_ratio = max(self.velocity_ratio, float((np.abs(v) / self._velocity).max()))
-        if self._looks % _EACH == 0:
+        if self._looks % _STEPS_PER_MEASUREMENT == 0:
             self._measure(data)
         self._looks += 1
 
@@ -152,11 +152,11 @@ class Judge:
 
     @property
     def breaks_position(self) -> bool:
-        return self.beyond_position > _ROUNDING
+        return self.beyond_position > _LIMIT_TOLERANCE
 
     @property
     def breaks_velocity(self) -> bool:
-        return self.velocity_ratio > 1.0 + _ROUNDING
+        return self.velocity_ratio > 1.0 + _LIMIT_TOLERANCE
 
 
 def _hull(points: Array) -> coal.ConvexBase:

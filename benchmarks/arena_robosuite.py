@@ -23,15 +23,22 @@ TASKS = ("TwoArmLift", "TwoArmHandover")
 OURS, OSC = "q2r2", "OSC_POSE"
 CONTROLLERS = (OURS, OSC)
 PERIOD = 0.05  # Period of the hands' targets, which is robosuite's default period of an action [s].
-_TICKS = 5  # Ticks of our controller in one period. Each tick commands robosuite's joint position controller.
+# Number of ticks of our controller in one period. Each tick commands robosuite's joint position controller.
+_TICKS_PER_PERIOD = 5
 _SETTINGS = ControllerSettings(min_distance=0.003)
 # The joints are stiff enough to follow the reference. They are critically damped, with a time constant of 1/60 s.
-_JOINTS = {"type": "JOINT_POSITION", "input_type": "absolute", "kp": 3600, "damping_ratio": 1, "interpolation": None}
-_JOINTS |= {"input_max": 7, "input_min": -7, "output_max": 7, "output_min": -7, "ramp_ratio": 0.2}
-_MEETING = np.array([0.0, -0.15, 1.12])  # Place where the right hand takes the hammer, in the world [m].
-_NEAREST = -0.5  # Least y at which the left hand can grasp while it points down [m].
-_LEAN = 0.9  # Angle by which the right hand leans towards its own base [rad].
-_OPENINGS = (0.0, 0.25, 0.5, 0.75, 1.0)  # Shares of the fingers' way from open to closed.
+_JOINT_CONTROL = {
+    "type": "JOINT_POSITION",
+    "input_type": "absolute",
+    "kp": 3600,
+    "damping_ratio": 1,
+    "interpolation": None,
+}
+_JOINT_CONTROL |= {"input_max": 7, "input_min": -7, "output_max": 7, "output_min": -7, "ramp_ratio": 0.2}
+_MEETING_PLACE = np.array([0.0, -0.15, 1.12])  # Place where the right hand takes the hammer, in the world [m].
+_MIN_GRASP_Y = -0.5  # Least y at which the left hand can grasp while it points down [m].
+_RIGHT_HAND_LEAN = 0.9  # Angle by which the right hand leans towards its own base [rad].
+_CLOSING_SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)  # Shares of the fingers' way from open to closed.
 
 logging.getLogger("robosuite_logs").setLevel(logging.ERROR)
 
@@ -52,7 +59,7 @@ class RobosuiteCell:
         """Begin another episode."""
         config = robosuite.load_composite_controller_config(robot="IIWA")
         if self._kind == OURS:
-            config["body_parts"]["right"] = {**_JOINTS, "gripper": config["body_parts"]["right"]["gripper"]}
+            config["body_parts"]["right"] = {**_JOINT_CONTROL, "gripper": config["body_parts"]["right"]["gripper"]}
         self._env = robosuite.make(
             self._task,
             robots=["IIWA", "IIWA"],
@@ -61,7 +68,7 @@ class RobosuiteCell:
             has_offscreen_renderer=False,
             use_camera_obs=False,
             use_object_obs=False,
-            control_freq=round((_TICKS if self._kind == OURS else 1) / PERIOD),
+            control_freq=round((_TICKS_PER_PERIOD if self._kind == OURS else 1) / PERIOD),
             ignore_done=True,
             seed=seed,
         )
@@ -97,10 +104,10 @@ class RobosuiteCell:
             action = [np.append(self._delta(side, tools[side], targets[side]), grip[side]) for side in self.arms]
             self._env.step(np.concatenate(action))
             return
-        for tick in range(_TICKS):
-            share = (tick + 1) / _TICKS
+        for tick in range(_TICKS_PER_PERIOD):
+            share = (tick + 1) / _TICKS_PER_PERIOD
             on_the_way = {side: pin.SE3.Interpolate(before[side], targets[side], share) for side in self.arms}
-            q = self._follower.step(on_the_way, PERIOD / _TICKS).q
+            q = self._follower.step(on_the_way, PERIOD / _TICKS_PER_PERIOD).q
             # Each action with a sign moves the gripper by one step. One such action in a period moves it as far as
             # with the other controllers.
             action = [
@@ -140,18 +147,18 @@ class RobosuiteCell:
         closing = np.cross(axis, [0.0, 0.0, 1.0])
         closing *= np.sign(closing @ tools["left"].rotation[:, 0])
         # The left hand cannot point down if it is nearer to its base than this.
-        way = min(half, max((handle.xpos[1] - _NEAREST) / max(axis[1], 1e-6), 0.0))
+        way = min(half, max((handle.xpos[1] - _MIN_GRASP_Y) / max(axis[1], 1e-6), 0.0))
         grasp = pin.SE3(looking_down(closing), handle.xpos - way * axis)
-        brought = pin.SE3(looking_down(np.array([np.sign(closing[0]) or 1.0, 0.0])), _MEETING - [0.0, way, 0.0])
+        brought = pin.SE3(looking_down(np.array([np.sign(closing[0]) or 1.0, 0.0])), _MEETING_PLACE - [0.0, way, 0.0])
         facing = float(np.sign(tools["right"].rotation[0, 0]))
-        ready = pin.SE3(looking_down(np.array([facing, 0.0])), _MEETING)
+        ready = pin.SE3(looking_down(np.array([facing, 0.0])), _MEETING_PLACE)
         yield Ask({"left": shifted(grasp, z=0.12), "right": shifted(ready, y=0.3, z=0.15)})
         yield Ask({"left": grasp})
         yield Ask({"left": grasp}, closed=("left",), pause=0.8)
         yield Ask({"left": shifted(grasp, z=0.15)}, closed=("left",))
         yield Ask({"left": brought}, closed=("left",), pause=0.5)
         place = handle.xpos + half * _towards_right(handle.xmat)
-        take = pin.SE3(looking_down(ready.rotation[:, 0], -_LEAN * facing), place)
+        take = pin.SE3(looking_down(ready.rotation[:, 0], -_RIGHT_HAND_LEAN * facing), place)
         yield Ask({"right": backed(take, 0.12)}, closed=("left",))
         yield Ask({"right": take}, closed=("left",))
         yield Ask({"right": take}, closed=("left", "right"), pause=0.8)
@@ -183,7 +190,7 @@ def _closing(model: mujoco.MjModel, q: Array, arms: Mapping[str, ArmModel]) -> l
     scratch, found = mujoco.MjData(model), []
     flags, model.opt.disableflags = model.opt.disableflags, model.opt.disableflags | mujoco.mjtDisableBit.mjDSBL_CONTACT
     scratch.qpos[:] = q
-    for opening in _OPENINGS:
+    for opening in _CLOSING_SHARES:
         for actuator in range(model.nu):
             if "finger" in model.actuator(actuator).name:
                 least, greatest = model.actuator_ctrlrange[actuator]

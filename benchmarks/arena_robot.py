@@ -20,7 +20,7 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.robot.urdf_parts import WORLD, numbers
 from q2r2_control.types import Array
 
-_CORNERS = 16  # Number of corners of the polygon around a circle.
+_CIRCLE_CORNERS = 16  # Number of corners of the polygon around a circle.
 
 
 @dataclass(frozen=True)
@@ -184,10 +184,10 @@ def corners_of(model: mujoco.MjModel, geom: int) -> Array:
         start = model.mesh_vertadr[mesh]
         return np.array(model.mesh_vert[start : start + model.mesh_vertnum[mesh]], dtype=np.float64)
     if kind == kinds.mjGEOM_CYLINDER:
-        angles = np.arange(_CORNERS) * 2 * np.pi / _CORNERS
-        radius = size[0] / np.cos(np.pi / _CORNERS)
+        angles = np.arange(_CIRCLE_CORNERS) * 2 * np.pi / _CIRCLE_CORNERS
+        radius = size[0] / np.cos(np.pi / _CIRCLE_CORNERS)
         circle = radius * np.column_stack([np.cos(angles), np.sin(angles)])
-        return np.concatenate([np.column_stack([circle, np.full(_CORNERS, z)]) for z in (-size[1], size[1])])
+        return np.concatenate([np.column_stack([circle, np.full(_CIRCLE_CORNERS, z)]) for z in (-size[1], size[1])])
     if kind == kinds.mjGEOM_BOX:
         return np.array(list(product((-1.0, 1.0), repeat=3))) * size
     raise ValueError(f"{model.geom(geom).name}: allowed: meshes, boxes and cylinders")

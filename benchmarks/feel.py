@@ -48,27 +48,29 @@ SPEED = FilterSettings(
 )
 OTHERS = {"precision": PRECISION, "speed": SPEED}
 
-SETTLES = 0.7  # Time before a tone or a tremor is measured, in which the motion settles [s].
+SETTLING_S = 0.7  # Time before a tone or a tremor is measured, in which the motion settles [s].
 ARM, HAND = "left", "left"
 MOTIONS = ((0.5, 0.06), (1.0, 0.04), (2.0, 0.02))  # Frequency [Hz] and amplitude [m] of intended motions.
-TREMORS = (8.0, 10.0, 12.0)  # Frequencies of tremors [Hz].
-TREMOR = 0.5e-3  # Amplitude of a tremor [m].
-SLOWLY = 0.03  # Speed of a hand that moves and trembles [m/s].
-NOISE = 2e-4  # Standard deviation of the sensor's noise along each axis [m].
+TREMOR_FREQUENCIES = (8.0, 10.0, 12.0)  # Frequencies of tremors [Hz].
+TREMOR_AMPLITUDE = 0.5e-3  # Amplitude of a tremor [m].
+SLOW_SPEED = 0.03  # Speed of a hand that moves and trembles [m/s].
+SENSOR_NOISE = 2e-4  # Standard deviation of the sensor's noise along each axis [m].
 # Standard deviations of the sensor's noise for a hand at rest [mm], and number of pauses of its arm.
 RESTING_NOISES, PAUSES = (0.2, 0.6, 1.0), 100
 STOP_SPEED, STOP_TIME = 0.3, 0.1  # Speed of a hand that stops [m/s], and time from that speed to rest [s].
 # Length [m] and time [s] of each reach, and the rest after it [s]. The hand moves to and fro, with a rest after each.
 # Peak speeds are 0.16 to 0.63 m/s, which the arm can follow sidewards.
-REACHES, REACH_RESTS = ((0.1, 0.6), (0.1, 1.2), (0.2, 0.8), (0.3, 1.0), (0.4, 1.2)), 0.3
-BAND, BAND_RMS = (8.0, 12.0), 1e-3  # Frequencies [Hz] and RMS [m] of a tremor within a band.
+REACHES, REACH_REST_S = ((0.1, 0.6), (0.1, 1.2), (0.2, 0.8), (0.3, 1.0), (0.4, 1.2)), 0.3
+TREMOR_BAND, TREMOR_BAND_RMS = (8.0, 12.0), 1e-3  # Frequencies [Hz] and RMS [m] of a tremor within a band.
 _BAND_PERIOD, _BAND_SEED = 4.0, 0  # Time after which the tremor within a band repeats [s], and seed of its phases.
-_PRESSED, _BEGINS = (0.2, 0.35), 0.8  # Begin and end of the press that engages, and begin of the hand's motion [s].
-_MEASURED = 2.0  # Measured duration of every tone [s].
-_RESTS, _CRUISES = 3.0, 0.4  # Duration of the run at rest, and time when the hand that stops begins to slow down [s].
+# Begin and end of the press that engages, and begin of the hand's motion [s].
+_PRESS_INTERVAL, _MOTION_BEGINS_S = (0.2, 0.35), 0.8
+_MEASURED_S = 2.0  # Measured duration of every tone [s].
+# Duration of the run at rest, and time when the hand that stops begins to slow down [s].
+_REST_RUN_S, _STOP_BEGINS_S = 3.0, 0.4
 _SIDEWARDS, _UP = 1, 2  # Indices of axes.
-_CYCLE = 0.6  # Time from one engagement to the next. The arm is engaged for half of it [s].
-_A_TICK = 0.05  # Longest period of a tick [s].
+_ENGAGEMENT_PERIOD_S = 0.6  # Time from one engagement to the next. The arm is engaged for half of it [s].
+_LONGEST_TICK_S = 0.05  # Longest period of a tick [s].
 NOTES = (
     f"pauses: Distance between the tool's places before and after {PAUSES} pauses, for a hand at rest whose samples "
     f"have a noise of {RESTING_NOISES} mm.",
@@ -78,12 +80,12 @@ NOTES = (
     "delays, gains: Figures for hand motions of "
     + ", ".join(f"{frequency:g} Hz, {1e3 * amplitude:g} mm" for frequency, amplitude in MOTIONS)
     + ".",
-    f"tremors: Gains at {TREMORS} Hz for a tremor of {1e3 * TREMOR:g} mm, of a hand that moves at {1e3 * SLOWLY:g} "
-    "mm/s.",
+    f"tremors: Gains at {TREMOR_FREQUENCIES} Hz for a tremor of {1e3 * TREMOR_AMPLITUDE:g} mm, of a hand that moves at "
+    f"{1e3 * SLOW_SPEED:g} mm/s.",
     "reaches: Delay for minimum-jerk motions of 0.1 to 0.4 m in 0.6 to 1.2 s, by correlation of velocities.",
-    f"band: Gain for a flat tremor of {BAND[0]:g} to {BAND[1]:g} Hz and {1e3 * BAND_RMS:g} mm RMS. All motion of the "
-    "tool counts.",
-    f"noise: RMS of the tool's motion if each sample has a noise of {1e6 * NOISE:g} um.",
+    f"band: Gain for a flat tremor of {TREMOR_BAND[0]:g} to {TREMOR_BAND[1]:g} Hz and {1e3 * TREMOR_BAND_RMS:g} mm "
+    "RMS. All motion of the tool counts.",
+    f"noise: RMS of the tool's motion if each sample has a noise of {1e6 * SENSOR_NOISE:g} um.",
     f"stop: A hand at {STOP_SPEED:g} m/s stops in {STOP_TIME:g} s. The delay ends when the tool stays within 2 mm of "
     "its rest.",
 )
@@ -97,12 +99,14 @@ class FeelFigures:
     filter_delay_ms: float  # Delay of the filter alone, from its settings.
     delays_ms: tuple[float, ...]  # Delay for each of :data:`MOTIONS`.
     gains_db: tuple[float, ...]  # Gain for each of :data:`MOTIONS`.
-    tremors_db: tuple[float, ...]  # Gain for each of :data:`TREMORS` of a hand that moves at :data:`SLOWLY`.
-    tremor_at_rest_db: float  # Gain for the middle frequency of :data:`TREMORS` of a hand that otherwise rests.
+    # Gain for each of :data:`TREMOR_FREQUENCIES` of a hand that moves at :data:`SLOW_SPEED`.
+    tremors_db: tuple[float, ...]
+    # Gain for the middle frequency of :data:`TREMOR_FREQUENCIES` of a hand that otherwise rests.
+    tremor_at_rest_db: float
     reach_delay_ms: float  # Delay over all of :data:`REACHES`, NaN if the tool does not follow.
     worst_reach_delay_ms: float  # Largest delay of one of :data:`REACHES`, NaN if the tool does not follow.
-    band_db: float  # Gain for a tremor in :data:`BAND` of a hand that moves at :data:`SLOWLY`.
-    band_at_rest_db: float  # Gain for a tremor in :data:`BAND` of a hand that otherwise rests.
+    band_db: float  # Gain for a tremor in :data:`TREMOR_BAND` of a hand that moves at :data:`SLOW_SPEED`.
+    band_at_rest_db: float  # Gain for a tremor in :data:`TREMOR_BAND` of a hand that otherwise rests.
     noise_um: float  # RMS of the tool's motion along the worst axis, for a hand at rest.
     stop_delay_ms: float  # Time from the hand's rest until the tool stays within 2 mm of its own rest.
     overshoot_mm: float  # Largest distance of the tool beyond its place of rest.
@@ -131,42 +135,42 @@ def _measure(name: str, config: Config, robot: Robot, plant: MujocoPlant, settin
         log = _Log(way, noise, axis, presses)
         pipeline = Pipeline(config, robot, log.hands, plant)
         pipeline.listeners.append(log.take)
-        pipeline.run(_BEGINS + lasts, realtime=False)
+        pipeline.run(_MOTION_BEGINS_S + lasts, realtime=False)
         if not log.reaches(lasts):
             raise KeyboardInterrupt  # A signal has ended the run early, so its figures mean nothing.
         return log
 
     def band(speed: float) -> float:
-        trembling = tremor(BAND, BAND_RMS, _BAND_PERIOD, _BAND_SEED, speed)
-        return run(trembling, SETTLES + _BAND_PERIOD, axis=_SIDEWARDS).attenuation(_BAND_PERIOD)
+        trembling = tremor(TREMOR_BAND, TREMOR_BAND_RMS, _BAND_PERIOD, _BAND_SEED, speed)
+        return run(trembling, SETTLING_S + _BAND_PERIOD, axis=_SIDEWARDS).attenuation(_BAND_PERIOD)
 
-    lasts = SETTLES + _MEASURED
+    lasts = SETTLING_S + _MEASURED_S
     motions = [run(tone(*motion), lasts).tone(motion[0]) for motion in MOTIONS]
-    tremors = [run(tone(each, TREMOR, SLOWLY), lasts).tone(each)[1] for each in TREMORS]
-    at_rest = TREMORS[len(TREMORS) // 2]
-    ends = np.cumsum([0.0, *(2.0 * (time + REACH_RESTS) for _, time in REACHES)])
-    reached = run(reaches(REACHES, REACH_RESTS), ends[-1], axis=_SIDEWARDS)
-    noise = run(lambda t: 0.0, _RESTS, NOISE).noise()
+    tremors = [run(tone(each, TREMOR_AMPLITUDE, SLOW_SPEED), lasts).tone(each)[1] for each in TREMOR_FREQUENCIES]
+    at_rest = TREMOR_FREQUENCIES[len(TREMOR_FREQUENCIES) // 2]
+    ends = np.cumsum([0.0, *(2.0 * (time + REACH_REST_S) for _, time in REACHES)])
+    reached = run(reaches(REACHES, REACH_REST_S), ends[-1], axis=_SIDEWARDS)
+    noise = run(lambda t: 0.0, _REST_RUN_S, SENSOR_NOISE).noise()
     pauses = [
-        run(lambda t: 0.0, (PAUSES + 1) * _CYCLE, 1e-3 * each, presses=_again_and_again).moved()
+        run(lambda t: 0.0, (PAUSES + 1) * _ENGAGEMENT_PERIOD_S, 1e-3 * each, presses=_again_and_again).moved()
         for each in RESTING_NOISES
     ]
-    stop_delay, overshoot = run(stop(STOP_SPEED, STOP_TIME, _CRUISES), _CRUISES + STOP_TIME + 1.5).stop()
+    stop_delay, overshoot = run(stop(STOP_SPEED, STOP_TIME, _STOP_BEGINS_S), _STOP_BEGINS_S + STOP_TIME + 1.5).stop()
     return FeelFigures(
         name=name,
         filter_delay_ms=1e3 * (settings.interpolation_delay + settings.smoothing_delay),
         delays_ms=tuple(1e3 * delay for delay, _ in motions),
         gains_db=tuple(gain for _, gain in motions),
         tremors_db=tuple(tremors),
-        tremor_at_rest_db=run(tone(at_rest, TREMOR), lasts).tone(at_rest)[1],
+        tremor_at_rest_db=run(tone(at_rest, TREMOR_AMPLITUDE), lasts).tone(at_rest)[1],
         reach_delay_ms=1e3 * reached.delay(0.0, ends[-1]),
         worst_reach_delay_ms=1e3 * float(np.max([reached.delay(*times) for times in pairwise(ends)])),
-        band_db=band(SLOWLY),
+        band_db=band(SLOW_SPEED),
         band_at_rest_db=band(0.0),
         noise_um=1e6 * noise,
         stop_delay_ms=1e3 * stop_delay,
         overshoot_mm=1e3 * overshoot,
-        overshoot_percent=1e2 * overshoot / (STOP_SPEED * _CRUISES),
+        overshoot_percent=1e2 * overshoot / (STOP_SPEED * _STOP_BEGINS_S),
         pauses_mm=tuple(1e3 * moved for moved in pauses),
     )
 
@@ -185,17 +189,17 @@ class _Log:
     def take(self, tick: Tick) -> None:
         """Keep the hand's and the tool's place of a tick."""
         way = self.hands.hand_pose(HAND, tick.now).translation - HANDS_AT_REST[HAND].translation
-        self._t.append(tick.t - _BEGINS)
+        self._t.append(tick.t - _MOTION_BEGINS_S)
         self._asked.append(float(way[self._axis]))
         self._tool.append(tick.tools[ARM].translation.copy())
 
     def reaches(self, lasts: float) -> bool:
         """Return whether the run lasted for ``lasts`` [s]."""
-        return bool(self._t) and self._t[-1] > lasts - _A_TICK
+        return bool(self._t) and self._t[-1] > lasts - _LONGEST_TICK_S
 
     def tone(self, frequency: float) -> tuple[float, float]:
         """Return delay [s] and gain [dB] of the tool for a tone of this ``frequency`` [Hz]."""
-        t, asked, tool = self._from(SETTLES)
+        t, asked, tool = self._from(SETTLING_S)
         basis = np.stack((np.sin(2 * np.pi * frequency * t), np.cos(2 * np.pi * frequency * t), np.ones_like(t), t), 1)
         (hand_sin, hand_cos, *_), (tool_sin, tool_cos, *_) = (
             np.linalg.lstsq(basis, way, rcond=None)[0] for way in (asked, tool)
@@ -221,8 +225,8 @@ class _Log:
 
         A steady motion does not count.
         """
-        t, asked, tool = self._from(SETTLES)
-        within = t < SETTLES + period
+        t, asked, tool = self._from(SETTLING_S)
+        within = t < SETTLING_S + period
         line = np.stack((np.ones_like(t), t), 1)[within]
         asked_rms, tool_rms = (
             math.sqrt(np.mean((way - line @ np.linalg.lstsq(line, way, rcond=None)[0]) ** 2))
@@ -238,7 +242,7 @@ class _Log:
         t, _, tool = self._from(0.0)
         ahead = tool - tool[-1]
         late = t[np.abs(ahead) > 2e-3]
-        return float(late[-1]) - (_CRUISES + STOP_TIME), max(float(ahead.max()), 0.0)
+        return float(late[-1]) - (_STOP_BEGINS_S + STOP_TIME), max(float(ahead.max()), 0.0)
 
     def moved(self) -> float:
         """Return the distance between the tool's first and last place [m]."""
@@ -252,22 +256,25 @@ class _Log:
 
     def _pose(self, hand: str, t: float) -> pin.SE3:
         home = HANDS_AT_REST[hand]
-        way = self._way(t - _BEGINS) if hand == HAND and t >= _BEGINS else 0.0
+        way = self._way(t - _MOTION_BEGINS_S) if hand == HAND and t >= _MOTION_BEGINS_S else 0.0
         return pin.SE3(home.rotation, home.translation + way * np.eye(3)[self._axis])
 
 
 def _buttons(hand: str, t: float) -> HandInputs:
-    return HandInputs(button_lower=_PRESSED[0] <= t < _PRESSED[1])
+    return HandInputs(button_lower=_PRESS_INTERVAL[0] <= t < _PRESS_INTERVAL[1])
 
 
 def _again_and_again(hand: str, t: float) -> HandInputs:
-    return HandInputs(button_lower=t > _PRESSED[0] and (t - _PRESSED[0]) % (_CYCLE / 2.0) < _CYCLE / 4.0)
+    return HandInputs(
+        button_lower=t > _PRESS_INTERVAL[0]
+        and (t - _PRESS_INTERVAL[0]) % (_ENGAGEMENT_PERIOD_S / 2.0) < _ENGAGEMENT_PERIOD_S / 4.0
+    )
 
 
 def tone(frequency: float, amplitude: float, speed: float = 0.0) -> Way:
     """Return a sine of ``frequency`` [Hz] and ``amplitude`` [m] on top of a steady motion at ``speed`` [m/s].
 
-    The sine grows from zero within the first half of :data:`SETTLES`.
+    The sine grows from zero within the first half of :data:`SETTLING_S`.
     """
 
     def way(t: float) -> float:
@@ -328,7 +335,7 @@ def reaches(lengths_and_times: Sequence[tuple[float, float]], rest: float) -> Wa
 
 
 def _grown(t: float) -> float:
-    share = min(max(t, 0.0) / (0.5 * SETTLES), 1.0)
+    share = min(max(t, 0.0) / (0.5 * SETTLING_S), 1.0)
     return math.sin(0.5 * math.pi * share) ** 2
 
 

@@ -34,13 +34,13 @@ from q2r2_control.types import CommandMode
 from q2r2_control.viewer.tables import figure_table
 
 _CONFIG = "config/dual_iiwa7_fri.yaml"
-_LONGEST_DELAY = 0.1  # Longest delay of the tools that is looked for [s].
-_FIRST = 90  # Real-time priority of the watching threads, above all others.
+_MAX_DELAY_S = 0.1  # Longest delay of the tools that is looked for [s].
+_WATCH_PRIORITY = 90  # Real-time priority of the watching threads, above all others.
 # A watching thread sleeps for the first of these times. If it wakes up late by more than the second one, its processor
 # stood still. The thread usually sleeps when a halt begins, so each halt of at least their sum is found. The sum is
 # 1 ms, half of the shortest period that is measured [s].
-_SLEEP, _STILL = 0.0005, 0.0005
-_WAIT = 60.0  # Timeout for the cabinets on a busy computer [s].
+_WATCH_SLEEP_S, _MIN_LATENESS_S = 0.0005, 0.0005
+_CABINET_TIMEOUT_S = 60.0  # Timeout for the cabinets on a busy computer [s].
 _end: Any = None  # Time when the watch of this watching process ends, by the monotonic clock [s].
 
 
@@ -57,11 +57,11 @@ def stand_stills(processor: int) -> list[tuple[float, float]]:
     """
     os.sched_setaffinity(0, {processor})
     found = []
-    with real_time(_FIRST):
+    with real_time(_WATCH_PRIORITY):
         while (before := time.monotonic()) < _end.value:
-            time.sleep(_SLEEP)
-            if (now := time.monotonic()) - before > _SLEEP + _STILL:
-                found.append((before + _SLEEP, now))
+            time.sleep(_WATCH_SLEEP_S)
+            if (now := time.monotonic()) - before > _WATCH_SLEEP_S + _MIN_LATENESS_S:
+                found.append((before + _WATCH_SLEEP_S, now))
     return found
 
 
@@ -152,7 +152,7 @@ def measure(mode: CommandMode, duration: float, rt: bool, options: list[str]) ->
     robot = Robot.from_config(config)
     plant = FriPlant.from_config(robot, config)
     plant.answers = deque()  # Without a maximum length, all answers are kept.
-    plant.longest_wait = plant.longest_session_wait = _WAIT
+    plant.longest_wait = plant.longest_session_wait = _CABINET_TIMEOUT_S
     with notice_of_compiling():
         pipeline = Pipeline(config, robot, ScriptedInput("circle"), plant, mode)
     pipeline.listeners.append(way := ToolWay(robot))
@@ -172,7 +172,7 @@ def measure(mode: CommandMode, duration: float, rt: bool, options: list[str]) ->
     answers = [(came, came + its) for came, its in zip(arrived, took, strict=True)]
     late = [its for its in answers if its[1] - its[0] > period]
     calm = undisturbed(answers, moments)
-    errors = way.errors(range(round(_LONGEST_DELAY * config.nominal_rate_hz)))
+    errors = way.errors(range(round(_MAX_DELAY_S * config.nominal_rate_hz)))
     # The circles repeat, so a short run is enough.
     direct_error, direct_errors = measure_directly(mode, min(duration, 30.0))
     return {

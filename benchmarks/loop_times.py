@@ -40,7 +40,7 @@ NOTES = (
     "drive: Impedance and wall in torque mode.",
     "physics: Time of the simulator, during which a real robot would move.",
 )
-TRAJECTORY, ENGAGED_AFTER = "circle", 1.0  # Both arms are engaged and move without a pause after this time [s].
+TRAJECTORY, ENGAGED_AFTER_S = "circle", 1.0  # Both arms are engaged and move without a pause after this time [s].
 
 
 @dataclass(frozen=True)
@@ -159,7 +159,7 @@ class Case:
 
     def _run(self, stages: bool = False, paced: bool = True, folder: Path | None = None) -> Array:
         pipeline, rate = self._pipeline, self._config.nominal_rate_hz
-        engaged = round(ENGAGED_AFTER * rate)
+        engaged = round(ENGAGED_AFTER_S * rate)
         pipeline.input = ScriptedInput(TRAJECTORY, hands=tuple(pipeline.robot.arms))
         clock = StageClock(1.0 / rate if paced else 0.0)
         with nullcontext() if folder is None else Recorder(folder, "bench") as recorder:

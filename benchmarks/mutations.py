@@ -25,8 +25,9 @@ from queue import SimpleQueue
 from xml.etree import ElementTree
 
 ROOT = Path(__file__).resolve().parents[1]
-_ANNOTATIONS = "BitOr"  # Operators of this kind are not changed, because almost every | here stands in a type hint.
-_STARTUP = 60.0  # Longest time that pytest takes beside its tests [s].
+# Operators of this kind are not changed, because almost every | in this project stands in a type hint.
+_SKIPPED_OPERATOR = "BitOr"
+_PYTEST_STARTUP_S = 60.0  # Longest time that pytest takes beside its tests [s].
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,7 @@ def mutants_of(root: Path, room: str) -> Iterator[Mutant]:
     from cosmic_ray.ast import ast_nodes, get_ast_from_path
     from cosmic_ray.plugins import get_operator, operator_names
 
-    names = [name for name in operator_names() if _ANNOTATIONS not in name and not get_operator(name).arguments()]
+    names = [name for name in operator_names() if _SKIPPED_OPERATOR not in name and not get_operator(name).arguments()]
     for file in sorted((root / room).rglob("*.py")):
         nodes = list(ast_nodes(get_ast_from_path(file)))
         for name in names:
@@ -102,7 +103,9 @@ def fate(copy: Path, env: dict[str, str], mutant: Mutant, tests: Sequence[str], 
     try:
         file.write_text(changed(copy, mutant))
         command = [*_pytest(), "-x", *tests]
-        result = subprocess.run(command, cwd=copy, env=env, capture_output=True, timeout=3.0 * limit + _STARTUP)
+        result = subprocess.run(
+            command, cwd=copy, env=env, capture_output=True, timeout=3.0 * limit + _PYTEST_STARTUP_S
+        )
         return "killed" if result.returncode else "survived"
     except subprocess.TimeoutExpired:
         return "killed"

@@ -30,8 +30,8 @@ from q2r2_control.cli.output import DEMO_CONFIG, Json, print_progress, print_rep
 from q2r2_control.viewer.tables import record_table
 
 WATCHERS = 10
-_RUN = ("run", DEMO_CONFIG, "--input", "scripted", "--trajectory", "circle", "--plant", "kinematic")
-_PAGE = ("--headless", "--web", "--web-port", "0", "--json")
+_RUN_ARGUMENTS = ("run", DEMO_CONFIG, "--input", "scripted", "--trajectory", "circle", "--plant", "kinematic")
+_PAGE_ARGUMENTS = ("--headless", "--web", "--web-port", "0", "--json")
 NOTES = (
     "tick: Time from the inputs until the command is applied [us].",
     "tracking: RMS error of the tool with the larger error.",
@@ -94,7 +94,7 @@ class Crowd:
 def measure(name: str, duration: float, crowd: bool) -> RunFigures:
     """Return the figures of one run of ``duration`` [s]."""
     print_progress(name)
-    command = [sys.executable, "-m", "q2r2_control", *_RUN, *_PAGE, "--duration", f"{duration:g}"]
+    command = [sys.executable, "-m", "q2r2_control", *_RUN_ARGUMENTS, *_PAGE_ARGUMENTS, "--duration", f"{duration:g}"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert process.stdout is not None
     assert process.stderr is not None

@@ -1,7 +1,7 @@
 """Which forces does a finger exert that presses on the table on purpose, in torque mode?
 
-The left tool is asked to go straight down to :data:`COMMANDED` below the table's surface, much faster than contact
-allows. It stays there, slides away from the arm's base or towards it while it presses, and is then lifted. This
+The left tool is asked to go straight down to :data:`COMMANDED_DEPTH` below the table's surface, much faster than
+contact allows. It stays there, slides away from the arm's base or towards it while it presses, and is then lifted. This
 direction is the hardest one, because the arm moves in its own plane, where its masses couple pressing and sliding. The
 controller and the impedance are complete. Forces are read from MuJoCo's contacts at every tick.
 """
@@ -31,17 +31,17 @@ from q2r2_control.verification.contract import Contract
 from q2r2_control.verification.fault_injection import TABLE_ONLY, with_contact
 from q2r2_control.viewer.tables import record_table
 
-COMMANDED = 0.010  # Depth of the target inside the table [m].
+COMMANDED_DEPTH = 0.010  # Depth of the target inside the table [m].
 _ARM, _TABLE = "left", "table"
-_Y = 0.40  # The tool's y during the whole run [m].
-_SPAN = (0.50, 0.60)  # Range of x over which the tool slides [m].
+_TOOL_Y = 0.40  # The tool's y during the whole run [m].
+_SLIDE_RANGE = (0.50, 0.60)  # Range of x over which the tool slides [m].
 # Height of the target before the press, its least height, and its rise after the press [m].
-_HEIGHT, _LOWEST, _RISE = 0.30, 0.10, 0.10
+_START_HEIGHT, _MIN_HEIGHT, _LIFT_HEIGHT = 0.30, 0.10, 0.10
 _APPROACH_SPEED = 0.5  # Speed of the target, far above the speed that contact allows [m/s].
 # Times when the tool goes down, slides and is lifted, and when the run ends [s].
-_DOWN, _SLIDING, _LIFT, _END = 2.5, 6.0, 8.5, 10.5
-_APPROACH, _SLIDE_TIME = 2.0, 1.5  # Durations of the approach and of the slide [s].
-_SETTLED = 1.0  # Time after the begin of a part until its force is steady [s].
+_DOWN_BEGINS_S, _SLIDE_BEGINS_S, _LIFT_BEGINS_S, _RUN_ENDS_S = 2.5, 6.0, 8.5, 10.5
+_APPROACH_S, _SLIDE_S = 2.0, 1.5  # Durations of the approach and of the slide [s].
+_SETTLING_S = 1.0  # Time after the begin of a part until its force is steady [s].
 NOTES = (
     "impact: Speed of the tool at the first touch [m/s], and largest force within the next 0.25 s [N].",
     "steady: Mean force while the tool stays [N].",
@@ -128,7 +128,7 @@ def _press(robot: Robot, config: Config, slide: PressSlide) -> _Trace:
     drive.reset(plant.state())
     dt = 1.0 / config.nominal_rate_hz
     touch: float | None = None  # Height of the tool at its first touch, None before it [m].
-    ticks = round(_END / dt)
+    ticks = round(_RUN_ENDS_S / dt)
     force, height, behind, reference_height = (np.zeros(ticks) for _ in range(4))
     for i in range(ticks):
         t = i * dt
@@ -167,9 +167,9 @@ def _pressing_force(plant: MujocoPlant) -> float:
 def _figures(config: Config, slide: PressSlide, bound: float, trace: _Trace) -> PressFigures:
     dt, force, height = 1.0 / config.nominal_rate_hz, trace.force, trace.height
     first = int(np.flatnonzero(force > 0.0)[0])
-    stays = slice(round((_DOWN + _SETTLED) / dt), round(_SLIDING / dt))
-    end = round((_SLIDING + _SLIDE_TIME) / dt)
-    slides, pressed = slice(stays.stop, end), slice(stays.stop, round(_LIFT / dt))
+    stays = slice(round((_DOWN_BEGINS_S + _SETTLING_S) / dt), round(_SLIDE_BEGINS_S / dt))
+    end = round((_SLIDE_BEGINS_S + _SLIDE_S) / dt)
+    slides, pressed = slice(stays.stop, end), slice(stays.stop, round(_LIFT_BEGINS_S / dt))
     settings, sliding = config.impedance, float(force[slides].mean())
     share, friction = config.mujoco.rotor_share, config.mujoco.obstacle_friction
     spring = settings.translational_stiffness * (height - trace.reference_height)[stays].mean()
@@ -201,16 +201,16 @@ def _along(slide: PressSlide) -> Array:
 
 def _asked(t: float, start: Array, touch: float | None, slide: PressSlide) -> Array:
     """Return the target position of the tool (3,) [m]."""
-    begin, end = _SPAN if slide is PressSlide.AWAY else _SPAN[::-1]
-    above = np.array([begin, _Y, _HEIGHT])
-    if t < _DOWN:
-        return start + minimum_jerk(min(t / _APPROACH, 1.0)) * (above - start)
-    bottom = -np.inf if touch is None else touch - COMMANDED
-    z = max(_HEIGHT - _APPROACH_SPEED * (t - _DOWN), bottom, _LOWEST)
-    x = begin + (end - begin) * minimum_jerk(min(max(t - _SLIDING, 0.0) / _SLIDE_TIME, 1.0))
-    if t > _LIFT:
-        z += minimum_jerk(min((t - _LIFT) / _APPROACH, 1.0)) * _RISE
-    return np.array([x, _Y, z])
+    begin, end = _SLIDE_RANGE if slide is PressSlide.AWAY else _SLIDE_RANGE[::-1]
+    above = np.array([begin, _TOOL_Y, _START_HEIGHT])
+    if t < _DOWN_BEGINS_S:
+        return start + minimum_jerk(min(t / _APPROACH_S, 1.0)) * (above - start)
+    bottom = -np.inf if touch is None else touch - COMMANDED_DEPTH
+    z = max(_START_HEIGHT - _APPROACH_SPEED * (t - _DOWN_BEGINS_S), bottom, _MIN_HEIGHT)
+    x = begin + (end - begin) * minimum_jerk(min(max(t - _SLIDE_BEGINS_S, 0.0) / _SLIDE_S, 1.0))
+    if t > _LIFT_BEGINS_S:
+        z += minimum_jerk(min((t - _LIFT_BEGINS_S) / _APPROACH_S, 1.0)) * _LIFT_HEIGHT
+    return np.array([x, _TOOL_Y, z])
 
 
 def _depth(robot: Robot, config: Config) -> float:
@@ -236,7 +236,7 @@ def main(json: Json = False) -> None:
     for press in PRESSES:
         print_progress(f"slide {press[0]}, rotor share {press[1]:g}, friction {press[2]:g}")
         figures.append(run_press(config, *press))
-    title = f"{config.name}: {1e3 * COMMANDED:g} mm commanded into the table, torque mode, MuJoCo"
+    title = f"{config.name}: {1e3 * COMMANDED_DEPTH:g} mm commanded into the table, torque mode, MuJoCo"
     print_report({"cell": config.name, "presses": figures}, (record_table(title, figures, NOTES),), json)
     raise typer.Exit(1 if any(press.violations for press in figures) else 0)
 

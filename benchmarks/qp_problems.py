@@ -37,9 +37,9 @@ from q2r2_control.types import Array
 from q2r2_control.viewer.tables import figure_table
 
 FILE = Path("build/qp_problems.parquet")
-TICKS, SOLVED = 2000, 200
+TICKS, SOLVED_PROBLEMS = 2000, 200
 DT = 0.002  # Period of a tick [s].
-_ANEW = 50  # Number of ticks of one recovery.
+_TICKS_PER_RECOVERY = 50  # Number of ticks of one recovery.
 Targets = dict[str, pin.SE3]
 Motion = Callable[[float, Mapping[str, pin.SE3]], Targets]
 
@@ -102,7 +102,7 @@ def problems(ticks: int) -> Iterator[qpbenchmark.Problem]:
     for name, motion in MOTIONS.items():
         controller.reset(robot.home)
         for tick in range(ticks // len(MOTIONS)):
-            if name == "recovery" and tick % _ANEW == 0:
+            if name == "recovery" and tick % _TICKS_PER_RECOVERY == 0:
                 controller.reset(outside(robot, random))
             targets = motion(tick * DT, start)
             yield qpbenchmark.Problem.from_qpsolvers(controller.problem(targets, DT), f"{name}_{tick:04d}")
@@ -182,7 +182,7 @@ def table_of(results: qpbenchmark.Results, ticks: int, solved: int) -> Table:
 
 def main(
     ticks: Annotated[int, typer.Option(min=4, help="Number of ticks whose QPs are written.")] = TICKS,
-    solved: Annotated[int, typer.Option(min=1, help="Number of problems to solve, evenly spread.")] = SOLVED,
+    solved: Annotated[int, typer.Option(min=1, help="Number of problems to solve, evenly spread.")] = SOLVED_PROBLEMS,
     file: Annotated[Path, typer.Option(help="The file to which the test set is written.")] = FILE,
     json: Json = False,
 ) -> None:

@@ -30,10 +30,10 @@ from q2r2_control.types import Array
 from q2r2_control.viewer.tables import figure_table
 from ros_processes import private_domain, started
 
-_START_TIMEOUT = 300.0  # Timeout for the nodes, which may have to compile kernels first [s].
-_STEP = 0.002  # Size of a step [m].
-_PAUSES = 0.07, 0.11  # Shortest and longest time between two steps, below any timeout of a stream [s].
-_PRESS, _CHORD = 0.3, 0.3  # Duration of a press of the lower button, and waiting time after its release [s].
+_START_TIMEOUT_S = 300.0  # Timeout for the nodes, which may have to compile kernels first [s].
+_STEP_SIZE = 0.002  # Size of a step [m].
+_STEP_PAUSES_S = 0.07, 0.11  # Shortest and longest time between two steps, below any timeout of a stream [s].
+_PRESS_S, _AFTER_PRESS_S = 0.3, 0.3  # Duration of a press of the lower button, and waiting time after its release [s].
 # Settings with the shortest delays that the hand's filters allow, so that mostly the nodes are measured.
 _SHORTEST_FILTER = {"interpolation_delay": 0.005, "smoothing_delay": 0.0, "min_cutoff": 100.0, "beta": 1000.0}
 
@@ -151,14 +151,14 @@ class _Probe:
         """
         targets: list[PoseStamped] = []
         subscription = self._node.create_subscription(PoseStamped, "/q2r2/left/target_frame", targets.append, 1)
-        deadline = time.monotonic() + _START_TIMEOUT
+        deadline = time.monotonic() + _START_TIMEOUT_S
         while not targets:
             if time.monotonic() > deadline:
-                raise LatencyError(f"left_arm_controller was not engaged within {_START_TIMEOUT:g} s")
-            for pressed, period in ((True, _PRESS), (False, _CHORD)):
+                raise LatencyError(f"left_arm_controller was not engaged within {_START_TIMEOUT_S:g} s")
+            for pressed, period in ((True, _PRESS_S), (False, _AFTER_PRESS_S)):
                 self._send_hand(pressed, period)
             targets.clear()
-            self._send_hand(False, _CHORD)
+            self._send_hand(False, _AFTER_PRESS_S)
         self._node.destroy_subscription(subscription)
 
     def step_hand(self, duration: float) -> CommandRecording:
@@ -175,10 +175,10 @@ class _Probe:
         end = time.monotonic() + duration
         while time.monotonic() < end:
             beside()
-            message.pose.position.z = height + _STEP * (len(steps) % 2)
+            message.pose.position.z = height + _STEP_SIZE * (len(steps) % 2)
             steps.append(time.time())  # This is the clock of the middleware's stamps.
             publisher.publish(message)
-            self._spin(random.uniform(*_PAUSES))
+            self._spin(random.uniform(*_STEP_PAUSES_S))
         if not self._commands:
             raise LatencyError(f"no joint command came within {duration:g} s")
         sent, received, v = (list(column) for column in zip(*self._commands, strict=True))
@@ -192,10 +192,10 @@ class _Probe:
             self._spin(0.02)
 
     def _wait(self, condition: Callable[[], object], what: str) -> None:
-        deadline = time.monotonic() + _START_TIMEOUT
+        deadline = time.monotonic() + _START_TIMEOUT_S
         while not condition():
             if time.monotonic() > deadline:
-                raise LatencyError(f"waited {_START_TIMEOUT:g} s for {what}")
+                raise LatencyError(f"waited {_START_TIMEOUT_S:g} s for {what}")
             self._spin(0.05)
 
     def _spin(self, period: float) -> None:

@@ -26,12 +26,12 @@ from q2r2_control.types import Array
 from q2r2_control.viewer.tables import figure_table
 from ros_processes import private_domain, processor_time, started
 
-_START_TIMEOUT = 300.0  # Timeout for the nodes, which may have to compile kernels first [s].
-_SETTLE = 3.0  # Time to wait after the nodes have started, and again after the hands have [s].
-_JITTER = 0.002  # Largest random delay of a headset's sample [s].
-_TREND = 0.15  # Width of the window that separates the hand's own slow motion from faster ripple [s].
-_RATED = "mujoco_robot", "cartesian_controller"  # Nodes whose rate is set.
-_SCRIPT = NodeProcess("SimulationInput", {"jitter": _JITTER})
+_START_TIMEOUT_S = 300.0  # Timeout for the nodes, which may have to compile kernels first [s].
+_SETTLING_S = 3.0  # Time to wait after the nodes have started, and again after the hands have [s].
+_SAMPLE_JITTER_S = 0.002  # Largest random delay of a headset's sample [s].
+_TREND_WINDOW_S = 0.15  # Width of the window that separates the hand's own slow motion from faster ripple [s].
+_NODES_WITH_RATE = "mujoco_robot", "cartesian_controller"  # Nodes whose rate is set.
+_SCRIPTED_HANDS = NodeProcess("SimulationInput", {"jitter": _SAMPLE_JITTER_S})
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +72,7 @@ def speed_ripple(times: Array, q: Array) -> float:
     """
     dt = np.diff(times)
     v = np.diff(q, axis=0) / dt[:, None]
-    window = np.hanning(2 * max(round(_TREND / float(np.median(dt)) / 2.0), 1) + 1)
+    window = np.hanning(2 * max(round(_TREND_WINDOW_S / float(np.median(dt)) / 2.0), 1) + 1)
     trend = np.apply_along_axis(lambda column: np.convolve(column, window / window.sum(), "valid"), 0, v)
     margin = len(window) // 2
     ripple = v[margin : len(v) - margin] - trend
@@ -87,18 +87,19 @@ def measure_load(config: str, duration: float, rate: float) -> LoadReport:
     """
     nodes, arms = nodes_of(config, "none"), len(load_config(config).arms)
     nodes = [
-        replace(node, parameters={**node.parameters, "rate": rate}) if node.name in _RATED else node for node in nodes
+        replace(node, parameters={**node.parameters, "rate": rate}) if node.name in _NODES_WITH_RATE else node
+        for node in nodes
     ]
     with private_domain(), _Watcher() as watcher, started(nodes) as processes:
         print_progress("Waiting for all nodes.")
         watcher.wait(lambda: watcher.active and len(watcher.engaged) == arms, "the nodes")
-        watcher.spin(_SETTLE)
+        watcher.spin(_SETTLING_S)
         print_progress(f"idle: {duration:g} s")
         idle = watcher.shares(processes, duration)
-        with started([_SCRIPT]) as script:
+        with started([_SCRIPTED_HANDS]) as script:
             print_progress("Waiting for the arms to follow.")
             watcher.wait(lambda: all(watcher.engaged.values()), "the arms to follow")
-            watcher.spin(_SETTLE)
+            watcher.spin(_SETTLING_S)
             print_progress(f"moving: {duration:g} s")
             watcher.forget_commands()
             moving = watcher.shares(processes | script, duration)
@@ -106,7 +107,7 @@ def measure_load(config: str, duration: float, rate: float) -> LoadReport:
         raise LoadError(f"an arm was paused within {duration:g} s: {watcher.last_event}")
     times, q = watcher.commands()
     rows = tuple(NodeLoad(name, idle.get(name, 0.0), moving[name]) for name in moving)
-    return LoadReport(duration, _JITTER, rows, len(times) / duration, speed_ripple(times_of_a_robot(times), q))
+    return LoadReport(duration, _SAMPLE_JITTER_S, rows, len(times) / duration, speed_ripple(times_of_a_robot(times), q))
 
 
 class _Watcher:
@@ -143,10 +144,10 @@ class _Watcher:
 
     def wait(self, condition: Callable[[], object], what: str) -> None:
         """Listen until ``condition`` holds."""
-        deadline = time.monotonic() + _START_TIMEOUT
+        deadline = time.monotonic() + _START_TIMEOUT_S
         while not condition():
             if time.monotonic() > deadline:
-                raise LoadError(f"waited {_START_TIMEOUT:g} s for {what}")
+                raise LoadError(f"waited {_START_TIMEOUT_S:g} s for {what}")
             self._executor.spin_once(0.05)
 
     def spin(self, period: float) -> None:

@@ -31,17 +31,17 @@ from q2r2_control.types import Array
 from q2r2_control.viewer.tables import record_table
 from ros_processes import private_domain, started
 
-_LATER = 4  # Number of presses that engage the arm after the first one, at each start of the nodes.
-_TIMEOUT = 300.0  # Timeout for the nodes, which may have to compile kernels first [s].
-# Duration of a press of the lower button, and of the pause after it. Both together are longer than WATCHED [s].
-_HELD = 0.3
-_STILL, _REST = 0.005, 0.5  # The joints rest if all commands were below this speed [rad/s] for this time [s].
-_SAMPLE = 1.0 / 75.0  # Period of the hand's samples [s].
-_RADIUS, _TURN = 0.03, 2.0  # Radius of the hand's circle [m], and time of one turn [s].
+_LATER_PRESSES = 4  # Number of presses that engage the arm after the first one, at each start of the nodes.
+_START_TIMEOUT_S = 300.0  # Timeout for the nodes, which may have to compile kernels first [s].
+# Duration of a press of the lower button, and of the pause after it. Both together are longer than WATCHED_S [s].
+_PRESS_S = 0.3
+_REST_SPEED, _REST_S = 0.005, 0.5  # The joints rest if all commands were below this speed [rad/s] for this time [s].
+_SAMPLE_PERIOD_S = 1.0 / 75.0  # Period of the hand's samples [s].
+_CIRCLE_RADIUS, _CIRCLE_PERIOD_S = 0.03, 2.0  # Radius of the hand's circle [m], and time of one turn [s].
 
 
-WATCHED = 0.5  # Time after a press in which its answers are looked for [s].
-_MOVES = 0.02  # A joint command above this speed belongs to a motion [rad/s].
+WATCHED_S = 0.5  # Time after a press in which its answers are looked for [s].
+_MOTION_SPEED = 0.02  # A joint command above this speed belongs to a motion [rad/s].
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +94,7 @@ def measure_presses(config: str, starts: int) -> PressReport:
             print_progress(f"Waiting for the nodes, start {number + 1} of {starts}.")
             hand.wait_until_ready()
             run = [hand.press_to_engage()]
-            for _ in range(_LATER):
+            for _ in range(_LATER_PRESSES):
                 hand.pause()
                 run.append(hand.press_to_engage())
             runs.append(run)
@@ -143,13 +143,13 @@ class _Hand:
         self._moved = time.monotonic()
 
         def ready() -> bool:
-            rests = time.monotonic() - self._moved > _REST
+            rests = time.monotonic() - self._moved > _REST_S
             return bool(self._state.get("ready") and not self._engaged and self._ticks and self._commands and rests)
 
         self._wait(ready, "left_arm_controller to be ready, which says: {message}")
 
     def press_to_engage(self) -> PressRecording:
-        """Press, and record what follows for longer than :data:`WATCHED`."""
+        """Press, and record what follows for longer than :data:`WATCHED_S`."""
         for times in (self._ticks, self._targets, self._commands, self._speeds):
             del times[:-1]
         press = time.time()  # This is the clock of the middleware's stamps.
@@ -166,17 +166,17 @@ class _Hand:
 
     def _press(self) -> None:
         self._pressed = True
-        self._move(_HELD)
+        self._move(_PRESS_S)
         self._pressed = False
-        self._move(_HELD)
+        self._move(_PRESS_S)
 
     def _wait(self, condition: Callable[[], bool], what: str) -> None:
-        deadline = time.monotonic() + _TIMEOUT
+        deadline = time.monotonic() + _START_TIMEOUT_S
         while not condition():
             if time.monotonic() > deadline:
                 said = self._state.get("message", "nothing")
-                raise PressError(f"waited {_TIMEOUT:g} s for {what.format(message=said)}")
-            self._move(_SAMPLE)
+                raise PressError(f"waited {_START_TIMEOUT_S:g} s for {what.format(message=said)}")
+            self._move(_SAMPLE_PERIOD_S)
 
     def _move(self, period: float) -> None:
         """Publish samples of the hand for ``period`` [s], and receive messages meanwhile."""
@@ -184,7 +184,7 @@ class _Hand:
         while (now := time.monotonic()) < end:
             self._inputs.publish(OVR2ROSInputs(button_lower=self._pressed))
             self._pose.publish(_on_circle(now))
-            until = min(now + _SAMPLE, end)
+            until = min(now + _SAMPLE_PERIOD_S, end)
             while (left := until - time.monotonic()) > 0.0:
                 self._executor.spin_once(left)
 
@@ -198,7 +198,7 @@ class _Hand:
     def _on_command(self, message: JointTrajectory, info: dict[str, int]) -> None:
         self._commands.append(_sent(info))
         self._speeds.append(max(abs(v) for v in message.points[0].velocities))
-        if self._speeds[-1] > _STILL:
+        if self._speeds[-1] > _REST_SPEED:
             self._moved = time.monotonic()
 
     def _on_state(self, message: String) -> None:
@@ -212,8 +212,11 @@ def _sent(info: dict[str, int]) -> float:
 def _on_circle(now: float) -> PoseStamped:
     """Return the hand's pose at the time ``now`` of the monotonic clock [s]."""
     message = PoseStamped()
-    angle = 2.0 * math.pi * now / _TURN
-    message.pose.position.y, message.pose.position.z = _RADIUS * math.cos(angle), _RADIUS * math.sin(angle)
+    angle = 2.0 * math.pi * now / _CIRCLE_PERIOD_S
+    message.pose.position.y, message.pose.position.z = (
+        _CIRCLE_RADIUS * math.cos(angle),
+        _CIRCLE_RADIUS * math.sin(angle),
+    )
     message.pose.orientation.w = 1.0
     return message
 
@@ -242,20 +245,20 @@ def _times(recording: PressRecording) -> tuple[float, float, float] | None:
     """
     press = recording.press
     target = _first(np.asarray(recording.targets), press)
-    moving = np.asarray(recording.commands)[np.asarray(recording.speeds) > _MOVES]
+    moving = np.asarray(recording.commands)[np.asarray(recording.speeds) > _MOTION_SPEED]
     motion = _first(moving, press)
     if target is None or motion is None:
         return None
     ticks = np.asarray(recording.ticks)
     # The delay that the press causes begins at the tick before the press.
-    begin, end = np.searchsorted(ticks, [press, press + WATCHED])
+    begin, end = np.searchsorted(ticks, [press, press + WATCHED_S])
     longest = float(np.diff(ticks[max(begin - 1, 0) : end + 1]).max(initial=0.0))
     return longest, target, motion
 
 
 def _first(times: Array, press: float) -> float | None:
-    """Return the time from the press to the first of ``times`` after it, None if that is later than WATCHED [s]."""
-    after = times[(times >= press) & (times <= press + WATCHED)]
+    """Return the time from the press to the first of ``times`` after it, None if that is later than WATCHED_S [s]."""
+    after = times[(times >= press) & (times <= press + WATCHED_S)]
     return float(after[0] - press) if len(after) else None
 
 
@@ -268,7 +271,7 @@ def main(
     """Print the times after a press: the longest tick of the arm's node, the first target, and the first motion."""
     report = measure_presses(DEMO_CONFIG, starts)
     notes = (
-        f"tick: Longest tick of the arm's node within {WATCHED:g} s after the press. The median of all ticks is "
+        f"tick: Longest tick of the arm's node within {WATCHED_S:g} s after the press. The median of all ticks is "
         f"{report.period_ms:.1f} ms.",
         "target: Time from the press until the first target.",
         "motion: Time from the press until the first joint command that moves.",

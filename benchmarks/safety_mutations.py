@@ -34,7 +34,7 @@ TESTS = {  # Tests that run for a row, by the folder of its line.
     "q2r2_control/teleop/": ("tests/teleop",),
     "q2r2_control/pipeline/": ("tests/pipeline/test_loop_clock.py", "tests/test_stalls.py"),
 }
-_LONGEST = 1800.0  # Timeout for a soak or the tests [s].
+_TIMEOUT_S = 1800.0  # Timeout for a soak or the tests [s].
 
 
 def broken_copy(mutation: Mutation, folder: Path) -> None:
@@ -62,7 +62,7 @@ def found_by(mutation: Mutation, ticks: int, seed: int) -> str:
         def run(*arguments: str) -> subprocess.CompletedProcess[str]:
             command = (sys.executable, "-m", *arguments)
             return subprocess.run(
-                command, cwd=folder, env=environment, capture_output=True, text=True, timeout=_LONGEST
+                command, cwd=folder, env=environment, capture_output=True, text=True, timeout=_TIMEOUT_S
             )
 
         if "/control/" in mutation.path:

@@ -28,8 +28,8 @@ from q2r2_control.viewer.tables import record_table
 
 CHROMIUM = "/usr/bin/chromium"
 ARGUMENTS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-_MOVED = 1e-6  # Least difference of a command that has moved [rad].
-_LATEST = 0.5  # Longest time from a jump to its command [s].
+_MIN_MOTION = 1e-6  # Least difference of a command that has moved [rad].
+_MAX_LATENCY_S = 0.5  # Longest time from a jump to its command [s].
 
 # A script for the page. Its function jump moves the left controller, and returns the wall clock's time of each jump and
 # the mean time of a frame, both in [s].
@@ -99,8 +99,8 @@ class CommandTimes:
         times, commands = np.array(self.times), np.array(self.commands)
         found = []
         for began in moved:
-            first, last = np.searchsorted(times, [began, began + _LATEST])
-            apart = np.abs(commands[first:last] - commands[first]).max(axis=1) > _MOVED
+            first, last = np.searchsorted(times, [began, began + _MAX_LATENCY_S])
+            apart = np.abs(commands[first:last] - commands[first]).max(axis=1) > _MIN_MOTION
             if apart.any():
                 found.append(times[first + int(apart.argmax())] - began)
         return np.array(found)
@@ -118,7 +118,7 @@ def main(
 
     config = WebXrInput.cell(load_config(DEMO_CONFIG))
     # A browser without a graphics card may pause longer than an arm waits. This timeout lets such pauses be measured.
-    gate = config.teleop.gate.model_copy(update={"timeout": _LATEST})
+    gate = config.teleop.gate.model_copy(update={"timeout": _MAX_LATENCY_S})
     config = config.model_copy(update={"teleop": config.teleop.model_copy(update={"gate": gate})})
     source = WebXrInput(port=0, watch=HandsWatch(None, frame=False))
     pipeline = Pipeline.from_config(config, input=source, plant="kinematic")
@@ -139,7 +139,7 @@ def main(
             page.wait_for_timeout(1000.0)
             page.evaluate("engage()")
             result = page.evaluate("jumps => jump(jumps)", jumps)
-            time.sleep(_LATEST)
+            time.sleep(_MAX_LATENCY_S)
         finally:
             pipeline.stop()
             thread.join()

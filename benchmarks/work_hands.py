@@ -19,15 +19,15 @@ from q2r2_control.teleop.relative import RelativeMotion
 from q2r2_control.types import SIDES, HandInputs
 
 # Time when each hand presses. The times differ, because nobody presses with both hands at the same instant [s].
-_PRESSES = {"left": 0.2, "right": 0.26}
+_PRESS_TIMES_S = {"left": 0.2, "right": 0.26}
 # Time when the hands begin to move. It is half a second after both presses count, including the wait for a chord [s].
-MOVES = 1.0
-_EVEN_RATE = 75.0  # Rate of even samples [Hz].
-_NOISE = 2e-4  # Standard deviation of the sensor's noise along each axis [m].
+MOTION_BEGINS_S = 1.0
+_EVEN_RATE_HZ = 75.0  # Rate of even samples [Hz].
+_SENSOR_NOISE = 2e-4  # Standard deviation of the sensor's noise along each axis [m].
 
 
 class WorkHands(PlayedInput):
-    """Both hands in one work motion, which begins :data:`MOVES` [s] after the first poll. Implements :class:`Input`.
+    """An :class:`Input` with both hands in one work motion, which begins :data:`MOTION_BEGINS_S` after the first poll.
 
     ``start`` has the tools' poses when the arms are engaged, in the world frame. ``settings`` say how hands move arms.
     ``seed`` decides what samples add to the hands' poses. If it is None, the samples are exact and even.
@@ -44,7 +44,7 @@ class WorkHands(PlayedInput):
 
     def asked(self, t: float) -> dict[str, pin.SE3]:
         """Return the tool poses that the hands ask for at ``t`` [s] since the first poll, in the world frame."""
-        return self._motion.targets(min(max(t - MOVES, 0.0), self._motion.ends), self._start)
+        return self._motion.targets(min(max(t - MOTION_BEGINS_S, 0.0), self._motion.ends), self._start)
 
     def _ideal(self, hand: str, t: float) -> pin.SE3:
         return self._relative[hand].hand(self.asked(t)[self._arm_of[hand]])
@@ -57,8 +57,8 @@ def _anchored(settings: TeleopSettings, hand: pin.SE3, tool: pin.SE3) -> Relativ
 
 
 def _sampling(hand: str, seed: int | None) -> SampleTiming:
-    return EvenSampling(_EVEN_RATE) if seed is None else HeadsetSampling(hand, seed, position_noise=_NOISE)
+    return EvenSampling(_EVEN_RATE_HZ) if seed is None else HeadsetSampling(hand, seed, position_noise=_SENSOR_NOISE)
 
 
 def _buttons(hand: str, t: float) -> HandInputs:
-    return HandInputs(button_lower=_PRESSES[hand] <= t < _PRESSES[hand] + PRESS_DURATION)
+    return HandInputs(button_lower=_PRESS_TIMES_S[hand] <= t < _PRESS_TIMES_S[hand] + PRESS_DURATION)

@@ -32,11 +32,11 @@ from q2r2_control.types import Array, CommandMode
 from q2r2_control.verification.contract import Contract
 from q2r2_control.viewer.tables import record_table
 from q2r2_control.wording import sentence
-from work_hands import MOVES, WorkHands
+from work_hands import MOTION_BEGINS_S, WorkHands
 
-_TAIL = 0.5  # Duration of the end of a motion in which the arms should rest [s].
-_ROUNDING = 1e-9  # Largest rounding error of a tick's time [s].
-_MARGIN_TICKS = 4  # Number of ticks from one posture whose margins are measured to the next.
+_TAIL_S = 0.5  # Duration of the end of a motion in which the arms should rest [s].
+_TIME_ROUNDING_S = 1e-9  # Largest rounding error of a tick's time [s].
+_TICKS_PER_MARGIN = 4  # Number of ticks from one posture whose margins are measured to the next.
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +96,7 @@ class Stack:
         hands = WorkHands(motion, self._start, self._config.teleop, seed)
         pipeline = Pipeline(self._config, self.robot, hands, self._plant, self.mode)
         log = _Log(pipeline, checked=len(self._kept) > 0)
-        ends = MOVES + motion.ends
+        ends = MOTION_BEGINS_S + motion.ends
         try:
             summary = pipeline.run(ends, realtime=False)
         except PlantError as fault:
@@ -110,9 +110,9 @@ class Stack:
             pauses=[f"{event.arm}: {sentence(event.reason)}" for event in summary.events if _pauses(event)],
             broken=log.broken,
         )
-        log.cut(MOVES + motion.begins, ends)
+        log.cut(MOTION_BEGINS_S + motion.begins, ends)
         errors, late, to_goal = _errors(log, hands, pipeline.teleop.delay, ends)
-        moving = np.array(log.t) <= MOVES + motion.rests
+        moving = np.array(log.t) <= MOTION_BEGINS_S + motion.rests
         return replace(
             self._with_distances(self._with_efforts(figures, log), log),
             rms_error_mm=_rms_mm(errors[moving]),
@@ -125,7 +125,7 @@ class Stack:
     def _with_efforts(self, figures: StackFigures, log: _Log) -> StackFigures:
         a, tau = np.array(log.a), np.array(log.tau)
         limit = self.robot.capped_acceleration(self._config.control.acceleration_limit)
-        tail = a[-round(_TAIL * self._config.nominal_rate_hz) :]
+        tail = a[-round(_TAIL_S * self._config.nominal_rate_hz) :]
         return replace(
             figures,
             fallback_percent=100.0 * float(np.mean(log.fallback)),
@@ -139,7 +139,7 @@ class Stack:
             return figures
         measured, reference = np.array(log.measured), np.array(log.reference)
         distance, pair = nearest_pair(measured, self.robot)
-        margins = [(self.robot.distance_values(q) - self._kept).min() for q in measured[::_MARGIN_TICKS]]
+        margins = [(self.robot.distance_values(q) - self._kept).min() for q in measured[::_TICKS_PER_MARGIN]]
         return replace(
             figures,
             measured_distance_mm=distance,
@@ -185,7 +185,7 @@ class _Log:
 
     def cut(self, begin: float, end: float) -> None:
         """Keep only the ticks after ``begin`` and up to ``end`` [s]."""
-        first, last = (bisect_right(self.t, time + _ROUNDING) for time in (begin, end))
+        first, last = (bisect_right(self.t, time + _TIME_ROUNDING_S) for time in (begin, end))
         for name in ("t", "measured", "reference", "a", "tau", "tools", "fallback"):
             setattr(self, name, getattr(self, name)[first:last])
 

@@ -34,17 +34,17 @@ from q2r2_control.plants import MujocoPlant
 from q2r2_control.recording import About, Recorder
 
 TASK = tasks_named(["grasp"])[0]
-BLOCK, SPREAD = "flat_block", 0.03  # Block, and its largest displacement along x and y [m].
+BLOCK, MAX_DISPLACEMENT = "flat_block", 0.03  # Block, and its largest displacement along x and y [m].
 FPS, CHUNK = 10, 100  # Number of actions per second [Hz], and of one chunk, which is the whole motion.
 PLACE = "observation.environment_state"  # lerobot's name of the block's place, x y [m].
 STATE, ACTION = "observation.state", "action"
-SMALL: dict[str, Any] = {"dim_model": 64, "n_heads": 4, "dim_feedforward": 256, "n_encoder_layers": 2}
-SMALL |= {"use_vae": False, "dropout": 0.0, "chunk_size": CHUNK, "n_action_steps": CHUNK, "device": "cpu"}
-BATCH, RATE = 16, 1e-3  # Batch size and learning rate.
+ACT_SETTINGS: dict[str, Any] = {"dim_model": 64, "n_heads": 4, "dim_feedforward": 256, "n_encoder_layers": 2}
+ACT_SETTINGS |= {"use_vae": False, "dropout": 0.0, "chunk_size": CHUNK, "n_action_steps": CHUNK, "device": "cpu"}
+BATCH_SIZE, LEARNING_RATE = 16, 1e-3  # Batch size and learning rate.
 # Least standard deviation by which an action is scaled [m or 1]. Numbers that vary less are mostly tremor, which the
 # policy would otherwise learn.
-STILL = 0.02
-WANTED = 0.5  # Least share of attempts that must succeed.
+MIN_DEVIATION = 0.02
+MIN_SUCCESS_SHARE = 0.5  # Least share of attempts that must succeed.
 
 
 class Whole:
@@ -85,7 +85,7 @@ def coarse(cell: Config) -> Config:
 
 def place_of(seed: int) -> Array:
     """Return the block's displacement (2,) from its place in the cell in the attempt with this ``seed`` [m]."""
-    return np.random.default_rng([seed, 7]).uniform(-SPREAD, SPREAD, 2)
+    return np.random.default_rng([seed, 7]).uniform(-MAX_DISPLACEMENT, MAX_DISPLACEMENT, 2)
 
 
 def attempt(cell: Config, source: Input, place: Array, recorder: Recorder | None = None, seconds: float = 11.0) -> str:
@@ -143,19 +143,19 @@ def train(dataset: LeRobotDataset, steps: int, folder: Path) -> Path:
     sizes = {name: tuple(values.shape[1:]) for name, values in columns.items()}
     seen = {STATE: PolicyFeature(FeatureType.STATE, sizes[STATE]), PLACE: PolicyFeature(FeatureType.ENV, sizes[PLACE])}
     config = ACTConfig(
-        input_features=seen, output_features={ACTION: PolicyFeature(FeatureType.ACTION, sizes[ACTION])}, **SMALL
+        input_features=seen, output_features={ACTION: PolicyFeature(FeatureType.ACTION, sizes[ACTION])}, **ACT_SETTINGS
     )
     policy = ACTPolicy(config)
-    scale = {"mean": actions.mean(axis=0), "std": np.maximum(actions.std(axis=0), STILL)}
+    scale = {"mean": actions.mean(axis=0), "std": np.maximum(actions.std(axis=0), MIN_DEVIATION)}
     stats = dataset.meta.stats | {ACTION: scale}
     before, after = make_pre_post_processors(config, dataset_stats=stats)
     ends = torch.from_numpy(np.repeat(dataset.meta.episodes["dataset_to_index"], dataset.meta.episodes["length"]))
     # The policy is only called in the first second of an episode, so it learns from these frames.
     begins = torch.from_numpy(np.flatnonzero(column(dataset, "frame_index") < FPS))
-    optimizer = torch.optim.AdamW(policy.parameters(), RATE)
+    optimizer = torch.optim.AdamW(policy.parameters(), LEARNING_RATE)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
     for step in range(steps):
-        frames = begins[torch.randint(len(begins), (BATCH,))]
+        frames = begins[torch.randint(len(begins), (BATCH_SIZE,))]
         ahead = frames[:, None] + torch.arange(CHUNK)
         over = ahead >= ends[frames, None]
         batch = {name: columns[name][frames] for name in seen}
@@ -210,7 +210,7 @@ def main() -> None:
         print(f"ACT, seed {seed}: {why or 'succeeded'}", flush=True)
         done["mean episode"] += not attempt(cell, PolicyInput(Whole(lambda seen: mean)), place)
     print(", ".join(f"{name}: {count} of {given.seeds}" for name, count in done.items()))
-    sys.exit(done["ACT"] < max(WANTED * given.seeds, done["mean episode"] + 1))
+    sys.exit(done["ACT"] < max(MIN_SUCCESS_SHARE * given.seeds, done["mean episode"] + 1))
 
 
 if __name__ == "__main__":

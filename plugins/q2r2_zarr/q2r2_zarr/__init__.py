@@ -15,8 +15,8 @@ import zarr
 
 from q2r2_control import EpisodeVectors, ExportFormat, RecordingError
 
-_LAYOUT = 2  # Version of zarr's format that diffusion_policy's version of the package reads.
-_ROWS = 1000  # Number of frames in one chunk of numbers. Each picture is a chunk of its own.
+_ZARR_FORMAT = 2  # Version of zarr's format that diffusion_policy's version of the package reads.
+_FRAMES_PER_CHUNK = 1000  # Number of frames in one chunk of numbers. Each picture is a chunk of its own.
 
 
 def array_name(feature: str) -> str:
@@ -27,7 +27,7 @@ def array_name(feature: str) -> str:
 def write_episode(episode: EpisodeVectors, path: Path) -> None:
     """Write one episode as a store of its own at ``path``. Anything that exists there is removed."""
 
-    root = zarr.open_group(str(path), mode="w", zarr_format=_LAYOUT)
+    root = zarr.open_group(str(path), mode="w", zarr_format=_ZARR_FORMAT)
     root.attrs.update(
         {
             **{name: getattr(episode, name) for name in ("cell", "task", "fps", "recording", "success")},
@@ -51,7 +51,7 @@ def write_episode(episode: EpisodeVectors, path: Path) -> None:
 
 def join_episodes(files: Sequence[Path], folder: Path) -> None:
     """Join stores of single episodes, at least one, in a new one. Raises :class:`RecordingError` if arrays differ."""
-    root = zarr.open_group(str(folder), mode="w-", zarr_format=_LAYOUT)
+    root = zarr.open_group(str(folder), mode="w-", zarr_format=_ZARR_FORMAT)
     data, ends, about, first = root.create_group("data"), list[int](), list[dict[str, Any]](), ""
     for file in files:
         episode = zarr.open_group(str(file), mode="r")
@@ -76,7 +76,7 @@ def join_episodes(files: Sequence[Path], folder: Path) -> None:
 
 def _create(group: Any, name: str, row: Any) -> Any:
     """Create an array without rows, with the shape and type of ``row``."""
-    rows = _ROWS if row.ndim < 2 else 1
+    rows = _FRAMES_PER_CHUNK if row.ndim < 2 else 1
     return group.create_array(name, shape=(0, *row.shape), chunks=(rows, *row.shape), dtype=row.dtype)
 
 
