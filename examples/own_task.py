@@ -12,7 +12,10 @@ class ElbowTask:
         self.joint, self.angle = robot.joint_names.index(joint), angle
 
     def cost(self, q: Array, v: Array) -> tuple[Array, Array]:
-        """Return H and g of the cost 1/2 v' H v + g' v, which turns the joint to its angle with a gain of 2/s."""
+        """Return H and g of the cost 1/2 v' H v + g' v.
+
+        The cost is least if the joint turns to its angle with a gain of 2/s.
+        """
         H, g = np.zeros((len(q), len(q))), np.zeros(len(q))
         H[self.joint, self.joint] = 0.1
         g[self.joint] = -0.1 * 2.0 * (self.angle - q[self.joint])
