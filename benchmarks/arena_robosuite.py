@@ -1,4 +1,4 @@
-"""robosuite's two-arm tasks with its own IIWA, for the arena."""
+"""The arena's cell for robosuite's two-arm tasks, with robosuite's model of the IIWA."""
 
 from __future__ import annotations
 
@@ -22,29 +22,36 @@ from q2r2_control.types import Array
 TASKS = ("TwoArmLift", "TwoArmHandover")
 OURS, OSC = "q2r2", "OSC_POSE"
 CONTROLLERS = (OURS, OSC)
-PERIOD = 0.05  # of the hands, and of the stock controllers' actions, robosuite's own [s]
-_TICKS = 5  # of ours, each a command to robosuite's joint position controller
+PERIOD = 0.05  # Period of the hands' targets, which is robosuite's default period of an action [s].
+# Number of ticks of our controller in one period. Each tick commands robosuite's joint position controller.
+_TICKS_PER_PERIOD = 5
 _SETTINGS = ControllerSettings(min_distance=0.003)
-# Stiff enough to follow the reference: a step is answered in 1/60 s, critically damped.
-_JOINTS = {"type": "JOINT_POSITION", "input_type": "absolute", "kp": 3600, "damping_ratio": 1, "interpolation": None}
-_JOINTS |= {"input_max": 7, "input_min": -7, "output_max": 7, "output_min": -7, "ramp_ratio": 0.2}
-_MEETING = np.array([0.0, -0.15, 1.12])  # of the hammer with the right hand [m]
-_NEAREST = -0.5  # y of a grasp of the left hand [m]
-_LEAN = 0.9  # of the right hand towards its own base [rad]
-_OPENINGS = (0.0, 0.25, 0.5, 0.75, 1.0)
+# The joints are stiff enough to follow the reference. They are critically damped, with a time constant of 1/60 s.
+_JOINT_CONTROL = {
+    "type": "JOINT_POSITION",
+    "input_type": "absolute",
+    "kp": 3600,
+    "damping_ratio": 1,
+    "interpolation": None,
+}
+_JOINT_CONTROL |= {"input_max": 7, "input_min": -7, "output_max": 7, "output_min": -7, "ramp_ratio": 0.2}
+_MEETING_PLACE = np.array([0.0, -0.15, 1.12])  # Place where the right hand takes the hammer, in the world [m].
+_MIN_GRASP_Y = -0.5  # Least y at which the left hand can grasp while it points down [m].
+_RIGHT_HAND_LEAN = 0.9  # Angle by which the right hand leans towards its own base [rad].
+_CLOSING_SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)  # Shares of the fingers' way from open to closed.
 
 logging.getLogger("robosuite_logs").setLevel(logging.ERROR)
 
 
 class RobosuiteCell:
-    """One of the tasks with one of the controllers, an episode at a time."""
+    """One of the tasks with one of the controllers, which plays one episode after the other."""
 
     PERIOD = PERIOD
 
     def __init__(self, task: str, controller: str) -> None:
         self._task, self._kind = task, controller
         self._follower: CartesianController | None = None
-        # KUKA's, of which robosuite's model says nothing.
+        # These are KUKA's limits, because robosuite's model has no velocity limits.
         limits = Robot.from_config(load_config("config/iiwa7.yaml")).velocity_limit
         self.arms = {side: _arm_model(number, limits) for number, side in enumerate(("left", "right"))}
 
@@ -52,7 +59,7 @@ class RobosuiteCell:
         """Begin another episode."""
         config = robosuite.load_composite_controller_config(robot="IIWA")
         if self._kind == OURS:
-            config["body_parts"]["right"] = {**_JOINTS, "gripper": config["body_parts"]["right"]["gripper"]}
+            config["body_parts"]["right"] = {**_JOINT_CONTROL, "gripper": config["body_parts"]["right"]["gripper"]}
         self._env = robosuite.make(
             self._task,
             robots=["IIWA", "IIWA"],
@@ -61,11 +68,11 @@ class RobosuiteCell:
             has_offscreen_renderer=False,
             use_camera_obs=False,
             use_object_obs=False,
-            control_freq=round((_TICKS if self._kind == OURS else 1) / PERIOD),
+            control_freq=round((_TICKS_PER_PERIOD if self._kind == OURS else 1) / PERIOD),
             ignore_done=True,
             seed=seed,
         )
-        self._env.sim.forward()  # for what was placed last
+        self._env.sim.forward()  # This updates the poses of the objects that were placed last.
         self.model, self._data = self._env.sim.model._model, self._env.sim.data._data
         self.judge = Judge(self.model, self.arms)
         step = self._env.sim.step2
@@ -86,39 +93,40 @@ class RobosuiteCell:
         return {side: tool_pose(self._data, arm) for side, arm in self.arms.items()}
 
     def succeeded(self) -> bool:
-        """By the environment's own judge."""
+        """Return whether the environment's own judge sees a success."""
         return bool(self._env._check_success())
 
     def step(self, before: Mapping[str, pin.SE3], targets: Mapping[str, pin.SE3], closed: tuple[str, ...]) -> None:
-        """One period, in which the hands go from ``before`` to ``targets``."""
+        """Simulate one period, in which the hands move from ``before`` to ``targets``."""
         grip = {side: 1.0 if side in closed else -1.0 for side in self.arms}
         if self._follower is None:
             tools = self.tools()
             action = [np.append(self._delta(side, tools[side], targets[side]), grip[side]) for side in self.arms]
             self._env.step(np.concatenate(action))
             return
-        for tick in range(_TICKS):
-            share = (tick + 1) / _TICKS
+        for tick in range(_TICKS_PER_PERIOD):
+            share = (tick + 1) / _TICKS_PER_PERIOD
             on_the_way = {side: pin.SE3.Interpolate(before[side], targets[side], share) for side in self.arms}
-            q = self._follower.step(on_the_way, PERIOD / _TICKS).q
-            # The gripper moves by each action that has a sign: as far as with the others in a period.
+            q = self._follower.step(on_the_way, PERIOD / _TICKS_PER_PERIOD).q
+            # Each action with a sign moves the gripper by one step. One such action in a period moves it as far as
+            # with the other controllers.
             action = [
                 np.append(q[self._follower.robot.arms[side].joints], grip[side] * (tick == 0)) for side in self.arms
             ]
             self._env.step(np.concatenate(action))
 
     def _delta(self, side: str, tool: pin.SE3, target: pin.SE3) -> Array:
-        """The action that asks for ``target``: of OSC in the arm's base and in shares of its largest step."""
+        """Return OSC's action (6,) for ``target``, as a share of its largest step in the frame of the arm's base."""
         way, turn = target.translation - tool.translation, pin.log3(target.rotation @ tool.rotation.T)
         base = self._env.robots[list(self.arms).index(side)].base_ori
         return np.clip(np.concatenate([base.T @ way / 0.05, base.T @ turn / 0.5]), -1.0, 1.0)
 
     def asks(self) -> Iterator[Ask]:
-        """All that the hands ask for; poses are read off the simulation when they are due."""
+        """Yield everything that the hands ask for. Poses are read from the simulation when they are due."""
         return self._lift() if self._task == "TwoArmLift" else self._handover()
 
     def _lift(self) -> Iterator[Ask]:
-        """Each hand grasps a handle from above, across its width, and lifts."""
+        """Let each hand grasp a handle from above, across its width, and lift it."""
         tools = self.tools()
         yield Ask({side: shifted(tool, z=0.13) for side, tool in tools.items()})
         pot = self._data.body("pot_root").xmat.reshape(3, 3)
@@ -132,25 +140,25 @@ class RobosuiteCell:
         yield Ask({side: shifted(grasp, z=0.2) for side, grasp in grasps.items()}, closed=("left", "right"), pause=1.0)
 
     def _handover(self) -> Iterator[Ask]:
-        """The left hand brings the hammer by one end of its handle, and the right hand takes it by the other."""
+        """Let the left hand bring the hammer by one end of its handle, and the right hand take the other end."""
         tools, handle = self.tools(), self._data.geom("hammer_handle")
-        half = float(self.model.geom("hammer_handle").size[2]) - 0.02  # of the way between the grasps
+        half = float(self.model.geom("hammer_handle").size[2]) - 0.02  # Half of the distance between the grasps [m].
         axis = _towards_right(handle.xmat)
         closing = np.cross(axis, [0.0, 0.0, 1.0])
         closing *= np.sign(closing @ tools["left"].rotation[:, 0])
-        # Nearer to its base the left hand cannot look down.
-        way = min(half, max((handle.xpos[1] - _NEAREST) / max(axis[1], 1e-6), 0.0))
+        # The left hand cannot point down if it is nearer to its base than this.
+        way = min(half, max((handle.xpos[1] - _MIN_GRASP_Y) / max(axis[1], 1e-6), 0.0))
         grasp = pin.SE3(looking_down(closing), handle.xpos - way * axis)
-        brought = pin.SE3(looking_down(np.array([np.sign(closing[0]) or 1.0, 0.0])), _MEETING - [0.0, way, 0.0])
+        brought = pin.SE3(looking_down(np.array([np.sign(closing[0]) or 1.0, 0.0])), _MEETING_PLACE - [0.0, way, 0.0])
         facing = float(np.sign(tools["right"].rotation[0, 0]))
-        ready = pin.SE3(looking_down(np.array([facing, 0.0])), _MEETING)
+        ready = pin.SE3(looking_down(np.array([facing, 0.0])), _MEETING_PLACE)
         yield Ask({"left": shifted(grasp, z=0.12), "right": shifted(ready, y=0.3, z=0.15)})
         yield Ask({"left": grasp})
         yield Ask({"left": grasp}, closed=("left",), pause=0.8)
         yield Ask({"left": shifted(grasp, z=0.15)}, closed=("left",))
         yield Ask({"left": brought}, closed=("left",), pause=0.5)
         place = handle.xpos + half * _towards_right(handle.xmat)
-        take = pin.SE3(looking_down(ready.rotation[:, 0], -_LEAN * facing), place)
+        take = pin.SE3(looking_down(ready.rotation[:, 0], -_RIGHT_HAND_LEAN * facing), place)
         yield Ask({"right": backed(take, 0.12)}, closed=("left",))
         yield Ask({"right": take}, closed=("left",))
         yield Ask({"right": take}, closed=("left", "right"), pause=0.8)
@@ -159,7 +167,7 @@ class RobosuiteCell:
 
 
 def _towards_right(rotation: Array) -> Array:
-    """The axis (3,) of the hammer's handle, in its direction to the right arm."""
+    """Return the axis (3,) of the hammer's handle, in the direction towards the right arm."""
     axis = rotation.reshape(3, 3)[:, 2]
     return axis * (np.sign(axis[1]) or 1.0)
 
@@ -174,12 +182,15 @@ def _arm_model(number: int, velocity_limit: Array) -> ArmModel:
 
 
 def _closing(model: mujoco.MjModel, q: Array, arms: Mapping[str, ArmModel]) -> list[Array]:
-    """Positions of the whole cell with grippers from open to closed, as their actuators move them in free air."""
+    """Return positions (nq,) of the whole cell, with grippers from open to closed.
+
+    The actuators move the fingers there without any contact.
+    """
     held = [int(model.joint(name).qposadr[0]) for arm in arms.values() for name in arm.joints]
     scratch, found = mujoco.MjData(model), []
     flags, model.opt.disableflags = model.opt.disableflags, model.opt.disableflags | mujoco.mjtDisableBit.mjDSBL_CONTACT
     scratch.qpos[:] = q
-    for opening in _OPENINGS:
+    for opening in _CLOSING_SHARES:
         for actuator in range(model.nu):
             if "finger" in model.actuator(actuator).name:
                 least, greatest = model.actuator_ctrlrange[actuator]

@@ -1,7 +1,7 @@
-"""Our robot out of a model that MuJoCo has compiled, whoever wrote it: the same joints, mounts and shapes.
+"""Our robot made from any model that MuJoCo has compiled, with the same joints, mounts and shapes.
 
-Kinematics and position limits are the model's. A MuJoCo model has no velocity limits, so that they are given. A gripper
-is a part of the link that carries it, and is all that it sweeps between open and closed.
+Kinematics and position limits are those of the model. A MuJoCo model has no velocity limits, so the caller gives them.
+A gripper is a part of the link that carries it. Its shape is everything that it sweeps between open and closed.
 """
 
 from __future__ import annotations
@@ -20,24 +20,24 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.robot.urdf_parts import WORLD, numbers
 from q2r2_control.types import Array
 
-_CORNERS = 16  # of the polygons around circles
+_CIRCLE_CORNERS = 16  # Number of corners of the polygon around a circle.
 
 
 @dataclass(frozen=True)
 class ArmModel:
-    """One arm in a MuJoCo model, by names."""
+    """The names of one arm's parts in a MuJoCo model."""
 
-    base: str  # body; it and all that it carries are the arm
-    joints: tuple[str, ...]  # hinges
-    velocity_limit: Array  # of each joint [rad/s]
-    tool: str  # site that is moved
+    base: str  # Base body. The arm consists of this body and all bodies that it carries.
+    joints: tuple[str, ...]  # Hinge joints from base to tool.
+    velocity_limit: Array  # Velocity limit of each joint (n,) [rad/s].
+    tool: str  # Site that the controller moves.
 
 
 def robot_of(model: mujoco.MjModel, arms: Mapping[str, ArmModel], closing: Sequence[Array]) -> Robot:
-    """The robot that ``arms`` of ``model`` make, by name.
+    """Return the robot that consists of the ``arms`` of ``model``, which are given by name.
 
-    ``closing`` are positions (nq,) of the whole model, at least two: arms at home, grippers from open to closed. One
-    capsule encloses what a finger's shape sweeps from one of them to the next.
+    ``closing`` are at least two positions (nq,) of the whole model. The arms are at home, and the grippers go from open
+    to closed. One capsule encloses what a finger's shape sweeps from one position to the next.
     """
     urdf = ET.Element("robot", name="arena")
     ET.SubElement(urdf, "link", name=WORLD)
@@ -51,7 +51,7 @@ def robot_of(model: mujoco.MjModel, arms: Mapping[str, ArmModel], closing: Seque
 
 
 def bodies_of(model: mujoco.MjModel, base: str) -> list[int]:
-    """The body ``base`` and all that it carries, from the root outwards."""
+    """Return the body ``base`` and all bodies that it carries, from the root outwards."""
     found = [model.body(base).id]
     for body in range(found[0] + 1, model.nbody):
         if model.body_parentid[body] in found:
@@ -60,14 +60,14 @@ def bodies_of(model: mujoco.MjModel, base: str) -> list[int]:
 
 
 def geoms_of(model: mujoco.MjModel, arm: ArmModel) -> list[int]:
-    """Shapes of an arm, its mount included, that something can touch."""
+    """Return the shapes of an arm and its mount that can touch anything."""
     bodies = bodies_of(model, arm.base)
     solid = (model.geom_contype | model.geom_conaffinity) > 0
     return [geom for geom in range(model.ngeom) if solid[geom] and model.geom_bodyid[geom] in bodies]
 
 
 def tool_pose(data: mujoco.MjData, arm: ArmModel) -> pin.SE3:
-    """Where MuJoCo has the arm's tool, in the world."""
+    """Return the pose of the arm's tool in MuJoCo, in the world frame."""
     site = data.site(arm.tool)
     return pin.SE3(site.xmat.reshape(3, 3).copy(), site.xpos.copy())
 
@@ -91,7 +91,8 @@ def _add_arm(
 ) -> None:
     bodies = bodies_of(model, arm.base)
     joints = {int(model.joint(joint).bodyid[0]): joint for joint in arm.joints}
-    carrier: dict[int, int] = {}  # of each body, that whose joint moves it; fingers count as parts of their hand
+    # Each body is mapped to the body whose arm joint moves it. Fingers therefore count as parts of their hand.
+    carrier: dict[int, int] = {}
     for body in bodies:
         carrier[body] = body if body in joints or body == bodies[0] else carrier[model.body_parentid[body]]
     for body in dict.fromkeys(carrier.values()):
@@ -115,7 +116,7 @@ def _add_arm(
 
 
 def _carries(model: mujoco.MjModel, link: int, body: int) -> bool:
-    """Whether no joint is between a link and a body that it carries."""
+    """Return whether there is no joint between a link and a body that it carries."""
     while body != link:
         if model.body_jntnum[body]:
             return False
@@ -154,7 +155,7 @@ def _add_capsule(link: ET.Element, name: str, points: Array) -> None:
     _add_origin(collision, pose)
     size = {"radius": repr(float(capsule.radius)), "length": repr(float(2 * capsule.halfLength))}
     ET.SubElement(ET.SubElement(collision, "geometry"), "cylinder", size)
-    declared = link.find("collision_checking")  # one for all: readers know no second
+    declared = link.find("collision_checking")  # A link has one such element, because readers ignore a second one.
     if declared is None:
         declared = ET.SubElement(link, "collision_checking")
     ET.SubElement(declared, "capsule", name=name)
@@ -165,7 +166,7 @@ def _add_origin(element: ET.Element, pose: pin.SE3) -> None:
 
 
 def _swept(model: mujoco.MjModel, states: Sequence[mujoco.MjData], body: int, geom: int) -> Array:
-    """Points (n, 3) whose hull holds a shape in all ``states``, in the frame of ``body``."""
+    """Return points (n, 3) whose convex hull contains a shape in all ``states``, in the frame of ``body`` [m]."""
     points = []
     for data in states:
         shape = pin.SE3(data.geom_xmat[geom].reshape(3, 3).copy(), data.geom_xpos[geom].copy())
@@ -175,7 +176,7 @@ def _swept(model: mujoco.MjModel, states: Sequence[mujoco.MjData], body: int, ge
 
 
 def corners_of(model: mujoco.MjModel, geom: int) -> Array:
-    """Points (n, 3) whose hull holds a shape, in its own frame."""
+    """Return points (n, 3) whose convex hull contains a shape, in the shape's own frame [m]."""
     kinds, size = mujoco.mjtGeom, model.geom_size[geom]
     kind = model.geom_type[geom]
     if kind == kinds.mjGEOM_MESH:
@@ -183,10 +184,10 @@ def corners_of(model: mujoco.MjModel, geom: int) -> Array:
         start = model.mesh_vertadr[mesh]
         return np.array(model.mesh_vert[start : start + model.mesh_vertnum[mesh]], dtype=np.float64)
     if kind == kinds.mjGEOM_CYLINDER:
-        angles = np.arange(_CORNERS) * 2 * np.pi / _CORNERS
-        radius = size[0] / np.cos(np.pi / _CORNERS)
+        angles = np.arange(_CIRCLE_CORNERS) * 2 * np.pi / _CIRCLE_CORNERS
+        radius = size[0] / np.cos(np.pi / _CIRCLE_CORNERS)
         circle = radius * np.column_stack([np.cos(angles), np.sin(angles)])
-        return np.concatenate([np.column_stack([circle, np.full(_CORNERS, z)]) for z in (-size[1], size[1])])
+        return np.concatenate([np.column_stack([circle, np.full(_CIRCLE_CORNERS, z)]) for z in (-size[1], size[1])])
     if kind == kinds.mjGEOM_BOX:
         return np.array(list(product((-1.0, 1.0), repeat=3))) * size
     raise ValueError(f"{model.geom(geom).name}: allowed: meshes, boxes and cylinders")

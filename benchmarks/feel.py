@@ -1,10 +1,10 @@
 """How does a filter feel to an operator: how late is the tool, how much tremor and noise is left, how does it stop?
 
-Nothing is taken from the settings. A hand moves in tones, reaches, trembles, rests, and moves and stops. The tool is
-measured, through samples at a headset's rate, teleoperation, controller and an arm in MuJoCo. Delay and gain of a tone
-come from the least-squares fit of a sine and a cosine to the hand's way and to the tool's. Hands do not move in tones.
-The delay of reaches is that of the highest correlation of velocities. Of a tremor within a band everything counts that
-it does to the tool, in the band or not.
+A scripted hand oscillates at single frequencies, reaches, trembles, rests, and moves and stops. The tool is measured
+through the whole chain: samples at a headset's rate, teleoperation, the controller, and an arm in MuJoCo. A tone is a
+sine motion of one frequency. Its delay and gain come from least-squares fits of a sine and a cosine to the paths of
+hand and tool. Real hands do not move in tones, so reaches are measured, too. Their delay is the one with the highest
+correlation of velocities. The figures for a tremor within a band count all motion of the tool, also outside the band.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ from q2r2_control.summary.tick import Tick
 from q2r2_control.types import Array, HandInputs
 from q2r2_control.viewer.tables import record_table
 
-Way = Callable[[float], float]  # of a hand along one axis [m], over time [s]
+Way = Callable[[float], float]  # Displacement of a hand along one axis [m] as a function of time [s].
 
-# Filters to compare with the cell's own: one that lets little through, and one that is late by little.
+# Filters to compare with the cell's own. PRECISION suppresses most of the tremor, and SPEED has a short delay.
 PRECISION = FilterSettings(
     interpolation_delay=0.02, smoothing_delay=0.06, min_cutoff=0.8, beta=3.0, rotation_beta=1.0, derivative_cutoff=2.0
 )
@@ -48,57 +48,70 @@ SPEED = FilterSettings(
 )
 OTHERS = {"precision": PRECISION, "speed": SPEED}
 
-SETTLES = 0.7  # of every tone and tremor, before it is measured [s]
+SETTLING_S = 0.7  # Time before a tone or a tremor is measured, in which the motion settles [s].
 ARM, HAND = "left", "left"
-MOTIONS = ((0.5, 0.06), (1.0, 0.04), (2.0, 0.02))  # of a hand that means it [Hz], [m]
-TREMORS = (8.0, 10.0, 12.0)  # [Hz]
-TREMOR = 0.5e-3  # amplitude [m]
-SLOWLY = 0.03  # of a hand that moves and trembles [m/s]
-NOISE = 2e-4  # of the sensor, standard deviation along each axis [m]
-RESTING_NOISES, PAUSES = (0.2, 0.6, 1.0), 100  # of the same, engaged and paused so often [mm]
-STOP_SPEED, STOP_TIME = 0.3, 0.1  # of a hand that moves on and stops [m/s], and from that speed to rest [s]
-# Reaches, to and fro, each followed by a rest: peaks of 0.16 to 0.63 m/s, which the arm can follow sidewards [m], [s].
-REACHES, REACH_RESTS = ((0.1, 0.6), (0.1, 1.2), (0.2, 0.8), (0.3, 1.0), (0.4, 1.2)), 0.3
-BAND, BAND_RMS = (8.0, 12.0), 1e-3  # of a tremor [Hz], [m]
-_BAND_PERIOD, _BAND_SEED = 4.0, 0  # [s]
-_PRESSED, _BEGINS = (0.2, 0.35), 0.8  # [s]
-_MEASURED = 2.0  # of every tone [s]
-_RESTS, _CRUISES = 3.0, 0.4  # [s]
-_SIDEWARDS, _UP = 1, 2  # axes
-_CYCLE = 0.6  # from one engagement to the next, half of it engaged [s]
-_A_TICK = 0.05  # the longest that there is [s]
+MOTIONS = ((0.5, 0.06), (1.0, 0.04), (2.0, 0.02))  # Frequency [Hz] and amplitude [m] of intended motions.
+TREMOR_FREQUENCIES = (8.0, 10.0, 12.0)  # Frequencies of tremors [Hz].
+TREMOR_AMPLITUDE = 0.5e-3  # Amplitude of a tremor [m].
+SLOW_SPEED = 0.03  # Speed of a hand that moves and trembles [m/s].
+SENSOR_NOISE = 2e-4  # Standard deviation of the sensor's noise along each axis [m].
+# Standard deviations of the sensor's noise for a hand at rest [mm], and number of pauses of its arm.
+RESTING_NOISES, PAUSES = (0.2, 0.6, 1.0), 100
+STOP_SPEED, STOP_TIME = 0.3, 0.1  # Speed of a hand that stops [m/s], and time from that speed to rest [s].
+# Length [m] and time [s] of each reach, and the rest after it [s]. The hand moves to and fro, with a rest after each.
+# Peak speeds are 0.16 to 0.63 m/s, which the arm can follow sidewards.
+REACHES, REACH_REST_S = ((0.1, 0.6), (0.1, 1.2), (0.2, 0.8), (0.3, 1.0), (0.4, 1.2)), 0.3
+TREMOR_BAND, TREMOR_BAND_RMS = (8.0, 12.0), 1e-3  # Frequencies [Hz] and RMS [m] of a tremor within a band.
+_BAND_PERIOD, _BAND_SEED = 4.0, 0  # Time after which the tremor within a band repeats [s], and seed of its phases.
+# Begin and end of the press that engages, and begin of the hand's motion [s].
+_PRESS_INTERVAL, _MOTION_BEGINS_S = (0.2, 0.35), 0.8
+_MEASURED_S = 2.0  # Measured duration of every tone [s].
+# Duration of the run at rest, and time when the hand that stops begins to slow down [s].
+_REST_RUN_S, _STOP_BEGINS_S = 3.0, 0.4
+_SIDEWARDS, _UP = 1, 2  # Indices of axes.
+_ENGAGEMENT_PERIOD_S = 0.6  # Time from one engagement to the next. The arm is engaged for half of it [s].
+_LONGEST_TICK_S = 0.05  # Longest period of a tick [s].
 NOTES = (
-    f"pauses: of a hand at rest, noise of {RESTING_NOISES} mm; from the tool's place to that after {PAUSES} pauses",
-    "all from the hand to the measured tool, from samples at 72 to 76 Hz to an arm in MuJoCo, position mode",
-    "filter delay: as its settings say; delays and gains: of a hand that moves at "
-    + ", ".join(f"{frequency:g} Hz, {1e3 * amplitude:g} mm" for frequency, amplitude in MOTIONS),
-    f"tremors of {TREMORS} Hz: {1e3 * TREMOR:g} mm, of a hand at {1e3 * SLOWLY:g} mm/s",
-    "reaches: 0.1 to 0.4 m in 0.6 to 1.2 s of least jerk, by correlation of velocities",
-    f"band: tremor of {BAND[0]:g} to {BAND[1]:g} Hz, {1e3 * BAND_RMS:g} mm RMS, flat; all that it does to the tool",
-    f"noise: RMS of the tool, for {1e6 * NOISE:g} um a sample",
-    f"stop: of a hand at {STOP_SPEED:g} m/s that stops in {STOP_TIME:g} s, until the tool is within 2 mm of its rest",
+    f"pauses: Distance between the tool's places before and after {PAUSES} pauses, for a hand at rest whose samples "
+    f"have a noise of {RESTING_NOISES} mm.",
+    "All figures are from the hand to the measured tool of an arm in MuJoCo, in position mode. Samples come at 72 to "
+    "76 Hz.",
+    "filter delay: Delay of the filter alone, from its settings.",
+    "delays, gains: Figures for hand motions of "
+    + ", ".join(f"{frequency:g} Hz, {1e3 * amplitude:g} mm" for frequency, amplitude in MOTIONS)
+    + ".",
+    f"tremors: Gains at {TREMOR_FREQUENCIES} Hz for a tremor of {1e3 * TREMOR_AMPLITUDE:g} mm, of a hand that moves at "
+    f"{1e3 * SLOW_SPEED:g} mm/s.",
+    "reaches: Delay for minimum-jerk motions of 0.1 to 0.4 m in 0.6 to 1.2 s, by correlation of velocities.",
+    f"band: Gain for a flat tremor of {TREMOR_BAND[0]:g} to {TREMOR_BAND[1]:g} Hz and {1e3 * TREMOR_BAND_RMS:g} mm "
+    "RMS. All motion of the tool counts.",
+    f"noise: RMS of the tool's motion if each sample has a noise of {1e6 * SENSOR_NOISE:g} um.",
+    f"stop: A hand at {STOP_SPEED:g} m/s stops in {STOP_TIME:g} s. The delay ends when the tool stays within 2 mm of "
+    "its rest.",
 )
 
 
 @dataclass(frozen=True, slots=True)
 class FeelFigures:
-    """One filter; delays are from the hand to the measured tool."""
+    """The figures of one filter. Delays are from the hand to the measured tool."""
 
     name: str
-    filter_delay_ms: float  # as the settings say, of the filter alone
-    delays_ms: tuple[float, ...]  # of each of :data:`MOTIONS`
-    gains_db: tuple[float, ...]  # of the same
-    tremors_db: tuple[float, ...]  # of a hand that trembles at :data:`TREMORS` while it moves at :data:`SLOWLY`
-    tremor_at_rest_db: float  # of the middle one, of a hand that rests otherwise
-    reach_delay_ms: float  # over all of :data:`REACHES`
-    worst_reach_delay_ms: float  # of the one that is latest; nan, as of all: the tool does not follow
-    band_db: float  # of a tremor in :data:`BAND`, of a hand that moves at :data:`SLOWLY`
-    band_at_rest_db: float  # of the same, of a hand that rests otherwise
-    noise_um: float  # RMS of the tool in the worst axis, of a hand that rests
-    stop_delay_ms: float  # from the hand's rest to the tool within 2 mm of its own for good
-    overshoot_mm: float  # of the tool, beyond where it comes to rest
-    overshoot_percent: float  # of the way of the hand that stops
-    pauses_mm: tuple[float, ...]  # how far the tool is from where it was, for each of :data:`RESTING_NOISES`
+    filter_delay_ms: float  # Delay of the filter alone, from its settings.
+    delays_ms: tuple[float, ...]  # Delay for each of :data:`MOTIONS`.
+    gains_db: tuple[float, ...]  # Gain for each of :data:`MOTIONS`.
+    # Gain for each of :data:`TREMOR_FREQUENCIES` of a hand that moves at :data:`SLOW_SPEED`.
+    tremors_db: tuple[float, ...]
+    # Gain for the middle frequency of :data:`TREMOR_FREQUENCIES` of a hand that otherwise rests.
+    tremor_at_rest_db: float
+    reach_delay_ms: float  # Delay over all of :data:`REACHES`, NaN if the tool does not follow.
+    worst_reach_delay_ms: float  # Largest delay of one of :data:`REACHES`, NaN if the tool does not follow.
+    band_db: float  # Gain for a tremor in :data:`TREMOR_BAND` of a hand that moves at :data:`SLOW_SPEED`.
+    band_at_rest_db: float  # Gain for a tremor in :data:`TREMOR_BAND` of a hand that otherwise rests.
+    noise_um: float  # RMS of the tool's motion along the worst axis, for a hand at rest.
+    stop_delay_ms: float  # Time from the hand's rest until the tool stays within 2 mm of its own rest.
+    overshoot_mm: float  # Largest distance of the tool beyond its place of rest.
+    overshoot_percent: float  # Overshoot as a share of the path of the hand that stops.
+    pauses_mm: tuple[float, ...]  # Drift of the tool over all pauses, for each of :data:`RESTING_NOISES`.
 
 
 def run_feel(config: Config) -> list[FeelFigures]:
@@ -122,48 +135,48 @@ def _measure(name: str, config: Config, robot: Robot, plant: MujocoPlant, settin
         log = _Log(way, noise, axis, presses)
         pipeline = Pipeline(config, robot, log.hands, plant)
         pipeline.listeners.append(log.take)
-        pipeline.run(_BEGINS + lasts, realtime=False)
+        pipeline.run(_MOTION_BEGINS_S + lasts, realtime=False)
         if not log.reaches(lasts):
-            raise KeyboardInterrupt  # a signal has ended the run early: what is left of it says nothing
+            raise KeyboardInterrupt  # A signal has ended the run early, so its figures mean nothing.
         return log
 
     def band(speed: float) -> float:
-        trembling = tremor(BAND, BAND_RMS, _BAND_PERIOD, _BAND_SEED, speed)
-        return run(trembling, SETTLES + _BAND_PERIOD, axis=_SIDEWARDS).attenuation(_BAND_PERIOD)
+        trembling = tremor(TREMOR_BAND, TREMOR_BAND_RMS, _BAND_PERIOD, _BAND_SEED, speed)
+        return run(trembling, SETTLING_S + _BAND_PERIOD, axis=_SIDEWARDS).attenuation(_BAND_PERIOD)
 
-    lasts = SETTLES + _MEASURED
+    lasts = SETTLING_S + _MEASURED_S
     motions = [run(tone(*motion), lasts).tone(motion[0]) for motion in MOTIONS]
-    tremors = [run(tone(each, TREMOR, SLOWLY), lasts).tone(each)[1] for each in TREMORS]
-    at_rest = TREMORS[len(TREMORS) // 2]
-    ends = np.cumsum([0.0, *(2.0 * (time + REACH_RESTS) for _, time in REACHES)])
-    reached = run(reaches(REACHES, REACH_RESTS), ends[-1], axis=_SIDEWARDS)
-    noise = run(lambda t: 0.0, _RESTS, NOISE).noise()
+    tremors = [run(tone(each, TREMOR_AMPLITUDE, SLOW_SPEED), lasts).tone(each)[1] for each in TREMOR_FREQUENCIES]
+    at_rest = TREMOR_FREQUENCIES[len(TREMOR_FREQUENCIES) // 2]
+    ends = np.cumsum([0.0, *(2.0 * (time + REACH_REST_S) for _, time in REACHES)])
+    reached = run(reaches(REACHES, REACH_REST_S), ends[-1], axis=_SIDEWARDS)
+    noise = run(lambda t: 0.0, _REST_RUN_S, SENSOR_NOISE).noise()
     pauses = [
-        run(lambda t: 0.0, (PAUSES + 1) * _CYCLE, 1e-3 * each, presses=_again_and_again).moved()
+        run(lambda t: 0.0, (PAUSES + 1) * _ENGAGEMENT_PERIOD_S, 1e-3 * each, presses=_again_and_again).moved()
         for each in RESTING_NOISES
     ]
-    stop_delay, overshoot = run(stop(STOP_SPEED, STOP_TIME, _CRUISES), _CRUISES + STOP_TIME + 1.5).stop()
+    stop_delay, overshoot = run(stop(STOP_SPEED, STOP_TIME, _STOP_BEGINS_S), _STOP_BEGINS_S + STOP_TIME + 1.5).stop()
     return FeelFigures(
         name=name,
         filter_delay_ms=1e3 * (settings.interpolation_delay + settings.smoothing_delay),
         delays_ms=tuple(1e3 * delay for delay, _ in motions),
         gains_db=tuple(gain for _, gain in motions),
         tremors_db=tuple(tremors),
-        tremor_at_rest_db=run(tone(at_rest, TREMOR), lasts).tone(at_rest)[1],
+        tremor_at_rest_db=run(tone(at_rest, TREMOR_AMPLITUDE), lasts).tone(at_rest)[1],
         reach_delay_ms=1e3 * reached.delay(0.0, ends[-1]),
         worst_reach_delay_ms=1e3 * float(np.max([reached.delay(*times) for times in pairwise(ends)])),
-        band_db=band(SLOWLY),
+        band_db=band(SLOW_SPEED),
         band_at_rest_db=band(0.0),
         noise_um=1e6 * noise,
         stop_delay_ms=1e3 * stop_delay,
         overshoot_mm=1e3 * overshoot,
-        overshoot_percent=1e2 * overshoot / (STOP_SPEED * _CRUISES),
+        overshoot_percent=1e2 * overshoot / (STOP_SPEED * _STOP_BEGINS_S),
         pauses_mm=tuple(1e3 * moved for moved in pauses),
     )
 
 
 class _Log:
-    """A run in which one hand goes a way along an axis, sampled at a headset's rate, and what the tool does."""
+    """The paths of hand and tool in a run in which one hand moves along an axis, sampled at a headset's rate."""
 
     def __init__(self, way: Way, noise: float, axis: int, presses: HandButtons) -> None:
         self._way, self._axis = way, axis
@@ -174,19 +187,19 @@ class _Log:
         self._asked: list[float] = []
 
     def take(self, tick: Tick) -> None:
-        """Keep a tick's hand and tool."""
+        """Keep the hand's and the tool's place of a tick."""
         way = self.hands.hand_pose(HAND, tick.now).translation - HANDS_AT_REST[HAND].translation
-        self._t.append(tick.t - _BEGINS)
+        self._t.append(tick.t - _MOTION_BEGINS_S)
         self._asked.append(float(way[self._axis]))
         self._tool.append(tick.tools[ARM].translation.copy())
 
     def reaches(self, lasts: float) -> bool:
-        """Whether it was run for so long [s]."""
-        return bool(self._t) and self._t[-1] > lasts - _A_TICK
+        """Return whether the run lasted for ``lasts`` [s]."""
+        return bool(self._t) and self._t[-1] > lasts - _LONGEST_TICK_S
 
     def tone(self, frequency: float) -> tuple[float, float]:
-        """Delay [s] and gain [dB] of a tone."""
-        t, asked, tool = self._from(SETTLES)
+        """Return delay [s] and gain [dB] of the tool for a tone of this ``frequency`` [Hz]."""
+        t, asked, tool = self._from(SETTLING_S)
         basis = np.stack((np.sin(2 * np.pi * frequency * t), np.cos(2 * np.pi * frequency * t), np.ones_like(t), t), 1)
         (hand_sin, hand_cos, *_), (tool_sin, tool_cos, *_) = (
             np.linalg.lstsq(basis, way, rcond=None)[0] for way in (asked, tool)
@@ -196,21 +209,24 @@ class _Log:
         return delay, -20.0 * math.log10(abs(turn))
 
     def noise(self) -> float:
-        """RMS about the mean, of the worst axis [m]."""
+        """Return the RMS of the tool's motion about its mean, along the worst axis [m]."""
         chosen = np.array(self._t) >= 1.0
         return float(np.array(self._tool)[chosen].std(axis=0).max())
 
     def delay(self, begin: float, end: float) -> float:
-        """Of what the hand does between these times [s]."""
+        """Return the tool's delay for the hand's motion between these times, NaN if there is none [s]."""
         t, asked, tool = self._from(-math.inf)
         hand, follower = (Track(t, way[:, None]) for way in (asked, tool))
         (found,) = delays_behind(hand, [follower], t[(t >= begin) & (t < end)])
         return math.nan if found is None else found
 
     def attenuation(self, period: float) -> float:
-        """RMS of all that the tool does over a ``period`` [s] but to move steadily, to that of the hand [dB]."""
-        t, asked, tool = self._from(SETTLES)
-        within = t < SETTLES + period
+        """Return the RMS of the tool's motion divided by that of the hand's [dB], over a ``period`` [s].
+
+        A steady motion does not count.
+        """
+        t, asked, tool = self._from(SETTLING_S)
+        within = t < SETTLING_S + period
         line = np.stack((np.ones_like(t), t), 1)[within]
         asked_rms, tool_rms = (
             math.sqrt(np.mean((way - line @ np.linalg.lstsq(line, way, rcond=None)[0]) ** 2))
@@ -219,38 +235,47 @@ class _Log:
         return 20.0 * math.log10(tool_rms / asked_rms)
 
     def stop(self) -> tuple[float, float]:
-        """When the tool is within 2 mm of its rest for good, after the hand's [s], and how far it went beyond [m]."""
+        """Return the delay of the tool's rest behind the hand's [s], and the tool's overshoot [m].
+
+        The tool rests when it stays within 2 mm of its last place.
+        """
         t, _, tool = self._from(0.0)
         ahead = tool - tool[-1]
         late = t[np.abs(ahead) > 2e-3]
-        return float(late[-1]) - (_CRUISES + STOP_TIME), max(float(ahead.max()), 0.0)
+        return float(late[-1]) - (_STOP_BEGINS_S + STOP_TIME), max(float(ahead.max()), 0.0)
 
     def moved(self) -> float:
-        """From the tool's first place to its last [m]."""
+        """Return the distance between the tool's first and last place [m]."""
         return float(np.linalg.norm(self._tool[-1] - self._tool[0]))
 
     def _from(self, begin: float) -> tuple[Array, Array, Array]:
-        """Times, and the ways of hand and tool along the axis, each (n,)."""
+        """Return times [s], and the paths of hand and tool along the axis [m], each (n,)."""
         t = np.array(self._t)
         chosen = t >= begin
         return t[chosen], np.array(self._asked)[chosen], np.array(self._tool)[chosen, self._axis]
 
     def _pose(self, hand: str, t: float) -> pin.SE3:
         home = HANDS_AT_REST[hand]
-        way = self._way(t - _BEGINS) if hand == HAND and t >= _BEGINS else 0.0
+        way = self._way(t - _MOTION_BEGINS_S) if hand == HAND and t >= _MOTION_BEGINS_S else 0.0
         return pin.SE3(home.rotation, home.translation + way * np.eye(3)[self._axis])
 
 
 def _buttons(hand: str, t: float) -> HandInputs:
-    return HandInputs(button_lower=_PRESSED[0] <= t < _PRESSED[1])
+    return HandInputs(button_lower=_PRESS_INTERVAL[0] <= t < _PRESS_INTERVAL[1])
 
 
 def _again_and_again(hand: str, t: float) -> HandInputs:
-    return HandInputs(button_lower=t > _PRESSED[0] and (t - _PRESSED[0]) % (_CYCLE / 2.0) < _CYCLE / 4.0)
+    return HandInputs(
+        button_lower=t > _PRESS_INTERVAL[0]
+        and (t - _PRESS_INTERVAL[0]) % (_ENGAGEMENT_PERIOD_S / 2.0) < _ENGAGEMENT_PERIOD_S / 4.0
+    )
 
 
 def tone(frequency: float, amplitude: float, speed: float = 0.0) -> Way:
-    """A sine [Hz], [m] that grows within the first half of :data:`SETTLES`, on top of a steady motion [m/s]."""
+    """Return a sine of ``frequency`` [Hz] and ``amplitude`` [m] on top of a steady motion at ``speed`` [m/s].
+
+    The sine grows from zero within the first half of :data:`SETTLING_S`.
+    """
 
     def way(t: float) -> float:
         return amplitude * _grown(t) * math.sin(2.0 * math.pi * frequency * t) + speed * t
@@ -259,10 +284,11 @@ def tone(frequency: float, amplitude: float, speed: float = 0.0) -> Way:
 
 
 def tremor(band: tuple[float, float], rms: float, period: float, seed: int, speed: float = 0.0) -> Way:
-    """Noise that is flat within ``band`` [Hz], nothing outside, with this ``rms`` [m], on top of a steady motion [m/s].
+    """Return noise of this ``rms`` [m] on top of a steady motion at ``speed`` [m/s].
 
-    It repeats after ``period`` [s], over which its RMS is exact. It is the sum of all tones of the band that do,
-    equally large, with phases drawn from ``seed``.
+    Its spectrum is flat within ``band`` [Hz] and zero outside. The noise repeats after ``period`` [s], over which its
+    RMS is exact. It is the sum of all tones of the band that repeat after the period. They have the same amplitude, and
+    their phases are drawn from ``seed``.
     """
     low, high = (round(frequency * period) for frequency in band)
     turns = 2.0 * math.pi * np.arange(low, high + 1) / period
@@ -276,7 +302,10 @@ def tremor(band: tuple[float, float], rms: float, period: float, seed: int, spee
 
 
 def stop(speed: float, ramp: float, cruises: float) -> Way:
-    """Speeds up within ``ramp`` [s], goes on until ``cruises`` [s], and stops within ``ramp``."""
+    """Return a motion that speeds up within ``ramp`` [s] and then moves at ``speed`` [m/s].
+
+    At the time ``cruises`` [s] it begins to stop, which takes ``ramp`` as well.
+    """
 
     def way(t: float) -> float:
         up = min(max(t, 0.0), ramp)
@@ -288,9 +317,9 @@ def stop(speed: float, ramp: float, cruises: float) -> Way:
 
 
 def reaches(lengths_and_times: Sequence[tuple[float, float]], rest: float) -> Way:
-    """Reaches of least jerk (Flash and Hogan 1985) of these lengths [m] and times [s], each to and fro.
+    """Return minimum-jerk reaches (Flash and Hogan 1985) of these lengths [m] and times [s], each to and fro.
 
-    Each is followed by a ``rest`` [s].
+    A ``rest`` [s] follows each motion.
     """
 
     def way(t: float) -> float:
@@ -306,15 +335,15 @@ def reaches(lengths_and_times: Sequence[tuple[float, float]], rest: float) -> Wa
 
 
 def _grown(t: float) -> float:
-    share = min(max(t, 0.0) / (0.5 * SETTLES), 1.0)
+    share = min(max(t, 0.0) / (0.5 * SETTLING_S), 1.0)
     return math.sin(0.5 * math.pi * share) ** 2
 
 
 def main(json: Json = False) -> None:
-    """Print what an operator feels of the cell's filter, of one for precision and of one for speed."""
+    """Print what an operator feels of three filters: the cell's own, one for precision, and one for speed."""
     config = load_config(DEMO_CONFIG)
     figures = run_feel(config)
-    table = record_table(f"{config.name}: what an operator feels of a filter", figures, NOTES)
+    table = record_table(f"{config.name}: What an operator feels of a filter", figures, NOTES)
     print_report({"cell": config.name, "filters": figures}, (table,), json)
 
 

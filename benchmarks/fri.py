@@ -34,37 +34,41 @@ from q2r2_control.types import CommandMode
 from q2r2_control.viewer.tables import figure_table
 
 _CONFIG = "config/dual_iiwa7_fri.yaml"
-_LONGEST_DELAY = 0.1  # that is looked for [s]
-_FIRST = 90  # a priority above all others
-# A thread that sleeps so long and wakes up later by more was kept waiting [s]. It sleeps when a halt begins: this finds
-# each halt of their sum, 1 ms, half of the shortest period that is measured.
-_SLEEP, _STILL = 0.0005, 0.0005
-_WAIT = 60.0  # for the cabinets, on a busy computer [s]
-_end: Any = None  # of a watching process: when its watch ends, by the monotonic clock [s]
+_MAX_DELAY_S = 0.1  # Longest delay of the tools that is looked for [s].
+_WATCH_PRIORITY = 90  # Real-time priority of the watching threads, above all others.
+# A watching thread sleeps for the first of these times. If it wakes up late by more than the second one, its processor
+# stood still. The thread usually sleeps when a halt begins, so each halt of at least their sum is found. The sum is
+# 1 ms, half of the shortest period that is measured [s].
+_WATCH_SLEEP_S, _MIN_LATENESS_S = 0.0005, 0.0005
+_CABINET_TIMEOUT_S = 60.0  # Timeout for the cabinets on a busy computer [s].
+_end: Any = None  # Time when the watch of this watching process ends, by the monotonic clock [s].
 
 
 def watch_until(end: Any) -> None:
-    """In a process that is going to watch: until the shared ``end.value`` [s]."""
+    """Initialize a watching process, whose watch ends at the shared time ``end.value`` [s]."""
     global _end
     _end = end
 
 
 def stand_stills(processor: int) -> list[tuple[float, float]]:
-    """From when to when a processor kept even its first thread waiting, which only sleeps, until the watch ends [s]."""
+    """Return begin and end of each standstill of a processor until the watch ends [s].
+
+    A standstill delays even the thread with the highest priority, which only sleeps.
+    """
     os.sched_setaffinity(0, {processor})
     found = []
-    with real_time(_FIRST):
+    with real_time(_WATCH_PRIORITY):
         while (before := time.monotonic()) < _end.value:
-            time.sleep(_SLEEP)
-            if (now := time.monotonic()) - before > _SLEEP + _STILL:
-                found.append((before + _SLEEP, now))
+            time.sleep(_WATCH_SLEEP_S)
+            if (now := time.monotonic()) - before > _WATCH_SLEEP_S + _MIN_LATENESS_S:
+                found.append((before + _WATCH_SLEEP_S, now))
     return found
 
 
 def held_up(late: list[tuple[float, float]], stills: list[tuple[float, float]]) -> int:
-    """How many answers waited for a processor that stood still, or for an answer before them that did.
+    """Return the number of late answers that waited for a standstill, or for an earlier answer that did.
 
-    Both from when to when [s].
+    Both lists have begin and end [s].
     """
     count, until = 0, -math.inf
     for begin, end in sorted(late):
@@ -74,17 +78,21 @@ def held_up(late: list[tuple[float, float]], stills: list[tuple[float, float]]) 
 
 
 def undisturbed(answers: list[tuple[float, float]], stills: list[tuple[float, float]]) -> list[float]:
-    """Durations [s] of the answers during which no processor stood still; both lists have begin and end [s]."""
+    """Return the durations [s] of the answers during which no processor stood still.
+
+    Both lists have begin and end [s].
+    """
     return [end - begin for begin, end in answers if not any(start < end and stop > begin for start, stop in stills)]
 
 
 class ToolWay:
-    """Where a reference led the tools, and where they were measured, of the ticks in which all were engaged."""
+    """The commanded and measured places of the tools in the ticks in which all arms were engaged."""
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
-        # Plain numbers: the garbage collector would go through a list of arrays, for more than 100 ms in mid-run. Where
-        # postures lead the tools is calculated after the run, of which it would be a twentieth.
+        # Arrays of plain numbers are used here, because the garbage collector would search a list of arrays for more
+        # than 100 ms during the run. The commanded places are computed after the run, because that takes a twentieth
+        # of the run's time.
         self._postures, self._tools = array("d"), array("d")
 
     def __call__(self, tick: Tick) -> None:
@@ -94,7 +102,10 @@ class ToolWay:
                 self._tools.extend(tick.tools[arm].translation)
 
     def errors(self, delays: range) -> list[float]:
-        """Of tools that are so many ticks behind, in the ticks in which a measurement was new [mm RMS]."""
+        """Return the error for each of the ``delays`` [ticks] of the tools behind their reference [mm RMS].
+
+        Only ticks with a new measurement count.
+        """
         postures = np.array(self._postures).reshape(-1, self._robot.model.nv)
         led = np.array([[self._robot.tool_pose(q, arm).translation for arm in self._robot.arms] for q in postures])
         led, measured = (np.array(places).reshape(-1, len(self._robot.arms), 3) for places in (led, self._tools))
@@ -106,7 +117,7 @@ class ToolWay:
 
 
 def measure_directly(mode: CommandMode, duration: float) -> tuple[float, dict[str, float | None]]:
-    """Errors without cabinets, in simulated time [mm RMS]: of the tools behind the reference, and behind the hands."""
+    """Return the errors [mm RMS] without cabinets in simulated time: from the reference, and by arm from the hands."""
     config = load_config(_CONFIG)
     robot = Robot.from_config(config)
     pipeline = Pipeline(config, robot, ScriptedInput("circle"), MujocoPlant(robot, config), mode)
@@ -116,7 +127,7 @@ def measure_directly(mode: CommandMode, duration: float) -> tuple[float, dict[st
 
 
 def measure(mode: CommandMode, duration: float, rt: bool, options: list[str]) -> dict[str, Any]:
-    """Both hands go round circles for ``duration`` [s]; ``options`` of q2r2 fri-cabinet."""
+    """Measure while both hands go round circles for ``duration`` [s]; ``options`` are those of q2r2 fri-cabinet."""
     words = [
         sys.executable,
         "-m",
@@ -136,12 +147,12 @@ def measure(mode: CommandMode, duration: float, rt: bool, options: list[str]) ->
     stills = [watching.submit(stand_stills, each) for each in processors if rt]
     cabinets = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert cabinets.stderr is not None
-    cabinets.stderr.readline()  # that they have begun
+    cabinets.stderr.readline()  # This line says that the cabinets have started.
     config = load_config(_CONFIG)
     robot = Robot.from_config(config)
     plant = FriPlant.from_config(robot, config)
-    plant.answers = deque()  # all of them
-    plant.longest_wait = plant.longest_session_wait = _WAIT
+    plant.answers = deque()  # Without a maximum length, all answers are kept.
+    plant.longest_wait = plant.longest_session_wait = _CABINET_TIMEOUT_S
     with notice_of_compiling():
         pipeline = Pipeline(config, robot, ScriptedInput("circle"), plant, mode)
     pipeline.listeners.append(way := ToolWay(robot))
@@ -161,8 +172,9 @@ def measure(mode: CommandMode, duration: float, rt: bool, options: list[str]) ->
     answers = [(came, came + its) for came, its in zip(arrived, took, strict=True)]
     late = [its for its in answers if its[1] - its[0] > period]
     calm = undisturbed(answers, moments)
-    errors = way.errors(range(round(_LONGEST_DELAY * config.nominal_rate_hz)))
-    direct_error, direct_errors = measure_directly(mode, min(duration, 30.0))  # the circles repeat
+    errors = way.errors(range(round(_MAX_DELAY_S * config.nominal_rate_hz)))
+    # The circles repeat, so a short run is enough.
+    direct_error, direct_errors = measure_directly(mode, min(duration, 30.0))
     return {
         "delay_ms": 1e3 * int(np.argmin(errors)) / config.nominal_rate_hz,
         "error_after_delay_mm_rms": min(errors),
@@ -187,16 +199,18 @@ def _percentiles_ms(times: Sequence[float]) -> dict[str, float]:
 
 
 def main(
-    options: Annotated[list[str] | None, typer.Argument(help="Of q2r2 fri-cabinet, after --.")] = None,
-    mode: Annotated[CommandMode, typer.Option(help="position or torque.")] = CommandMode.POSITION,
-    duration: Annotated[float, typer.Option(min=1, help="[s]")] = 60.0,
-    rt: Annotated[bool, typer.Option("--rt", help="Under SCHED_FIFO, as far as permitted.")] = False,
+    options: Annotated[list[str] | None, typer.Argument(help="Options of q2r2 fri-cabinet, after --.")] = None,
+    mode: Annotated[CommandMode, typer.Option(help="Command mode of the arms.")] = CommandMode.POSITION,
+    duration: Annotated[float, typer.Option(min=1, help="Duration of the run [s].")] = 60.0,
+    rt: Annotated[
+        bool, typer.Option("--rt", help="Run with the real-time scheduling SCHED_FIFO where it is permitted.")
+    ] = False,
     json: Json = False,
 ) -> None:
-    """Print how long cabinets wait for their answers, what they missed, and the error of the arms."""
+    """Print how long cabinets wait for their answers, how many answers they missed, and the error of the arms."""
     data = measure(mode, duration, rt, options or [])
     keys = "engaged_s", "error_mm_rms", "direct_errors_mm_rms"
-    # The last end of a session is that of this run.
+    # The last end of a session is the end of this run, so it is left out.
     rows = [
         (arm, *(data[key][arm] for key in keys), its["missed"], ", ".join(its["trips"][:-1]) or "-")
         for arm, its in data["cabinets"].items()
@@ -205,14 +219,14 @@ def main(
     columns = ("arm", "engaged [s]", *errors, "missed [answers]", "session ends before the run's")
     times, calm = data["answer_ms"], data["undisturbed_answer_ms"]
     notes = [
-        f"answers after {times['p50']:.2f} ms in the median, {times['p99']:.2f} ms at 99 %",
-        f"of the {data['undisturbed_answers']} of {data['answers']} answers during which this machine kept no processor"
-        f" waiting: {calm['p50']:.2f} ms in the median, {calm['p99']:.2f} ms at 99 %",
-        f"{data['late_answers']} answers after more than a period, {data['late_answers_in_stand_stills']} of them since"
-        " this machine kept a processor waiting",
-        f"it did so for {max(data['stand_stills_ms'], default=0.0):.1f} ms at most",
-        f"the tools are {data['delay_ms']:.0f} ms behind the reference, and apart from that"
-        f" {data['error_after_delay_mm_rms']:.2f} mm from it; without cabinets {data['direct_error_mm_rms']:.2f} mm",
+        f"An answer takes {times['p50']:.2f} ms in the median, and {times['p99']:.2f} ms at the 99th percentile.",
+        f"During {data['undisturbed_answers']} of {data['answers']} answers no processor of this machine stood still."
+        f" These take {calm['p50']:.2f} ms in the median, and {calm['p99']:.2f} ms at the 99th percentile.",
+        f"{data['late_answers']} answers took more than a period, {data['late_answers_in_stand_stills']} of them"
+        " because a processor of this machine stood still.",
+        f"The longest standstill took {max(data['stand_stills_ms'], default=0.0):.1f} ms.",
+        f"The tools are {data['delay_ms']:.0f} ms behind the reference. Apart from that delay their error is"
+        f" {data['error_after_delay_mm_rms']:.2f} mm RMS. Without cabinets it is {data['direct_error_mm_rms']:.2f} mm.",
         *(machine_notes() if rt else ()),
     ]
     print_report(data, (figure_table("two cabinets", columns, rows, notes),), json)

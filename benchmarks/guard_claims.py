@@ -1,7 +1,7 @@
 """The lines beside the certificate that keep arms safe, each with a way to break it: see safety_mutations.py.
 
-They are of the controller around its kernels, of supervision, of everything that ages, and of the watch of two arms
-that follow one reference. Every row names a claim and one line that keeps it.
+The lines belong to the controller around its kernels, to supervision, and to everything that ages. Others belong to the
+watch of two arms that follow one reference. Every row names a claim and one line that keeps it.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ CLOCK = "q2r2_control/pipeline/loop_clock.py"
 
 CONTROL = (
     Mutation(
-        "a solver of somebody else gets copies",
+        "a solver of another package gets copies of the problem",
         GUARD,
         "self._solver.solve(_copy_of(problem))",
         "self._solver.solve(problem)",
     ),
     Mutation(
-        "a solver's word about its time is not trusted",
+        "the time that a solver reports is not trusted",
         GUARD,
         "max(float(solve_time), measured)",
         "float(solve_time)",
@@ -45,43 +45,43 @@ CONTROL = (
         "self._certified = True",
     ),
     Mutation(
-        "no tick moves the reference by more than the longest one",
+        "no tick moves the reference by more than a tick of the longest period",
         CONTROLLER,
         "time = min(float(dt), LONGEST_DT) if usable else 0.0",
         "time = float(dt) if usable else 0.0",
     ),
     Mutation(
-        "a step that is undone takes back what pairs have come to keep",
+        "a step that is undone also undoes the distances that pairs have begun to keep",
         CONTROLLER,
         "self._live.keep_no_more_than(pairs_kept)",
         "pass",
     ),
     Mutation(
-        "a step that is undone takes back what objects have come to keep",
+        "a step that is undone also undoes the distances that objects have begun to keep",
         CONTROLLER,
         "self._objects.keep_no_more_than(objects_kept)",
         "pass",
     ),
     Mutation(
-        "a hard constraint holds for what the certificate has made of a solution",
+        "a hard constraint also holds for a solution that the certificate has reduced",
         CONTROLLER,
         "if outcome == REDUCED and not own.permit(state.v):",
         "if False:",
     ),
     Mutation(
-        "pairs keep more only where a stop proves it",
+        "pairs keep a larger distance only if a stop proves it",
         LIVE,
         "np.maximum(self.kept, np.minimum(np.minimum(self._goal, self.kept + most), room))",
         "np.maximum(self.kept, np.minimum(self._goal, self.kept + most + 0.0 * room))",
     ),
     Mutation(
-        "no min_distance beyond what the watched pairs were chosen for",
+        "min_distance does not exceed the distance for which the monitored pairs were chosen",
         LIVE,
         "if settings.min_distance > CLEARANCE:",
         "if False:",
     ),
     Mutation(
-        "an object that is gripped keeps only what a stop proves",
+        "an object that is gripped keeps only a distance that a stop proves",
         LIVE,
         "kept = np.where(self._new, np.minimum(self._goal, self._within_reach()), self.kept)",
         "kept = np.where(self._new, self._goal, self.kept)",
@@ -184,7 +184,7 @@ WATCHES = (
         "if False and (fault := self._jump(",
     ),
     Mutation(
-        "states that are no numbers stop the arms",
+        "measured states that are not finite stop the arms",
         SUPERVISION + "joint_watch.py",
         "if now - self._stamp > self._settings.unusable_time:",
         "if False:",
@@ -196,7 +196,7 @@ WATCHES = (
         "if True:",
     ),
     Mutation(
-        "arms of another controller stop where measured pairs are too close",
+        "arms of another controller stop if measured pairs are too close",
         SUPERVISION + "joint_watch.py",
         "if (distances - kept).min(initial=np.inf) >= -self._settings.tolerance:",
         "if True:",
@@ -307,7 +307,7 @@ TWO_ARMS = (
         "return allowed_skew(timings) + lead",
     ),
     Mutation(
-        "a lag is found where the driver tells none",
+        "a lag is found if the driver reports none",
         SUPERVISION + "measured_lags.py",
         "times[off <= off.min() + _SAME_FIT], 0.0)",
         "times[off <= off.min() + _SAME_FIT], 0.0) * 0.0",

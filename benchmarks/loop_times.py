@@ -1,9 +1,9 @@
 """Where does a tick of the whole live loop go, stage by stage, with each plant and mode?
 
-Ticks come at the loop's rate, since one that comes right after another finds warmer caches. Time in the run is
-simulated all the same, so that every round moves the same way whatever the machine does. The cases run in turns. Rounds
-with clocks in the stages alternate with rounds without, whose whole counts. Other rounds have ticks that come right
-after one another. They show the time of the program itself, whatever else the machine does while a loop sleeps.
+Ticks come at the loop's rate, because a tick that directly follows another one finds warmer caches. Time in the run is
+still simulated, so every round moves the same way whatever the machine does. The cases run in turns. Rounds that time
+each stage alternate with rounds that time only the whole tick. In other rounds each tick directly follows the last one.
+They show the time of the program itself, whatever else the machine does while a loop sleeps.
 """
 
 from __future__ import annotations
@@ -34,33 +34,33 @@ CASES = (("kinematic", CommandMode.POSITION), ("mujoco", CommandMode.POSITION), 
 PHYSICS, REST = "physics", "rest of the loop"
 STAGES = ("inputs", "measured state", "teleop", "supervision", "control", "drive", "apply", REST, PHYSICS)
 NOTES = (
-    "without physics: of rounds without clocks in the stages; medians do not add up",
-    "to the command: from the inputs until it is applied, a tick's time in the summary of a run",
-    "back to back: without physics, where no tick waits until it is due",
-    "drive: impedance and wall in torque mode; physics: of the simulator, where a real robot would move",
+    "without physics: Time of a tick in rounds that do not time the stages. Medians of stages do not add up to it.",
+    "to the command: Time from the inputs until the command is applied, as the summary of a run has it.",
+    "back to back: Time of a tick without physics, in rounds in which no tick waits until it is due.",
+    "drive: Impedance and wall in torque mode.",
+    "physics: Time of the simulator, during which a real robot would move.",
 )
-# Scripted hands move both arms at any time, once they are engaged.
-TRAJECTORY, ENGAGED_AFTER = "circle", 1.0  # [s]
+TRAJECTORY, ENGAGED_AFTER_S = "circle", 1.0  # Both arms are engaged and move without a pause after this time [s].
 
 
 @dataclass(frozen=True)
 class Times:
-    """One stage of a tick, over all rounds."""
+    """The times of one stage of a tick, over all rounds."""
 
     median_us: float
     p99_us: float
 
     @classmethod
     def of(cls, times: Array) -> Times:
-        """``times`` (n,) [s]."""
+        """Return the figures of ``times`` (n,) [s]."""
         return cls(1e6 * float(np.median(times)), 1e6 * float(np.percentile(times, 99)))
 
 
 class StageClock:
-    """Charges every moment of a run to the innermost watched method that runs, or to the rest of the loop."""
+    """A clock that charges every moment of a run to the innermost watched method that runs, or else to the rest."""
 
     def __init__(self, period: float) -> None:
-        """``period`` [s]: a tick is held back until one is over since the last; 0: none is."""
+        """A tick begins at the earliest a ``period`` [s] after the last one. If it is 0, no tick waits."""
         self._period = period
         self._due = self._last = time.perf_counter()
         self._stage = STAGES.index(REST)
@@ -69,12 +69,12 @@ class StageClock:
 
     @property
     def times(self) -> Array:
-        """(ticks, stages) [s]."""
+        """The times (ticks, stages) [s]."""
         return np.array(self._rows)
 
     @contextmanager
     def watching(self, pipeline: Pipeline, stages: bool) -> Iterator[None]:
-        """Watch the plant, whose physics end a tick, and if ``stages`` all that a tick calls."""
+        """Watch the plant, whose physics end a tick. If ``stages`` is True, also watch all other stages."""
         plant = type(pipeline.plant)
         watched: list[tuple[type, str, str]] = [(plant, "advance", PHYSICS)]
         if stages:
@@ -125,7 +125,7 @@ class StageClock:
 
 
 class Case:
-    """One plant and mode, and the times of its rounds so far."""
+    """One plant and mode, with the times of its rounds so far."""
 
     def __init__(self, config: Config, plant: str, mode: CommandMode, ticks: int) -> None:
         self.name = f"{plant} {mode}"
@@ -136,7 +136,7 @@ class Case:
         self._to_command: list[float] = []
 
     def run_round(self, record: bool) -> None:
-        """One run with clocks in every stage, one without, one back to back, and if asked for one that is recorded."""
+        """Run once with every stage timed, once without, once back to back, and once recorded if ``record`` is True."""
         self._add("stages", self._run(stages=True))
         self._add("whole", self._run())
         self._add("back to back", self._run(paced=False))
@@ -145,7 +145,7 @@ class Case:
                 self._add("recorded", self._run(folder=Path(folder)))
 
     def rows(self) -> dict[str, Times]:
-        """Times by what they are of."""
+        """Return the times by the name of the row."""
         found = {what: np.concatenate(times) for what, times in self._times.items()}
         stages = found.pop("stages")
         rows = {stage: Times.of(stages[:, index]) for index, stage in enumerate(STAGES) if stage != PHYSICS}
@@ -159,7 +159,7 @@ class Case:
 
     def _run(self, stages: bool = False, paced: bool = True, folder: Path | None = None) -> Array:
         pipeline, rate = self._pipeline, self._config.nominal_rate_hz
-        engaged = round(ENGAGED_AFTER * rate)
+        engaged = round(ENGAGED_AFTER_S * rate)
         pipeline.input = ScriptedInput(TRAJECTORY, hands=tuple(pipeline.robot.arms))
         clock = StageClock(1.0 / rate if paced else 0.0)
         with nullcontext() if folder is None else Recorder(folder, "bench") as recorder:
@@ -176,12 +176,12 @@ class Case:
 
 
 def main(
-    ticks: Annotated[int, typer.Option(min=100, help="Of each run.")] = 3000,
-    rounds: Annotated[int, typer.Option(min=1, help="Of each case.")] = 3,
-    record: Annotated[bool, typer.Option("--record", help="Also while the run is recorded.")] = False,
+    ticks: Annotated[int, typer.Option(min=100, help="Number of ticks of each run.")] = 3000,
+    rounds: Annotated[int, typer.Option(min=1, help="Number of rounds of each case.")] = 3,
+    record: Annotated[bool, typer.Option("--record", help="Also time runs that are recorded.")] = False,
     json: Json = False,
 ) -> None:
-    """Print where a tick of the live loop goes: a column for each plant and mode."""
+    """Print where the time of a tick of the live loop goes, with a column for each plant and mode."""
     config = load_config(DEMO_CONFIG)
     cases = [Case(config, *case, ticks) for case in CASES]
     for turn in range(rounds):
@@ -194,7 +194,7 @@ def main(
         "cases": {name: {what: asdict(times) for what, times in rows.items()} for name, rows in found.items()},
     }
     table = figure_table(
-        f"{config.name}: one tick of the live loop at {config.nominal_rate_hz:g} Hz, {rounds} runs of {ticks} ticks",
+        f"{config.name}: One tick of the live loop at {config.nominal_rate_hz:g} Hz, {rounds} runs of {ticks} ticks",
         ("median / p99", *(f"{name} [us]" for name in found)),
         (
             (what, *(f"{rows[what].median_us:.0f} / {rows[what].p99_us:.0f}" for rows in found.values()))

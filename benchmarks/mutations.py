@@ -2,8 +2,8 @@
 
     python benchmarks/mutations.py q2r2_control/teleop tests/teleop tests/pipeline
 
-A mutant is one changed operator, constant, condition or statement. Only tests that run the changed line are asked, the
-fastest first, up to a time for each mutant. Needs `pip install cosmic-ray pytest-cov`.
+A mutant has one changed operator, constant, condition or statement. Only tests that run the changed line are run, the
+fastest first, up to a limit of time for each mutant. This needs `pip install cosmic-ray pytest-cov`.
 """
 
 from __future__ import annotations
@@ -25,13 +25,14 @@ from queue import SimpleQueue
 from xml.etree import ElementTree
 
 ROOT = Path(__file__).resolve().parents[1]
-_ANNOTATIONS = "BitOr"  # almost every | of this project stands in a type hint
-_STARTUP = 60.0  # of one pytest, beside its tests [s]
+# Operators of this kind are not changed, because almost every | in this project stands in a type hint.
+_SKIPPED_OPERATOR = "BitOr"
+_PYTEST_STARTUP_S = 60.0  # Longest time that pytest takes beside its tests [s].
 
 
 @dataclass(frozen=True)
 class Mutant:
-    """A place that can be changed: the ``occurrence``-th one of an operator in a file."""
+    """A place that can be changed: the place with number ``occurrence`` of an ``operator`` in a file."""
 
     path: str
     operator: str
@@ -40,11 +41,11 @@ class Mutant:
 
 
 def mutants_of(root: Path, room: str) -> Iterator[Mutant]:
-    """All mutants of the modules under ``room``."""
+    """Yield all mutants of the modules under ``room``."""
     from cosmic_ray.ast import ast_nodes, get_ast_from_path
     from cosmic_ray.plugins import get_operator, operator_names
 
-    names = [name for name in operator_names() if _ANNOTATIONS not in name and not get_operator(name).arguments()]
+    names = [name for name in operator_names() if _SKIPPED_OPERATOR not in name and not get_operator(name).arguments()]
     for file in sorted((root / room).rglob("*.py")):
         nodes = list(ast_nodes(get_ast_from_path(file)))
         for name in names:
@@ -55,7 +56,7 @@ def mutants_of(root: Path, room: str) -> Iterator[Mutant]:
 
 
 def changed(root: Path, mutant: Mutant) -> str:
-    """The text of the mutant's file with the change in it."""
+    """Return the text of the mutant's file with the change in it."""
     from cosmic_ray.mutating import mutate_code
     from cosmic_ray.plugins import get_operator
 
@@ -67,14 +68,14 @@ def changed(root: Path, mutant: Mutant) -> str:
 def covering_tests(
     copy: Path, env: dict[str, str], tests: Sequence[str]
 ) -> tuple[dict[str, dict[int, set[str]]], dict[str, float]]:
-    """Tests that run each line of each file, and the time that each test takes [s]."""
+    """Return the tests that run each line of each file, and the time that each test takes [s]."""
     from coverage import CoverageData
 
     report, data_file = copy / "times.xml", copy / ".coverage"
     command = [*_pytest(), *tests, "--cov=q2r2_control", "--cov-context=test", "--cov-report=", f"--junitxml={report}"]
     result = subprocess.run([*command, "-o", "junit_family=xunit1"], cwd=copy, env=env, capture_output=True, text=True)
     if result.returncode:
-        raise SystemExit(f"The tests fail without any change:\n{result.stdout[-3000:]}{result.stderr[-1000:]}")
+        raise SystemExit(f"The tests fail even without a change:\n{result.stdout[-3000:]}{result.stderr[-1000:]}")
     times: dict[str, float] = {}
     for case in ElementTree.parse(report).iter("testcase"):
         times[f"{case.get('file')}::{case.get('name')}"] = float(case.get("time", "0"))
@@ -94,7 +95,7 @@ def _pytest() -> list[str]:
 
 
 def fate(copy: Path, env: dict[str, str], mutant: Mutant, tests: Sequence[str], limit: float) -> str:
-    """``killed``, ``survived`` or ``uncovered``; a run that hangs or cannot import is killed."""
+    """Return ``killed``, ``survived`` or ``uncovered``. A mutant that hangs or cannot be imported is killed."""
     if not tests:
         return "uncovered"
     file = copy / mutant.path
@@ -102,7 +103,9 @@ def fate(copy: Path, env: dict[str, str], mutant: Mutant, tests: Sequence[str], 
     try:
         file.write_text(changed(copy, mutant))
         command = [*_pytest(), "-x", *tests]
-        result = subprocess.run(command, cwd=copy, env=env, capture_output=True, timeout=3.0 * limit + _STARTUP)
+        result = subprocess.run(
+            command, cwd=copy, env=env, capture_output=True, timeout=3.0 * limit + _PYTEST_STARTUP_S
+        )
         return "killed" if result.returncode else "survived"
     except subprocess.TimeoutExpired:
         return "killed"
@@ -111,7 +114,7 @@ def fate(copy: Path, env: dict[str, str], mutant: Mutant, tests: Sequence[str], 
 
 
 def within(tests: set[str], times: dict[str, float], limit: float) -> list[str]:
-    """The fastest of some tests, as many as take ``limit`` [s] together, and at least one."""
+    """Return the fastest of the ``tests``, which together take at most ``limit`` [s], but at least one test."""
     chosen: list[str] = []
     for test in sorted(tests, key=lambda test: (times.get(test, 0.0), test)):
         limit -= times.get(test, 0.0)
@@ -124,15 +127,17 @@ def within(tests: set[str], times: dict[str, float], limit: float) -> list[str]:
 def main() -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("room", help="a folder of the package")
-    parser.add_argument("tests", nargs="*", help="folders of tests that are to notice")
-    parser.add_argument("--root", type=Path, default=ROOT, help="the checkout, such as an older one")
-    parser.add_argument("--count", type=int, default=200, help="mutants")
+    parser.add_argument("room", help="A folder of the package.")
+    parser.add_argument("tests", nargs="*", help="Folders of the tests that should notice the mutants.")
+    parser.add_argument("--root", type=Path, default=ROOT, help="The checkout, which may be an older one.")
+    parser.add_argument("--count", type=int, default=200, help="Number of mutants.")
     parser.add_argument("--seed", type=int, default=11)
-    parser.add_argument("--limit", type=float, default=60.0, help="time of tests for each mutant [s]")
+    parser.add_argument("--limit", type=float, default=60.0, help="Time of the tests for each mutant [s].")
     parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--python-kernels", action="store_true", help="run kernels as Python, for rooms that hold them")
-    parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.add_argument(
+        "--python-kernels", action="store_true", help="Run kernels as Python, for rooms that contain kernels."
+    )
+    parser.add_argument("--json", action="store_true", help="Print JSON.")
     options = parser.parse_args()
     root = options.root.resolve()
     env = {**os.environ, "PYTHONDONTWRITEBYTECODE": "1"}

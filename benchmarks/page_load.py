@@ -1,8 +1,8 @@
-"""Does a crowd on the page cost the loop anything: ten watchers, and a client that sends garbage without a pause?
+"""Do ten watchers, and a client that sends garbage without a pause, slow down the loop of a run with a page?
 
-Two runs of q2r2 run --web in real time, in which scripted hands lead both arms round circles. In the second one
-watchers read all that the page sends, and a hostile client sends what no browser does, and connects anew whenever it is
-thrown out. They share this machine with the run, which those of another computer do not.
+The command q2r2 run --web runs twice in real time, while scripted hands lead both arms round circles. In the second run
+the watchers read everything that the page sends. A hostile client sends messages that no browser sends, and connects
+again whenever it is disconnected. All these clients share the machine with the run, which remote clients would not.
 """
 
 from __future__ import annotations
@@ -30,34 +30,38 @@ from q2r2_control.cli.output import DEMO_CONFIG, Json, print_progress, print_rep
 from q2r2_control.viewer.tables import record_table
 
 WATCHERS = 10
-_RUN = ("run", DEMO_CONFIG, "--input", "scripted", "--trajectory", "circle", "--plant", "kinematic")
-_PAGE = ("--headless", "--web", "--web-port", "0", "--json")
-NOTES = ("tracking: RMS of the worse tool behind its target", "logged: lines, and the most of them within one second")
+_RUN_ARGUMENTS = ("run", DEMO_CONFIG, "--input", "scripted", "--trajectory", "circle", "--plant", "kinematic")
+_PAGE_ARGUMENTS = ("--headless", "--web", "--web-port", "0", "--json")
+NOTES = (
+    "tick: Time from the inputs until the command is applied [us].",
+    "tracking: RMS error of the tool with the larger error.",
+    "logged: Number of lines, and largest number of lines within one second.",
+)
 
 
 @dataclass(frozen=True)
 class RunFigures:
-    """One run; ticks in [us], from the inputs until the command is applied."""
+    """The figures of one run. The time of a tick is from the inputs until the command is applied."""
 
     name: str
     loop_rate_hz: float
-    tick_p50: float
-    tick_p99: float
-    tracking_mm: float
+    tick_p50: float  # [us]
+    tick_p99: float  # [us]
+    tracking_mm: float  # RMS error of the tool with the larger error.
     fallback_ticks: int
-    garbage: int  # messages that were sent
-    logged: tuple[int, int]
+    garbage: int  # Number of messages that the hostile client sent.
+    logged: tuple[int, int]  # Number of logged lines, and largest number of lines within one second.
 
 
 def joined(url: str) -> ClientConnection:
-    """A client as the page's own."""
+    """Return a client that connects as the page's own script does."""
     host = urlsplit(url).netloc
     protocol = [Subprotocol(f"viser-v{viser.__version__}")]
     return connect(f"ws://{host}", origin=Origin(f"http://{host}"), subprotocols=protocol, max_size=None)
 
 
 class Crowd:
-    """Watchers, and one that is hostile."""
+    """Clients in threads: :data:`WATCHERS` that read, and one that sends garbage."""
 
     def __init__(self, url: str) -> None:
         self._url, self._ended = url, threading.Event()
@@ -88,13 +92,13 @@ class Crowd:
 
 
 def measure(name: str, duration: float, crowd: bool) -> RunFigures:
-    """Figures of one run of ``duration`` [s]."""
+    """Return the figures of one run of ``duration`` [s]."""
     print_progress(name)
-    command = [sys.executable, "-m", "q2r2_control", *_RUN, *_PAGE, "--duration", f"{duration:g}"]
+    command = [sys.executable, "-m", "q2r2_control", *_RUN_ARGUMENTS, *_PAGE_ARGUMENTS, "--duration", f"{duration:g}"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert process.stdout is not None
     assert process.stderr is not None
-    lines: list[float] = []  # when each came [s]
+    lines: list[float] = []  # Time when each line came [s].
     disturbers: list[Crowd] = []
     for line in process.stderr:
         if (found := re.search(r"page: (http\S+)", line)) is None:
@@ -105,7 +109,7 @@ def measure(name: str, duration: float, crowd: bool) -> RunFigures:
         each.end()
     summary = json_module.loads(process.stdout.read())
     if process.wait():
-        sys.exit(f"the run has failed: {summary}")
+        sys.exit(f"The run has failed: {summary}")
     most = max(Counter(int(at - lines[0]) for at in lines).values(), default=0)
     return RunFigures(
         name=name,
@@ -119,7 +123,9 @@ def measure(name: str, duration: float, crowd: bool) -> RunFigures:
     )
 
 
-def main(duration: Annotated[float, Option(min=5.0, help="Of each run [s].")] = 60.0, json: Json = False) -> None:
+def main(
+    duration: Annotated[float, Option(min=5.0, help="Duration of each run [s].")] = 60.0, json: Json = False
+) -> None:
     """Measure a run alone, and one with a crowd on its page."""
     figures = [measure("alone", duration, False), measure("with the crowd", duration, True)]
     table = record_table(f"{WATCHERS} watchers and a hostile client on the page of a run", figures, NOTES)

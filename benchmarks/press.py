@@ -1,9 +1,9 @@
-"""How does the table feel a finger that presses on it on purpose, in torque mode?
+"""Which forces does a finger exert that presses on the table on purpose, in torque mode?
 
-The left tool is asked to go straight down until :data:`COMMANDED` inside the table, much faster than contact allows. It
-stays, slides away from the arm's base or towards it while it presses, and is lifted. That way is the hardest: the arm
-moves in its own plane, where pressing and sliding are coupled by its masses. Controller and impedance are whole. Forces
-are read from MuJoCo's contacts at every tick.
+The left tool is asked to go straight down to :data:`COMMANDED_DEPTH` below the table's surface, much faster than
+contact allows. It stays there, slides away from the arm's base or towards it while it presses, and is then lifted. This
+direction is the hardest one, because the arm moves in its own plane, where its masses couple pressing and sliding. The
+controller and the impedance are complete. Forces are read from MuJoCo's contacts at every tick.
 """
 
 from __future__ import annotations
@@ -31,27 +31,32 @@ from q2r2_control.verification.contract import Contract
 from q2r2_control.verification.fault_injection import TABLE_ONLY, with_contact
 from q2r2_control.viewer.tables import record_table
 
-COMMANDED = 0.010  # inside the table [m]
+COMMANDED_DEPTH = 0.010  # Depth of the target inside the table [m].
 _ARM, _TABLE = "left", "table"
-_Y = 0.40  # of all the run [m]
-_SPAN = (0.50, 0.60)  # of x, over which it slides [m]
-_HEIGHT, _LOWEST, _RISE = 0.30, 0.10, 0.10  # of the tool before, at least, and after [m]
-_APPROACH_SPEED = 0.5  # asked for, far above what contact allows [m/s]
-# Times at which parts of the run begin [s].
-_DOWN, _SLIDING, _LIFT, _END = 2.5, 6.0, 8.5, 10.5
-_APPROACH, _SLIDE_TIME = 2.0, 1.5  # [s]
-_SETTLED = 1.0  # of a part, after which force is steady [s]
+_TOOL_Y = 0.40  # The tool's y during the whole run [m].
+_SLIDE_RANGE = (0.50, 0.60)  # Range of x over which the tool slides [m].
+# Height of the target before the press, its least height, and its rise after the press [m].
+_START_HEIGHT, _MIN_HEIGHT, _LIFT_HEIGHT = 0.30, 0.10, 0.10
+_APPROACH_SPEED = 0.5  # Speed of the target, far above the speed that contact allows [m/s].
+# Times when the tool goes down, slides and is lifted, and when the run ends [s].
+_DOWN_BEGINS_S, _SLIDE_BEGINS_S, _LIFT_BEGINS_S, _RUN_ENDS_S = 2.5, 6.0, 8.5, 10.5
+_APPROACH_S, _SLIDE_S = 2.0, 1.5  # Durations of the approach and of the slide [s].
+_SETTLING_S = 1.0  # Time after the begin of a part until its force is steady [s].
 NOTES = (
-    "impact: speed [m/s] of the tool when it first touches, and the greatest force [N] in the 0.25 s after it",
-    "steady: mean force while it stays; spring, bound: stiffness times the way from the reference, times the depth",
-    "    that is allowed; slide: mean force and extremes until the lift [N]",
-    "slide error: of the tool at the slide's end; friction lag: what it has to be, friction times force over stiffness",
-    "rotor share: of the rotors' inertia that the joints feel (mujoco.rotor_share); friction: mujoco.obstacle_friction",
+    "impact: Speed of the tool at the first touch [m/s], and largest force within the next 0.25 s [N].",
+    "steady: Mean force while the tool stays [N].",
+    "spring: Stiffness times the distance of the tool from its reference [N].",
+    "bound: Stiffness times the depth that control.contact_allowed allows the reference [N].",
+    "slide: Mean force while the tool slides, and its extremes until the lift [N].",
+    "slide error: Error of the tool at the end of the slide.",
+    "friction lag: Error that friction causes, which is friction times force divided by stiffness.",
+    "rotor share: Share of the rotors' inertia that the joints feel (mujoco.rotor_share).",
+    "friction: Coefficient mujoco.obstacle_friction.",
 )
 
 
 class PressSlide(StrEnum):
-    """Where a press slides to, as seen from the arm's base."""
+    """The direction in which a press slides, as seen from the arm's base."""
 
     AWAY = "away"
     TOWARDS = "towards"
@@ -59,28 +64,29 @@ class PressSlide(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class PressFigures:
-    """One press. Forces are the table's normal force on the hand [N]."""
+    """The figures of one press. Forces are the table's normal force on the hand [N]."""
 
     slide: PressSlide
     rotor_share: float
     friction: float
-    impact_speed: float  # of the tool in the tick before it first touches [m/s]
-    impact_force: float  # greatest in the first 0.25 s of contact [N]
-    steady_force: float  # mean while it stays [N]
-    spring_force: float  # stiffness times how far the tool is above its reference meanwhile [N]
-    largest_force: float  # of all the run [N]
-    bound: float  # stiffness times the depth that the reference may have [N]
-    bounce_s: float  # without contact from the first touch to the slide [s]
-    lost_contact_s: float  # the same from there to the lift [s]
-    slide_error_mm: float  # tool behind its target along the table when the slide has just ended [mm]
-    friction_lag_mm: float  # friction times the mean force over the stiffness: what that has to be [mm]
-    slide_force: float  # mean while it slides [N]
-    slide_least: float  # and the extremes [N]
-    slide_largest: float
-    violations: int  # of the controller's promises, over all ticks
+    impact_speed: float  # Speed of the tool in the tick before it first touches the table [m/s].
+    impact_force: float  # Largest force in the first 0.25 s of contact [N].
+    steady_force: float  # Mean force while the tool stays [N].
+    spring_force: float  # Stiffness times the height of the tool above its reference while it stays [N].
+    largest_force: float  # Largest force of the whole run [N].
+    bound: float  # Stiffness times the largest allowed depth of the reference [N].
+    bounce_s: float  # Time without contact between the first touch and the slide [s].
+    lost_contact_s: float  # Time without contact between the begin of the slide and the lift [s].
+    slide_error_mm: float  # Distance of the tool behind its target along the table at the end of the slide [mm].
+    friction_lag_mm: float  # Slide error that friction causes: friction times mean force divided by stiffness [mm].
+    slide_force: float  # Mean force while the tool slides [N].
+    slide_least: float  # Least force from the begin of the slide to the lift [N].
+    slide_largest: float  # Largest force from the begin of the slide to the lift [N].
+    violations: int  # Number of broken promises of the controller, over all ticks.
 
 
-# Slides with the rotor share and the friction of each: metal on wood, the cell's own, and rubber that grips well.
+# Direction of the slide, rotor share and friction. The friction is that of metal on wood (0.3), that of the cell (0.6),
+# or that of rubber that grips well (0.9).
 PRESSES = (
     *((PressSlide.AWAY, 1.0, friction) for friction in (0.3, 0.6, 0.9)),
     (PressSlide.TOWARDS, 1.0, 0.9),
@@ -89,12 +95,12 @@ PRESSES = (
 
 
 def run_press(config: Config, slide: PressSlide, rotor_share: float, friction: float) -> PressFigures:
-    """Press with the cell of ``config``, in which the left fingers and the table may touch.
+    """Press with the cell of ``config``, in which the left fingers may touch the table.
 
-    Raises :class:`ConfigError` where nothing of that arm may touch the table.
+    Raises :class:`ConfigError` if none of the left arm's fingers may touch the table.
     """
     mujoco = config.mujoco.model_copy(update={"rotor_share": rotor_share, "obstacle_friction": friction})
-    # In simulated time no solution is late, however busy the machine is.
+    # Time is simulated, so no solution may count as late, however busy the machine is.
     control = config.control.model_copy(update={"solve_time_limit": None})
     config = config.model_copy(update={"mujoco": mujoco, "control": control})
     robot = Robot.from_config(config)
@@ -105,13 +111,13 @@ def run_press(config: Config, slide: PressSlide, rotor_share: float, friction: f
 
 @dataclass(frozen=True, slots=True)
 class _Trace:
-    """One run, by ticks (n,)."""
+    """The values of one run at each tick (n,)."""
 
-    force: Array  # of the table [N]
-    height: Array  # of the tool [m]
-    reference_height: Array
-    behind: Array  # of the target, along the slide [m]
-    violations: int
+    force: Array  # Normal force of the table [N].
+    height: Array  # Measured height of the tool [m].
+    reference_height: Array  # Height of the tool's reference [m].
+    behind: Array  # Distance of the tool behind its target, along the slide [m].
+    violations: int  # Number of broken promises of the controller.
 
 
 def _press(robot: Robot, config: Config, slide: PressSlide) -> _Trace:
@@ -121,8 +127,8 @@ def _press(robot: Robot, config: Config, slide: PressSlide) -> _Trace:
     start, data = controller.tool_pose(_ARM), robot.model.createData()
     drive.reset(plant.state())
     dt = 1.0 / config.nominal_rate_hz
-    touch: float | None = None  # height of the tool when it first touched [m]
-    ticks = round(_END / dt)
+    touch: float | None = None  # Height of the tool at its first touch, None before it [m].
+    ticks = round(_RUN_ENDS_S / dt)
     force, height, behind, reference_height = (np.zeros(ticks) for _ in range(4))
     for i in range(ticks):
         t = i * dt
@@ -141,13 +147,13 @@ def _press(robot: Robot, config: Config, slide: PressSlide) -> _Trace:
             touch = height[i]
     plant.close()
     if touch is None:
-        raise ConfigError(f"obstacles.{_TABLE}: not reached by arm {_ARM}; allowed: as in config/dual_iiwa7.yaml")
+        raise ConfigError(f"obstacles.{_TABLE}: arm {_ARM} does not reach it; allowed: as in config/dual_iiwa7.yaml")
     violations = sum(margin.violations for margin in contract.margins.values())
     return _Trace(force, height, reference_height, behind, violations)
 
 
 def _pressing_force(plant: MujocoPlant) -> float:
-    """Sum of the normal forces [N] of all contacts between the arm and the table."""
+    """Return the sum of the normal forces of all contacts between the arm and the table [N]."""
     model, data, total, wrench = plant.model, plant.data, 0.0, np.zeros(6)
     for i in range(data.ncon):
         geoms = data.contact[i].geom1, data.contact[i].geom2
@@ -161,9 +167,9 @@ def _pressing_force(plant: MujocoPlant) -> float:
 def _figures(config: Config, slide: PressSlide, bound: float, trace: _Trace) -> PressFigures:
     dt, force, height = 1.0 / config.nominal_rate_hz, trace.force, trace.height
     first = int(np.flatnonzero(force > 0.0)[0])
-    stays = slice(round((_DOWN + _SETTLED) / dt), round(_SLIDING / dt))
-    end = round((_SLIDING + _SLIDE_TIME) / dt)
-    slides, pressed = slice(stays.stop, end), slice(stays.stop, round(_LIFT / dt))
+    stays = slice(round((_DOWN_BEGINS_S + _SETTLING_S) / dt), round(_SLIDE_BEGINS_S / dt))
+    end = round((_SLIDE_BEGINS_S + _SLIDE_S) / dt)
+    slides, pressed = slice(stays.stop, end), slice(stays.stop, round(_LIFT_BEGINS_S / dt))
     settings, sliding = config.impedance, float(force[slides].mean())
     share, friction = config.mujoco.rotor_share, config.mujoco.obstacle_friction
     spring = settings.translational_stiffness * (height - trace.reference_height)[stays].mean()
@@ -189,26 +195,26 @@ def _figures(config: Config, slide: PressSlide, bound: float, trace: _Trace) -> 
 
 
 def _along(slide: PressSlide) -> Array:
-    """Direction (3,) of a slide."""
+    """Return the direction (3,) of a slide."""
     return np.array([1.0 if slide is PressSlide.AWAY else -1.0, 0.0, 0.0])
 
 
 def _asked(t: float, start: Array, touch: float | None, slide: PressSlide) -> Array:
-    """Where the tool is asked to be (3,) [m]."""
-    begin, end = _SPAN if slide is PressSlide.AWAY else _SPAN[::-1]
-    above = np.array([begin, _Y, _HEIGHT])
-    if t < _DOWN:
-        return start + minimum_jerk(min(t / _APPROACH, 1.0)) * (above - start)
-    bottom = -np.inf if touch is None else touch - COMMANDED
-    z = max(_HEIGHT - _APPROACH_SPEED * (t - _DOWN), bottom, _LOWEST)
-    x = begin + (end - begin) * minimum_jerk(min(max(t - _SLIDING, 0.0) / _SLIDE_TIME, 1.0))
-    if t > _LIFT:
-        z += minimum_jerk(min((t - _LIFT) / _APPROACH, 1.0)) * _RISE
-    return np.array([x, _Y, z])
+    """Return the target position of the tool (3,) [m]."""
+    begin, end = _SLIDE_RANGE if slide is PressSlide.AWAY else _SLIDE_RANGE[::-1]
+    above = np.array([begin, _TOOL_Y, _START_HEIGHT])
+    if t < _DOWN_BEGINS_S:
+        return start + minimum_jerk(min(t / _APPROACH_S, 1.0)) * (above - start)
+    bottom = -np.inf if touch is None else touch - COMMANDED_DEPTH
+    z = max(_START_HEIGHT - _APPROACH_SPEED * (t - _DOWN_BEGINS_S), bottom, _MIN_HEIGHT)
+    x = begin + (end - begin) * minimum_jerk(min(max(t - _SLIDE_BEGINS_S, 0.0) / _SLIDE_S, 1.0))
+    if t > _LIFT_BEGINS_S:
+        z += minimum_jerk(min((t - _LIFT_BEGINS_S) / _APPROACH_S, 1.0)) * _LIFT_HEIGHT
+    return np.array([x, _TOOL_Y, z])
 
 
 def _depth(robot: Robot, config: Config) -> float:
-    """How far the reference of the left fingers may get inside the table [m]."""
+    """Return the depth inside the table that the reference of the left fingers may reach [m]."""
     names, kept = pair_names(robot.collision_model), kept_distances(robot, config.control).values
     depths = [
         -float(kept[p])
@@ -218,19 +224,19 @@ def _depth(robot: Robot, config: Config) -> float:
     ]
     if not depths or max(depths) <= 0.0:
         raise ConfigError(
-            f"control.contact_allowed: nothing of arm {_ARM}'s fingers and {_TABLE}; allowed: such a pair"
+            f"control.contact_allowed: no pair of arm {_ARM}'s fingers and {_TABLE}; allowed: at least one such pair"
         )
     return max(depths)
 
 
 def main(json: Json = False) -> None:
-    """Press a finger on the table in torque mode, and print the forces in MuJoCo; exit 1 if a promise was broken."""
+    """Press a finger on the table in torque mode, and print MuJoCo's forces. Exit with 1 if a promise was broken."""
     config = with_contact(load_config(DEMO_CONFIG), TABLE_ONLY)
     figures = []
     for press in PRESSES:
-        print_progress(f"slides {press[0]}, rotor share {press[1]:g}, friction {press[2]:g}")
+        print_progress(f"slide {press[0]}, rotor share {press[1]:g}, friction {press[2]:g}")
         figures.append(run_press(config, *press))
-    title = f"{config.name}: {1e3 * COMMANDED:g} mm commanded into the table, torque mode, MuJoCo"
+    title = f"{config.name}: {1e3 * COMMANDED_DEPTH:g} mm commanded into the table, torque mode, MuJoCo"
     print_report({"cell": config.name, "presses": figures}, (record_table(title, figures, NOTES),), json)
     raise typer.Exit(1 if any(press.violations for press in figures) else 0)
 

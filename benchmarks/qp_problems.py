@@ -1,13 +1,13 @@
 """Which QP solvers solve the controller's problems, as the public qpbenchmark counts it?
 
-Writes the QPs of 2,000 ticks, of arms that move freely, press against each other, run into limits and recover, and
-prints qpbenchmark's success rates of the installed solvers. ``qpbenchmark --results-path build/qp_problems.csv
-benchmarks/qp_problems.py run`` then plays the same file, with reports and plots.
+This file writes the QPs of 2,000 ticks, in which arms move freely, press against each other, run into limits and
+recover. It then prints qpbenchmark's success rates of the installed solvers. The command ``qpbenchmark --results-path
+build/qp_problems.csv benchmarks/qp_problems.py run`` solves the same problems, with reports and plots.
 Both need ``pip install -e '.[bench]'``.
 
 A problem is solved if the largest primal residual, dual residual and duality gap are below the tolerance of the
-settings: 1 (default), 1e-3, 1e-6 and 1e-9. The problem is that of ``CartesianController.problem``, with a slack for
-each row, given to each solver through qpsolvers. OSQP is therefore set up anew at every problem, and DAQP is not called
+settings: 1 (default), 1e-3, 1e-6 and 1e-9. ``CartesianController.problem`` makes the problems, with a slack for each
+row. Each solver gets them through qpsolvers. OSQP is therefore set up again for every problem, and DAQP is not called
 directly.
 """
 
@@ -37,15 +37,15 @@ from q2r2_control.types import Array
 from q2r2_control.viewer.tables import figure_table
 
 FILE = Path("build/qp_problems.parquet")
-TICKS, SOLVED = 2000, 200
-DT = 0.002  # [s]
-_ANEW = 50  # ticks of a recovery
+TICKS, SOLVED_PROBLEMS = 2000, 200
+DT = 0.002  # Period of a tick [s].
+_TICKS_PER_RECOVERY = 50  # Number of ticks of one recovery.
 Targets = dict[str, pin.SE3]
 Motion = Callable[[float, Mapping[str, pin.SE3]], Targets]
 
 
 class QpProblems(ParquetTestSet):
-    """The problems of ``path``, under the name that qpbenchmark looks for in this file."""
+    """The problems in the file ``path``. qpbenchmark looks for a class of this name."""
 
     title = "Two arms of a QP controller"
     description = "QPs of differential inverse kinematics of two KUKA iiwa 7 that keep limits and distances."
@@ -56,17 +56,17 @@ class QpProblems(ParquetTestSet):
 
 
 def moved(start: Mapping[str, pin.SE3], *by: float) -> Targets:
-    """The tools' poses at the start, shifted [m]."""
+    """Return the tools' poses at the start, shifted in the world frame [m]."""
     return {arm: pin.SE3(pose.rotation, pose.translation + np.array(by)) for arm, pose in start.items()}
 
 
 def freely(t: float, start: Mapping[str, pin.SE3]) -> Targets:
-    """Both tools go round a circle in free air."""
+    """Return targets that go round a circle in free air."""
     return moved(start, 0.0, 0.1 * math.sin(math.pi * t), 0.1 - 0.1 * math.cos(math.pi * t))
 
 
 def pressing(t: float, start: Mapping[str, pin.SE3]) -> Targets:
-    """Each tool is sent to where the other one was, up and down."""
+    """Return targets that swing up and down where the other tool was at the start."""
     left, right = start["left"], start["right"]
     swing = np.array([0.0, 0.0, 0.1 * math.sin(math.tau * t)])
     return {
@@ -76,7 +76,7 @@ def pressing(t: float, start: Mapping[str, pin.SE3]) -> Targets:
 
 
 def out_of_reach(t: float, start: Mapping[str, pin.SE3]) -> Targets:
-    """Targets jump to places beyond the reach every quarter of a second."""
+    """Return targets that jump every quarter of a second, often to places beyond the reach."""
     random = np.random.default_rng(int(4.0 * t))
     places = {arm: random.uniform([-0.5, -1.5, -0.6], [2.0, 1.5, 1.5]) for arm in start}
     turns = {arm: pin.exp3(random.normal(size=3)) for arm in start}
@@ -87,7 +87,7 @@ MOTIONS: dict[str, Motion] = {"free": freely, "contact": pressing, "limits": out
 
 
 def outside(robot: Robot, random: np.random.Generator) -> Array:
-    """Anywhere within the limits, where arms often overlap, with one joint 0.05 rad beyond its own (nv,) [rad]."""
+    """Return a random posture (nv,) in which arms may overlap and one joint is 0.05 rad beyond its limit [rad]."""
     q = random.uniform(robot.position_lower, robot.position_upper)
     joint = random.integers(robot.model.nv)
     q[joint] = robot.position_upper[joint] + 0.05
@@ -95,14 +95,14 @@ def outside(robot: Robot, random: np.random.Generator) -> Array:
 
 
 def problems(ticks: int) -> Iterator[qpbenchmark.Problem]:
-    """The problem of every tick, as many of each of ``MOTIONS``."""
+    """Yield the problem of every tick. Each of ``MOTIONS`` has the same number of ticks."""
     robot = Robot.from_config(load_config(DEMO_CONFIG))
     controller, random = CartesianController(robot), np.random.default_rng(1)
     start = {arm: robot.tool_pose(robot.home, arm) for arm in robot.arms}
     for name, motion in MOTIONS.items():
         controller.reset(robot.home)
         for tick in range(ticks // len(MOTIONS)):
-            if name == "recovery" and tick % _ANEW == 0:
+            if name == "recovery" and tick % _TICKS_PER_RECOVERY == 0:
                 controller.reset(outside(robot, random))
             targets = motion(tick * DT, start)
             yield qpbenchmark.Problem.from_qpsolvers(controller.problem(targets, DT), f"{name}_{tick:04d}")
@@ -119,7 +119,7 @@ def write(path: Path, ticks: int) -> None:
 
 
 def solve(test_set: QpProblems, count: int) -> qpbenchmark.Results:
-    """The results of all installed solvers and all settings, of ``count`` problems evenly spread over the set."""
+    """Return the results of all installed solvers and settings for ``count`` problems, evenly spread over the set."""
     total = test_set.count_problems()
     chosen = set(np.linspace(0, total - 1, min(count, total)).astype(int).tolist())
     rows: list[dict[str, Any]] = []
@@ -132,14 +132,14 @@ def solve(test_set: QpProblems, count: int) -> qpbenchmark.Results:
             for settings, by_solver in test_set.solver_settings.items():
                 rows.append(_row(problem, solver, settings, by_solver[solver]))
     results = qpbenchmark.Results(None, test_set)
-    # In one go, since a row that is added by ``update`` copies all others.
+    # All rows are added at once, because ``update`` copies all earlier rows for each new one.
     results.df = pandas.DataFrame(rows)
     return results
 
 
 def _row(problem: qpbenchmark.Problem, solver: str, settings: str, options: Mapping[str, Any]) -> dict[str, Any]:
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of matrices that a solver wants sparse
+        warnings.simplefilter("ignore")  # Some solvers warn that they convert dense matrices to sparse ones.
         solution, runtime = time_solve_problem(problem, solver, **options)
     return {
         "problem": problem.name,
@@ -154,7 +154,7 @@ def _row(problem: qpbenchmark.Problem, solver: str, settings: str, options: Mapp
 
 
 def success_rates(results: qpbenchmark.Results) -> pandas.DataFrame:
-    """Percentage of problems that each solver solves, by solver and settings, as qpbenchmark's reports have it."""
+    """Return the percentage of solved problems by solver and settings, as qpbenchmark's reports have it."""
     tolerances = results.test_set.tolerances
     by_kind = [
         {name: getattr(tolerance, kind) for name, tolerance in tolerances.items()} for kind in ("primal", "dual", "gap")
@@ -163,7 +163,7 @@ def success_rates(results: qpbenchmark.Results) -> pandas.DataFrame:
 
 
 def table_of(results: qpbenchmark.Results, ticks: int, solved: int) -> Table:
-    """Success rates, and the median time of a solve with default settings."""
+    """Return the table of success rates, with the median time of a solve with default settings."""
     rates = success_rates(results)
     default = results.df[results.df["settings"] == "default"]
     median = 1e6 * default.groupby("solver")["runtime"].median()
@@ -172,17 +172,21 @@ def table_of(results: qpbenchmark.Results, ticks: int, solved: int) -> Table:
         f"QPs of {ticks} ticks, {solved} of them solved",
         ("solver", "default [%]", "1e-3 [%]", "1e-6 [%]", "1e-9 [%]", "median [us]"),
         [(solver, *(float(rates.at[solver, name]) for name in order), float(median[solver])) for solver in rates.index],
-        ("solved: primal and dual residual and duality gap below 1, 1e-3, 1e-6, 1e-9; median: of a default solve",),
+        (
+            "default, 1e-3, 1e-6, 1e-9: Share of problems whose primal and dual residuals and duality gap are below "
+            "this tolerance. The tolerance of default is 1.",
+            "median: Median time of a solve with default settings.",
+        ),
     )
 
 
 def main(
-    ticks: Annotated[int, typer.Option(min=4, help="Whose QPs are written.")] = TICKS,
-    solved: Annotated[int, typer.Option(min=1, help="Problems to solve, evenly spread.")] = SOLVED,
-    file: Annotated[Path, typer.Option(help="Where the test set is written.")] = FILE,
+    ticks: Annotated[int, typer.Option(min=4, help="Number of ticks whose QPs are written.")] = TICKS,
+    solved: Annotated[int, typer.Option(min=1, help="Number of problems to solve, evenly spread.")] = SOLVED_PROBLEMS,
+    file: Annotated[Path, typer.Option(help="The file to which the test set is written.")] = FILE,
     json: Json = False,
 ) -> None:
-    """Write the test set, solve a part of it by every installed solver, and print the success rates."""
+    """Write the test set, solve a part of it with every installed solver, and print the success rates."""
     print_progress(f"{ticks} ticks")
     write(file, ticks)
     with printing_to_stderr():

@@ -1,7 +1,7 @@
-"""Do the arms come to rest at constant targets that they cannot reach or get in each other's way at, and how smoothly?
+"""Do the arms come to rest, and how smoothly, at constant targets that they cannot reach or that bring them together?
 
-Each tool is asked for a place drawn at random, near where both work or on the other arm's side, until the end. Most of
-these cannot be reached with every distance kept: the arms slide along each other, for seconds, until they rest.
+Each tool gets a constant target at random, near the place where both arms work or on the other arm's side. Most targets
+cannot be reached with every distance kept. The arms then slide along each other for seconds until they rest.
 """
 
 from __future__ import annotations
@@ -20,62 +20,68 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 from q2r2_control.viewer.tables import record_table
 
-RUNS = 50  # of each kind
-DURATION = 30.0  # [s]
-DT = 0.001  # [s]
-AT_REST = 0.1  # RMS of the acceleration over the last 0.5 s, norm over the joints [rad/s^2]
-STARTED = 2.0  # when a slide has begun, and what the targets' jump did is over [s]
+RUNS_PER_KIND = 50  # Number of runs of each kind.
+DURATION_S = 30.0  # Duration of a run [s].
+DT = 0.001  # Period of a tick [s].
+# Largest acceleration of arms at rest: RMS over the last 0.5 s of the norm over the joints [rad/s^2].
+MAX_REST_ACCELERATION = 0.1
+# Time after which the jump of the targets no longer has an effect, and slides have begun [s].
+JOLTS_COUNT_AFTER_S = 2.0
 NOTES = (
-    f"targets stay where they are for {DURATION:g} s; most cannot be reached with every distance kept",
-    f"at rest: acceleration, norm over the joints, RMS over the last 0.5 s, below {AT_REST:g} rad/s^2",
-    f"jolts: ticks of a run after {STARTED:g} s in which a joint's acceleration changes by more than {JOLT:g} rad/s^2",
-    "fallback ticks: in which the certified stop was executed, in all runs",
+    f"Targets stay constant for {DURATION_S:g} s. Most of them cannot be reached with every distance kept.",
+    f"at rest: Number of runs that end with an acceleration below {MAX_REST_ACCELERATION:g} rad/s^2.",
+    "acceleration: RMS over the last 0.5 s of the norm over the joints [rad/s^2].",
+    f"jolts: Number of ticks of a run after {JOLTS_COUNT_AFTER_S:g} s in which a joint's acceleration changes by more "
+    f"than {JOLT:g} rad/s^2.",
+    "fallback ticks: Number of ticks of all runs in which the certified stop was executed.",
 )
 
-# From the middle between both tools at home, for the left tool; of the right one the second is the other way [m].
+# Range of the left tool's target, measured from the middle between both tools at home [m]. For the right tool, y has
+# the opposite sign.
 KINDS: dict[str, tuple[Array, Array]] = {
     "anywhere": (np.array([-0.25, -0.35, -0.3]), np.array([0.25, 0.35, 0.3])),
     "other side": (np.array([-0.2, -0.35, -0.15]), np.array([0.2, 0.0, 0.3])),
 }
-_TURN = 0.4  # standard deviation of each component of the rotation from home [rad]
+_ROTATION_DEVIATION = 0.4  # Standard deviation of each component of the rotation from home [rad].
 
 
 @dataclass(frozen=True, slots=True)
 class RestFigures:
-    """All runs of one kind."""
+    """The figures of all runs of one kind."""
 
     kind: str
     runs: int
-    at_rest: int  # of these, at the end
-    median_acceleration: float  # RMS over the last 0.5 s, norm over the joints [rad/s^2]
-    worst_acceleration: float
-    jolts: float  # ticks from STARTED on in which a joint's acceleration changes by more than JOLT, in a run
-    most_jolts: int
-    fallback_ticks: int  # of all runs
+    at_rest: int  # Number of runs whose arms rest at the end.
+    median_acceleration: float  # Median of the runs' RMS over the last 0.5 s of the norm over the joints [rad/s^2].
+    worst_acceleration: float  # Largest of these accelerations [rad/s^2].
+    # Mean number of ticks of a run after JOLTS_COUNT_AFTER_S in which an acceleration changes by more than JOLT.
+    jolts: float
+    most_jolts: int  # Largest number of such ticks in one run.
+    fallback_ticks: int  # Number of ticks of all runs in which the certified stop was executed.
 
 
-def run_rest(config: Config, seed: int, runs: int = RUNS) -> list[RestFigures]:
-    """Ask for ``runs`` pairs of targets of each kind; the same ones for the same ``seed``."""
+def run_rest(config: Config, seed: int, runs: int = RUNS_PER_KIND) -> list[RestFigures]:
+    """Run with ``runs`` pairs of targets of each kind. The same ``seed`` gives the same targets."""
     robot = Robot.from_config(config)
     controller = OwnController(robot, config)
     figures = []
     for number, kind in enumerate(KINDS):
         random = np.random.default_rng((seed, number))
-        print_progress(f"{kind}: {runs} pairs of targets, {DURATION:g} s each")
+        print_progress(f"{kind}: {runs} pairs of targets, {DURATION_S:g} s each")
         rest, jolts, fallbacks = np.empty(runs), np.empty(runs, dtype=np.int64), 0
         for run in range(runs):
-            v = np.empty((round(DURATION / DT), robot.model.nv))
+            v = np.empty((round(DURATION_S / DT), robot.model.nv))
             targets = draw_targets(robot, kind, random)
             controller.reset(robot.home)
             for tick in range(len(v)):
                 v[tick] = controller.step(targets, DT)[1]
-            rest[run], jolts[run] = rest_acceleration(v, DT), count_jolts(v, DT, STARTED)
+            rest[run], jolts[run] = rest_acceleration(v, DT), count_jolts(v, DT, JOLTS_COUNT_AFTER_S)
             fallbacks += sum(controller.stopped)
         figures.append(
             RestFigures(
                 kind=kind,
                 runs=runs,
-                at_rest=int((rest < AT_REST).sum()),
+                at_rest=int((rest < MAX_REST_ACCELERATION).sum()),
                 median_acceleration=float(np.median(rest)),
                 worst_acceleration=float(rest.max()),
                 jolts=float(jolts.mean()),
@@ -87,7 +93,7 @@ def run_rest(config: Config, seed: int, runs: int = RUNS) -> list[RestFigures]:
 
 
 def draw_targets(robot: Robot, kind: str, random: np.random.Generator) -> dict[str, pin.SE3]:
-    """A pose for each tool, turned a little from how it is at home."""
+    """Return a random target for each tool, turned a little from its rotation at home."""
     home = {arm: robot.tool_pose(robot.home, arm) for arm in robot.arms}
     middle = np.mean([pose.translation for pose in home.values()], axis=0)
     targets = {}
@@ -95,19 +101,19 @@ def draw_targets(robot: Robot, kind: str, random: np.random.Generator) -> dict[s
         place = random.uniform(*KINDS[kind])
         if arm != "left":
             place[1] *= -1.0
-        targets[arm] = pin.SE3(pin.exp3(_TURN * random.normal(size=3)) @ pose.rotation, middle + place)
+        targets[arm] = pin.SE3(pin.exp3(_ROTATION_DEVIATION * random.normal(size=3)) @ pose.rotation, middle + place)
     return targets
 
 
 def main(
-    seed: Annotated[int, typer.Option(min=0, help="Of the targets.")] = 0,
-    runs: Annotated[int, typer.Option(min=1, help="Of each kind of targets.")] = RUNS,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the targets.")] = 0,
+    runs: Annotated[int, typer.Option(min=1, help="Number of runs for each kind of targets.")] = RUNS_PER_KIND,
     json: Json = False,
 ) -> None:
-    """Ask for constant targets drawn at random, and print how quiet the arms are at the end."""
+    """Move the arms to constant random targets, and print how quiet the arms are at the end."""
     config = load_config(DEMO_CONFIG)
     figures = run_rest(config, seed, runs)
-    table = record_table(f"{config.name}: constant targets, seed {seed}", figures, NOTES)
+    table = record_table(f"{config.name}: Constant targets, seed {seed}", figures, NOTES)
     print_report({"cell": config.name, "seed": seed, "kinds": figures}, (table,), json)
 
 

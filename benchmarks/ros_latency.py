@@ -1,8 +1,8 @@
 """How long does it take from a message on an input topic to the joint command that answers it, through real nodes?
 
-Runs real processes on this machine, in a ROS domain that nothing else uses: the simulated robot, the controller, and
-one arm's teleoperation. The input steps up and down by millimetres at random times. The command that answers a step is
-the first after it with an acceleration that only a step causes.
+The simulated robot, the controller, and the teleoperation of one arm run as real processes on this machine. They have a
+ROS domain of their own. The input steps up and down by millimetres at random times. The command that answers a step is
+the first one after it whose acceleration only a step can cause.
 """
 
 from __future__ import annotations
@@ -30,56 +30,60 @@ from q2r2_control.types import Array
 from q2r2_control.viewer.tables import figure_table
 from ros_processes import private_domain, started
 
-_START_TIMEOUT = 300.0  # kernels may have to be compiled [s]
-_STEP = 0.002  # [m]
-_PAUSES = 0.07, 0.11  # between two steps; shorter than any timeout of a stream [s]
-_PRESS, _CHORD = 0.3, 0.3  # the lower button is held, and what follows its release [s]
-# The shortest delays that the hand's filters allow, so that mostly the nodes are measured.
+_START_TIMEOUT_S = 300.0  # Timeout for the nodes, which may have to compile kernels first [s].
+_STEP_SIZE = 0.002  # Size of a step [m].
+_STEP_PAUSES_S = 0.07, 0.11  # Shortest and longest time between two steps, below any timeout of a stream [s].
+_PRESS_S, _AFTER_PRESS_S = 0.3, 0.3  # Duration of a press of the lower button, and waiting time after its release [s].
+# Settings with the shortest delays that the hand's filters allow, so that mostly the nodes are measured.
 _SHORTEST_FILTER = {"interpolation_delay": 0.005, "smoothing_delay": 0.0, "min_cutoff": 100.0, "beta": 1000.0}
 
 
-# Share of the acceleration limit that marks an answer: a step asks for all of it, the one before for a tenth by then.
+# Share of the acceleration limit that marks an answer. A step asks for the whole limit. The motion that is left of the
+# step before it asks for a tenth of the limit by then.
 _ANSWER_SHARE = 0.4
 
 
 @dataclass(frozen=True, slots=True)
 class CommandRecording:
-    """Steps of one input and the joint commands meanwhile; times of one clock [s], ascending."""
+    """The steps of one input and the joint commands meanwhile. Times are ascending and come from one clock [s]."""
 
-    steps: Sequence[float]  # when each step was published
-    sent: Sequence[float]  # when each command was published, by the middleware's stamps
-    received: Sequence[float]  # and received
-    v: Array  # (n, nv) of the commands [rad/s]
+    steps: Sequence[float]  # Time when each step was published.
+    sent: Sequence[float]  # Time when each command was published, from the middleware's stamps.
+    received: Sequence[float]  # Time when each command was received, from the middleware's stamps.
+    v: Array  # Velocities of the commands (n, nv) [rad/s].
 
 
 @dataclass(frozen=True, slots=True)
 class LatencyRow:
-    """Latencies of one input, from the step until the command was received."""
+    """The latencies of one input, from the step until the command was received. They are None without any answer."""
 
-    path: str  # from which topic to which
-    steps: int
-    missed: int  # not answered before the next step
-    p50_ms: float | None  # None without any answer
+    path: str  # Names of the first and the last topic.
+    steps: int  # Number of steps.
+    missed: int  # Number of steps that were not answered before the next step.
+    p50_ms: float | None
     p99_ms: float | None
     max_ms: float | None
 
 
 @dataclass(frozen=True, slots=True)
 class LatencyReport:
-    """The measured latencies."""
+    """The measured latencies of all inputs."""
 
-    loop_rate_hz: float  # of the controller, as configured
-    transport_p50_ms: float  # of a joint command between two processes, contained in all rows
-    transport_p99_ms: float
+    loop_rate_hz: float  # Configured loop rate of the controller.
+    transport_p50_ms: float  # Median time that a joint command takes between two processes. All rows include it.
+    transport_p99_ms: float  # 99th percentile of the same time.
     rows: tuple[LatencyRow, ...]
 
 
 class LatencyError(Q2R2Error):
-    """A node did not start in time; the message says what was waited for."""
+    """An error of a node that did not start in time. The message says what was waited for."""
 
 
 def measure_latency(config: str, duration: float, rate: float) -> LatencyReport:
-    """Measure for ``duration`` [s] each way, with the controller at ``rate`` [Hz]. Raises :class:`LatencyError`."""
+    """Measure each input for ``duration`` [s], with the controller at ``rate`` [Hz].
+
+    Raises :class:`LatencyError` if a node does not start in time.
+    """
     cell = load_config(config)
     limit = Robot.from_config(cell).capped_acceleration(cell.control.acceleration_limit)
     filters = {f"teleop.filter.{name}": value for name, value in _SHORTEST_FILTER.items()}
@@ -89,12 +93,12 @@ def measure_latency(config: str, duration: float, rate: float) -> LatencyReport:
     ]
     arm = NodeProcess("left_arm_controller", filters)
     with private_domain(), started(nodes), _Probe() as probe:
-        print_progress("waiting for the controller")
+        print_progress("Waiting for the controller.")
         probe.wait_for_tool()
         print_progress(f"target topic to joint command: {duration:g} s")
         target = probe.step_targets(duration)
         with started([arm]):
-            print_progress("waiting for the arm's teleoperation")
+            print_progress("Waiting for the arm's teleoperation.")
             probe.engage_hand()
             print_progress(f"hand topic to joint command: {duration:g} s")
             hand = probe.step_hand(duration)
@@ -102,7 +106,7 @@ def measure_latency(config: str, duration: float, rate: float) -> LatencyReport:
 
 
 class _Probe:
-    """Publishes steps and records commands. Their times are the middleware's, so a late callback changes none."""
+    """A node that publishes steps and records commands. Their times are the middleware's, whenever a callback runs."""
 
     def __init__(self) -> None:
         self._context = rclpy.Context()
@@ -110,7 +114,7 @@ class _Probe:
         self._node = rclpy.create_node("latency_probe", context=self._context)
         self._commands: list[tuple[float, float, list[float]]] = []
         self._tool: PoseStamped | None = None
-        listen: Any = self._on_command  # rclpy's types know callbacks without the message's stamps only
+        listen: Any = self._on_command  # rclpy's type hints do not know callbacks that get the message's stamps.
         self._node.create_subscription(JointTrajectory, "/joint_trajectory", listen, 1000)
         self._node.create_subscription(PoseStamped, "/cartesian_controller/safe_target/left", self._on_tool, 1)
         self._target = self._node.create_publisher(PoseStamped, "/q2r2/left/target_frame", COMMAND_QOS)
@@ -133,32 +137,32 @@ class _Probe:
         self._wait(lambda: self._target.get_subscription_count() > 0, "cartesian_controller's subscription")
 
     def step_targets(self, duration: float) -> CommandRecording:
-        """Step the target up and down at the tool."""
+        """Step the target up and down at the tool's pose."""
         assert self._tool is not None
         recording = self._step(self._target, self._tool, duration, lambda: None)
-        self._node.destroy_publisher(self._target)  # the next one is the arm controller's
+        self._node.destroy_publisher(self._target)  # The arm's node publishes the targets from now on.
         return recording
 
     def engage_hand(self) -> None:
-        """Press the lower button until the arm's node publishes targets, and goes on.
+        """Press the lower button until the arm's node keeps publishing targets.
 
-        A press that is answered late may meet the next one, which pauses the arm again. The answer is therefore looked
-        for after the buttons rest, not among messages that came while they were pressed.
+        If a press is answered late, the next press may already pause the arm again. Therefore only targets count that
+        come after the buttons were released, not those that came during a press.
         """
         targets: list[PoseStamped] = []
         subscription = self._node.create_subscription(PoseStamped, "/q2r2/left/target_frame", targets.append, 1)
-        deadline = time.monotonic() + _START_TIMEOUT
+        deadline = time.monotonic() + _START_TIMEOUT_S
         while not targets:
             if time.monotonic() > deadline:
-                raise LatencyError(f"left_arm_controller was not engaged within {_START_TIMEOUT:g} s")
-            for pressed, period in ((True, _PRESS), (False, _CHORD)):
+                raise LatencyError(f"left_arm_controller was not engaged within {_START_TIMEOUT_S:g} s")
+            for pressed, period in ((True, _PRESS_S), (False, _AFTER_PRESS_S)):
                 self._send_hand(pressed, period)
             targets.clear()
-            self._send_hand(False, _CHORD)
+            self._send_hand(False, _AFTER_PRESS_S)
         self._node.destroy_subscription(subscription)
 
     def step_hand(self, duration: float) -> CommandRecording:
-        """Step the hand's pose."""
+        """Step the hand's pose up and down."""
         return self._step(self._hand, _pose(), duration, lambda: self._inputs.publish(OVR2ROSInputs()))
 
     def _step(
@@ -171,10 +175,10 @@ class _Probe:
         end = time.monotonic() + duration
         while time.monotonic() < end:
             beside()
-            message.pose.position.z = height + _STEP * (len(steps) % 2)
-            steps.append(time.time())  # the clock of the middleware's stamps
+            message.pose.position.z = height + _STEP_SIZE * (len(steps) % 2)
+            steps.append(time.time())  # This is the clock of the middleware's stamps.
             publisher.publish(message)
-            self._spin(random.uniform(*_PAUSES))
+            self._spin(random.uniform(*_STEP_PAUSES_S))
         if not self._commands:
             raise LatencyError(f"no joint command came within {duration:g} s")
         sent, received, v = (list(column) for column in zip(*self._commands, strict=True))
@@ -188,10 +192,10 @@ class _Probe:
             self._spin(0.02)
 
     def _wait(self, condition: Callable[[], object], what: str) -> None:
-        deadline = time.monotonic() + _START_TIMEOUT
+        deadline = time.monotonic() + _START_TIMEOUT_S
         while not condition():
             if time.monotonic() > deadline:
-                raise LatencyError(f"waited {_START_TIMEOUT:g} s for {what}")
+                raise LatencyError(f"waited {_START_TIMEOUT_S:g} s for {what}")
             self._spin(0.05)
 
     def _spin(self, period: float) -> None:
@@ -214,7 +218,10 @@ def _pose() -> PoseStamped:
 
 
 def latency_report(rate: float, acceleration_limit: Array, recordings: Mapping[str, CommandRecording]) -> LatencyReport:
-    """Latencies by path, of a controller at ``rate`` [Hz] with ``acceleration_limit`` (nv,) [rad/s^2]."""
+    """Return the latencies of each path.
+
+    The controller runs at ``rate`` [Hz] and has the ``acceleration_limit`` (nv,) [rad/s^2].
+    """
     transport = 1e3 * np.concatenate(
         [np.subtract(recording.received, recording.sent) for recording in recordings.values()]
     )
@@ -225,14 +232,14 @@ def latency_report(rate: float, acceleration_limit: Array, recordings: Mapping[s
 
 
 def _row(path: str, recording: CommandRecording, acceleration_limit: Array) -> LatencyRow:
-    """Find the first command after each step with an acceleration that only a step causes."""
+    """Find the first command after each step whose acceleration only a step can cause, and return the latencies."""
     times = np.asarray(recording.sent)
-    # Ticks may be early or late, so changes of velocity are divided by dt; half the usual dt is the least that counts.
+    # Ticks may be early or late, so each change of velocity is compared with its own dt, at least half the usual dt.
     dt = np.diff(times)
     change = np.abs(np.diff(recording.v, axis=0) / acceleration_limit).max(axis=1)
     answering = np.concatenate([[False], change > _ANSWER_SHARE * np.maximum(dt, 0.5 * np.median(dt))])
     latencies = []
-    # The last step is left out: the recording ends before its answer.
+    # The last step is left out, because the recording ends before its answer.
     for step, following in zip(recording.steps[:-1], recording.steps[1:], strict=True):
         first, last = np.searchsorted(times, [step, following])
         if len(found := np.flatnonzero(answering[first:last])):
@@ -243,20 +250,20 @@ def _row(path: str, recording: CommandRecording, acceleration_limit: Array) -> L
 
 
 def main(
-    duration: Annotated[float, typer.Option(min=1, max=3600, help="Of each input [s].")] = 30.0,
-    rate: Annotated[float, typer.Option(min=20, max=1000, help="Of the controller's node [Hz].")] = 250.0,
+    duration: Annotated[float, typer.Option(min=1, max=3600, help="Duration for each input [s].")] = 30.0,
+    rate: Annotated[float, typer.Option(min=20, max=1000, help="Rate of the controller's node [Hz].")] = 250.0,
     json: Json = False,
 ) -> None:
-    """Print latencies from an input topic to the joint command that answers it."""
+    """Print the latencies from an input topic to the joint command that answers it."""
     report = measure_latency(DEMO_CONFIG, duration, rate)
     table = figure_table(
-        f"from an input topic to the joint command that answers it, controller at {rate:g} Hz",
+        f"Latency from an input topic to the joint command that answers it, controller at {rate:g} Hz",
         ("path", "p50 [ms]", "p99 [ms]", "max [ms]", "steps", "missed"),
         ((row.path, row.p50_ms, row.p99_ms, row.max_ms, row.steps, row.missed) for row in report.rows),
         (
-            f"one joint command between two processes: p50 {report.transport_p50_ms:.2f} ms, "
-            f"p99 {report.transport_p99_ms:.2f} ms",
-            "the hand's latency includes an interpolation of 5 ms, the shortest; its filters are off",
+            f"A joint command alone takes {report.transport_p50_ms:.2f} ms between two processes in the median, and "
+            f"{report.transport_p99_ms:.2f} ms at the 99th percentile.",
+            "The hand's latency includes an interpolation of 5 ms, which is the shortest one. Its filters are off.",
         ),
     )
     print_report(report, (table,), json)

@@ -1,4 +1,4 @@
-"""How much processor time does the set of ``q2r2 ros up`` need, and how evenly do its commands move?"""
+"""How much processor time do the nodes of ``q2r2 ros up`` need, and how even is the motion of their commands?"""
 
 from __future__ import annotations
 
@@ -26,51 +26,53 @@ from q2r2_control.types import Array
 from q2r2_control.viewer.tables import figure_table
 from ros_processes import private_domain, processor_time, started
 
-_START_TIMEOUT = 300.0  # kernels may have to be compiled [s]
-_SETTLE = 3.0  # after the nodes have begun, and after the hands have [s]
-_JITTER = 0.002  # of a headset's samples: each comes later by up to this [s]
-_TREND = 0.15  # a slower motion is the hand's own, a faster one is ripple [s]
-_RATED = "mujoco_robot", "cartesian_controller"
-_SCRIPT = NodeProcess("SimulationInput", {"jitter": _JITTER})
+_START_TIMEOUT_S = 300.0  # Timeout for the nodes, which may have to compile kernels first [s].
+_SETTLING_S = 3.0  # Time to wait after the nodes have started, and again after the hands have [s].
+_SAMPLE_JITTER_S = 0.002  # Largest random delay of a headset's sample [s].
+_TREND_WINDOW_S = 0.15  # Width of the window that separates the hand's own slow motion from faster ripple [s].
+_NODES_WITH_RATE = "mujoco_robot", "cartesian_controller"  # Nodes whose rate is set.
+_SCRIPTED_HANDS = NodeProcess("SimulationInput", {"jitter": _SAMPLE_JITTER_S})
 
 
 @dataclass(frozen=True, slots=True)
 class NodeLoad:
-    """Processor time of one node, in percent of one core."""
+    """The processor time of one node, in percent of one core."""
 
     node: str
-    idle: float  # all are up and no arm is engaged
-    moving: float  # both arms follow circles
+    idle: float  # Load while all nodes run and no arm is engaged.
+    moving: float  # Load while both arms follow circles.
 
 
 @dataclass(frozen=True, slots=True)
 class LoadReport:
-    """The measured figures of the whole set."""
+    """The measured figures of all nodes."""
 
-    seconds: float  # of each of both
-    jitter: float  # each sample of the hands comes later by up to this, at random [s]
+    seconds: float  # Duration of each of the two measurements [s].
+    jitter: float  # Largest random delay of a hand's sample [s].
     rows: tuple[NodeLoad, ...]
-    commands_hz: float
-    speed_ripple: float  # RMS of the joints' commanded speed about its trend, as a share of its RMS, to a robot
+    commands_hz: float  # Number of joint commands per second.
+    # RMS of the commanded joint speeds about their trend, as a share of the trend's RMS, as a robot receives them.
+    speed_ripple: float
 
     @property
     def total(self) -> NodeLoad:
-        """All nodes together."""
+        """The load of all nodes together."""
         return NodeLoad("all", sum(row.idle for row in self.rows), sum(row.moving for row in self.rows))
 
 
 class LoadError(Q2R2Error):
-    """The nodes did not begin in time; the message says what was waited for."""
+    """An error of nodes that did not start in time. The message says what was waited for."""
 
 
 def speed_ripple(times: Array, q: Array) -> float:
-    """RMS of the speeds between joint positions about their trend, as a share of the trend's RMS.
+    """Return the RMS of the joint speeds about their trend, as a share of the trend's RMS.
 
-    ``times`` (n,) [s], ascending; ``q`` (n, nv) [rad]. The trend is a mean over 0.15 s, weighted by a Hann window.
+    The speeds are those between the joint positions ``q`` (n, nv) [rad] at the ascending ``times`` (n,) [s]. The trend
+    is a mean over 0.15 s, weighted by a Hann window.
     """
     dt = np.diff(times)
     v = np.diff(q, axis=0) / dt[:, None]
-    window = np.hanning(2 * max(round(_TREND / float(np.median(dt)) / 2.0), 1) + 1)
+    window = np.hanning(2 * max(round(_TREND_WINDOW_S / float(np.median(dt)) / 2.0), 1) + 1)
     trend = np.apply_along_axis(lambda column: np.convolve(column, window / window.sum(), "valid"), 0, v)
     margin = len(window) // 2
     ripple = v[margin : len(v) - margin] - trend
@@ -78,24 +80,26 @@ def speed_ripple(times: Array, q: Array) -> float:
 
 
 def measure_load(config: str, duration: float, rate: float) -> LoadReport:
-    """Measure for ``duration`` [s] at rest, and as long with both arms moving. Raises :class:`LoadError`.
+    """Measure for ``duration`` [s] at rest, and for the same time with both arms moving.
 
-    ``rate`` of robot and controller [Hz].
+    ``rate`` is that of robot and controller [Hz]. Raises :class:`LoadError` if a node does not start in time or an arm
+    is paused.
     """
     nodes, arms = nodes_of(config, "none"), len(load_config(config).arms)
     nodes = [
-        replace(node, parameters={**node.parameters, "rate": rate}) if node.name in _RATED else node for node in nodes
+        replace(node, parameters={**node.parameters, "rate": rate}) if node.name in _NODES_WITH_RATE else node
+        for node in nodes
     ]
     with private_domain(), _Watcher() as watcher, started(nodes) as processes:
-        print_progress("waiting for all nodes")
+        print_progress("Waiting for all nodes.")
         watcher.wait(lambda: watcher.active and len(watcher.engaged) == arms, "the nodes")
-        watcher.spin(_SETTLE)
+        watcher.spin(_SETTLING_S)
         print_progress(f"idle: {duration:g} s")
         idle = watcher.shares(processes, duration)
-        with started([_SCRIPT]) as script:
-            print_progress("waiting for the arms to follow")
+        with started([_SCRIPTED_HANDS]) as script:
+            print_progress("Waiting for the arms to follow.")
             watcher.wait(lambda: all(watcher.engaged.values()), "the arms to follow")
-            watcher.spin(_SETTLE)
+            watcher.spin(_SETTLING_S)
             print_progress(f"moving: {duration:g} s")
             watcher.forget_commands()
             moving = watcher.shares(processes | script, duration)
@@ -103,22 +107,22 @@ def measure_load(config: str, duration: float, rate: float) -> LoadReport:
         raise LoadError(f"an arm was paused within {duration:g} s: {watcher.last_event}")
     times, q = watcher.commands()
     rows = tuple(NodeLoad(name, idle.get(name, 0.0), moving[name]) for name in moving)
-    return LoadReport(duration, _JITTER, rows, len(times) / duration, speed_ripple(times_of_a_robot(times), q))
+    return LoadReport(duration, _SAMPLE_JITTER_S, rows, len(times) / duration, speed_ripple(times_of_a_robot(times), q))
 
 
 class _Watcher:
-    """Listens to the nodes' states and to the joint commands, whose times are the middleware's at the sender."""
+    """A node that listens to the nodes' states and to joint commands, with the middleware's times at the sender."""
 
     def __init__(self) -> None:
-        self.active = False  # the controller
-        self.engaged: dict[str, bool] = {}  # by arm
-        self.last_event: dict[str, str] = {}  # by arm
-        self._commands: list[tuple[int, bytes]] = []  # time [ns] and message
+        self.active = False  # True if the controller is active.
+        self.engaged: dict[str, bool] = {}  # By arm, True if it is engaged.
+        self.last_event: dict[str, str] = {}  # Last event of each arm.
+        self._commands: list[tuple[int, bytes]] = []  # Time [ns] and serialized message of each command.
         self._context = rclpy.Context()
         rclpy.init(context=self._context)
         self._node = rclpy.create_node("load_watcher", context=self._context)
-        # Read after the run: a watcher that reads while it listens takes as much time as a node.
-        listen: Any = self._on_command  # rclpy's types know callbacks without the message's stamps only
+        # Messages are read after the run, because reading them at once would take as much time as a node takes.
+        listen: Any = self._on_command  # rclpy's type hints do not know callbacks that get the message's stamps.
         qos = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
         node: Any = self._node
         node.tick_group = TickGroup()
@@ -140,10 +144,10 @@ class _Watcher:
 
     def wait(self, condition: Callable[[], object], what: str) -> None:
         """Listen until ``condition`` holds."""
-        deadline = time.monotonic() + _START_TIMEOUT
+        deadline = time.monotonic() + _START_TIMEOUT_S
         while not condition():
             if time.monotonic() > deadline:
-                raise LoadError(f"waited {_START_TIMEOUT:g} s for {what}")
+                raise LoadError(f"waited {_START_TIMEOUT_S:g} s for {what}")
             self._executor.spin_once(0.05)
 
     def spin(self, period: float) -> None:
@@ -153,7 +157,7 @@ class _Watcher:
             self._executor.spin_once(left)
 
     def shares(self, processes: Mapping[str, int], duration: float) -> dict[str, float]:
-        """The share of one core that each process takes for ``duration`` [s], in percent."""
+        """Measure for ``duration`` [s], and return the share of one core that each process takes, in percent."""
         began, before = time.monotonic(), {name: processor_time(pid) for name, pid in processes.items()}
         self.spin(duration)
         passed = time.monotonic() - began
@@ -163,7 +167,7 @@ class _Watcher:
         self._commands.clear()
 
     def commands(self) -> tuple[Array, Array]:
-        """Times (n,) [s] and positions (n, nv) [rad] of those that were heard."""
+        """Return times (n,) [s] and positions (n, nv) [rad] of the received commands."""
         messages = [deserialize_message(payload, JointTrajectory) for _, payload in self._commands]
         times = 1e-9 * np.array([at for at, _ in self._commands], dtype=float)
         return times, np.array([message.points[0].positions for message in messages])
@@ -180,10 +184,10 @@ class _Watcher:
 
 
 def times_of_a_robot(times: Array) -> Array:
-    """When a robot follows commands that were sent at ``times`` (n,) [s]: one of its own periods after the other.
+    """Return the times at which a robot follows commands that were sent at ``times`` (n,) [s].
 
-    It takes the newest command once a period, so a command that is a little early or late makes no difference. Where
-    one is missing it waits for two.
+    The robot takes the newest command once in each of its own periods, so small differences of their times do not
+    matter. If a command is missing, the robot waits for two periods.
     """
     gaps = np.diff(times)
     period = float(np.median(gaps))
@@ -192,20 +196,22 @@ def times_of_a_robot(times: Array) -> Array:
 
 
 def main(
-    duration: Annotated[float, typer.Option(min=1, max=3600, help="At rest, and again moving [s].")] = 30.0,
-    rate: Annotated[float, typer.Option(min=20, max=1000, help="Of robot and controller [Hz].")] = 250.0,
+    duration: Annotated[
+        float, typer.Option(min=1, max=3600, help="Duration of each measurement, at rest and in motion [s].")
+    ] = 30.0,
+    rate: Annotated[float, typer.Option(min=20, max=1000, help="Rate of robot and controller [Hz].")] = 250.0,
     json: Json = False,
 ) -> None:
-    """Print what each node takes of the processors, and how much the commanded speeds ripple."""
+    """Print the processor time of each node, and the ripple of the commanded speeds."""
     report = measure_load(DEMO_CONFIG, duration, rate)
     table = figure_table(
-        f"the nodes of q2r2 ros up with the loops at {rate:g} Hz, {duration:g} s each",
+        f"Nodes of q2r2 ros up with the loops at {rate:g} Hz, {duration:g} s each",
         ("node", "idle [% of a core]", "moving [% of a core]"),
         ((row.node, row.idle, row.moving) for row in (*report.rows, report.total)),
         (
-            f"moving: {report.commands_hz:.0f} joint commands a second; their speeds ripple by "
-            f"{100.0 * report.speed_ripple:.1f} % RMS while both hands go round circles,",
-            f"with samples up to {1e3 * report.jitter:g} ms late",
+            "moving: Both hands go round circles, with samples that are up to "
+            f"{1e3 * report.jitter:g} ms late. There are {report.commands_hz:.0f} joint commands per second, "
+            f"and their speeds have a ripple of {100.0 * report.speed_ripple:.1f} % RMS.",
         ),
     )
     print_report(asdict(report) | {"total": asdict(report.total)}, (table,), json)

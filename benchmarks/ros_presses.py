@@ -1,7 +1,7 @@
-"""How long does it take from a press until the arm moves, the first time after the nodes are ready and later?
+"""How long does it take from a press until the arm moves, for the first press after the nodes are ready and for others?
 
-The set is started anew for each first press. The hand goes round a circle all the time, so that an arm that is engaged
-moves at once. A tick of the arm's node ends with its flags, which it publishes for whoever records it.
+All nodes are started again for each first press. The hand always goes round a circle, so an engaged arm moves at once.
+Each tick of the arm's node ends with its flags, which the node publishes for recorders.
 """
 
 from __future__ import annotations
@@ -31,66 +31,70 @@ from q2r2_control.types import Array
 from q2r2_control.viewer.tables import record_table
 from ros_processes import private_domain, started
 
-_LATER = 4  # presses that engage after the first one, at each start
-_TIMEOUT = 300.0  # kernels may have to be compiled [s]
-_HELD = 0.3  # the lower button, and as long after its release: together longer than WATCHED [s]
-_STILL, _REST = 0.005, 0.5  # joints rest when all commands were slower for so long [rad/s], [s]
-_SAMPLE = 1.0 / 75.0  # from one sample of the hand to the next [s]
-_RADIUS, _TURN = 0.03, 2.0  # of the hand's circle [m], [s]
+_LATER_PRESSES = 4  # Number of presses that engage the arm after the first one, at each start of the nodes.
+_START_TIMEOUT_S = 300.0  # Timeout for the nodes, which may have to compile kernels first [s].
+# Duration of a press of the lower button, and of the pause after it. Both together are longer than WATCHED_S [s].
+_PRESS_S = 0.3
+_REST_SPEED, _REST_S = 0.005, 0.5  # The joints rest if all commands were below this speed [rad/s] for this time [s].
+_SAMPLE_PERIOD_S = 1.0 / 75.0  # Period of the hand's samples [s].
+_CIRCLE_RADIUS, _CIRCLE_PERIOD_S = 0.03, 2.0  # Radius of the hand's circle [m], and time of one turn [s].
 
 
-WATCHED = 0.5  # after a press [s]
-_MOVES = 0.02  # a joint command that is faster belongs to a motion [rad/s]
+WATCHED_S = 0.5  # Time after a press in which its answers are looked for [s].
+_MOTION_SPEED = 0.02  # A joint command above this speed belongs to a motion [rad/s].
 
 
 @dataclass(frozen=True, slots=True)
 class PressRecording:
-    """The answers to one press that was to engage an arm at rest; times of one clock [s], ascending."""
+    """The answers to one press that should engage an arm at rest. Times are ascending and come from one clock [s]."""
 
-    press: float  # when it was published
-    ticks: Sequence[float]  # of the arm's node, when each had ended; some from before the press
-    targets: Sequence[float]  # when each target was published
-    commands: Sequence[float]  # when each joint command was published
-    speeds: Sequence[float]  # of each of these, the fastest joint's [rad/s]
+    press: float  # Time when the press was published.
+    ticks: Sequence[float]  # Time when each tick of the arm's node ended. Some are before the press.
+    targets: Sequence[float]  # Time when each target was published.
+    commands: Sequence[float]  # Time when each joint command was published.
+    speeds: Sequence[float]  # Speed of the fastest joint of each joint command [rad/s].
 
 
 @dataclass(frozen=True, slots=True)
 class PressRow:
-    """Presses of one kind. Medians and maxima, in ms from the press; None where none was answered."""
+    """Medians and maxima of the presses of one kind [ms]. They are None if no press was answered."""
 
-    press: str  # which
-    count: int
-    unanswered: int  # within half a second
-    tick_p50_ms: float | None  # the longest time from one tick of the arm's node to the next, in that half second
+    press: str  # Kind of the presses.
+    count: int  # Number of presses.
+    unanswered: int  # Number of presses that nothing answered within half a second.
+    tick_p50_ms: float | None  # Longest time between two ticks of the arm's node in the half second after a press.
     tick_max_ms: float | None
-    target_p50_ms: float | None  # until the first target
+    target_p50_ms: float | None  # Time from a press until the first target.
     target_max_ms: float | None
-    motion_p50_ms: float | None  # until the first joint command that moves
+    motion_p50_ms: float | None  # Time from a press until the first joint command that moves.
     motion_max_ms: float | None
 
 
 @dataclass(frozen=True, slots=True)
 class PressReport:
-    """The measured figures of presses."""
+    """The measured figures of all presses."""
 
-    starts: int  # of the set of nodes, with one first press each
-    period_ms: float  # from one tick of the arm's node to the next, as a rule
+    starts: int  # Number of starts of all nodes. Each start has one first press.
+    period_ms: float  # Median time from one tick of the arm's node to the next.
     rows: tuple[PressRow, ...]
 
 
 class PressError(Q2R2Error):
-    """The nodes did not become ready in time; the message says what was waited for."""
+    """An error of nodes that were not ready in time. The message says what was waited for."""
 
 
 def measure_presses(config: str, starts: int) -> PressReport:
-    """Press for the first time and four times more, at each of ``starts`` of the set. Raises :class:`PressError`."""
+    """Press for the first time and four times more, at each of ``starts`` starts of the nodes.
+
+    Raises :class:`PressError` if the nodes are not ready in time.
+    """
     runs = []
     for number in range(starts):
         with private_domain(), _Hand() as hand, started(nodes_of(config, "none")):
-            print_progress(f"presses: waiting for the nodes, {number + 1} of {starts}")
+            print_progress(f"Waiting for the nodes, start {number + 1} of {starts}.")
             hand.wait_until_ready()
             run = [hand.press_to_engage()]
-            for _ in range(_LATER):
+            for _ in range(_LATER_PRESSES):
                 hand.pause()
                 run.append(hand.press_to_engage())
             runs.append(run)
@@ -98,7 +102,10 @@ def measure_presses(config: str, starts: int) -> PressReport:
 
 
 class _Hand:
-    """The left hand, and what its arm's node and the controller answer; times are the middleware's, at the sender."""
+    """A node for the left hand that records what the arm's node and the controller answer.
+
+    Times are the middleware's at the sender.
+    """
 
     def __init__(self) -> None:
         self._state: dict[str, Any] = {}
@@ -107,11 +114,12 @@ class _Hand:
         self._targets: list[float] = []
         self._commands: list[float] = []
         self._speeds: list[float] = []
-        self._moved = math.inf  # when a command moved a joint last [s] of steady time
+        self._moved = math.inf  # Time of the last command that moved a joint, by the monotonic clock [s].
         self._context = rclpy.Context()
         rclpy.init(context=self._context)
         self._node = rclpy.create_node("press_probe", context=self._context)
-        listen: Any = self._node.create_subscription  # rclpy's types know callbacks without the message's stamps only
+        # rclpy's type hints do not know callbacks that get the message's stamps.
+        listen: Any = self._node.create_subscription
         listen(Float64MultiArray, arm_flags("left"), self._on_flags, RECORDED_QOS)
         listen(PoseStamped, asked_target("left"), self._on_target, RECORDED_QOS)
         listen(JointTrajectory, "/joint_trajectory", self._on_command, STREAM_QOS)
@@ -130,53 +138,53 @@ class _Hand:
         self._context.try_shutdown()
 
     def wait_until_ready(self) -> None:
-        """Wait until the arm's node says that it can be engaged, and the arms rest."""
+        """Wait until the arm's node says that the arm can be engaged, and until the arms rest."""
         self._state = {}
         self._moved = time.monotonic()
 
         def ready() -> bool:
-            rests = time.monotonic() - self._moved > _REST
+            rests = time.monotonic() - self._moved > _REST_S
             return bool(self._state.get("ready") and not self._engaged and self._ticks and self._commands and rests)
 
         self._wait(ready, "left_arm_controller to be ready, which says: {message}")
 
     def press_to_engage(self) -> PressRecording:
-        """Press, and record what follows for as long as is watched."""
+        """Press, and record what follows for longer than :data:`WATCHED_S`."""
         for times in (self._ticks, self._targets, self._commands, self._speeds):
             del times[:-1]
-        press = time.time()  # the clock of the middleware's stamps
+        press = time.time()  # This is the clock of the middleware's stamps.
         self._press()
         return PressRecording(
             press, tuple(self._ticks), tuple(self._targets), tuple(self._commands), tuple(self._speeds)
         )
 
     def pause(self) -> None:
-        """Press once more where the arm is engaged, and wait until it can be engaged again."""
+        """Press once more if the arm is engaged, and wait until it can be engaged again."""
         if self._engaged:
             self._press()
         self.wait_until_ready()
 
     def _press(self) -> None:
         self._pressed = True
-        self._move(_HELD)
+        self._move(_PRESS_S)
         self._pressed = False
-        self._move(_HELD)
+        self._move(_PRESS_S)
 
     def _wait(self, condition: Callable[[], bool], what: str) -> None:
-        deadline = time.monotonic() + _TIMEOUT
+        deadline = time.monotonic() + _START_TIMEOUT_S
         while not condition():
             if time.monotonic() > deadline:
                 said = self._state.get("message", "nothing")
-                raise PressError(f"waited {_TIMEOUT:g} s for {what.format(message=said)}")
-            self._move(_SAMPLE)
+                raise PressError(f"waited {_START_TIMEOUT_S:g} s for {what.format(message=said)}")
+            self._move(_SAMPLE_PERIOD_S)
 
     def _move(self, period: float) -> None:
-        """Publish samples of the hand for ``period`` [s], and take what comes."""
+        """Publish samples of the hand for ``period`` [s], and receive messages meanwhile."""
         end = time.monotonic() + period
         while (now := time.monotonic()) < end:
             self._inputs.publish(OVR2ROSInputs(button_lower=self._pressed))
             self._pose.publish(_on_circle(now))
-            until = min(now + _SAMPLE, end)
+            until = min(now + _SAMPLE_PERIOD_S, end)
             while (left := until - time.monotonic()) > 0.0:
                 self._executor.spin_once(left)
 
@@ -190,7 +198,7 @@ class _Hand:
     def _on_command(self, message: JointTrajectory, info: dict[str, int]) -> None:
         self._commands.append(_sent(info))
         self._speeds.append(max(abs(v) for v in message.points[0].velocities))
-        if self._speeds[-1] > _STILL:
+        if self._speeds[-1] > _REST_SPEED:
             self._moved = time.monotonic()
 
     def _on_state(self, message: String) -> None:
@@ -202,16 +210,19 @@ def _sent(info: dict[str, int]) -> float:
 
 
 def _on_circle(now: float) -> PoseStamped:
-    """Where the hand is at ``now`` [s] of steady time."""
+    """Return the hand's pose at the time ``now`` of the monotonic clock [s]."""
     message = PoseStamped()
-    angle = 2.0 * math.pi * now / _TURN
-    message.pose.position.y, message.pose.position.z = _RADIUS * math.cos(angle), _RADIUS * math.sin(angle)
+    angle = 2.0 * math.pi * now / _CIRCLE_PERIOD_S
+    message.pose.position.y, message.pose.position.z = (
+        _CIRCLE_RADIUS * math.cos(angle),
+        _CIRCLE_RADIUS * math.sin(angle),
+    )
     message.pose.orientation.w = 1.0
     return message
 
 
 def press_report(runs: Sequence[Sequence[PressRecording]]) -> PressReport:
-    """Of runs of a set of nodes, each with the recordings of its presses in their order, at least one."""
+    """Return the figures of ``runs``, which have the recordings of at least one press each, in their order."""
     gaps = np.concatenate([np.diff(recording.ticks) for run in runs for recording in run])
     first, later = [run[0] for run in runs], [recording for run in runs for recording in run[1:]]
     return PressReport(len(runs), 1e3 * float(np.median(gaps)), (_row("first", first), _row("later", later)))
@@ -228,37 +239,44 @@ def _row(press: str, recordings: Sequence[PressRecording]) -> PressRow:
 
 
 def _times(recording: PressRecording) -> tuple[float, float, float] | None:
-    """The longest tick, and from the press until the first target and the first motion [s]."""
+    """Return the longest tick, and the times from the press until the first target and the first motion [s].
+
+    Returns None if the press was not answered.
+    """
     press = recording.press
     target = _first(np.asarray(recording.targets), press)
-    moving = np.asarray(recording.commands)[np.asarray(recording.speeds) > _MOVES]
+    moving = np.asarray(recording.commands)[np.asarray(recording.speeds) > _MOTION_SPEED]
     motion = _first(moving, press)
     if target is None or motion is None:
         return None
     ticks = np.asarray(recording.ticks)
-    # The delay by the press begins at the tick before it.
-    begin, end = np.searchsorted(ticks, [press, press + WATCHED])
+    # The delay that the press causes begins at the tick before the press.
+    begin, end = np.searchsorted(ticks, [press, press + WATCHED_S])
     longest = float(np.diff(ticks[max(begin - 1, 0) : end + 1]).max(initial=0.0))
     return longest, target, motion
 
 
 def _first(times: Array, press: float) -> float | None:
-    """How long after the press the first of ``times`` is, where that is watched yet [s]."""
-    after = times[(times >= press) & (times <= press + WATCHED)]
+    """Return the time from the press to the first of ``times`` after it, None if that is later than WATCHED_S [s]."""
+    after = times[(times >= press) & (times <= press + WATCHED_S)]
     return float(after[0] - press) if len(after) else None
 
 
 def main(
-    starts: Annotated[int, typer.Option(min=1, help="Of the set of nodes, with one first press each.")] = 3,
+    starts: Annotated[
+        int, typer.Option(min=1, help="Number of starts of all nodes. Each start has one first press.")
+    ] = 3,
     json: Json = False,
 ) -> None:
-    """Print what follows a press: the longest tick of the arm's node, the first target, the first motion."""
+    """Print the times after a press: the longest tick of the arm's node, the first target, and the first motion."""
     report = measure_presses(DEMO_CONFIG, starts)
     notes = (
-        f"tick: the longest of the arm's node within {WATCHED:g} s of the press; usually {report.period_ms:.1f} ms",
-        "target, motion: from the press until the first target, and until the first joint command that moves",
+        f"tick: Longest tick of the arm's node within {WATCHED_S:g} s after the press. The median of all ticks is "
+        f"{report.period_ms:.1f} ms.",
+        "target: Time from the press until the first target.",
+        "motion: Time from the press until the first joint command that moves.",
     )
-    table = record_table(f"from a press until the arm moves; starts of the nodes: {starts}", report.rows, notes)
+    table = record_table(f"Time from a press until the arm moves, {starts} starts of the nodes", report.rows, notes)
     print_report(report, (table,), json)
 
 

@@ -1,4 +1,4 @@
-"""Nodes as processes, for the benchmarks of ROS: in a domain of their own, ended at the end; and the time they take."""
+"""Nodes as processes in a ROS domain of their own, and their processor time, for the benchmarks of ROS."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from q2r2_control.ros.launch.processes import NodeProcess
 
 @contextmanager
 def private_domain() -> Iterator[None]:
-    """A ROS domain of its own, on this host only: no message reaches a robot on the network, or comes from one."""
+    """Use a ROS domain of its own on this host, so no message reaches a robot on the network or comes from one."""
     with domain_coordinator.domain_id() as number:
         private = {"ROS_DOMAIN_ID": str(number), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
         before = dict(os.environ)
@@ -32,7 +32,7 @@ def private_domain() -> Iterator[None]:
 
 @contextmanager
 def started(nodes: Sequence[NodeProcess]) -> Iterator[dict[str, int]]:
-    """Run the nodes as processes, and yield their ids by name; at the end they are interrupted in reverse order."""
+    """Run the nodes as processes, and yield their ids by name. At the end, interrupt them in reverse order."""
     processes = [
         subprocess.Popen(node.command(), stdin=subprocess.DEVNULL, stderr=subprocess.DEVNULL) for node in nodes
     ]
@@ -49,7 +49,7 @@ def started(nodes: Sequence[NodeProcess]) -> Iterator[dict[str, int]]:
 
 
 def processor_time(pid: int) -> float:
-    """The processor time of a process since it began [s], by Linux's /proc."""
-    # The name in parentheses may have blanks in it.
+    """Return the processor time of a process since its start, from Linux's /proc [s]."""
+    # The process name in parentheses may contain spaces.
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")

@@ -11,10 +11,10 @@ SAFETY = "q2r2_control/control/safety/"
 
 
 class Mutation(NamedTuple):
-    """One line, broken. ``old`` stands once in the file."""
+    """A change that breaks one line. ``old`` occurs exactly once in the file."""
 
     claim: str
-    file: str  # below SAFETY, or from the root where it names a folder
+    file: str  # Path from SAFETY, or from the repository's root if it contains a folder.
     old: str
     new: str
 
@@ -41,7 +41,7 @@ CERTIFICATE = (
         "data.wanted[j] = solution[j]",
     ),
     Mutation(
-        "numbers that are not finite are no solution", "safety_filter.py", "if np.isfinite(total):", "if total != 1.0:"
+        "a solution that is not finite is not used", "safety_filter.py", "if np.isfinite(total):", "if total != 1.0:"
     ),
     Mutation(
         "a stop keeps its position limits",
@@ -68,19 +68,19 @@ CERTIFICATE = (
         "if _has_room(model, data, p, time) or model.collision.bodies.box[model.collision.pairs.second[p]] == 1:",
     ),
     Mutation(
-        "between two samples the way counts",
+        "the path between two samples counts",
         "stop_certificate.py",
         "0.5 * (data.distance[p] + after - way(model, p, data.rollout.step.travel))",
         "0.5 * (data.distance[p] + after)",
     ),
     Mutation(
-        "a pair that shares a joint may come closer by the way of the stop",
+        "a pair that shares a joint may come closer by the path of the stop",
         "stop_certificate.py",
         "data.distance[p] - step - stop >= model.min_distance[p]",
         "data.distance[p] - step >= model.min_distance[p]",
     ),
     Mutation(
-        "what is left of a stop is a way too",
+        "the rest of a stop is also a path that counts",
         "stop_certificate.py",
         "if distance - rest >= threshold:",
         "if distance >= threshold:",
@@ -110,13 +110,13 @@ CERTIFICATE = (
         "if rate < -1e3:",
     ),
     Mutation(
-        "rounding does not add up",
+        "rounding errors do not add up",
         "stop_certificate.py",
         "if data.distance[p] < model.min_distance[p] - 0.5 * ROUNDING and not",
         "if data.distance[p] < -1.0 and not",
     ),
     Mutation(
-        "rounding is no penetration",
+        "a rounding error does not count as penetration",
         "safety_data.py",
         "ROUNDING = 1e-9",
         "ROUNDING = 0.0",
@@ -152,13 +152,13 @@ CERTIFICATE = (
         "needed += 0.0",
     ),
     Mutation(
-        "a gap is least inside a piece",
+        "the least gap may be inside a piece, not at its ends",
         "separating_plane.py",
         "least = min(least, value - rate * rate / (2.0 * change))",
         "least = min(least, value)",
     ),
     Mutation(
-        "a joint that rests on the way is anywhere between its ends",
+        "a joint that rests on the way may be anywhere between its ends",
         "separating_plane.py",
         "loose += min(0.0, along * piece.loose[j])",
         "loose += 0.0",
@@ -179,7 +179,7 @@ CERTIFICATE = (
         "if False:  # No rounding",
     ),
     Mutation(
-        "a distance that grows leaves the way of the stop",
+        "a distance that grows leaves room for the path of the stop",
         "safety_data.py",
         "np.asarray(data.distance - way)",
         "np.asarray(data.distance - 0.0 * way)",

@@ -1,9 +1,9 @@
 """Does each line that keeps a promise of the controller matter? Break it, and see a hostile soak or a test fail.
 
-Every row names a claim and one line that keeps it: of the certificate in safety_claims.py, and of what stands beside it
-in guard_claims.py. The line is changed in a copy of the package. For a line of the controller `q2r2 soak` runs there,
-and where that finds nothing, the tests of the line's room do. A row that nothing finds is a line without teeth: exit 1.
-Where the line is one of a kernel, all kernels are compiled anew, which takes a minute or two.
+Every row names a claim and one line that keeps it. The file safety_claims.py has the lines of the certificate, and
+guard_claims.py has those beside it. Each line is broken in a copy of the package. For a line of the controller,
+`q2r2 soak` runs there. If it finds nothing, the tests of the line's room run. If nothing finds a broken line, this
+program exits with 1. For a line of a kernel, all kernels are compiled again, which takes a minute or two.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from safety_claims import CERTIFICATE, SAFETY, Mutation
 
 ROOT = Path(__file__).resolve().parents[1]
 MUTATIONS = (*CERTIFICATE, *CONTROL, *AGES, *WATCHES, *TWO_ARMS)
-TESTS = {  # of a row, by where its line stands
+TESTS = {  # Tests that run for a row, by the folder of its line.
     SAFETY: (
         "tests/control/safety",
         "tests/control/test_contract.py",
@@ -34,11 +34,11 @@ TESTS = {  # of a row, by where its line stands
     "q2r2_control/teleop/": ("tests/teleop",),
     "q2r2_control/pipeline/": ("tests/pipeline/test_loop_clock.py", "tests/test_stalls.py"),
 }
-_LONGEST = 1800.0  # of a soak or the tests [s]
+_TIMEOUT_S = 1800.0  # Timeout for a soak or the tests [s].
 
 
 def broken_copy(mutation: Mutation, folder: Path) -> None:
-    """Write the package with one line broken, its tests, its cells and its compiled kernels, into ``folder``."""
+    """Write the package with one broken line into ``folder``, with its tests, cells and compiled kernels."""
     for name in ("q2r2_control", "tests", "config", "robots", "docs"):  # Some tests compare a page with the code.
         shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copy(ROOT / "pyproject.toml", folder)
@@ -48,12 +48,12 @@ def broken_copy(mutation: Mutation, folder: Path) -> None:
     file = folder / mutation.path
     text = file.read_text(encoding="utf-8")
     if text.count(mutation.old) != 1:
-        sys.exit(f"{mutation.path}: {mutation.old!r} stands there {text.count(mutation.old)} times; expected 1")
+        sys.exit(f"{mutation.path}: {mutation.old!r} occurs {text.count(mutation.old)} times; allowed: once")
     file.write_text(text.replace(mutation.old, mutation.new), encoding="utf-8")
 
 
 def found_by(mutation: Mutation, ticks: int, seed: int) -> str:
-    """The first broken promise of the soak, "tests", or nothing where neither finds the line."""
+    """Return the first broken promise of the soak or the first failed test, or an empty text if nothing fails."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         broken_copy(mutation, folder)
@@ -62,7 +62,7 @@ def found_by(mutation: Mutation, ticks: int, seed: int) -> str:
         def run(*arguments: str) -> subprocess.CompletedProcess[str]:
             command = (sys.executable, "-m", *arguments)
             return subprocess.run(
-                command, cwd=folder, env=environment, capture_output=True, text=True, timeout=_LONGEST
+                command, cwd=folder, env=environment, capture_output=True, text=True, timeout=_TIMEOUT_S
             )
 
         if "/control/" in mutation.path:
@@ -82,10 +82,12 @@ def found_by(mutation: Mutation, ticks: int, seed: int) -> str:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--ticks", type=int, default=5000, help="of the soak (default: 5000)")
-    parser.add_argument("--seed", type=int, default=0, help="of the soak (default: 0)")
-    parser.add_argument("--only", default="", help="only rows whose claim or file contains this")
-    parser.add_argument("--json", action="store_true", help="one object: claim -> what found it")
+    parser.add_argument("--ticks", type=int, default=5000, help="Number of ticks of the soak (default: 5000).")
+    parser.add_argument("--seed", type=int, default=0, help="Seed of the soak (default: 0).")
+    parser.add_argument("--only", default="", help="Check only rows whose claim or file contains this text.")
+    parser.add_argument(
+        "--json", action="store_true", help="Print one object that maps each claim to what found its broken line."
+    )
     options = parser.parse_args()
     rows: dict[str, str] = {}
     for mutation in MUTATIONS:

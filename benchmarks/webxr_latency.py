@@ -1,8 +1,8 @@
-"""How long from the motion of a controller to the command of its arm's joints, through a browser and its page?
+"""How long does it take from a controller's motion to the joint command, through a browser and its page?
 
-A headset is emulated in Chromium (Meta's iwer), and the run is the one of q2r2 run --input webxr. A controller jumps by
-5 mm now and then, and the page's clock says when. Joint commands are watched until they differ. Both clocks are those
-of one computer. The time includes waiting for the next frame of the headset, half a frame in the mean.
+Meta's iwer emulates a headset in Chromium, and the run is that of q2r2 run --input webxr. A controller jumps by 5 mm
+at random times, which the page's clock measures. The time ends with the first joint command that differs. Both clocks
+are those of one computer. The time includes the wait for the headset's next frame, which takes half a frame on average.
 """
 
 from __future__ import annotations
@@ -28,10 +28,11 @@ from q2r2_control.viewer.tables import record_table
 
 CHROMIUM = "/usr/bin/chromium"
 ARGUMENTS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-_MOVED = 1e-6  # a command that differs by more has moved [rad]
-_LATEST = 0.5  # behind a jump [s]
+_MIN_MOTION = 1e-6  # Least difference of a command that has moved [rad].
+_MAX_LATENCY_S = 0.5  # Longest time from a jump to its command [s].
 
-# Both hands jump; returns when, by the clock on the wall, and how long a frame takes, both in [s].
+# A script for the page. Its function jump moves the left controller, and returns the wall clock's time of each jump and
+# the mean time of a frame, both in [s].
 EMULATED = """
 const device = new IWER.XRDevice(IWER.metaQuest3);
 device.installRuntime({ forceInstall: true });
@@ -68,18 +69,18 @@ window.jump = async (times) => {
 
 @dataclass(frozen=True)
 class PageLatency:
-    """Times are in [ms]."""
+    """The latencies of all motions [ms]."""
 
     input: str
-    motions: int
-    followed: int
-    frame: float
-    p50: float
-    p99: float
+    motions: int  # Number of motions of the controller.
+    followed: int  # Number of motions that a joint command followed in time.
+    frame: float  # Mean time of a frame [ms].
+    p50: float  # Median latency [ms].
+    p99: float  # 99th percentile of the latency [ms].
 
 
 class CommandTimes:
-    """A listener that keeps when each command of the left arm was made, by the clock on the wall."""
+    """A listener that keeps each command of the left arm and its time by the wall clock."""
 
     def __init__(self, joints: Array) -> None:
         self._joints = joints
@@ -91,30 +92,33 @@ class CommandTimes:
         self.commands.append(tick.command.q[self._joints])
 
     def delays(self, moved: list[float]) -> Array:
-        """From each motion to the first command that differs from that of the time of the motion [s]."""
+        """Return the time from each motion to the first command that differs from the command at its begin [s].
+
+        ``moved`` are the times of the motions by the wall clock [s]. Motions without such a command are left out.
+        """
         times, commands = np.array(self.times), np.array(self.commands)
         found = []
         for began in moved:
-            first, last = np.searchsorted(times, [began, began + _LATEST])
-            apart = np.abs(commands[first:last] - commands[first]).max(axis=1) > _MOVED
+            first, last = np.searchsorted(times, [began, began + _MAX_LATENCY_S])
+            apart = np.abs(commands[first:last] - commands[first]).max(axis=1) > _MIN_MOTION
             if apart.any():
                 found.append(times[first + int(apart.argmax())] - began)
         return np.array(found)
 
 
 def main(
-    jumps: Annotated[int, Option(min=10, help="How often the controller moves.")] = 100,
-    emulator: Annotated[Path, Option(help="iwer, as make test-web fetches it.")] = Path(
+    jumps: Annotated[int, Option(min=10, help="Number of jumps of the controller.")] = 100,
+    emulator: Annotated[Path, Option(help="The file of iwer, which make test-web fetches.")] = Path(
         ".venv/iwer/package/build/iwer.min.js"
     ),
     json: Json = False,
 ) -> None:
-    """Measure from a controller's motion in a browser to the joints' command."""
-    from playwright.sync_api import sync_playwright  # which only this needs
+    """Measure the time from a controller's motion in a browser to the joint command."""
+    from playwright.sync_api import sync_playwright  # Only this function needs playwright.
 
     config = WebXrInput.cell(load_config(DEMO_CONFIG))
-    # A browser that draws by the processor may be late for longer than an arm waits; it is measured all the same.
-    gate = config.teleop.gate.model_copy(update={"timeout": _LATEST})
+    # A browser without a graphics card may pause longer than an arm waits. This timeout lets such pauses be measured.
+    gate = config.teleop.gate.model_copy(update={"timeout": _MAX_LATENCY_S})
     config = config.model_copy(update={"teleop": config.teleop.model_copy(update={"gate": gate})})
     source = WebXrInput(port=0, watch=HandsWatch(None, frame=False))
     pipeline = Pipeline.from_config(config, input=source, plant="kinematic")
@@ -135,17 +139,17 @@ def main(
             page.wait_for_timeout(1000.0)
             page.evaluate("engage()")
             result = page.evaluate("jumps => jump(jumps)", jumps)
-            time.sleep(_LATEST)
+            time.sleep(_MAX_LATENCY_S)
         finally:
             pipeline.stop()
             thread.join()
             browser.close()
     delays = 1e3 * commands.delays(result["moved"])
     if not len(delays):
-        sys.exit("no motion reached the arm: was it engaged?")
+        sys.exit("No motion reached the arm. Check that the arm was engaged.")
     p50, p99 = np.percentile(delays, [50, 99]).tolist()
     report = PageLatency("webxr", jumps, len(delays), 1e3 * result["frame"], p50, p99)
-    print_report(asdict(report), (record_table("hand to joint command, by a page in Chromium", [report]),), json)
+    print_report(asdict(report), (record_table("Latency through a page in Chromium [ms]", [report]),), json)
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
-"""The hands of an operator who makes the arms go through a work motion, as a headset would send them.
+"""The hands of an operator who leads the arms through a work motion, as a headset would send them.
 
-Both hands rest and press the lower button to engage, the right one a little later. Then they move so that the relative
-motion asks for the tool poses of the motion. The same things as at work stand in the way of these poses. Samples are
-noisy, uneven and late, and filter, leash and gate are between them and the targets.
+Both hands rest and press the lower button to engage, the right one a little later. Then they move so that relative
+motion asks for the tool poses of the work motion. The same effects as in real work disturb these poses. Samples are
+noisy, uneven and late, and filter, leash and gate stand between the samples and the targets.
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ from q2r2_control.inputs.scripted import HANDS_AT_REST, PRESS_DURATION
 from q2r2_control.teleop.relative import RelativeMotion
 from q2r2_control.types import SIDES, HandInputs
 
-# When each hand presses: nobody presses with both at once [s].
-_PRESSES = {"left": 0.2, "right": 0.26}
-# From when on the hands move: half a second after both presses count, however long a chord is waited for [s].
-MOVES = 1.0
-_EVEN_RATE = 75.0  # [Hz]
-_NOISE = 2e-4  # of the sensor, along each axis [m]
+# Time when each hand presses. The times differ, because nobody presses with both hands at the same instant [s].
+_PRESS_TIMES_S = {"left": 0.2, "right": 0.26}
+# Time when the hands begin to move. It is half a second after both presses count, including the wait for a chord [s].
+MOTION_BEGINS_S = 1.0
+_EVEN_RATE_HZ = 75.0  # Rate of even samples [Hz].
+_SENSOR_NOISE = 2e-4  # Standard deviation of the sensor's noise along each axis [m].
 
 
 class WorkHands(PlayedInput):
-    """Both hands in one work motion, which begins at :data:`MOVES` after the first poll. Implements :class:`Input`.
+    """An :class:`Input` with both hands in one work motion, which begins :data:`MOTION_BEGINS_S` after the first poll.
 
-    ``start``: the tools' poses when the arms are engaged, in the world frame. ``settings`` say how hands move arms.
-    Everything that samples add to the hands' poses comes from ``seed``; None: the samples are exact and even.
+    ``start`` has the tools' poses when the arms are engaged, in the world frame. ``settings`` say how hands move arms.
+    ``seed`` decides what samples add to the hands' poses. If it is None, the samples are exact and even.
     """
 
     def __init__(
@@ -43,8 +43,8 @@ class WorkHands(PlayedInput):
         super().__init__(self._ideal, _buttons, {hand: _sampling(hand, seed) for hand in SIDES})
 
     def asked(self, t: float) -> dict[str, pin.SE3]:
-        """Where the hands ask the tools to be at ``t`` [s] since the first poll, in the world frame."""
-        return self._motion.targets(min(max(t - MOVES, 0.0), self._motion.ends), self._start)
+        """Return the tool poses that the hands ask for at ``t`` [s] since the first poll, in the world frame."""
+        return self._motion.targets(min(max(t - MOTION_BEGINS_S, 0.0), self._motion.ends), self._start)
 
     def _ideal(self, hand: str, t: float) -> pin.SE3:
         return self._relative[hand].hand(self.asked(t)[self._arm_of[hand]])
@@ -57,8 +57,8 @@ def _anchored(settings: TeleopSettings, hand: pin.SE3, tool: pin.SE3) -> Relativ
 
 
 def _sampling(hand: str, seed: int | None) -> SampleTiming:
-    return EvenSampling(_EVEN_RATE) if seed is None else HeadsetSampling(hand, seed, position_noise=_NOISE)
+    return EvenSampling(_EVEN_RATE_HZ) if seed is None else HeadsetSampling(hand, seed, position_noise=_SENSOR_NOISE)
 
 
 def _buttons(hand: str, t: float) -> HandInputs:
-    return HandInputs(button_lower=_PRESSES[hand] <= t < _PRESSES[hand] + PRESS_DURATION)
+    return HandInputs(button_lower=_PRESS_TIMES_S[hand] <= t < _PRESS_TIMES_S[hand] + PRESS_DURATION)

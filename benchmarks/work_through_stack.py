@@ -1,9 +1,9 @@
 """How well do two arms work when hand samples drive them through the whole stack, to arms in MuJoCo?
 
-Everything is as in ``q2r2 run``, but that time is simulated and that the cell has no loose objects, of which no motion
-knows. An error is from where the operator's hand asks the tool to be in that very instant to where the tool is measured
-to be. All delays are in it: of the samples, the filter, the loop and the arm. Beside each motion stands the same one
-with the same samples in free air, where nothing is watched: what is worse than that, the pairs cost.
+Everything is as in ``q2r2 run``, but time is simulated, and the cell has no loose objects, because no motion knows of
+them. An error is the distance from the pose that the hand asks for at that instant to the measured tool. It includes
+the delays of samples, filter, loop and arm. Each motion also runs with the same samples in free air, where no pair is
+monitored. The difference between both runs is the cost of the monitored pairs.
 """
 
 from __future__ import annotations
@@ -32,48 +32,51 @@ from q2r2_control.types import Array, CommandMode
 from q2r2_control.verification.contract import Contract
 from q2r2_control.viewer.tables import record_table
 from q2r2_control.wording import sentence
-from work_hands import MOVES, WorkHands
+from work_hands import MOTION_BEGINS_S, WorkHands
 
-_TAIL = 0.5  # [s]
-_ROUNDING = 1e-9  # of the ticks' times [s]
-_MARGIN_TICKS = 4  # between postures whose margins are measured
+_TAIL_S = 0.5  # Duration of the end of a motion in which the arms should rest [s].
+_TIME_ROUNDING_S = 1e-9  # Largest rounding error of a tick's time [s].
+_TICKS_PER_MARGIN = 4  # Number of ticks from one posture whose margins are measured to the next.
 
 
 @dataclass(frozen=True, slots=True)
 class StackFigures:
-    """One motion through the stack. All but the last four are measured from the end of the approach on."""
+    """The figures of one motion. All except the last four are measured from the end of the approach on."""
 
     mode: str
     motion: str
-    done: float  # share of the ticks, 1 unless the run was stopped
-    rms_error_mm: float | None = None  # of the tool with the larger one, until the hands rest
-    max_error_mm: float | None = None  # of either tool, until the hands rest
-    path_error_mm: float | None = None  # as rms_error_mm, from where the hand asked it to be the filter's delay ago
-    end_error_mm: float | None = None  # of either tool, at the end
-    arrival_s: float | None = None  # since the hands began, to within 10 mm of the goal for good; also None: no goal
-    fallback_percent: float | None = None  # of the ticks
-    measured_distance_mm: float | None = None  # of the monitored pairs where the arms were measured, by Coal
-    measured_pair: tuple[str, str] | None = None
-    measured_margin_mm: float | None = None  # least measured distance less the one that the pair keeps
-    reference_distance_mm: float | None = None  # of the reference
-    max_acceleration_ratio: float | None = None  # of the reference, to the limit of the joint
-    max_torque_ratio: float | None = None  # of a motor, to its limit, where it saturates
-    rest_acceleration: float | None = None  # of the reference: RMS over the last 0.5 s, norm over joints [rad/s^2]
-    slip_mm: float = 0.0  # largest, how far the leash moved a target
-    pauses: list[str] = field(default_factory=list)  # why an arm was paused in mid-run
-    stopped: str | None = None  # why the run was stopped before its end
-    broken: dict[str, int] = field(default_factory=dict)  # promises of the controller, and in how many ticks
+    done: float  # Share of the planned ticks that ran; 1 unless the run was stopped.
+    rms_error_mm: float | None = None  # RMS error of the tool with the larger one, until the hands rest.
+    max_error_mm: float | None = None  # Largest error of either tool, until the hands rest.
+    path_error_mm: float | None = None  # RMS error from the pose that the hand asked for one filter delay earlier.
+    end_error_mm: float | None = None  # Largest error of either tool at the end.
+    # Time from the end of the approach until both tools stay within 10 mm of the goal. None if they do not, or if the
+    # motion has no goal.
+    arrival_s: float | None = None
+    fallback_percent: float | None = None  # Percentage of ticks in which the certified stop was executed.
+    measured_distance_mm: float | None = None  # Least distance of a monitored pair at measured postures, by Coal.
+    measured_pair: tuple[str, str] | None = None  # The pair with that distance.
+    measured_margin_mm: float | None = None  # Least difference between a pair's measured and kept distance.
+    reference_distance_mm: float | None = None  # Least distance of a monitored pair at the reference's postures.
+    max_acceleration_ratio: float | None = None  # Largest acceleration of the reference, divided by the joint's limit.
+    max_torque_ratio: float | None = None  # Largest motor torque, divided by the limit at which the motor saturates.
+    # RMS over the last 0.5 s of the norm over the joints of the reference's acceleration [rad/s^2].
+    rest_acceleration: float | None = None
+    slip_mm: float = 0.0  # Largest distance by which the leash moved a target.
+    pauses: list[str] = field(default_factory=list)  # Reasons why an arm was paused during the run.
+    stopped: str | None = None  # Reason why the run was stopped before its end, None if it was not.
+    broken: dict[str, int] = field(default_factory=dict)  # Number of ticks that broke each promise of the controller.
 
     @property
     def passed(self) -> bool:
-        """Whether the motion came to its end, every promise kept at every tick."""
+        """Return whether the motion reached its end, without a pause and with every promise kept at every tick."""
         return not (self.broken or self.pauses or self.stopped)
 
 
 class Stack:
-    """A cell in MuJoCo, driven in one ``mode``, that hands make go through one work motion after another.
+    """A cell in MuJoCo that hands lead through one work motion after another, in one ``mode``.
 
-    ``free``: in free air, where no pair is monitored and all bodies pass through each other.
+    If ``free`` is True, no pair is monitored, and all bodies pass through each other.
     """
 
     def __init__(self, config: Config, mode: CommandMode | str, free: bool = False) -> None:
@@ -89,11 +92,11 @@ class Stack:
         self._kept = kept_distances(self.robot, self._config.control).values
 
     def run(self, motion: WorkMotion, seed: int | None = 0) -> StackFigures:
-        """Run ``motion`` from home; ``seed``: of what samples add to the hands' poses, None: nothing."""
+        """Run ``motion`` from home. ``seed`` decides what samples add to the hands' poses. If None, they are exact."""
         hands = WorkHands(motion, self._start, self._config.teleop, seed)
         pipeline = Pipeline(self._config, self.robot, hands, self._plant, self.mode)
         log = _Log(pipeline, checked=len(self._kept) > 0)
-        ends = MOVES + motion.ends
+        ends = MOTION_BEGINS_S + motion.ends
         try:
             summary = pipeline.run(ends, realtime=False)
         except PlantError as fault:
@@ -107,9 +110,9 @@ class Stack:
             pauses=[f"{event.arm}: {sentence(event.reason)}" for event in summary.events if _pauses(event)],
             broken=log.broken,
         )
-        log.cut(MOVES + motion.begins, ends)
+        log.cut(MOTION_BEGINS_S + motion.begins, ends)
         errors, late, to_goal = _errors(log, hands, pipeline.teleop.delay, ends)
-        moving = np.array(log.t) <= MOVES + motion.rests
+        moving = np.array(log.t) <= MOTION_BEGINS_S + motion.rests
         return replace(
             self._with_distances(self._with_efforts(figures, log), log),
             rms_error_mm=_rms_mm(errors[moving]),
@@ -122,7 +125,7 @@ class Stack:
     def _with_efforts(self, figures: StackFigures, log: _Log) -> StackFigures:
         a, tau = np.array(log.a), np.array(log.tau)
         limit = self.robot.capped_acceleration(self._config.control.acceleration_limit)
-        tail = a[-round(_TAIL * self._config.nominal_rate_hz) :]
+        tail = a[-round(_TAIL_S * self._config.nominal_rate_hz) :]
         return replace(
             figures,
             fallback_percent=100.0 * float(np.mean(log.fallback)),
@@ -136,7 +139,7 @@ class Stack:
             return figures
         measured, reference = np.array(log.measured), np.array(log.reference)
         distance, pair = nearest_pair(measured, self.robot)
-        margins = [(self.robot.distance_values(q) - self._kept).min() for q in measured[::_MARGIN_TICKS]]
+        margins = [(self.robot.distance_values(q) - self._kept).min() for q in measured[::_TICKS_PER_MARGIN]]
         return replace(
             figures,
             measured_distance_mm=distance,
@@ -147,23 +150,23 @@ class Stack:
 
 
 class _Log:
-    """A listener that keeps what figures are made of and, if ``checked``, checks the contract at every tick."""
+    """A listener that keeps the data of the figures. If ``checked`` is True, it checks the contract at every tick."""
 
     def __init__(self, pipeline: Pipeline, checked: bool) -> None:
         self._pipeline, self._checked = pipeline, checked
         self._contract: Contract | None = None
-        self.t: list[float] = []  # since the start of the run [s]
-        self.measured: list[Array] = []  # (nv,) [rad]
-        self.reference: list[Array] = []  # (nv,) [rad]
-        self.a: list[Array] = []  # of the reference (nv,) [rad/s^2]
-        self.tau: list[Array] = []  # of the motors (nv,) [Nm]
-        self.tools: list[Array] = []  # measured (arms, 3) [m]
-        self.fallback: list[bool] = []
+        self.t: list[float] = []  # Time since the start of the run [s].
+        self.measured: list[Array] = []  # Measured joint positions (nv,) [rad].
+        self.reference: list[Array] = []  # Joint positions of the reference (nv,) [rad].
+        self.a: list[Array] = []  # Accelerations of the reference (nv,) [rad/s^2].
+        self.tau: list[Array] = []  # Torques of the motors (nv,) [Nm].
+        self.tools: list[Array] = []  # Measured tool positions (arms, 3) [m].
+        self.fallback: list[bool] = []  # True if the certified stop was executed.
         pipeline.listeners.append(self)
 
     def __call__(self, tick: Tick) -> None:
         if self._checked:
-            # Not before the first tick: a run may make a controller of its own.
+            # The contract is made at the first tick, because a run may make a controller of its own.
             self._contract = self._contract or Contract(self._pipeline.controller)
             self._contract.observe(tick.reference, tick.step)
         self.t.append(tick.t)
@@ -176,20 +179,21 @@ class _Log:
 
     @property
     def broken(self) -> dict[str, int]:
-        """Promises that the controller broke, each with the number of ticks."""
+        """Return the promises that the controller broke, with the number of ticks of each."""
         margins = self._contract.margins.values() if self._contract is not None else ()
         return {margin.name: margin.violations for margin in margins if margin.violations}
 
     def cut(self, begin: float, end: float) -> None:
-        """Forget the ticks that are not after ``begin`` and up to ``end`` [s]."""
-        first, last = (bisect_right(self.t, time + _ROUNDING) for time in (begin, end))
+        """Keep only the ticks after ``begin`` and up to ``end`` [s]."""
+        first, last = (bisect_right(self.t, time + _TIME_ROUNDING_S) for time in (begin, end))
         for name in ("t", "measured", "reference", "a", "tau", "tools", "fallback"):
             setattr(self, name, getattr(self, name)[first:last])
 
 
 def _errors(log: _Log, hands: WorkHands, delay: float, end: float) -> tuple[Array, Array, Array]:
-    """Distances (n, arms) [m] of the measured tools. They are from where the hands ask them to be at each tick, from
-    where they asked them to be ``delay`` [s] before, and from where they ask them to be at the ``end`` [s].
+    """Return three distances (n, arms) [m] of the measured tools from the places that the hands ask for.
+
+    The hands ask for these places at the tick itself, ``delay`` [s] before it, and at the ``end`` [s].
     """
     tools = np.array(log.tools)
     asked = (
@@ -201,7 +205,7 @@ def _errors(log: _Log, hands: WorkHands, delay: float, end: float) -> tuple[Arra
 
 
 def _rms_mm(errors: Array) -> float:
-    """Of the tool with the larger one, from errors (n, arms) [m]."""
+    """Return the RMS error of the tool with the larger one [mm], from errors (n, arms) [m]."""
     return 1e3 * float(np.sqrt(np.mean(errors**2, axis=0)).max())
 
 
@@ -210,12 +214,14 @@ def _pauses(event: Event) -> bool:
 
 
 def main(
-    motion: Annotated[list[str] | None, typer.Option(help="Only this one, or those that begin with it.")] = None,
-    mode: Annotated[list[CommandMode] | None, typer.Option(help="How the arms are driven; repeatable.")] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of what samples add to the hands' poses.")] = 0,
+    motion: Annotated[
+        list[str] | None, typer.Option(help="Run only this motion, or the motions whose names begin with it.")
+    ] = None,
+    mode: Annotated[list[CommandMode] | None, typer.Option(help="Command mode of the arms. Repeatable.")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of what samples add to the hands' poses.")] = 0,
     json: Json = False,
 ) -> None:
-    """Print how well the tools follow and what that takes; exit 1 if a promise was broken or a motion did not end."""
+    """Print how well the tools follow, and at which cost. Exit with 1 if a motion broke a promise or did not end."""
     config = load_config(DEMO_CONFIG)
     modes = mode or [CommandMode.POSITION, CommandMode.TORQUE]
     stacks = [Stack(config, driven, free) for driven in modes for free in (False, True)]

@@ -1,4 +1,4 @@
-"""Write docs/configuration.md, the reference of a cell's YAML, from the settings' own descriptions and bounds."""
+"""Write docs/configuration.md, the reference of a cell's YAML, from the descriptions and bounds of the settings."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ _BOUNDS = (("minimum", ">="), ("exclusiveMinimum", ">"), ("maximum", "<="), ("ex
 
 
 def reference() -> str:
-    """The page."""
+    """Return the text of the page."""
     schema = Config.model_json_schema()
     return _HEAD + "".join(_sections("", schema, schema["$defs"]))
 
 
 def _sections(key: str, model: dict[str, Any], models: dict[str, Any]) -> Iterator[str]:
-    """A section for the ``model`` of settings at ``key``, then one for each below it."""
+    """Yield a section for the ``model`` of settings at ``key``, and then one for each model below it."""
     about = " ".join(model.get("description", "").split("\n\n")[0].split()) if key else "The whole file."
     rows = [_row(name, field, name in model.get("required", ()), models) for name, field in model["properties"].items()]
     yield f"\n## {f'`{key}`' if key else 'Top level'}\n\n{about}\n\n"
@@ -46,7 +46,7 @@ def _row(name: str, field: dict[str, Any], required: bool, models: dict[str, Any
 
 
 def _choices(field: dict[str, Any], models: dict[str, Any]) -> list[dict[str, Any]]:
-    """The types that a field may have, each resolved."""
+    """Return the types that a field may have, with all references resolved."""
     found = []
     for choice in field.get("anyOf") or field.get("allOf") or [field]:
         reference = choice.get("$ref")
@@ -58,7 +58,7 @@ def _choices(field: dict[str, Any], models: dict[str, Any]) -> list[dict[str, An
 
 
 def _models_in(field: dict[str, Any], models: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Models of settings that a field holds, with what stands between its key and theirs."""
+    """Yield the models of settings that a field contains, with the text between the field's key and theirs."""
     for choice in _choices(field, models):
         if "properties" in choice:
             yield "", choice

@@ -1,4 +1,4 @@
-"""Draw docs/demo.webp, the README's moving picture: three tasks of the demo as MuJoCo simulates them."""
+"""Draw docs/demo.webp, the README's moving picture. It shows three tasks of the demo as MuJoCo simulates them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from q2r2_control.summary.tick import Tick
 ROOT = Path(__file__).resolve().parents[1]
 TASKS = "handover+stack+peg"
 WIDTH, HEIGHT = 960, 540
-SPEED, RATE = 4.0, 10.0  # of the playback, in pictures a second
+# Speed of the playback as a multiple of real time, and pictures per second [Hz].
+PLAYBACK_SPEED, PICTURE_RATE_HZ = 4.0, 10.0
 
 
 def camera() -> mujoco.MjvCamera:
@@ -30,12 +31,12 @@ def main() -> None:
     )
     plant = pipeline.plant
     assert isinstance(plant, MujocoPlant)
-    plant.model.vis.quality.shadowsize = 2048  # of 8192, which takes long without a graphics card
+    plant.model.vis.quality.shadowsize = 2048  # The default of 8192 takes long without a graphics card.
     renderer, view = mujoco.Renderer(plant.model, HEIGHT, WIDTH), camera()
     pictures: list[Image.Image] = []
 
     def draw(tick: Tick) -> None:
-        if tick.t * RATE / SPEED >= len(pictures):
+        if tick.t * PICTURE_RATE_HZ / PLAYBACK_SPEED >= len(pictures):
             renderer.update_scene(plant.data, view)
             pictures.append(Image.fromarray(renderer.render()))
 
@@ -43,7 +44,9 @@ def main() -> None:
     pipeline.run(trajectory_named(TASKS).duration, realtime=False)
     first, *rest = pictures
     file = ROOT / "docs" / "demo.webp"
-    first.save(file, save_all=True, append_images=rest, duration=round(1e3 / RATE), loop=0, quality=60, method=4)
+    first.save(
+        file, save_all=True, append_images=rest, duration=round(1e3 / PICTURE_RATE_HZ), loop=0, quality=60, method=4
+    )
     print(f"{file}: {len(pictures)} pictures, {file.stat().st_size / 1e6:.1f} MB")
 
 

@@ -1,6 +1,6 @@
-"""Hook of mkdocs: a link to a file outside of docs/ becomes its text, since the site has no such page.
+"""A hook of mkdocs that replaces each link to a file outside of docs/ by its text, because the site has no such page.
 
-tests/test_project.py checks these links. All others are left to mkdocs, which fails on one that leads nowhere.
+tests/test_project.py checks these links. mkdocs itself checks all others, and fails if one leads nowhere.
 """
 
 from __future__ import annotations

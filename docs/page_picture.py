@@ -1,6 +1,6 @@
 """Draw docs/page.webp, the page of the demo's hand-over in Chromium: python -m docs.page_picture.
 
-The run stands still while the picture is taken. The loop's figures on it are those of this machine.
+The run stands still while the picture is taken. The picture shows the loop's figures of this machine.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from tests.web.browser import ARGUMENTS, CHROMIUM, HIDDEN, one_processor
 FILE = Path(__file__).resolve().parent / "page.webp"
 CELL = FILE.parents[1] / "config" / "dual_iiwa7.yaml"
 VIEW = {"width": 1280, "height": 760}
-MOMENT = 11.4  # of the run: both grippers hold the bar [s]
-_SETTLE = 4.0  # before the first look, and for the last frame [s]
+PICTURE_TIME_S = 11.4  # Time of the run at which both grippers hold the bar [s].
+_SETTLING_S = 4.0  # Time to wait before the run begins, and again before the picture is taken [s].
 
 
 class Photographer:
-    """A listener, at the run's own speed, that lets a browser open the page and take its picture."""
+    """A listener that runs the loop in real time, and lets a browser open the page and take its picture."""
 
     def __init__(self) -> None:
         self.url = ""
@@ -39,7 +39,7 @@ class Photographer:
             self._opened.wait()
             self._began = time.monotonic() - tick.t
         time.sleep(max(self._began + tick.t - time.monotonic(), 0.0))
-        if tick.t >= MOMENT and not self._due.is_set():
+        if tick.t >= PICTURE_TIME_S and not self._due.is_set():
             self._due.set()
             self._taken.wait()
 
@@ -50,12 +50,12 @@ class Photographer:
         page.set_default_timeout(0)  # A busy computer may draw slowly; Ctrl-C ends the wait.
         page.goto(f"{self.url}?fixedDpr=1")
         page.add_style_tag(content=HIDDEN)
-        page.wait_for_timeout(1e3 * _SETTLE)
+        page.wait_for_timeout(1e3 * _SETTLING_S)
         self._opened.set()
         page.get_by_text("certified").first.wait_for()
         self._due.wait()
-        page.wait_for_timeout(1e3 * _SETTLE)
-        page.screenshot()  # which draws the last frame
+        page.wait_for_timeout(1e3 * _SETTLING_S)
+        page.screenshot()  # This first picture makes the browser draw the last frame.
         Image.open(io.BytesIO(page.screenshot())).save(FILE, quality=82, method=6)
         playwright.stop()
         self._taken.set()
@@ -71,7 +71,7 @@ def main() -> None:
         pipeline.listeners.append(photographer)
         worker = Thread(target=photographer.work)
         worker.start()
-        pipeline.run(MOMENT + 0.1, realtime=False)
+        pipeline.run(PICTURE_TIME_S + 0.1, realtime=False)
         worker.join()
     print(f"{FILE}: {FILE.stat().st_size / 1e3:.0f} kB")
 

@@ -1,4 +1,4 @@
-"""A hand reaches into the cell: the arm slows down, keeps away from it, and goes on when it has gone."""
+"""A hand reaches into the cell. The arm slows down, keeps away from the hand, and goes on when the hand has gone."""
 
 import numpy as np
 
@@ -12,8 +12,8 @@ start = controller.tool_pose("left")
 
 for tick in range(6000):
     t = 0.001 * tick
-    if tick % 33 == 0:  # reports of a camera, 30 times a second
-        away = 0.15 + 0.6 * abs(t / 3.0 - 1.0)  # 0.75 m, at 3 s 0.15 m, and back at 0.2 m/s
+    if tick % 33 == 0:  # A camera would report the hand about 30 times per second.
+        away = 0.15 + 0.6 * abs(t / 3.0 - 1.0)  # The hand comes from 0.75 m to 0.15 m at 3 s, and returns at 0.2 m/s.
         place = start.translation + np.array([0.0, away, 0.0])
         hand = MovingObstacle(shape="sphere", size=(0.1,), position=tuple(place.tolist()), speed=0.25)
         controller.move_obstacle("hand", hand)

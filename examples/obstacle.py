@@ -1,4 +1,4 @@
-"""An obstacle: a target behind it is not reached through it."""
+"""An obstacle in the way of a target. The arm does not go through it."""
 
 import numpy as np
 import pinocchio as pin
@@ -9,7 +9,7 @@ config = load_config("config/dual_iiwa7.yaml")
 empty = Robot.from_config(config)
 tool = empty.tool_pose(empty.home, "left").translation
 
-# A post that stands 15 cm to the left of the left tool.
+# The post stands 15 cm to the left of the left tool.
 post = ObstacleConfig(shape="capsule", size=(0.03, 0.6), position=tuple(tool + np.array([0.0, 0.15, 0.0])))
 config = config.model_copy(update={"obstacles": {**config.obstacles, "post": post}})
 

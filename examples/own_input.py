@@ -1,4 +1,4 @@
-"""Your own input device: anything that knows where two hands are. docs/extending.md says how to install one."""
+"""Your own input device, which can be anything that knows where two hands are. docs/extending.md installs one."""
 
 import numpy as np
 
@@ -15,7 +15,7 @@ class SwingingHands:
         self._next = 0.0
 
     def poll(self, now: float) -> list[HandSample]:
-        """Samples since the last poll, 90 a second of each hand."""
+        """Return the samples since the last poll. Each hand has 90 samples per second."""
         if now < self._next:
             return []
         self._next = now + 1.0 / 90.0

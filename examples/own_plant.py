@@ -6,6 +6,8 @@ from q2r2_control import Array, Command, CommandMode, Pipeline, Robot, RobotStat
 
 
 class LaggingPlant:
+    """A plant whose joints follow commanded positions with a time constant of 5 ms."""
+
     modes: tuple[CommandMode, ...] = (CommandMode.POSITION,)
 
     def __init__(self, robot: Robot) -> None:
@@ -16,10 +18,12 @@ class LaggingPlant:
         self.q = self.wanted = self.home if q is None else q
         self.v, self.time = np.zeros(len(self.q)), 0.0
 
-    def apply(self, command: Command) -> None:  # sends the command to the robot
+    def apply(self, command: Command) -> None:
+        """Send the command to the robot."""
         self.wanted = command.q.copy()
 
-    def advance(self, dt: float) -> None:  # waits for the next measurement
+    def advance(self, dt: float) -> None:
+        """Wait for the next measurement."""
         step = (1.0 - np.exp(-dt / 0.005)) * (self.wanted - self.q)
         self.q, self.v, self.time = self.q + step, step / dt, self.time + dt
 

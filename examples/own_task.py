@@ -1,4 +1,4 @@
-"""Your own task of the QP: the left arm's elbow turns towards an angle while both tools keep their pose."""
+"""Your own task of the QP, which turns the left arm's elbow towards an angle while both tools keep their pose."""
 
 import numpy as np
 
@@ -6,11 +6,16 @@ from q2r2_control import Array, CartesianController, Robot, load_config
 
 
 class ElbowTask:
+    """A task that pulls ``joint`` towards ``angle`` [rad]."""
+
     def __init__(self, robot: Robot, joint: str, angle: float) -> None:
         self.joint, self.angle = robot.joint_names.index(joint), angle
 
     def cost(self, q: Array, v: Array) -> tuple[Array, Array]:
-        """H and g of 1/2 v' H v + g' v, least where the joint moves to its angle with 2 /s."""
+        """Return H and g of the cost 1/2 v' H v + g' v.
+
+        The cost is least if the joint turns to its angle with a gain of 2/s.
+        """
         H, g = np.zeros((len(q), len(q))), np.zeros(len(q))
         H[self.joint, self.joint] = 0.1
         g[self.joint] = -0.1 * 2.0 * (self.angle - q[self.joint])

@@ -1,11 +1,11 @@
-"""Your own URDF: an arm of six joints, described here, under the same controller."""
+"""Your own URDF, which describes an arm of six joints for the same controller."""
 
 import numpy as np
 import pinocchio as pin
 
 from q2r2_control import CartesianController, ControllerSettings, Robot
 
-# Links of 0.2 m along z, and the axis of the joint at the end of each.
+# Each link is 0.2 m long along its z axis. The next joint is at its end and turns about one of AXES.
 LINK = """<link name="link_{0}">
   <inertial><mass value="1"/><origin xyz="0 0 0.1"/>
     <inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial>

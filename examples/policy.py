@@ -1,4 +1,4 @@
-"""A policy drives the arms, within every promise. A trained one computes its actions from the observation."""
+"""A policy drives the arms, and every promise holds. A trained policy would compute its actions from observations."""
 
 import numpy as np
 import pinocchio as pin
@@ -7,16 +7,19 @@ from q2r2_control import Array, Observation, Pipeline, PolicyInput, load_config
 
 
 class Circles:
-    """Both tools go round circles. The numbers are those of a dataset's action.tool: x y z qx qy qz qw of each arm."""
+    """A policy that moves both tools round circles.
+
+    The numbers of an action are those of a dataset's action.tool: x y z qx qy qz qw of each arm.
+    """
 
     space = "action.tool"
-    rate = 30.0  # actions a second
+    rate = 30.0  # Number of actions per second [Hz].
 
     def __init__(self) -> None:
         self.start: Observation | None = None
 
     def __call__(self, observation: Observation) -> Array:
-        """The actions of the next half second, the first of them for the observation's time."""
+        """Return the actions of the next half second. The first action is for the time of the observation."""
         self.start = self.start or observation
         t = observation.time - self.start.time + np.arange(15) / self.rate
         poses = np.array([[pin.SE3ToXYZQUAT(tool) for tool in self.start.tools.values()]] * len(t))

@@ -1,4 +1,4 @@
-"""Read the QP of each step, add a row and a cost, solve it twice, go on: python examples/qp_by_hand.py [PICTURE.png]"""
+"""Read the QP of each step, add a row and a cost, and solve it twice: python examples/qp_by_hand.py [PICTURE.png]."""
 
 import sys
 import warnings
@@ -23,14 +23,14 @@ left, right = controller.tool_pose("left"), controller.tool_pose("right")
 targets = {"left": pin.SE3(left.rotation, right.translation), "right": pin.SE3(right.rotation, left.translation)}
 
 speeds, differences, margins = [], [], []
-for _ in range(1000):  # both tools are sent to where the other one is
-    problem = controller.problem(targets, DT)  # of x = [v; s]: joint velocities, and a slack for each row
-    own_row = -np.eye(1, len(problem.q), joint)  # left_A1 turns back by 0.1 rad/s at most: -v <= 0.1
+for _ in range(1000):  # Each tool is sent to the other tool's place.
+    problem = controller.problem(targets, DT)  # Its variable is x = [v; s]: joint velocities, and a slack for each row.
+    own_row = -np.eye(1, len(problem.q), joint)  # The row -v <= 0.1 lets left_A1 turn back at 0.1 rad/s at most.
     problem.G = own_row if problem.G is None else np.vstack([problem.G, own_row])
     problem.h = np.append([] if problem.h is None else problem.h, 0.1)
-    problem.P[joint, joint] += 0.01  # and as slowly as the tools allow
+    problem.P[joint, joint] += 0.01  # This cost lets left_A1 turn as slowly as the tools allow.
     first, second = (qpsolvers.solve_problem(problem, solver=name).x for name in SOLVERS)
-    reference = controller.advance(first, targets, DT)  # certified, or braked if there is no solution
+    reference = controller.advance(first, targets, DT)  # This step is certified. Without a solution, the arms brake.
     if first is not None and second is not None:
         differences.append(np.abs(first - second)[: robot.model.nv].max())
     speeds.append(reference.v[joint])

@@ -1,4 +1,4 @@
-"""A recording as NumPy arrays: python examples/replay_to_numpy.py [RECORDING]; without one, it records two seconds."""
+"""Read a recording as NumPy arrays: python examples/replay_to_numpy.py [RECORDING]. Without one, it makes one."""
 
 import subprocess
 import sys
@@ -10,7 +10,7 @@ from q2r2_control.recording import recordings_in
 
 
 def record(folder: str) -> Path:
-    """Two seconds of scripted hands, as fast as the machine can."""
+    """Record two seconds of scripted hands, as fast as the machine can, and return the recording."""
     command = [sys.executable, "-m", "q2r2_control", "run", "config/dual_iiwa7.yaml", "--headless", "--fast"]
     subprocess.run(
         [*command, "--duration", "2", "--record", folder, "--task", "swing"], check=True, stdout=subprocess.DEVNULL

@@ -1,9 +1,10 @@
-"""Write the SRDF files that lie beside the models of arms and tools: which pairs of their links need no watching.
+"""Write the SRDF files beside the models of arms and tools, which list the pairs of links that need no monitoring.
 
     python robots/make_srdf.py config/dual_iiwa7.yaml FOLDER
 
-``ARM.srdf`` speaks of an arm's own links, ``TOOL.srdf`` of a tool's, ``TOOL_on_ARM.srdf`` of both, with the tool flat
-on the arm's last link. With a flange between them there are ``FLANGE_on_ARM.srdf`` and ``TOOL_on_FLANGE_on_ARM.srdf``.
+``ARM.srdf`` lists pairs of an arm's own links, ``TOOL.srdf`` those of a tool, and ``TOOL_on_ARM.srdf`` those of both,
+with the tool flat on the arm's last link. A flange between them has ``FLANGE_on_ARM.srdf`` and
+``TOOL_on_FLANGE_on_ARM.srdf``.
 """
 
 from __future__ import annotations
@@ -26,23 +27,23 @@ from q2r2_control.robot.robot import Robot
 
 _SIDE = "left"
 
-Disabled = tuple[str, str, str]  # two links, and why they need no watching
+Disabled = tuple[str, str, str]  # Two links, and the reason why they need no monitoring.
 
 
 def model_srdfs(config: Config, samples: int) -> dict[str, str]:
-    """Text of every such file by file name, for all models of ``config``'s arms.
+    """Return the text of every SRDF file by its name, for all models of ``config``'s arms.
 
-    The present files are not used. Neighbours and pairs that overlap at every posture are listed, and also pairs that
-    stay more than :data:`CLEARANCE` apart, as far as ``samples`` postures and the way downhill from them show. Raises
-    :class:`ConfigError` for arms of one ``robot``, and for a flange without a model.
+    The existing files are not used. Neighbours, pairs that overlap at every posture, and pairs that stay more than
+    :data:`CLEARANCE` apart are listed. Whether a pair stays apart is found from ``samples`` random postures and a
+    descent from them. Raises :class:`ConfigError` for arms of one ``robot``, and for a flange without a model.
     """
     files: dict[str, str] = {}
     if config.robot is not None:
-        raise ConfigError("robot: its arms have no models of their own; q2r2 check --pairs looks at the whole cell")
+        raise ConfigError("robot: its arms have no models of their own; q2r2 check --pairs checks the whole cell")
     for side, arm in config.arms.items():
         model = load_model(arm, config.packages, f"arms.{side}")
         if arm.flange.thickness is not None:
-            raise ConfigError(f"arms.{side}.flange: has no model; q2r2 check --pairs looks at the whole cell")
+            raise ConfigError(f"arms.{side}.flange: has no model; q2r2 check --pairs checks the whole cell")
         flange = load_flange(arm.flange, config.packages, f"arms.{side}.flange")
         tool = None if arm.tool.model is None else load_model(arm.tool, config.packages, f"arms.{side}.tool")
         stack = [part for part in (model, flange, tool) if part is not None]
@@ -66,7 +67,7 @@ def model_srdfs(config: Config, samples: int) -> dict[str, str]:
 
 
 def _of_layers(disabled: list[Disabled], layers: Mapping[str, int], inner: set[int], outer: int) -> list[Disabled]:
-    """Pairs of a link of the part ``outer`` with one of the parts ``inner``, where 0 is the arm."""
+    """Return the pairs of a link of the part ``outer`` and a link of the parts ``inner``. Part 0 is the arm."""
     found = []
     for pair in disabled:
         first, second = sorted(layers[link] for link in pair[:2])
@@ -76,7 +77,7 @@ def _of_layers(disabled: list[Disabled], layers: Mapping[str, int], inner: set[i
 
 
 def _alone(config: Config, arm: ArmConfig) -> Config:
-    """A cell of nothing but ``arm``, upright, its tool flat on its last link."""
+    """Return a cell that consists only of ``arm``, which stands upright with its tool flat on its last link."""
     flat = {"link": None, "mount": PoseConfig()}
     tool = arm.tool if arm.tool.model is None else arm.tool.model_copy(update=flat)
     changes = {"tip": arm.named_tip, "mount": PoseConfig(), "tool": tool}
@@ -85,7 +86,7 @@ def _alone(config: Config, arm: ArmConfig) -> Config:
 
 
 def _disabled(config: Config, hidden: tuple[str, ...], samples: int) -> list[Disabled]:
-    """Pairs of links of one arm with its tool that need no watching, in the order of the chain, by reason."""
+    """Return the pairs of links of one arm and its tool that need no monitoring, sorted by reason."""
     cell, prefix = compose(config), f"{_SIDE}_"
     exclusions = [ET.Element("disable_default_collisions", link=prefix + link) for link in hidden]
     robot = Robot(parse_urdf(cell.urdf, cell.name), exclusions, cell.tool_frames, cell.home, cell.name, cell.parts)
@@ -102,7 +103,7 @@ def _disabled(config: Config, hidden: tuple[str, ...], samples: int) -> list[Dis
 
 
 def _enveloped(tool: Description | None) -> tuple[str, ...]:
-    """Links with shapes of a tool that has an envelope, which stands for them."""
+    """Return the links of a tool whose shapes are replaced by its envelope."""
     if tool is None:
         return ()
     links = [link.get("name", "") for link in tool.urdf.findall("link") if link.find("collision") is not None]
@@ -118,11 +119,11 @@ def _tool_srdf(tool: Description, disabled: list[Disabled]) -> str:
 
 
 def main() -> None:
-    """Write the files of a cell's models, in place of those that there are."""
+    """Write the files of a cell's models, and replace existing ones."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("config", help="a cell's YAML")
+    parser.add_argument("config", help="The YAML of a cell.")
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--samples", type=int, default=20_000, help="random postures")
+    parser.add_argument("--samples", type=int, default=20_000, help="Number of random postures.")
     options = parser.parse_args()
     for name, text in model_srdfs(load_config(options.config), options.samples).items():
         (options.folder / name).write_text(text, encoding="utf-8")

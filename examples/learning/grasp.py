@@ -1,9 +1,10 @@
-"""The whole chain in simulation: hands grasp a block 50 times, and a policy that is trained on that grasps it as well.
+"""Train a policy in simulation: hands grasp a block 50 times, and a policy that learns from them grasps it, too.
 
     .venv-lerobot/bin/python examples/learning/grasp.py FOLDER [--episodes 50] [--steps 3000] [--seeds 20]
 
-The block lies elsewhere at each attempt, and the policy is told where: an ACT of lerobot, small and from scratch, on a
-CPU. Its actions go through the door of policies, as those of the policy that it is compared with: the mean episode.
+The block lies at a different place in each attempt, and the policy gets this place as an input. The policy is a small
+ACT of lerobot, which is trained from scratch on a CPU. It is compared with a policy that always plays the mean episode.
+The actions of both policies go through the same policy input of the control loop.
 """
 
 from __future__ import annotations
@@ -33,19 +34,21 @@ from q2r2_control.plants import MujocoPlant
 from q2r2_control.recording import About, Recorder
 
 TASK = tasks_named(["grasp"])[0]
-BLOCK, SPREAD = "flat_block", 0.03  # how far from its place along x and y at most [m]
-FPS, CHUNK = 10, 100  # actions a second, and in the one chunk that is the whole motion
-PLACE = "observation.environment_state"  # lerobot's name; where the block lies, x y [m]
+BLOCK, MAX_DISPLACEMENT = "flat_block", 0.03  # Block, and its largest displacement along x and y [m].
+FPS, CHUNK = 10, 100  # Number of actions per second [Hz], and of one chunk, which is the whole motion.
+PLACE = "observation.environment_state"  # lerobot's name of the block's place, x y [m].
 STATE, ACTION = "observation.state", "action"
-SMALL: dict[str, Any] = {"dim_model": 64, "n_heads": 4, "dim_feedforward": 256, "n_encoder_layers": 2}
-SMALL |= {"use_vae": False, "dropout": 0.0, "chunk_size": CHUNK, "n_action_steps": CHUNK, "device": "cpu"}
-BATCH, RATE = 16, 1e-3  # of the learning
-STILL = 0.02  # numbers that vary less are not stretched, or their tremor is all that is learned [m or 1]
-WANTED = 0.5  # of the attempts succeed
+ACT_SETTINGS: dict[str, Any] = {"dim_model": 64, "n_heads": 4, "dim_feedforward": 256, "n_encoder_layers": 2}
+ACT_SETTINGS |= {"use_vae": False, "dropout": 0.0, "chunk_size": CHUNK, "n_action_steps": CHUNK, "device": "cpu"}
+BATCH_SIZE, LEARNING_RATE = 16, 1e-3  # Batch size and learning rate.
+# Least standard deviation by which an action is scaled [m or 1]. Numbers that vary less are mostly tremor, which the
+# policy would otherwise learn.
+MIN_DEVIATION = 0.02
+MIN_SUCCESS_SHARE = 0.5  # Least share of attempts that must succeed.
 
 
 class Whole:
-    """A policy that says the whole motion when it is asked first, and later what is left of it."""
+    """A policy that returns the whole motion at its first call, and the rest of this motion at later calls."""
 
     space, rate = ActionSpace.TOOL, float(FPS)
 
@@ -59,7 +62,7 @@ class Whole:
 
 
 def learned(folder: Path, place: Array) -> Callable[[Observation], Array]:
-    """The motion that the policy in ``folder`` makes where the block lies at ``place``."""
+    """Return a function for the motion of the policy in ``folder`` if the block lies at ``place`` (2,) [m]."""
     policy = ACTPolicy.from_pretrained(folder)
     before, after = make_pre_post_processors(policy.config, str(folder))
 
@@ -75,14 +78,14 @@ def learned(folder: Path, place: Array) -> Callable[[Observation], Array]:
 
 
 def coarse(cell: Config) -> Config:
-    """The cell with a slow control loop, 100 Hz: a tenth of the work."""
+    """Return the cell with a slow control loop of 100 Hz, which needs a tenth of the work."""
     control = cell.control.model_copy(update={"max_substep": 0.01})
     return cell.model_copy(update={"loop_rate_hz": 100.0, "control": control})
 
 
 def place_of(seed: int) -> Array:
-    """Of the block in the attempt with this ``seed``, from where the cell has it [m]."""
-    return np.random.default_rng([seed, 7]).uniform(-SPREAD, SPREAD, 2)
+    """Return the block's displacement (2,) from its place in the cell in the attempt with this ``seed`` [m]."""
+    return np.random.default_rng([seed, 7]).uniform(-MAX_DISPLACEMENT, MAX_DISPLACEMENT, 2)
 
 
 def attempt(cell: Config, source: Input, place: Array, recorder: Recorder | None = None, seconds: float = 11.0) -> str:
@@ -108,7 +111,7 @@ def attempt(cell: Config, source: Input, place: Array, recorder: Recorder | None
 
 
 def record(cell: Config, episodes: int, folder: Path) -> None:
-    """Hands that tremble, and whose samples get lost and late, grasp the block wherever it lies."""
+    """Record hands that grasp the block wherever it lies. They tremble, and their samples are late or lost."""
     failed = 0
     for seed in range(episodes):
         place = place_of(seed)
@@ -120,7 +123,7 @@ def record(cell: Config, episodes: int, folder: Path) -> None:
 
 
 def export(recordings: Path, folder: Path) -> LeRobotDataset:
-    """The dataset of q2r2 export lerobot, with where the block lay in each episode."""
+    """Return the dataset of q2r2 export lerobot, with the block's place in each episode."""
     plain = folder.with_name("exported")
     command = [sys.executable, "-m", "q2r2_control", "export", "lerobot", recordings, "--output", plain]
     subprocess.run([*map(str, command), "--fps", str(FPS), "--trim", "--no-pictures"], check=True)
@@ -133,25 +136,26 @@ def export(recordings: Path, folder: Path) -> LeRobotDataset:
 
 
 def train(dataset: LeRobotDataset, steps: int, folder: Path) -> Path:
-    """Train an ACT on tensors in memory, since the loader takes longer than the policy; returns its folder."""
+    """Train an ACT on tensors in memory, because the loader takes longer than the policy. Returns its folder."""
     actions = actions_of(dataset)
     columns = {name: torch.from_numpy(column(dataset, name)) for name in (STATE, PLACE)}
     columns[ACTION] = torch.from_numpy(actions)
     sizes = {name: tuple(values.shape[1:]) for name, values in columns.items()}
     seen = {STATE: PolicyFeature(FeatureType.STATE, sizes[STATE]), PLACE: PolicyFeature(FeatureType.ENV, sizes[PLACE])}
     config = ACTConfig(
-        input_features=seen, output_features={ACTION: PolicyFeature(FeatureType.ACTION, sizes[ACTION])}, **SMALL
+        input_features=seen, output_features={ACTION: PolicyFeature(FeatureType.ACTION, sizes[ACTION])}, **ACT_SETTINGS
     )
     policy = ACTPolicy(config)
-    scale = {"mean": actions.mean(axis=0), "std": np.maximum(actions.std(axis=0), STILL)}
+    scale = {"mean": actions.mean(axis=0), "std": np.maximum(actions.std(axis=0), MIN_DEVIATION)}
     stats = dataset.meta.stats | {ACTION: scale}
     before, after = make_pre_post_processors(config, dataset_stats=stats)
     ends = torch.from_numpy(np.repeat(dataset.meta.episodes["dataset_to_index"], dataset.meta.episodes["length"]))
-    begins = torch.from_numpy(np.flatnonzero(column(dataset, "frame_index") < FPS))  # when the policy is asked
-    optimizer = torch.optim.AdamW(policy.parameters(), RATE)
+    # The policy is only called in the first second of an episode, so it learns from these frames.
+    begins = torch.from_numpy(np.flatnonzero(column(dataset, "frame_index") < FPS))
+    optimizer = torch.optim.AdamW(policy.parameters(), LEARNING_RATE)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
     for step in range(steps):
-        frames = begins[torch.randint(len(begins), (BATCH,))]
+        frames = begins[torch.randint(len(begins), (BATCH_SIZE,))]
         ahead = frames[:, None] + torch.arange(CHUNK)
         over = ahead >= ends[frames, None]
         batch = {name: columns[name][frames] for name in seen}
@@ -169,7 +173,10 @@ def train(dataset: LeRobotDataset, steps: int, folder: Path) -> Path:
 
 
 def actions_of(dataset: LeRobotDataset) -> Array:
-    """Targets of the tools, whose errors do not add up along an arm, with the openings of both grippers."""
+    """Return the targets of the tools and the openings of both grippers.
+
+    Unlike errors of joints, errors of these targets do not add up along an arm.
+    """
     return np.hstack((column(dataset, ActionSpace.TOOL), column(dataset, ACTION)[:, -2:]))
 
 
@@ -178,7 +185,7 @@ def column(dataset: LeRobotDataset, name: str) -> Array:
 
 
 def mean_episode(dataset: LeRobotDataset) -> Array:
-    """Actions (n, size) of the mean of all episodes, for as long as a policy's chunk is."""
+    """Return the actions (n, size) of the mean of all episodes, for the length of a policy's chunk."""
     actions, frames = actions_of(dataset), column(dataset, "frame_index")
     return np.array([actions[frames == frame].mean(axis=0) for frame in range(CHUNK)])
 
@@ -190,7 +197,7 @@ def main() -> None:
         parser.add_argument(f"--{name}", type=int, default=value)
     given = parser.parse_args()
     torch.manual_seed(0)
-    torch.set_num_threads(1)  # the policy is too small for more
+    torch.set_num_threads(1)  # The policy is too small to gain from more threads.
     cell = coarse(load_config("config/dual_iiwa7.yaml"))
     record(cell, given.episodes, given.folder / "recordings")
     dataset = export(given.folder / "recordings", given.folder / "dataset")
@@ -203,7 +210,7 @@ def main() -> None:
         print(f"ACT, seed {seed}: {why or 'succeeded'}", flush=True)
         done["mean episode"] += not attempt(cell, PolicyInput(Whole(lambda seen: mean)), place)
     print(", ".join(f"{name}: {count} of {given.seeds}" for name, count in done.items()))
-    sys.exit(done["ACT"] < max(WANTED * given.seeds, done["mean episode"] + 1))
+    sys.exit(done["ACT"] < max(MIN_SUCCESS_SHARE * given.seeds, done["mean episode"] + 1))
 
 
 if __name__ == "__main__":

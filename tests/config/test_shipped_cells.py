@@ -77,7 +77,7 @@ class TestTheShippedCellShowsAllThereIsToTune:
             assert getattr(load_config(CELL), key) == Config.model_fields[key].default
 
     def test_the_example_of_a_pair_by_name_exists_in_the_cell(self) -> None:
-        (example,) = re.findall(r"pairs: \[\] +# .*such as (\[.*?\}\])", CELL.read_text(encoding="utf-8"))
+        (example,) = re.findall(r"names of the bodies, such as (\[.*?\}\])", CELL.read_text(encoding="utf-8"))
         config = Config.model_validate(yaml.safe_load(changed("control.pairs", yaml.safe_load(example))))
         kept = kept_distances(Robot.from_config(config), config.control)
         assert "pairs[0]" in kept.keys

@@ -108,7 +108,7 @@ def test_a_store_has_the_subtask_of_each_frame_and_the_names_by_episode(tmp_path
     ("changes", "told"),
     [
         ({"cameras": {}}, f"run-2.mcap: has no {CAMERA}, which run-1.mcap has"),
-        ({"names": {**EPISODES[1].names, "action": ("a",) * len(EPISODES[1].names["action"])}}, "has not the action"),
+        ({"names": {**EPISODES[1].names, "action": ("a",) * len(EPISODES[1].names["action"])}}, "its action differs"),
     ],
     ids=["a camera less", "other joints"],
 )

@@ -1,6 +1,6 @@
 """The hands of a headset, of a page or of a script, for a cell that lerobot runs in the same program.
 
-They drive the cell's own loop, with its clutch, leash and vibrations; lerobot gets what the arms are led to.
+The hands drive the cell's own loop, with its clutch, leash and vibrations. lerobot gets the targets of the arms.
 """
 
 from __future__ import annotations
@@ -23,16 +23,18 @@ _logger = logging.getLogger(__name__)
 @TeleoperatorConfig.register_subclass("q2r2_hands")
 @dataclass(kw_only=True)
 class Q2R2HandsConfig(TeleoperatorConfig):
-    input: str = "headset"  # an installed input: headset, web, scripted, or of another package
-    options: dict[str, Any] = field(default_factory=dict)  # of the input, such as {trajectory: circle}
-    web_host: str = "127.0.0.1"
-    web_port: int = 8080
+    """The settings of the hands."""
+
+    input: str = "headset"  # Name of an installed input: headset, web, scripted, or one of another package.
+    options: dict[str, Any] = field(default_factory=dict)  # Options of the input, such as {trajectory: circle}.
+    web_host: str = "127.0.0.1"  # Address on which the page of the input web is served.
+    web_port: int = 8080  # Port on which the page of the input web is served.
 
 
 class Q2R2Hands(Teleoperator):
-    """A press engages an arm where it is, as in ``q2r2 run``. There is one cell of lerobot in the program.
+    """Hands that engage an arm where it is by a press, as in ``q2r2 run``. The program has one cell of lerobot.
 
-    In ``lerobot-rollout`` these are hands with a clutch: ``--strategy.smooth_handover=false``.
+    The hands have a clutch, so ``lerobot-rollout`` needs ``--strategy.smooth_handover=false``.
     """
 
     config_class = Q2R2HandsConfig
@@ -46,7 +48,7 @@ class Q2R2Hands(Teleoperator):
     @property
     def _cell(self) -> Q2R2Cell:
         if Q2R2Cell.newest is None:
-            raise DeviceNotConnectedError(f"{self}: there is no cell; allowed: with --robot.type=q2r2_cell")
+            raise DeviceNotConnectedError(f"{self}: there is no cell; allowed: a robot of --robot.type=q2r2_cell")
         return Q2R2Cell.newest
 
     @property
@@ -94,7 +96,7 @@ class Q2R2Hands(Teleoperator):
         return self._cell.hands_action()
 
     def send_feedback(self, feedback: dict[str, Any]) -> None:
-        """Nothing to do: the cell's loop lets the hands feel the arms."""
+        """Do nothing, because the cell's own loop sends vibrations to the hands."""
 
     def disconnect(self) -> None:
         if self._attached is None:

@@ -1,6 +1,6 @@
-"""The format ``zarr`` of ``q2r2 export``: one store, as diffusion_policy's ReplayBuffer reads it.
+"""The format ``zarr`` of ``q2r2 export``, which is one store that diffusion_policy's ReplayBuffer reads.
 
-All episodes stand one after the other in arrays under ``data``; ``meta/episode_ends`` has where each of them ends. See
+The arrays under ``data`` contain all episodes one after the other, and ``meta/episode_ends`` has the end of each. See
 https://github.com/real-stanford/diffusion_policy, diffusion_policy/common/replay_buffer.py.
 """
 
@@ -15,19 +15,19 @@ import zarr
 
 from q2r2_control import EpisodeVectors, ExportFormat, RecordingError
 
-_LAYOUT = 2  # of zarr's own formats, the one that diffusion_policy's version of the package reads
-_ROWS = 1000  # numbers of so many frames in one chunk; each picture is a chunk by itself
+_ZARR_FORMAT = 2  # Version of zarr's format that diffusion_policy's version of the package reads.
+_FRAMES_PER_CHUNK = 1000  # Number of frames in one chunk of numbers. Each picture is a chunk of its own.
 
 
 def array_name(feature: str) -> str:
-    """The name of a feature's array: ``state`` for ``observation.state``, ``action_tool`` for ``action.tool``."""
+    """Return the name of a feature's array, such as ``state`` for ``observation.state``."""
     return feature.removeprefix("observation.").replace(".", "_")
 
 
 def write_episode(episode: EpisodeVectors, path: Path) -> None:
-    """Write one episode as a store of its own, at ``path``; what is there is removed."""
+    """Write one episode as a store of its own at ``path``. Anything that exists there is removed."""
 
-    root = zarr.open_group(str(path), mode="w", zarr_format=_LAYOUT)
+    root = zarr.open_group(str(path), mode="w", zarr_format=_ZARR_FORMAT)
     root.attrs.update(
         {
             **{name: getattr(episode, name) for name in ("cell", "task", "fps", "recording", "success")},
@@ -50,8 +50,8 @@ def write_episode(episode: EpisodeVectors, path: Path) -> None:
 
 
 def join_episodes(files: Sequence[Path], folder: Path) -> None:
-    """Join stores of single episodes, at least one, in a new one. Raises :class:`RecordingError` where they differ."""
-    root = zarr.open_group(str(folder), mode="w-", zarr_format=_LAYOUT)
+    """Join stores of single episodes, at least one, in a new one. Raises :class:`RecordingError` if arrays differ."""
+    root = zarr.open_group(str(folder), mode="w-", zarr_format=_ZARR_FORMAT)
     data, ends, about, first = root.create_group("data"), list[int](), list[dict[str, Any]](), ""
     for file in files:
         episode = zarr.open_group(str(file), mode="r")
@@ -64,7 +64,7 @@ def join_episodes(files: Sequence[Path], folder: Path) -> None:
                 _create(data, name, np.empty(rows.shape[1:], dtype=rows.dtype)).attrs.update(dict(rows.attrs))
             made = data.get(name)
             if made is None or made.shape[1:] != rows.shape[1:] or dict(made.attrs) != dict(rows.attrs):
-                raise RecordingError(f"{recording}: has not the {name} that {first} has")
+                raise RecordingError(f"{recording}: its {name} differs from that of {first}")
             for begin in range(0, rows.shape[0], made.chunks[0]):
                 made.append(rows[begin : begin + made.chunks[0]])
         if missing := set(data.array_keys()) - arrays.keys():
@@ -75,8 +75,8 @@ def join_episodes(files: Sequence[Path], folder: Path) -> None:
 
 
 def _create(group: Any, name: str, row: Any) -> Any:
-    """An array without rows yet, of the shape and type of ``row``."""
-    rows = _ROWS if row.ndim < 2 else 1
+    """Create an array without rows, with the shape and type of ``row``."""
+    rows = _FRAMES_PER_CHUNK if row.ndim < 2 else 1
     return group.create_array(name, shape=(0, *row.shape), chunks=(rows, *row.shape), dtype=row.dtype)
 
 
