@@ -44,7 +44,8 @@ def enclose_shapes(geometry: pin.GeometryModel, capsules: Mapping[str, int] | No
 
     Args:
         geometry: The geometry model.
-        capsules: For some links, the greatest number of capsules for each of their meshes; 1 also for other shapes.
+        capsules: For some links, the greatest number of capsules for each of their meshes. The value 1 is also allowed
+            for links with other shapes.
 
     Raises:
         RobotError: If a shape has no extent or no bounds.

@@ -19,11 +19,11 @@ from q2r2_control.errors import ConfigError
 from q2r2_control.robot.pairs import CLEARANCE, keep_pairs, link_of
 from q2r2_control.robot.urdf_parts import fixed_joint
 
-FLOOR = "floor"  # The name of its link.
+FLOOR = "floor"  # The name of the floor's link.
 
 _SIZE = (100.0, 100.0, 10.0)  # [m]
 _ON = 1e-3  # A box stands on the floor if its underside is not higher than this [m].
-_UPRIGHT = 1e-9  # sine of the angle to the vertical [-]
+_UPRIGHT = 1e-9  # Greatest sine of the angle to the vertical at which an axis counts as vertical [-].
 
 
 def floor_link(height: float, parent: str, obstacles: Collection[str]) -> list[ET.Element]:

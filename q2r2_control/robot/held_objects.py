@@ -34,7 +34,7 @@ class HeldObject:
     arm: str
     link: str  # The link after which its bodies are named.
     joint: int  # The joint in ``Robot.model`` that carries it.
-    placement: pin.SE3  # Of its centre, in the frame of that joint.
+    placement: pin.SE3  # Placement of its centre in the frame of that joint.
     config: HeldObjectConfig
 
     def inertia(self, share: float = 1.0) -> pin.Inertia:

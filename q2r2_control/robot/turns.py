@@ -25,13 +25,13 @@ class TurnCounter:
         joints = self._joints = np.flatnonzero(robot.endless)
         self._half_turn_s = math.pi / robot.velocity_limit[joints]
         self._last = np.zeros(len(joints))  # The last positions of these joints with their turns [rad].
-        self._at = np.full(len(joints), -math.inf)  # When each was measured [s].
+        self._at = np.full(len(joints), -math.inf)  # The times at which they were measured [s].
 
     def counted(self, q: Array, at: float | Array) -> Array:
         """Return the reported positions ``q`` (nv,) [rad] with the turns of continuous joints.
 
-        ``at`` is when they were measured [s]: one time, or one for each joint (nv,). Without a change ``q`` itself is
-        returned. Positions that are not finite are not changed.
+        ``at`` is the time of the measurement [s]: one time, or one for each joint (nv,). If nothing changes, ``q``
+        itself is returned. Positions that are not finite are not changed.
         """
         if not len(self._joints) or not np.isfinite(given := q[self._joints]).all():
             return q
