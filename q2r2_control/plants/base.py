@@ -55,7 +55,7 @@ class Plant(Protocol):
         """
 
     def gripper_openings(self) -> dict[str, float]:
-        """Return the measured opening of each gripper, from 0 for closed to 1, as a new mapping at each call."""
+        """Return the measured opening of each gripper, from 0 for closed to 1 for open, as a new mapping each time."""
 
     def close(self) -> None:
         """Free every resource. It may be called twice."""
@@ -157,7 +157,7 @@ def check_command(command: Command, robot: Robot, modes: tuple[CommandMode, ...]
 def check_joints(what: str, values: Array, robot: Robot) -> None:
     """Raise :class:`PlantError` if ``values`` does not have one finite number for each joint of the robot."""
     _check_shape(what, values, robot)
-    # A scalar product is a fast test. The squares of large finite numbers may overflow, and are looked at again.
+    # A scalar product is a fast test. The squares of large finite numbers may overflow, and so they are checked again.
     if not math.isfinite(values.dot(values)) and not np.isfinite(values).all():
         joint = int(np.flatnonzero(~np.isfinite(values))[0])
         raise PlantError(f"{what}: {robot.joint_names[joint]} = {values[joint]}: allowed: finite numbers")

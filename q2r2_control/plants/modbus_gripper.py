@@ -46,11 +46,11 @@ logging.getLogger("pymodbus").addHandler(logging.NullHandler())  # It would prin
 class GripperStatus:
     """One reading of a gripper."""
 
-    requested: bool  # gACT: an activation was asked for.
-    activated: bool  # gSTA: the activation is complete.
-    holds: bool  # gOBJ: an object has stopped the fingers while they opened or closed.
-    fault: int  # gFLT
-    position: int  # gPO: from about 0 for open to 255 for closed.
+    requested: bool  # The register gACT: an activation was requested.
+    activated: bool  # The register gSTA: the activation is complete.
+    holds: bool  # The register gOBJ: an object has stopped the fingers while they opened or closed.
+    fault: int  # The register gFLT: the number of the fault.
+    position: int  # The register gPO: the position, from about 0 for open to 255 for closed.
 
     @classmethod
     def of(cls, registers: Sequence[int]) -> GripperStatus:
