@@ -73,7 +73,7 @@ class ModbusGripper:
     """The gripper of one arm in one run. Openings go from 0 for closed to 1 for open."""
 
     def __init__(self, arm: str, config: ModbusGripperConfig) -> None:
-        """Raises :class:`ConfigError` if pymodbus is not installed."""
+        """Raise :class:`ConfigError` if pymodbus is not installed."""
         self._arm, self._config, self._client = arm, config, _client(arm, config)
         self._where = f"{config.modbus}, unit {config.unit}"
         self.status: GripperStatus | None = None  # None if the gripper does not answer.

@@ -125,11 +125,11 @@ class ArmAssembly:
         return self.model.name_in_cell(name)
 
     def finger_names(self) -> tuple[str, ...]:
-        """The joints that the gripper drives, with their names in the cell."""
+        """Return the joints that the gripper drives, with their names in the cell."""
         return tuple(map(self.name_in_cell, self.config.gripper.joints))
 
     def tool_links(self) -> tuple[str, ...]:
-        """The links of the tool, or of the hand that carries the gripper's joints, with their names in the cell."""
+        """Return the names in the cell of the links of the tool, or of the hand that carries the gripper's joints."""
         has_tool = self.config.tool.model is not None
         links = self.mounted[-1].model.links if has_tool else hand_links(self.tree, self.config.gripper.joints)
         return tuple(sorted(map(self.name_in_cell, links)))
