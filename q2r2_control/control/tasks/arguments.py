@@ -1,4 +1,4 @@
-"""Checks of the arguments of tasks. Each error names the argument and what is allowed."""
+"""Check the arguments of tasks. Each error names the argument and what is allowed."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def positive(key: str, value: float, most: float = math.inf) -> float:
 
 
 def vector(key: str, value: Sequence[float]) -> Array:
-    """Return ``value`` as an array (3,). Raises :class:`ConfigError` unless it is three finite numbers."""
+    """Return ``value`` as an array (3,); raises :class:`ConfigError` unless it is three finite numbers."""
     try:
         numbers = np.array(value, dtype=np.float64)
     except (TypeError, ValueError):
