@@ -46,7 +46,7 @@ class Guard:
 
         The answer must have a real array ``v`` of shape (nv,), all finite, and a finite ``solve_time`` of at least 0.
         An exception or any other answer counts as a failed solve. With ``v = None`` the solver itself reports a failed
-        solve. The ``solve_time`` of the result is at least our measured time, so that no solver can claim to be in time.
+        solve. The ``solve_time`` of the result is at least our measured time, so that no solver can hide a delay.
         """
         try:
             self.failure = _fault_of(problem)
