@@ -1,4 +1,4 @@
-"""Checks whether a camera's pictures came in time, are not black or damaged, and change when the arms move."""
+"""Check whether a camera's pictures came in time, are not black or damaged, and change when the arms move."""
 
 from __future__ import annotations
 
