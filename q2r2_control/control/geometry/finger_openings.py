@@ -47,7 +47,7 @@ class FingerOpenings:
         self._parts: dict[int, tuple[float, float]] = {}
 
     def checked(self, arm: str, least: float, greatest: float) -> Interval:
-        """Return the interval in a form that can be set. Raises :class:`RobotError` for an invalid interval."""
+        """Return the interval in a form that can be set; raises :class:`RobotError` if it is not an interval."""
         usable = all(isinstance(value, int | float | np.floating) for value in (least, greatest))
         if not (usable and -math.inf < least <= greatest < math.inf):
             raise RobotError(

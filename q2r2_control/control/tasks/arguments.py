@@ -22,7 +22,7 @@ def check_robot(robot: Robot) -> None:
 def chosen_arms(robot: Robot, arms: Sequence[str] | None) -> list[str]:
     """Return the names in ``arms``, or all arms if it is None.
 
-    Raises :class:`ConfigError` for a name without an arm.
+    Raises :class:`ConfigError` if a name is not the name of an arm.
     """
     names = list(robot.arms) if arms is None else arms
     if not isinstance(names, list | tuple) or not names or any(name not in [*robot.arms] for name in names):

@@ -148,7 +148,7 @@ class FriCommand:
 
 
 def read_monitoring(datagram: bytes) -> Monitoring:
-    """Return a cabinet's message. Raises :class:`ProtocolError` for other bytes."""
+    """Return a cabinet's message; raises :class:`ProtocolError` if the bytes are not one."""
     version, message = _parsed(datagram, MonitoringMessage, _MONITORING)
     data, connection, ipo, robot = message.data, message.connection, message.ipo, message.robot
     if (q := _joints(data, "q")) is None:
@@ -201,7 +201,7 @@ def write_monitoring(monitoring: Monitoring) -> bytes:
 
 
 def read_command(datagram: bytes) -> tuple[int, FriCommand]:
-    """Return version and answer of a client. Raises :class:`ProtocolError` for other bytes."""
+    """Return version and answer of a client; raises :class:`ProtocolError` if the bytes are not an answer."""
     version, message = _parsed(datagram, CommandMessage, _COMMAND)
     data, header = message.data, message.header
     return version, FriCommand(
