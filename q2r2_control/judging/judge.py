@@ -226,7 +226,7 @@ def discarded_episodes(file: Path, pictures: bool) -> dict[int, str]:
     The pictures are judged if ``pictures`` is True.
 
     Raises:
-        RecordingError: If the recording cannot be read.
+        RecordingError: If the recording cannot be opened or judged.
     """
     changed = open_recording(file).file.stat().st_mtime_ns
     return _discarded(file, pictures, file.absolute(), changed)
