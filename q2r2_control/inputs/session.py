@@ -83,7 +83,7 @@ class HeadsetSession:
 
     Data on topics outside ``HAND_TOPICS`` is counted and ignored. A registration whose topic or type the app's user
     left empty gets an error for the app's console, as from Unity's own endpoint. An unknown command, a name that no
-    topic can have, or a payload that its topic cannot have raises a :class:`ProtocolError`, since the two sides do not
+    topic can have, or a payload that its topic cannot have raises a :class:`ProtocolError`. The two sides then do not
     speak the same protocol.
     """
 

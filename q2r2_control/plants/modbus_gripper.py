@@ -5,7 +5,7 @@ Hand-E, 2F-85 and 2F-140 have the same registers (chapter 4 of their instruction
 **Safety.** Until an opening is measured, the fingers count as their whole way. After that, they count as the openings
 that were measured and commanded a moment ago. An activation opens and closes the fingers fully. It is therefore done
 only before the first opening of a run. If the measured opening, or the command at that time, is older than
-``MODBUS_DELAY``, the opening is not known any more, and supervision grants no other opening.
+``MODBUS_DELAY``, the opening is no longer known. Supervision then grants no other opening.
 """
 
 from __future__ import annotations

@@ -124,8 +124,8 @@ def let_fingers_slide(spec: mujoco.MjSpec, config: Config) -> None:
                 pair.solref, pair.solreffriction = _STIFFNESS, _SLIDING
 
 
-# Contacts of soft objects: share of MuJoCo's answer for a rigid body, time in which foam takes its shape again [s], and
-# number of points on which a box stands.
+# Contacts of soft objects. The numbers are the share of MuJoCo's answer for a rigid body, the time in which foam takes
+# its shape again [s], and the number of points on which a box stands.
 _SHARE, _RECOVERY, _CORNERS = 0.9, 0.02, 4
 
 

@@ -1,7 +1,7 @@
 """Compute the bodies of fingers. Each body is the volume that a finger sweeps over the travel of its joints.
 
 Distances depend on the arm's joints only, and so the body of a finger covers its whole way. While the opening of the
-gripper is known, a smaller body counts: a part of the segment if the finger slides, and a capsule of
+gripper is known, a smaller body counts. It is a part of the segment if the finger slides, and a capsule of
 turning_fingers.py if it turns.
 """
 

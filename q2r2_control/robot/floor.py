@@ -48,7 +48,7 @@ def sink_boxes_into_floor(geometry: pin.GeometryModel) -> None:
     """Extend fixed upright boxes that stand on the floor deep into it, so that nothing is pushed out downwards.
 
     A body inside a box is pushed out through the nearest face. It cannot leave through the underside of a box on the
-    floor: a hand deep in the box and its wrist above would be pushed apart, and stay there for ever. Above the floor
+    floor. A hand deep in the box and its wrist above would be pushed apart, and stay there for ever. Above the floor
     the box does not change.
     """
     floor = next((item for item in geometry.geometryObjects if _is_floor(item)), None)

@@ -1,9 +1,9 @@
 """Identify the mass and the centre of mass that an arm carries, from torques at rest in many postures.
 
-At rest the torques of gravity are linear in the mass m of the last link and in m c, where c is its centre of mass. The
-difference between measured torques and a model therefore tells by how much m and m c differ from the model. Published
-masses of an arm's links differ by up to a factor of two. If they are wrong, no load explains the torques, and the load
-is not judged.
+Let m be the mass of the last link, and c its centre of mass. At rest the torques of gravity are linear in m and in m c.
+The difference between measured torques and a model therefore tells by how much m and m c differ from the model.
+Published masses of an arm's links differ by up to a factor of two. If they are wrong, no load explains the torques, and
+the load is not judged.
 """
 
 from __future__ import annotations

@@ -75,8 +75,8 @@ def checked_chain(tree: LinkTree, arm: str, frame: str, where: str) -> list[str]
     """Return the names of the joints that move an arm's ``frame``.
 
     Raises:
-        RobotError: With a text that begins with ``where``, if there are none, or if the controller cannot use one of
-            them because of its type or its limits.
+        RobotError: If there are none, or if the controller cannot use the type or the limits of one of them. The text
+            begins with ``where``.
     """
     if frame != tree.root and frame not in tree.joint_to:
         raise RobotError(f"{where}: arm {arm}: no link {frame!r:.60}; links: {', '.join([tree.root, *tree.joint_to])}")

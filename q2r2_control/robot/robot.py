@@ -76,9 +76,9 @@ class Robot:
     prismatic joints they are in [m], [m/s] and [N]. ``acceleration_limit`` is infinite for joints without such a limit
     in the model. :meth:`capped_acceleration` returns the limits that hold.
 
-    ``collision_model`` holds exactly the monitored pairs: each arm with the other arm and its base, with its own links
-    that it can meet, and with obstacles. Every monitored shape is a capsule, a sphere, or a box fixed in the world. The
-    body of a finger is the volume that it sweeps, and ``finger_bodies`` tells which part counts at a known opening.
+    ``collision_model`` holds exactly the monitored pairs. Each arm has pairs with the other arm and its base, with its
+    own links that it can meet, and with obstacles. Every monitored shape is a capsule, a sphere, or a box fixed in the
+    world. The body of a finger is the volume that it sweeps. ``finger_bodies`` tells which part counts at an opening.
     ``objects`` are the objects that grippers hold, in addition to the collision model. ``ignored_pairs`` are pairs of
     one arm's shapes that overlap by construction.
 

@@ -107,9 +107,9 @@ def segment_box(a0: Array, a1: Array, half: Array, on_a: Array, on_box: Array, n
     """Return the signed distance [m] of a segment and a box of half sides ``half``, all in the box frame, (3,).
 
     The closest points and the unit normal from the segment to the box are written. The squared distance along the
-    segment is convex and piecewise quadratic. The zero of its slope is therefore found exactly between two of the at
-    most six parameters at which the segment crosses the plane of a face. A segment that enters the box is pushed out on
-    the shortest way.
+    segment is convex and piecewise quadratic. Its pieces meet at the parameters, six at most, at which the segment
+    crosses the plane of a face. Between two of them, the zero of the slope is found exactly. A segment that enters the
+    box is pushed out on the shortest way.
     """
     s = _minimum_along(a0, a1, half)
     for k in range(3):

@@ -16,8 +16,8 @@ _HARD, _SOFT = 0, 8  # Marks of a row in DAQP.
 class DaqpSolver:
     """DAQP (Arnstrom, Bemporad, Axehill, IEEE TAC 2022), a dual active-set method with soft rows.
 
-    It starts cold at each tick. A start from the last multipliers would save 16 of 17 iterations in contact, but no
-    time, because most of the time goes into the set-up of the problem. The solution would also depend on the past.
+    It starts cold at each tick. A start from the last multipliers would save 16 of 17 iterations in contact. It would
+    save no time, because most of it goes into the set-up of the problem. The solution would also depend on the past.
 
     Args:
         nv: Number of joints.

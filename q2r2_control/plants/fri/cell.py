@@ -3,8 +3,8 @@
 **The loop's time and the cabinets' time.** Each tick of the loop moves the reference to one period after the tick. If
 ticks took longer lately, or commands came too late, the reference goes farther ahead by as much. The cabinets get their
 answers from it a little later (``DELAY``). If the loop is so late that an answer would pass the end of the reference,
-the cabinets get the certified stop, and :meth:`FriCell.due` lets the reference follow the same stop first. If an answer
-passes the end in the middle of a tick, the sessions refuse the command of this tick, and it is withdrawn.
+the cabinets get the certified stop. :meth:`FriCell.due` then lets the reference follow the same stop first. If an
+answer passes the end in the middle of a tick, the sessions refuse the command of this tick, and it is withdrawn.
 """
 
 from __future__ import annotations
