@@ -316,8 +316,8 @@ def parse_config(text: str, path: str | os.PathLike[str], folder: Path | None = 
 # does so one step at a joint's greatest speed before the limits. This step is 1.8 degrees at most if commands are due
 # every 10 ms, which the 5 degrees include.
 _DRIVER_MARGIN = 0.105
-# Commands come unevenly. One more command than usual in a period of the driver speeds up its filter of time constant T
-# by the time between commands / T, which is an eighth for 5 ms and 40 ms. A command that was late by d adds
+# Commands come unevenly. One more command than usual in a period of the driver speeds up its filter of time constant T.
+# The share is the time between commands / T, which is an eighth for 5 ms and 40 ms. A command that was late by d adds
 # (d / T)^2 / 2. A joint beyond its velocity limit closes the connection as well.
 _DRIVER_SPEED = 0.85
 # If answers catch up with a cabinet's clock, the cabinet sees 1.05 times the reference's speeds (plants.fri.answers).

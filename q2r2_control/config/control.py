@@ -299,7 +299,7 @@ def _live_fields(settings: type[StrictModel]) -> tuple[str, ...]:
 
 
 LIVE = _live_fields(ControllerSettings)  # Names of the settings that may change while a controller runs.
-LIVE_IMPEDANCE = _live_fields(ImpedanceSettings)  # The same for an impedance.
+LIVE_IMPEDANCE = _live_fields(ImpedanceSettings)  # Names of the settings of an impedance that may change.
 
 
 class SupervisionSettings(StrictModel):

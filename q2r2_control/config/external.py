@@ -158,7 +158,7 @@ class ExternalConfig(StrictModel):
 
     @property
     def terms(self) -> Preset:
-        """The preset."""
+        """The preset of the controller."""
         return preset_called(self.preset)
 
     @property

@@ -13,7 +13,7 @@ from q2r2_control.errors import raised
 from q2r2_control.types import Array
 
 Answer = tuple[Array, Array]
-_MAX_LENGTH = 120  # Of the line.
+_MAX_LENGTH = 120  # Greatest length of the line [characters].
 
 
 def answer_of(ask: Callable[[Array, Array], object], q: Array, v: Array, shapes: str = "") -> Answer | str:

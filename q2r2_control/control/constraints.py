@@ -60,7 +60,7 @@ class OwnConstraints:
     """The constraints of one controller, and their rows at the present step."""
 
     def __init__(self, robot: Robot, own: Sequence[Constraint]) -> None:
-        """Raises :class:`ConfigError` if an object is not a constraint, or has no usable rows at home."""
+        """Raise :class:`ConfigError` if an object is not a constraint, or has no usable rows at home."""
         allowed = "an object with a method rows(q, v), and hard = True or False if it has that"
         if not isinstance(own, list | tuple):
             raise ConfigError(f"constraints = {shown(own)}: allowed: a list of objects with a method rows(q, v)")

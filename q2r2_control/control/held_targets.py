@@ -1,9 +1,9 @@
-"""Bridges the time between targets that come less often than the controller's steps, as those of a tracker do.
+"""Bridge the time between targets that come less often than the controller's steps, such as the targets of a tracker.
 
-A target that is held until the next one stands still in most steps and jumps in one of them. The controller would
-follow each jump with a joint at its limit of acceleration. Here, a target that replaces one which was held for some
-steps is reached in 1.25 times as long, along a straight line and by a constant rotation. It therefore arrives later by
-that time. A target that changes at every step, or after more than :data:`LONGEST_HOLD`, is passed on at once.
+A target that is held until the next one stands still in most steps, and jumps in one of them. The controller would
+follow each jump with a joint at its acceleration limit. Here, a target that replaces one which was held for some steps
+is reached in 1.25 times as long. It moves along a straight line with a constant rotation, and arrives later by that
+time. A target that changes at every step, or after more than :data:`LONGEST_HOLD`, is passed on at once.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-LONGEST_HOLD = 0.11  # A target that was held for longer was not one of a stream [s].
+LONGEST_HOLD = 0.11  # A target that was held for longer did not belong to a stream [s].
 _SPARE = 1.25  # A target is reached in this many times the last hold, so that the next one may come late by a quarter.
-_FARTHEST = 1e3  # A target that is farther away is no place that an arm could reach [m].
-_ORTHONORMAL = 5e-4  # The largest error of a rotation matrix R R' of a target; half of that at which it is refused.
+_FARTHEST = 1e3  # No arm could reach a target that is farther away [m].
+_ORTHONORMAL = 5e-4  # Largest error of R R' of a target's rotation R. A target is refused at twice this error.
 _STEPS = 1.5  # A target that changes after fewer steps than this is new at every step, or nearly so.
 
 
@@ -29,7 +29,7 @@ class _Way:
     start: pin.SE3
     goal: pin.SE3
     duration: float = 0.0  # [s]
-    held: float = 0.0  # How long the goal has been given [s].
+    held: float = 0.0  # Time for which the goal has been given [s].
 
     def begin(self, goal: pin.SE3, dt: float) -> None:
         """Begin a way to a new ``goal``, with steps of ``dt`` [s]. It has no length if the goals are no samples."""
@@ -48,7 +48,7 @@ class _Way:
 
 
 class HeldTargets:
-    """The targets of all arms, with what lies between two of them while the newest one is held."""
+    """The targets of all arms, with poses between two of them while the newest one is held."""
 
     def __init__(self) -> None:
         self._ways: dict[str, _Way] = {}
@@ -77,7 +77,7 @@ class HeldTargets:
         return found
 
     def peek(self, targets: Mapping[str, pin.SE3 | None], dt: float) -> dict[str, pin.SE3 | None]:
-        """Return what :meth:`between` would return, and change nothing."""
+        """Return the result of :meth:`between` without a change of this object."""
         kept = self._ways
         try:
             self._ways = {arm: copy.copy(way) for arm, way in kept.items()}
@@ -87,8 +87,8 @@ class HeldTargets:
 
 
 def _is_ordinary(pose: pin.SE3) -> bool:
-    """Return whether what lies between this pose and another such pose is a pose, too."""
+    """Return whether the poses between this pose and another such pose are valid poses."""
     rotation = pose.rotation
-    if not (np.abs(rotation).max() < 2.0 and np.abs(pose.translation).max() < _FARTHEST):  # Neither NaN nor infinite.
+    if not (np.abs(rotation).max() < 2.0 and np.abs(pose.translation).max() < _FARTHEST):  # NaN fails too.
         return False
     return bool(np.abs(rotation @ rotation.T - np.eye(3)).max() < _ORTHONORMAL and np.linalg.det(rotation) > 0.0)

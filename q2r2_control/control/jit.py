@@ -14,20 +14,20 @@ from q2r2_control.control.kernel_compiler import Kernel
 
 
 def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile ``function`` at its first call; strict IEEE arithmetic, no Python objects, division by 0 gives inf.
+    """Compile ``function`` at its first call: strict IEEE arithmetic, no Python objects, a division by 0 gives inf.
 
-    It may allocate nothing, so that references to the arrays of its calls are not counted.
+    The function may not allocate memory. References to the arrays of its arguments are therefore not counted.
     """
     return _compiled(function, _nrt=False)
 
 
 def inlined_kernel(function: Callable[..., Any]) -> Callable[..., Any]:
-    """A :func:`kernel` that becomes part of its callers: for a small one that is called for each pair."""
+    """Compile a small function that is called for each pair as a :func:`kernel` that becomes part of its callers."""
     return _compiled(function, _nrt=False, forceinline=True)
 
 
 def numpy_kernel(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile a function of NumPy that may allocate: for a few large steps in a tick that BLAS and LAPACK do."""
+    """Compile a function of NumPy that may allocate memory, for the few large steps of a tick in BLAS and LAPACK."""
     return _compiled(function)
 
 
@@ -37,7 +37,7 @@ _kernels: list[Any] = []  # All dispatchers of this process.
 def _compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
     if numba.config.DISABLE_JIT:
         return function
-    # Nothing calls a kernel through its C wrapper, which would be compiled beside the one for Python.
+    # Nothing calls a kernel through its C wrapper, which would be compiled in addition to the one for Python.
     options |= {"nopython": True, "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
     compiled: Any = Kernel(function, options)
     compiled._cache = KernelCache(function)
@@ -72,7 +72,7 @@ class _Progress(Listener):
 def compiling(progress: Callable[[int, int], None]) -> Iterator[None]:
     """Report to ``progress`` the number of compiled kernels, and of those that this process may need.
 
-    It is called before the first one, and after each; never where all come from the cache.
+    It is called before the first kernel is compiled and after each. It is not called if all come from the cache.
     """
     with install_listener("numba:compile", _Progress(progress)):
         yield
@@ -81,7 +81,8 @@ def compiling(progress: Callable[[int, int], None]) -> Iterator[None]:
 def bound(function: Callable[..., Any], *arguments: Any) -> Callable[..., Any]:
     """Return a kernel's machine code for the types of these arguments, after one run with them.
 
-    It does not look at the types of its arguments, which saves time: hand it exactly these types and layouts.
+    The code does not check the types of its arguments, which saves time. Its arguments must have exactly these types
+    and layouts.
     """
     function(*arguments)
     dispatcher: Any = function  # At run time, Numba sets get_overload too.

@@ -1,9 +1,9 @@
 """Keep the machine code of kernels between runs.
 
-Numba's own cache looks only at the path and the time of the compiled function's file. A kernel that calls another
-module's kernel would go on running that module's old code after an edit, and a second checkout would compile everything
-again. The cache folder is therefore named by a hash of every source file of this package that machine code is made
-from, and each kernel in it is found by its module's name and its file's content.
+Numba's own cache looks only at the path and the time of the compiled function's file. After an edit, a kernel that
+calls another module's kernel would go on running that module's old code. A second checkout would compile everything
+again. The cache folder is therefore named by a hash of all source files from which machine code is made. Each kernel in
+it is found by its module's name and its file's content.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ def compiled_sources() -> list[Path]:
 def _cache_folder() -> Path:
     """Return the folder of this version's machine code. It becomes the newest, and all but the two newest are deleted.
 
-    A folder that another process has loaded from may be deleted: its machine code is in memory, and what that process
-    still compiles is written again. If the cache cannot be written, its content is still used.
+    A folder from which another process has loaded may be deleted. The machine code of that process is in memory, and
+    the code that it still compiles is written again. If the cache cannot be written, its content is still used.
     """
     digest = hashlib.sha256(b"".join(source.read_bytes() for source in compiled_sources())).hexdigest()[:16]
     try:

@@ -1,9 +1,9 @@
 """Compile each kernel once, however many other kernels call it.
 
-Numba optimises a function together with all that it calls, and translates it to machine code, each time that one of its
-callers is compiled: a chain of eleven calls would be optimised eleven times. Here, a kernel that is compiled on behalf
-of another one stays as it was written. Only a kernel that Python calls is linked with all its parts, optimised and
-translated as one.
+Numba optimises a function together with all functions that it calls, and translates it to machine code. It does so
+again each time that one of its callers is compiled. A chain of eleven calls would therefore be optimised eleven times.
+Here, a kernel that is compiled for another kernel is not optimised. Only a kernel that Python calls is linked with all
+its parts, optimised and translated as one.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from numba.core.sigutils import normalize_signature
 
 
 class _PartLibrary(JITCodeLibrary):
-    """Code of a kernel that is compiled as a part of another one.
+    """The code of a kernel that is compiled as a part of another one.
 
-    It is only linked into that one, and does not run alone.
+    It is only linked into the other one, and does not run alone.
     """
 
     def finalize(self) -> None:
@@ -50,12 +50,12 @@ class _PartLibrary(JITCodeLibrary):
 
 
 class _WholeLibrary(JITCodeLibrary):
-    """Code of a kernel that Python calls, with all of its parts."""
+    """The code of a kernel that Python calls, with all of its parts."""
 
     _linking_libraries: list[Any]
 
     def finalize(self) -> None:
-        """Link, optimise and translate all of it."""
+        """Link, optimise and translate all of the code."""
         libraries: dict[Any, None] = {}
         waiting = list(self._linking_libraries)
         while waiting:
@@ -68,7 +68,7 @@ class _WholeLibrary(JITCodeLibrary):
         super().finalize()
 
     def _optimize_final_module(self) -> None:
-        # Numba optimises twice, since some code that counts references is found to be superfluous only after that.
+        # Numba itself optimises twice, because it finds some superfluous code that counts references only afterwards.
         manager, builder = self._codegen._module_pass_manager()
         manager.run(self._final_module, builder)
 
@@ -77,7 +77,7 @@ class _WholeCompiler(Compiler):
     library_class: Any = _WholeLibrary
 
     def define_pipelines(self) -> Any:
-        """Numba's passes, which write into a library of our class."""
+        """Return Numba's passes, which write into a library of our class."""
         state = self.state
         state.library = self.library_class(state.targetctx.codegen(), state.func_id.func_qualname)
         state.library.enable_object_caching()
@@ -89,7 +89,7 @@ class _PartCompiler(_WholeCompiler):
 
 
 class Kernel(CPUDispatcher):
-    """A function that is compiled for each combination of types that it is called with."""
+    """A function that is compiled for each combination of argument types with which it is called."""
 
     _being_compiled = 0  # Number of kernels in compilation, each as a part of the one before.
 
@@ -109,7 +109,7 @@ class Kernel(CPUDispatcher):
 
     @property
     def nopython_signatures(self) -> list[Any]:
-        """The types that this kernel has been compiled for, as a whole or as a part."""
+        """The types for which this kernel has been compiled, as a whole or as a part."""
         return [compiled.signature for compiled in (self.overloads | self.parts).values()]
 
     def get_overload(self, sig: Any) -> Any:
@@ -119,7 +119,7 @@ class Kernel(CPUDispatcher):
             return super().get_overload(sig) if part is None else part.entry_point
 
     def compile(self, sig: Any) -> Any:
-        """Compile for one signature, as a whole unless a kernel's compilation asks for a part."""
+        """Compile for one signature, as a whole unless the compilation of another kernel needs a part."""
         with global_compiler_lock:
             as_part, self._wanted_as_part = self._wanted_as_part, False
             arguments, result = normalize_signature(sig)

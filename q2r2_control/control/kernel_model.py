@@ -21,9 +21,9 @@ from q2r2_control.robot.pairs import pair_names
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
-# For pairs that may touch: rows that aim exactly at the distance would leave the certificate no room [m].
+# Least buffer of pairs that may touch. Rows that aim exactly at the distance would leave the certificate no room [m].
 LEAST_BUFFER = 0.00025
-# Pairs that may touch are slowed down this far before contact, because bodies are larger than their contents [m].
+# Pairs that may touch are slowed down from this distance on, because bodies are larger than their contents [m].
 _CONTACT_ZONE = 0.002
 # Largest depth, relative to the depth at which the cores of two bodies meet.
 _DEEPEST = 0.8
@@ -37,10 +37,11 @@ class KernelModel(NamedTuple):
 
 
 def kernel_model_of(robot: Robot, settings: ControllerSettings) -> KernelModel:
-    """Arrays of a robot's joints, tools, pairs and limits.
+    """Return the arrays of a robot's joints, tools, pairs and limits.
 
-    Raises :class:`RobotError` for what no kernel handles, :class:`ConfigError` for a priority that is no arm's name and
-    for names of ``settings.pairs`` that no pair has.
+    Raises:
+        RobotError: If no kernel handles a joint or a shape.
+        ConfigError: If the priority is not the name of an arm, or if no pair has a name in ``settings.pairs``.
     """
     check_priority(settings.priority, tuple(robot.arms))
     kept, geometry = kept_distances(robot, settings), with_obstacle_bodies(robot, settings.moving_obstacles)

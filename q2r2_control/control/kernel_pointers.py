@@ -1,8 +1,8 @@
-"""Hand a model or its data to kernels by one address.
+"""Pass a model or its data to kernels by one address.
 
-A named tuple of arrays is laid out in memory once, as Numba's own struct of it. Kernels hand its address to each other
-and read each attribute where they use it, instead of the hundreds of numbers that a model's arrays consist of. That
-makes less code to compile.
+A named tuple of arrays is written to memory once, in the layout of Numba's own struct. Kernels pass its address to each
+other, and read each attribute where they use it. Otherwise they would pass the hundreds of numbers of which a model's
+arrays consist. This makes less code to compile.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ extending: Any = numba.extending
 
 
 class _Address(types.Type):
-    """Type of an address in a kernel. Two are the same type if the values behind them are of the same type."""
+    """The type of an address in a kernel. Two such types are equal if the values at the addresses have one type."""
 
     def __init__(self, pointee: Any) -> None:
         self.pointee = pointee
@@ -32,16 +32,16 @@ class _Address(types.Type):
 
     @property
     def key(self) -> Any:
-        """The type of the value, since two named tuples with other fields may have the same name."""
+        """The type of the value, because two named tuples with different fields may have the same name."""
         return self.pointee
 
 
 class _Pointer(_Address):
-    """Kernels' type of a :class:`KernelPointer`."""
+    """The type of a :class:`KernelPointer` in kernels."""
 
 
 class _Pointers(_Address):
-    """Kernels' type of :class:`KernelPointers`."""
+    """The type of :class:`KernelPointers` in kernels."""
 
 
 for _kind in (_Pointer, _Pointers):
@@ -49,12 +49,12 @@ for _kind in (_Pointer, _Pointers):
 
 
 class KernelPointer:
-    """A named tuple of arrays behind one pointer: made by :func:`pointer_to`, read in a kernel by :func:`pointee`."""
+    """A pointer to a named tuple of arrays. :func:`pointer_to` makes it, and :func:`pointee` reads it in a kernel."""
 
     __slots__ = ("address", "memory", "numba_type", "value")
 
     def __init__(self, value: Any, memory: npt.NDArray[np.int64], numba_type: _Pointer) -> None:
-        self.value = value  # The arrays of the value have to stay.
+        self.value = value  # The arrays of the value have to stay in memory.
         self.memory = memory
         self.address = memory.ctypes.data
         self.numba_type = numba_type
@@ -64,7 +64,7 @@ class KernelPointer:
 
 
 class KernelPointers:
-    """Named tuples of one type behind one pointer: made by :func:`pointers_to`, read by :func:`pointee_at`."""
+    """A pointer to named tuples of one type. :func:`pointers_to` makes it, and :func:`pointee_at` reads it."""
 
     __slots__ = ("address", "memory", "numba_type", "pointers")
 
@@ -98,10 +98,10 @@ def _unbox(kind: _Pointer, boxed: Any, context: Any) -> Any:
 
 @extending.intrinsic
 def pointee(typing_context: Any, pointer: Any) -> Any:
-    """The tuple behind ``pointer``, in a kernel. No reference is counted: the caller keeps the pointer.
+    """Return, in a kernel, the tuple to which ``pointer`` points. No reference is counted, so the caller keeps it.
 
-    A named tuple stays behind its pointer, and each attribute is read where it is used. Kernels hand one address to
-    each other instead of the hundreds of numbers that a model's arrays consist of, which makes less code to compile.
+    A named tuple stays in memory, and each attribute is read where it is used. Kernels pass one address to each other
+    instead of the hundreds of numbers of which a model's arrays consist. This makes less code to compile.
     """
     if isinstance(pointer.pointee, types.BaseNamedTuple):
         return pointer(pointer), lambda context, builder, signature, arguments: arguments[0]
@@ -115,7 +115,7 @@ def pointee(typing_context: Any, pointer: Any) -> Any:
 
 @extending.intrinsic
 def pointee_at(typing_context: Any, pointers: Any, index: Any) -> Any:
-    """The named tuple of ``index`` among :class:`KernelPointers`, in a kernel; as :func:`pointee` gives it."""
+    """Return, in a kernel, the named tuple of number ``index`` in :class:`KernelPointers`, as :func:`pointee` does."""
 
     def read(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         addresses = builder.bitcast(arguments[0], cgutils.voidptr_t.as_pointer())
@@ -125,19 +125,19 @@ def pointee_at(typing_context: Any, pointers: Any, index: Any) -> Any:
 
 
 def _invariant(builder: Any, loaded: Any) -> Any:
-    """Tell LLVM that a loaded value never changes: what is behind a pointer is written once, before any kernel runs."""
+    """Tell LLVM that a loaded value never changes. The memory of a pointer is written once, before any kernel runs."""
     loaded.set_metadata("invariant.load", builder.module.add_metadata([]))
     return loaded
 
 
 @infer_getattr
 class _PointerAttribute(AttributeTemplate):
-    """Types of the attributes of a named tuple behind a pointer."""
+    """Finds the types of the attributes of a named tuple to which a pointer points."""
 
     key = _Pointer
 
     def generic_resolve(self, pointer: Any, name: str) -> Any:
-        """Returns the type of an attribute, None if there is no such attribute."""
+        """Return the type of an attribute; None if there is no such attribute."""
         fields = getattr(pointer.pointee, "fields", ())
         if name not in fields:
             return None
@@ -147,7 +147,7 @@ class _PointerAttribute(AttributeTemplate):
 
 @lower_getattr_generic(_Pointer)
 def _read_attribute(context: Any, builder: Any, pointer: Any, value: Any, name: str) -> Any:
-    """Read an array or a number behind a pointer; of a nested named tuple, only its address."""
+    """Read an array or a number to which a pointer leads. Of a nested named tuple, only the address is read."""
     index = pointer.pointee.fields.index(name)
     kind = pointer.pointee.types[index]
     whole = builder.bitcast(value, context.get_data_type(pointer.pointee).as_pointer())
@@ -158,11 +158,11 @@ def _read_attribute(context: Any, builder: Any, pointer: Any, value: Any, name: 
 
 
 def _words(value: Any) -> list[int]:
-    """``value`` as Numba lays it out in memory, in words of 8 bytes."""
+    """Return the words of 8 bytes with which Numba represents ``value`` in memory."""
     if isinstance(value, tuple):
         return [word for part in value for word in _words(part)]
     if isinstance(value, np.ndarray):
-        # The pointer's owner keeps the array: no reference is counted, and both of Numba's owners are left out.
+        # The owner of the pointer keeps the array. No reference is counted, and both of Numba's owners are left out.
         owners = [0, 0]
         return [*owners, value.size, value.itemsize, value.ctypes.data, *value.shape, *value.strides]
     if isinstance(value, KernelPointer | KernelPointers):
@@ -177,7 +177,7 @@ def _words(value: Any) -> list[int]:
 
 
 def _form(value: Any) -> Any:
-    """All of ``value`` that Numba's type for it depends on: a key that is found faster than that type."""
+    """Return a key with everything on which Numba's type of ``value`` depends. It is found faster than the type."""
     if isinstance(value, tuple):
         return type(value), *[_form(part) for part in value]
     if isinstance(value, np.ndarray):
@@ -190,7 +190,7 @@ _kinds: dict[Any, _Pointer] = {}
 
 
 def _kind_of_pointer_to(value: Any, size: int) -> _Pointer:
-    """Kernels' type of a pointer to ``value``, which has ``size`` bytes."""
+    """Return the type in kernels of a pointer to ``value``, which has ``size`` bytes."""
     form = _form(value)
     if form not in _kinds:
         kind, context = _Pointer(numba.typeof(value)), cpu_target.target_context
@@ -201,15 +201,15 @@ def _kind_of_pointer_to(value: Any, size: int) -> _Pointer:
 
 
 def pointer_to(value: Any) -> KernelPointer:
-    """Put ``value``, a named tuple of arrays, numbers and more of its kind, behind a pointer.
+    """Return a pointer to ``value``, a named tuple of arrays, numbers and further named tuples.
 
     Raises:
-        TypeError: if a part of ``value`` is anything else.
+        TypeError: If a part of ``value`` is anything else.
     """
     memory = np.array(_words(value), dtype=np.int64)
     return KernelPointer(value, memory, _kind_of_pointer_to(value, memory.nbytes))
 
 
 def pointers_to(values: list[Any]) -> KernelPointers:
-    """Put ``values``, one or more named tuples of one type, behind a pointer to all of them."""
+    """Return one pointer to all ``values``, which are one or more named tuples of one type."""
     return KernelPointers([pointer_to(value) for value in values])

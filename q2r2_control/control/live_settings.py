@@ -119,7 +119,7 @@ class ObjectPairs:
         self._write(np.where(np.isfinite(kept), np.minimum(self.kept, kept), self.kept))
 
     def _within_reach(self) -> Array:
-        """d - S - buffer [m]."""
+        """Return d - S - buffer [m]."""
         return np.asarray(provable_distances(self._safety, self._data)[self._range] - self._buffer)
 
     def _write(self, kept: Array) -> None:

@@ -1,12 +1,12 @@
-"""The QP of a step: built from tasks, box and separation rows by compiled kernels, and solved where a bound matters.
+"""The QP of a step. Compiled kernels build it from tasks, box and separation rows. It is solved if a bound matters.
 
     minimise    1/2 v' H v + g' v + 1/2 sum_i s_i^2 / rho_i,    rho_i = SOFTNESS a_i' H^-1 a_i,  a_i the i-th row
     subject to  lower <= v <= upper,    rows v + s >= rows_lower,    s >= 0
 
-The box is never empty (joint_limits.py) and the rows are soft, so a solution always exists. Rows have unit norm, so
-that a slack is a joint speed. H^-1 along a row is the cost's compliance to it. A row alone gives way by the part
-SOFTNESS of what it corrects, however strong the cost. Where the cost's own minimum keeps box and rows it is the
-solution, and no solver has to be asked.
+The box is never empty (joint_limits.py) and the rows are soft. A solution therefore always exists. Rows have unit norm,
+so that a slack is a joint speed. H^-1 along a row is the compliance of the cost to it. A single row gives way by the
+share SOFTNESS of its correction, however strong the cost is. If the minimum of the cost alone keeps box and rows, it is
+the solution, and no solver is called.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from q2r2_control.control.targets import update_targets
 from q2r2_control.control.tasks.built_in import write_task_cost
 from q2r2_control.types import Array
 
-SOFTNESS = 1e-5  # Part of its correction by which a row yields.
+SOFTNESS = 1e-5  # Share of its correction by which a row yields.
 
 
 @dataclass(slots=True)  # A frozen class would cost a microsecond a tick.
@@ -37,8 +37,8 @@ class QpProblem:
         minimise    1/2 v' H v + g' v + 1/2 sum_i s_i^2 / rho_i
         subject to  lower <= v <= upper,    rows v + s >= rows_lower,    s >= 0,    s_i = 0 for a hard row
 
-    The variables are the next joint velocities v [rad/s]; rho_i is :func:`row_softness`. Our own solver is handed the
-    controller's arrays, which hold until the next step; every other solver is handed copies.
+    The variables are the next joint velocities v [rad/s], and rho_i is :func:`row_softness`. Our own solver gets the
+    controller's arrays, which are valid until the next step. Every other solver gets copies.
 
     Attributes:
         H: Matrix of the cost (nv, nv), symmetric and positive definite.
@@ -47,8 +47,8 @@ class QpProblem:
         upper: Greatest next velocities (nv,) [rad/s].
         rows: Left-hand sides (m, nv), of unit norm: separation first, then soft constraints, then hard ones.
         rows_lower: Right-hand sides (m,) [rad/s].
-        minimum: Minimum of the cost alone (nv,) [rad/s] where it keeps box and rows, and so is the solution; else None.
-        hard: How many of the last rows are hard.
+        minimum: Minimum of the cost alone (nv,) [rad/s] if it keeps box and rows, and is the solution; else None.
+        hard: Number of hard rows, which are the last ones.
     """
 
     H: Array
@@ -77,24 +77,24 @@ class QpSolution:
 class Solver(Protocol):
     """An object that solves a :class:`QpProblem`: ``CartesianController(robot, settings, solver=MySolver())`` uses it.
 
-    Nothing about its answer is trusted. An exception, and an answer that is not usable, is a failed solve: the step
-    executes the certified stop.
+    Nothing about its answer is trusted. An exception or an answer that is not usable counts as a failed solve, and the
+    step executes the certified stop.
     """
 
     def solve(self, problem: QpProblem) -> QpSolution:
-        """Solve ``problem``, as well as may be.
+        """Solve ``problem`` as well as possible.
 
         Args:
             problem: The problem of this step.
 
         Returns:
-            The solution; one whose ``v`` is None where there is none.
+            The solution. Its ``v`` is None if none was found.
         """
         ...
 
 
 def row_softness(H: Array, rows: Array) -> Array:
-    """Return rho_i = SOFTNESS a_i' H^-1 a_i of each of the ``rows`` (m, nv), (m,)."""
+    """Return rho_i = SOFTNESS a_i' H^-1 a_i (m,) of each of the ``rows`` (m, nv)."""
     compliance: Array = np.sum(rows * np.linalg.solve(H, rows.T).T, axis=1)
     return SOFTNESS * compliance
 
@@ -107,7 +107,7 @@ def find_minimum(data_pointer: KernelPointer) -> bool:
 
 @kernel
 def _find_minimum(data: KernelData) -> bool:
-    """:func:`find_minimum` as a part of :func:`assemble`: of kernels, only those that Python calls are optimised."""
+    """Find the minimum, for :func:`find_minimum` and :func:`assemble`. Only kernels that Python calls are optimised."""
     tasks, box, rows, minimum = data.tasks, data.safety.box, data.safety.rows, data.tasks.minimum
     nv = minimum.shape[0]
     for i in range(nv):
@@ -133,8 +133,9 @@ def assemble(
 ) -> tuple[bool, bool, bool]:
     """Write cost, rows and box of a step of ``h`` [s] from an observed reference.
 
-    ``tick`` [s]: of which it is the first step, with the targets that were offered; below 0: it is another one. Returns
-    whether all targets were usable, whether all joints are within their limits, and what :func:`find_minimum` says.
+    If the step is the first one of a tick, ``tick`` is the duration of this tick [s], and the offered targets are
+    taken. In other steps it is below 0. Returns whether all targets were usable, whether all joints are within their
+    limits, and the result of :func:`find_minimum`.
     """
     model, targets, data = pointee(model_pointer), pointee(targets_pointer), pointee(data_pointer)
     state, usable = data.safety.state, True

@@ -1,4 +1,4 @@
-"""The reference: its observation, and its motion as far as the safety filter allows, compiled."""
+"""Observe the reference, and move it as far as the safety filter allows (compiled)."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from q2r2_control.control.safety.speed_bound import update_body_velocities
 from q2r2_control.control.tasks.frame import tool_pose
 from q2r2_control.types import Array
 
-# The closest pair and its distance, and the pair with the least margin and that margin, its distance less the kept one
-# [m]. Both are infinite if there is no pair.
+# The closest pair and its distance [m], and the pair with the least margin and this margin [m]. The margin of a pair is
+# its distance minus its kept distance. Both numbers are infinite if there is no pair.
 Observed = tuple[int, float, int, float]
 
 
 @kernel
 def start_reference(model_pointer: KernelPointer, data_pointer: KernelPointer) -> bool:
-    """Observe after a reset. Return whether a stop is known that keeps all pairs apart."""
+    """Observe the reference after a reset. Return whether a stop is known that keeps all pairs apart."""
     model, data = pointee(model_pointer), pointee(data_pointer)
     rest_always(data.safety.history, data.safety.state.q)
     _observe(model, data)
@@ -32,9 +32,9 @@ def start_reference(model_pointer: KernelPointer, data_pointer: KernelPointer) -
 
 @kernel
 def observe_bodies(model_pointer: KernelPointer, data_pointer: KernelPointer, grown: IntArray) -> tuple[Observed, int]:
-    """Observe after bodies, some of which have ``grown`` (g,), or kept distances have changed.
+    """Observe the reference after bodies or kept distances have changed. ``grown`` (g,) marks bodies that have grown.
 
-    Also returns the pair in the way, see :func:`certify_bodies`; -1 where the bodies may be as they are.
+    Also returns the pair in the way, see :func:`certify_bodies`; -1 if the bodies are allowed.
     """
     model, data = pointee(model_pointer), pointee(data_pointer)
     return _observe(model, data), certify_bodies(model.safety, data.safety, grown)
@@ -44,9 +44,9 @@ def observe_bodies(model_pointer: KernelPointer, data_pointer: KernelPointer, gr
 def move_reference(
     model_pointer: KernelPointer, data_pointer: KernelPointer, solution: Array, usable: bool, h: float, share: float
 ) -> tuple[Observed, int, float]:
-    """Do one step of ``h`` [s] with the solver's next velocities (nv,), and observe.
+    """Do one step of ``h`` [s] with the solver's next velocities (nv,), observe the reference, and return the results.
 
-    Return the safety filter's result.
+    The last two results are those of the safety filter.
     """
     model, data = pointee(model_pointer), pointee(data_pointer)
     outcome, slack = apply_safety_filter(model.safety, data.safety, solution, usable, h, share)

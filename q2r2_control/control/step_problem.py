@@ -24,7 +24,7 @@ class StepProblem:
     def __init__(
         self, robot: Robot, settings: ControllerSettings, tasks: Sequence[Task], constraints: Sequence[Constraint]
     ) -> None:
-        """Raises :class:`ConfigError` if one of the tasks or constraints is not usable at home."""
+        """Raise :class:`ConfigError` if one of the tasks or constraints is not usable at home."""
         self._longest = settings.max_substep
         self._external = ExternalTasks(robot, settings.tasks, tasks)
         self.constraints = OwnConstraints(robot, constraints)
@@ -51,7 +51,7 @@ class StepProblem:
         summary.targets_usable, _, _ = self._assemble(*self._pointers, self._longest, 0.0)
 
     def write(self, h: float, tick: float, summary: StepSummary) -> None:
-        """Write the problem of a step of ``h`` [s]; ``tick``: see :func:`assemble`."""
+        """Write the problem of a step of ``h`` [s]. See :func:`assemble` for ``tick``."""
         usable, inside, free = self._assemble(*self._pointers, h, tick)
         summary.targets_usable &= usable
         summary.inside &= inside

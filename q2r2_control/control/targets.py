@@ -19,7 +19,7 @@ from q2r2_control.control.tasks.frame import rotation_vector, times_transposed
 from q2r2_control.errors import shown
 from q2r2_control.types import Array
 
-# The distance is larger than any cell, so that squares of larger ones stay finite.
+# Greatest coordinate of a target. It is larger than any cell, and squares of such numbers stay finite.
 _FARTHEST = 100.0  # [m]
 _ORTHONORMAL = 1e-3
 _AT_REST = 1e-2  # [rad/s]
@@ -49,7 +49,7 @@ class TaskTargets(NamedTuple):
     hold: Array  # (nv,) Joint positions to hold [rad].
     posture: Array  # (nv,) Joint positions for the joints that the tools leave free [rad].
     latched: IntArray  # (n,) 1 if the arm has come to rest where it holds.
-    offered: IntArray  # (n,) What this tick offered: nothing, a pose, something else.
+    offered: IntArray  # (n,) The kind of offer in this tick: nothing, a pose, or something else.
     pose: Array  # (n, 4, 4) Homogeneous pose, as offered.
     feed_forward_time: float  # Time constant that smooths the feed-forward [s].
     teleport_speed: float  # A faster target has jumped [m/s].
@@ -87,14 +87,14 @@ class TargetTracker:
         self.pointer = pointer_to(self._targets)
 
     def reset(self, q: Array) -> None:
-        """Forget all targets; every arm holds where it is, ``q`` (nv,) [rad]."""
+        """Forget all targets. Every arm holds at its present posture ``q`` (nv,) [rad]."""
         self._targets.latched[:] = 0
         self._targets.follows[:] = 0
         self._targets.hold[:] = q
         self._targets.posture[:] = self._home
 
     def hold_at(self, q: Array | None) -> None:
-        """Let arms without a target move to ``q`` (nv,) [rad] and hold there; None: where they come to rest."""
+        """Let arms without a target move to ``q`` (nv,) [rad] and hold there. With None they hold where they rest."""
         if q is None:
             self._targets.latched[:] = 0
         else:
@@ -117,7 +117,7 @@ class TargetTracker:
             self._targets.posture[:] = posture
 
     def offer(self, targets: Mapping[str, pin.SE3 | None]) -> bool:
-        """Write the targets of one tick for :func:`update_targets`. Return whether every name is an arm's."""
+        """Write the targets of one tick for :func:`update_targets`. Return whether every name is the name of an arm."""
         known = 0
         for i, arm in enumerate(self._arms):
             target = targets.get(arm)
@@ -152,7 +152,7 @@ class TargetTracker:
 def update_targets(targets: TaskTargets, q: Array, v: Array, dt: float) -> bool:
     """Make each offered pose the arm's target, or hold the last one. Return False if an offer was not usable.
 
-    A target that is no pose is marked so in ``targets.offered``.
+    A target that is not a pose is marked in ``targets.offered``.
     """
     all_usable = True
     for i in range(targets.offered.shape[0]):
@@ -187,7 +187,7 @@ def _hold(targets: TaskTargets, i: int, q: Array, v: Array) -> None:
 def _update_pose(targets: TaskTargets, i: int, dt: float) -> bool:
     """Make the offered homogeneous pose the target of arm ``i``. Return False if it is not a finite pose.
 
-    A target that moves has its twist smoothed over a time; one that was put elsewhere, faster than any tool, has none.
+    The twist of a target that moves is smoothed over a time. A target that jumped, faster than any tool, has no twist.
     """
     scratch = targets.scratch
     if not _checked_pose(targets.pose[i], scratch):

@@ -20,15 +20,15 @@ _GRIP, _OVER = 0.243, 0.33
 def _meeting(middle: float) -> dict[str, tuple[WayPoint, ...]]:
     """Return way points with which both hands bring their blocks to ``middle`` [m] from the cell's centre, and back."""
     left: tuple[WayPoint, ...] = (
-        (1.4, 0.55, 0.25, 0.35, 0.0, 0.0),  # over the block
-        (3.2, 0.55, 0.25, _GRIP, 0.0, 0.0),  # down around it
-        (4.2, 0.55, 0.25, _GRIP, 0.0, 0.0),  # grasp
-        (5.8, 0.55, 0.25, 0.40, 0.0, 0.0),  # lift
-        (9.0, 0.55, middle, 0.40, -0.25, 0.0),  # move to the middle, with the wrists outwards
+        (1.4, 0.55, 0.25, 0.35, 0.0, 0.0),  # Over the block.
+        (3.2, 0.55, 0.25, _GRIP, 0.0, 0.0),  # Go down around the block.
+        (4.2, 0.55, 0.25, _GRIP, 0.0, 0.0),  # Grasp.
+        (5.8, 0.55, 0.25, 0.40, 0.0, 0.0),  # Lift.
+        (9.0, 0.55, middle, 0.40, -0.25, 0.0),  # Move to the middle, with the wrists outwards.
         (10.0, 0.55, middle, 0.40, -0.25, 0.0),
-        (12.8, 0.55, 0.25, 0.40, 0.0, 0.0),  # move back
-        (14.6, 0.55, 0.25, _GRIP, 0.0, 0.0),  # put down
-        (15.6, 0.55, 0.25, _GRIP, 0.0, 0.0),  # let go
+        (12.8, 0.55, 0.25, 0.40, 0.0, 0.0),  # Move back.
+        (14.6, 0.55, 0.25, _GRIP, 0.0, 0.0),  # Put down.
+        (15.6, 0.55, 0.25, _GRIP, 0.0, 0.0),  # Let go.
         (17.4, *LEFT_HOME),
     )
     return {"left": left, "right": tuple((t, x, -y, z, -tilt, -turn) for t, x, y, z, tilt, turn in left)}
@@ -56,13 +56,13 @@ GRASP = HandWork(
     duration=10.6,
     tools={
         "right": (
-            (1.4, 0.45, -0.35, 0.30, 0.0, 0.0),  # over the block
+            (1.4, 0.45, -0.35, 0.30, 0.0, 0.0),  # Over the block.
             (2.8, 0.45, -0.35, _LOW, 0.0, 0.0),
-            (3.5, 0.45, -0.35, _LOW, 0.0, 0.0),  # grasp
-            (4.9, 0.45, -0.35, _LOW + 0.101, 0.0, 0.0),  # lift
+            (3.5, 0.45, -0.35, _LOW, 0.0, 0.0),  # Grasp.
+            (4.9, 0.45, -0.35, _LOW + 0.101, 0.0, 0.0),  # Lift.
             (6.1, 0.45, -0.35, _LOW + 0.101, 0.0, 0.0),
-            (7.5, 0.45, -0.35, _LOW, 0.0, 0.0),  # put down
-            (8.2, 0.45, -0.35, _LOW, 0.0, 0.0),  # let go
+            (7.5, 0.45, -0.35, _LOW, 0.0, 0.0),  # Put down.
+            (8.2, 0.45, -0.35, _LOW, 0.0, 0.0),  # Let go.
             (9.2, 0.45, -0.35, 0.30, 0.0, 0.0),
             (10.6, *RIGHT_HOME),
         )
@@ -83,11 +83,11 @@ STACK = HandWork(
         "left": (
             (0.9, 0.55, 0.25, _OVER, 0.0, 0.0),
             (2.1, 0.55, 0.25, _GRIP, 0.0, 0.0),
-            (2.8, 0.55, 0.25, _GRIP, 0.0, 0.0),  # grasp
+            (2.8, 0.55, 0.25, _GRIP, 0.0, 0.0),  # Grasp.
             (3.8, 0.55, 0.25, 0.36, 0.0, 0.0),
-            (5.6, 0.52, 0.00, 0.36, 0.0, 0.0),  # over the block in the middle
+            (5.6, 0.52, 0.00, 0.36, 0.0, 0.0),  # Over the block in the middle.
             (6.6, 0.52, 0.00, _GRIP + 0.06, 0.0, 0.0),
-            (7.3, 0.52, 0.00, _GRIP + 0.06, 0.0, 0.0),  # let go
+            (7.3, 0.52, 0.00, _GRIP + 0.06, 0.0, 0.0),  # Let go.
             (8.3, 0.52, 0.00, 0.40, 0.0, 0.0),
             (9.9, *LEFT_HOME),
         ),
@@ -95,12 +95,12 @@ STACK = HandWork(
             (4.0, *RIGHT_HOME),
             (5.0, 0.55, -0.25, _OVER, 0.0, 0.0),
             (6.2, 0.55, -0.25, _GRIP, 0.0, 0.0),
-            (6.9, 0.55, -0.25, _GRIP, 0.0, 0.0),  # grasp
+            (6.9, 0.55, -0.25, _GRIP, 0.0, 0.0),  # Grasp.
             (8.2, 0.55, -0.25, 0.41, 0.0, 0.0),
             (8.4, 0.55, -0.25, 0.41, 0.0, 0.0),
-            (10.2, 0.52, 0.00, 0.41, 0.0, 0.0),  # over both blocks, while the other hand leaves
+            (10.2, 0.52, 0.00, 0.41, 0.0, 0.0),  # Over both blocks, while the other hand leaves.
             (11.2, 0.52, 0.00, _GRIP + 0.12, 0.0, 0.0),
-            (11.9, 0.52, 0.00, _GRIP + 0.12, 0.0, 0.0),  # let go
+            (11.9, 0.52, 0.00, _GRIP + 0.12, 0.0, 0.0),  # Let go.
             (12.8, 0.52, 0.00, 0.42, 0.0, 0.0),
             (14.8, *RIGHT_HOME),
         ),
@@ -129,25 +129,25 @@ HANDOVER = HandWork(
     duration=18.4,
     tools={
         "left": (
-            (2.2, 0.44, 0.15 + _OFF + _BACK_Y, _BAR_LOW + _BACK_Z, *_LEFT),  # over the bar's left end
+            (2.2, 0.44, 0.15 + _OFF + _BACK_Y, _BAR_LOW + _BACK_Z, *_LEFT),  # Over the bar's left end.
             (3.4, 0.44, 0.15 + _OFF, _BAR_LOW, *_LEFT),
-            (4.1, 0.44, 0.15 + _OFF, _BAR_LOW, *_LEFT),  # grasp
-            (5.2, 0.44, 0.15 + _OFF, 0.34, *_LEFT),  # lift
-            (6.8, 0.46, _OFF, 0.38, *_LEFT),  # move to the middle
-            (9.2, 0.46, _OFF, 0.38, *_LEFT),  # let go when the other hand holds the bar
+            (4.1, 0.44, 0.15 + _OFF, _BAR_LOW, *_LEFT),  # Grasp.
+            (5.2, 0.44, 0.15 + _OFF, 0.34, *_LEFT),  # Lift.
+            (6.8, 0.46, _OFF, 0.38, *_LEFT),  # Move to the middle.
+            (9.2, 0.46, _OFF, 0.38, *_LEFT),  # Let go when the other hand holds the bar.
             (10.2, 0.46, _OFF + _BACK_Y, 0.38 + _BACK_Z, *_LEFT),
             (12.4, *LEFT_HOME),
         ),
         "right": (
             (3.4, *RIGHT_HOME),
-            (5.8, 0.46, -_OFF - _BACK_Y, 0.38 + _BACK_Z, *_RIGHT),  # where the bar's right end will be
+            (5.8, 0.46, -_OFF - _BACK_Y, 0.38 + _BACK_Z, *_RIGHT),  # At the place where the bar's right end will be.
             (6.8, 0.46, -_OFF - _BACK_Y, 0.38 + _BACK_Z, *_RIGHT),
             (8.0, 0.46, -_OFF, 0.38, *_RIGHT),
-            (10.2, 0.46, -_OFF, 0.38, *_RIGHT),  # grasp, and wait until the other hand has left
-            (11.8, 0.46, -_OFF - 0.12, 0.38, *_RIGHT),  # carry the bar away
+            (10.2, 0.46, -_OFF, 0.38, *_RIGHT),  # Grasp, and wait until the other hand has left.
+            (11.8, 0.46, -_OFF - 0.12, 0.38, *_RIGHT),  # Carry the bar away.
             (13.0, 0.46, -_OFF - 0.12, 0.38, *_RIGHT),
-            (14.6, 0.46, -_OFF - 0.12, _BAR_LOW, *_RIGHT),  # put down
-            (15.3, 0.46, -_OFF - 0.12, _BAR_LOW, *_RIGHT),  # let go
+            (14.6, 0.46, -_OFF - 0.12, _BAR_LOW, *_RIGHT),  # Put down.
+            (15.3, 0.46, -_OFF - 0.12, _BAR_LOW, *_RIGHT),  # Let go.
             (16.2, 0.46, -_OFF - 0.12 - _BACK_Y, _BAR_LOW + _BACK_Z, *_RIGHT),
             (18.4, *RIGHT_HOME),
         ),
@@ -166,7 +166,7 @@ HANDOVER = HandWork(
 )
 
 
-# All works, in the order in which they can follow each other.
+# All pieces of work, in the order in which they can follow each other.
 WORKS: Mapping[str, HandWork] = {
     "meet": MEET,
     "clash": CLASH,

@@ -17,14 +17,14 @@ def _at_handle(side: float) -> tuple[WayPoint, ...]:
     return (
         (2.2, _X, side * _Y, _HELD + 0.09, 0.0, turn),
         (3.4, _X, side * _Y, _HELD, 0.0, turn),
-        (4.8, _X, side * _Y, _HELD, 0.0, turn),  # grasp; the left hand moves both tools from here
+        (4.8, _X, side * _Y, _HELD, 0.0, turn),  # Grasp. From here, the left hand moves both tools.
     )
 
 
 def _from_handle(side: float, home: tuple[float, float, float, float, float]) -> tuple[WayPoint, ...]:
     turn = -side * _TURN
     return (
-        (15.2, _X, side * _Y, _HELD, 0.0, turn),  # let go; each hand moves its own tool again
+        (15.2, _X, side * _Y, _HELD, 0.0, turn),  # Let go. Each hand moves its own tool again.
         (16.4, _X, side * _Y, _HELD + 0.09, 0.0, turn),
         (18.6, *home),
     )
@@ -35,11 +35,11 @@ CARRY = HandWork(
     tools={
         "left": (
             *_at_handle(1.0),
-            (6.2, _X, _Y, _CARRIED[1], 0.0, -_TURN),  # lift
+            (6.2, _X, _Y, _CARRIED[1], 0.0, -_TURN),  # Lift.
             (7.8, _CARRIED[0], _Y, _CARRIED[1], 0.0, -_TURN),
             (9.2, _CARRIED[0], _Y, _CARRIED[1], 0.0, -_TURN),
-            (10.8, _X, _Y, _CARRIED[1], 0.0, -_TURN),  # move back
-            (12.6, _X, _Y, _HELD - 0.003, 0.0, -_TURN),  # put down, until it rests on the table
+            (10.8, _X, _Y, _CARRIED[1], 0.0, -_TURN),  # Move back.
+            (12.6, _X, _Y, _HELD - 0.003, 0.0, -_TURN),  # Put down, until it rests on the table.
             *_from_handle(1.0, LEFT_HOME),
         ),
         "right": (*_at_handle(-1.0), *_from_handle(-1.0, RIGHT_HOME)),
@@ -66,12 +66,12 @@ WIPE = HandWork(
         "left": (
             (1.6, _SPONGE_X, _SPONGE_Y, 0.33, 0.0, 0.0),
             (3.0, _SPONGE_X, _SPONGE_Y, _SPONGE_HELD, 0.0, 0.0),
-            (3.8, _SPONGE_X, _SPONGE_Y, _SPONGE_HELD, 0.0, 0.0),  # grasp
+            (3.8, _SPONGE_X, _SPONGE_Y, _SPONGE_HELD, 0.0, 0.0),  # Grasp.
             (5.0, _SPONGE_X, _SPONGE_Y, _SPONGE_HELD + 0.05, 0.0, 0.0),
             (6.6, _SPONGE_X, _SPONGE_Y, _SPONGE_HELD + 0.01, 0.0, 0.0),
-            (8.2, _SPONGE_X, _SPONGE_Y, _WIPING, 0.0, 0.0),  # press
+            (8.2, _SPONGE_X, _SPONGE_Y, _WIPING, 0.0, 0.0),  # Press.
             *((10.0 + 1.5 * i, *place, _WIPING, 0.0, 0.0) for i, place in enumerate(_STROKES)),
-            (17.4, *_STROKES[-1], _WIPING, 0.0, 0.0),  # let go where the sponge cannot fall
+            (17.4, *_STROKES[-1], _WIPING, 0.0, 0.0),  # Let go where the sponge cannot fall.
             (18.2, *_STROKES[-1], 0.33, 0.0, 0.0),
             (19.4, *LEFT_HOME),
         )
@@ -109,13 +109,13 @@ PEG = HandWork(
         "right": (
             (1.6, *_PEG, 0.35, 0.0, 0.0),
             (3.0, *_PEG, _PEG_HELD, 0.0, 0.0),
-            (3.8, *_PEG, _PEG_HELD, 0.0, 0.0),  # grasp
+            (3.8, *_PEG, _PEG_HELD, 0.0, 0.0),  # Grasp.
             (5.0, *_PEG, _ON_TOP + 0.03, 0.0, 0.0),
             (6.8, *_HOLE, _ON_TOP + 0.03, 0.0, 0.0),
             (8.2, *_HOLE, _ON_TOP + 0.008, 0.0, 0.0),
             *_searching(9.4, 8.0),
-            (19.2, *_HOLE, _ON_TOP - 0.028, 0.0, 0.0),  # push the peg in
-            (20.6, *_HOLE, _ON_TOP - 0.028, 0.0, 0.0),  # let go
+            (19.2, *_HOLE, _ON_TOP - 0.028, 0.0, 0.0),  # Push the peg in.
+            (20.6, *_HOLE, _ON_TOP - 0.028, 0.0, 0.0),  # Let go.
             (21.8, *_HOLE, 0.36, 0.0, 0.0),
             (24.0, *RIGHT_HOME),
         )

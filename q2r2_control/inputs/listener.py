@@ -32,7 +32,7 @@ class RateLimit:
         self._start, self._taken = -math.inf, 0
 
     def is_open(self, now: float) -> bool:
-        """Return whether one more is allowed at ``now`` [s]."""
+        """Return whether one more event is allowed at ``now`` [s]."""
         return self._taken < self._count or now - self._start >= self._period
 
     def take(self, now: float) -> bool:

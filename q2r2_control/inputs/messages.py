@@ -65,7 +65,7 @@ class HandTwist:
 
 HandMessage = HandPose | HandTwist | HandInputs
 
-# quest2ros/msg/OVR2ROSInputs and OVR2ROSHapticFeedback of the public Quest2ROS repository.
+# The messages OVR2ROSInputs and OVR2ROSHapticFeedback of quest2ros/msg in the public Quest2ROS repository.
 _INPUTS_FIELDS = """
 bool button_upper
 bool button_lower
@@ -91,7 +91,7 @@ def decode(kind: MessageType, payload: bytes, dialect: Dialect) -> HandMessage:
     """Read a pose, twist or inputs message. Its numbers may have any value, also NaN.
 
     Raises:
-        ProtocolError: For a length, encapsulation, boolean or string that ``kind`` does not have in ``dialect``.
+        ProtocolError: If a length, an encapsulation, a boolean or a string is not one of ``kind`` in ``dialect``.
     """
     _check_bytes(kind, payload, dialect)
     store = message_types(dialect)
@@ -173,7 +173,7 @@ def _vector(message: Any) -> Array:
     return np.array([message.x, message.y, message.z])
 
 
-MAX_FRAME_BYTES = 1 << 20  # A hand message has under 200. A longer frame shows that its start was read wrongly.
+MAX_FRAME_BYTES = 1 << 20  # A hand message has under 200 bytes. A longer frame shows that its start was read wrongly.
 KEEPALIVE = bytes(8)  # A frame without destination and payload.
 
 

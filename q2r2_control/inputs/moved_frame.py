@@ -60,8 +60,8 @@ class HandPair(NamedTuple):
 def moved_as_one(before: HandPair, after: HandPair, tolerance: Move) -> bool:
     """Return whether distance, relative rotation and direction of the hands are unchanged, as after a rigid motion.
 
-    An error of a hand's rotation by the angle of the tolerance moves the other hand, in the axes of the first, by that
-    angle times the distance of the hands. A smaller bound would allow less rotation noise than the tolerance itself.
+    Let a hand's rotation have an error of the tolerance's angle. In the axes of this hand, the other hand then moves by
+    that angle times the distance of the hands. A smaller bound would allow less rotation noise than the tolerance.
     """
     shift = math.dist(after.seen, before.seen)
     if (
@@ -72,8 +72,8 @@ def moved_as_one(before: HandPair, after: HandPair, tolerance: Move) -> bool:
     return 0.5 * (float(np.vdot(before.turn, after.turn)) - 1.0) >= math.cos(tolerance.angle)
 
 
-# A step is a motion from one sample to the next by more than this, and by more than _STANDS_OUT times the motion at any
-# of the last _BEFORE samples. From rest, this is 0.7 m/s within one sample, or more than 30 m/s^2.
+# A step is a motion from one sample to the next by more than _STEP. It is also more than _STANDS_OUT times the motion
+# at any of the last _BEFORE samples. From rest, this is 0.7 m/s within one sample, or more than 30 m/s^2.
 _STEP = Move(0.010, math.radians(2.0))
 _STANDS_OUT, _BEFORE = 3.0, 4
 _PERIOD = 1.0 / 72.0  # Period of samples [s]. Samples come closer together if one was delayed on the way.

@@ -27,7 +27,7 @@ class HandTracker:
     def update(self, hand: str, message: HandMessage, now: float, fault: HandFault | None = None) -> HandSample | None:
         """Return the sample after ``message`` was received at ``now`` [s]; None before the first pose and for a twist.
 
-        ``fault`` is that of a pose.
+        ``fault`` is the fault of the pose in ``message``.
         """
         if isinstance(message, HandPose):
             self._poses[hand] = (message, now, fault)

@@ -265,7 +265,7 @@ class ScriptedInput(PlayedInput):
         frequency_hz: Repetitions of circle, line and rotate per second [Hz].
         jitter: Greatest delay of each evenly sampled pose [s].
         scale: Factor of all distances of the trajectory. Rotations are not scaled.
-        shaky: As ``human``, with more tremor. The hands work as :func:`hurried` says.
+        shaky: Sample the hands as with ``human``, but with more tremor. The hands work as :func:`hurried` says.
         spread: Greatest shift of the parts of a task [m]; see :func:`place_of`.
 
     Raises:

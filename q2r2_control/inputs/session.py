@@ -22,7 +22,7 @@ from q2r2_control.inputs.messages import (
 from q2r2_control.types import SIDES, HandFault, HapticFeedback
 
 MAX_OUTGOING_BYTES = 1 << 16  # Size of the answers that a client may leave unread.
-MAX_COMMAND_BYTES = 1 << 14  # Length of the JSON of a system command. The app's have under 200.
+MAX_COMMAND_BYTES = 1 << 14  # Greatest length of the JSON of a system command. Commands of the app have under 200.
 MAX_TOPICS = 64  # Number of topics that a client may name. The app names about ten.
 MAX_INCOMPLETE = 64  # Number of registrations without topic or type that are answered in one session.
 
@@ -83,7 +83,7 @@ class HeadsetSession:
 
     Data on topics outside ``HAND_TOPICS`` is counted and ignored. A registration whose topic or type the app's user
     left empty gets an error for the app's console, as from Unity's own endpoint. An unknown command, a name that no
-    topic can have, or a payload that its topic cannot have raises a :class:`ProtocolError`, since the two sides do not
+    topic can have, or a payload that its topic cannot have raises a :class:`ProtocolError`. The two sides then do not
     speak the same protocol.
     """
 
@@ -159,7 +159,7 @@ class HeadsetSession:
                 names = [f"/{name}" for name in types]  # The names are written as in the ROS graph.
                 self._answer("__topic_list", {"topics": names, "types": list(types.values())})
             case "__ros_service" | "__unity_service" | "__remove_ros_service" | "__remove_unity_service":
-                pass  # q2r2 has no services.
+                pass  # The package q2r2 has no services.
             case "__request" | "__response":
                 self._skip_body = True
                 if command == "__request":
@@ -234,7 +234,7 @@ class HeadsetStatistics:
     """A snapshot of the server. After a disconnect, dialect and topics are those of the last connection."""
 
     address: tuple[str, int]  # Bound host and port.
-    peer: str | None  # host:port of the connected headset.
+    peer: str | None  # Host and port of the connected headset, as host:port; None if there is none.
     dialect: Dialect | None
     topics: dict[str, TopicStatistics]
     unknown_topics: dict[str, int]  # Number of messages that nothing here reads, by topic.

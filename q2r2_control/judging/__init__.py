@@ -1,4 +1,4 @@
-"""Decides whether a recorded episode is fit for learning, and gives the reasons if it is not."""
+"""Decide whether a recorded episode is fit for learning, and give the reasons if it is not."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Checks whether a camera's pictures came in time, are not black or damaged, and change when the arms move."""
+"""Check whether a camera's pictures came in time, are not black or damaged, and change when the arms move."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from q2r2_control.types import Array, Flags
 _DARK = 8.0  # A black picture has a mean brightness below this.
 _PLAIN = 1.0  # A picture of one colour has a standard deviation of its brightness below this.
 _TRAVEL = 0.01  # If the joints of an arm move more than this between two pictures, the picture has to change [rad].
-# A part of a picture is damaged if its brightness differs from the pictures before and after by more than the first
-# number, plus the second number times the difference between these two.
+# A part of a picture is damaged if its brightness differs too much from the pictures before and after. The limit is the
+# first number, plus the second number times the difference between these two pictures.
 _ODD, _ODD_RATIO = 10.0, 3.0
 _PARTS = (4, 6, 4, 8)  # The parts of a view: rows of parts, rows in each; columns of parts, columns in each.
 # Damaged pictures are looked for in cameras of at least this rate [Hz]. At a lower rate, a body that moves may be in a
@@ -135,8 +135,8 @@ class _CameraLook:
         """Return the lag [s] at which the arms' speeds s explain the change of the pictures best.
 
         The model is c_1 s_1 + c_2 s_2 + c_0, with all c >= 0. A lag that is not near zero counts only if it explains
-        the change clearly better than those near zero: an arm that moves to and fro has the same speed again later, and
-        an arm that moves round looks faster when it is nearer to the camera.
+        the change clearly better than the lags near zero. An arm that moves to and fro has the same speed again later.
+        An arm that moves round looks faster when it is nearer to the camera.
         """
         change, lags = self._change, np.arange(-LARGEST_LAG, LARGEST_LAG + _LAG_STEP, _LAG_STEP)
         energy = float(np.sum((change - change.mean()) ** 2)) if len(change) >= _FEWEST else 0.0
@@ -176,9 +176,9 @@ class _CameraLook:
 def _swapped(looks: dict[str, _CameraLook]) -> dict[str, str]:
     """Return the cameras that were swapped, by name, each with the other one.
 
-    Two cameras on different arms are swapped if the pictures of each change with the arm of the other. A fixed camera
-    and a camera on an arm are swapped if hardly anything stands still in the view of the fixed one, and most things
-    stand still in the view of the other one.
+    Two cameras on different arms are swapped if the pictures of each change with the arm of the other. For a fixed
+    camera and a camera on an arm there are two conditions: Hardly anything stands still in the view of the fixed one.
+    Most things stand still in the view of the other one.
     """
     found: dict[str, str] = {}
     for (one, first), (two, second) in combinations(looks.items(), 2):

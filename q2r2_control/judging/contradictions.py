@@ -1,4 +1,4 @@
-"""Finds contradictions between parts of an episode's file, of which one cannot be true."""
+"""Find contradictions between parts of an episode's file, of which one cannot be true."""
 
 from __future__ import annotations
 

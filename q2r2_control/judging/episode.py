@@ -1,4 +1,4 @@
-"""Reads a recording into arrays: some numbers of every tick, and poses about a hundred times a second."""
+"""Read a recording into arrays: some numbers of every tick, and poses about a hundred times a second."""
 
 from __future__ import annotations
 

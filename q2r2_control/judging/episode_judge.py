@@ -1,4 +1,4 @@
-"""Judges each episode of a recording as soon as it has ended, while the run goes on."""
+"""Judge each episode of a recording as soon as it has ended, while the run goes on."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.wording import sentence
 
 LONGEST_LINE = 300  # The longest text of a verdict [characters].
-_NICENESS = 10  # The same as that of the writer: the loop has a higher priority.
+_NICENESS = 10  # The niceness of the process, which is that of the writer. The loop has a higher priority.
 _LOOKS = 0.3  # Time between two readings of the file, which grows twice a second [s].
 _PATIENCE = 30.0  # Time to wait for a recorder that is behind [s].
 _BEFORE = 1_000_000_000  # Reading begins this long before the episode [ns].
@@ -155,7 +155,7 @@ class EpisodeJudge:
             self._fail(self._process.fault)
 
     def close(self) -> None:
-        """Kill the process; it is not started again."""
+        """Kill the process, which is not started again."""
         self._started = True
         if self._process is not None:
             self._process.kill()

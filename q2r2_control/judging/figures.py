@@ -1,4 +1,4 @@
-"""Computes all numbers of an episode."""
+"""Compute all numbers of an episode."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Judges the episodes of recordings, and writes the verdicts into a file beside each recording."""
+"""Judge the episodes of recordings, and write the verdicts into a file beside each recording."""
 
 from __future__ import annotations
 
@@ -223,7 +223,10 @@ def judgements_of(settings: JudgeSettings | None, file: Path) -> list[Judgement 
 def discarded_episodes(file: Path, pictures: bool) -> dict[int, str]:
     """Return why episodes of a recording are discarded, by their number; 0 is the whole recording.
 
-    The pictures are judged if ``pictures`` is True. Raises :class:`RecordingError`.
+    The pictures are judged if ``pictures`` is True.
+
+    Raises:
+        RecordingError: If the recording cannot be opened or judged.
     """
     changed = open_recording(file).file.stat().st_mtime_ns
     return _discarded(file, pictures, file.absolute(), changed)
@@ -242,7 +245,8 @@ def _discarded(file: Path, pictures: bool, absolute: Path, changed: int) -> dict
 def keep_verdicts(judged: Sequence[Judged]) -> Path:
     """Write the verdicts on a recording's episodes into a file beside it, completely or not at all.
 
-    Raises :class:`RecordingError`.
+    Raises:
+        RecordingError: If the file cannot be written.
     """
     recording = judged[0].episode.recording
     target = recording.file.with_name(VERDICT_FILE)

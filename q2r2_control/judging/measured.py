@@ -1,4 +1,4 @@
-"""Checks whether measurements of an arm are plausible: finite, not faster than its joints, and near its reference."""
+"""Check whether measurements of an arm are plausible: finite, not faster than its joints, and near its reference."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Measures how well the arms followed, how smooth and how late their motion was, and whether they moved at all."""
+"""Measure how well the arms followed, how smooth and how late their motion was, and whether they moved at all."""
 
 from __future__ import annotations
 

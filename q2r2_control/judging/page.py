@@ -1,4 +1,4 @@
-"""Makes one HTML page of judged episodes that needs no other files: it contains its styles and pictures."""
+"""Make one HTML page of judged episodes that needs no other files: it contains its styles and pictures."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reads the pictures of a recording's cameras, and keeps a small view of each, so that an episode fits into memory."""
+"""Read the pictures of a recording's cameras, and keep a small view of each, so that an episode fits into memory."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class _Look(NamedTuple):
 
 
 def read_pictures(recording: Recording, cameras: dict[str, CameraConfig]) -> dict[str, Pictures]:
-    """Read all pictures of ``cameras``, by name. Raises :class:`RecordingError` for a damaged file."""
+    """Read all pictures of ``cameras``, by name; raises :class:`RecordingError` if the file is damaged."""
     looks: dict[str, list[_Look]] = {name: [] for name in cameras}
     last: defaultdict[str, bytes] = defaultdict(bytes)
     for name, picture in recording.pictures_of(cameras):

@@ -24,7 +24,7 @@ class _Unit(NamedTuple):
 class Threshold:
     """A limit of a number of an episode, or of each of its hands, arms, cameras or subtasks."""
 
-    name: str  # min_... is a lower limit, and max_... is an upper limit.
+    name: str  # A name min_... stands for a lower limit, and max_... for an upper limit.
     of: Literal["episode", "hand", "arm", "measured", "camera", "subtask", "timing"]
     figure: str
     words: str

@@ -24,7 +24,7 @@ MAX_ADVANCE = 1.0
 class Plant(Protocol):
     """A robot that moves, simulated or real. Joint arrays are (nv,) in the order of ``Robot.joint_names``.
 
-    In each tick ``apply`` takes the posture that the plant should have at the end of the tick, ``advance`` lets the
+    In each tick ``apply`` takes the posture that the plant should have at the end of the tick. ``advance`` lets the
     time of the tick pass, and ``state`` returns the measurement. The time of real hardware passes by itself, so that
     ``advance`` of such a plant waits for the next measurement. A new plant stands at home with open grippers until a
     command comes. A plant that is found by its name also has a class method ``from_config(robot, config)``. A plant
@@ -55,7 +55,7 @@ class Plant(Protocol):
         """
 
     def gripper_openings(self) -> dict[str, float]:
-        """Return the measured opening of each gripper, from 0 for closed to 1, as a new mapping at each call."""
+        """Return the measured opening of each gripper, from 0 for closed to 1 for open, as a new mapping each time."""
 
     def close(self) -> None:
         """Free every resource. It may be called twice."""
@@ -76,7 +76,7 @@ class WindowedPlant(Protocol):
 class SessionPlant(Protocol):
     """The additional methods of a plant whose arms follow only during sessions, with a timing of their own.
 
-    The arms start where they stand. If the session of one arm ends, the run goes on: all arms brake, and are activated
+    The arms start where they stand. If the session of one arm ends, the run goes on. All arms brake. They are activated
     again where they rest, as soon as all of them are in a session again.
     """
 
@@ -157,7 +157,7 @@ def check_command(command: Command, robot: Robot, modes: tuple[CommandMode, ...]
 def check_joints(what: str, values: Array, robot: Robot) -> None:
     """Raise :class:`PlantError` if ``values`` does not have one finite number for each joint of the robot."""
     _check_shape(what, values, robot)
-    # A scalar product is a fast test. The squares of large finite numbers may overflow, and are looked at again.
+    # A scalar product is a fast test. The squares of large finite numbers may overflow, and so they are checked again.
     if not math.isfinite(values.dot(values)) and not np.isfinite(values).all():
         joint = int(np.flatnonzero(~np.isfinite(values))[0])
         raise PlantError(f"{what}: {robot.joint_names[joint]} = {values[joint]}: allowed: finite numbers")

@@ -5,7 +5,7 @@ Hand-E, 2F-85 and 2F-140 have the same registers (chapter 4 of their instruction
 **Safety.** Until an opening is measured, the fingers count as their whole way. After that, they count as the openings
 that were measured and commanded a moment ago. An activation opens and closes the fingers fully. It is therefore done
 only before the first opening of a run. If the measured opening, or the command at that time, is older than
-``MODBUS_DELAY``, the opening is not known any more, and supervision grants no other opening.
+``MODBUS_DELAY``, the opening is no longer known. Supervision then grants no other opening.
 """
 
 from __future__ import annotations
@@ -46,11 +46,11 @@ logging.getLogger("pymodbus").addHandler(logging.NullHandler())  # It would prin
 class GripperStatus:
     """One reading of a gripper."""
 
-    requested: bool  # gACT: an activation was asked for.
-    activated: bool  # gSTA: the activation is complete.
-    holds: bool  # gOBJ: an object has stopped the fingers while they opened or closed.
-    fault: int  # gFLT
-    position: int  # gPO: from about 0 for open to 255 for closed.
+    requested: bool  # The register gACT: an activation was requested.
+    activated: bool  # The register gSTA: the activation is complete.
+    holds: bool  # The register gOBJ: an object has stopped the fingers while they opened or closed.
+    fault: int  # The register gFLT: the number of the fault.
+    position: int  # The register gPO: the position, from about 0 for open to 255 for closed.
 
     @classmethod
     def of(cls, registers: Sequence[int]) -> GripperStatus:
@@ -73,7 +73,7 @@ class ModbusGripper:
     """The gripper of one arm in one run. Openings go from 0 for closed to 1 for open."""
 
     def __init__(self, arm: str, config: ModbusGripperConfig) -> None:
-        """Raises :class:`ConfigError` if pymodbus is not installed."""
+        """Raise :class:`ConfigError` if pymodbus is not installed."""
         self._arm, self._config, self._client = arm, config, _client(arm, config)
         self._where = f"{config.modbus}, unit {config.unit}"
         self.status: GripperStatus | None = None  # None if the gripper does not answer.

@@ -1,4 +1,4 @@
-"""The cell in MuJoCo: position servos or direct torque, fingers that grasp, pushes for tests."""
+"""The cell in MuJoCo, with position servos or direct torques, fingers that grasp, and pushes for tests."""
 
 from __future__ import annotations
 
@@ -47,11 +47,11 @@ class _Fingers:
 class MujocoPlant:
     """The simulated cell. The mode of each command chooses one of three ways to drive it.
 
-    In position mode each joint has a servo, tau = K (q_ref - q) + D (v_ref - v) + M a_ref + bias, with the simulator's
-    M and bias (gravity and Coriolis), clipped at the torque limits. Its reference moves straight from the last command
-    to the newest one, and rests without a new one. In velocity mode the same servos follow a reference that moves at
-    the commanded velocity for one ``advance``. In torque mode the commanded torque is applied, clipped; the sender has
-    to bear gravity.
+    In position mode each joint has a servo, tau = K (q_ref - q) + D (v_ref - v) + M a_ref + bias. M and the bias
+    (gravity and Coriolis) come from the simulator, and tau is clipped at the torque limits. The reference moves
+    straight from the last command to the newest one. Without a new command it rests. In velocity mode the same servos
+    follow a reference that moves at the commanded velocity for one ``advance``. In torque mode the commanded torque is
+    clipped and applied, and the sender has to compensate gravity.
     """
 
     modes: tuple[CommandMode, ...] = (CommandMode.POSITION, CommandMode.VELOCITY, CommandMode.TORQUE)
@@ -86,7 +86,8 @@ class MujocoPlant:
         self._tools = {arm.name: self.model.body(arm.tool_frame).id for arm in robot.arms.values()}
         self._acceleration = np.zeros(self.model.nv)
         self._inertial_torque = np.zeros(self.model.nv)
-        self.observed_qpos: Array = self._qpos.copy()  # (model.nq,) Of all moving bodies, at the last :meth:`state`.
+        # Positions of all moving bodies at the last :meth:`state` (model.nq,).
+        self.observed_qpos: Array = self._qpos.copy()
         self.reset()
         self._stiffness, self._damping = self._tuned(config)
 
@@ -105,10 +106,10 @@ class MujocoPlant:
             self.data.qpos[fingers.positions] = fingers.open_position
         settle_mimics(self.model, self.data)
         self._start = self._end = self._at_rest(posture)  # Posture and velocity at both ends of the tick.
-        self._next: tuple[Array, Array] | None = None  # Commanded for the end of the next tick.
-        self._torque: Array | None = None  # Commanded in torque mode.
-        self._velocity: Array | None = None  # Commanded in velocity mode, for the next advance.
-        self._pushes: dict[str, tuple[Array, int]] = {}  # By arm, the wrench and the step before which it ends.
+        self._next: tuple[Array, Array] | None = None  # Commanded posture and velocity at the end of the next tick.
+        self._torque: Array | None = None  # Commanded torque in torque mode.
+        self._velocity: Array | None = None  # Commanded velocity in velocity mode, for the next advance.
+        self._pushes: dict[str, tuple[Array, int]] = {}  # Wrench and the step before which it ends, by arm.
         self._steps = 0
         self._clock = 0.0
         mujoco.mj_forward(self.model, self.data)
@@ -158,12 +159,12 @@ class MujocoPlant:
             raise PlantError(f"the simulation diverged at {self._clock:.3f} s; reset it")
 
     def state(self) -> RobotState:
-        """See :meth:`Plant.state`. External torques are those of contacts, pushes and the joints' hard stops."""
+        """See :meth:`Plant.state`. External torques come from contacts, pushes and the hard stops of the joints."""
         index, data = self._v_index, self.data
         self.observed_qpos = self._qpos.copy()
         tau = data.qfrc_actuator.take(index)
-        # MuJoCo's sum of forces before contacts, less the terms that are not external, leaves the pushes from here and
-        # from its window.
+        # MuJoCo's sum of forces before contacts, minus the terms that are not external, leaves the pushes of
+        # :meth:`push` and of MuJoCo's window.
         external = (data.qfrc_constraint + data.qfrc_smooth - data.qfrc_passive + self._bias).take(index) - tau
         q, v = self._qpos.take(self._q_index), self._qvel.take(index)
         return RobotState(q, v, tau, external, self._steps * self._timestep)
@@ -214,9 +215,9 @@ class MujocoPlant:
             self._window = None
 
     def _tuned(self, config: Config) -> tuple[Array, Array]:
-        """Return stiffness [Nm/rad] and damping [Nm s/rad] of the servos (nv,), within what the timestep can integrate.
+        """Return stiffness [Nm/rad] and damping [Nm s/rad] of the servos (nv,). The timestep bounds both.
 
-        The damping is for the effective inertia of each joint at home, 1 / (M^-1)_ii, while the other joints yield.
+        The damping fits the effective inertia of each joint at home, 1 / (M^-1)_ii, while the other joints yield.
         """
         inverse = np.empty((self.model.nv, self.model.nv))
         mujoco.mj_solveM(self.model, self.data, inverse, np.eye(self.model.nv))

@@ -21,9 +21,9 @@ from q2r2_control.types import Array
 _FROM_OURS = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 _STRAIGHT = 1e-9  # Least sine of the angle between the line of sight and the vertical.
 _LONGEST_CLOSE = 5.0  # Time to wait until a window is closed [s].
-_OPACITY = 0.6  # Of moving obstacles.
-# Without a graphics card, MuJoCo's 8 samples per pixel and shadow map of 8192 take five times as long, and its round
-# shapes of 28 x 16 parts take twice as long.
+_OPACITY = 0.6  # Opacity of moving obstacles.
+# Without a graphics card, MuJoCo's 8 samples per pixel and shadow map of 8192 take five times as long. Its round shapes
+# of 28 x 16 parts take twice as long.
 _SHADOW_MAP, _SAMPLES, _ROUND = 1024, 0, (16, 8)
 
 
@@ -139,7 +139,7 @@ def close_window(window: mujoco.viewer.Handle) -> None:
             thread.join(_LONGEST_CLOSE)
 
 
-# MuJoCo's kind of each shape, and its sizes from ours.
+# For each of our shapes, MuJoCo's kind of shape, and the factors from our sizes to MuJoCo's.
 _DRAWN = {
     "sphere": (mujoco.mjtGeom.mjGEOM_SPHERE, (1.0,)),
     "capsule": (mujoco.mjtGeom.mjGEOM_CAPSULE, (1.0, 0.5)),

@@ -1,7 +1,7 @@
-"""Builds the MuJoCo model of a cell from its URDF.
+"""Build the MuJoCo model of a cell from its URDF.
 
-MuJoCo's URDF reader knows neither capsules nor rotors, SRDF or servos: they are put in here, from the :class:`Robot`
-that the controller uses.
+MuJoCo's URDF reader knows no capsules, rotors, SRDF or servos. This module adds them from the :class:`Robot` that the
+controller uses.
 """
 
 from __future__ import annotations
@@ -34,30 +34,33 @@ from q2r2_control.robot.followers import Follower, followers_of
 from q2r2_control.robot.pairs import ENVELOPE, link_of, pair_names
 from q2r2_control.robot.robot import Robot
 
-# Least viscous friction [Nm s/rad]: it keeps light wrist joints steady.
+# Least viscous friction of a joint, which keeps light wrist joints steady [Nm s/rad].
 _MIN_DAMPING = 0.2
 
-# [kg m^2]: a thousandth of what a drive's rotor adds to its joint.
+# A negligible inertia. It is a thousandth of the inertia that a drive's rotor adds to its joint [kg m^2].
 _NEGLIGIBLE_INERTIA = 1e-6
 
-# Rubber on a box.
+# Friction of rubber on a box.
 _PAD_FRICTION = (1.0, TORSION, ROLLING)
 
 # Time constant [s] and damping ratio of a finger's contacts. MuJoCo scales their stiffness with the inertia behind
-# them, which is small in a finger. With its usual 0.02 s the grip would sink millimetres into the held part.
+# them, which is small in a finger. With MuJoCo's usual 0.02 s the fingers would sink millimetres into the held part.
 _PAD_STIFFNESS = (0.004, 1.0)
 
-# Of meshes that MuJoCo reads by itself.
+# Formats of meshes that MuJoCo reads by itself.
 _FORMATS = (".stl", ".obj", ".msh")
 
-# A finger servo gives its full force at this part of the stroke.
+# A finger servo gives its full force if the error of its position is this share of the stroke.
 _FINGER_SERVO_BAND = 0.05
 
 
 def build_model(robot: Robot, config: Config) -> mujoco.MjModel:
-    """Compile the cell: actuators ``robot.joint_names`` first, in that order, then each gripper's finger joints.
+    """Compile the model of the cell.
 
-    Raises :class:`PlantError` where MuJoCo cannot make a model of it.
+    Its first actuators are ``robot.joint_names`` in that order. The finger joints of each gripper follow.
+
+    Raises:
+        PlantError: If MuJoCo cannot make a model of the cell.
     """
     try:
         spec = mujoco.MjSpec.from_string(_readable_urdf(robot.urdf))
@@ -81,9 +84,9 @@ def build_model(robot: Robot, config: Config) -> mujoco.MjModel:
 
 
 def _readable_urdf(urdf: str) -> str:
-    """The URDF with every link kept as a body and every drawing that MuJoCo can read.
+    """Return the URDF with settings that keep every link as a body, and with every drawing that MuJoCo can read.
 
-    Mimics are left out: not every MuJoCo reads them, and :func:`_set_grippers` couples the joints.
+    Each <mimic> is removed, because not every version of MuJoCo reads it. :func:`_set_grippers` couples the joints.
     """
     root = ET.fromstring(urdf)
     extension = ET.SubElement(root, "mujoco")
@@ -100,7 +103,7 @@ def _readable_urdf(urdf: str) -> str:
 
 
 def _load_meshes(spec: mujoco.MjSpec) -> None:
-    """Read every mesh of ``spec`` that MuJoCo cannot, such as DAE, by Coal; their scale stays the mesh's."""
+    """Read by Coal every mesh of ``spec`` that MuJoCo cannot read, such as DAE. The mesh keeps its scale."""
     for mesh in spec.meshes:
         if mesh.file.lower().endswith(_FORMATS):
             continue
@@ -117,20 +120,20 @@ def _load_meshes(spec: mujoco.MjSpec) -> None:
 
 def _set_solver(spec: mujoco.MjSpec, config: MujocoConfig) -> None:
     spec.option.timestep = config.timestep
-    # A diverged simulation is an error here, and no reason to jump back to the start.
+    # A diverged simulation is an error. Without this flag, MuJoCo would jump back to the start.
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     spec.option.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    # The elliptic cone with this ratio keeps what is grasped from creeping out of the fingers.
+    # The elliptic cone with this ratio keeps grasped objects from creeping out of the fingers.
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = FRICTION_IMPEDANCE
 
 
 def _correct_inertias(spec: mujoco.MjSpec) -> None:
-    """Raise eigenvalues of inertias that no body can have, as files have them of antennas of a milligram.
+    """Raise eigenvalues of inertias that no real body can have. Some files have them, for antennas of a milligram.
 
-    MuJoCo refuses such a file as a whole. The added terms are far below anything that a joint feels, or it is refused
-    after all.
+    MuJoCo refuses such a file as a whole. Only terms that no joint feels are added. MuJoCo still refuses inertias that
+    are wrong by more.
     """
     for body in spec.bodies:
         if not body.explicitinertial or np.isnan(body.fullinertia).any():
@@ -143,13 +146,13 @@ def _correct_inertias(spec: mujoco.MjSpec) -> None:
 
 
 def _set_shapes(spec: mujoco.MjSpec, robot: Robot) -> None:
-    """Sort shapes into groups, keep envelopes out of contact, and restore capsules, which the URDF has as cylinders."""
+    """Sort shapes into groups, keep envelopes out of contact, and restore capsules. The URDF has them as cylinders."""
     declared = ET.fromstring(robot.urdf).iterfind("link/collision_checking/capsule")
     capsules = {capsule.get("name", "") for capsule in declared}
     for body in spec.bodies:
         drawn = any(not geom.contype for geom in body.geoms)
         for geom in body.geoms:
-            # In a URDF shapes weigh nothing; without this, links that name no mass would get one from their shapes.
+            # Shapes of a URDF have no mass. Without this line, links without a mass would get one from their shapes.
             geom.mass = 0.0
             if geom.name in capsules:
                 geom.type = mujoco.mjtGeom.mjGEOM_CAPSULE
@@ -173,7 +176,7 @@ def _set_arm_joints(spec: mujoco.MjSpec, robot: Robot, config: MujocoConfig) -> 
 
 
 def _set_grippers(spec: mujoco.MjSpec, robot: Robot, config: Config) -> None:
-    """A servo for each finger joint, all of one gripper coupled as by its gear, with contacts that hold a box."""
+    """Add a servo for each finger joint, couple the joints of a gripper like its gear, and let contacts hold a box."""
     robot_urdf = ET.fromstring(robot.urdf)
     for side, arm in config.arms.items():
         gripper, names = arm.gripper, robot.arms[side].finger_joints
@@ -197,13 +200,13 @@ def _set_grippers(spec: mujoco.MjSpec, robot: Robot, config: Config) -> None:
             for geom in spec.joint(name).parent.geoms:
                 geom.condim, geom.friction, geom.solref = 4, _PAD_FRICTION, _PAD_STIFFNESS
                 geom.priority = PAD_PRIORITY
-        # The joint limits keep the fingers apart already.
+        # The joint limits already keep the fingers apart.
         for first, second in combinations(moved, 2):
             _exclude(spec, spec.joint(first).parent.name, spec.joint(second).parent.name)
 
 
 def settle_mimics(model: mujoco.MjModel, data: mujoco.MjData) -> None:
-    """Put every joint that follows another one where its coupling wants it."""
+    """Move every joint that follows another one to the position that its coupling requires."""
     for i in range(model.neq):
         if model.eq_type[i] == mujoco.mjtEq.mjEQ_JOINT:
             follower, leader = (model.jnt_qposadr[joint[i]] for joint in (model.eq_obj1id, model.eq_obj2id))
@@ -217,7 +220,7 @@ def _exclude_contacts(spec: mujoco.MjSpec, robot: Robot) -> None:
         if frozenset((first, second)) not in watched:
             _exclude(spec, first, second)
     for name in robot.joint_names:
-        # MuJoCo leaves out contacts with a parent only where that parent can move.
+        # MuJoCo leaves out contacts of a body with its parent only if that parent can move.
         link = spec.joint(name).parent
         if frozenset((link.parent.name, link.name)) not in watched:
             _exclude(spec, link.parent.name, link.name)
@@ -247,6 +250,6 @@ def _add_objects(spec: mujoco.MjSpec, config: MujocoConfig) -> None:
                 condim=4,
                 friction=(thing.friction, TORSION, ROLLING),
             )
-            # Parts that slide into each other are hard: MuJoCo's usual contacts let light ones sink in by millimetres.
+            # Parts that slide into each other are hard. With MuJoCo's usual contacts, light ones sink in millimetres.
             if thing.friction < _PAD_FRICTION[0]:
                 geom.solref = _PAD_STIFFNESS

@@ -91,19 +91,19 @@ PAD_PRIORITY, _OBSTACLE_PRIORITY = 1, 2
 # Torsion [m] and rolling [m] of a contact of about a square centimetre.
 TORSION, ROLLING = 0.02, 0.001
 
-# T_n [s], which is MuJoCo's usual one, and the damping ratio. With the pads' values and the inertia of a whole arm, a
-# table would have millions of N/m.
+# Time constant of contacts in the normal direction [s], which is MuJoCo's default, and the damping ratio. With the
+# values of the pads and the inertia of a whole arm, a table would have a stiffness of millions of N/m.
 _STIFFNESS = (0.02, 1.0)
 
-# T_f [s]; a damping ratio has no effect on friction.
+# Time constant of friction [s], and a damping ratio, which has no effect on friction.
 _SLIDING = (0.1, 1.0)
 
-# Stiffness of friction relative to that of the normal direction. It holds grasped objects, and a finger on an obstacle.
+# Stiffness of friction relative to the normal direction. It holds grasped objects, and a finger on an obstacle.
 FRICTION_IMPEDANCE = 100.0
 
 
 def set_obstacles(spec: mujoco.MjSpec, config: Config) -> None:
-    """Set the contacts of obstacles, which have priority over those of the pads."""
+    """Set the contacts of obstacles, which have priority over the contacts of the pads."""
     for name in config.obstacles:
         for geom in spec.body(name).geoms:
             geom.condim, geom.friction = 4, (config.mujoco.obstacle_friction, TORSION, ROLLING)
@@ -111,7 +111,7 @@ def set_obstacles(spec: mujoco.MjSpec, config: Config) -> None:
 
 
 def let_fingers_slide(spec: mujoco.MjSpec, config: Config) -> None:
-    """Name the pairs of pads and obstacles that can touch, with friction that leaves the normal force alone."""
+    """Add a pair for each pad and obstacle that can touch, with a friction that does not change the normal force."""
     pads = [geom for body in spec.bodies for geom in body.geoms if geom.priority == PAD_PRIORITY and geom.contype]
     friction = config.mujoco.obstacle_friction
     for name in config.obstacles:
@@ -124,8 +124,8 @@ def let_fingers_slide(spec: mujoco.MjSpec, config: Config) -> None:
                 pair.solref, pair.solreffriction = _STIFFNESS, _SLIDING
 
 
-# Contacts of soft objects: share of MuJoCo's rigid answer, time in which foam takes its shape again [s], and number of
-# points on which a box stands.
+# Contacts of soft objects. The numbers are the share of MuJoCo's answer for a rigid body, the time in which foam takes
+# its shape again [s], and the number of points on which a box stands.
 _SHARE, _RECOVERY, _CORNERS = 0.9, 0.02, 4
 
 

@@ -23,10 +23,9 @@ _INTERVAL_SHARE = 0.1
 class JointFollower:
     """Computes the wanted place of each joint at any time, from the newest command that names it.
 
-    A command says posture and velocity at a time; in between the joint moves on at that velocity. When the next command
-    stays out the joint brakes at its ``acceleration_limit`` (nv,) [rad/s^2], so that a velocity never outlives its
-    sender. No joint moves faster than its ``velocity_limit`` (nv,) [rad/s]. Times are seconds on one clock that is
-    passed in.
+    A command has a posture and a velocity at a time. Until the next command, the joint moves on at that velocity. If no
+    command comes for too long, the joint brakes at its ``acceleration_limit`` (nv,) [rad/s^2], so that no velocity
+    outlives its sender. No joint moves faster than its ``velocity_limit`` (nv,) [rad/s]. Times are passed in [s].
     """
 
     def __init__(self, q: Array, acceleration_limit: Array, velocity_limit: Array) -> None:
@@ -34,16 +33,16 @@ class JointFollower:
         self.stop(q, np.zeros_like(q))
 
     def stop(self, q: Array, v: Array) -> None:
-        """Forget all commands and brake from posture ``q`` and velocity ``v`` (nv,)."""
+        """Forget all commands, and brake from posture ``q`` and velocity ``v`` (nv,)."""
         self.q, self.v = q.copy(), np.minimum(np.maximum(v, -self._velocity_limit), self._velocity_limit)
         self._command_q, self._command_v = q.copy(), np.zeros_like(q)
         self._due = np.full(len(q), -np.inf)
         self._interval = np.full(len(q), _SHORTEST_COAST)
 
     def command(self, joints: Array, q: Array, v: Array | None, due: float) -> None:
-        """Take posture ``q`` and velocity ``v`` of the joints with these indices at time ``due`` [s].
+        """Take posture ``q`` and velocity ``v`` of the joints with the indices ``joints`` at time ``due`` [s].
 
-        Without ``v`` the velocity is what leads from the last command to this one in the time between two.
+        Without ``v``, the velocity is the way from the last command to this one, divided by the mean time between two.
         """
         interval = due - self._due[joints]
         known = (interval > 0.0) & (interval <= _LONGEST_COAST)
@@ -84,7 +83,7 @@ _LONGEST_TORQUE = 0.012
 class SimulatedCell:
     """A plant that follows commands. Without commands, position servos stop and hold it in any mode.
 
-    Every refusal is a line of text that is returned; nothing is commanded then.
+    A command that is refused changes nothing, and its method returns a line of text with the reason.
     """
 
     def __init__(self, robot: Robot, config: Config, hold_after: float, max_jump: float) -> None:
@@ -117,7 +116,7 @@ class SimulatedCell:
         self._openings = dict.fromkeys(self.plant.gripper_openings(), 1.0)
 
     def mode(self, now: float) -> str:
-        """The kind of commands that drive the arms: positions, torques or none."""
+        """Return the kind of commands that drive the arms at ``now`` [s]: positions, torques or none."""
         if now - self._last_command > self._hold_after:
             return "holding"
         return "position" if self._tau is None else "torque"
@@ -125,9 +124,9 @@ class SimulatedCell:
     def command_positions(
         self, names: Sequence[str], q: Array, v: Array | None, now: float, delay: float = 0.0
     ) -> str | None:
-        """Follow positions [rad] and velocities [rad/s], if known, of joints ``names``; others' names are ignored.
+        """Follow the positions ``q`` [rad] and, if known, the velocities ``v`` [rad/s] of the joints ``names``.
 
-        They came at ``now`` and are due ``delay`` later [s].
+        Names of other joints are ignored. The command came at ``now`` [s], and is due ``delay`` [s] later.
         """
         if fault := self._unusable(names, q, v, delay):
             return fault
@@ -152,7 +151,7 @@ class SimulatedCell:
         if len(v) != len(self._columns):
             return f"{len(v)} velocities for {len(self._columns)} joints"
         q = self._follower.q if self._tau is None else self.plant.state().q
-        if self._time is not None:  # This is the place for now, because the follower stands at the last step.
+        if self._time is not None:  # The wanted place moves on to ``now``, because the follower is at the last step.
             q = q + v * min(max(now - self._time, 0.0), _LONGEST_CATCH_UP)
         return self.command_positions(self.robot.joint_names, q, v, now)
 
@@ -198,7 +197,7 @@ class SimulatedCell:
         return self.plant.state()
 
     def _drive(self, now: float, dt: float) -> None:
-        # A torque that is not renewed would push for ever.
+        # Without this limit, a torque that nobody renews would push for ever.
         if self._tau is not None and now - self._last_command > self._hold_after:
             self._back_to_servos()
         zero = np.zeros_like(self.robot.home)
@@ -227,7 +226,7 @@ class SimulatedCell:
         return None
 
     def _find(self, names: tuple[str, ...]) -> tuple[list[int], Array] | str:
-        """Return the places of our joints among ``names``, and their indices here; or the fault of these names."""
+        """Return the places of our joints in ``names`` and their indices in our arrays, or the fault of these names."""
         if len(set(names)) != len(names):
             return "a joint is named twice"
         if not (ours := [place for place, name in enumerate(names) if name in self._columns]):

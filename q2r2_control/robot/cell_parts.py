@@ -21,9 +21,9 @@ def cylinder_flange(thickness: float, radius: float, mass: float) -> Description
     """Return the model of a flange: a cylinder on the arm's last link along z, with a link at its far end.
 
     Args:
-        thickness: Of the cylinder [m].
-        radius: Of the cylinder [m].
-        mass: Of the cylinder [kg].
+        thickness: Length of the cylinder [m].
+        radius: Radius of the cylinder [m].
+        mass: Mass of the cylinder [kg].
     """
     across, along = mass * (3.0 * radius**2 + thickness**2) / 12.0, mass * radius**2 / 2.0
     moments = f'ixx="{across}" iyy="{across}" izz="{along}" ixy="0" ixz="0" iyz="0"'
@@ -42,7 +42,7 @@ def cylinder_flange(thickness: float, radius: float, mass: float) -> Description
 
 
 class Model:
-    """One model in the cell. Its names get a prefix."""
+    """One model in the cell. The names of its links and joints get a prefix."""
 
     def __init__(self, description: Description, prefix: str) -> None:
         self.description = description
@@ -54,7 +54,7 @@ class Model:
         self.exclusions = [] if description.srdf is None else [*description.srdf]
 
     def name_in_cell(self, name: str) -> str:
-        # The cell already has a link with this name, the root of the model.
+        # The root link of the cell already has the name WORLD.
         return f"robot_{name}" if not self.prefix and name == WORLD else self.prefix + name
 
     def urdf(self, mount: PoseConfig) -> list[ET.Element]:
@@ -68,7 +68,7 @@ class Mounted(NamedTuple):
 
     model: Model
     joint: ET.Element  # The joint to the part that carries it.
-    is_flat: bool  # Whether it sits flat on the end of that part, so that a file may exclude pairs of both.
+    is_flat: bool  # True if it sits flat on the end of that part, so that a file may exclude pairs of both.
 
 
 class ArmAssembly:
@@ -125,11 +125,11 @@ class ArmAssembly:
         return self.model.name_in_cell(name)
 
     def finger_names(self) -> tuple[str, ...]:
-        """The joints that the gripper drives, with their names in the cell."""
+        """Return the joints that the gripper drives, with their names in the cell."""
         return tuple(map(self.name_in_cell, self.config.gripper.joints))
 
     def tool_links(self) -> tuple[str, ...]:
-        """The links of the tool, or of the hand that carries the gripper's joints, with their names in the cell."""
+        """Return the names in the cell of the links of the tool, or of the hand that carries the gripper's joints."""
         has_tool = self.config.tool.model is not None
         links = self.mounted[-1].model.links if has_tool else hand_links(self.tree, self.config.gripper.joints)
         return tuple(sorted(map(self.name_in_cell, links)))

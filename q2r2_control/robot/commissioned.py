@@ -63,12 +63,12 @@ def load_commissioned(path: str | os.PathLike[str], plant: str | None = None, *,
     A cell that drives no real cabinets is returned as :func:`load_config` returns it.
 
     Args:
-        path: The cell's YAML, as of :func:`load_config`.
+        path: The cell's YAML, in a form that :func:`load_config` takes.
         plant: The name of the plant that will move the arms; None for the one that the cell names.
-        full_speed: True to let real arms move as fast as the cell says. Otherwise their joints go at a tenth of it.
+        full_speed: True to let real arms move as fast as the cell says. Otherwise they move at a tenth of this speed.
 
     Raises:
-        ConfigError: If the file cannot be used, or if its real cabinets were not commissioned as they are now.
+        ConfigError: If the file cannot be used, or if its real cabinets were not commissioned in their present state.
     """
     config = load_config(path)
     if (plant or config.plant) != "fri":

@@ -44,7 +44,8 @@ def enclose_shapes(geometry: pin.GeometryModel, capsules: Mapping[str, int] | No
 
     Args:
         geometry: The geometry model.
-        capsules: For some links, the greatest number of capsules for each of their meshes; 1 also for other shapes.
+        capsules: For some links, the greatest number of capsules for each of their meshes. The value 1 is also allowed
+            for links with other shapes.
 
     Raises:
         RobotError: If a shape has no extent or no bounds.
@@ -100,8 +101,8 @@ def enclosing_capsule(points: Array) -> Capsule:
     """Return a small capsule around ``points`` (n, 3): the radius and both ends of the segment (3,).
 
     It starts from the principal axes, and minimises the volume over the axis (two angles), its place (two offsets), and
-    the radius. With an axis and a radius r, a point at the height t and the distance rho from the axis is inside if the
-    segment has a height within sqrt(r^2 - rho^2) of t.
+    the radius. Let a point have the height t and the distance rho from the axis. It is inside a capsule of radius r if
+    the segment has a height within sqrt(r^2 - rho^2) of t.
     """
     return _cached_capsule(np.array(points, dtype=float, order="C").tobytes())
 

@@ -1,8 +1,8 @@
 """Compute the bodies of fingers. Each body is the volume that a finger sweeps over the travel of its joints.
 
-Distances depend on the arm's joints only, and so the body of a finger is its whole way. While the opening of the
-gripper is known, less counts: a part of the segment if the finger slides, and a capsule of turning_fingers.py if it
-turns.
+Distances depend on the arm's joints only, and so the body of a finger covers its whole way. While the opening of the
+gripper is known, a smaller body counts. It is a part of the segment if the finger slides, and a capsule of
+turning_fingers.py if it turns.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from q2r2_control.types import ALL_OF_THE_WAY, Array, Interval
 
 @dataclass(frozen=True, slots=True)
 class FingerBody:
-    """A body that is all of the way of one arm's fingers along a line."""
+    """A body that covers the whole way of one arm's fingers along a line."""
 
     arm: str
-    name: str  # of the geometry
-    length: float  # of its segment [m]
-    # Places along the segment at home [m], and the joints that move each, with the part of their way along the line.
+    name: str  # Name of the geometry object.
+    length: float  # Length of its segment [m].
+    # Places along the segment at home [m]. Each has the joints that move it, with the part of their way along the line.
     ends: tuple[tuple[float, tuple[tuple[float, FingerJoint], ...]], ...]
 
     def part(self, interval: Interval) -> tuple[float, float]:
@@ -95,8 +95,8 @@ def sweep_fingers(
     its whole way. A finger that is moved by a joint with more than one axis stays as it is.
 
     Returns:
-        The bodies of which less counts while the gripper's opening is known: those along whose line the fingers slide,
-        and those that turn.
+        The bodies that become smaller while the gripper's opening is known. These are bodies along whose line the
+        fingers slide, and bodies of fingers that turn.
     """
     bodies: list[FingerBody | TurningBody] = []
     for arm, joints in parts.finger_joints.items():
@@ -175,7 +175,7 @@ def _ends(item: pin.GeometryObject) -> Array:
 
 
 def _sweep(item: pin.GeometryObject, joints: tuple[FingerJoint, ...]) -> bool:
-    """Replace a shape by the volume that it sweeps; returns whether its whole segment moves along one line."""
+    """Replace a shape by the volume that it sweeps, and return whether its whole segment moves along one line."""
     ways = [[(end - joint.home) * joint.axis for end in (joint.before, joint.beyond)] for joint in joints]
     points = np.array([end + np.sum(move, axis=0) for move in product(*ways) for end in _ends(item)])
     radius, line = float(item.geometry.radius), _line_of(points)
@@ -199,7 +199,10 @@ def _line_of(points: Array) -> Array | None:
 
 
 def _merge(geometry: pin.GeometryModel, swept: dict[str, list[_Finger] | None]) -> dict[str, list[_Finger] | None]:
-    """Join bodies on one line; returns the fingers of the remaining bodies, None for those that move across a line."""
+    """Join bodies on one line, and return the fingers of the remaining bodies.
+
+    The value is None for bodies with a finger that moves across the line.
+    """
     kept: dict[str, list[_Finger] | None] = {}
     for name, fingers in swept.items():
         item = geometry.geometryObjects[geometry.getGeometryId(name)]

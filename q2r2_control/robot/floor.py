@@ -19,11 +19,11 @@ from q2r2_control.errors import ConfigError
 from q2r2_control.robot.pairs import CLEARANCE, keep_pairs, link_of
 from q2r2_control.robot.urdf_parts import fixed_joint
 
-FLOOR = "floor"  # The name of its link.
+FLOOR = "floor"  # The name of the floor's link.
 
 _SIZE = (100.0, 100.0, 10.0)  # [m]
 _ON = 1e-3  # A box stands on the floor if its underside is not higher than this [m].
-_UPRIGHT = 1e-9  # sine of the angle to the vertical [-]
+_UPRIGHT = 1e-9  # Greatest sine of the angle to the vertical at which an axis counts as vertical [-].
 
 
 def floor_link(height: float, parent: str, obstacles: Collection[str]) -> list[ET.Element]:
@@ -48,7 +48,7 @@ def sink_boxes_into_floor(geometry: pin.GeometryModel) -> None:
     """Extend fixed upright boxes that stand on the floor deep into it, so that nothing is pushed out downwards.
 
     A body inside a box is pushed out through the nearest face. It cannot leave through the underside of a box on the
-    floor: a hand deep in the box and its wrist above would be pushed apart, and stay there for ever. Above the floor
+    floor. A hand deep in the box and its wrist above would be pushed apart, and stay there for ever. Above the floor
     the box does not change.
     """
     floor = next((item for item in geometry.geometryObjects if _is_floor(item)), None)

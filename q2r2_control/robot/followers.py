@@ -24,15 +24,17 @@ class Follower:
 
 
 def followers_of(joints: Iterable[ET.Element], driven: Collection[str] = (), where: str = "") -> dict[str, Follower]:
-    """Return all joints that follow another one, by name. A follower of a follower gets the driver of that one.
+    """Return all joints that follow another joint, by name.
+
+    If a joint follows a follower, its driver is the driver of that follower.
 
     Args:
         joints: All joints of the model.
-        driven: Joints with a motor. They follow no joint, also with a <mimic>. The same holds for fixed joints.
+        driven: Joints with a motor. They follow no joint, even with a <mimic>. The same holds for fixed joints.
         where: Begins the text of an error.
 
     Raises:
-        RobotError: If a joint follows one that is not in ``joints``, or itself through other joints.
+        RobotError: If a joint follows a joint that is not in ``joints``, or itself through other joints.
     """
     named = {joint.get("name", ""): joint for joint in joints}
     leads = {
@@ -65,7 +67,7 @@ def with_followers(positions: Mapping[str, float], followers: Mapping[str, Follo
 def narrow_limits(joints: Collection[ET.Element], where: str = "") -> None:
     """Narrow the limits of drivers in place, so that all followers stay within their own limits.
 
-    A follower without limits, one that turns on for ever, and one that does not move, has no effect. A follower whose
+    A follower has no effect if it has no limits, if it turns on for ever, or if it does not move. A follower whose
     limits have the wrong sign, as in models of mirrored fingers, gets the range in which it follows.
 
     Raises:

@@ -1,11 +1,11 @@
 """Held objects: bodies that are fixed to the tools, and the monitored pairs with them.
 
 They are in a copy of ``Robot.collision_model``, after its own bodies and pairs. An object has pairs with the same
-bodies as its link. There are no pairs with its own hand, and none with the fingers of other hands, because these must
-be able to take the object over.
+bodies as its link. There are no pairs with its own hand. There are also none with the fingers of other hands, because
+these must be able to take the object over.
 
 **The distance of two boxes** has no short closed form. One of the two closest points of two convex polyhedra can be
-taken on an edge: if both points lie inside of faces, these faces are parallel, and both points can be moved along
+taken on an edge. If both points lie inside of faces, these faces are parallel. Both points can then be moved along
 them until one of them meets an edge. Two polyhedra also begin to overlap only by an edge of one in the other. The
 distance of two boxes is therefore the least distance of the twelve edges of each box from the other box. Each edge is
 a capsule without a radius.
@@ -34,7 +34,7 @@ class HeldObject:
     arm: str
     link: str  # The link after which its bodies are named.
     joint: int  # The joint in ``Robot.model`` that carries it.
-    placement: pin.SE3  # Of its centre, in the frame of that joint.
+    placement: pin.SE3  # Placement of its centre in the frame of that joint.
     config: HeldObjectConfig
 
     def inertia(self, share: float = 1.0) -> pin.Inertia:

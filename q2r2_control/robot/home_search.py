@@ -29,10 +29,10 @@ _AHEAD = np.array([0.8, 0.0, -0.6])  # Direction in which the tool points.
 _LEAST_GAIN = 0.15  # Least gain of the weakest direction of motion, in reaches of the arm.
 _BORNE = 0.7  # Share of the torque limits that gravity may need.
 _ROOM = 0.04  # Wanted room in addition to the distance that a pair keeps [m].
-_BELOW = 0.16  # The same between the tool and the floor. Scripted hands go down by less [m].
+_BELOW = 0.16  # Wanted room between the tool and the floor. Scripted hands go down by less [m].
 _NEEDED = 0.005  # Required room [m].
 _MIRROR = np.array([1.0, -1.0, 1.0])
-_ALONG_X, _ALONG_Z = np.diag([0.01, 0.0, 0.01])[[0, 2]]  # in the tool's frame [m]
+_ALONG_X, _ALONG_Z = np.diag([0.01, 0.0, 0.01])[[0, 2]]  # Points on two axes of the tool's frame [m].
 _FAULTY = 100.0  # Cost of each requirement that a posture does not meet.
 
 
@@ -59,7 +59,7 @@ def mirrored_home(robot: Robot, arm: str, placed: str, q: Array) -> Array | None
     """Return positions of ``arm`` (n,) [rad] that mirror the arm ``placed`` at ``q`` (nv,) in the plane y = 0.
 
     Joints of mirrored arms differ in their signs only. The signs that mirror the places of the joints best are taken.
-    None if the arms have different numbers of joints.
+    Returns None if the arms have different numbers of joints.
     """
     own, other = robot.arms[arm], robot.arms[placed]
     if len(own.joints) != len(other.joints):
@@ -104,7 +104,7 @@ class _HomeSearch:
         below = [FLOOR in map(link_of, pair) and bool(last & {*pair}) for pair in pair_names(robot.collision_model)]
         self._rooms = (counts, _ROOM), (np.array(below, bool), _BELOW)
         self._reach = 1.0  # [m]
-        # The first two joints turn and lift most arms: the shoulder is where the second is.
+        # In most arms the first joint turns the arm and the second one lifts it. The shoulder is at the second joint.
         self._shoulder = int(self._joints[min(1, len(self._joints) - 1)]) + 1
 
     def best(self, random: np.random.Generator) -> Array:
@@ -151,7 +151,7 @@ class _HomeSearch:
         )
 
     def cost(self, x: Array) -> float:
-        """With what bodies lack of their room."""
+        """Return the cost of the posture ``x``, including a cost for pairs of bodies with too little room."""
         cost, kept = self._cost_of_posture(x), self._robot.distance_values(self._at(x)) - self._kept
         for pairs, room in self._rooms:
             cost += _beyond(room - float(kept[pairs].min(initial=room)), room - _NEEDED)

@@ -22,9 +22,9 @@ _OUTERMOST_FIRST = list(LinkClass)
 class KeptDistances:
     """The distances of all pairs, in the order of ``Robot.distances``."""
 
-    values: Array  # (p,) [m]. For pairs that may touch, minus the depth that the reference may have.
-    keys: tuple[str, ...]  # The key in the block ``control``, such as min_distance, distances.arm_arm or pairs[0].
-    contact_speed: Array  # (p,) Closing speed near contact of pairs that may touch [m/s]; infinite for others.
+    values: Array  # Kept distances (p,) [m]. A pair that may touch has minus the depth that the reference may have.
+    keys: tuple[str, ...]  # Keys in the block ``control``, such as min_distance, distances.arm_arm or pairs[0].
+    contact_speed: Array  # Closing speeds near contact of pairs that may touch (p,) [m/s]; infinite for others.
 
 
 def kept_distances(robot: Robot, settings: ControllerSettings) -> KeptDistances:
@@ -37,17 +37,17 @@ def kept_distances(robot: Robot, settings: ControllerSettings) -> KeptDistances:
 
 
 def kept_by_objects(robot: Robot, settings: ControllerSettings) -> KeptDistances:
-    """Return the same for the pairs of ``robot.objects``; raises as :func:`kept_distances` does."""
+    """Return the distances that the pairs of ``robot.objects`` keep; raises as :func:`kept_distances` does."""
     return _of_all_pairs(robot, settings)[1]
 
 
 def kept_by_obstacles(robot: Robot, settings: ControllerSettings) -> KeptDistances:
-    """Return the same for the pairs of moving obstacles; raises as :func:`kept_distances` does."""
+    """Return the distances that the pairs of moving obstacles keep; raises as :func:`kept_distances` does."""
     return _of_all_pairs(robot, settings)[2]
 
 
 def near_at_home(robot: Robot, kept: KeptDistances) -> list[NearPair]:
-    """Return the pairs that are closer at home than they have to keep, the closest first."""
+    """Return the pairs that are closer at home than the distance that they have to keep, the closest first."""
     pairs = zip(robot.distances(robot.home), kept.values.tolist(), kept.keys, strict=True)
     found = [NearPair((pair.name_a, pair.name_b), pair.distance, least, key) for pair, least, key in pairs]
     return sorted((pair for pair in found if pair.distance < pair.kept), key=lambda pair: pair.distance)
@@ -56,7 +56,7 @@ def near_at_home(robot: Robot, kept: KeptDistances) -> list[NearPair]:
 def too_close_at_home(robot: Robot, kept: KeptDistances, *, remedies: bool = False) -> list[str]:
     """Return a line for each pair of :func:`near_at_home`.
 
-    With ``remedies`` it says what to write into the cell's YAML, for which postures are sampled.
+    With ``remedies`` the line also says what to write into the cell's YAML. To find this, postures are sampled.
     """
     lines = []
     for pair in near_at_home(robot, kept):

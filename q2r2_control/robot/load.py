@@ -1,9 +1,9 @@
 """Identify the mass and the centre of mass that an arm carries, from torques at rest in many postures.
 
-At rest the torques of gravity are linear in the mass m of the last link and in m c, where c is its centre of mass. The
-difference between measured torques and a model therefore tells by how much m and m c differ from the model. Published
-masses of an arm's links differ by up to a factor of two. If they are wrong, no load explains the torques, and the load
-is not judged.
+Let m be the mass of the last link, and c its centre of mass. At rest the torques of gravity are linear in m and in m c.
+The difference between measured torques and a model therefore tells by how much m and m c differ from the model.
+Published masses of an arm's links differ by up to a factor of two. If they are wrong, no load explains the torques, and
+the load is not judged.
 """
 
 from __future__ import annotations
@@ -64,8 +64,8 @@ def identify_load(robot: Robot, arm: str, postures: Array, missing: Array, again
         robot: The robot.
         arm: The arm.
         postures: The postures at rest (n, nv) [rad].
-        missing: The measured torques less those of the arm with its expected tool (n, nv) [Nm].
-        against: The model of the latter: the robot's own, or the cabinet's.
+        missing: The measured torques minus the torques of a model with the expected tool (n, nv) [Nm].
+        against: The name of that model: MODEL for the robot's own, or PENDANT for the cabinet's.
 
     Raises:
         RobotError: If there are fewer than eight postures, or if they are too similar.
@@ -74,7 +74,7 @@ def identify_load(robot: Robot, arm: str, postures: Array, missing: Array, again
         raise RobotError(f"{len(postures)} postures: allowed: {LEAST_POSTURES} or more")
     model, data, joints = robot.model, robot.model.createData(), robot.arms[arm].joints
     at_rest, last = np.zeros(model.nv), 10 * int(joints[-1])
-    # Of each body: m, m c (3,), inertia (6,).
+    # The regressor has ten columns for each body: m, m c (3,), inertia (6,).
     regressors = [pin.computeJointTorqueRegressor(model, data, q, at_rest, at_rest).copy() for q in postures]
     A = np.concatenate([regressor[joints, last : last + 4] for regressor in regressors])
     b = missing[:, joints].ravel()
@@ -83,7 +83,7 @@ def identify_load(robot: Robot, arm: str, postures: Array, missing: Array, again
         raise RobotError(f"the postures are too alike: spread {least:.2f}; allowed: {_LEAST_SPREAD:g} or more")
     difference = np.linalg.lstsq(A, b, rcond=None)[0]
     flange, tool = _tool_of(robot, arm)
-    # As a mass and its moment in the flange's frame.
+    # The difference as a mass and its moment in the flange's frame.
     mass, moment = difference[0], flange.rotation.T @ (difference[1:] - difference[0] * flange.translation)
     known = tool.mass * tool.lever
     return LoadReport(
@@ -98,13 +98,16 @@ def identify_load(robot: Robot, arm: str, postures: Array, missing: Array, again
 
 
 def _centre(mass: float, moment: Array) -> list[float]:
-    """Of a ``mass`` [kg] with that ``moment`` (3,) [kg m], in [mm]."""
+    """Return the centre of a ``mass`` [kg] with the ``moment`` (3,) [kg m], in [mm]; zeros for a light mass."""
     centre: list[float] = (1e3 * moment / mass).round(1).tolist() if mass > _LIGHT else [0.0, 0.0, 0.0]
     return centre
 
 
 def _tool_of(robot: Robot, arm: str) -> tuple[pin.SE3, pin.Inertia]:
-    """Return the pose of the flange on the last joint, and the inertia in its frame of all links that are no arm's."""
+    """Return the pose of the flange on the last joint, and the inertia of the tool's and the fingers' links.
+
+    The inertia is in the frame of the flange.
+    """
     frames, its = robot.model.frames, robot.arms[arm]
     carried = [
         frame
@@ -114,7 +117,7 @@ def _tool_of(robot: Robot, arm: str) -> tuple[pin.SE3, pin.Inertia]:
         and role.part in (LinkClass.TOOL, LinkClass.FINGER)
         and arm in role.arms
     ]
-    # A link's inertia is that of the fixed joint's frame before it.
+    # Pinocchio keeps the inertia of a link in the frame of the fixed joint before it.
     mounts = [frames[frame.parentFrame] for frame in carried]
     names = {frame.name for frame in carried}
     bases = [frames[mount.parentFrame] for mount in mounts if frames[mount.parentFrame].name not in names]

@@ -1,7 +1,7 @@
-"""A URDF of the robot in an MJCF file: what MuJoCo compiles it to, written down.
+"""Write the robot of an MJCF file as a URDF. It describes the model that MuJoCo compiles from the file.
 
-MJCF has no limits of speed, which the caller gives. The scene beside the robot is left out, and all that moves freely
-in it. Loops that constraints close stay open.
+MJCF has no limits of speed, and so the caller gives them. The scene around the robot and everything that moves freely
+in it are left out. Kinematic loops that constraints close stay open.
 """
 
 from __future__ import annotations
@@ -19,25 +19,31 @@ from q2r2_control.errors import RobotError
 from q2r2_control.robot.urdf_parts import numbers
 from q2r2_control.types import Array
 
-_MESHES = (".stl", ".obj")  # that others than MuJoCo read
+_MESHES = (".stl", ".obj")  # Formats of meshes that other programs than MuJoCo read as well.
 _TOOL_SITE = re.compile(r"attachment|tcp|tool|end_?eff|(^|_)eef?(_|$)|grasp|pinch|flange", re.IGNORECASE)
 _Joint, _Geom = mujoco.mjtJoint, mujoco.mjtGeom
 _ON_JOINTS = int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)
-# Of links between two joints of one body, without which no simulation takes them [kg], [kg m^2].
+# Mass and principal inertia of links between two joints of one body. Without them no simulation takes these links [kg],
+# [kg m^2].
 _NEXT_TO_NONE = 1e-6, np.full(3, 1e-9)
 
 
 def urdf_of_mjcf(file: Path, folder: Path, velocity: float) -> ET.Element:
-    """The robot of an MJCF ``file`` as a URDF tree, for a file in ``folder``, from where meshes are named.
+    """Return the robot of an MJCF file as a URDF tree.
 
-    Joints that turn get a limit of ``velocity`` [rad/s], those that slide none. Raises :class:`RobotError` for a file
-    that MuJoCo cannot read, and for joints and shapes that a URDF has not.
+    Args:
+        file: The MJCF file.
+        folder: The folder of the URDF. The paths of meshes are relative to it.
+        velocity: The speed limit of joints that turn [rad/s]. Joints that slide get no speed limit.
+
+    Raises:
+        RobotError: If MuJoCo cannot read the file, or if it has joints or shapes that a URDF cannot describe.
     """
     try:
         if (kind := ET.parse(file).getroot().tag) != "mujoco":
             raise RobotError(f"{file}: the root element is <{kind}>; an MJCF starts with <mujoco>")
         spec = mujoco.MjSpec.from_file(str(file.resolve()))
-        spec.compiler.fusestatic = False  # a base is one of the robot's links
+        spec.compiler.fusestatic = False  # The base stays one of the robot's links.
         model = spec.compile()
     except (ValueError, OSError, ET.ParseError) as error:
         raise RobotError(f"{file}: MuJoCo cannot read it: {' '.join(str(error).split())}") from error
@@ -51,9 +57,9 @@ def urdf_of_mjcf(file: Path, folder: Path, velocity: float) -> ET.Element:
 
 
 class _Writer:
-    """One model on its way into a URDF.
+    """Converts one model into a URDF.
 
-    A link's frame is where the last joint of its body is, with the body's axes.
+    The frame of a link has its origin at the last joint of the body, and the axes of the body.
     """
 
     def __init__(self, model: mujoco.MjModel, name: str, folder: Path, velocity: float) -> None:
@@ -61,8 +67,8 @@ class _Writer:
         self._urdf = ET.Element("robot", name=name)
         self._names = {model.body(body).name for body in range(model.nbody)}
         self._names |= {model.joint(j).name for j in range(model.njnt)}
-        self._links: dict[int, str] = {}  # of bodies
-        self._within: dict[int, pin.SE3] = {}  # frame of a body's link in the body's frame
+        self._links: dict[int, str] = {}  # Names of links by the number of their body.
+        self._within: dict[int, pin.SE3] = {}  # The frame of a body's link in the body's frame.
 
     def robot(self) -> ET.Element:
         model = self._model
@@ -73,7 +79,7 @@ class _Writer:
             raise RobotError("no joint that turns or slides")
         if len(roots) > 1 or self._joints(next(iter(roots))):
             self._add_link(0, self._new_name("mjcf_world"), pin.SE3.Identity())
-        for body in range(1, model.nbody):  # parents come first
+        for body in range(1, model.nbody):  # Parents come before their children.
             if int(model.body_rootid[body]) in roots:
                 self._add_body(body)
         self._add_mimics()
@@ -106,7 +112,7 @@ class _Writer:
             self._add_tool_sites(body)
 
     def _add_tool_sites(self, body: int) -> None:
-        """A URDF has no sites, so those with the name of a tool's frame become links, which a cell can name as tips."""
+        """Write sites with the name of a tool's frame as links, which a cell can name as tips. A URDF has no sites."""
         model = self._model
         for i in np.flatnonzero(model.site_bodyid == body).tolist():
             if _TOOL_SITE.search(site := model.site(i).name):
@@ -132,7 +138,7 @@ class _Writer:
         return joint
 
     def _add_moving_joint(self, j: int, parent: str, child: str, at: pin.SE3) -> None:
-        """Joint ``j`` at the pose that it has with the position for which the file places its body."""
+        """Add joint ``j``. ``at`` is its pose at the position for which the file places its body."""
         model = self._model
         axis, there = model.jnt_axis[j], float(model.qpos0[model.jnt_qposadr[j]])
         turns, limited = model.jnt_type[j] == _Joint.mjJNT_HINGE, bool(model.jnt_limited[j])
@@ -148,7 +154,7 @@ class _Writer:
         damping, friction = float(model.dof_damping[dof]), float(model.dof_frictionloss[dof])
         ET.SubElement(joint, "dynamics", damping=repr(damping), friction=repr(friction))
         armature = float(model.dof_armature[dof])
-        if hasattr(model, "actuator_armature"):  # since MuJoCo 4
+        if hasattr(model, "actuator_armature"):  # MuJoCo 4 and later have this attribute.
             for a in self._actuators(j):
                 armature += float(model.actuator_gear[a, 0] ** 2 * model.actuator_armature[a])
         if armature > 0.0:
@@ -163,7 +169,7 @@ class _Writer:
         ]
 
     def _effort(self, j: int) -> float:
-        """The least, in either direction, that the file limits the joint's force to [N, Nm]; 0 where nothing does."""
+        """Return the least limit of the joint's force in either direction [N or Nm]; 0 if the file has none."""
         model, found = self._model, []
         if model.jnt_actfrclimited[j]:
             found.append(np.abs(model.jnt_actfrcrange[j]).min())
@@ -180,7 +186,7 @@ class _Writer:
         model = self._model
         self._links[body], self._within[body] = name, within
         link = ET.SubElement(self._urdf, "link", name=name)
-        if body == 0:  # its shapes are the scene's
+        if body == 0:  # The shapes of the world body belong to the scene.
             return
         if model.body_mass[body] > 0.0:
             at = within.inverse() * _pose(model.body_ipos[body], model.body_iquat[body])
@@ -191,7 +197,7 @@ class _Writer:
         touching = [g for g in geoms if model.geom_contype[g] or model.geom_conaffinity[g] or g in paired]
         for g in geoms:
             at = within.inverse() * _pose(model.geom_pos[g], model.geom_quat[g])
-            # A body of which nothing may touch would be one that nobody watches: then all that is drawn counts.
+            # Nobody would watch a body without a shape that may touch something. Then all drawn shapes count.
             if g in touching or not touching:
                 self._add_shape(link, "collision", g, at)
             if g not in touching:
@@ -211,7 +217,8 @@ class _Writer:
         geometry = ET.SubElement(shape, "geometry")
         if form == _Geom.mjGEOM_MESH:
             mesh = int(model.geom_dataid[g])
-            at = at * _pose(model.mesh_pos[mesh], model.mesh_quat[mesh]).inverse()  # MuJoCo centres what it reads
+            # MuJoCo moves a mesh that it reads to its centre of mass and principal axes.
+            at = at * _pose(model.mesh_pos[mesh], model.mesh_quat[mesh]).inverse()
             scale = numbers(model.mesh_scale[mesh])
             ET.SubElement(geometry, "mesh", filename=self._mesh_file(mesh), scale=scale)
         elif form == _Geom.mjGEOM_SPHERE:
@@ -220,7 +227,7 @@ class _Writer:
             ET.SubElement(geometry, "cylinder", radius=repr(size[0]), length=repr(2.0 * size[1]))
             if form == _Geom.mjGEOM_CAPSULE and kind == "collision":
                 ET.SubElement(ET.SubElement(link, "collision_checking"), "capsule", name=name)
-        elif form in (_Geom.mjGEOM_BOX, _Geom.mjGEOM_ELLIPSOID):  # the box that holds it
+        elif form in (_Geom.mjGEOM_BOX, _Geom.mjGEOM_ELLIPSOID):  # An ellipsoid becomes the box around it.
             ET.SubElement(geometry, "box", size=numbers([2.0 * half for half in size]))
         else:
             raise RobotError(f"body {link.get('name')} has a shape of kind {form.name}; allowed: solids and meshes")
@@ -240,7 +247,7 @@ class _Writer:
         return os.path.relpath(path, self._folder.resolve())
 
     def _add_mimics(self) -> None:
-        """Joints that a constraint lets follow another one on a straight line."""
+        """Add a <mimic> to joints that a constraint makes a linear function of another joint."""
         model, joints = self._model, {joint.get("name"): joint for joint in self._urdf.findall("joint")}
         for e in np.flatnonzero((model.eq_type == mujoco.mjtEq.mjEQ_JOINT) & model.eq_active0):
             (follower, leader), factors = (int(model.eq_obj1id[e]), int(model.eq_obj2id[e])), model.eq_data[e, :5]
@@ -256,7 +263,7 @@ class _Writer:
 
 
 def _pose(position: Array, quaternion: Array) -> pin.SE3:
-    """Of MuJoCo's arrays, whose quaternions are w, x, y, z."""
+    """Return the pose of MuJoCo's arrays, whose quaternions are w, x, y, z."""
     return pin.SE3(pin.Quaternion(*quaternion.tolist()).normalized().matrix(), position.copy())
 
 

@@ -1,4 +1,4 @@
-"""Answers that a model gives by itself about arms, fingers and shapes, before a cell is written for it."""
+"""Find out what a model alone tells about its arms, fingers and shapes, before a cell is written for it."""
 
 from __future__ import annotations
 
@@ -25,18 +25,21 @@ from q2r2_control.types import Array
 
 _ARM_NAME = re.compile(r"arm|hand|grip|wrist|elbow|shoulder", re.IGNORECASE)
 _SIDE_NAMES = {side: re.compile(rf"{side}|(^|[_-]){side[0]}([_-]|$)", re.IGNORECASE) for side in ("left", "right")}
-_ON_SPHERE = 400  # points of a capsule's ends that are compared with its mesh
-_IN_BOX = 20_000  # points that volumes of several capsules are measured by
-_SEVERAL = (2, 3)  # capsules that are tried
-# Of one capsule's volume, what several may have, and what each more has to save beyond the pairs that it costs.
+_ON_SPHERE = 400  # Number of points on the surface of a capsule that are compared with its mesh.
+_IN_BOX = 20_000  # Number of random points by which the volume of several capsules is measured.
+_SEVERAL = (2, 3)  # Numbers of capsules that are tried.
+# Several capsules may have at most the first share of one capsule's volume. Each further capsule has to save at least
+# the second share, because it costs more pairs.
 _CLEARLY_LESS, _EACH_SAVES = 0.8, 0.1
-_WIDEST, _STRONGEST, _FASTEST = 3.15, 500.0, 5.0  # that a cell's gripper may have
+# Greatest position, force and speed that a cell's gripper may have [m or rad], [N or Nm], [m/s or rad/s].
+_WIDEST, _STRONGEST, _FASTEST = 3.15, 500.0, 5.0
 
 
 def tip_of(tree: LinkTree, key: str) -> str:
-    """The last link of the model's arm: the one that leaves no doubt, or that of the only long chain.
+    """Return the last link of the model's arm: the only possible one, or the last link of the only long chain.
 
-    Raises :class:`ConfigError` that begins with ``key`` and names the candidates.
+    Raises:
+        ConfigError: With a text that begins with ``key`` and names the candidates, if there are several.
     """
     try:
         return default_tip(tree, (), key)
@@ -47,7 +50,11 @@ def tip_of(tree: LinkTree, key: str) -> str:
 
 
 def tips_by_side(tree: LinkTree, key: str) -> dict[str, str]:
-    """The last link of each arm of a model that holds both. Raises :class:`ConfigError` as :func:`tip_of` does."""
+    """Return the last link of each arm, by side, of a model that has both arms.
+
+    Raises:
+        ConfigError: With a text that begins with ``key``, if not exactly one link belongs to each side.
+    """
     tips = _tips(tree, key)
     found = {
         side: [tip for tip in tips if any(map(name.search, tree.path(tip)[-3:]))] for side, name in _SIDE_NAMES.items()
@@ -58,14 +65,14 @@ def tips_by_side(tree: LinkTree, key: str) -> dict[str, str]:
 
 
 def _tips(tree: LinkTree, key: str) -> list[str]:
-    """Ends of long chains; of arms only, where names tell arms from legs."""
+    """Return the ends of long chains. If the names tell arms from legs, only the ends of arms count."""
     ends = arm_ends(tree)
     named = [end for end in ends if any(map(_ARM_NAME.search, tree.path(end)))]
     return [end_of(tree, end, key) for end in named or ends]
 
 
 def lacks_of(description: Description, tree: LinkTree, tip: str) -> tuple[list[str], list[str]]:
-    """Limits that joints of the arm lack, and links that move without a mass."""
+    """Return a line for each joint of the arm that lacks limits, and the names of moving links without a mass."""
     limits, masses, links = [], [], description.urdf.findall("link")
     for joint in tree.chain(tip):
         limit, name = joint.find("limit"), joint.get("name", "")
@@ -85,9 +92,9 @@ def lacks_of(description: Description, tree: LinkTree, tip: str) -> tuple[list[s
 
 
 def gripper_of(description: Description, tree: LinkTree, tip: str) -> dict[str, Any]:
-    """Settings of a gripper beyond the arm's last joint, empty where there is none.
+    """Return the settings of the gripper beyond the arm's last joint; empty if there is no gripper.
 
-    It is closed at the end of its travel where the fingers are nearer to the axis of the arm's last joint.
+    The gripper is closed at that end of its travel at which the fingers are nearer to the axis of the arm's last joint.
     """
     last = tree.chain(tip)[-1]
     beyond = {
@@ -98,7 +105,7 @@ def gripper_of(description: Description, tree: LinkTree, tip: str) -> dict[str, 
     driven = [name for name, joint in beyond.items() if mimic_of(joint) is None and joint.get("type") != "floating"]
     if not driven:
         return {}
-    # A cell drives all of them alike, so joints of one travel only: that of most.
+    # A cell drives all finger joints alike, and so only joints with the same travel are taken: the most frequent one.
     travels = [joint_limits(beyond[name]) for name in driven]
     ends = max(travels, key=travels.count)
     driven = [name for name, travel in zip(driven, travels, strict=True) if travel == ends]
@@ -129,7 +136,7 @@ def _span(
     followers: Mapping[str, Follower],
     end: float,
 ) -> float:
-    """Mean distance of the fingers from the axis of the arm's last joint [m]."""
+    """Return the mean distance of the fingers from the axis of the arm's last joint [m]."""
     q, data = pin.neutral(model), model.createData()
     places = with_followers(dict.fromkeys(driven, end), followers)
     for name in beyond:
@@ -148,19 +155,19 @@ def _span(
 
 @dataclass(frozen=True, slots=True)
 class CapsuleFit:
-    """The capsule that stands for a mesh, which it holds wholly."""
+    """The capsule that encloses a mesh and stands for it, and how well it fits."""
 
     link: str
     radius: float  # [m]
-    length: float  # of its segment [m]
-    beyond: float  # how far it reaches beyond the mesh's convex hull, at least [m]
-    wasted: float  # share of its volume that is more than the hull's
-    capsules: int  # that hold the mesh together in clearly less volume; 1: one does
-    then_wasted: float  # the share that is left with these
+    length: float  # Length of its segment [m].
+    beyond: float  # Distance by which it reaches at least beyond the mesh's convex hull [m].
+    wasted: float  # Share of its volume by which it exceeds the hull's volume.
+    capsules: int  # Number of capsules that enclose the mesh in clearly less volume; 1 if more capsules do not.
+    then_wasted: float  # The wasted share with this number of capsules.
 
 
 def capsule_fits(description: Description, several: Collection[str]) -> list[CapsuleFit]:
-    """How well capsules fit the collision meshes of a model, the worst first.
+    """Return how well capsules fit the collision meshes of a model, the worst first.
 
     Several capsules are tried for the meshes of links in ``several``.
     """
@@ -172,9 +179,9 @@ def capsule_fits(description: Description, several: Collection[str]) -> list[Cap
         if not isinstance(mesh.geometry, coal.BVHModelBase) or not isinstance(item.geometry, coal.Capsule):
             continue
         points = np.array(mesh.geometry.vertices())
-        if len(points) <= points.shape[1]:  # a single triangle
+        if len(points) <= points.shape[1]:  # The mesh is a single triangle.
             continue
-        hull = ConvexHull(points, qhull_options="QJ")  # QJ: flat ones too
+        hull = ConvexHull(points, qhull_options="QJ")  # The option QJ allows flat meshes as well.
         radius, half = float(item.geometry.radius), float(item.geometry.halfLength)
         surface = mesh.placement.actInv(item.placement)
         on = [surface.act(point) for point in _on_capsule(radius, half)]
@@ -205,7 +212,7 @@ def _volume_of(capsules: Sequence[Capsule]) -> float:
 
 
 def _on_capsule(radius: float, half: float) -> Array:
-    """Points on the surface of a capsule along z (n, 3) [m]."""
+    """Return points on the surface of a capsule along z (n, 3) [m]."""
     points = np.random.default_rng(0).normal(size=(_ON_SPHERE, 3))
     points *= radius / np.linalg.norm(points, axis=1, keepdims=True)
     return points + np.outer(np.sign(points[:, 2]) * half, [0.0, 0.0, 1.0])

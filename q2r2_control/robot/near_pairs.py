@@ -1,4 +1,4 @@
-"""Pairs that are too near at home: whether they ever part, and what a user can change about them."""
+"""Examine pairs that are too near at home: whether they ever part, and what a user can change about them."""
 
 from __future__ import annotations
 
@@ -22,16 +22,17 @@ from q2r2_control.types import Interval
 if TYPE_CHECKING:
     from q2r2_control.robot.robot import Robot
 
-_POSTURES = 50  # that are looked at besides home
-_NAMED = 4  # pairs in one warning
+_POSTURES = 50  # Number of random postures that are examined besides home.
+_NAMED = 4  # Greatest number of pairs in one warning.
 
-Pair = tuple[str, str]  # names of bodies, or of links
+Pair = tuple[str, str]  # The names of two bodies or of two links.
 
 
 def spreads_of(robot: Robot, pairs: Sequence[Pair]) -> dict[Pair, Interval]:
-    """Least and greatest distance [m] of ``pairs`` of bodies, watched or not, at home and in the same random postures.
+    """Return the least and the greatest distance of pairs of links [m], at home and in random postures.
 
-    Pairs of links: bodies of the same two links count together.
+    The postures are always the same. ``pairs`` are the names of bodies, watched or not. Bodies of the same two links
+    count together, and so the keys are pairs of links.
     """
     geometry = robot.collision_model.copy()
     geometry.removeAllCollisionPairs()
@@ -52,24 +53,27 @@ def spreads_of(robot: Robot, pairs: Sequence[Pair]) -> dict[Pair, Interval]:
 
 
 class NearPair(NamedTuple):
-    """A pair of bodies that is nearer at home than it has to be; distances in metres."""
+    """A pair of bodies that is nearer at home than the distance that it has to keep."""
 
     names: Pair
-    distance: float
-    kept: float
-    key: str  # in the block ``control``, that says so
+    distance: float  # [m]
+    kept: float  # The distance that it has to keep [m].
+    key: str  # The key in the block ``control`` that names this distance.
 
 
 class _Ways(NamedTuple):
-    """Ways out for a pair that belongs to one robot."""
+    """Possible remedies for a pair that belongs to one robot."""
 
     links: Pair
-    parts: bool  # somewhere it keeps its distance
-    nearer: float | None  # that it could keep instead, as control.pairs may have it [m]
+    parts: bool  # True if the pair keeps its distance in some posture.
+    nearer: float | None  # A smaller distance that control.pairs could name instead [m]; None if there is none.
 
 
 def _ways_out(robot: Robot, pair: NearPair) -> _Ways | None:
-    """None for bodies of two arms, obstacles and the floor, which have to keep their distance."""
+    """Return the remedies for a pair.
+
+    Returns None for bodies of two arms, for obstacles and for the floor, because these have to keep their distance.
+    """
     links = link_of(pair.names[0]), link_of(pair.names[1])
     if FLOOR in links or not robot.roles[links[0]].arms & robot.roles[links[1]].arms:
         return None
@@ -79,7 +83,7 @@ def _ways_out(robot: Robot, pair: NearPair) -> _Ways | None:
 
 
 def remedy(robot: Robot, pair: NearPair) -> str:
-    """The change that lets a ``pair`` be, or another home."""
+    """Return a text with the changes that make a near ``pair`` allowed, such as another home."""
     if FLOOR in map(link_of, pair.names):
         return "the key floor takes another height, or null for no floor"
     ways = _ways_out(robot, pair)
@@ -93,7 +97,10 @@ def remedy(robot: Robot, pair: NearPair) -> str:
 
 
 def lines_to_paste(robot: Robot, config: Config, near: Iterable[NearPair]) -> list[str]:
-    """Lines that let ``near`` pairs of a robot's own links be as near as they are, and lines that say where they go."""
+    """Return lines for the cell's YAML that allow ``near`` pairs of a robot's own links to be as near as they are.
+
+    Other lines say where these lines belong.
+    """
     nearer: dict[Pair, float] = {}
     disabled: dict[Pair, str] = {}
     for ways in (_ways_out(robot, pair) for pair in near):
@@ -104,7 +111,7 @@ def lines_to_paste(robot: Robot, config: Config, near: Iterable[NearPair]) -> li
     entries = [f"    - {_pair_entry(links, least)}" for links, least in nearer.items() if links not in disabled]
     lines = []
     if entries:
-        # A block that the file has already cannot be given twice.
+        # A block that the file already has cannot be written a second time.
         above = [
             key for key in ("control", "pairs") if key in config.model_fields_set | config.control.model_fields_set
         ]
@@ -123,9 +130,14 @@ def lines_to_paste(robot: Robot, config: Config, near: Iterable[NearPair]) -> li
 def warning_at_home(
     robot: Robot, exclusions: Iterable[ET.Element] | None, positions: Mapping[str, float]
 ) -> str | None:
-    """One line about pairs that are nearer at home than usual settings allow, and about overlapping ones that part.
+    """Return a line about pairs that are nearer at home than usual settings allow; None if there are none.
 
-    ``exclusions`` and ``positions`` of all joints are those that the robot is made of.
+    Pairs that overlap at home and can part elsewhere are named as well, because they are not watched.
+
+    Args:
+        robot: The robot.
+        exclusions: The excluded pairs with which the robot was made.
+        positions: The positions of all joints with which the robot was made [rad or m].
     """
     kept = ControllerSettings().min_distance
     near = {(pair.name_a, pair.name_b): pair for pair in robot.distances(robot.home) if pair.distance < kept}
@@ -151,10 +163,10 @@ def warning_at_home(
     more = f"; and {len(lines) - _NAMED} more" if len(lines) > _NAMED else ""
     text = f"{robot.name}: at home, with min_distance {1e3 * kept:g} mm: {'; '.join([*lines.values()][:_NAMED])}{more}"
     if elsewhere := len(never) < len(lines):
-        # Those that overlap at this home are watched at one where they do not.
+        # Pairs that overlap at this home are watched with a home at which they do not overlap.
         hardly = [links for links, (least, greatest) in spreads.items() if least < 0.0 <= greatest < kept]
         never += [links for links in hardly if links not in never]
-    # With an SRDF, links that always overlap are no longer left out by themselves.
+    # With an SRDF, links that overlap at home are no longer left out automatically.
     disabled = [_srdf_line(links) for links, (_, greatest) in spreads.items() if greatest < kept]
     remedies = []
     if never:
@@ -174,7 +186,7 @@ def warning_at_home(
 
 
 def _home_apart(robot: Robot, kept: float) -> dict[str, float] | None:
-    """Positions by joint at which all pairs are ``kept`` [m] apart; None where none are found."""
+    """Return positions by joint at which all pairs are at least ``kept`` [m] apart; None if none are found."""
     q, room, placed = robot.home.copy(), np.full(len(robot.collision_model.collisionPairs), kept), list[str]()
     for name, arm in robot.arms.items():
         like = mirrored_home(robot, name, placed[0], q) if placed else None

@@ -1,6 +1,6 @@
-"""Bodies for moving obstacles: one for each name, and its pairs with all that moves.
+"""Make the bodies of moving obstacles: one body for each name, with pairs with every body that moves.
 
-They end the collision geometries that a controller is made with. Shape and pose are written at run time.
+They come last in the collision geometry with which a controller is made. Shape and pose are written at run time.
 """
 
 from __future__ import annotations
@@ -21,21 +21,21 @@ from q2r2_control.robot.pairs import LinkClass, Role
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
-HULL = "_hull"  # ending of the capsule around a held object
+HULL = "_hull"  # The ending of the name of the capsule around a held object.
 _SHAPES = {"sphere": coal.Sphere, "capsule": coal.Capsule, "box": coal.Box}
 
 
 def body_of(name: str, obstacle: MovingObstacle) -> pin.GeometryObject:
-    """The body of an obstacle where it was reported, in the world."""
+    """Return the body of an obstacle at the pose in the world at which it was reported."""
     placement = pin.SE3(pin.rpy.rpyToMatrix(*obstacle.rpy), np.array(obstacle.position))
     return pin.GeometryObject(name, 0, placement, _SHAPES[obstacle.shape](*obstacle.size))
 
 
 def with_obstacle_bodies(robot: Robot, names: Iterable[str], held: bool = True) -> pin.GeometryModel:
-    """``Robot.objects.geometry``, and after it a sphere and its pairs for each of ``names``.
+    """Return a copy of ``Robot.objects.geometry``, followed by a sphere with its pairs for each of ``names``.
 
-    Without what is ``held`` it is the collision model that these come after. A held object counts as the capsule
-    around it: two boxes would need pairs of all their edges.
+    If ``held`` is False, they follow the collision model without held objects. A held object counts as the capsule
+    around it, because two boxes would need pairs of all their edges.
     """
     known = robot.objects.geometry if held else robot.collision_model
     if not names:
@@ -51,7 +51,10 @@ def with_obstacle_bodies(robot: Robot, names: Iterable[str], held: bool = True) 
 
 
 def distances_with(robot: Robot, obstacles: Mapping[str, MovingObstacle]) -> Callable[[Array], Array]:
-    """A function that measures all pairs of :func:`with_obstacle_bodies` at ``q`` (nv,) by Coal, (p,) [m]."""
+    """Return a function that measures all pairs of :func:`with_obstacle_bodies` by Coal.
+
+    The function takes the positions q (nv,) and returns the distances (p,) [m].
+    """
     geometry = with_obstacle_bodies(robot, obstacles)
     for number, (name, obstacle) in enumerate(obstacles.items(), geometry.ngeoms - len(obstacles)):
         geometry.geometryObjects[number] = body_of(name, obstacle)
@@ -59,7 +62,11 @@ def distances_with(robot: Robot, obstacles: Mapping[str, MovingObstacle]) -> Cal
 
 
 def roles_with_obstacles(robot: Robot, names: Iterable[str]) -> dict[str, Role]:
-    """Roles of links and of moving obstacles. Raises :class:`ConfigError` for the name of a link."""
+    """Return the roles of links and of moving obstacles.
+
+    Raises:
+        ConfigError: If an obstacle has the name of a link.
+    """
     for name in names:
         if name in robot.roles:
             raise ConfigError(f"control.moving_obstacles: {name}: the cell has a link {name}; allowed: another name")

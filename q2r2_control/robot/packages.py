@@ -1,4 +1,4 @@
-"""Where ROS packages are, and what ``xacro`` makes of their models."""
+"""Find ROS packages, and expand their models by ``xacro``."""
 
 from __future__ import annotations
 
@@ -13,10 +13,12 @@ _PLACES = "`packages` of the YAML, AMENT_PREFIX_PATH or ROS_PACKAGE_PATH"
 
 
 def package_file(url: str, near: Path | None, packages: Mapping[str, str]) -> Path:
-    """File of a ``package://NAME/PATH``.
+    """Return the file of a ``package://NAME/PATH``.
 
-    Looked for in ``packages`` (folders by name), the ROS paths, the folders above ``near`` and example-robot-data.
-    Raises :class:`ConfigError`.
+    It is searched in ``packages`` (folders by name), the ROS paths, the folders above ``near`` and example-robot-data.
+
+    Raises:
+        ConfigError: If there is no such file.
     """
     name, _, path = url.removeprefix("package://").lstrip("/").partition("/")
     if name and path:
@@ -28,7 +30,11 @@ def package_file(url: str, near: Path | None, packages: Mapping[str, str]) -> Pa
 
 
 def package_folder(name: str, near: Path | None, packages: Mapping[str, str]) -> Path:
-    """Folder of the package ``name``, looked for as by :func:`package_file`. Raises :class:`ConfigError`."""
+    """Return the folder of the package ``name``, which is searched as :func:`package_file` does.
+
+    Raises:
+        ConfigError: If there is no such folder.
+    """
     for folder in _folders(name, near, packages):
         if folder.is_dir():
             return folder.resolve()
@@ -48,10 +54,13 @@ def _folders(name: str, near: Path | None, packages: Mapping[str, str]) -> Itera
 
 
 def expand_xacro(file: Path, arguments: Mapping[str, object], packages: Mapping[str, str]) -> str:
-    """URDF text of ``file`` with ``arguments`` by name; ``$(find NAME)`` is looked up as ``package://NAME`` is.
+    """Return the URDF text of ``file`` with ``arguments`` by name.
 
-    Raises :class:`ConfigError` where xacro is not installed or the file has no such argument, and
-    :class:`RobotError` where xacro cannot expand the file.
+    ``$(find NAME)`` is searched like ``package://NAME``.
+
+    Raises:
+        ConfigError: If xacro is not installed, or if the file has no such argument.
+        RobotError: If xacro cannot expand the file.
     """
     try:
         import xacro
@@ -60,7 +69,7 @@ def expand_xacro(file: Path, arguments: Mapping[str, object], packages: Mapping[
         raise ConfigError(
             f"{file}: needs the Python package xacro: {install_line('xacro')}, or expand it to .urdf"
         ) from error
-    # As on xacro's command line.
+    # The texts are those that a user would write on xacro's command line.
     texts = {name: str(value).lower() if isinstance(value, bool) else str(value) for name, value in arguments.items()}
     given, usual = _Arguments(texts), substitution_args._eval_find
 
@@ -68,10 +77,10 @@ def expand_xacro(file: Path, arguments: Mapping[str, object], packages: Mapping[
         return str(package_folder(name, file.parent, packages))
 
     try:
-        # For $(find NAME) xacro asks ament's Python package only, which need not be installed.
+        # For $(find NAME) xacro asks only ament's Python package, which may not be installed.
         substitution_args._eval_find = substitution_args._eval_dict["find"] = find
         text: str = xacro.process_file(str(file), mappings=given).toxml()
-    # A file holds Python expressions, from which any exception can come.
+    # A file may hold Python expressions, which can raise any exception.
     except (Exception, SystemExit) as error:
         inside = next((f" (in {name})" for name in reversed(xacro.filestack or []) if name != str(file)), "")
         reason = " ".join(str(error).split())[:300] or type(error).__name__
@@ -85,7 +94,7 @@ def expand_xacro(file: Path, arguments: Mapping[str, object], packages: Mapping[
 
 
 class _Arguments(dict[str, str]):
-    """Arguments by name, and which of them the file declares: xacro ignores the others."""
+    """Arguments by name, which note for which names the file asks. xacro ignores all other arguments."""
 
     def __init__(self, given: Mapping[str, str]) -> None:
         super().__init__(given)

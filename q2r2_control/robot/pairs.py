@@ -1,4 +1,4 @@
-"""Which collision pairs are monitored, and the roles of links that decide it."""
+"""Choose which collision pairs are monitored, and find the roles of links, on which this choice depends."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from q2r2_control.types import Array
 
 
 class LinkClass(StrEnum):
-    """A link's class, as in ``control.distances``, the outermost first."""
+    """The class of a link, as ``control.distances`` names it. The outermost class comes first."""
 
     OBJECT = "object"
     FINGER = "finger"
@@ -31,18 +31,24 @@ class LinkClass(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class KnownParts:
-    """Facts about links that a URDF alone does not tell. By arm; names as in the URDF."""
+    """Facts about links that a URDF alone does not tell. Links and joints have their names in the URDF."""
 
-    finger_joints: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    tool_links: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    obstacles: tuple[str, ...] = ()  # links
-    strokes: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # finger joints closed and open [m or rad]
-    capsules: Mapping[str, int] = field(default_factory=dict)  # of each mesh, at most, by link; else one
-    following: Mapping[str, str] = field(default_factory=dict)  # joint of an arm that a link beside it follows, by link
+    finger_joints: Mapping[str, tuple[str, ...]] = field(default_factory=dict)  # Joints of the fingers, by arm.
+    tool_links: Mapping[str, tuple[str, ...]] = field(default_factory=dict)  # Links of the tool, by arm.
+    obstacles: tuple[str, ...] = ()  # Names of links.
+    # Positions of the finger joints with the gripper closed and open [m or rad], by arm.
+    strokes: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    # Greatest number of capsules for each mesh, by link. The default is one.
+    capsules: Mapping[str, int] = field(default_factory=dict)
+    # The joint of an arm that a link beside the arm follows, by link.
+    following: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
     def carried_by(cls, tree: LinkTree, chains: Mapping[str, Sequence[str]]) -> KnownParts:
-        """Roles that the tree shows, ``chains`` being each arm's joints: those that it carries move its fingers."""
+        """Return the roles that the tree shows. Joints beyond an arm's own joints are taken for joints of its fingers.
+
+        ``chains`` are the joints of each arm, from base to tool.
+        """
         of_arms = {joint for chain in chains.values() for joint in chain}
         last = {arm: joint_end(tree.movable()[chain[-1]], "child") for arm, chain in chains.items()}
         fingers = {
@@ -59,14 +65,14 @@ class KnownParts:
 
 @dataclass(frozen=True, slots=True)
 class Role:
-    """One link. A robot's body may carry several arms, or none."""
+    """The class of one link, and the arms to which it belongs. A link of the torso may carry several arms or none."""
 
     part: LinkClass
     arms: frozenset[str]
 
 
 def roles_of(tree: LinkTree, own_links: Mapping[str, set[str]], parts: KnownParts) -> dict[str, Role]:
-    """The role of every link; ``own_links`` are those of each arm, from the root to whatever its joints carry."""
+    """Return the role of every link. ``own_links`` are the links of each arm, from the root to all that it carries."""
     classes = dict.fromkeys([tree.root, *tree.joint_to], LinkClass.ARM)
     classes |= dict.fromkeys(parts.obstacles, LinkClass.OBSTACLE)
     for links in parts.tool_links.values():
@@ -80,7 +86,7 @@ def roles_of(tree: LinkTree, own_links: Mapping[str, set[str]], parts: KnownPart
 
 
 def links_moved_by(tree: LinkTree, joints: Iterable[str]) -> set[str]:
-    """Links that ``joints``, or joints that follow one of them, carry."""
+    """Return the links that are carried by ``joints`` or by joints that follow one of them."""
     named = set(joints)
     followers = followers_of(tree.joint_to.values(), driven=named)
     named |= {name for name, one in followers.items() if one.driver in named}
@@ -89,32 +95,40 @@ def links_moved_by(tree: LinkTree, joints: Iterable[str]) -> set[str]:
 
 
 def links_that_follow(tree: LinkTree, joints: Collection[str]) -> dict[str, str]:
-    """Links of parts beside an arm, such as the bars of a parallelogram, each with the one of ``joints`` it follows."""
+    """Return the links of parts beside an arm that follow it, such as the bars of a parallelogram.
+
+    The value is the one of ``joints`` that the link follows.
+    """
     followers = followers_of(tree.joint_to.values(), driven=joints)
     beside = {name: one.driver for name, one in followers.items() if one.driver in joints}
     return {link: driver for name, driver in beside.items() for link in sorted(links_moved_by(tree, [name]))}
 
 
 def hand_links(tree: LinkTree, finger_joints: Iterable[str]) -> set[str]:
-    """Links that carry ``finger_joints``, and all that hangs on these: the hand of an arm that has no tool model."""
+    """Return the links of the hand of an arm without a tool model.
+
+    These are the links that carry ``finger_joints``, and all links beyond them.
+    """
     named = set(finger_joints)
     palms = {joint_end(joint, "parent") for joint in tree.joint_to.values() if joint.get("name") in named}
     return {link for link in tree.joint_to if palms & set(tree.path(link))}
 
 
-# Links that always stay farther apart than this need no watching: more than twice what is usually kept [m].
+# Links that always stay farther apart than this distance need no watching. It is more than twice the distance that is
+# usually kept [m].
 CLEARANCE = 0.05
-# Links and shapes of this name ending stand for a whole tool at every opening: watched from afar, never touched.
+# Links and shapes whose names end in this way stand for a whole tool at every opening. Their distances are watched, and
+# they take part in no contact.
 ENVELOPE = "_envelope"
 
 
 def link_of(geometry_name: str) -> str:
-    """Link of a geometry object: Pinocchio names the objects of a link LINK_0, LINK_1, ..."""
+    """Return the link of a geometry object. Pinocchio names the objects of a link LINK_0, LINK_1, ..."""
     return geometry_name.rsplit("_", 1)[0]
 
 
 def pairs_with_others(pairs: Iterable[tuple[str, str]], roles: Mapping[str, Role], arm: str) -> np.ndarray:
-    """Numbers (p,) of those ``pairs`` of geometry names that are of a part of ``arm`` and of something else."""
+    """Return the numbers (p,) of those ``pairs`` of geometry names of which exactly one body belongs to ``arm``."""
     own = [[arm in roles[link_of(name)].arms for name in names].count(True) for names in pairs]
     return np.flatnonzero(np.array(own, dtype=np.int64) == 1)
 
@@ -122,9 +136,9 @@ def pairs_with_others(pairs: Iterable[tuple[str, str]], roles: Mapping[str, Role
 def add_movable_pairs(model: pin.Model, geometry: pin.GeometryModel, tree: LinkTree) -> None:
     """Add every pair whose bodies can move relative to each other and are not neighbours in the chain.
 
-    Neighbours: bodies with one joint between them, where fixed parts such as a tool belong to the body that carries
-    them. Everything fixed in the world is one body for Pinocchio, yet a table is no neighbour of an arm's first link.
-    There only the link that carries the joint is.
+    Neighbours are bodies with one joint between them. Fixed parts such as a tool belong to the body that carries them.
+    For Pinocchio everything that is fixed in the world is one body, although a table is no neighbour of an arm's first
+    link. In the world, only the link that carries the joint is a neighbour.
     """
     carrier = {joint.get("name", ""): joint_end(joint, "parent") for joint in tree.joint_to.values()}
     geometry.removeAllCollisionPairs()
@@ -139,7 +153,10 @@ def add_movable_pairs(model: pin.Model, geometry: pin.GeometryModel, tree: LinkT
 
 
 def remove_disabled_pairs(geometry: pin.GeometryModel, exclusions: Iterable[ET.Element]) -> None:
-    """Remove what an SRDF disables: ``disable_collisions`` of two links, ``disable_default_collisions`` of one."""
+    """Remove the pairs that an SRDF disables.
+
+    ``disable_collisions`` names two links, and ``disable_default_collisions`` names one link.
+    """
     pairs: set[frozenset[str]] = set()
     links: set[str] = set()
     for element in exclusions:
@@ -154,9 +171,11 @@ def remove_disabled_pairs(geometry: pin.GeometryModel, exclusions: Iterable[ET.E
 
 
 def exclusions_of_file(path: str, links: set[str]) -> list[ET.Element]:
-    """Pairs that an SRDF of a whole cell disables; all of them have to be among the cell's ``links``.
+    """Return the pairs that an SRDF of a whole cell disables.
 
-    Raises :class:`ConfigError`: a link that is not there was meant for another cell.
+    Raises:
+        ConfigError: If the file cannot be read, or if it names a link that is not among the cell's ``links``. Such a
+            file was probably meant for another cell.
     """
     file = find_resource(path)
     try:
@@ -174,8 +193,8 @@ def remove_overlapping_own_pairs(
 ) -> tuple[tuple[str, str], ...]:
     """Remove pairs of one arm's own links that touch at every one of ``postures``, and return their names.
 
-    Such shapes overlap by construction. ``own_links`` has one set of links an arm, from its base to its tool. A pair
-    with the other arm or with an obstacle stays, however it lies.
+    Such shapes overlap by construction. ``own_links`` has one set of links for each arm, from its base to its tool. A
+    pair with the other arm or with an obstacle always stays.
     """
     distances = CoalDistances(model, geometry)
     names = pair_names(geometry)
@@ -189,13 +208,13 @@ def remove_overlapping_own_pairs(
 
 
 def pair_names(geometry: pin.GeometryModel) -> tuple[tuple[str, str], ...]:
-    """Names of both objects of each pair, in Pinocchio's order."""
+    """Return the names of both objects of each pair, in Pinocchio's order."""
     objects = geometry.geometryObjects
     return tuple((objects[pair.first].name, objects[pair.second].name) for pair in geometry.collisionPairs)
 
 
 def keep_pairs(geometry: pin.GeometryModel, wanted: Callable[[str, str], bool]) -> None:
-    """Remove every pair but those whose two names are ``wanted``."""
+    """Remove every pair for whose two names ``wanted`` returns False."""
     pairs = list(geometry.collisionPairs)
     names = pair_names(geometry)
     geometry.removeAllCollisionPairs()
@@ -207,9 +226,10 @@ def keep_pairs(geometry: pin.GeometryModel, wanted: Callable[[str, str], bool]) 
 def distance_gradient(
     model: pin.Model, data: pin.Data, geometries: pin.GeometryModel, geometry_data: pin.GeometryData, pair: int
 ) -> Array:
-    """(nv,) of a pair's distance with respect to the joints [m/rad]: its normal times what moves its nearest points.
+    """Return the gradient of a pair's distance with respect to the joints (nv,) [m/rad].
 
-    Joint Jacobians, geometry placements and the pair's distance are those that the data hold.
+    It is the normal times the difference of the Jacobians of both nearest points. ``data`` has to hold the joint
+    Jacobians, and ``geometry_data`` the placements of the geometry and the distance of the pair.
     """
     result, bodies = geometry_data.distanceResults[pair], geometries.collisionPairs[pair]
     points = result.getNearestPoint1(), result.getNearestPoint2()

@@ -1,4 +1,4 @@
-"""Pinocchio's models of a URDF: the joints that move a tool are checked, all others locked, rotors added."""
+"""Make Pinocchio's models of a URDF. The joints that move a tool are checked, and all others are locked."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from q2r2_control.types import Array
 
 
 def joint_origin(joint: ET.Element) -> pin.SE3:
-    """Placement of a joint's child link in its parent link, at position 0."""
+    """Return the placement of a joint's child link in its parent link, at position 0."""
     xyz, rpy = (_vector(joint.find("origin"), name) or [0.0, 0.0, 0.0] for name in ("xyz", "rpy"))
     return pin.SE3(pin.rpy.rpyToMatrix(*rpy), np.array(xyz))
 
 
 def lock_joints(robot: ET.Element, movable: Collection[str], positions: Mapping[str, float]) -> None:
-    """Fix every joint of the URDF ``robot`` but the ``movable`` ones, in place, so that every reader locks them alike.
+    """Fix in place every joint of the URDF ``robot`` except the ``movable`` ones. So every reader locks them alike.
 
-    A joint with one axis is fixed at its value in ``positions`` [rad or m], at 0 without one. A planar or floating
-    joint is fixed where it stands.
+    A joint with one axis is fixed at its value in ``positions`` [rad or m], or at 0 if it has none. A planar or
+    floating joint is fixed at its origin.
     """
     for joint in robot.findall("joint"):
         name, kind = joint.get("name", ""), joint.get("type")
@@ -51,13 +51,13 @@ def lock_joints(robot: ET.Element, movable: Collection[str], positions: Mapping[
 
 
 def resting_position(joint: ET.Element) -> float:
-    """0, or what the joint's limits allow that is nearest to it."""
+    """Return the position nearest to 0 that the joint's limits allow."""
     lower, upper = joint_limits(joint)
     return min(max(0.0, lower), upper)
 
 
 def joint_axis(joint: ET.Element) -> Array:
-    """Unit vector (3,) that a joint turns about or slides along, in its own frame."""
+    """Return the unit vector (3,) about which a joint turns or along which it slides, in its own frame."""
     axis = np.array(_vector(joint.find("axis"), "xyz") or [1.0, 0.0, 0.0])
     return np.asarray(axis / np.linalg.norm(axis))
 
@@ -66,15 +66,17 @@ def _vector(element: ET.Element | None, attribute: str) -> list[float]:
     return [] if element is None else [float(part) for part in element.get(attribute, "").split()]
 
 
-# Inertia that the rotor of a geared drive adds where the URDF does not say [kg m^2]. Without any, a control loop is too
-# slow for light wrist joints.
+# Inertia that the rotor of a geared drive adds if the URDF does not say [kg m^2]. Without a rotor's inertia, a control
+# loop is too slow for light wrist joints.
 _USUAL_ARMATURE = 0.1
 
 
 def checked_chain(tree: LinkTree, arm: str, frame: str, where: str) -> list[str]:
-    """Names of the joints that move an arm's ``frame``, each of a kind and with limits that the controller can hold to.
+    """Return the names of the joints that move an arm's ``frame``.
 
-    Raises :class:`RobotError` that begins with ``where``.
+    Raises:
+        RobotError: If there are none, or if the controller cannot use the type or the limits of one of them. The text
+            begins with ``where``.
     """
     if frame != tree.root and frame not in tree.joint_to:
         raise RobotError(f"{where}: arm {arm}: no link {frame!r:.60}; links: {', '.join([tree.root, *tree.joint_to])}")
@@ -103,9 +105,10 @@ def checked_chain(tree: LinkTree, arm: str, frame: str, where: str) -> list[str]
 def build_models(
     urdf: ET.Element, chains: Mapping[str, list[str]], home: Mapping[str, float], where: str
 ) -> tuple[pin.Model, pin.GeometryModel]:
-    """Kinematics with rotors, and collision shapes, with every joint outside ``chains`` locked at home.
+    """Return the kinematics with rotors, and the collision shapes, with every joint outside ``chains`` locked at home.
 
-    Raises :class:`RobotError` that begins with ``where``.
+    Raises:
+        RobotError: With a text that begins with ``where``, if Pinocchio cannot read the whole model.
     """
     locked = copy.deepcopy(urdf)
     lock_joints(locked, {name for chain in chains.values() for name in chain}, home)
@@ -117,9 +120,10 @@ def build_models(
 
 
 def read_models(urdf: ET.Element, where: str) -> tuple[pin.Model, pin.GeometryModel]:
-    """Kinematics and collision shapes as Pinocchio reads them, each mesh with some extent.
+    """Return the kinematics and the collision shapes as Pinocchio reads them.
 
-    Raises :class:`RobotError` that begins with ``where``, and names the mesh that cannot be read.
+    Raises:
+        RobotError: With a text that begins with ``where``. It names a mesh that cannot be read or has no extent.
     """
     text = ET.tostring(urdf, encoding="unicode")
     try:
@@ -146,7 +150,7 @@ def _check_mesh(file: str, where: str) -> None:
 
 
 def _has_extent(mesh: coal.BVHModelBase) -> bool:
-    """Whether the corners of a mesh span more than a straight line."""
+    """Return whether the corners of a mesh span more than a straight line."""
     points = np.array(mesh.vertices()).reshape(-1, 3)
     if len(points) < 3 or not np.isfinite(points).all():
         return False
@@ -155,7 +159,7 @@ def _has_extent(mesh: coal.BVHModelBase) -> bool:
 
 
 def _set_rotors(model: pin.Model, urdf: ET.Element) -> None:
-    """Put each joint's rotor into the model, its armature (rotor inertia times gear squared) included."""
+    """Write each joint's rotor into the model, with its armature (rotor inertia times gear ratio squared)."""
     model.armature[:] = _USUAL_ARMATURE
     for joint in urdf.findall("joint"):
         rotor, name = joint.find("rotor"), joint.get("name", "")

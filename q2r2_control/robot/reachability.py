@@ -1,7 +1,8 @@
-"""Which monitored pairs can meet at all inside the joint limits, found by sampling, and the SRDF that says so.
+"""Find by sampling which monitored pairs can meet inside the joint limits, and write the SRDF that excludes the others.
 
-A sample shows that two bodies can come near, never that they cannot. Where none does, the nearest postures found are
-followed downhill. A pair is out of reach only if it stays farther apart than a clearance well above what is kept.
+A sample can show that two bodies can come near, but never that they cannot. If no sample shows it, the search follows
+the nearest postures downhill. A pair is out of reach only if it stays farther apart than a clearance, which is much
+greater than the distance that pairs keep.
 """
 
 from __future__ import annotations
@@ -21,31 +22,38 @@ from q2r2_control.robot.pairs import distance_gradient, link_of, pair_names
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
-# Told how far a search has got: what it does, how much of it is done, how much there is.
+# A function that is called with the progress of a search: what it does, how much of it is done, and how much there is.
 Progress = Callable[[str, int, int], None]
 
-_STARTS = 8  # nearest samples of each pair that are followed downhill
-_STEPS = 30
-_FLAT = 1e-6  # relative progress in a step downhill that is too small to go on
-_BATCH, _FEW = 250, 4  # postures at a time, and how many of these before pairs are first followed downhill
+_STARTS = 8  # Number of nearest samples of each pair that are followed downhill.
+_STEPS = 30  # Greatest number of steps downhill.
+_FLAT = 1e-6  # If the relative progress of a step downhill is smaller, the descent ends.
+_BATCH, _FEW = 250, 4  # Number of postures in a batch, and of batches before pairs are first followed downhill.
 
 
 @dataclass(frozen=True, slots=True)
 class PairReach:
-    """How near two links can come."""
+    """The least distance to which two links can come."""
 
     link_a: str
     link_b: str
-    nearest: float  # least distance found [m]
+    nearest: float  # The least distance that was found [m].
 
 
 def nearest_approaches(
     robot: Robot, samples: int, seed: int, clearance: float, progress: Progress | None = None
 ) -> list[PairReach]:
-    """Least distance found of every monitored pair of links, nearest first; ``samples`` postures are looked at.
+    """Return the least distance that was found of every monitored pair of links, the nearest first.
 
-    The search for a pair ends where it is no more than ``clearance`` [m]. ``progress`` is called often. Raises
-    :class:`RobotError` for fewer than 100 samples.
+    Args:
+        robot: The robot.
+        samples: The number of random postures.
+        seed: The seed of the random postures.
+        clearance: The search for a pair ends when its distance is not greater than this [m].
+        progress: A function that is called often during the search.
+
+    Raises:
+        RobotError: If there are fewer than 100 samples.
     """
     if samples < 100:
         raise RobotError(f"samples = {samples}: allowed: 100 or more")
@@ -55,7 +63,7 @@ def nearest_approaches(
     for begin in range(0, samples, _BATCH):
         search.look_at(postures[begin : begin + _BATCH])
         if begin == _FEW * _BATCH:
-            # Most pairs that can meet do so here, and need no more samples.
+            # Most pairs that can meet are found here, and need no more samples.
             search.go_downhill(1)
         if progress is not None:
             progress("random postures", min(begin + _BATCH, samples), samples)
@@ -68,9 +76,9 @@ def nearest_approaches(
 
 
 class _Search:
-    """The nearest postures found of each pair. A pair that has come as near as ``clearance`` [m] is looked at no more.
+    """Finds the nearest postures of each pair. A pair that has come as near as ``clearance`` [m] is no longer examined.
 
-    On a robot with thousands of pairs most are done with after a few hundred postures.
+    On a robot with thousands of pairs, the search for most of them ends after a few hundred postures.
     """
 
     def __init__(self, robot: Robot, clearance: float) -> None:
@@ -78,15 +86,15 @@ class _Search:
         self._pairs = [pin.CollisionPair(pair.first, pair.second) for pair in self._geometry.collisionPairs]
         self._bounds = Bounds(robot.position_lower, robot.position_upper)
         self.names = pair_names(self._geometry)
-        self.nearest = np.full(len(self.names), np.inf)  # (pairs,) [m]
+        self.nearest = np.full(len(self.names), np.inf)  # The least distance of each pair so far (pairs,) [m].
         self._left = np.arange(len(self.names))
-        # Of each pair, the postures to go downhill from and their distances, nearest first.
+        # The postures of each pair from which the search goes downhill, and their distances, the nearest first.
         self._starts = np.zeros((len(self.names), _STARTS, self._model.nv))
         self._at = np.full((len(self.names), _STARTS), np.inf)
         self._distances = CoalDistances(self._model, self._geometry)
 
     def look_at(self, postures: Array) -> None:
-        """Take the distances at ``postures`` (n, nv)."""
+        """Measure the distances at ``postures`` (n, nv), and keep the nearest postures of each pair."""
         distances = np.empty((len(postures), len(self._left)))
         for i, q in enumerate(postures):
             distances[i] = self._distances.at(q)
@@ -99,7 +107,7 @@ class _Search:
         self._drop_the_near()
 
     def go_downhill(self, starts: int, progress: Progress | None = None) -> None:
-        """Follow that many of the nearest postures of each pair downhill inside the limits."""
+        """Follow the number ``starts`` of the nearest postures of each pair downhill inside the limits."""
         for k, p in enumerate(self._left):
             for q in self._starts[p][np.isfinite(self._at[p])][:starts]:
                 if self.nearest[p] > self._clearance:
@@ -109,7 +117,7 @@ class _Search:
         self._drop_the_near()
 
     def _downhill(self, k: int, q: Array) -> float:
-        """Least distance of the pair of number ``k`` among those left."""
+        """Return the least distance of the pair with the number ``k`` among the remaining ones, downhill from ``q``."""
         data, geometry_data = self._distances.data, self._distances.geometry_data
 
         def distance(posture: Array) -> tuple[float, Array]:
@@ -131,7 +139,7 @@ class _Search:
 
 
 def srdf_of(robot: Robot, approaches: Sequence[PairReach], clearance: float, samples: int) -> str:
-    """SRDF text that disables links which never come nearer than ``clearance`` [m], or overlap by construction."""
+    """Return an SRDF that disables links that never come nearer than ``clearance`` [m], or overlap by construction."""
     comment = (
         f"Found by looking at {samples} random postures inside the joint limits and going downhill from the "
         f"nearest ones: these links stay more than {1e3 * clearance:g} mm apart, or overlap by construction."
@@ -143,7 +151,7 @@ def srdf_of(robot: Robot, approaches: Sequence[PairReach], clearance: float, sam
 
 
 def srdf_text(name: str, comment: str, pairs: Iterable[tuple[str, str, str]], links: Iterable[str] = ()) -> str:
-    """SRDF text that disables ``links``, and ``pairs`` of links with the reason, in MoveIt's words."""
+    """Return an SRDF that disables ``links``, and ``pairs`` of links with a reason, which is a word of MoveIt."""
     root = ET.Element("robot", name=name)
     root.append(ET.Comment("\n    " + "\n    ".join(textwrap.wrap(comment, 112)) + "\n  "))
     for link in links:

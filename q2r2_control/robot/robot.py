@@ -1,4 +1,4 @@
-"""The robot as the controller sees it: a Pinocchio model, monitored collision pairs, arms, limits."""
+"""The robot as the controller sees it: a Pinocchio model, monitored collision pairs, arms and limits."""
 
 from __future__ import annotations
 
@@ -43,60 +43,63 @@ from q2r2_control.robot.urdf_parts import CONTINUOUS_RANGE, acceleration_limit
 from q2r2_control.types import Array
 
 _logger = logging.getLogger(__name__)
-_SAME_FRAME = 1e-3  # two frames that are one in two files differ by less [m], [rad]
+_SAME_FRAME = 1e-3  # Greatest difference between two frames that count as the same frame [m], [rad].
 
 
 @dataclass(frozen=True, slots=True)
 class Arm:
-    """One arm: the frame the operator moves and the joints that move it."""
+    """One arm: the frame that the operator moves, and the joints that move it."""
 
     name: str
-    tool_frame: str  # link name
-    frame_id: int  # of the tool frame in ``Robot.model``
-    joints: np.ndarray  # velocity indices from base to tool; a joint that several arms hang on is in each of them
-    finger_joints: tuple[str, ...] = ()  # that its gripper drives
-    stroke: float = 0.0  # of each of them, from closed to open [m or rad]; 0: not known
-    finger_way: float = 0.0  # how far that moves a finger [m]; 0: not known
+    tool_frame: str  # Name of the link.
+    frame_id: int  # Number of the tool frame in ``Robot.model``.
+    joints: np.ndarray  # Velocity indices from base to tool. A joint that carries several arms belongs to each of them.
+    finger_joints: tuple[str, ...] = ()  # The joints that its gripper drives.
+    stroke: float = 0.0  # Travel of each finger joint from closed to open [m or rad]; 0 if it is not known.
+    finger_way: float = 0.0  # Distance by which the stroke moves a finger [m]; 0 if it is not known.
 
 
 @dataclass(frozen=True, slots=True)
 class PairDistance:
-    """Distance of one monitored pair."""
+    """The distance of one monitored pair."""
 
     name_a: str
     name_b: str
-    distance: float  # [m]; negative: penetration depth
+    distance: float  # [m]. A negative distance is a penetration depth.
 
 
 class Robot:
     """Kinematics, dynamics and collision model of a cell, reduced to the joints that move a tool.
 
-    All arrays are (nv,) in the order of ``model``'s velocity, which is that of ``joint_names``. Positions in rad (m for
-    prismatic joints), velocities per second, torques in Nm (N). Made by :meth:`from_config` or :meth:`from_urdf`.
-    ``acceleration_limit`` is infinite for joints of which the model says none; what holds is
-    :meth:`capped_acceleration`.
+    Make it by :meth:`from_config` or :meth:`from_urdf`. All arrays are (nv,) in the order of ``model``'s velocity,
+    which is the order of ``joint_names``. Positions are in [rad], velocities in [rad/s] and torques in [Nm]; for
+    prismatic joints they are in [m], [m/s] and [N]. ``acceleration_limit`` is infinite for joints without such a limit
+    in the model. :meth:`capped_acceleration` returns the limits that hold.
 
-    ``collision_model`` holds exactly the monitored pairs: each arm against the other with its base, its own links that
-    can meet, and what stands in the cell. Every monitored shape is a capsule, a sphere, or a box fixed in the world. A
-    finger is all that it sweeps, and ``finger_bodies`` says what counts at a known opening. ``objects`` are what
-    grippers hold, beside the collision model. ``ignored_pairs`` of one arm's shapes overlap by construction.
+    ``collision_model`` holds exactly the monitored pairs. Each arm has pairs with the other arm and its base, with its
+    own links that it can meet, and with obstacles. Every monitored shape is a capsule, a sphere, or a box fixed in the
+    world. The body of a finger is the volume that it sweeps. ``finger_bodies`` tells which part counts at an opening.
+    ``objects`` are the objects that grippers hold, in addition to the collision model. ``ignored_pairs`` are pairs of
+    one arm's shapes that overlap by construction.
 
     Attributes:
-        name: Of the URDF.
+        name: Name of the URDF.
         model: ``pinocchio.Model`` of the joints that move a tool. With data of its own, ``robot.model.createData()``, a
             task or a constraint computes Jacobians by Pinocchio: ``pinocchio.computeFrameJacobian(robot.model, data,
-            q, robot.arms["left"].frame_id, pinocchio.LOCAL_WORLD_ALIGNED)``, (6, nv), linear, then angular.
+            q, robot.arms["left"].frame_id, pinocchio.LOCAL_WORLD_ALIGNED)``, (6, nv), first linear, then angular.
         joint_names: Names in the order of every array of joints.
-        arms: By name, base to tool: ``frame_id`` of its tool in ``model``, ``joints``, the places of its joints in
-            arrays of joints, and ``tool_frame``, the name of its tool's link.
+        arms: Arms by name. ``tool_frame`` is the name of the tool's link, and ``frame_id`` is its number in ``model``.
+            ``joints`` are the places of the arm's joints in arrays of joints, from base to tool.
         home: Joint positions at which the cell starts (nv,) [rad].
-        position_lower: The model's limits (nv,) [rad]; ``position_upper`` likewise.
-        endless: Whether each joint turns on for ever (nv,).
-        velocity_limit: The model's limits (nv,) [rad/s].
-        torque_limit: The model's limits (nv,) [Nm].
+        position_lower: The model's lower position limits (nv,) [rad].
+        position_upper: The model's upper position limits (nv,) [rad].
+        endless: True for each joint that turns on for ever (nv,).
+        velocity_limit: The model's velocity limits (nv,) [rad/s].
+        torque_limit: The model's torque limits (nv,) [Nm].
         urdf: The whole cell as a text.
-        following_links: By link, the arm's joint that a link beside the arm follows; it is watched where it is at home.
-        unchecked_links: Names of links without a collision shape that nothing keeps off anything, by the maker's will.
+        following_links: The joint of an arm that a link beside the arm follows, by link. Such a link is watched only at
+            its place at home.
+        unchecked_links: Names of links without a collision shape, which by the user's choice are not watched.
     """
 
     def __init__(
@@ -130,13 +133,13 @@ class Robot:
         self.home: Array = np.array([home[joint] for joint in self.joint_names])
         self.position_lower: Array = self.model.lowerPositionLimit.copy()
         self.position_upper: Array = self.model.upperPositionLimit.copy()
-        # A continuous joint is known by the range that a model without limits gets, see description.parse_urdf.
+        # A continuous joint is recognised by the range that description.parse_urdf gives to joints without limits.
         self.endless = (self.position_lower <= -CONTINUOUS_RANGE) & (self.position_upper >= CONTINUOUS_RANGE)
         self.velocity_limit: Array = self.model.velocityLimit.copy()
         self.torque_limit: Array = self.model.effortLimit.copy()
         joints = {joint.get("name", ""): joint for joint in urdf.findall("joint")}
         self.acceleration_limit: Array = np.array([acceleration_limit(joints[name]) for name in self.joint_names])
-        # From the root to the tool, and branches beside that way, such as fingers.
+        # The links of an arm are those from the root to the tool, and those of branches beside this way, like fingers.
         bodies = [frame for frame in self.model.frames if frame.type == pin.FrameType.BODY]
         own_links = {
             name: {*tree.path(arm.tool_frame), *(body.name for body in bodies if body.parentJoint - 1 in arm.joints)}
@@ -161,7 +164,12 @@ class Robot:
 
     @classmethod
     def from_config(cls, config: Config) -> Robot:
-        """The robot of a cell. Raises :class:`ConfigError` or :class:`RobotError` with what is wrong and where."""
+        """Return the robot of a cell.
+
+        Raises:
+            ConfigError: If the configuration cannot be used. The text says what is wrong and where.
+            RobotError: If a model cannot be used. The text says what is wrong and where.
+        """
         check_kind("config", config, Config, "a Config, as load_config returns")
         cell = compose(config)
         urdf = parse_urdf(cell.urdf, cell.name)
@@ -180,15 +188,22 @@ class Robot:
         home: Mapping[str, float] | None = None,
         unchecked_links: Collection[str] = (),
     ) -> Robot:
-        """A robot from any URDF, given as file or text.
+        """Return a robot from any URDF.
 
-        ``arms`` maps an arm's name to its tool frame, a link of the URDF. Other joints that an arm carries move its
-        fingers, and the links that these hang on are its tool. No link is known as an obstacle. ``home`` has
-        positions by joint [rad or m]; other joints are at 0, or in the middle of their range where 0 is outside.
-        ``srdf`` (file or text) says which pairs need no watching; without one, links of one arm that overlap at home
-        are taken to overlap by construction. Pairs at home that would hold the arm up, or overlap there only, are
-        named in a warning. ``unchecked_links`` names links without a collision shape that nothing shall keep off
-        anything. Raises :class:`RobotError`, also for a link that weighs something, has no shape and is not named.
+        Joints that an arm carries beyond its own joints move its fingers, and the links that carry these joints are
+        its tool. No link counts as an obstacle. A warning names pairs that would hold the arm up at home, and pairs
+        that overlap only there.
+
+        Args:
+            path_or_xml: The URDF as a file or a text.
+            arms: The tool frame of each arm, by the arm's name. A tool frame is a link of the URDF.
+            srdf: An SRDF (file or text) that tells which pairs need no watching. Without it, links of one arm that
+                overlap at home are taken to overlap by construction.
+            home: Positions by joint [rad or m]. Other joints are at 0, or in the middle of their range if 0 is outside.
+            unchecked_links: Names of links without a collision shape that shall not be watched.
+
+        Raises:
+            RobotError: If an argument cannot be used, or if a link has a mass but no shape and is not named.
         """
         text, where, folder = _text_of(path_or_xml, "URDF text")
         urdf = parse_urdf(text, where, folder)
@@ -208,22 +223,27 @@ class Robot:
         return robot
 
     def capped_acceleration(self, cap: float) -> Array:
-        """Acceleration limits (nv,) with ``cap`` [rad/s^2] for every joint: the smaller one of it and the robot's.
+        """Return acceleration limits (nv,) [rad/s^2]: the smaller one of ``cap`` and the robot's, for every joint.
 
-        Raises :class:`RobotError` for no number above 0.
+        Raises:
+            RobotError: If ``cap`` is not a number above 0.
         """
         if not isinstance(cap, float | int | np.number) or not cap > 0:
             raise RobotError(f"acceleration cap = {shown(cap)}: allowed: a number above 0 [rad/s^2]")
         return np.minimum(self.acceleration_limit, cap)
 
     def arm(self, name: str) -> Arm:
-        """The arm called ``name``. Raises :class:`RobotError` where there is none."""
+        """Return the arm called ``name``; raises :class:`RobotError` if there is none."""
         if not isinstance(name, str) or name not in self.arms:
             raise RobotError(f"{self.name}: no arm {shown(name)}; arms: {', '.join(self.arms)}")
         return self.arms[name]
 
     def checked(self, name: str, values: npt.ArrayLike) -> Array:
-        """A copy of ``values``, one for each joint (nv,). Raises :class:`RobotError` that says their ``name``."""
+        """Return a copy of ``values``, one for each joint (nv,).
+
+        Raises:
+            RobotError: With a text that begins with ``name``, if they have another shape or are not finite.
+        """
         try:
             given = np.asarray(values)
             array = np.array(given, dtype=np.float64) if given.dtype.kind != "c" else np.empty(0)
@@ -234,18 +254,22 @@ class Robot:
         return array
 
     def tool_pose(self, q: npt.ArrayLike, arm: str) -> pin.SE3:
-        """Pose of the arm's tool frame in the world at ``q`` (nv,).
+        """Return the pose of the arm's tool frame in the world at ``q`` (nv,).
 
-        Raises :class:`RobotError` for another shape, no finite number and an arm that does not exist.
+        Raises:
+            RobotError: If ``q`` has another shape or is not finite, or if the arm does not exist.
         """
         frame_id = self.arm(arm).frame_id
         pin.forwardKinematics(self.model, self._data, self.checked("q", q))
         return pin.updateFramePlacement(self.model, self._data, frame_id).copy()
 
     def distances(self, q: npt.ArrayLike) -> list[PairDistance]:
-        """Distance of every monitored pair at ``q`` (nv,), computed by Coal, in the order of the collision pairs.
+        """Return the distance of every monitored pair at ``q`` (nv,), in the order of the collision pairs.
 
-        Raises :class:`RobotError` for another shape and no finite number.
+        Coal computes the distances.
+
+        Raises:
+            RobotError: If ``q`` has another shape or is not finite.
         """
         values = self.distance_values(q).tolist()
         return [
@@ -253,11 +277,11 @@ class Robot:
         ]
 
     def distance_values(self, q: npt.ArrayLike) -> Array:
-        """The numbers of :meth:`distances` alone (pairs,) [m]."""
+        """Return the numbers of :meth:`distances` alone (pairs,) [m]."""
         return self._distances.at(self.checked("q", q))
 
     def closest_points(self, q: npt.ArrayLike, pair: tuple[str, str]) -> Array | None:
-        """The nearest points (2, 3) [m] of a monitored pair in the world at ``q`` (nv,); None where it is none."""
+        """Return the nearest points of a pair in the world at ``q`` (nv,), (2, 3) [m]; None if it is not monitored."""
         check_kind("pair", pair, tuple, "the names of two bodies", RobotError)
         names = pair_names(self.collision_model)
         if pair not in names:
@@ -270,7 +294,7 @@ class Robot:
     def _monitor(
         self, tree: LinkTree, exclusions: Iterable[ET.Element] | None, own_links: Sequence[set[str]]
     ) -> tuple[tuple[str, str], ...]:
-        """Choose the pairs; returns those of one arm that overlap by construction and are left out."""
+        """Choose the monitored pairs. Returns the pairs of one arm that overlap by construction and are left out."""
         sink_boxes_into_floor(self.collision_model)
         add_movable_pairs(self.model, self.collision_model, tree)
         remove_unreachable_floor_pairs(self.model, self.collision_model)
@@ -278,7 +302,7 @@ class Robot:
             remove_disabled_pairs(self.collision_model, exclusions)
         postures = [self.home]
         if exclusions is not None:
-            # An SRDF is believed: only pairs that overlap everywhere are dropped, since they can never be parted.
+            # The SRDF is trusted. Only pairs that overlap everywhere are dropped, because nothing can part them.
             random = np.random.default_rng(0)
             postures += [random.uniform(self.position_lower, self.position_upper) for _ in range(50)]
         return remove_overlapping_own_pairs(self.model, self.collision_model, own_links, postures)
@@ -296,13 +320,13 @@ class Robot:
             self.roles[held.link] = Role(LinkClass.OBJECT, frozenset({arm}))
 
     def _check_operators_frames(self, config: Config) -> None:
-        """In mode filtered the frame that the operator moves has to be the cell's tool, or no target begins there."""
+        """Check that in mode filtered the operator moves the cell's tool. A target has to begin at this frame."""
         if config.external is None or not config.external.filtered:
             return
         for arm in self.arms:
             frame, tool = config.external.arm(arm).tool_frame, self.arms[arm].tool_frame
             if frame is None or not self.model.existFrame(frame, pin.FrameType.BODY):
-                continue  # only /tf knows it, and the arm's node compares it there
+                continue  # Only /tf has this frame, and the arm's node compares it there.
             at_home = self.tool_pose(self.home, arm)
             frame_id = self.model.getFrameId(frame, pin.FrameType.BODY)
             between = at_home.actInv(pin.updateFramePlacement(self.model, self._data, frame_id))
@@ -342,7 +366,7 @@ def _home_of(urdf: ET.Element, given: Mapping[str, float], where: str) -> dict[s
 
 
 def _text_of(path_or_text: str | os.PathLike[str], name_of_text: str) -> tuple[str, str, Path | None]:
-    """Text, what to call it in errors, and the folder it came from."""
+    """Return the text, its name in errors, and the folder of its file; None if it came from no file."""
     if not isinstance(path_or_text, str | os.PathLike):
         raise RobotError(f"{shown(path_or_text)}: neither {name_of_text} nor the path of a file")
     if isinstance(path_or_text, str) and path_or_text.lstrip().startswith("<"):

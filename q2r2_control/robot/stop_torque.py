@@ -1,12 +1,12 @@
-"""The torque that a commanded stop asks of the joints, against their limits.
+"""Compare the torques that a commanded stop requires with the torque limits of the joints.
 
-The controller promises stops in which every joint j decelerates at its limit a_j, whatever the torque. Joints that come
-from a low speed may do so with any signs, so joint i is asked for at most
+The controller promises stops in which every joint j decelerates at its limit a_j, whatever the torque. Joints with a
+low speed may decelerate with any signs. Joint i therefore requires at most the torque
 
     |g_i(q)| + sum_j |M_ij(q)| a_j
 
-which the signs of M's row, turned to gravity's, do ask. It is inverse dynamics at v = 0, rotors included; Coriolis
-torques and friction are not counted. Where gravity alone is too much, the model or the posture is wrong.
+and reaches it if the signs of M's row agree with the sign of gravity. This is inverse dynamics at v = 0 with rotors.
+Coriolis torques and friction are not counted. If gravity alone is too much, the model or the posture is wrong.
 """
 
 from __future__ import annotations
@@ -22,49 +22,59 @@ from q2r2_control.types import Array
 
 @dataclass(frozen=True, slots=True)
 class WorstTorque:
-    """Where joints of one arm are asked for most, in relation to what they have, and how often for more than that."""
+    """The posture in which one arm requires the most torque, relative to the limits of its joints."""
 
-    share_over: float  # of postures where some joint is asked for more than it has
-    joint: str  # that is asked for most
-    ratio: float  # of that torque to the joint's limit
-    posture: tuple[float, ...]  # of the arm's joints, from base to tip, where that is [rad]
+    share_over: float  # Share of the postures in which some joint requires more than its torque limit.
+    joint: str  # The joint with the greatest ratio.
+    ratio: float  # Ratio of the required torque to the joint's limit.
+    posture: tuple[float, ...]  # Positions of the arm's joints in the worst posture, from base to tip [rad].
 
 
 @dataclass(frozen=True, slots=True)
 class JointTorque:
-    """The most that one joint is asked for, in relation to its torque limit."""
+    """The greatest torques that one joint requires, as ratios to its torque limit."""
 
     joint: str
-    acceleration: float  # at which it stops [rad/s^2]
-    gravity: float  # alone
-    stop: float  # gravity and a full stop
+    acceleration: float  # Deceleration of the stop [rad/s^2].
+    gravity: float  # Ratio for gravity alone.
+    stop: float  # Ratio for gravity and a full stop.
 
 
 @dataclass(frozen=True, slots=True)
 class StopTorque:
-    """Torque that a full stop of one arm asks for, over random postures inside the position limits."""
+    """The torque that a full stop of one arm requires, over random postures inside the position limits."""
 
     arm: str
-    joints: tuple[JointTorque, ...]  # from base to tip
-    postures: int
-    seed: int  # of the random postures
-    stop: WorstTorque  # gravity and a full stop
-    gravity: WorstTorque  # gravity alone
-    bearable: float  # share of all these decelerations that asks no joint for more than it has in any of the postures
+    joints: tuple[JointTorque, ...]  # The joints from base to tip.
+    postures: int  # Number of random postures.
+    seed: int  # Seed of the random postures.
+    stop: WorstTorque  # The worst torque of gravity and a full stop.
+    gravity: WorstTorque  # The worst torque of gravity alone.
+    bearable: float  # Share of all decelerations with which no joint exceeds its torque limit in any of the postures.
 
 
 def joints_that_cannot_hold(robot: Robot, q: Array) -> dict[str, tuple[float, float]]:
-    """Joints that gravity at ``q`` (nv,) asks for more than they have: the torque, and the joint's limit [Nm or N]."""
+    """Return the joints whose torque limit is less than the torque of gravity at ``q`` (nv,).
+
+    The values are the torque of gravity and the joint's limit [Nm or N].
+    """
     gravity = np.abs(pin.computeGeneralizedGravity(robot.model, robot.model.createData(), q))
     over = np.flatnonzero(gravity > robot.torque_limit)
     return {robot.joint_names[j]: (float(gravity[j]), float(robot.torque_limit[j])) for j in over}
 
 
 def stop_torques(robot: Robot, acceleration: Array, postures: int = 5000, seed: int = 0) -> tuple[StopTorque, ...]:
-    """One :class:`StopTorque` an arm, for decelerations (nv,) [rad/s^2] of the joints."""
+    """Return one :class:`StopTorque` for each arm, from random postures.
+
+    Args:
+        robot: The robot.
+        acceleration: The decelerations of the joints (nv,) [rad/s^2].
+        postures: The number of random postures.
+        seed: The seed of the random postures.
+    """
     random, data = np.random.default_rng(seed), robot.model.createData()
     samples = random.uniform(robot.position_lower, robot.position_upper, (postures, robot.model.nv))
-    gravity, inertial = np.empty_like(samples), np.empty_like(samples)  # [Nm]
+    gravity, inertial = np.empty_like(samples), np.empty_like(samples)  # Torques (postures, nv) [Nm].
     for i, q in enumerate(samples):
         upper = np.triu(pin.crba(robot.model, data, q))
         inertial[i] = np.abs(upper + np.triu(upper, 1).T) @ acceleration

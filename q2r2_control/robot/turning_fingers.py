@@ -1,26 +1,30 @@
-"""The space that a turning finger sweeps while its gripper's opening is in an interval: one capsule for each shape as
-drawn.
+"""Compute the space that a turning finger sweeps while its gripper's opening is in an interval.
+
+Each shape of the finger gets one capsule.
 
 **Claim.** The capsule of an interval encloses the shape at every opening in that interval, not only at samples.
 
-*Proof.* A shape is the hull of two balls, so it is enough to hold the balls' centres with the balls' radius. Where a
-driven joint goes from one position to another in m equal steps, with the joints that mimic it, a centre x is a function
-of that one parameter. In a step in which these joints move by w_i, linear interpolation between both ends of the step
-is off by at most an eighth of the greatest second derivative,
+*Proof.* A shape is the hull of two balls. It is therefore enough to enclose the centres of the balls with the radius of
+the balls. Let a driven joint go from one position to another in m equal steps, together with the joints that mimic it.
+Then a centre x is a function of this one parameter. Let these joints move by w_i in a step. Linear interpolation
+between both ends of the step has an error of at most an eighth of the greatest second derivative,
 
     1/8 sum_ik w_i w_k r_(the outer one of i and k),
 
-since the second derivative by two turning joints is a product of rotations about both axes with the lever of the outer
-one. r bounds how far x is from a joint's axis. A slide has r = 1, as the outer one of two, and 0 as the inner one or
-twice. With several driven joints in one chain, interpolation is by each of them in turn. Each time it takes means of
-the values before. The errors add up, and derivatives by two different driven joints do not count. Interpolated points
-lie in the hull of the samples. A capsule is convex: one that holds each sample with the shape's radius and that
-remainder holds all. For any segment the radius that does this is the farthest sample's distance from it, plus both. []
+because the second derivative by two turning joints is a product of rotations about both axes with the lever of the
+outer joint. Here r bounds the distance of x from the axis of a joint. For a joint that slides, r = 1 if it is the outer
+one of two joints, and r = 0 if it is the inner one or both. Several driven joints in one chain are interpolated one
+after the other. Each interpolation takes means of the values of the one before. The errors therefore add up, and
+derivatives by two different driven joints do not count. Interpolated points lie in the hull of the samples. A capsule
+is convex. If it encloses each sample with the shape's radius and that remainder, it encloses all points. For any
+segment, this radius is the distance of the farthest sample from the segment, plus the shape's radius and the remainder.
+[]
 
-The choice of the segment decides on size only. Of some along the shape and some along its way, the one of the least
-mean width is taken. Capsules of two intervals are not nested even if the intervals are: one for less may stick out of
-one for more. A narrower interval has to be proven as if a body grew (:func:`sticks_out`). The wider interval's capsule
-stays valid as long as the opening is in it, so a narrower one may always be refused.
+The choice of the segment decides only on the size. Some candidates lie along the shape and some along its way. The one
+with the least mean width is taken. Capsules of nested intervals are not nested: the capsule of the narrower interval
+may stick out of the capsule of the wider one. A narrower interval has to be proven as if a body grew
+(:func:`sticks_out`). The capsule of the wider interval stays valid as long as the opening is in that interval. A
+narrower interval may therefore always be refused.
 """
 
 from __future__ import annotations
@@ -35,54 +39,60 @@ import numpy as np
 
 from q2r2_control.types import ALL_OF_THE_WAY, Array, Interval
 
-_REMAINDER = 5e-5  # that steps are made short enough for [m]
-_MOST_SAMPLES = 512  # of all driven joints of a chain together; with fewer than it takes the remainder is larger
-_ROUNDING = 1e-9  # [m]
-# By which share of the least radius less a segment's ends are pulled in: a thicker capsule with a flatter end.
+_REMAINDER = 5e-5  # The wanted error of the interpolation. The steps are made short enough for it [m].
+# Greatest number of samples of all driven joints of a chain together. If more were needed, the error is greater.
+_MOST_SAMPLES = 512
+_ROUNDING = 1e-9  # Addition to radii for the rounding of numbers [m].
+# Shares of the least radius (without the shape's) by which both ends of a segment are pulled in. The capsule becomes
+# thicker and its ends flatter.
 _PULLED_IN = np.array([0.0, 0.58, 1.2])
 
 
 @dataclass(frozen=True, slots=True)
 class FingerJoint:
-    """A joint that moves a shape, as that was drawn, in the frame of the arm's link that carries the hand.
+    """A joint that moves a shape, in the frame of the arm's link that carries the hand.
 
-    Positions of the joints of one driver are linear in the driver's, also beyond the stroke.
+    The shape was drawn at the position ``home``. The positions of all joints with one driver are linear functions of
+    the driver's position, also beyond the stroke. All positions are in [m or rad].
     """
 
     slides: bool
-    axis: Array  # (3,) unit vector
-    point: Array  # (3,) on the axis [m]
-    home: float  # position where the shape was drawn [m or rad]
-    closed: float  # positions of the closed and of the open gripper
-    open: float
-    before: float  # positions at the ends of the travel, before the closed and beyond the open gripper
-    beyond: float
-    driver: str  # the joint that it mimics, or itself
+    axis: Array  # Unit vector (3,).
+    point: Array  # A point on the axis (3,) [m].
+    home: float  # The position at which the shape was drawn.
+    closed: float  # The position with the gripper closed.
+    open: float  # The position with the gripper open.
+    before: float  # The end of the travel before the closed position.
+    beyond: float  # The end of the travel beyond the open position.
+    driver: str  # The joint that it mimics, or its own name.
 
     def travel(self, interval: Interval) -> tuple[float, float]:
-        """Positions at both ends of ``interval``; an end at 0 or 1 is that of the travel, beyond the gripper's."""
+        """Return the positions at both ends of ``interval``.
+
+        For an end at 0 or 1 it is the end of the joint's travel, which may lie beyond the gripper's stroke.
+        """
         first = self.before if interval[0] <= 0.0 else self.closed + interval[0] * (self.open - self.closed)
         last = self.beyond if interval[1] >= 1.0 else self.closed + interval[1] * (self.open - self.closed)
         return first, last
 
 
 class Capsules(NamedTuple):
-    """One for each of some bodies, in the frame of the link that carries the hand."""
+    """One capsule for each of b bodies, in the frame of the link that carries the hand."""
 
     start: Array  # (b, 3) [m]
-    end: Array  # (b, 3)
-    radius: Array  # (b,)
+    end: Array  # (b, 3) [m]
+    radius: Array  # (b,) [m]
 
 
 @dataclass(frozen=True)
 class TurningBody:
-    """A shape of a finger of which some joint turns."""
+    """A shape of a finger that has at least one turning joint."""
 
     arm: str
-    name: str  # of the geometry
-    ends: Array  # (2, 3) of its segment as drawn [m]
-    radius: float  # as drawn [m], which no capsule around it is below
-    joints: tuple[FingerJoint, ...]  # from the hand outwards
+    name: str  # Name of the geometry object.
+    ends: Array  # Both ends of its segment as drawn (2, 3) [m].
+    radius: float  # Radius as drawn [m]. A capsule around it has at least this radius.
+    joints: tuple[FingerJoint, ...]  # The joints that move it, from the hand outwards.
 
     def curvatures(self) -> Array:
         """Return a bound (j, j) [m] on the second derivatives of a shape's points by the positions of two joints.
@@ -90,7 +100,7 @@ class TurningBody:
         It is 0 if the two joints have different drivers.
         """
         bounds = np.zeros((len(self.joints), len(self.joints)))
-        farthest, beyond = 0.0, self.ends  # from a point on the joint's axis to the ends, at most [m]
+        farthest, beyond = 0.0, self.ends  # ``farthest`` bounds the distance of the ends from the joint's axis [m].
         for k, outer in reversed(list(enumerate(self.joints))):
             farthest += float(np.linalg.norm(beyond - outer.point, axis=1).max())
             if outer.slides:
@@ -103,23 +113,23 @@ class TurningBody:
 
     @cached_property
     def extent(self) -> float:
-        """How far the segment of any interval's capsule is from the carrying link's origin, at most [m]."""
+        """The greatest distance of the segment of any interval's capsule from the origin of the carrying link [m]."""
         return float(TurningSweeps((self,)).extent[0])
 
     @cached_property
     def way(self) -> float:
-        """How far an end is from where it was when the closed gripper has opened, at most [m]."""
+        """The greatest distance between the closed and the open place of an end of the segment [m]."""
         closed, opened = map(TurningSweeps((self,)).ends_at, (0.0, 1.0))
         return float(np.linalg.norm(opened[0] - closed[0], axis=1).max())
 
     def capsule(self, interval: Interval) -> tuple[Array, Array, float]:
-        """Both ends (3,) of the segment and the radius [m] of the capsule around the shape in ``interval``."""
+        """Return both ends of the segment (3,) and the radius of the capsule around the shape in ``interval`` [m]."""
         capsules = TurningSweeps((self,)).capsules(interval)
         return capsules.start[0], capsules.end[0], float(capsules.radius[0])
 
 
 class TurningSweeps:
-    """Capsules of several bodies at once, in arrays: a gripper asks for all of its own in mid-motion."""
+    """Computes the capsules of several bodies together in arrays. A gripper needs all of its own in mid-motion."""
 
     def __init__(self, bodies: Sequence[TurningBody]) -> None:
         count, depth = len(bodies), max(len(body.joints) for body in bodies)
@@ -145,16 +155,18 @@ class TurningSweeps:
         self._across = np.eye(3) - self._along
         self._drivers, self._most_steps = drivers, max(int(_MOST_SAMPLES ** (1.0 / drivers)) - 1, 1)
         points, remainder = self._samples(ALL_OF_THE_WAY)
-        self.extent: Array = np.linalg.norm(points, axis=2).max(axis=1) + remainder  # (b,) see TurningBody.extent
+        # TurningBody.extent of each body (b,) [m].
+        self.extent: Array = np.linalg.norm(points, axis=2).max(axis=1) + remainder
 
     def capsules(self, interval: Interval) -> Capsules:
-        """The capsules that enclose the shapes at every opening in ``interval``."""
+        """Return the capsules that enclose the shapes at every opening in ``interval``."""
         points, remainder = self._samples(interval)
         half = points.shape[1] // 2
         first, second = points[:, :half], points[:, half:]
         middles = 0.5 * (first + second)
         way, middle = 0.5 * (middles[:, -1] - middles[:, 0]), middles.mean(axis=1)
-        starts = np.stack([first.mean(axis=1), middle - way], axis=1)  # (b, 2, 3): along the shape, along its way
+        # The candidates (b, 2, 3): the first segment lies along the shape, the second one along its way.
+        starts = np.stack([first.mean(axis=1), middle - way], axis=1)
         ends = np.stack([second.mean(axis=1), middle + way], axis=1)
         pull = _PULLED_IN * _farthest(points, starts, ends)[..., None]
         length = np.linalg.norm(ends - starts, axis=2)[..., None]
@@ -164,7 +176,8 @@ class TurningSweeps:
         starts, ends = starts.reshape(len(points), -1, 3), ends.reshape(len(points), -1, 3)
         radius = _farthest(points, starts, ends) + (self._radius + remainder + _ROUNDING)[:, None]
         width = radius + 0.25 * np.linalg.norm(ends - starts, axis=2)
-        # Bounds of how fast bodies move are made of the extent; segments along the shape are in the samples' hull.
+        # The bounds of the bodies' speeds rely on the extent, and so no segment may reach beyond it. Segments along the
+        # shape never do, because they lie in the hull of the samples.
         reached = np.maximum(np.linalg.norm(starts, axis=2), np.linalg.norm(ends, axis=2))
         reached[:, : len(_PULLED_IN)] = 0.0
         best = np.argmin(np.where(reached <= self.extent[:, None], width, np.inf), axis=1)
@@ -180,12 +193,12 @@ class TurningSweeps:
         return points[0]
 
     def _samples(self, interval: Interval) -> tuple[Array, Array]:
-        """Both ends of each segment (b, 2 s, 3) at samples of ``interval``, the first ends before the second ones.
+        """Return the ends of each segment at samples of ``interval`` (b, 2 s, 3) [m], and the remainders (b,) [m].
 
-        And by how much what is between may be off (b,) [m].
+        All first ends come before all second ends. A remainder bounds the error of the interpolation between samples.
         """
         closed, opened = self._stroke
-        # An end of the interval at 0 or 1 is that of the joints' travel, which may be beyond the gripper's.
+        # An end of the interval at 0 or 1 is the end of the joints' travel, which may lie beyond the gripper's stroke.
         first = self._travel[0] if interval[0] <= 0.0 else closed + interval[0] * (opened - closed)
         last = self._travel[1] if interval[1] >= 1.0 else closed + interval[1] * (opened - closed)
         travel, count = np.abs(last - first), len(self._ends)
@@ -197,14 +210,14 @@ class TurningSweeps:
         points = np.broadcast_to(self._ends, (len(shares), count, 2, 3))
         for j in reversed(range(len(self._home))):
             share = shares[:, self._driver[j]]  # (s, b)
-            # Exact at both ends of the travel.
+            # This form is exact at both ends of the travel.
             moved = (1.0 - share) * first[j] + share * last[j] - self._home[j]
             points = self._moved(j, moved, points)
         ends = points.transpose(1, 2, 0, 3).reshape(count, -1, 3)
         return ends, in_one_step / steps**2
 
     def _moved(self, j: int, by: Array, points: Array) -> Array:
-        """Points (s, b, 2, 3) as joint ``j`` of each body moves them ``by`` (s, b) [m or rad]."""
+        """Return points (s, b, 2, 3) [m] after joint ``j`` of each body has moved them ``by`` (s, b) [m or rad]."""
         slide = (by * self._slides[j])[..., None] * self._axis[j]
         angle = (by * (1.0 - self._slides[j]))[..., None, None]
         rotation = self._along[j] + np.cos(angle) * self._across[j] + np.sin(angle) * self._cross[j]
@@ -214,9 +227,9 @@ class TurningSweeps:
 
 
 def sticks_out(inner: Capsules, outer: Capsules) -> Array:
-    """Of each capsule of ``inner`` (b,), whether it is not within that of ``outer``.
+    """Return for each capsule of ``inner`` whether it is not within the capsule of ``outer`` (b,).
 
-    A capsule is the hull of the balls at its ends, so it is within another one exactly when these are.
+    A capsule is the hull of the balls at its ends. It is within another one exactly if both balls are.
     """
     points = np.stack([inner.start, inner.end], axis=1)
     farthest = _farthest(points, outer.start[:, None], outer.end[:, None])[:, 0]
@@ -224,7 +237,10 @@ def sticks_out(inner: Capsules, outer: Capsules) -> Array:
 
 
 def _farthest(points: Array, start: Array, end: Array) -> Array:
-    """How far the farthest of ``points`` (b, n, 3) is from each segment, ``start`` and ``end`` (b, k, 3): (b, k)."""
+    """Return the distance of the farthest of ``points`` (b, n, 3) from each segment (b, k) [m].
+
+    ``start`` and ``end`` are the ends of the segments (b, k, 3) [m].
+    """
     along = end - start
     square = np.maximum((along * along).sum(axis=2), 1e-30)
     offset = points[:, None] - start[:, :, None]  # (b, k, n, 3)

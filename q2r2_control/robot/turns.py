@@ -1,8 +1,8 @@
 """Count the turns of continuous joints, whose angle may be reported within one turn, as in (-pi, pi].
 
-If the angle jumps by a whole turn between two reports, the joint has not jumped, as long as it cannot have turned by
-half a turn meanwhile. Reports that count turns themselves do not change. The same holds for the first report, and for a
-report after a longer gap.
+If the angle jumps by a whole turn between two reports, the joint has not jumped. This is certain while it cannot have
+turned by half a turn between them. Reports that count turns themselves do not change. The same holds for the first
+report, and for a report after a longer gap.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ class TurnCounter:
         joints = self._joints = np.flatnonzero(robot.endless)
         self._half_turn_s = math.pi / robot.velocity_limit[joints]
         self._last = np.zeros(len(joints))  # The last positions of these joints with their turns [rad].
-        self._at = np.full(len(joints), -math.inf)  # When each was measured [s].
+        self._at = np.full(len(joints), -math.inf)  # The times at which they were measured [s].
 
     def counted(self, q: Array, at: float | Array) -> Array:
         """Return the reported positions ``q`` (nv,) [rad] with the turns of continuous joints.
 
-        ``at`` is when they were measured [s]: one time, or one for each joint (nv,). Without a change ``q`` itself is
-        returned. Positions that are not finite are not changed.
+        ``at`` is the time of the measurement [s]: one time, or one for each joint (nv,). If nothing changes, ``q``
+        itself is returned. Positions that are not finite are not changed.
         """
         if not len(self._joints) or not np.isfinite(given := q[self._joints]).all():
             return q

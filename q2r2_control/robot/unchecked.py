@@ -1,7 +1,7 @@
 """Find links that move with an arm and have no collision shape, so that nothing keeps them apart from other bodies.
 
-A certificate says nothing about such a link. Whatever commands arms refuses a robot with such a link by
-:func:`check_watched`, unless its cell names the link.
+A certificate says nothing about such a link. Every part that commands arms calls :func:`check_watched`, which refuses
+a robot with such a link unless its cell names the link.
 """
 
 from __future__ import annotations

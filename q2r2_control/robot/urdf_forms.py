@@ -1,7 +1,7 @@
-"""Parts of a URDF that its readers take in different ways: each is brought to one form, refused, or told.
+"""Handle parts of a URDF that different readers understand in different ways.
 
-Readers of URDF skip what they do not know without a word: a hand, a mass or half of a joint's
-range could be missing.
+Each part is brought to one form, refused, or reported. Readers of URDF silently skip elements that they do not know. A
+hand, a mass or half of a joint's range could be missing.
 """
 
 from __future__ import annotations
@@ -16,18 +16,19 @@ import pinocchio as pin
 
 from q2r2_control.errors import RobotError
 
-_LARGEST_ANGLE = 6.0 * math.pi  # that a joint which counts its turns usually has [rad]
-_LARGEST_SPEED = 40.0  # of an arm's joint [rad/s]
+_LARGEST_ANGLE = 6.0 * math.pi  # Greatest angle that a joint that counts its turns usually has [rad].
+_LARGEST_SPEED = 40.0  # Greatest speed that the joint of an arm usually has [rad/s].
 _UNIT = re.compile(r"<unit\b[^>]*\bmeter\s*=\s*[\"']([0-9.eE+-]+)[\"']")
-_HEADER = 20_000  # characters of a COLLADA file, in which its unit stands
-_UNIT_LENGTH = 1e-3  # that a quaternion's length may be off 1
+_HEADER = 20_000  # Number of characters at the beginning of a COLLADA file in which its unit is searched.
+_UNIT_LENGTH = 1e-3  # Greatest difference of a quaternion's length from 1.
 
 
 def unify(root: ET.Element, where: str) -> None:
-    """Bring origins by quaternion to roll, pitch and yaw, in place.
+    """Convert the quaternions of origins to roll, pitch and yaw in place.
 
-    Raises :class:`RobotError` that begins with ``where`` for elements of xacro, which all readers skip, and for links
-    with only one of mass and inertia, which Pinocchio leaves out with their shapes.
+    Raises:
+        RobotError: With a text that begins with ``where``, if there are elements of xacro, which all readers skip. Also
+            if a link has only one of mass and inertia, because Pinocchio leaves out such a link with its shapes.
     """
     _refuse_xacro(root, where)
     for origin in root.iter("origin"):
@@ -37,7 +38,7 @@ def unify(root: ET.Element, where: str) -> None:
 
 
 def notes_on(root: ET.Element) -> list[str]:
-    """A line for each joint of a model, as it was written, that a user should look at."""
+    """Return a line for each joint whose limits a user should check. ``root`` is the model as it was written."""
     notes = []
     for joint in root.findall("joint"):
         name, limit = joint.get("name", ""), joint.find("limit")
@@ -56,7 +57,10 @@ def notes_on(root: ET.Element) -> list[str]:
 
 
 def scale_to_metres(root: ET.Element) -> None:
-    """Scale collision meshes by their files' units, in place. COLLADA names one, which RViz applies, not Pinocchio."""
+    """Scale collision meshes in place by the length unit of their files.
+
+    COLLADA files name a unit, which RViz applies and Pinocchio ignores.
+    """
     for mesh in root.iterfind("link/collision/geometry/mesh"):
         if (unit := _unit_of(mesh.get("filename", ""))) != 1.0:
             scale = [unit * float(part) for part in mesh.get("scale", "1 1 1").split()]
@@ -64,9 +68,9 @@ def scale_to_metres(root: ET.Element) -> None:
 
 
 def _soft_limits(joint: ET.Element) -> tuple[float, float] | None:
-    """The range that a joint's ``safety_controller`` leaves of its position limits; None if it leaves all of it.
+    """Return the part of a joint's position range that its ``safety_controller`` leaves; None if it leaves all of it.
 
-    A range of no width counts as none, since both of its ends are 0 where they are not written.
+    Soft limits without a width do not count, because both of them are 0 if they are not written.
     """
     safety, limit = joint.find("safety_controller"), joint.find("limit")
     if safety is None or limit is None or joint.get("type") not in ("revolute", "prismatic"):
@@ -78,7 +82,7 @@ def _soft_limits(joint: ET.Element) -> tuple[float, float] | None:
 
 
 def _unit_of(file: str) -> float:
-    """The length of a mesh file's unit [m]."""
+    """Return the length of a mesh file's unit [m]."""
     if not file.lower().endswith(".dae"):
         return 1.0
     with Path(file).open(encoding="utf-8", errors="replace") as opened:
@@ -112,11 +116,11 @@ def _unify_origin(origin: ET.Element, where: str) -> None:
 
 
 def _check_inertial(link: ET.Element, where: str) -> None:
-    """Refuse an <inertial> with one of mass and inertia, for which Pinocchio leaves out the link's shapes."""
+    """Refuse an <inertial> that lacks its mass or its inertia. Pinocchio leaves out the shapes of such a link."""
     if (inertial := link.find("inertial")) is None:
         return
     lacks = [tag for tag in ("mass", "inertia") if inertial.find(tag) is None]
     if len(lacks) == 1:
         raise RobotError(f"{where}: the <inertial> of link {link.get('name')} has no <{lacks[0]}>; allowed: both")
-    if lacks:  # An empty element says as much as none.
+    if lacks:  # An empty element means the same as no element.
         link.remove(inertial)

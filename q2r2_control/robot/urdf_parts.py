@@ -1,4 +1,4 @@
-"""Elements of URDF and SRDF as a cell is put together from them: with other names, or made from a configuration."""
+"""Make the elements of URDF and SRDF of which a cell consists, by renaming others or from a configuration."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from collections.abc import Callable, Collection, Sequence
 from q2r2_control.config.arms import PoseConfig
 from q2r2_control.config.cell import ObstacleConfig
 
-WORLD = "world"  # root link of every cell
+WORLD = "world"  # The root link of every cell.
 
-# Range of a joint without limits: two turns each way.
+# Range of a joint without limits: two turns in each direction [rad].
 CONTINUOUS_RANGE = 4 * math.pi
 
-# Elements that name links or joints, and the attribute that does.
+# Elements that name links or joints, and the attribute that holds the name.
 _NAMING = {"parent": "link", "child": "link", "mimic": "joint"}
 
 
 def renamed(part: ET.Element, name_of: Callable[[str], str]) -> ET.Element:
-    """A copy of a link, joint or material with every name in it changed by ``name_of``."""
+    """Return a copy of a link, joint or material with every name in it changed by ``name_of``."""
     part = copy.deepcopy(part)
     for element in part.iter():
         if element.tag in _NAMING:
@@ -33,7 +33,7 @@ def renamed(part: ET.Element, name_of: Callable[[str], str]) -> ET.Element:
 
 
 def renamed_exclusions(parts: Sequence[ET.Element], name_of: Callable[[str], str]) -> list[ET.Element]:
-    """Copies of what disables collisions among the elements of an SRDF, links renamed by ``name_of``."""
+    """Return copies of those elements of an SRDF that disable collisions, with links renamed by ``name_of``."""
     naming = {"disable_collisions": ("link1", "link2"), "disable_default_collisions": ("link",)}
     found = [copy.deepcopy(part) for part in parts if part.tag in naming]
     for part in found:
@@ -43,7 +43,7 @@ def renamed_exclusions(parts: Sequence[ET.Element], name_of: Callable[[str], str
 
 
 def shape_from_drawings(links: Sequence[ET.Element], names: Collection[str]) -> None:
-    """Give each link called by one of ``names`` that has no collision shape those of its drawing."""
+    """Give each link in ``names`` without a collision shape the shapes of its drawing."""
     for link in links:
         if link.get("name") in names and link.find("collision") is None:
             for drawing in link.findall("visual"):
@@ -52,7 +52,10 @@ def shape_from_drawings(links: Sequence[ET.Element], names: Collection[str]) -> 
 
 
 def name_shapes(links: Sequence[ET.Element]) -> None:
-    """Give every shape a name of its own, which MuJoCo needs; shapes that share one or have none get their link's."""
+    """Give every shape a unique name, which MuJoCo needs.
+
+    Shapes without a name or with a shared name are named after their link.
+    """
     for tag in ("collision", "visual"):
         used = Counter(shape.get("name") for link in links for shape in link.findall(tag))
         for link in links:
@@ -62,7 +65,7 @@ def name_shapes(links: Sequence[ET.Element]) -> None:
 
 
 def fixed_joint(name: str, parent: str, child: str, pose: PoseConfig) -> ET.Element:
-    """A fixed joint that places ``child`` in ``parent``."""
+    """Return a fixed joint that places ``child`` in ``parent``."""
     joint = ET.Element("joint", name=name, type="fixed")
     ET.SubElement(joint, "parent", link=parent)
     ET.SubElement(joint, "child", link=child)
@@ -71,7 +74,7 @@ def fixed_joint(name: str, parent: str, child: str, pose: PoseConfig) -> ET.Elem
 
 
 def obstacle_link(name: str, config: ObstacleConfig) -> ET.Element:
-    """An obstacle as a link; its name has letters, digits and _ only."""
+    """Return an obstacle as a link. Its name may have only letters, digits and _."""
     if config.shape == "box":
         shape = f'<box size="{numbers(config.size)}"/>'
     elif config.shape == "sphere":
@@ -92,20 +95,21 @@ def numbers(values: Sequence[float]) -> str:
 
 
 ACCELERATION = "acceleration"
-ATTRIBUTES = (ACCELERATION, "deceleration", "{http://drake.mit.edu}acceleration")  # of limit
+# The attributes of <limit> that limit the acceleration of a joint.
+ATTRIBUTES = (ACCELERATION, "deceleration", "{http://drake.mit.edu}acceleration")
 
 
 def mimic_of(joint: ET.Element) -> tuple[str, float, float] | None:
-    """The joint that this one follows, multiplier and offset; None where it follows none."""
+    """Return the joint that this one follows, the multiplier and the offset; None if it follows no joint."""
     if (mimic := joint.find("mimic")) is None:
         return None
     return mimic.get("joint", ""), float(mimic.get("multiplier", "1")), float(mimic.get("offset", "0"))
 
 
 def acceleration_limit(joint: ET.Element) -> float:
-    """The least of a joint's limits [rad/s^2, m/s^2 of a sliding joint]; infinity where it has none.
+    """Return the least acceleration limit of a joint [rad/s^2, or m/s^2 of a sliding joint]; infinity without limits.
 
-    One number for both directions, and for speeding up and braking.
+    The number holds for both directions, and for speeding up and braking.
     """
     limit = joint.find("limit")
     written = [] if limit is None else [limit.get(attribute) for attribute in ATTRIBUTES]
@@ -113,7 +117,7 @@ def acceleration_limit(joint: ET.Element) -> float:
 
 
 def set_acceleration_limit(joint: ET.Element, value: float) -> None:
-    """Write ``value`` [rad/s^2, m/s^2] into a joint that has limits, in place of what it says of them."""
+    """Replace the acceleration limits of a joint that has a <limit> by ``value`` [rad/s^2 or m/s^2]."""
     for limit in joint.findall("limit"):
         for attribute in ATTRIBUTES:
             limit.attrib.pop(attribute, None)

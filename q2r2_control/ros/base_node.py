@@ -46,19 +46,20 @@ _NEVER_IDLE = 0.5
 _LEAST_END = 2.0  # Least time that a process has to end after its nodes are closed [s]. Arms brake for 3 s at most.
 _deadline = math.inf  # Time of the steady clock at which this process must have ended [s].
 # All QoS profiles keep the last messages. They are reliable and volatile unless they say otherwise.
-# For the receiver of commands. Only the newest one counts, and it must arrive.
+# The profile of a receiver of commands. Only the newest command counts, and it must arrive.
 COMMAND_QOS = QoSProfile(depth=1)
-# For the sender of commands. A reliable sender repeats messages that have not arrived, also after the network was down
-# for a while. An old target would be a jump. The lifespan counts by the sender's clock; the receiver's may differ.
+# The profile of a sender of commands. A reliable sender repeats messages that have not arrived, also after the network
+# was down for a while. An old target would be a jump. The lifespan is measured by the sender's clock, and the clock of
+# the receiver may differ.
 SENT_COMMAND_QOS = QoSProfile(depth=1, lifespan=Duration(seconds=0.1))
-# For streams of a headset or of joint states, where a late message is worth less than the next one.
+# The profile of streams of a headset or of joint states, in which a late message is worth less than the next one.
 STREAM_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
-# For messages that are only recorded. All of them count, and nobody waits for them.
+# The profile of messages that are only recorded. All of them count, and nobody waits for them.
 RECORDED_QOS = QoSProfile(depth=200)
-# For messages that later subscribers need as well, such as robot_description.
+# The profile of messages that later subscribers need as well, such as robot_description.
 LATCHED_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-_DIAGNOSTICS_PERIOD = 0.5  # [s]
-STEADY = Clock(clock_type=ClockType.STEADY_TIME)  # For timers that go on while /clock stands still.
+_DIAGNOSTICS_PERIOD = 0.5  # Time between two diagnostics [s].
+STEADY = Clock(clock_type=ClockType.STEADY_TIME)  # The clock of timers that go on while /clock stands still.
 _CLOCK_TIMEOUT = 1.0  # Simulated time that stands still for longer than this is reported [s].
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
@@ -68,7 +69,7 @@ class BaseNode(Node):
     """A node with described parameters, ``/diagnostics`` and ``~/state`` (one JSON object in a String)."""
 
     exit_code: int | None = None  # As soon as it is set, the executable ends with this exit code.
-    ticks = False  # Whether messages are taken at the node's ticks only, see TickExecutor.
+    ticks = False  # True if messages are taken only at the node's ticks, see TickExecutor.
     priority = 0  # Real-time priority, if it is permitted; 0 for an ordinary one.
 
     def __init__(self, name: str, **kwargs: Any) -> None:

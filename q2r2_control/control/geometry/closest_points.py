@@ -1,8 +1,8 @@
-"""Closest points of segments and boxes, signed, compiled.
+"""Compute the closest points and the signed distances of segments and boxes (compiled).
 
-A capsule is the set of points within ``radius`` of a segment, so the distance of two capsules is that of their segments
-less both radii. A sphere is a capsule whose segment is a point. Because the radius only shifts the distance, the
-distance stays exact and its gradient smooth well into penetration, until the segments themselves meet.
+A capsule is the set of points within ``radius`` of a segment. The distance of two capsules is therefore the distance of
+their segments minus both radii. A sphere is a capsule whose segment is a point. Because the radius only shifts the
+distance, it stays exact, and its gradient smooth, well into penetration, until the segments themselves meet.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ def dot(a: Array, b: Array) -> float:
 
 @inlined_kernel
 def size_of(a: Array) -> float:
-    """Euclidean norm of a vector."""
+    """Return the Euclidean norm of a vector."""
     return np.sqrt(dot(a, a))
 
 
 @inlined_kernel
 def way_between(a: Array, b: Array) -> float:
-    """Euclidean distance of two points."""
+    """Return the Euclidean distance of two points."""
     square = 0.0
     for k in range(a.shape[0]):
         square += (a[k] - b[k]) ** 2
@@ -41,24 +41,25 @@ def way_between(a: Array, b: Array) -> float:
 
 @kernel
 def clamp(value: float, lower: float, upper: float) -> float:
-    """``value`` moved into ``[lower, upper]``."""
+    """Return the number in ``[lower, upper]`` that is nearest to ``value``."""
     return min(max(value, lower), upper)
 
 
 @kernel
 def segment_segment(a0: Array, a1: Array, b0: Array, b1: Array, on_a: Array, on_b: Array) -> float:
-    """Return the distance [m] of segments a0-a1 and b0-b1, each (3,), and write the closest points ``on_a`` and
-    ``on_b``.
+    """Return the distance [m] of segments a0-a1 and b0-b1, each (3,). The closest points are written too.
 
-    Minimises the convex quadratic |a(s) - b(t)|^2 over the unit square. It takes the free minimum of s, then t for it,
-    then s again for the clamped t (Ericson, Real-Time Collision Detection, 2005, section 5.1.9).
+    The kernel minimises the convex quadratic |a(s) - b(t)|^2 over the unit square. It takes the free minimum of s, then
+    t for it, then s again for the clamped t (Ericson, Real-Time Collision Detection, 2005, section 5.1.9). The closest
+    points are written into ``on_a`` and ``on_b`` (3,).
     """
     aa, bb, ab, ar, br = products(a0, a1, b0, b1)
     s, t = 0.0, 0.0
     if aa > _TINY and bb > _TINY:
         determinant = aa * bb - ab * ab
-        # Parallel segments have many closest pairs; the middle of the overlap turns least when they tilt. It is too
-        # far by at most half the overlap times the angle, so only an angle below 1e-7 counts as parallel.
+        # Parallel segments have many pairs of closest points. The middle of the overlap changes least if they tilt. Its
+        # distance is too large by at most half the overlap times the angle. Therefore only segments with an angle below
+        # 1e-7 count as parallel.
         if determinant > 1e-14 * aa * bb:
             s = clamp((ab * br - ar * bb) / determinant, 0.0, 1.0)
         else:
@@ -96,7 +97,7 @@ def products(a0: Array, a1: Array, b0: Array, b1: Array) -> tuple[float, float, 
 
 @kernel
 def _middle_of_overlap(aa: float, ab: float, ar: float) -> float:
-    """Parameter on a of the middle of what b covers of it, for parallel segments."""
+    """Return, for parallel segments, the parameter on a of the middle of the part that b covers."""
     start, end = -ar / aa, (ab - ar) / aa  # Parameters of b on a.
     return 0.5 * (clamp(start, 0.0, 1.0) + clamp(end, 0.0, 1.0))
 
@@ -105,9 +106,10 @@ def _middle_of_overlap(aa: float, ab: float, ar: float) -> float:
 def segment_box(a0: Array, a1: Array, half: Array, on_a: Array, on_box: Array, normal: Array) -> float:
     """Return the signed distance [m] of a segment and a box of half sides ``half``, all in the box frame, (3,).
 
-    Writes the closest points and the unit normal from the segment to the box. The squared distance along the segment is
-    convex and piecewise quadratic. The zero of its slope is therefore found exactly between two of the at most six
-    parameters where the segment crosses a face plane. A segment that enters the box is pushed out the least way.
+    The closest points and the unit normal from the segment to the box are written. The squared distance along the
+    segment is convex and piecewise quadratic. Its pieces meet at the parameters, six at most, at which the segment
+    crosses the plane of a face. Between two of them, the zero of the slope is found exactly. A segment that enters the
+    box is pushed out on the shortest way.
     """
     s = _minimum_along(a0, a1, half)
     for k in range(3):
@@ -123,7 +125,7 @@ def segment_box(a0: Array, a1: Array, half: Array, on_a: Array, on_box: Array, n
 
 @kernel
 def _slope_along(a0: Array, a1: Array, half: Array, s: float) -> float:
-    """Half the derivative of the squared distance at parameter s."""
+    """Return half the derivative of the squared distance at the parameter s."""
     slope = 0.0
     for k in range(3):
         direction = a1[k] - a0[k]
@@ -134,10 +136,10 @@ def _slope_along(a0: Array, a1: Array, half: Array, s: float) -> float:
 
 @kernel
 def _minimum_along(a0: Array, a1: Array, half: Array) -> float:
-    """Parameter of the minimum; where many share it (a segment along a face) the middle of them.
+    """Return the parameter of the minimum. If many share it (a segment along a face), it is the middle of them.
 
-    The slope never falls, so the largest break with a negative and the smallest with a positive slope enclose all
-    minima. No break lies between them but those where the slope is zero.
+    The slope never falls. The largest break with a negative slope and the smallest break with a positive slope
+    therefore enclose all minima. Between them there are only breaks at which the slope is zero.
     """
     low, low_slope = 0.0, _slope_along(a0, a1, half, 0.0)
     high, high_slope = 1.0, _slope_along(a0, a1, half, 1.0)
@@ -178,8 +180,9 @@ def _minimum_along(a0: Array, a1: Array, half: Array) -> float:
 def _push_out(a0: Array, a1: Array, half: Array, on_a: Array, on_box: Array, normal: Array) -> float:
     """Return the shortest way out of the box for a segment that enters it.
 
-    That is to the nearest face of their Minkowski difference (Cameron, ICRA 1997). The faces belong to the box's faces,
-    and to each of its edges with the segment. Without these the depth would jump where a segment begins to cut an edge.
+    It leads to the nearest face of their Minkowski difference (Cameron, ICRA 1997). These faces belong to the faces of
+    the box, and to each of its edges with the segment. Without the latter, the depth would jump when a segment begins
+    to cut an edge.
     """
     best, axis, sign, edge = np.inf, 0, 1.0, -1
     least = 1e-6 * way_between(a0, a1)
@@ -208,9 +211,12 @@ def _push_out(a0: Array, a1: Array, half: Array, on_a: Array, on_box: Array, nor
 
 @kernel
 def _depth_across(a0: Array, a1: Array, half: Array, k: int, least: float, normal: Array) -> float:
-    """Way out of the box across its edges along axis ``k``; ``normal`` leads from the segment into the box."""
+    """Return the way out of the box across its edges along the axis ``k`` [m].
+
+    ``normal`` is written. It leads from the segment into the box.
+    """
     i, j = (k + 1) % 3, (k + 2) % 3
-    # e_k x (a1 - a0)
+    # The way out is along the cross product e_k x (a1 - a0).
     x, y = a0[j] - a1[j], a1[i] - a0[i]
     size = np.sqrt(x * x + y * y)
     if size <= least:
@@ -224,11 +230,11 @@ def _depth_across(a0: Array, a1: Array, half: Array, k: int, least: float, norma
 
 @kernel
 def _across_edge(a0: Array, a1: Array, half: Array, k: int, on_a: Array, on_box: Array, normal: Array) -> None:
-    """Return where the segment crosses the box's edge along axis ``k`` when it leaves against ``normal``."""
+    """Write where the segment crosses the box's edge along axis ``k`` when it leaves against ``normal``."""
     i, j = (k + 1) % 3, (k + 2) % 3
     for axis in (i, j):
         on_box[axis] = -half[axis] if normal[axis] > 0.0 else half[axis]
-    # Seen along the edge the segment is a line; its foot is where the edge is nearest.
+    # Seen along the edge, the segment is a line. The foot of the perpendicular is its point nearest to the edge.
     x, y = a1[i] - a0[i], a1[j] - a0[j]
     s = clamp(((on_box[i] - a0[i]) * x + (on_box[j] - a0[j]) * y) / (x * x + y * y), 0.0, 1.0)
     for axis in range(3):

@@ -1,7 +1,7 @@
-"""A robot's collision geometries and monitored pairs as arrays, and their places at a posture, compiled.
+"""A robot's collision geometries and monitored pairs as arrays, and their places at a posture (compiled).
 
-Every geometry is a segment with a radius (capsule, sphere) or a box. Only joints that move one body of a pair relative
-to the other are listed with the pair.
+Every geometry is a segment with a radius (capsule, sphere) or a box. A pair lists only the joints that move one of its
+bodies relative to the other.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from q2r2_control.types import Array
 
 
 class CollisionBodies(NamedTuple):
-    """Collision geometries in their joint's frame.
+    """The collision geometries, each in the frame of its joint.
 
-    Start and end of fingers change, radius and size of those that turn too, see :mod:`finger_openings`.
+    Start and end of fingers change. Radius and size of fingers that turn change too, see :mod:`finger_openings`.
     """
 
-    joint: IntArray  # (g,) 0 is the world
-    box: IntArray  # (g,) 1 for a box
+    joint: IntArray  # (g,) Number of the joint; 0 is the world.
+    box: IntArray  # (g,) 1 for a box, 0 for a segment.
     start: Array  # (g, 3) Start of the segment, or centre of the box [m].
     end: Array  # (g, 3) End of the segment [m].
     radius: Array  # (g,) Radius [m]; for a box 0, or the radius of its rounded edges.
@@ -39,14 +39,14 @@ class CollisionBodies(NamedTuple):
 class Pairs(NamedTuple):
     """The pairs of geometries that must not meet, and the joints that move them relative to each other."""
 
-    first: IntArray  # (p,) Index of a geometry that is never a box.
-    second: IntArray  # (p,)
-    joint: IntArray  # (p, k) joint indices, padded with 0
-    sign: Array  # (p, k) +1: the joint moves the second geometry, -1: the first
+    first: IntArray  # (p,) Index of the first geometry, which is never a box.
+    second: IntArray  # (p,) Index of the second geometry.
+    joint: IntArray  # (p, k) Numbers of the joints, padded with 0.
+    sign: Array  # (p, k) +1 if the joint moves the second geometry, -1 if it moves the first one.
     # (p, k) Bound on the distance of the geometry's points from the joint's axis [m]; 1 for a sliding joint.
     reach: Array
-    leverage: Array  # (p,) Sum of reach.
-    carried: IntArray  # (p,) 1: some joint moves both geometries alike, and is not listed
+    leverage: Array  # (p,) Sum of ``reach`` over the joints.
+    carried: IntArray  # (p,) 1 if some joint moves both geometries alike. Such a joint is not listed.
 
 
 class CollisionModel(NamedTuple):
@@ -60,19 +60,19 @@ class CollisionModel(NamedTuple):
 class BodyPlacements(NamedTuple):
     """Geometries in the world, written by :func:`update_placements`."""
 
-    start: Array  # (g, 3)
-    end: Array  # (g, 3)
+    start: Array  # (g, 3) [m]
+    end: Array  # (g, 3) [m]
     rotation: Array  # (g, 3, 3)
 
 
 class Contact(NamedTuple):
-    """The last pair that was measured, in the world."""
+    """The pair that was measured last, in the world."""
 
-    first: Array  # (3,) closest points [m]
-    second: Array  # (3,)
+    first: Array  # (3,) The closest point of the first body [m].
+    second: Array  # (3,) The closest point of the second body [m].
     normal: Array  # (3,) Unit vector from the first to the second body.
-    local: Array  # (3, 3) scratch
-    kept: Array  # (2, 3) scratch: closest points that are needed after another part has been measured
+    local: Array  # (3, 3) Scratch.
+    kept: Array  # (2, 3) Scratch: closest points that are needed after another part has been measured.
 
     @classmethod
     def empty(cls) -> Contact:
@@ -80,7 +80,7 @@ class Contact(NamedTuple):
 
 
 class CollisionData(NamedTuple):
-    """A posture as :func:`update_placements` writes it, and scratch to measure a pair there."""
+    """A posture, written by :func:`update_placements`, and scratch to measure a pair there."""
 
     placements: Placements
     posed: BodyPlacements
@@ -94,22 +94,23 @@ class CollisionData(NamedTuple):
 
 
 def collision_model_of(robot: Robot, geometry: pin.GeometryModel | None = None) -> CollisionModel:
-    """Joints, bodies and pairs of a robot, or of a ``geometry`` that begins with the robot's.
+    """Return the joints, bodies and pairs of a robot, or of a ``geometry`` that begins with the robot's.
 
-    Raises :class:`RobotError` for what no kernel handles.
+    Raises:
+        RobotError: If no kernel handles a joint, a shape or a pair.
     """
     geometry = robot.collision_model if geometry is None else geometry
     chain, bodies = chain_of(robot.model), bodies_of(geometry)
     travel = np.maximum(np.abs(robot.position_lower), np.abs(robot.position_upper))
     extent = farthest_of(bodies)
-    # Capsules of other intervals may reach outside that of the whole interval.
+    # Capsules of other intervals may reach beyond the capsule of the whole interval.
     for number, finger in turning_bodies(robot):
         extent[number] = max(extent[number], finger.extent)
     return CollisionModel(chain, bodies, pairs_of(geometry, chain, bodies, travel, extent))
 
 
 def bodies_of(model: pin.GeometryModel) -> CollisionBodies:
-    """Read capsules, spheres and boxes. Raises :class:`RobotError` for any other shape."""
+    """Return the arrays of capsules, spheres and boxes; raises :class:`RobotError` for any other shape."""
     count = model.ngeoms
     bodies = CollisionBodies(
         joint=np.array([geometry.parentJoint for geometry in model.geometryObjects], dtype=np.int64),
@@ -138,22 +139,29 @@ def bodies_of(model: pin.GeometryModel) -> CollisionBodies:
 
 
 def turning_bodies(robot: Robot) -> list[tuple[int, TurningBody]]:
-    """Fingers that turn, each with the number of its geometry."""
+    """Return the fingers that turn, each with the number of its geometry."""
     numbers = {geometry.name: number for number, geometry in enumerate(robot.collision_model.geometryObjects)}
     return [(numbers[finger.name], finger) for finger in robot.finger_bodies if isinstance(finger, TurningBody)]
 
 
 def farthest_of(bodies: CollisionBodies) -> Array:
-    """Return how far segments and boxes reach from the origins of their joints' frames (g,) [m]."""
+    """Return the farthest distance of segments and boxes from the origins of their joints' frames (g,) [m]."""
     ends = np.maximum(np.linalg.norm(bodies.start, axis=1), np.linalg.norm(bodies.end, axis=1))
     return np.asarray(np.linalg.norm(bodies.half, axis=1) + ends)
 
 
 def pairs_of(model: pin.GeometryModel, chain: Chain, bodies: CollisionBodies, travel: Array, extent: Array) -> Pairs:
-    """Return the monitored pairs of ``model``. Joints can be ``travel`` (nv,) away from zero [rad or m].
+    """Return the monitored pairs of ``model``.
 
-    ``extent`` (g,) is what :func:`farthest_of` the bodies never exceeds, whatever becomes of them [m]. Raises
-    :class:`RobotError` for a pair of two boxes, which no kernel measures.
+    Args:
+        model: The geometries and their pairs.
+        chain: The joints.
+        bodies: The bodies of ``model``.
+        travel: Greatest distance of each joint from zero (nv,) [rad or m].
+        extent: A bound (g,) on :func:`farthest_of` the bodies, which holds for all their later changes [m].
+
+    Raises:
+        RobotError: If both bodies of a pair are boxes, because no kernel measures such a pair.
     """
     rows = []
     offsets = [float(np.linalg.norm(translation)) for translation in chain.translation]
@@ -167,7 +175,7 @@ def pairs_of(model: pin.GeometryModel, chain: Chain, bodies: CollisionBodies, tr
         for body, sign in ((first, -1.0), (second, 1.0)):
             farthest = extent[body]
             joint = int(bodies.joint[body])
-            # Walking up, the bound grows by each link's offset and by how far each slide extends.
+            # On the way to the base, the bound grows by the offset of each link, and by the travel of each slide.
             while joint != 0:
                 if chain.prismatic[joint]:
                     farthest += travel[joint - 1]
@@ -191,7 +199,7 @@ def pairs_of(model: pin.GeometryModel, chain: Chain, bodies: CollisionBodies, tr
 
 @kernel
 def update_placements(model: CollisionModel, data: CollisionData, q: Array) -> None:
-    """Write joint frames and geometries in the world at ``q`` (nv,)."""
+    """Write the joint frames and the geometries in the world at ``q`` (nv,)."""
     bodies, placements, posed = model.bodies, data.placements, data.posed
     place(model.chain, q, placements)
     for g in range(bodies.joint.shape[0]):

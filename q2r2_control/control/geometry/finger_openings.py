@@ -1,9 +1,10 @@
 """The bodies of the fingers in one collision model, for the known openings of their grippers.
 
-They are changed in place, where the kernels read them. A part of a sliding finger's way is nowhere farther from a
-joint's axis than all of it (``Pairs.reach``, ``leverage``) and fits into a ball of that size about its own middle
-(``CollisionBodies.size``), so every bound made of these holds as it is. A finger that turns has another capsule, radius
-and size for each interval; ``reach`` and ``leverage`` are made of the farthest of them (``collision_model_of``).
+They are changed in place, where the kernels read them. Let a sliding finger count as a part of its way. This part is
+nowhere farther from a joint's axis than the whole way (``Pairs.reach``, ``leverage``). It also fits into a ball of the
+same size about its own middle (``CollisionBodies.size``). Every bound that uses these numbers therefore stays valid. A
+finger that turns has another capsule, radius and size for each interval. Its ``reach`` and ``leverage`` come from the
+farthest one (``collision_model_of``).
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.robot.turning_fingers import Capsules, TurningBody, TurningSweeps, sticks_out
 from q2r2_control.types import ALL_OF_THE_WAY, Interval
 
-# A gripper that is held asks again and again for intervals that it already has.
+# Number of intervals whose capsules are kept. A gripper that is held asks again and again for the same intervals.
 _REMEMBERED = 16
 
 
@@ -46,7 +47,7 @@ class FingerOpenings:
         self._parts: dict[int, tuple[float, float]] = {}
 
     def checked(self, arm: str, least: float, greatest: float) -> Interval:
-        """Return the interval in a form that can be set. Raises :class:`RobotError` for an invalid interval."""
+        """Return the interval in a form that can be set; raises :class:`RobotError` if it is not an interval."""
         usable = all(isinstance(value, int | float | np.floating) for value in (least, greatest))
         if not (usable and -math.inf < least <= greatest < math.inf):
             raise RobotError(
@@ -55,10 +56,10 @@ class FingerOpenings:
         return float(min(max(least, 0.0), 1.0)), float(min(max(greatest, 0.0), 1.0))
 
     def set(self, arm: str, interval: Interval) -> IntArray:
-        """Let an arm's fingers sweep ``interval``. Return 1 for each body (g,) that has grown.
+        """Let an arm's fingers sweep ``interval``. Return 1 for each body that has grown, else 0 (g,).
 
-        That is: is not within what it was before. One that slides grows by a wider interval only, one that turns may
-        by a narrower one.
+        A body has grown if it is not within its former volume. A sliding finger grows only with a wider interval. A
+        turning finger may also grow with a narrower one.
         """
         grown: IntArray = np.zeros(len(self._bodies.joint), dtype=np.int64)
         self.intervals[arm] = interval

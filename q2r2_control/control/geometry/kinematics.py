@@ -1,7 +1,7 @@
-"""Forward kinematics of a tree of one-axis joints, compiled; equal to Pinocchio's, without its call overhead.
+"""Forward kinematics of a tree of one-axis joints (compiled). It equals Pinocchio's, without the overhead of calls.
 
-The stop roll-out needs the links' placements at many configurations per tick, so this part of Pinocchio is written out
-here. A test holds it to Pinocchio for every robot.
+The roll-out of a stop needs the placements of the links at many configurations in each tick. For that reason this part
+of Pinocchio is written again here. A test compares it with Pinocchio for every robot.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ _ANY_MOTION = 1e-9  # Least length of a unit axis that is more than rounding.
 
 
 class Chain(NamedTuple):
-    """Joint tree as arrays; index 0 is the world, joint i moves with velocity index i - 1."""
+    """The tree of joints as arrays. Index 0 is the world, and joint i has the velocity index i - 1."""
 
-    parent: IntArray  # (n,)
-    rotation: Array  # (n, 3, 3) joint frame in the parent joint's frame at zero
-    translation: Array  # (n, 3) [m]
-    axis: Array  # (n, 3) unit axis in the joint frame
-    prismatic: IntArray  # (n,) 1 where the joint slides
+    parent: IntArray  # (n,) Number of the parent joint.
+    rotation: Array  # (n, 3, 3) Rotation of the joint's frame in the frame of the parent joint, at zero.
+    translation: Array  # (n, 3) Position of the same frame [m].
+    axis: Array  # (n, 3) Unit axis in the joint's frame.
+    prismatic: IntArray  # (n,) 1 if the joint slides.
 
 
 class Placements(NamedTuple):
@@ -45,7 +45,11 @@ class Placements(NamedTuple):
 
 
 def chain_of(model: pin.Model) -> Chain:
-    """Read a Pinocchio model whose joints each have one position and one velocity. Raises :class:`RobotError`."""
+    """Return the joints of a Pinocchio model.
+
+    Raises:
+        RobotError: If a joint does not have exactly one position and one velocity, or if it is a screw.
+    """
     axis = np.zeros((model.njoints, 3))
     prismatic = np.zeros(model.njoints, dtype=np.int64)
     data = model.createData()
@@ -79,7 +83,7 @@ def place(chain: Chain, q: Array, placements: Placements) -> None:
         sine, versine = 0.0, 0.0
         if chain.prismatic[i] == 0:
             sine, versine = np.sin(q[i - 1]), 1.0 - np.cos(q[i - 1])
-        # Rodrigues: I + sin K + (1 - cos) K^2
+        # This is the formula of Rodrigues, I + sin K + (1 - cos) K^2.
         t00 = 1.0 - versine * (y * y + z * z)
         t01 = versine * x * y - sine * z
         t02 = versine * x * z + sine * y

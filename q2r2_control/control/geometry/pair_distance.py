@@ -1,17 +1,17 @@
-"""Signed distances of monitored pairs, exact and smooth, and the rows that are their gradients, compiled.
+"""Compute the signed distances of monitored pairs, exact and smooth, and the rows that are their gradients (compiled).
 
 For the closest points p1, p2 and the unit normal n from the first body to the second, the distance changes with d' = n'
 (J_p2 - J_p1) v. Only joints that move one body relative to the other appear in it.
 
-**Smooth distances** have a gradient that never jumps, for forces that follow it. The closest points of two parallel
-segments, or of a segment along a box's face, jump from end to end as the bodies tilt. Here their parameters s, t in
-[0, 1] are drawn to the segments' middles by a small cost,
+**Smooth distances** have a gradient that never jumps. Forces that follow the gradient need this. The closest points of
+two parallel segments, or of a segment along a box's face, jump from end to end as the bodies tilt. Here a small cost
+draws their parameters s, t in [0, 1] to the middles of the segments,
 
-    D^2 = min |a(s) - b(t)|^2 + e ((s - 1/2)^2 + (t - 1/2)^2),
+    D^2 = min |a(s) - b(t)|^2 + e ((s - 1/2)^2 + (t - 1/2)^2).
 
-which makes them unique and continuous in the posture. By the envelope theorem dD = (b - a)' d(b - a) / D at the points
-found. The pair's row with the normal (b - a) / D, slightly shorter than one, is exactly the gradient of D. D is larger
-than the distance d of the cores, by e / (4 d) at most.
+This makes them unique, and continuous in the posture. By the envelope theorem dD = (b - a)' d(b - a) / D at these
+points. The row of the pair with the normal (b - a) / D, which is slightly shorter than one, is exactly the gradient of
+D. D is larger than the distance d of the cores, by e / (4 d) at most.
 """
 
 from __future__ import annotations
@@ -56,8 +56,8 @@ def at_least(model: CollisionModel, data: CollisionData, p: int) -> float:
 def measure(model: CollisionModel, data: CollisionData, p: int) -> float:
     """Return the signed distance [m] of pair ``p``, and fill ``data.contact``.
 
-    The points lie on the core segment, not on the capsule's surface: they differ by a multiple of the normal, which
-    changes no rate of distance.
+    The points lie on the core segments, and not on the surfaces of the capsules. Both differ by a multiple of the
+    normal, which does not change the rate of the distance.
     """
     first = model.pairs.first[p]
     return measure_part(model, data, p, data.posed.start[first], data.posed.end[first])
@@ -65,7 +65,7 @@ def measure(model: CollisionModel, data: CollisionData, p: int) -> float:
 
 @inlined_kernel
 def measure_part(model: CollisionModel, data: CollisionData, p: int, start: Array, end: Array) -> float:
-    """As :func:`measure`, of the part from ``start`` to ``end``, (3,) each, of the pair's first geometry."""
+    """Measure like :func:`measure`, with only the part from ``start`` to ``end`` (3,) of the pair's first geometry."""
     bodies, posed, first, second = model.bodies, data.posed, model.pairs.first[p], model.pairs.second[p]
     if bodies.box[second] == 1:
         cores = _to_box(start, end, posed.start[second], posed.rotation[second], bodies.half[second], data.contact)
@@ -90,7 +90,7 @@ def _to_box(start: Array, end: Array, centre: Array, axes: Array, half: Array, c
 
 @kernel
 def _into_box_frame(start: Array, end: Array, centre: Array, axes: Array, local: Array) -> None:
-    """Two points, (3,) each, into the first rows of ``local``."""
+    """Write two points (3,) of the world, in the frame of the box, into the first rows of ``local``."""
     for k in range(3):
         local[0, k], local[1, k] = 0.0, 0.0
         for row in range(3):
@@ -120,7 +120,7 @@ def _to_segment(start: Array, end: Array, other_start: Array, other_end: Array, 
 
 @kernel
 def _any_normal(a0: Array, a1: Array, b0: Array, b1: Array, normal: Array) -> None:
-    """A unit normal for segments that touch: across both, or between their middles if they are parallel."""
+    """Write a unit normal of segments that touch. It is normal to both, or between the middles of parallel ones."""
     between = 0.0
     for k in range(3):
         i, j = (k + 1) % 3, (k + 2) % 3
@@ -154,14 +154,15 @@ def distance_row(model: CollisionModel, data: CollisionData, p: int, row: Array)
         row[joint - 1] = sign * (nx * (ay * z - az * y) + ny * (az * x - ax * z) + nz * (ax * y - ay * x))
 
 
-# Of half a box's thickness: what its skin takes at most.
+# Greatest share of half the thickness of a box by which its edges are rounded.
 _THICKEST_SKIN = 0.9
 
 
 def with_rounded_boxes(model: CollisionModel, depth: Array) -> CollisionModel:
-    """A model whose pairs with ``depth`` (p,) [m] above 0 see a box rounded by that much, or by as much as it is thick.
+    """Return a model with rounded boxes for the pairs with a ``depth`` (p,) [m] above 0.
 
-    Every other pair sees the boxes as they are. Pairs keep their order.
+    The radius of the edges is the depth, or less if the box is thin. All other pairs have the boxes without rounded
+    edges. The pairs keep their order.
     """
     bodies, pairs = model.bodies, model.pairs
     second = pairs.second.copy()
@@ -182,9 +183,9 @@ def with_rounded_boxes(model: CollisionModel, depth: Array) -> CollisionModel:
 
 
 def deeper_at_corners(model: CollisionModel, kept: Array) -> Array:
-    """Return how much deeper than -``kept`` (p,) [m] pairs that may touch can get into a real corner (p,) [m]
+    """Return by how much more than -``kept`` (p,) [m] pairs that may touch can get into a real corner (p,) [m].
 
-    else 0.
+    It is 0 for all other pairs.
     """
     boxed = (kept < 0.0) & (model.bodies.box[model.pairs.second] == 1)
     return np.where(boxed, (1.0 - 1.0 / np.sqrt(3.0)) * model.bodies.radius[model.pairs.first], 0.0)
@@ -195,7 +196,10 @@ _HALVINGS = 40
 
 @kernel
 def measure_smooth(model: CollisionModel, data: CollisionData, p: int, smoothing: float) -> float:
-    """Smooth signed distance [m] of pair ``p``, cores apart; fills ``data.contact``. ``smoothing``: e [m^2]."""
+    """Return the smooth signed distance [m] of pair ``p``, whose cores do not meet, and fill ``data.contact``.
+
+    ``smoothing`` is e [m^2].
+    """
     bodies, posed, contact = model.bodies, data.posed, data.contact
     first, second = model.pairs.first[p], model.pairs.second[p]
     start, end = posed.start[first], posed.end[first]
@@ -210,7 +214,7 @@ def measure_smooth(model: CollisionModel, data: CollisionData, p: int, smoothing
 
 @kernel
 def _segment_segment(a0: Array, a1: Array, b0: Array, b1: Array, smoothing: float, contact: Contact) -> float:
-    """D of two segments; the quadratic is strictly convex, so no case is degenerate."""
+    """Return D of two segments [m]. The quadratic is strictly convex, and so no case is degenerate."""
     aa, bb, ab, ar, br = products(a0, a1, b0, b1)
     aa, bb, ar, br = aa + smoothing, bb + smoothing, ar - 0.5 * smoothing, br + 0.5 * smoothing
     s = clamp((ab * br - ar * bb) / (aa * bb - ab * ab), 0.0, 1.0)
@@ -230,7 +234,7 @@ def _segment_segment(a0: Array, a1: Array, b0: Array, b1: Array, smoothing: floa
 def _segment_box(
     a0: Array, a1: Array, posed: BodyPlacements, half: Array, box: int, smoothing: float, contact: Contact
 ) -> float:
-    """D of a segment and a box. The slope of D^2 rises strictly with s, so halving finds its zero."""
+    """Return D of a segment and a box [m]. The slope of D^2 rises strictly with s, and so bisection finds its zero."""
     axes, centre, start, along = posed.rotation[box], posed.start[box], contact.local[0], contact.local[1]
     _into_box_frame(a0, a1, centre, axes, contact.local)
     along -= start

@@ -1,4 +1,4 @@
-"""Proof that two arms stay apart though one of them is late, or stands still while the other one stops, compiled.
+"""Prove that two arms stay apart if one of them is late, or stands still while the other one stops (compiled).
 
 One reference moves all arms. Each real arm follows it on its own: the answers of one may come later, and one may stop
 alone. Let a real arm be nowhere but on its own way, which is where the reference had it in the last ``window`` [s], and
@@ -12,16 +12,16 @@ bodies (the ends of a segment, the corners of a box) let
 Then the bodies are c apart wherever on its way each arm is, whatever the other one does. *Proof.* The plane between
 them lies beyond all places of either body. []
 
-The ways are looked at from instant to instant. Between two of them, a time l apart, a corner is off the straight line
-between its places by at most l^2/8 of its greatest acceleration. That is at most
+The ways are examined from instant to instant. Let two of them be a time l apart. Between them, a corner is off the
+straight line between its places by at most l^2/8 of its greatest acceleration. That is at most
 
     sum_k reach_k (|a_k| + |v_k| (|v_k| + 2 sum_(i before k) |v_i|))
 
 for speeds v and accelerations a of the joints that move it (separating_plane.py has why).
 
-**Induction.** A step is taken only if that is proven for the way that ends with its own stop. Where none is, the arms
-go on along the stop before. That way was proven then, and the window leaves more and more of it behind. A window that
-grows no faster than time passes begins where it began before, so it needs no proof.
+**Induction.** A step is taken only if that is proven for the way that ends with its own stop. If it is proven for no
+step, the arms go on along the stop before. That way was proven then, and the window leaves more and more of it behind.
+A window that grows no faster than time passes begins where it began before, and so it needs no proof.
 
 Most pairs need no plane. Compared with v t, a joint is off by e_j at most in the window, which is known, and by rho_j
 in the step and the stop (speed_bound.py). Neither body then comes closer to the other by more than its own speed times
@@ -47,7 +47,7 @@ _STOP_SPACING = 0.015  # Longest time between two examined instants of a stop [s
 def write_way(model: SafetyModel, data: SafetyData, h: float, duration: float) -> None:
     """Write bounds on all joints along their whole way, with a step of ``h`` and a stop of ``duration`` [s].
 
-    Needs :func:`look_back`, and what the other proofs write of the step and the stop.
+    It needs :func:`look_back`, and the data that the other proofs write about the step and the stop.
     """
     history, v, v_next, candidate = data.history, data.state.v, data.candidate.v, data.candidate
     last = data.rollout.q.shape[0] - 1
@@ -77,7 +77,7 @@ def _stride(data: SafetyData, duration: float, finely: bool) -> int:
 def is_far(model: SafetyModel, data: SafetyData, p: int, time: float) -> bool:
     """Return whether pair ``p`` of two arms is too far apart to meet on their own ways; see the claim's end.
 
-    ``time`` is that of the step and the stop, h + T / 2 [s]. Needs :func:`write_way`.
+    ``time`` is the time of the step and the stop, h + T / 2 [s]. It needs :func:`write_way`.
     """
     pairs = model.collision.pairs
     speed = speed_of(data.velocities, pairs.first[p]) + speed_of(data.velocities, pairs.second[p])

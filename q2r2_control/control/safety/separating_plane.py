@@ -125,7 +125,7 @@ def _gap(
     piece: QuadraticPiece,
     then: QuadraticPiece,
 ) -> Gap:
-    """The share of a  ``corner`` (3,) of one side of a pair, -1 the first's or 1 the second's, in the gap."""
+    """Return the share of a ``corner`` (3,) in the gap. ``side`` is -1 for the pair's first body, 1 for the second."""
     chain, pairs, placements, normal = model.chain, model.pairs, data.placements, data.contact.normal
     nx, ny, nz = side * normal[0], side * normal[1], side * normal[2]
     x, y, z = corner[0], corner[1], corner[2]
@@ -141,7 +141,7 @@ def _gap(
         if chain.prismatic[joint] == 1:
             along = nx * ax + ny * ay + nz * az
         else:
-            # n'(axis x r) = (n x axis)'r, for the lever r of the corner.
+            # The following numbers are n x axis, because n'(axis x r) = (n x axis)'r for the lever r of the corner.
             mx, my, mz = ny * az - nz * ay, nz * ax - nx * az, nx * ay - ny * ax
             origin = placements.translation[joint]
             along = mx * (x - origin[0]) + my * (y - origin[1]) + mz * (z - origin[2])

@@ -56,7 +56,7 @@ class StopTime(NamedTuple):
 _SHARE = 0.25
 # An end of a near-parallel capsule gets a row of its own if it is farther than this from the closest point.
 _SAME_POINT = 0.005  # [m]
-# An instant whose distance is greater than the least one by less than this has a row already, so that rows do not
+# An instant gets a row already if its distance is greater than the least one by less than this. Otherwise rows would
 # switch from tick to tick.
 _SAME_DISTANCE = 0.002  # [m]
 # If a stop bends the ways of a pair's points by less than this, the row looks along the tangent at its start.
@@ -161,7 +161,7 @@ def _append_row(
     if slow < np.inf:
         allowed = max(allowed, -h * max(slow, gain * (free - model.approach.contact_zone[p])))
     if free < 0.0:
-        # Rows that ask for more than the joints can do would be weighed against each other, and a deep pair would open
+        # Rows that ask for more than the joints can do would be weighed against each other. A deep pair would then open
         # at the cost of closing another one.
         allowed = min(allowed, model.approach.recovery_speed * h, max(h * rate, 0.0) + _SHARE * change)
     if h * rate - change >= allowed or change <= 0.0:

@@ -1,7 +1,7 @@
 """Bound how much closer two bodies come in a step and the stop after it, by their present speeds (compiled).
 
 The bound by reach (stop_certificate.py) treats every joint as if it moved straight towards the other body. For most
-pairs of two moving arms the speeds of the bodies suffice: joints that stop together keep the direction of their motion,
+pairs of two moving arms the speeds of the bodies suffice. Joints that stop together keep the direction of their motion,
 and arms that move alike do not close in at all.
 
 **Speed.** A geometry lies in the ball of radius s around its middle. With the middle moving at u and the link turning

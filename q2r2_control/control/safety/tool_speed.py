@@ -1,4 +1,4 @@
-"""The proof that no tool is faster than allowed in a step and in the full stop after it, compiled.
+"""Prove that no tool is faster than allowed in a step and in the full stop after it (compiled).
 
 The speed of a tool's origin is |J(q) v|, with the linear part J of its Jacobian. J_j is what joint j adds, and reach_j
 bounds how far the tool ever is from that joint's axis.
@@ -47,14 +47,14 @@ _SAME_TIME = 1e-9  # Relative tolerance: two joints whose stops differ by less r
 class ToolLimits(NamedTuple):
     """The origins of all tools, and their largest speed."""
 
-    joint: IntArray  # (n,) joint that carries the tool
-    translation: Array  # (n, 3) in the joint's frame [m]
-    reach: Array  # (n, nv) bound on how far the tool is from a joint's axis [m]; 1 for a sliding joint
-    speed: float  # Speed that no tool exceeds, infinite without a limit [m/s].
+    joint: IntArray  # (n,) Number of the joint that carries the tool.
+    translation: Array  # (n, 3) Origin of the tool in the joint's frame [m].
+    reach: Array  # (n, nv) Bound on the distance of the tool from each joint's axis [m]; 1 for a sliding joint.
+    speed: float  # Speed that no tool exceeds; infinite without a limit [m/s].
 
 
 def tool_limits_of(robot: Robot, chain: Chain, speed: float | None) -> ToolLimits:
-    """The tools of a robot's arms, which may be as fast as ``speed`` [m/s], or as they can be if it is None."""
+    """Return the tools of a robot's arms with the speed limit ``speed`` [m/s]; None if there is no limit."""
     n, nv = len(robot.arms), robot.model.nv
     speed = np.inf if speed is None else speed
     limits = ToolLimits(np.zeros(n, dtype=np.int64), np.zeros((n, 3)), np.zeros((n, nv)), float(speed))
@@ -73,12 +73,12 @@ def tool_limits_of(robot: Robot, chain: Chain, speed: float | None) -> ToolLimit
 
 
 class ToolSpeeds(NamedTuple):
-    """Written when a step is decided on."""
+    """Data that are written when a step is decided on."""
 
-    held: IntArray  # (n,) 1 where a tool's limit held a step back
-    origin: Array  # (3,) scratch [m]
-    columns: Array  # (nv, 3) scratch: J_j v+_j of each joint [m/s]
-    total: Array  # (3,) scratch [m/s]
+    held: IntArray  # (n,) 1 if the limit of a tool held a step back.
+    origin: Array  # (3,) Scratch [m].
+    columns: Array  # (nv, 3) Scratch: J_j v+_j of each joint [m/s].
+    total: Array  # (3,) Scratch [m/s].
 
     @classmethod
     def empty(cls, limits: ToolLimits) -> ToolSpeeds:
@@ -90,7 +90,7 @@ class ToolSpeeds(NamedTuple):
 def keeps_tool_speed(model: SafetyModel, data: SafetyData, h: float) -> bool:
     """Return whether no tool is too fast in the step to ``data.candidate`` in ``h`` [s] and the full stop after it.
 
-    Needs the placements at the reference, where tools are not too fast, or the stop at hand is executed.
+    It needs the placements at the reference. The tools are not too fast there, or the known stop is being executed.
     """
     limits = model.tools
     if limits.speed == np.inf:

@@ -1,5 +1,5 @@
-"""Solvers of the QP by name, with one module for each: DAQP and OSQP called directly, all others through qpsolvers.
+"""Solvers of the QP by name. DAQP and OSQP are called directly, and all others through qpsolvers.
 
-``registry`` finds the solver of a name. ``guard`` stands before every solver but DAQP: it hands out copies, and turns
-whatever is not a solution into a failed solve, after which the certified stop is executed.
+``registry`` finds the solver of a name. ``guard`` stands before every solver except DAQP. It passes copies to the
+solver, and turns every answer that is not a solution into a failed solve. The certified stop is executed then.
 """

@@ -1,4 +1,4 @@
-"""DAQP called directly: the default, and the fast path."""
+"""Call DAQP directly. It is the default solver and the fastest way."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ _HARD, _SOFT = 0, 8  # Marks of a row in DAQP.
 
 
 class DaqpSolver:
-    """DAQP (Arnstrom, Bemporad, Axehill, IEEE TAC 2022): dual active set, soft rows.
+    """DAQP (Arnstrom, Bemporad, Axehill, IEEE TAC 2022), a dual active-set method with soft rows.
 
-    It starts cold at each tick. The last multipliers as a start save 16 of 17 iterations in contact, but no time: most
-    of it goes into setting the problem up. The solution would depend on the past besides.
+    It starts cold at each tick. A start from the last multipliers would save 16 of 17 iterations in contact. It would
+    save no time, because most of it goes into the set-up of the problem. The solution would also depend on the past.
 
     Args:
-        nv: number of joints.
-        time_limit: DAQP gives up after this time [s]; None: never.
-        options: settings of ``daqp.solve``, such as ``iter_limit``.
+        nv: Number of joints.
+        time_limit: DAQP gives up after this time [s]; None if it never gives up.
+        options: Settings of ``daqp.solve``, such as ``iter_limit``.
     """
 
     _OPTIMAL = (1, 2)  # The value 2 means optimal with a violated soft row.
@@ -35,7 +35,7 @@ class DaqpSolver:
         self._sense = np.zeros(nv, dtype=np.int32)
 
     def solve(self, problem: QpProblem) -> QpSolution:
-        """See :class:`Solver`; DAQP is asked only where a bound holds the cost's own minimum back."""
+        """See :class:`Solver`. DAQP is called only if a bound holds the minimum of the cost back."""
         if problem.minimum is not None:
             return QpSolution(problem.minimum, 0.0)
         nv = self._nv

@@ -1,10 +1,10 @@
-"""Keeps a foreign solver away from the controller's arrays, and its failures out of a step.
+"""Keep a foreign solver away from the controller's arrays, and its failures out of a step.
 
-The safety filter clamps the answer to the very box that a solver is handed. A solver that wrote into that box would
-move the limits, and the certificate would be about the moved ones. A solver therefore gets copies.
+The safety filter clamps the answer to the same box that a solver gets. If a solver wrote into this box, it would move
+the limits, and the certificate would be about the moved limits. A solver therefore gets copies.
 
-Costs and rows of a program's own may be of any size, and the sum of costs need not be convex. Libraries print a line
-or loop for ever at such a problem. No solver is asked about one.
+The user's own costs and rows may be of any size, and the sum of costs need not be convex. Libraries print a line or
+loop for ever at such a problem. No solver gets one.
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ from q2r2_control.control.qp import QpProblem, QpSolution, Solver
 from q2r2_control.errors import raised, shown
 
 _REAL = "fiu"  # Kinds of dtype that are real numbers.
-# Numbers of a problem that may be solved, and the least diagonal of its cost's Cholesky factor. Ours are near 1.
+# Largest number of a problem that may be solved, and least diagonal of its cost's Cholesky factor. Ours are near 1.
 _LARGEST, _FLATTEST = 1e12, 1e-8
 _FAILED = QpSolution(None, 0.0)
 
 
 class Guard:
-    """Asks a ``solver`` and returns a solution of our own arrays, or none. It raises nothing.
+    """Calls a ``solver``, and returns a solution in arrays of its own, or none. It raises nothing.
 
     Args:
-        solver: an object with ``solve``, from anywhere.
-        nv: number of joints.
-        clock: what a solve is timed by [s].
+        solver: An object with ``solve``, from any source.
+        nv: Number of joints.
+        clock: The clock that measures the time of a solve [s].
 
     Attributes:
-        failure: why the last answer was not a solution; None if it was one.
+        failure: The reason why the last answer was not a solution; None if it was one.
     """
 
     def __init__(self, solver: Solver, nv: int, clock: Callable[[], float] = time.perf_counter) -> None:
@@ -45,8 +45,8 @@ class Guard:
         """See :class:`Solver`.
 
         The answer must have a real array ``v`` of shape (nv,), all finite, and a finite ``solve_time`` of at least 0.
-        An exception, and any other answer, is a failed solve. ``v = None`` is one by the solver's own word. The
-        ``solve_time`` of the result is at least what we measured, so that no solver can say that it was in time.
+        An exception or any other answer counts as a failed solve. With ``v = None`` the solver itself reports a failed
+        solve. The ``solve_time`` of the result is at least our measured time, so that no solver can hide a delay.
         """
         try:
             self.failure = _fault_of(problem)
@@ -61,7 +61,7 @@ class Guard:
                 return QpSolution(np.array(v, dtype=float), max(float(solve_time), measured))
         except (KeyboardInterrupt, SystemExit):  # The handler of a signal ends the program.
             raise
-        except BaseException as error:  # A panic in Rust is one too. Each means a tick without a solution.
+        except BaseException as error:  # This includes a panic in Rust. Each means a tick without a solution.
             self.failure = raised(error)
         return _FAILED
 

@@ -1,14 +1,14 @@
-"""OSQP (Stellato et al., Mathematical Programming Computation 2020), set up once and warm-started from tick to tick.
+"""Call OSQP (Stellato et al., Mathematical Programming Computation 2020) with a warm start from tick to tick.
 
-OSQP is a first-order method, which needs a problem of even scale. With H = L L' and w = L' v the cost is that of
-a unit ball, and with rows a_i L^-T of unit norm the slack of each has one and the same softness:
+OSQP is a first-order method, which needs a problem of even scale. With H = L L' and w = L' v the quadratic part of the
+cost is w' w / 2. With rows a_i L^-T of unit norm, the slacks of all rows have the same softness:
 
     minimise    1/2 w' w + (L^-1 g)' w + 1/2 sum_i t_i^2
     subject to  D lower <= D L^-T w <= D upper,    a_i L^-T w / n_i + sqrt(SOFTNESS) t_i >= lower_i / n_i
 
-with n_i = |L^-1 a_i|, and D, which makes the rows of the box unit rows as well. A slack that is below 0 costs as much
-as one above, so t >= 0 need not be said. The pattern is dense and fixed for 16, 32, 48, ... rows, of which unused ones
-bound nothing. Each of these is set up once, at the first tick that needs it, and warm-started from then on.
+Here n_i = |L^-1 a_i|, and D makes the rows of the box unit rows as well. A slack below 0 costs as much as a slack above
+0, and so the problem does not need t >= 0. The pattern is dense and fixed for 16, 32, 48, ... rows. Unused rows bound
+nothing. Each size is set up once, at the first tick that needs it, and warm-started from then on.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ class OsqpSolver:
     """OSQP with a fixed sparsity pattern.
 
     Args:
-        nv: number of joints.
-        time_limit: OSQP gives up after this time [s]; None: never.
-        options: settings of ``osqp.OSQP.setup``, in place of :data:`_DEFAULTS`.
+        nv: Number of joints.
+        time_limit: OSQP gives up after this time [s]; None if it never gives up.
+        options: Settings of ``osqp.OSQP.setup``. They replace settings in :data:`_DEFAULTS`.
     """
 
     def __init__(self, nv: int, time_limit: float | None = None, **options: Any) -> None:
@@ -53,9 +53,10 @@ class OsqpSolver:
         self._sized: dict[int, _SizedOsqp] = {}
 
     def solve(self, problem: QpProblem) -> QpSolution:
-        """See :class:`Solver`; OSQP is asked only where a bound holds the cost's own minimum back.
+        """See :class:`Solver`. OSQP is called only if a bound holds the minimum of the cost back.
 
-        Raises ``numpy.linalg.LinAlgError`` where H is not positive definite.
+        Raises:
+            numpy.linalg.LinAlgError: If H is not positive definite.
         """
         if problem.minimum is not None:
             return QpSolution(problem.minimum, 0.0)
@@ -70,12 +71,12 @@ class _SizedOsqp:
 
     def __init__(self, nv: int, capacity: int, options: dict[str, Any]) -> None:
         self._nv = nv
-        # All entries of the columns of w, also zeros, then one entry in each column of t.
+        # The pattern has all entries of the columns of w, also zeros, and then one entry in each column of t.
         pattern = scipy.sparse.csc_matrix(np.hstack([np.ones((nv + capacity, nv)), np.eye(nv + capacity)[:, nv:]]))
         self._entries = pattern.data.copy()
-        # The array shares memory.
+        # Both arrays below share their memory with ``_entries``.
         self._matrix = self._entries[: (nv + capacity) * nv].reshape((nv + capacity, nv), order="F")
-        self._slacks = self._entries[self._matrix.size :]  # The array shares memory.
+        self._slacks = self._entries[self._matrix.size :]
         self._slacks[:] = pattern.data[self._matrix.size :] = math.sqrt(SOFTNESS)
         self._lower, self._upper = np.full(nv + capacity, -np.inf), np.full(nv + capacity, np.inf)
         self._cost = np.zeros(nv + capacity)
@@ -97,7 +98,7 @@ class _SizedOsqp:
         return QpSolution(v, time)
 
     def _write(self, problem: QpProblem, inverse: Array) -> None:
-        """Put the problem into OSQP, with unit rows; ``inverse`` is L^-1."""
+        """Write the problem into OSQP, with unit rows; ``inverse`` is L^-1."""
         nv, m = self._nv, len(problem.rows_lower)
         rows = np.concatenate([inverse.T, problem.rows @ inverse.T])
         norms = np.sqrt(np.einsum("ij,ij->i", rows, rows))

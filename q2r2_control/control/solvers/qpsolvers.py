@@ -1,6 +1,6 @@
-"""Any solver of the package qpsolvers, which contains some twenty by name.
+"""Call any solver of the package qpsolvers, which contains some twenty by name.
 
-Such a solver has no soft rows, so every row gets a slack of its own: x = [v; s],
+Such a solver has no soft rows. Every row therefore gets a slack of its own, and the variables are x = [v; s],
 
     minimise    1/2 v' H v + g' v + 1/2 sum_i s_i^2 / rho_i,    rho_i = SOFTNESS a_i' H^-1 a_i
     subject to  lower <= v <= upper,    s >= 0,    rows v + s >= rows_lower,    s_i = 0 for a hard row
@@ -26,11 +26,11 @@ def slack_problem(problem: QpProblem, sparse: bool = False, scaled: bool = False
     """Return the problem with a slack for each row.
 
     Args:
-        problem: of nv joints and m rows.
-        sparse: whether matrices are ``scipy.sparse.csc_matrix``, as some solvers need.
-        scaled: whether the slacks are s_i / sqrt(rho_i), of which each costs as much as the other. quadprog takes some
-            problems for contradictions where costs differ by orders of magnitude. Others stop at residuals, which
-            are larger in these units.
+        problem: The problem, with nv joints and m rows.
+        sparse: True for matrices of the type ``scipy.sparse.csc_matrix``, which some solvers need.
+        scaled: True for the slacks s_i / sqrt(rho_i), which all have the same cost. If costs differ by orders of
+            magnitude, quadprog takes some problems for contradictions. Other solvers stop at residuals, which are
+            larger in these units.
 
     Returns:
         A ``qpsolvers.Problem`` in x = [v; s], (nv + m,) [rad/s], which shares no memory with ``problem``.
@@ -65,20 +65,21 @@ class QpSolversSolver:
     """A solver of qpsolvers by its name.
 
     Args:
-        name: one of ``qpsolvers.available_solvers``.
-        options: keyword arguments of that solver, see qpsolvers' documentation. They go before :data:`_DEFAULTS`.
+        name: One of ``qpsolvers.available_solvers``.
+        options: Keyword arguments of that solver, see qpsolvers' documentation. They replace those in
+            :data:`_DEFAULTS`.
     """
 
     def __init__(self, name: str, **options: Any) -> None:
         self._name, self._options = name, _DEFAULTS.get(name, {}) | options
         self._sparse = name not in qpsolvers.dense_solvers
-        # The wrappers warn at each problem that is not solved. The report of the step says so already.
+        # The wrappers warn at each problem that is not solved. The report of the step already says so.
         warnings.filterwarnings("ignore", module=r"qpsolvers\.solvers\.")
 
     def solve(self, problem: QpProblem) -> QpSolution:
-        """See :class:`Solver`; the solver is asked only where a bound holds the cost's own minimum back.
+        """See :class:`Solver`. The solver is called only if a bound holds the minimum of the cost back.
 
-        Raises what qpsolvers and its solver raise.
+        All exceptions of qpsolvers and of its solver are passed on.
         """
         if problem.minimum is not None:
             return QpSolution(problem.minimum, 0.0)

@@ -1,4 +1,4 @@
-"""Solvers by name."""
+"""Find solvers by name."""
 
 from __future__ import annotations
 
@@ -25,16 +25,17 @@ def make_solver(
     """Return the solver called ``name``.
 
     Args:
-        name: ``daqp`` and ``osqp`` are called directly, any other of ``qpsolvers.available_solvers`` through qpsolvers.
-        nv: number of joints.
-        time_limit: DAQP and OSQP give up after this time [s]; None: never.
-        options: keyword arguments of the solver.
+        name: The name. ``daqp`` and ``osqp`` are called directly, and any other one of
+            ``qpsolvers.available_solvers`` through qpsolvers.
+        nv: Number of joints.
+        time_limit: DAQP and OSQP give up after this time [s]; None if they never give up.
+        options: Keyword arguments of the solver.
 
     Returns:
-        DAQP as it is; any other one behind a :class:`Guard`.
+        DAQP itself, or any other solver behind a :class:`Guard`.
 
     Raises:
-        ConfigError: There is no such solver, it is not installed, or it does not take the ``options``.
+        ConfigError: If there is no such solver, if it is not installed, or if it does not take the ``options``.
     """
     given = dict(options or {})
     check_installed(name)

@@ -1,6 +1,6 @@
-"""The tasks of the arms, as costs of the QP: kernels that add to H and g of  1/2 v' H v + g' v.
+"""The tasks of the arms, as costs of the QP. Kernels add them to H and g of  1/2 v' H v + g' v.
 
-``frame`` follows a tool target, ``hold`` holds joints, ``posture`` uses those that no tool needs; which arm gives way
-is a matter of the weights in ``priority``. Each of these modules has its model, data and kernels, and a line in each
-part of ``built_in``. ``external`` loads costs by name: those of other packages, and of ``elbow`` and ``named_tasks``.
+``frame`` follows a tool target, ``hold`` holds joints, and ``posture`` moves the joints that no tool needs. The weights
+in ``priority`` decide which arm gives way. Each of these modules has its model, data and kernels, and a line in each
+part of ``built_in``. ``external`` loads costs by name: costs of other packages, of ``elbow`` and of ``named_tasks``.
 """

@@ -1,4 +1,4 @@
-"""Checks of the arguments of tasks. Each error names the argument and what is allowed."""
+"""Check the arguments of tasks. Each error names the argument and what is allowed."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def check_robot(robot: Robot) -> None:
 def chosen_arms(robot: Robot, arms: Sequence[str] | None) -> list[str]:
     """Return the names in ``arms``, or all arms if it is None.
 
-    Raises :class:`ConfigError` for a name without an arm.
+    Raises :class:`ConfigError` if a name is not the name of an arm.
     """
     names = list(robot.arms) if arms is None else arms
     if not isinstance(names, list | tuple) or not names or any(name not in [*robot.arms] for name in names):
@@ -42,7 +42,7 @@ def positive(key: str, value: float, most: float = math.inf) -> float:
 
 
 def vector(key: str, value: Sequence[float]) -> Array:
-    """Return ``value`` as an array (3,). Raises :class:`ConfigError` unless it is three finite numbers."""
+    """Return ``value`` as an array (3,); raises :class:`ConfigError` unless it is three finite numbers."""
     try:
         numbers = np.array(value, dtype=np.float64)
     except (TypeError, ValueError):

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 class TaskModel(NamedTuple):
-    """The constants of a tick. Arrays of live settings may change between ticks (live_settings.py)."""
+    """Data that are constant in a tick. Arrays of live settings may change between ticks (live_settings.py)."""
 
     chain: Chain
     tools: Tools
@@ -43,13 +43,13 @@ class TaskData(NamedTuple):
     placements: Placements  # Placements of the joint frames at the reference.
     rotation: Array  # (n, 3, 3) Rotations of the tools.
     translation: Array  # (n, 3) [m]
-    J: Array  # (6 n, nv) Tool Jacobians, one below the other, zero if an arm follows no target.
+    J: Array  # (6 n, nv) Jacobians of the tools, one below the other; zero for an arm that follows no target.
     frame: FrameData
     posture: PostureData
     H: Array  # (nv, nv) H of the cost 1/2 v' H v + g' v.
     g: Array  # (nv,)
     minimum: Array  # (nv,) Minimum of that cost without bounds [rad/s].
-    factor: Array  # (nv, nv) Cholesky factor of H
+    factor: Array  # (nv, nv) Cholesky factor of H.
 
     @classmethod
     def empty(cls, model: TaskModel, placements: Placements) -> TaskData:

@@ -1,4 +1,4 @@
-"""The swivel of an arm's elbow about the line from shoulder to wrist: a task that YAML names ``swivel``.
+"""Control the swivel of an arm's elbow about the line from shoulder to wrist: the task that YAML names ``swivel``.
 
 With shoulder S, elbow E, wrist W, w = (W - S) / |W - S|, e = E - S and V pointing up, the elbow's offset from the line
 is p = e - (w'e) w and that of V is l = V - (w'V) w. The swivel angle is the angle from l to p about w,
@@ -27,14 +27,14 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
 _UP = np.array([0.0, 0.0, 1.0])
-# Below these the cost fades out: |p| [m], and |l|, the sine of the angle between the line and V.
+# Below these values the cost fades out: |p| [m], and |l|, which is the sine of the angle between the line and V.
 _FULL_RADIUS, _FULL_SINE = 0.05, 0.2
 _TINY = 1e-6
 _DAMPING = 1e-6  # Damping of the projection into the nullspace of the tool's motion.
 
 
 class ElbowSwivel:
-    """Turns elbows towards their angles, in the nullspace of the tools: a tool pays nothing for its elbow.
+    """Turns elbows towards their angles in the nullspace of the tools. A tool pays nothing for its elbow.
 
     The cost of each arm is  s w (n' v - k (psi* - psi))^2.  psi is the swivel angle above, n its gradient projected
     into the nullspace of the tool's motion, and s falls from 1 to 0 where psi ceases to be defined. A YAML names the
@@ -42,13 +42,13 @@ class ElbowSwivel:
 
     Args:
         robot: The robot with these arms.
-        angles: Wanted angle psi* of each arm that has the task, 0: elbow up; None: as at home [rad].
+        angles: Wanted angle psi* of each arm that has the task; 0 for elbow up, None for the angle at home [rad].
         joints: Names of the joints at shoulder, elbow and wrist, without the arm's prefix.
-        gain: k, swivel speed per angle [1/s].
-        weight: w, against 1 of a tool's error in metres.
+        gain: The swivel speed per angle k [1/s].
+        weight: The weight w, compared with 1 for a tool's error in metres.
 
     Raises:
-        ConfigError: For an arm or a joint that does not exist, and for numbers that are not allowed.
+        ConfigError: If an arm or a joint does not exist, or if a number is not allowed.
     """
 
     def __init__(
@@ -98,7 +98,7 @@ class ElbowSwivel:
         return H, g
 
     def _swivel(self, arm: str) -> tuple[float, float, Array]:
-        """Return the angle [rad], the share of 0 .. 1 to which it is defined, and its gradient (nv,)."""
+        """Return the angle [rad], the share from 0 to 1 to which it is defined, and its gradient (nv,)."""
         model, data = self._robot.model, self._data
         joints, axes = self._joints[arm], pin.LOCAL_WORLD_ALIGNED
         S, E, W = (data.oMi[joint].translation for joint in joints)
@@ -114,12 +114,12 @@ class ElbowSwivel:
         by_wrist = (w @ _UP / sine * t_l - w @ e / radius * t_p) / length
         row = t_p / radius @ (J_E - J_S) + by_wrist @ (J_W - J_S)
         share = min(radius / _FULL_RADIUS, 1.0) * min(sine / _FULL_SINE, 1.0)
-        # V = (0, 0, 1): V x p = (-p_y, p_x, 0)
+        # With V = (0, 0, 1) the cross product is V x p = (-p_y, p_x, 0).
         return math.atan2(w[1] * p[0] - w[0] * p[1], p[2]), share, row
 
 
 def _joint(robot: Robot, arm: str, name: str) -> int:
-    """Return the number of an arm's joint in the model. Raises :class:`ConfigError`."""
+    """Return the number of an arm's joint in the model; raises :class:`ConfigError` if there is none."""
     if arm not in robot.arms:
         raise ConfigError(f"angles: no arm {arm!r:.40}; allowed: {', '.join(robot.arms)}")
     own = {robot.joint_names[j].removeprefix(f"{arm}_"): int(j) + 1 for j in robot.arms[arm].joints}

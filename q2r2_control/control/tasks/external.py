@@ -1,9 +1,9 @@
 """Tasks of the user's program and of other packages: costs on the next joint velocities, written in NumPy.
 
-A program hands its tasks to the controller as objects. A package names its task as an entry point of the group
-``q2r2_control.tasks``; a cell's YAML asks for it, with its settings, under ``control.tasks``. Their costs are added to
-those of the built-in tasks before the QP is solved. Limits, separation and the certificate do not depend on costs, so
-no task can break them.
+A program passes its tasks to the controller as objects. A package names its task as an entry point of the group
+``q2r2_control.tasks``. A cell's YAML asks for it, with its settings, under ``control.tasks``. The costs are added to
+the costs of the built-in tasks before the QP is solved. Limits, separation and the certificate do not depend on costs,
+and so no task can break them.
 """
 
 from __future__ import annotations
@@ -27,16 +27,17 @@ _ROUNDING = 1e-9  # Allowed error of a matrix by rounding, as a share of its gre
 class Task(Protocol):
     """A cost on the next joint velocities: any object with this method.
 
-    ``CartesianController(robot, settings, tasks=[MyTask()])`` adds it to the tools' own. A task that a YAML names is
-    made as ``make(robot, **settings)``.
+    ``CartesianController(robot, settings, tasks=[MyTask()])`` adds it to the tasks of the tools. A task that a YAML
+    names is made as ``make(robot, **settings)``.
     """
 
     def cost(self, q: Array, v: Array) -> tuple[Array, Array]:
         """Return the cost 1/2 v+' H v+ + g' v+ of the next joint velocities v+.
 
-        A task that wants J v+ = u with a weight w returns H = w J'J and g = -w J'u. A tool's own error has the weight
-        1 for metres and 0.09 for radians, the posture 1e-3. The method is asked at every substep and by
-        :meth:`CartesianController.problem`, so its answer may depend on q and v alone. It should take less than 20 us.
+        A task that wants J v+ = u with a weight w returns H = w J'J and g = -w J'u. The error of a tool has the weight
+        1 for metres and 0.09 for radians, and the posture has 1e-3. The method is called at every substep and by
+        :meth:`CartesianController.problem`. Its answer may therefore depend on q and v alone. It should take less than
+        20 us.
 
         Args:
             q: Joint positions of the reference (nv,) [rad].
@@ -52,7 +53,7 @@ class Task(Protocol):
 def load_tasks(robot: Robot, wanted: Mapping[str, Mapping[str, Any]]) -> dict[str, Task]:
     """Return the tasks that the settings ask for, by key.
 
-    Raises :class:`ConfigError` for unknown ones and bad settings.
+    Raises :class:`ConfigError` if a task is unknown, or if its settings are not allowed.
     """
     if not wanted:
         return {}
@@ -87,7 +88,7 @@ class ExternalTasks:
     """The tasks of one controller that are called at every substep. Those of its settings come first."""
 
     def __init__(self, robot: Robot, settings: Mapping[str, Mapping[str, Any]], own: Sequence[Task]) -> None:
-        """Raise :class:`ConfigError` for an object that is not a task, or whose cost at home is not usable."""
+        """Raise :class:`ConfigError` if an object is not a task, or if its cost at home is not usable."""
         if not isinstance(own, list | tuple):
             raise ConfigError(f"tasks = {shown(own)}: allowed: a list of objects with a method cost(q, v)")
         self._tasks = load_tasks(robot, settings)

@@ -1,16 +1,17 @@
-"""The cost of a tool that follows its target, as H and g of  1/2 v' H v + g' v, compiled.
+"""Write the cost of a tool that follows its target, as H and g of  1/2 v' H v + g' v (compiled).
 
-For each following arm:  |J v - u|^2_W + v' M v, u the wanted tool twist, W = diag(1, 1, 1, l^2, l^2, l^2) with the
-length l that makes a radian comparable to a metre, times the weights of the settings: along the world's axes, and about
-the tool's own. The posture may use an axis as far as its weight leaves it free.
+The cost of each following arm is  |J v - u|^2_W + v' M v  with the wanted twist u of the tool. The weights are
+W = diag(1, 1, 1, l^2, l^2, l^2), where the length l makes a radian comparable to a metre, times the weights of the
+settings. The latter are along the world's axes, and about the tool's own. The posture may use an axis as far as its
+weight leaves it free.
 
-**Damping M.** Stretched out towards an unreachable target, the gradient of the reach with respect to the elbow angle
-vanishes like L theta. Under a wanted speed s the loop near that posture therefore has the gain L s / mu. Without
-damping mu that is unbounded, and with bounded accelerations it ends in a limit cycle. In general the wanted velocity s
-adds the geometric stiffness E_ij = s' d2x / dq_i dq_j, and only its negative part, the pull outwards, needs damping.
-The pull inwards drives the arm away from the singular posture, as it should. Joint i gets mu_i = d_i + sum_j
-min(|E_ij|, d_i) over k, with d_i = max(0, -E_ii). Where an arm is pulled straight, |E_ij| <= d_i, so that by
-Gershgorin's theorem the gain is at most k. M vanishes at the target.
+**Damping M.** If an arm is stretched out towards an unreachable target, the gradient of the reach with respect to the
+elbow angle vanishes like L theta. Under a wanted speed s the loop near that posture therefore has the gain L s / mu.
+Without damping mu this gain is unbounded, and with bounded accelerations it ends in a limit cycle. In general the
+wanted velocity s adds the geometric stiffness E_ij = s' d2x / dq_i dq_j. Only its negative part, the pull outwards,
+needs damping. The pull inwards drives the arm away from the singular posture, as it should. Joint i gets mu_i = d_i +
+sum_j min(|E_ij|, d_i) over k, with d_i = max(0, -E_ii). If an arm is pulled straight, |E_ij| <= d_i. By Gershgorin's
+theorem the gain is then at most k. M vanishes at the target.
 """
 
 from __future__ import annotations
@@ -34,10 +35,10 @@ if TYPE_CHECKING:
 class Tools(NamedTuple):
     """The tool frame of each arm."""
 
-    joint: IntArray  # (n,) joint that carries it
-    rotation: Array  # (n, 3, 3) in the joint's frame
-    translation: Array  # (n, 3) [m]
-    member: Array  # (n, nv) 1 where a joint moves the tool
+    joint: IntArray  # (n,) Number of the joint that carries the tool.
+    rotation: Array  # (n, 3, 3) Rotation in the joint's frame.
+    translation: Array  # (n, 3) Position in the joint's frame [m].
+    member: Array  # (n, nv) 1 if a joint moves the tool.
 
 
 def tools_of(robot: Robot) -> Tools:
@@ -53,8 +54,8 @@ def tools_of(robot: Robot) -> Tools:
     return tools
 
 
-ROTATION_LENGTH = 0.3  # [m/rad]
-# Share of a tool's speed limit that its task asks for, because the certificate needs a part of it.
+ROTATION_LENGTH = 0.3  # The length l that makes a radian comparable to a metre [m/rad].
+# Share of a tool's speed limit for which its task asks. The certificate needs the rest.
 _SHARE_OF_LIMIT = 0.9
 
 
@@ -152,7 +153,7 @@ def tool_jacobian(chain: Chain, placements: Placements, tools: Tools, i: int, tr
 
 @kernel
 def express_in(rotation: Array, vector: Array) -> None:
-    """Turn the ``vector`` (3,) of world axes into one of the axes of ``rotation`` (3, 3), in place."""
+    """Convert the ``vector`` (3,) in place from world axes to the axes of ``rotation`` (3, 3)."""
     x, y, z = vector[0], vector[1], vector[2]
     for k in range(3):
         vector[k] = rotation[0, k] * x + rotation[1, k] * y + rotation[2, k] * z
@@ -162,7 +163,7 @@ def express_in(rotation: Array, vector: Array) -> None:
 def rotation_vector(R: Array, out: Array) -> None:
     """Write the rotation vector [rad] of a rotation matrix (3, 3), with its angle in [0, pi].
 
-    That of :mod:`q2r2_control.quaternions` takes a quaternion of Python floats, which a kernel has none of.
+    The function of :mod:`q2r2_control.quaternions` takes a quaternion of Python floats, which kernels do not have.
     """
     trace = R[0, 0] + R[1, 1] + R[2, 2]
     if trace > 0.0:
@@ -197,8 +198,9 @@ def times_transposed(A: Array, B: Array, product: Array) -> None:
 def approach_speed(error: float, gain: float, deceleration: float) -> float:
     """Return the speed towards a target at distance ``error``: proportional when near, constant deceleration when far.
 
-    v = gain e up to e0 = deceleration / gain^2, then v = sqrt(2 deceleration e - (deceleration / gain)^2), which
-    continues it smoothly. A purely proportional law asks for deceleration gain v, more than the joints have at speed.
+    It is v = gain e up to e0 = deceleration / gain^2, and then v = sqrt(2 deceleration e - (deceleration / gain)^2),
+    which continues it smoothly. A purely proportional law asks for the deceleration gain v. At speed the joints cannot
+    decelerate so strongly.
     """
     if error * gain * gain <= deceleration:
         return gain * error
@@ -229,11 +231,11 @@ def wanted_twist(motion: Motion, data: TaskData, targets: TaskTargets, i: int) -
 
 @kernel
 def accumulate_tool_cost(J: Array, twist: Array, weight: Array, priority: float, H: Array, g: Array) -> None:
-    """Add ``priority`` |J v - twist|^2_W of one arm to H (nv, nv) and g (nv,); ``weight`` (6,) of each row."""
+    """Add ``priority`` |J v - twist|^2_W of one arm to H (nv, nv) and g (nv,). ``weight`` (6,) is that of each row."""
     nv = g.shape[0]
     square = priority * ROTATION_LENGTH * ROTATION_LENGTH
     for i in range(nv):
-        # Other arms' joints do not move this tool; a revolute one that does turns it, a sliding one shifts it.
+        # Joints of other arms do not move this tool. A revolute joint that moves it turns it, and a slide shifts it.
         if J[0, i] == J[1, i] == J[2, i] == J[3, i] == J[4, i] == J[5, i] == 0.0:
             continue
         for k in range(6):
@@ -251,8 +253,8 @@ def accumulate_tool_cost(J: Array, twist: Array, weight: Array, priority: float,
 def accumulate_stretch_damping(model: TaskModel, data: TaskData, i: int) -> None:
     """Add the damping M of tool ``i``, with the arm's weight, to ``data.H``.
 
-    For joint k between the base and joint j, d2x / dq_k dq_j = z_k x J_j (linear part). For the angular part, whose
-    second derivative is no Hessian, the same bound in magnitude stands in: J_j turns with joint k by at most |z_k|.
+    For joint k between the base and joint j, d2x / dq_k dq_j = z_k x J_j (linear part). The second derivative of the
+    angular part is no Hessian. The same bound in magnitude replaces it: J_j turns with joint k by at most |z_k|.
     """
     chain, placements, H = model.chain, data.placements, data.H
     J, feedback = data.J[6 * i : 6 * i + 6], data.frame.feedback[i]

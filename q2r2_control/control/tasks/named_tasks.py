@@ -1,8 +1,8 @@
-"""Tasks beside the tools' targets, by their names in a cell's YAML: joints, look_at, upright, relative.
+"""Tasks in addition to the tools' targets, by their names in a cell's YAML: joints, look_at, upright, relative.
 
-Each adds  weight |J v - u|^2  with the velocity u that reduces its error at a gain. Tasks that want different things
-meet in between, as their weights say; a tool's own are 1 for a metre and 0.09 for a radian. The settings
-``position_weights`` and ``rotation_weights`` leave a tool the freedom that such a task needs.
+Each task adds  weight |J v - u|^2  with the velocity u that reduces its error at a gain. Tasks with different goals
+reach a compromise according to their weights. The weights of a tool are 1 for a metre and 0.09 for a radian. The
+settings ``position_weights`` and ``rotation_weights`` leave a tool the freedom that such a task needs.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _SOFT_EDGE = 0.05  # Angle beyond the cone over which the weight of ``upright`` 
 
 
 class _Cost:
-    """H and g of a sum of  weight |J v - u|^2."""
+    """Computes H and g of a sum of  weight |J v - u|^2."""
 
     def __init__(self, nv: int) -> None:
         self.H, self.g = np.zeros((nv, nv)), np.zeros(nv)
@@ -44,7 +44,7 @@ class _Tools:
     def __init__(self, robot: Robot, arms: Sequence[str] | None) -> None:
         """Take the tools of ``arms``, or all tools if it is None.
 
-        Raises as :func:`chosen_arms` and :func:`check_robot`.
+        Raises :class:`ConfigError` as :func:`chosen_arms` and :func:`check_robot` do.
         """
         check_robot(robot)
         names = chosen_arms(robot, arms)
@@ -64,18 +64,18 @@ class _Tools:
 
 
 class JointTarget:
-    """Moves joints to their own positions within their limits, with the cost w |v_j - k (q*_j - q_j)|^2 of each.
+    """Moves joints to wanted positions within their limits. Each has the cost w |v_j - k (q*_j - q_j)|^2.
 
-    A YAML names it ``joints``.
+    A YAML names the task ``joints``.
 
     Args:
         robot: The robot with these joints.
         positions: Wanted position q* by the joint's name, such as ``{"left_A3": 0.3}`` [rad, or m of a sliding joint].
-        gain: k, speed per distance [1/s].
-        weight: w, against 1 of a tool's error in metres.
+        gain: The speed per distance k [1/s].
+        weight: The weight w, compared with 1 for a tool's error in metres.
 
     Raises:
-        ConfigError: For a joint that does not exist, a position outside its limits, and a number that is not above 0.
+        ConfigError: If a joint does not exist, if a position is outside its limits, or if a number is not above 0.
     """
 
     def __init__(self, robot: Robot, positions: Mapping[str, float], gain: float = 2.0, weight: float = 0.1) -> None:
@@ -101,22 +101,23 @@ class JointTarget:
 
 
 class LookAt:
-    """An axis of the tool points at a point of the world; the turn about that axis is left free.
+    """Lets an axis of the tool point at a point of the world. The rotation about that axis is free.
 
-    With the axis a, the unit vector d from the tool to the point, at the distance r, and their angle t about the unit
-    vector n = a x d / sin t, the cost is  w |(I - a a') (omega - dd) - k t n|^2.  The tool turns with omega, and
-    dd = -d x v / r  is how fast d turns where the tool moves across it with v. A YAML names the task ``look_at``.
+    Let a be the axis, d the unit vector from the tool to the point, and r their distance. Let t be the angle between a
+    and d about the unit vector n = a x d / sin t. The cost is  w |(I - a a') (omega - dd) - k t n|^2.  Here omega is
+    the angular velocity of the tool, and  dd = -d x v / r  is that of d, while the tool moves with the velocity v. A
+    YAML names the task ``look_at``.
 
     Args:
-        robot: Whose tools they are.
+        robot: The robot with the tools.
         point: The point in the world (3,) [m].
-        arms: Names of the arms that have the task; None: all.
-        axis: a in the tool's frame (3,), of any length.
-        gain: k, angular speed per angle [1/s].
-        weight: w, against 0.09 of a tool's own rotation.
+        arms: Names of the arms that have the task; None for all.
+        axis: The axis a in the tool's frame (3,), of any length.
+        gain: The angular speed per angle k [1/s].
+        weight: The weight w, compared with 0.09 for a tool's own rotation.
 
     Raises:
-        ConfigError: For an arm that does not exist, and for numbers that are not allowed.
+        ConfigError: If an arm does not exist, or if a number is not allowed.
     """
 
     def __init__(
@@ -138,7 +139,8 @@ class LookAt:
             pointing, way = pose.rotation @ self._axis, self._point - pose.translation
             distance = max(float(np.linalg.norm(way)), _TINY)
             towards = way / distance
-            # The direction to the point turns as well, where the tool moves across it: by towards x d(towards)/dt.
+            # The direction to the point turns as well, if the tool moves across it. Its angular velocity is
+            # towards x d(towards)/dt.
             across = pin.skew(towards) @ J[:3] / -distance
             free = np.eye(3) - np.outer(pointing, pointing)
             cost.add(free @ (J[3:] - across), self._gain * _turn(pointing, towards), self._weight)
@@ -146,23 +148,23 @@ class LookAt:
 
 
 class Upright:
-    """An axis of the tool stays within a cone about a direction of the world.
+    """Keeps an axis of the tool within a cone about a direction of the world.
 
-    Within the cone the task costs nothing. At an angle t beyond its edge the cost is  w(t) (n' omega - k t)^2,  with n
-    the axis of the shortest turn back and omega how fast the tool turns. The weight grows to w over the first 0.05 rad.
-    A YAML names the task ``upright``.
+    Within the cone the task costs nothing. At an angle t beyond its edge the cost is  w(t) (n' omega - k t)^2.  Here n
+    is the axis of the shortest rotation back, and omega is the angular velocity of the tool. The weight grows to w over
+    the first 0.05 rad. A YAML names the task ``upright``.
 
     Args:
-        robot: Whose tools they are.
+        robot: The robot with the tools.
         angle: Angle from the middle of the cone to its edge, up to pi [rad].
-        arms: Names of the arms that have the task; None: all.
+        arms: Names of the arms that have the task; None for all.
         axis: The axis in the tool's frame (3,), of any length.
         up: The middle of the cone in the world (3,), of any length.
-        gain: k, angular speed per angle [1/s].
-        weight: w, against 0.09 of a tool's own rotation.
+        gain: The angular speed per angle k [1/s].
+        weight: The weight w, compared with 0.09 for a tool's own rotation.
 
     Raises:
-        ConfigError: For an arm that does not exist, and for numbers that are not allowed.
+        ConfigError: If an arm does not exist, or if a number is not allowed.
     """
 
     def __init__(
@@ -193,21 +195,21 @@ class Upright:
 
 
 class RelativePose:
-    """The right tool keeps its pose in the left tool's frame.
+    """Lets the right tool keep its pose in the left tool's frame.
 
-    The cost is  w |J_r v - J_c v - k e|^2  with the pose error e of the right tool (6,), the Jacobian J_r of that tool,
-    and the Jacobian J_c of a body that the left tool would carry at the wanted pose. Rotations count 0.09 as much as
-    metres. A YAML names the task ``relative``.
+    The cost is  w |J_r v - J_c v - k e|^2  with the pose error e of the right tool (6,) and the Jacobian J_r of that
+    tool. J_c is the Jacobian of a body that the left tool would carry at the wanted pose. Rotations count 0.09 times as
+    much as metres. A YAML names the task ``relative``.
 
     Args:
         robot: A robot with the arms ``left`` and ``right``.
-        position: Position of the right tool in the left tool's frame (3,) [m]; None: as at home.
-        rpy: Its roll, pitch and yaw there (3,) [rad]; None: as at home.
-        gain: k, speed per distance [1/s].
-        weight: w, against 1 of a tool's error in metres.
+        position: Position of the right tool in the left tool's frame (3,) [m]; None for the position at home.
+        rpy: Its roll, pitch and yaw there (3,) [rad]; None for the rotation at home.
+        gain: The speed per distance k [1/s].
+        weight: The weight w, compared with 1 for a tool's error in metres.
 
     Raises:
-        ConfigError: For a robot without both arms, and for numbers that are not allowed.
+        ConfigError: If the robot does not have both arms, or if a number is not allowed.
     """
 
     def __init__(
@@ -240,7 +242,7 @@ class RelativePose:
 
 
 def _turn(of: Array, to: Array) -> Array:
-    """Return the shortest rotation vector (3,) [rad] between unit vectors, about any axis if they are opposite."""
+    """Return the shortest rotation vector (3,) [rad] between unit vectors. If they are opposite, the axis is any."""
     across = np.cross(of, to)
     sine = float(np.linalg.norm(across))
     if sine < _TINY:

@@ -1,7 +1,7 @@
-"""The cost of joints that no tool needs. They are pulled towards a posture.
+"""Write the cost of the joints that no tool needs. They are pulled towards a posture.
 
-For all joints w |v - v_p|^2 with the posture velocity v_p projected into the tools' nullspace, so that at rest it
-leaves no tool error. Joints of an arm without a target are not pulled.
+The cost of all joints is w |v - v_p|^2. The posture velocity v_p is projected into the nullspace of the tools, so that
+it leaves no error of a tool at rest. Joints of an arm without a target are not pulled.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class Posture(NamedTuple):
 
     home: Array  # (nv,) [rad]
     gain: Array  # (1,) [1/s]
-    weight: Array  # (1,) Weight, relative to the tool task's 1.
+    weight: Array  # (1,) Weight, compared with 1 for the task of a tool.
     speed: float  # Largest speed [rad/s].
 
 
@@ -43,7 +43,7 @@ class PostureData(NamedTuple):
     """Data that are written at each tick."""
 
     v: Array  # (nv,) Wanted velocities where the tools leave joints free [rad/s].
-    factor: Array  # (6 n, 6 n) Cholesky factor of J J', damped
+    factor: Array  # (6 n, 6 n) Cholesky factor of the damped J J'.
     moved: Array  # (6 n,) Scratch.
 
     @classmethod
@@ -53,7 +53,7 @@ class PostureData(NamedTuple):
 
 @kernel
 def accumulate_posture_cost(model: TaskModel, data: TaskData, targets: TaskTargets, q: Array) -> None:
-    """Add the cost of all joints' distance from the posture velocity; needs the Jacobians of the tools."""
+    """Add the cost of all joints' distance from the posture velocity. It needs the Jacobians of the tools."""
     gain, speed, v = model.posture.gain[0], model.posture.speed, data.posture.v
     for j in range(q.shape[0]):
         v[j] = clamp(gain * (targets.posture[j] - q[j]), -speed, speed)
@@ -71,7 +71,7 @@ def accumulate_posture_cost(model: TaskModel, data: TaskData, targets: TaskTarge
 
 @kernel
 def project_to_nullspace(J: Array, factor: Array, moved: Array, v: Array) -> None:
-    """Remove from ``v`` (nv,) what moves the tools with Jacobians J (6n, nv): v -= J' (J J' + d I)^-1 J v.
+    """Remove from ``v`` (nv,) the part that moves the tools with Jacobians J (6n, nv): v -= J' (J J' + d I)^-1 J v.
 
     ``factor`` (6n, 6n) and ``moved`` (6n,) are scratch.
     """

@@ -14,17 +14,17 @@ from q2r2_control.types import Array
 class Priority(NamedTuple):
     """The arm that gives way if two arms are in each other's way. The weights may change between ticks.
 
-    Arms meet in the QP only where separation rows couple their joints. There all costs of an arm that gives way, also
-    posture and damping, are multiplied by a small weight, so that its motion pays for a row that both arms need. Where
-    no row is active nothing changes. An arm without a target holds its joints, and does not give way.
+    In the QP the arms influence each other only through separation rows, which couple their joints. All costs of an arm
+    that gives way, also posture and damping, are multiplied by a small weight. Its motion then pays for a row that both
+    arms need. If no row is active, nothing changes. An arm without a target holds its joints, and does not give way.
     """
 
     arm: Array  # (n,) Weight of an arm's costs while it follows a target: 1, or less if it gives way.
-    joint: Array  # (nv,) the same for each joint
+    joint: Array  # (nv,) The weight of each joint.
 
 
 def priority_of(robot: Robot, settings: ControllerSettings) -> Priority:
-    """The weights of the arms' costs; ``settings.priority`` names an arm, or none."""
+    """Return the weights of the arms' costs. ``settings.priority`` names the arm that does not give way, or no arm."""
     priority = Priority(np.ones(len(robot.arms)), np.ones(robot.model.nv))
     if settings.priority == EQUAL:
         return priority

@@ -17,7 +17,7 @@ from q2r2_control.inputs.session import HAND_TOPICS, Reception
 from q2r2_control.inputs.webxr.shown import Seven
 from q2r2_control.types import QUEST_CONTROLS, DeviceControls, HandFault, HandInputs
 
-LONGEST = 4096  # Greatest length of a message [bytes]. Those of the page have under 600.
+LONGEST = 4096  # Greatest length of a message [bytes]. Messages of the page have under 600.
 # A pinch is one of bare fingers, or a touch of a phone's screen. These devices have no other button.
 _NOUNS = {**QUEST_WORDS.nouns, "lower": "A, X or Space", "upper": "B, Y or G", "pinch": "the pinch"}
 _ABSENT = "nothing: no browser drives, open the page"
@@ -46,7 +46,7 @@ class _PageModel(BaseModel):
 
 
 class HeadsetHand(_PageModel):
-    """One hand. Its numbers may have any value, also NaN, since the gate checks them as those of every headset."""
+    """One hand. Its numbers may have any value, also NaN, since the gate checks the numbers of every headset."""
 
     # Position [m] and quaternion x y z w, in a frame with x forward, y left and z up; None if not known.
     pose: Seven | None

@@ -27,7 +27,7 @@ from q2r2_control.process.scheduling import few_garbage_collections, how_it_ende
 
 _TAKEN, _TOO_LATE = b"1", b"0"  # The replies to commands.
 _RESERVED = 0.0015, 0.002  # Processor time that is reserved for answers in each interval [s]. An answer takes 0.2 ms.
-_BEGUN = b"2"  # The first reply: the process hears the cabinets.
+_BEGUN = b"2"  # The first reply, which says that the process hears the cabinets.
 _LARGEST = 1 << 16  # Largest datagram between the processes [bytes].
 _POLL = 0.05  # After the loop has ended, time between two looks whether the arms stand still [s].
 _PATIENCE = 5.0  # Time to wait until the process ends [s].

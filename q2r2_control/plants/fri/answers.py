@@ -37,10 +37,10 @@ class _Move(NamedTuple):
     """The motion from the posture and velocity of one tick to those of the next one."""
 
     start: float  # [s]
-    end: float
-    q: tuple[Array, Array]  # [rad]
-    v: tuple[Array, Array]  # [rad/s]
-    deceleration: Array  # Of the certified stop from its end [rad/s^2].
+    end: float  # [s]
+    q: tuple[Array, Array]  # Postures at the start and at the end [rad].
+    v: tuple[Array, Array]  # Velocities at the start and at the end [rad/s].
+    deceleration: Array  # Deceleration of the certified stop from the end [rad/s^2].
 
     def at(self, t: float) -> tuple[Array, Array]:
         """Return posture and velocity by the cubic through both ends, a parabola if the acceleration is constant."""
@@ -154,8 +154,8 @@ class AnswerTimes:
         """Make the times of one cabinet.
 
         Args:
-            period: Between two answers [s].
-            delay: By how much the time of an answer is before the expected time of its question [s].
+            period: Time between two answers [s].
+            delay: Time by which the time of an answer is before the expected time of its question [s].
         """
         self._period, self._delay = period, delay
         self._question = -1  # The newest question.

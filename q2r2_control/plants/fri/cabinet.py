@@ -1,7 +1,7 @@
-"""A simulated Sunrise cabinet: its session, its guards and its arm, with a time that is passed in.
+"""A simulated Sunrise cabinet: its session, its guards and its arm. The caller passes the time in.
 
-It is the test of a client, not a model of KUKA's controller. The states and their conditions follow the public client
-kits; where those are silent, such as in how long a client may miss, it is stricter rather than more lenient.
+It is a test of a client, and not a model of KUKA's controller. The states and their conditions follow the public client
+kits. Where the kits say nothing, such as how many answers a client may miss, the simulation is rather too strict.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class CabinetArm(Protocol):
         """Torques by contacts [Nm]."""
 
     def advance(self, dt: float, q: Joints, tau: Joints | None) -> None:
-        """Let ``dt`` [s] pass: the drives move to ``q`` [rad]; ``tau`` [Nm] is added to their impedance."""
+        """Let ``dt`` [s] pass. The drives move to ``q`` [rad], and ``tau`` [Nm] is added to their impedance."""
 
     def tool_way(self, start: Joints, end: Joints) -> float:
         """Return the distance of the tool between two postures [m]."""
@@ -82,7 +82,7 @@ class CabinetArm(Protocol):
 
 @dataclass(slots=True)
 class StillArm:
-    """An arm that is always where it was commanded to be."""
+    """An arm that is always at its commanded position."""
 
     q: Joints
     tau: Joints = (0.0,) * JOINTS
@@ -100,18 +100,18 @@ class StillArm:
 class CabinetSettings:
     """One cabinet's FRI settings and guards. Joints are A1 .. A7."""
 
-    lower: Joints  # Allowed positions [rad].
-    upper: Joints
-    velocity: Joints  # [rad/s]
-    acceleration: Joints  # [rad/s^2]
-    torque: Joints  # Limits of the overlay [Nm].
+    lower: Joints  # Least allowed positions [rad].
+    upper: Joints  # Greatest allowed positions [rad].
+    velocity: Joints  # Velocity limits [rad/s].
+    acceleration: Joints  # Acceleration limits [rad/s^2].
+    torque: Joints  # Torque limits of the overlay [Nm].
     version: int = 2
     period: float = 0.005  # Time between two messages [s].
     multiplier: int = 1  # Number of messages for which one answer is due.
     command: CommandKind = CommandKind.POSITION
 
     def __post_init__(self) -> None:
-        """Raises ConfigError for torques that come less often than Sunrise allows."""
+        """Raise ConfigError if torques come less often than Sunrise allows."""
         if self.command is CommandKind.TORQUE and self.answer_period > _LONGEST_TORQUE_PERIOD * (1.0 + _ROUNDING):
             allowed = f"allowed with torques: {1e3 * _LONGEST_TORQUE_PERIOD:g} ms or less"
             raise ConfigError(f"a cabinet that is answered every {1e3 * self.answer_period:g} ms: {allowed}")
@@ -128,9 +128,9 @@ class Cabinet:
     def __init__(
         self, settings: CabinetSettings, arm: CabinetArm, outputs: Mapping[str, IoValue] | None = None
     ) -> None:
-        """Make a cabinet
+        """Make a cabinet.
 
-        ``outputs`` are those that the application registers for a client, with their first values.
+        ``outputs`` are the outputs that the application registers for a client, with their first values.
         """
         self.settings, self.arm = settings, arm
         self.session, self.safety, self.operation = Session.MONITORING_WAIT, Safety.NORMAL, Operation.AUTOMATIC
@@ -143,7 +143,7 @@ class Cabinet:
         self._answer: FriCommand | None = None  # Answer to the newest message that asked for one.
         self._in_time: deque[bool] = deque(maxlen=_WINDOW)
         self._misses = 0  # Number of successive misses.
-        # Misses of a client that commanded and answered again. Those of a client that has ended do not count.
+        # Number of misses while a client commanded and answered again later. Misses after its last answer do not count.
         self.missed = 0
         self._overlay = False  # True if the application asks for the client's command.
         self._held: Joints = arm.q  # Position that the cabinet's own motion holds.
@@ -186,7 +186,7 @@ class Cabinet:
             self.stop(Trip.SAFETY)
 
     def send(self, stamp: float) -> Monitoring:
-        """Begin a period at ``stamp`` [s]: judge the last answer, move the arm, and say how things are."""
+        """Begin a period at ``stamp`` [s]: judge the last answer, move the arm, and return the cabinet's message."""
         if self._sent and self._sent % self.settings.multiplier == 0:
             self._judge()
         self.arm.advance(self.settings.period, self.commanded, self._tau)
@@ -217,7 +217,7 @@ class Cabinet:
         return self.message
 
     def receive(self, datagram: bytes) -> None:
-        """An answer. One that repeats an older one, or answers an older message, counts as late."""
+        """Take an answer. An answer that repeats an older one, or answers an older message, counts as late."""
         try:
             version, command = read_command(datagram)
         except ProtocolError:
@@ -234,13 +234,13 @@ class Cabinet:
 
     @property
     def _commanded_tau(self) -> Joints:
-        """Torques of the arm's motors: what they bear, and the client's overlay."""
+        """The torques of the arm's motors: the torques that they bear, and the client's overlay [Nm]."""
         overlay = self._tau or (0.0,) * JOINTS
         return tuple(borne + added for borne, added in zip(self.arm.tau, overlay, strict=True))
 
     @property
     def _bears_the_load(self) -> bool:
-        """Return whether the load data explain the torques of an arm before an overlay of torques."""
+        """True if the load data explain the torques of an arm before an overlay of torques."""
         torques = self.settings.command is CommandKind.TORQUE
         return self.load_fits and not (torques and max(map(abs, self.arm.external_tau)) > _LARGEST_LOAD_ERROR)
 

@@ -33,7 +33,7 @@ from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Command, CommandMode
 
-_LONGEST_STALL = 1.0  # Longest stall of this process that is compensated; a longer one counts as the cabinet's [s].
+_LONGEST_STALL = 1.0  # Longest stall of this process that is compensated. A longer one counts as the cabinet's [s].
 _LONGEST_CATCH_UP = 0.05  # Longest delay that is caught up; the rest is dropped [s].
 _LOOK_AGAIN = 2e-4  # Time between two checks for the answer that a late message waits for [s].
 _ROUNDING = 1e-6
@@ -181,9 +181,19 @@ class CabinetServer:
         network: Network,
         seed: int = 0,
     ) -> None:
-        """Bind ``origins``, address and port (0: any free one) of each arm's cabinet; ``clients`` are their clients.
+        """Make the server, and bind the addresses of the cabinets.
 
-        Raises :class:`ConfigError` for an origin that cannot be bound, such as one that another program has.
+        Args:
+            cell: The simulated arms.
+            cabinets: The settings of each arm's cabinet.
+            origins: Address and port of each arm's cabinet. Port 0 stands for any free port.
+            clients: Address and port of each cabinet's client.
+            grippers: The grippers at the cabinets, by arm.
+            network: The faults of the network.
+            seed: The seed of the random faults.
+
+        Raises:
+            ConfigError: If an origin cannot be bound, such as one that another program has.
         """
         self.cell, self._clients, self._grippers, self._network = cell, dict(clients), dict(grippers), network
         self.cabinets = {
@@ -197,7 +207,10 @@ class CabinetServer:
         self._sent_at: dict[str, float] = {}  # Time of the newest message of each arm [s].
 
     def run(self, until: Callable[[float], bool], tick: Callable[[float], None] = lambda t: None) -> None:
-        """Go on until a function of the time since the begin [s] returns True; ``tick`` is called for each message."""
+        """Run until ``until``, called with the time since the begin [s], returns True.
+
+        ``tick`` is called for each message.
+        """
         self._began, now, arms = time.monotonic(), 0.0, {opened: arm for arm, opened in self._sockets.items()}
         for index, (arm, cabinet) in enumerate(self.cabinets.items()):
             self._at(index * 0.37 * cabinet.settings.period, lambda arm=arm: self._send(arm, 0.0, tick))  # type: ignore[misc]

@@ -3,8 +3,8 @@
 **The loop's time and the cabinets' time.** Each tick of the loop moves the reference to one period after the tick. If
 ticks took longer lately, or commands came too late, the reference goes farther ahead by as much. The cabinets get their
 answers from it a little later (``DELAY``). If the loop is so late that an answer would pass the end of the reference,
-the cabinets get the certified stop, and :meth:`FriCell.due` lets the reference follow the same stop first. If an answer
-passes the end in the middle of a tick, the sessions refuse the command of this tick, and it is withdrawn.
+the cabinets get the certified stop. :meth:`FriCell.due` then lets the reference follow the same stop first. If an
+answer passes the end in the middle of a tick, the sessions refuse the command of this tick, and it is withdrawn.
 """
 
 from __future__ import annotations
@@ -54,10 +54,10 @@ class FriCell:
 
         Args:
             robot: The robot.
+            states: The state of each arm's session.
             period: Period of the loop [s].
             longest: The longest step of the reference with one acceleration [s].
-            states: The state of each arm's session.
-            grippers: The grippers, of the arms that have one.
+            grippers: The grippers of those arms that have one.
         """
         self.states = {state.arm: state for state in states}
         self._robot, self._period, self._longest, self._grippers = robot, period, longest, dict(grippers or {})
@@ -65,9 +65,9 @@ class FriCell:
         self._data = robot.model.createData()
         # The time of the newest tick, and both ends of its piece of the path [s].
         self._now = self._start = self._end = -math.inf
-        # Whether the newest command is withdrawn, and the time of the last command that was not [s].
+        # Whether the newest command is withdrawn, and the time of the last command that was not withdrawn [s].
         self._withdraws, self._in_time = False, -math.inf
-        self._margin = _MARGIN  # For the next command [s].
+        self._margin = _MARGIN  # Margin for the next command [s].
         self._longest_tick = period  # The longest recent tick [s].
         self._told = self._ends()
         # Time of the first message of each arm whose losses were not reported yet [s].
@@ -158,9 +158,9 @@ class FriCell:
 
     @property
     def _ahead(self) -> float:
-        """Return the time from a tick to the end of its piece of the path [s].
+        """The time from a tick to the end of its piece of the path [s].
 
-        If no tick and no command is later than the latest ones lately, no answer passes this end.
+        If no tick and no command is later than the recent ones, no answer passes this end.
         """
         return self._longest_tick + self._margin - _MARGIN
 
@@ -180,7 +180,7 @@ class FriCell:
         return 0.0 if is_torque else farther + DELAY + _PASSING + 2.5 * max(state.period for state in states)
 
     def timings(self) -> dict[str, ArmTiming]:
-        """Return the timing of all arms that were heard. Torques have no time, so that only silence counts for them."""
+        """Return the timing of all arms that were heard. Torques have no lag, so that only silence counts for them."""
         return {arm: state.timing(self._now) for arm, state in self.states.items() if state.newest is not None}
 
     def lead(self) -> float:

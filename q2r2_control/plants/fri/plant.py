@@ -23,7 +23,7 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import ArmTiming, Array, Command, CommandMode, RobotState
 from q2r2_control.wording import sentence
 
-_KEPT = 100_000  # Number of answers that are kept. The garbage collector looks at all of them during a run.
+_KEPT = 100_000  # Number of answers that are kept. During a run the garbage collector looks at all of them.
 _KINDS = {CommandMode.POSITION: CommandKind.POSITION, CommandMode.TORQUE: CommandKind.TORQUE}
 
 

@@ -19,7 +19,8 @@ _TYPES = {
     "double": _Field.TYPE_DOUBLE,
     "bytes": _Field.TYPE_BYTES,
 }
-# Message -> name of a field -> (number, type); a type that is no key above is a message; [] repeated, ! required.
+# For each message, the number and the type of each field. A type that is no key of _TYPES is a message. A type with []
+# is repeated, and a type with ! is required.
 _MESSAGES: dict[str, dict[str, tuple[int, str]]] = {
     "Header": {"identifier": (1, "uint!"), "counter": (2, "uint!"), "reflected": (3, "uint!")},
     "Joints": {"value": (1, "double[]")},

@@ -26,7 +26,7 @@ from q2r2_control.types import Array
 # An answer is for a time that is this much before the arrival of its question [s]. Also on a busy computer the loop has
 # ticked by then.
 DELAY = 0.004
-_AT_REST = 1e-9  # [rad]
+_AT_REST = 1e-9  # Greatest distance from the end of the path at which the arm counts as resting [rad].
 _RESTARTED = 1000  # A counter that goes back by more shows that the session has begun again.
 _COUNTERS = 1 << 32
 _MOST_AHEAD = 20  # Number of messages that may come at once after a gap.
@@ -156,7 +156,7 @@ class ArmSession:
             raise ProtocolError(f"FRI message counter {ahead} ahead, {passed:.3f} s after the last one")
 
     def _take(self, message: Monitoring, now: float) -> bool:
-        """Take the contents of a message; returns False for one that is older than the newest."""
+        """Take the contents of a message; returns False if it is older than the newest one."""
         state, before = self.state, self.state.newest
         state.problem = None
         if before is None or state.is_silent(now):
@@ -253,7 +253,10 @@ class ArmSession:
         return {name: value for name, value in fitting.items() if value is not None}
 
     def _torque(self, message: Monitoring, now: float) -> FriCommand | None:
-        """Return the newest torque overlay, or one that brakes, with the cabinet's own position, as KUKA's examples."""
+        """Return the newest torque overlay, or one that brakes.
+
+        It has the cabinet's own position, as in KUKA's examples.
+        """
         age = now - self._tau_came
         if self.state.is_too_slow or (message.session is Session.COMMANDING_ACTIVE and age > _TORQUE_GONE):
             return None
@@ -268,7 +271,10 @@ class ArmSession:
 
 
 def follow(sessions: Mapping[str, ArmSession], commands: Mapping[str, ArmCommand]) -> bool:
-    """Let every arm take its command; returns False, and none takes it, if one came too late. Both arms then brake."""
+    """Let every arm take its command. If one of them came too late, no arm takes its own, and False is returned.
+
+    All arms then brake.
+    """
     if any(sessions[arm].has_passed(command) for arm, command in commands.items()):
         return False
     for arm, command in commands.items():
@@ -287,5 +293,5 @@ def answer(sessions: Mapping[str, ArmSession], arm: str, datagram: bytes, now: f
 
 
 def _ahead(message: Monitoring, before: Monitoring) -> int:
-    """Return by how many messages ``message`` is newer than ``before``; negative if it is older."""
+    """Return the number of messages by which ``message`` is newer than ``before``; negative if it is older."""
     return (message.counter - before.counter + _COUNTERS // 2) % _COUNTERS - _COUNTERS // 2

@@ -14,7 +14,7 @@ from q2r2_control.types import ArmTiming
 TORQUE_PERIOD = 0.005  # Longest time between two answers. With 0.01 an arm at the default stiffness is unstable [s].
 _SILENT = 0.1  # A cabinet without a message for longer than this has gone [s].
 _LONGEST_LAG = 0.25  # Lag from which a cabinet that asks too seldom is not answered any more [s].
-_EARLY = 5e-4  # By how much a message may come before it is expected [s].
+_EARLY = 5e-4  # Time by which a message may come before it is expected [s].
 
 
 @dataclass
@@ -29,19 +29,19 @@ class SessionState:
     source: str  # The cabinet in words.
     wanted: CommandKind = CommandKind.POSITION  # TORQUE stands for an overlay of torques.
     newest: Monitoring | None = None
-    arrival: float = -math.inf  # Of the newest message.
-    velocity: Joints = (0.0,) * JOINTS  # Measured [rad/s].
-    rest: Joints = (0.0,) * JOINTS  # Where the arm's path ends [rad].
-    following: bool = False
+    arrival: float = -math.inf  # Arrival of the newest message.
+    velocity: Joints = (0.0,) * JOINTS  # Measured velocities [rad/s].
+    rest: Joints = (0.0,) * JOINTS  # Positions at the end of the arm's path [rad].
+    following: bool = False  # True while the arm follows the reference.
     ended: int = 0  # Number of times that the arm ceased to follow because its cabinet ended the session.
-    answered: float = -math.inf  # The latest time for which an answer was.
-    expected: float = -math.inf  # When the message of that answer would have come without delay.
-    lag: float = 0.0  # By how much the times of answers are behind.
-    behind: float = 0.0  # The same by the cabinet's clock, which does not depend on when its messages arrive.
-    took: float | None = None  # From the newest message until its answer was sent; None if it got no answer.
+    answered: float = -math.inf  # The latest time for which there was an answer.
+    expected: float = -math.inf  # The time at which the message of that answer would have come without delay.
+    lag: float = 0.0  # Time by which the times of answers are behind.
+    behind: float = 0.0  # The lag by the cabinet's clock, which does not depend on the arrival of its messages.
+    took: float | None = None  # Time from the newest message until its answer was sent; None if it got no answer.
     lost: int = 0  # Number of lost messages of the cabinet.
-    unreadable: int = 0
-    problem: str | None = None  # What is wrong with the newest datagram.
+    unreadable: int = 0  # Number of unreadable messages.
+    problem: str | None = None  # The fault of the newest datagram; None if it has none.
 
     @property
     def period(self) -> float:
@@ -69,7 +69,7 @@ class SessionState:
         return ArmTiming(self.behind, now - self.arrival, self.period)
 
     def latest(self, t: float) -> float:
-        """Return the latest time for which an answer until ``t`` may be [s]."""
+        """Return the latest time for which there may be an answer until ``t`` [s]."""
         if self.period == 0.0 or self.answered == -math.inf:
             return -math.inf
         messages = max(math.floor((t + _EARLY - self.expected) / self.period), 0)
@@ -104,12 +104,12 @@ class SessionState:
 class ArmCommand:
     """The command of one tick for one arm: its reference at the end of the tick, and the certified stop from there."""
 
-    now: float  # Of the tick [s].
-    start: float  # When the reference leaves the earlier stop [s].
-    end: float  # [s]
-    q: Joints  # [rad]
-    v: Joints  # [rad/s]
-    deceleration: Joints  # Of the stop [rad/s^2].
+    now: float  # Time of the tick [s].
+    start: float  # Time at which the reference leaves the earlier stop [s].
+    end: float  # Time of the reference's end [s].
+    q: Joints  # Posture at the end [rad].
+    v: Joints  # Velocity at the end [rad/s].
+    deceleration: Joints  # Deceleration of the stop [rad/s^2].
     outputs: dict[str, IoValue] = field(default_factory=dict)  # Outputs of the cabinet that are set, by name.
     tau: Joints | None = None  # Torque overlay [Nm]; None with positions, or if the damping brakes.
     damping: Joints | None = None  # Damping that brakes if no overlay comes [Nm s/rad]; None with positions.

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable
 from q2r2_control.plants.fri.session_state import SessionState
 from q2r2_control.plants.fri.wire import Session
 
-_LOOKS = 0.01  # Time between two looks at the cabinets [s].
+_LOOKS = 0.01  # Time between two checks of the cabinets [s].
 _FIRST_LINE, _BETWEEN_LINES = 3.0, 10.0  # Delay of the first line, and time between two lines [s].
 _START = (
     "start its FRI application at the smartPAD: choose it, in T1 or T2 hold the enabling switch, press the play key"
@@ -50,7 +50,7 @@ class CabinetWait:
         """Wait until ``done``, at most until ``longest`` [s] after the begin of all waiting.
 
         Args:
-            done: Looks at the cabinets, and returns True if there is nothing to wait for.
+            done: Checks the cabinets, and returns True if there is nothing left to wait for.
             states: Returns the sessions of all arms, for the lines.
             longest: The longest wait; infinite if there is no bound [s].
 

@@ -1,7 +1,7 @@
 """Messages of KUKA's Fast Robot Interface, converted from and to datagrams.
 
-A cabinet sends a :class:`Monitoring` datagram every period, its client answers with a :class:`FriCommand`. FRI 1 sends
-the protobuf message itself; FRI 2 puts its length before it and a CRC-32 behind it, both uint32, little endian.
+A cabinet sends a :class:`Monitoring` datagram in every period, and its client answers with a :class:`FriCommand`. FRI 1
+sends the protobuf message itself. FRI 2 puts its length before it and a CRC-32 behind it, both uint32, little endian.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class Operation(IntEnum):
 
 
 class Drives(IntEnum):
-    """The state of the drives, which is that of the worst joint."""
+    """The state of the drives, which is the state of the worst joint."""
 
     OFF = 0
     TRANSITIONING = 1
@@ -103,7 +103,7 @@ _IN, _OUT = 0, 1
 class Monitoring:
     """A message of a cabinet. Joints are A1 .. A7 [rad, Nm]. A field is None if the message does not contain it."""
 
-    version: int  # 1 or 2
+    version: int  # Version of FRI, 1 or 2.
     counter: int  # Counter of the cabinet's messages.
     reflected: int  # Counter of the client's message that the cabinet received last.
     session: Session
@@ -148,7 +148,7 @@ class FriCommand:
 
 
 def read_monitoring(datagram: bytes) -> Monitoring:
-    """Return a cabinet's message. Raises :class:`ProtocolError` for other bytes."""
+    """Return a cabinet's message; raises :class:`ProtocolError` if the bytes are not one."""
     version, message = _parsed(datagram, MonitoringMessage, _MONITORING)
     data, connection, ipo, robot = message.data, message.connection, message.ipo, message.robot
     if (q := _joints(data, "q")) is None:
@@ -201,7 +201,7 @@ def write_monitoring(monitoring: Monitoring) -> bytes:
 
 
 def read_command(datagram: bytes) -> tuple[int, FriCommand]:
-    """Return version and answer of a client. Raises :class:`ProtocolError` for other bytes."""
+    """Return version and answer of a client; raises :class:`ProtocolError` if the bytes are not an answer."""
     version, message = _parsed(datagram, CommandMessage, _COMMAND)
     data, header = message.data, message.header
     return version, FriCommand(
@@ -274,7 +274,7 @@ def _set_joints(message: Any, name: str, values: Joints | None) -> None:
         getattr(message, name).value.extend(values)
 
 
-# Calling an enum takes ten times as long, and this happens six times a message.
+# A call of an enum takes ten times as long as this table, and there are six look-ups for each message.
 _ENUMS: tuple[type[IntEnum], ...] = (Session, Quality, CommandKind, Safety, Operation, Drives)
 _MEMBERS = {kind: {one.value: one for one in kind} for kind in _ENUMS}
 

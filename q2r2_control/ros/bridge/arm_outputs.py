@@ -88,7 +88,7 @@ class ArmOutputs:
 
     @property
     def conflict(self) -> Reason | None:
-        """A reason if an output's topic has other publishers."""
+        """The reason if an output's topic has other publishers, or None."""
         return next((conflict for output in self._all if (conflict := output.conflict)), None)
 
     @property
@@ -106,7 +106,7 @@ class ArmOutputs:
 
     @property
     def homing(self) -> tuple[bool, Reason | None]:
-        """Whether the built-in controller reports that it goes home, and how the last way home ended by itself."""
+        """True if the built-in controller reports that it goes home, and how the last way home ended by itself."""
         return (False, None) if self._follows is None else (self._follows.homing, self._follows.homing_outcome)
 
     @property
@@ -280,7 +280,7 @@ class FollowWatch:
 class CommandType:
     """Sets MoveIt Servo to its type of targets after each of its starts.
 
-    Raises :class:`ConfigError` without moveit_msgs.
+    Raises :class:`ConfigError` if moveit_msgs is missing.
     """
 
     def __init__(self, node: BaseNode, service: str, message: str = POSE) -> None:

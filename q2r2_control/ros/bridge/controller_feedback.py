@@ -1,7 +1,7 @@
 """Outputs of the built-in controller besides joint commands: safe targets, the arms that follow, openings of grippers.
 
 Fingers and held objects are bodies, which must not collide. Openings are 0 closed .. 1 fully open. The client of a
-gripper publishes the wanted opening and the last commanded one, on the topic of the arm's targets with
+gripper publishes the wanted opening and the last commanded one. Its topic is the topic of the arm's targets with
 ``/wanted_opening`` at its end. On ``~/opening/<arm>`` the controller answers with the wanted opening and the proven
 one, which the client commands. Without a client, without measured fingers, or with another controller of the arms,
 fingers may be anywhere on their way.

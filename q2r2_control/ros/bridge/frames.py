@@ -132,7 +132,7 @@ class FrameListener:
     def __init__(self, node: Any) -> None:
         self.tree = FrameTree()
         self._node = node
-        self._numbers: defaultdict[str, SequenceWatch] = defaultdict(SequenceWatch)  # By frame.
+        self._numbers: defaultdict[str, SequenceWatch] = defaultdict(SequenceWatch)  # Sequence numbers by frame.
         self._publishers = Publishers(node, [_TF])
         self._disagree: dict[str, float] = {}  # By disputed frame, the time of the last difference [s].
         latched = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)

@@ -50,7 +50,7 @@ class HandPublishers:
         self._publishers = {
             name: node.create_publisher(_KINDS[topic.kind][0], name, _DEPTH) for name, topic in topics.items()
         }
-        self._template = lru_cache(maxsize=8)(convert.pose_template)  # By frame.
+        self._template = lru_cache(maxsize=8)(convert.pose_template)  # The templates of poses, by frame.
         self.sent: dict[str, int] = {publisher.topic_name: 0 for publisher in self._publishers.values()}
 
     def publish(self, topic: str, message: HandMessage, frame: str, t: float) -> None:
@@ -134,9 +134,9 @@ class HandIntake:
             (PoseStamped, "pose", take_pose, on_pose is None),
             (OVR2ROSInputs, "inputs", on_inputs, False),
         )
-        self._publishers: dict[str, Publishers] = {}  # By hand.
+        self._publishers: dict[str, Publishers] = {}  # The publishers of each hand.
         self._haptics: dict[str, Any] = {}
-        self._one: dict[str, OnePublisher] = {}  # By hand.
+        self._one: dict[str, OnePublisher] = {}  # The check for several publishers of each hand.
         self._samples = SampleQueue()
         self._received = -math.inf  # Receipt time of the message in progress [s].
         self.follow(hand)

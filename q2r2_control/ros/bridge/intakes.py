@@ -41,7 +41,7 @@ from q2r2_control.types import ArmTiming, Array, RobotState
 from q2r2_control.wording import sentence
 
 _SHARED = "joint_states"  # The default topic.
-_LATEST = 0.02  # By how much later than usual a target may arrive, so that its stamp still tells when it is due [s].
+_LATEST = 0.02  # Greatest delay beyond the usual one with which a target's stamp still tells when it is due [s].
 _OLD = 0.5  # A target that is older than the one before by this much was made before its sender stood still [s].
 # Longest period of joint states from which the lags of two arms can be compared [s], and the weight of a new period.
 _LONGEST_PERIOD, _PERIOD_SHARE = 0.02, 0.05
@@ -60,7 +60,7 @@ class TargetFrame(NamedTuple):
     """The frame of target poses."""
 
     name: str
-    pose: pin.SE3  # In the world frame.
+    pose: pin.SE3  # Pose in the world frame.
 
 
 class TargetIntake:

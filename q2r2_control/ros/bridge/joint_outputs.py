@@ -216,7 +216,7 @@ class JointOutput:
     def driver_namespaces(self, robot: Robot) -> dict[str, str]:
         """Return the namespace of each arm's driver for outputs ``lbr_*``, in which it reports its session.
 
-        Raises :class:`ConfigError` for a command topic that does not tell the namespace.
+        Raises :class:`ConfigError` if a command topic does not tell the namespace.
         """
         found: dict[str, str] = {}
         for arm, its in robot.arms.items() if self._kind.older is not None else ():

@@ -46,7 +46,7 @@ class ObstacleIntake:
 def obstacle_of(message: Marker, now: float) -> MovingObstacle | None:
     """Return the obstacle of a marker that came at ``now`` [s], or None if the marker removes it.
 
-    Raises :class:`RobotError` or :class:`ConfigError`.
+    Raises :class:`RobotError` or :class:`ConfigError` if the marker does not describe an allowed obstacle.
     """
     if message.action in (Marker.DELETE, Marker.DELETEALL):
         return None

@@ -85,12 +85,12 @@ class TargetOutput:
 
     @property
     def conflict(self) -> Reason | None:
-        """A reason if there are other publishers of the same topic."""
+        """The reason if there are other publishers of the same topic, or None."""
         return self._one.conflict()
 
     @property
     def unready(self) -> Reason | None:
-        """A reason if the topic has no subscriber, or one whose node is not known yet."""
+        """The reason if the topic has no subscriber, or one whose node is not known yet, or None."""
         if self._publisher.listeners == 0:
             return Reason.of(RosReason.NO_SUBSCRIBER, topic=f"{self.topic} ({self.preset.message})")
         return self._unknown_node if self._unknown and not self.following else None

@@ -232,7 +232,8 @@ class BaseArmController(BaseNode):
         if (held := self.outputs.gripper_held) is not None:
             return WARN, held, values
         if self.state in AT_REST:
-            return OK, f"ready to engage ({self.feedback.paused})", values  # whatever refused an earlier press is over
+            # The reason for which an earlier press was refused is over.
+            return OK, f"ready to engage ({self.feedback.paused})", values
         return OK, self.feedback.last_line, values
 
     def _base(self) -> pin.SE3 | None:

@@ -46,10 +46,10 @@ from q2r2_control.supervision.tick_pacer import TickClock
 from q2r2_control.types import LONGEST_DT, Reference
 from q2r2_control.wording import sentence
 
-_LONGEST_STOP = 3.0  # [s]
+_LONGEST_STOP = 3.0  # Longest time until the arms rest at the end [s].
 _QUIET = 0.3  # Other commanders must be silent for this long first [s].
-_LONGEST_ACTIVATION = 2.0  # In addition to the settle time [s].
-_SAFE_TARGET_PERIOD = 0.02  # For arms that only listen [s].
+_LONGEST_ACTIVATION = 2.0  # Longest time of an activation in addition to the settle time [s].
+_SAFE_TARGET_PERIOD = 0.02  # Time between two safe targets if nodes only listen to them [s].
 
 
 class CartesianControllerNode(ManagedNode):

@@ -43,7 +43,7 @@ _LOG_PERIOD = 1.0  # Least time between lines about refusals [s].
 _TRAJECTORY = "joint_trajectory"
 _REACHED = 0.02  # Distance from the goal that counts as reached, as a share of the stroke.
 _STALLED_AFTER = 0.3  # A gripper that does not move by _MOVES within this time has stalled [s].
-_MOVES = 0.004  # Share of the stroke.
+_MOVES = 0.004  # Least motion of a gripper that counts, as a share of the stroke.
 _OUTSIDE = 0.02  # A goal beyond the stroke by this share still counts as its end.
 _CLOSED = 0.05  # Closed position in goals, as in Quest2ROS2; 0 is fully open [m].
 
@@ -145,7 +145,7 @@ class MujocoRobot(BaseNode):
         self._received = 0.0  # Receipt time of the command in progress [s].
         self._refused: dict[str, str] = {}
         self._refusals = 0
-        self._delays: dict[tuple[str, ...], DelayWatch] = {}  # By topic and first joint.
+        self._delays: dict[tuple[str, ...], DelayWatch] = {}  # The delays of commands, by topic and first joint.
         self._make_publishers()
         self._make_subscriptions()
         self._grippers = {

@@ -60,7 +60,7 @@ _STREAM_QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 class RecorderNode(BaseNode):
-    """Writes a file from its start to its end; episodes in it are told by controls of the operator, and by services."""
+    """Writes a file from its start to its end. Controls of the operator and services mark the episodes in it."""
 
     ticks = True
 
@@ -78,7 +78,8 @@ class RecorderNode(BaseNode):
             raise ConfigError("parameter folder: empty; allowed: a folder")
         cameras = {name: camera.topic for name, camera in config.cameras.items() if camera.topic is not None}
         room = ROOM_WITH_PICTURES if cameras else ROOM
-        self._recorder = MessageRecorder(Path(folder), config.name, room)  # its process starts while this one builds
+        # The process of the recorder starts while this process makes the node.
+        self._recorder = MessageRecorder(Path(folder), config.name, room)
         self._judge = EpisodeJudge(lambda: self._recorder.file, self._tell, timed=False)
         robot = Robot.from_config(config)
         self._marks = EpisodeMarks()
@@ -123,7 +124,7 @@ class RecorderNode(BaseNode):
             self.create_subscription(message, name, take, qos, raw=True)
 
     def _take(self, topic: Topic, told: bool, payload: bytes, info: Mapping[str, Any]) -> None:
-        """Keep a message until :meth:`_write`; ``told``: it is an arm's event, which may be about an episode."""
+        """Keep a message until :meth:`_write`. ``told`` is True for an arm's event, which may be about an episode."""
         received = self._day() - round(age(info) * 1e9)
         number, sent = info["publication_sequence_number"] or 0, info["source_timestamp"]
         self._waiting.append(Message(topic.channel, number, received, max(sent, 0), bytes(payload)))
@@ -205,7 +206,7 @@ class RecorderNode(BaseNode):
         return OK, f"records to {recorder.file}", values
 
     def close(self) -> None:
-        """Write what there is, and say what became of it: by the exit code too, if the recording failed."""
+        """Write all messages, and report the result of the recording. If it failed, the exit code shows it as well."""
         recorder = self._recorder
         self._judge.close()
         recorder.record(self._waiting)

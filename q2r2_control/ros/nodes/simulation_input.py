@@ -140,7 +140,8 @@ class SimulationInput(BaseNode):
 class HandInput(BaseNode):
     """Polls an input and publishes each sample. A pose with a fault is left out, so that its arm pauses.
 
-    Raises :class:`ConfigError` for an unknown input or control.
+    Raises:
+        ConfigError: If the input or a control is unknown.
     """
 
     ticks = True

@@ -32,11 +32,14 @@ _SERVER_LOG = logging.getLogger("q2r2_control.inputs.headset")
 
 
 class TcpEndpoint(BaseNode):
-    """Serves one headset at a time. Each message is published as it is by the thread that receives it.
+    """Serves one headset at a time. The thread that receives a message publishes it without a change.
 
-    Poses are stamped with this node's clock when they are received, since the headset has a clock of its own. Poses
-    that no arm may follow, frozen ones and those of a frame that moved, are left out, so that arms pause.
-    Raises :class:`InputError` when host and port cannot be bound, :class:`ConfigError` for what ``allow`` cannot be.
+    Poses are stamped with this node's clock when they are received, because the headset has a clock of its own. Poses
+    that no arm may follow are left out, so that arms pause. These are frozen poses, and poses of a frame that moved.
+
+    Raises:
+        InputError: If host and port cannot be bound.
+        ConfigError: If the value of ``allow`` is not allowed.
     """
 
     def __init__(self, **kwargs: Any) -> None:
@@ -114,10 +117,10 @@ class TcpEndpoint(BaseNode):
 
 
 class CheckTcpConnection(BaseNode):
-    """Shows pose, inputs and twist of both hands with rate and age: a table on a terminal, else a line a topic.
+    """Shows pose, inputs and twist of both hands with rate and age, as a table on a terminal, or else in lines.
 
-    A topic that is silent for 2 s has timed out. Ages are measured with the machine's steady clock, not in ROS time.
-    After ``duration`` it ends, with exit code 1 when every topic has timed out.
+    A topic that is silent for 2 s has timed out. Ages are measured by the machine's steady clock, and not in ROS time.
+    After ``duration`` the node ends, with exit code 1 if every topic has timed out.
     """
 
     def __init__(self, **kwargs: Any) -> None:

@@ -56,8 +56,9 @@ from q2r2_control.viewer.web.exchange import Frame, PageRequest
 from q2r2_control.viewer.web.page import Page
 
 _PERIOD = 1.0 / 30.0  # Time between two frames [s].
-_LOOK_PERIOD = 0.5  # Time between two looks for nodes [s].
-_STREAM_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)  # Deep enough for the ticks of a frame.
+_LOOK_PERIOD = 0.5  # Time between two searches for nodes [s].
+# The queue is deep enough for all ticks in the time of a frame.
+_STREAM_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
 _PICTURE_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 _OF_RECORDER = PageRequest.RECORD, PageRequest.MARK, PageRequest.SUBTASK
 _PICTURE_PERIOD = 0.2  # Time between two pictures of a camera [s].
@@ -65,7 +66,7 @@ _UNREADABLE = SerdeError, ValueError, KeyError, IndexError, TypeError
 
 
 class WebPage(BaseNode):
-    """Draws what it has heard, and passes on the requests of the page's buttons."""
+    """Draws the data that it has received, and passes on the requests of the page's buttons."""
 
     ticks = True
 
@@ -102,7 +103,7 @@ class WebPage(BaseNode):
             if topic.name in shown:
                 name, qos = self.name_in_set(heard_on(topic.name)), RECORDED_QOS if topic.type == TEXT else _STREAM_QOS
                 self._listen(name, topic.type, partial(self._take, topic), qos)
-        self._obstacles: dict[str, tuple[MovingObstacle, float]] = {}  # The newest ones and their times [s].
+        self._obstacles: dict[str, tuple[MovingObstacle, float]] = {}  # The newest obstacles and their times [s].
         if config.control.moving_obstacles:
             self.create_subscription(Marker, OBSTACLES.replace("~", self._controller), self._on_obstacle, 10)
         self._pictures: dict[str, bytes] = {}  # The newest messages by camera.
@@ -157,7 +158,7 @@ class WebPage(BaseNode):
             case PageRequest.RESET:
                 return [f"{self._controller}/reset", *(f"{arm}/reset" for arm in arms)]
             case PageRequest.RECORD:
-                # The node's state comes twice a second, later than what the page shows of an episode.
+                # The node's state comes twice a second, later than the marks of episodes that the page shows.
                 told = self._marks.open if self._marks.any else states.get(self._recorder, {}).get("episode_open")
                 return [f"{self._recorder}/{'stop' if told else 'start'}"]
             case PageRequest.MARK | PageRequest.SUBTASK:
@@ -178,11 +179,11 @@ class WebPage(BaseNode):
             self._notice = f"{name}: {future.result().message}"
 
     def _show(self) -> None:
-        """Do what the page's users have asked for, and draw the newest tick."""
+        """Carry out the requests of the page's users, and draw the newest tick."""
         while not self._asked.empty():
             self._serve(self._asked.get())
         waiting, self._waiting = self._waiting, []
-        # A frame has one posture, flag and target of each; all ticks, references and events count.
+        # A frame shows only the newest posture, flags and targets. All ticks, references and events count.
         try:
             chunk = self._ticks.add_messages(waiting)
         except _UNREADABLE as error:
@@ -196,12 +197,13 @@ class WebPage(BaseNode):
             self._slowest = max(self._slowest, float(chunk.rows["compute_time"].max()))
         if self._row is None:
             return
-        # A controller that is stopped has no ticks; where the joints are is shown all the same.
+        # A controller that is stopped has no ticks. The positions of the joints are still shown.
         self._row["now"] = (time.monotonic_ns() - self._begun) / NANOSECONDS
         self._row["q"], self._row["v"], self._row["tau"] = self._ticks.joints
         nodes = node_views(self._states)
         views = arm_views(nodes, self._cell)
-        told = {node.arm: node.values.get("hand_age") for node in nodes}  # twice a second, and at each event
+        # The nodes report this age twice a second, and at each event.
+        told = {node.arm: node.values.get("hand_age") for node in nodes}
         ages = {arm: age for arm, age in told.items() if arm is not None and isinstance(age, int | float)}
         frame = Frame(
             tick=self._tick_of(self._row.copy(), {view.name: view.state for view in views}),

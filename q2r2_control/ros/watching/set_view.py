@@ -114,7 +114,7 @@ class DriverView:
 class SetView:
     nodes: tuple[NodeView, ...]
     topics: tuple[TopicView, ...]
-    names: tuple[str, ...]  # Of all nodes in the domain. A node that runs twice is there twice.
+    names: tuple[str, ...]  # Names of all nodes in the domain. A node that runs twice is there twice.
     arms: tuple[ArmView, ...]
     drivers: tuple[DriverView, ...] = ()  # Empty if drivers were not listened to.
 
