@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from arena_hands import SPEED, Ask, Judge, ScriptedHands, looking_down
+from arena_hands import TARGET_SPEED, Ask, Judge, ScriptedHands, looking_down
 from arena_robot import ArmModel, corners_of, geoms_of, robot_of, tool_pose
 
 LIMIT = 2.0  # [rad/s]
@@ -103,7 +103,7 @@ def test_hands_move_straight_and_wait_for_their_tools_before_they_go_on() -> Non
 
     def asks() -> Iterator[Ask]:
         asked.append("first")
-        yield Ask({"left": pin.SE3(np.eye(3), np.array([SPEED, 0.0, 0.0]))}, pause=0.2)
+        yield Ask({"left": pin.SE3(np.eye(3), np.array([TARGET_SPEED, 0.0, 0.0]))}, pause=0.2)
         asked.append("second")
         yield Ask({}, closed=("left",))
 
@@ -111,7 +111,7 @@ def test_hands_move_straight_and_wait_for_their_tools_before_they_go_on() -> Non
     hands = ScriptedHands(asks(), start)
     for step in range(1, 11):
         hands.advance(start, 0.1)
-        assert hands.targets["left"].translation == pytest.approx([SPEED * step / 10, 0.0, 0.0])
+        assert hands.targets["left"].translation == pytest.approx([TARGET_SPEED * step / 10, 0.0, 0.0])
     for _ in range(4):  # The tool has not arrived.
         hands.advance(start, 0.1)
     assert asked == ["first"]

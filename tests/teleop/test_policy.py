@@ -210,7 +210,7 @@ def test_grippers_change_at_the_time_of_the_action() -> None:
 def test_actions_that_curve_in_all_directions_are_followed_between_their_times_too() -> None:
     run = Run()
     run.now = 0.0
-    way, times = np.array([0.1, -0.2, 0.3]), TICK + PERIOD * np.arange(8)
+    way, times = np.array([0.1, -0.2, 0.3]), np.array([TICK + PERIOD * index for index in range(8)])
 
     def place(t: float) -> Array:
         return TOOLS["left"].translation + way * (t - times[0]) ** 2
