@@ -54,7 +54,7 @@ class ImpedanceReport:
     """The result of one tick. Joints and arms are given by name."""
 
     errors: dict[str, Array]  # By arm (6,): clipped way to the reference, in world axes [m], [rad].
-    clipped: tuple[str, ...]  # Arms that are farther from their reference than the clip allows.
+    clipped: tuple[str, ...]  # Arms whose deviation from their reference is clipped.
     saturated: tuple[str, ...]  # Joints that would need more than their torque limit.
     rate_limited: tuple[str, ...]  # Joints whose torque could not change as fast as it should.
     repelled: tuple[str, ...]  # Joints that are pushed away from a position limit.

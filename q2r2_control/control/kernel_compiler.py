@@ -109,7 +109,7 @@ class Kernel(CPUDispatcher):
 
     @property
     def nopython_signatures(self) -> list[Any]:
-        """The types for which this kernel has been compiled, as a whole or as a part."""
+        """The argument types for which this kernel has been compiled, called directly or from other kernels."""
         return [compiled.signature for compiled in (self.overloads | self.parts).values()]
 
     def get_overload(self, sig: Any) -> Any:

@@ -1,4 +1,4 @@
-"""The limits of the numbers of an episode, and the texts about numbers that are beyond them."""
+"""The limits of the numbers of an episode, and the messages about numbers outside these limits."""
 
 from __future__ import annotations
 

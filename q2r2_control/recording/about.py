@@ -132,7 +132,7 @@ def program() -> dict[str, str]:
 
 
 def anonymous(notes: Mapping[str, str]) -> dict[str, str]:
-    """Return the notes without those that identify a person or contain the name or address of a computer."""
+    """Return only the notes that name no person and no computer."""
     kept = {name: text for name, text in notes.items() if name not in _PERSONAL}
     if "machine" in kept:
         kept["machine"] = kept["machine"].partition(", ")[2]  # Only the operating system is kept.

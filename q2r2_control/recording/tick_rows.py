@@ -58,7 +58,7 @@ class PackedTick(NamedTuple):
 
 
 def tick_type(arms: int, joints: int) -> np.dtype[np.void]:
-    """Return the type of a row for the given numbers of arms and joints; all numbers are float64."""
+    """Return the NumPy dtype of a row for these numbers of arms and joints; all its numbers are float64."""
     number, pose, of_joints = "<f8", f"({len(POSE_FIELDS)},)<f8", f"({joints},)<f8"
     arm = [*((name, number) for name in ARM_FIELDS), *((name, pose) for name in ARM_POSES)]
     return np.dtype(

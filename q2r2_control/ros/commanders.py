@@ -17,7 +17,7 @@ from q2r2_control.ros.base_node import STREAM_QOS, BaseNode
 from q2r2_control.ros.monitoring import WatchedPublisher, node_of
 from q2r2_control.ros.reasons import RosReason
 
-_DISCOVERY = 1.0  # A publisher that a new node discovers within this time was there before it [s].
+_DISCOVERY = 1.0  # Publishers that are discovered within this time are taken to be older than the node [s].
 _GRAPH_PERIOD = 0.04  # Time between two queries of the graph [s].
 _UNKNOWN = "a node not known yet"  # The graph knows an endpoint before it knows its node.
 HEARD = 0.3  # A node that sent a command within this time is a commander [s].

@@ -49,7 +49,7 @@ class Tick:
     compute_time: float  # [s]
     impedance: ImpedanceReport | None = None  # Only in torque mode.
     wall: WallReport | None = None  # Only in torque mode.
-    admittance: AdmittanceReport | None = None  # Only in position mode with an admittance.
+    admittance: AdmittanceReport | None = None  # None unless in position mode with an admittance.
     held_grippers: dict[str, tuple[str, str]] = field(default_factory=dict)  # See :attr:`ControlLoop.held_grippers`.
     holding: dict[str, bool] = field(default_factory=dict)  # For each arm with an object, whether its gripper holds it.
     obstacles: dict[str, ObstacleReport] = field(default_factory=dict)  # The last reports of moving obstacles.

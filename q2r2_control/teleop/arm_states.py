@@ -33,7 +33,7 @@ class Cause(StrEnum):
     LET_GO = "the dead man is let go"
     CHORD = "the headset's alignment: both buttons of a hand"
     ALIGNED = "both buttons are released, and a new pose has come"
-    NOT_ALIGNED = "the same, with something in the way"
+    NOT_ALIGNED = "the same, but a condition for engaging is not met"
     CARRY = "the control that carries, by the hand of the other arm, which is engaged"
     CARRY_ENDS = "that control, one that pauses or an alignment, by either hand"
     GIVE_BACK = "a program gives the arms to the policy"
@@ -43,7 +43,7 @@ class Cause(StrEnum):
     PRESS = "any press"
     STOP = "the control that stops"
     GO_ON = "the control that stops, once more"
-    FAULT = "data lost or not usable, a jump, a stall, what moves the arm has stopped"
+    FAULT = "data lost or not usable, a jump, a stall, or the arm's controller has stopped"
 
 
 class Who(StrEnum):

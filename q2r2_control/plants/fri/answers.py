@@ -125,7 +125,7 @@ class ReferencePath:
 
 class _Answer(NamedTuple):
     time: float  # The time for which the answer is [s].
-    rate: float  # Rate of this time since the answer before.
+    rate: float  # How fast this time has passed since the answer before [s/s].
 
 
 class MessageClock:

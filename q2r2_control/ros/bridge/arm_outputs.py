@@ -67,7 +67,7 @@ class ArmOutputs:
         self.builtin = values.builtin_node if self.first.preset is BUILTIN else None
         self.home_controller = None if self._filtered else self.builtin
         if self.first.preset is BUILTIN:
-            # The timeout is twice the usual one, because the targets have to arrive first, and then the answer.
+            # The timeout is twice the usual one, because a target must arrive before the answer can be sent.
             self._follows = FollowWatch(node, values.builtin_node, arm, 2.0 * values.listener_timeout)
         service = preset.command_type
         self._command_type = (

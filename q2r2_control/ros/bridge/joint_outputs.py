@@ -66,7 +66,7 @@ class TrajectoryOutput(Kind):
 
     def encode(self, command: Command, state: RobotState, t: float, names: list[str], joints: np.ndarray) -> bytes:
         numbers = [*command.q[joints].tolist(), *command.v[joints].tolist()]
-        # Stamp 0 means now for any clock of the receiver.
+        # Stamp 0 means "now", whichever clock the receiver uses.
         return self._template(tuple(names)).fill(numbers, 0.0)
 
     def _make(self, names: tuple[str, ...]) -> Template:
