@@ -33,8 +33,8 @@ class ReferenceHistory(NamedTuple):
     travel: Array  # (nv,) Greatest distance of a joint in the window from its present position [rad or m].
     off: Array  # (nv,) Greatest deviation of a joint from v t in the window, plus the effect of turning [rad or m].
     speed: Array  # (nv,) Greatest speed of a joint in the window [rad/s].
-    # How much each joint makes a body's corner leave a straight line (3, nv). The first row is for the window, the other
-    # two for the whole way, with instants that are far apart, and with instants that are close together.
+    # How much each joint makes a body's corner leave a straight line (3, nv). The first row is for the window. The two
+    # others are for the whole way, with instants that are far apart, and with instants that are close together.
     bend: Array
     deviation: Array  # (nv,) Greatest deviation from v t on the whole way, plus the effect of turning [rad or m].
 
