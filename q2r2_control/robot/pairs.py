@@ -204,12 +204,15 @@ def remove_overlapping_own_pairs(
         apart = np.flatnonzero(~(distances.at(q) <= 0.0))
         if len(apart):  # At all other postures, only the few pairs that are left have to be measured.
             names = pair_names(touching)
-            parted = {names[pair] for pair in apart}
-            keep_pairs(touching, lambda a, b, parted=parted: (a, b) not in parted)
+            keep_pairs(touching, _not_among({names[pair] for pair in apart}))
             distances = CoalDistances(model, touching)
     removed = pair_names(touching)
-    keep_pairs(geometry, lambda a, b: (a, b) not in removed)
+    keep_pairs(geometry, _not_among(removed))
     return removed
+
+
+def _not_among(pairs: Collection[tuple[str, str]]) -> Callable[[str, str], bool]:
+    return lambda a, b: (a, b) not in pairs
 
 
 def pair_names(geometry: pin.GeometryModel) -> tuple[tuple[str, str], ...]:
