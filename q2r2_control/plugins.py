@@ -8,7 +8,11 @@ gamepad = "my_package.gamepad:Gamepad"
 
 from __future__ import annotations
 
-from importlib.metadata import entry_points
+import os
+import sys
+from collections.abc import Mapping
+from functools import lru_cache
+from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 from q2r2_control.errors import ConfigError
@@ -20,9 +24,32 @@ EXPORTS = "q2r2_control.exports"
 REASONS = "q2r2_control.reasons"
 
 
+def points_of(group: str) -> Mapping[str, EntryPoint]:
+    """Return the entry points that installed packages declare, by name in alphabetical order.
+
+    To read the files of some hundred packages takes longer than to load a cell. They are read again when a folder of
+    the path has changed, as it does when a package is installed.
+    """
+    folders = tuple((folder, _changed_at(folder)) for folder in sys.path)
+    return _points(group, folders)
+
+
+@lru_cache(maxsize=32)
+def _points(group: str, folders: tuple[tuple[str, int], ...]) -> Mapping[str, EntryPoint]:
+    """Return the entry points of a group. ``folders`` are those of the path, with the times of their changes [ns]."""
+    return {point.name: point for point in sorted(entry_points(group=group), key=lambda point: point.name)}
+
+
+def _changed_at(folder: str) -> int:
+    try:
+        return os.stat(folder or os.curdir).st_mtime_ns
+    except OSError:
+        return 0
+
+
 def names_of(group: str) -> tuple[str, ...]:
     """Return the names that installed packages declare, in alphabetical order."""
-    return tuple(sorted({point.name for point in entry_points(group=group)}))
+    return tuple(points_of(group))
 
 
 def load_class(group: str, name: str) -> Any:
@@ -31,7 +58,7 @@ def load_class(group: str, name: str) -> Any:
     Raises:
         ConfigError: If there is no such name, or if it cannot be imported.
     """
-    found = {point.name: point for point in sorted(entry_points(group=group), key=lambda point: point.name)}
+    found = points_of(group)
     if name not in found:
         kind = group.rpartition(".")[2].removesuffix("s")
         raise ConfigError(f"{kind} {name!r:.60}: allowed are {', '.join(found)}; installed as entry points {group}")

@@ -11,7 +11,6 @@ from typing import Annotated, Any
 import numpy as np
 import pinocchio as pin
 import typer
-import yaml
 from rich.console import Console
 from typer import Argument, Exit, Option
 
@@ -21,6 +20,7 @@ from q2r2_control.cli.cell_yaml import commented_yaml
 from q2r2_control.cli.model_arguments import SPEEDS, named_values, without_mjcf
 from q2r2_control.cli.output import Json, as_json_text, counted, counting, say
 from q2r2_control.config.cell import Config, load_config, parse_config
+from q2r2_control.config.yaml_text import yaml_of
 from q2r2_control.errors import ConfigError, Q2R2Error
 from q2r2_control.robot.compose import compose
 from q2r2_control.robot.description import LinkTree, joint_limits, load_description
@@ -66,7 +66,7 @@ class _Draft:
         return {"model": model, **args, "mount": {"position": [0.0, 0.0, 0.0]}}
 
     def config(self) -> Config:
-        return parse_config(yaml.safe_dump(self.data), self.file, self.file.absolute().parent)
+        return parse_config(yaml_of(self.data), self.file, self.file.absolute().parent)
 
 
 def new_cell(

@@ -40,12 +40,8 @@ from q2r2_control.config.recording import CameraConfig, CameraName, JudgeSetting
 from q2r2_control.config.resources import find_resource
 from q2r2_control.config.strict import Network, StrictModel, network_of, validated
 from q2r2_control.config.teleop import TeleopSettings
+from q2r2_control.config.yaml_text import SafeLoader
 from q2r2_control.errors import ConfigError
-
-try:
-    from yaml import CSafeLoader as _SafeLoader  # With libyaml, a cell is read ten times as fast.
-except ImportError:  # PyYAML was built without libyaml.
-    from yaml import SafeLoader as _SafeLoader  # type: ignore[assignment]
 
 AUTO: Literal["auto"] = "auto"  # The loop's rate is chosen when a run in real time begins.
 HIGHEST_FITTING_RATE_HZ = 1000.0
@@ -337,7 +333,7 @@ def _within_driver_limits(config: Config) -> Config:
     return config.model_copy(update={"control": control.model_copy(update=narrower)})
 
 
-class _Loader(_SafeLoader):
+class _Loader(SafeLoader):
     """A stricter loader than that of YAML 1.1, where a later key silently replaces an equal one, and 1e-3 is a text."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import sysconfig
+from collections.abc import Iterator
 from difflib import get_close_matches
+from itertools import chain
 from pathlib import Path
 
 from q2r2_control.errors import ConfigError, shown
@@ -12,12 +14,13 @@ from q2r2_control.errors import ConfigError, shown
 _CHECKOUT = Path(__file__).resolve().parents[2]
 
 
-def resource_roots() -> list[Path]:
-    """Return the folders that can hold config/ and robots/, nearest first."""
+def resource_roots() -> Iterator[Path]:
+    """Yield the folders that can hold config/ and robots/, nearest first."""
+    yield _CHECKOUT
     installed = [Path(sysconfig.get_path("data", scheme)) for scheme in ("venv", "posix_user", "posix_prefix")]
     # With pip --target, share/ is beside the package. With colcon, it is beside lib/ of lib/python3.x/site-packages.
     installed += [_CHECKOUT, *_CHECKOUT.parents[2:3]]
-    return [_CHECKOUT, *(root / "share" / "q2r2_control" for root in installed)]
+    yield from (root / "share" / "q2r2_control" for root in installed)
 
 
 def find_resource(path: str | os.PathLike[str]) -> Path:
@@ -31,8 +34,8 @@ def find_resource(path: str | os.PathLike[str]) -> Path:
     wanted = Path(path)
     try:
         wanted = wanted.expanduser()
-        candidates = [wanted] if wanted.is_absolute() else [wanted, *(root / wanted for root in resource_roots())]
-        for candidate in candidates:
+        roots = () if wanted.is_absolute() else resource_roots()
+        for candidate in chain([wanted], (root / wanted for root in roots)):
             if candidate.is_file():
                 return candidate
     except (OSError, ValueError, RuntimeError) as error:

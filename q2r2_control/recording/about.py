@@ -13,8 +13,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import yaml
-
+from q2r2_control.config.yaml_text import read_yaml, yaml_of
 from q2r2_control.recording.messages import Topic, run_topics
 
 if TYPE_CHECKING:  # The process of the writer does not import these modules.
@@ -115,7 +114,7 @@ class Conclusion:
 
 def as_yaml(config: Config) -> str:
     """Return the cell with all its defaults, so that other defaults of a later version change nothing."""
-    return str(yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False))
+    return yaml_of(config.model_dump(mode="json"))
 
 
 def program() -> dict[str, str]:
@@ -148,7 +147,7 @@ def changes(about: About, config: Config, robot: Robot) -> list[str]:
         if name in about.notes and about.notes[name] != now.get(name)
     ]
     if about.cell != as_yaml(config):
-        old, new = dict(_flat(yaml.safe_load(about.cell))), dict(_flat(yaml.safe_load(as_yaml(config))))
+        old, new = (dict(_flat(read_yaml(cell))) for cell in (about.cell, as_yaml(config)))
         for key in dict.fromkeys((*old, *new)):
             if old.get(key) != new.get(key):
                 found.append(f"cell: {key}: {old.get(key, 'nothing')} when recorded, now {new.get(key, 'nothing')}")

@@ -16,11 +16,11 @@ from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from typing import Any
 
-import yaml
 from mcap.data_stream import RecordBuilder
 from mcap.records import DataEnd, Footer
 from mcap.writer import MCAP0_MAGIC, Writer
 
+from q2r2_control.config.yaml_text import yaml_of
 from q2r2_control.recording.about import ABOUT, CELL, CONCLUSION, FIELDS, ROBOT, About, Conclusion
 from q2r2_control.recording.messages import STORE, Message, Topic
 
@@ -135,7 +135,7 @@ class BagWriter(AbstractContextManager["BagWriter"]):
 
     def _register(self) -> dict[int, int]:
         """Declare the topics; returns the id in the file of each topic's channel."""
-        qos = {"offered_qos_profiles": str(yaml.safe_dump([_QOS], sort_keys=False)).strip()}
+        qos = {"offered_qos_profiles": yaml_of([_QOS]).strip()}
         schemas: dict[str, int] = {}
         for kind in dict.fromkeys(topic.type for topic in self._topics):
             definition, _ = STORE.generate_msgdef(kind, ros_version=2)
@@ -179,5 +179,5 @@ class BagWriter(AbstractContextManager["BagWriter"]):
         part = target.with_suffix(".part")
         # A copy by JSON shares no objects, so the YAML has no references.
         plain = json.loads(json.dumps({"rosbag2_bagfile_information": information}))
-        part.write_text(yaml.safe_dump(plain, sort_keys=False), encoding="utf-8")
+        part.write_text(yaml_of(plain), encoding="utf-8")
         os.replace(part, target)

@@ -179,6 +179,7 @@ class LinkTree:
             if child in self.joint_to:
                 raise RobotError(f"{where}: link {child} hangs on two joints; a robot has to be one tree")
             self.joint_to[child] = joint
+        self._carriers = {child: joint_end(joint, "parent") for child, joint in self.joint_to.items()}
         roots = [link for link in links if link not in self.joint_to]
         if len(roots) != 1:
             raise RobotError(f"{where}: expected one root link, found {len(roots)}: {', '.join(roots) or 'a loop'}")
@@ -190,8 +191,8 @@ class LinkTree:
     def path(self, link: str) -> list[str]:
         """Return the links from the root to ``link``, with both of them."""
         path = [link]
-        while path[-1] in self.joint_to and len(path) <= len(self.joint_to) + 1:
-            path.append(joint_end(self.joint_to[path[-1]], "parent"))
+        while path[-1] in self._carriers and len(path) <= len(self._carriers) + 1:
+            path.append(self._carriers[path[-1]])
         return path[::-1]
 
     def movable(self) -> dict[str, ET.Element]:
@@ -205,7 +206,7 @@ class LinkTree:
             found += [
                 child
                 for child, joint in self.joint_to.items()
-                if joint.get("type") == "fixed" and joint_end(joint, "parent") == carrier
+                if joint.get("type") == "fixed" and self._carriers[child] == carrier
             ]
         return found
 
@@ -229,9 +230,9 @@ def joint_limits(joint: ET.Element) -> tuple[float, float]:
 
 def _check_numbers(root: ET.Element, where: str) -> None:
     for element in root.iter():
-        for attribute in (*_VECTORS, *_SCALARS.get(element.tag, ())):
-            text = element.get(attribute)
-            if text is None:
+        scalars = _SCALARS.get(element.tag, ())
+        for attribute, text in element.items():
+            if attribute not in _VECTORS and attribute not in scalars:
                 continue
             count = 3 if attribute in _VECTORS else 1
             parts = text.split()

@@ -8,7 +8,7 @@ turning_fingers.py if it turns.
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import product
 
@@ -101,14 +101,18 @@ def sweep_fingers(
     bodies: list[FingerBody | TurningBody] = []
     for arm, joints in parts.finger_joints.items():
         links, stroke = links_moved_by(tree, joints), parts.strokes.get(arm)
+        # The gripper moves its joints from closed to open. Without a stroke, it drives none of them.
+        followers = followers_of(tree.joint_to.values(), joints if stroke is not None else ())
         swept: dict[str, list[_Finger] | None] = {}
         for item in geometry.geometryObjects:
+            if (link := link_of(item.name)) not in links:
+                continue
             # The finger joints that carry the body, from the hand outwards.
-            chain = [joint for joint in tree.chain(link_of(item.name)) if joint_end(joint, "child") in links]
+            chain = [joint for joint in tree.chain(link) if joint_end(joint, "child") in links]
             kinds = {joint.get("type", "") for joint in chain}
             if not chain or not kinds <= _KINDS:
                 continue
-            moving = tuple(_finger_joint(model, tree, joint, home, joints, stroke) for joint in chain)
+            moving = tuple(_finger_joint(model, tree, joint, home, followers, stroke) for joint in chain)
             if "revolute" in kinds:
                 body = TurningBody(arm, item.name, _ends(item), float(item.geometry.radius), moving)
                 start, end, radius = body.capsule(ALL_OF_THE_WAY)
@@ -136,17 +140,15 @@ def _finger_joint(
     tree: LinkTree,
     joint: ET.Element,
     home: Mapping[str, float],
-    driven: Collection[str],
+    followers: Mapping[str, Follower],
     stroke: tuple[float, float] | None,
 ) -> FingerJoint:
     """Return a joint of a finger that is locked at ``home`` in ``model``.
 
-    ``driven`` are the joints that the gripper moves from closed to open, by its ``stroke`` [m or rad]. Without a
-    stroke, a joint without a <mimic> may be anywhere in its limits. A joint with a <mimic> follows its driver, also at
-    the end of the driver's travel.
+    ``stroke`` [m or rad] moves the gripper's joints from closed to open. Without a stroke, a joint without a <mimic>
+    may be anywhere in its limits. One of the ``followers`` follows its driver, also at the end of the driver's travel.
     """
     name = joint.get("name", "")
-    followers = followers_of(tree.joint_to.values(), driven if stroke is not None else ())
     followed = followers.get(name, Follower(name, 1.0, 0.0))
     lower, upper = joint_limits(next(one for one in tree.joint_to.values() if one.get("name") == followed.driver))
     closed, opened = (lower, upper) if stroke is None else stroke

@@ -54,7 +54,7 @@ def sink_boxes_into_floor(geometry: pin.GeometryModel) -> None:
     floor = next((item for item in geometry.geometryObjects if _is_floor(item)), None)
     if floor is None:
         return
-    height = floor.placement.translation[2] + floor.geometry.halfSide[2]
+    height = _top(floor)
     for item in geometry.geometryObjects:
         if item is floor or item.parentJoint != 0 or not isinstance(item.geometry, coal.Box):
             continue
@@ -76,16 +76,14 @@ def remove_unreachable_floor_pairs(model: pin.Model, geometry: pin.GeometryModel
     data = model.createData()
     pin.computeJointJacobians(model, data, pin.neutral(model))
     items = {item.name: item for item in geometry.geometryObjects}
+    tops = {name: _top(item) for name, item in items.items() if _is_floor(item)}
 
     def can_meet(a: str, b: str) -> bool:
-        surface, body = items[a], items[b]
-        if not _is_floor(surface):
-            surface, body = body, surface
-        if not _is_floor(surface):
+        surface, body = (a, b) if a in tops else (b, a)
+        if surface not in tops:
             return True
-        lowest = _lowest(model, data, body)
-        top = surface.placement.translation[2] + surface.geometry.halfSide[2]
-        return lowest is not None and lowest - top <= CLEARANCE
+        lowest = _lowest(model, data, items[body])
+        return lowest is not None and lowest - tops[surface] <= CLEARANCE
 
     keep_pairs(geometry, can_meet)
 
@@ -93,6 +91,11 @@ def remove_unreachable_floor_pairs(model: pin.Model, geometry: pin.GeometryModel
 def _is_floor(item: pin.GeometryObject) -> bool:
     fixed_box = isinstance(item.geometry, coal.Box) and item.parentJoint == 0
     return fixed_box and link_of(item.name) == FLOOR and bool(item.placement.rotation[2, 2] > 1.0 - _UPRIGHT)
+
+
+def _top(floor: pin.GeometryObject) -> float:
+    """Return the height of the floor's surface [m]."""
+    return float(floor.placement.translation[2] + floor.geometry.halfSide[2])
 
 
 def _lowest(model: pin.Model, data: pin.Data, item: pin.GeometryObject) -> float | None:

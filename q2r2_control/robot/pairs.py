@@ -142,13 +142,14 @@ def add_movable_pairs(model: pin.Model, geometry: pin.GeometryModel, tree: LinkT
     """
     carrier = {joint.get("name", ""): joint_end(joint, "parent") for joint in tree.joint_to.values()}
     geometry.removeAllCollisionPairs()
-    for first, second in combinations(range(geometry.ngeoms), 2):
-        a, b = (geometry.geometryObjects[index] for index in (first, second))
-        if a.parentJoint == b.parentJoint:
+    bodies = [(int(item.parentJoint), link_of(item.name)) for item in geometry.geometryObjects]
+    names, parents = list(model.names), list(model.parents)
+    for (first, a), (second, b) in combinations(enumerate(bodies), 2):
+        if a[0] == b[0]:
             continue
-        inner, outer = (a, b) if a.parentJoint < b.parentJoint else (b, a)
-        carries = inner.parentJoint != 0 or carrier.get(model.names[outer.parentJoint]) == link_of(inner.name)
-        if not (model.parents[outer.parentJoint] == inner.parentJoint and carries):
+        (inner, link), (outer, _) = (a, b) if a[0] < b[0] else (b, a)
+        carries = inner != 0 or carrier.get(names[outer]) == link
+        if not (parents[outer] == inner and carries):
             geometry.addCollisionPair(pin.CollisionPair(first, second))
 
 
@@ -196,21 +197,28 @@ def remove_overlapping_own_pairs(
     Such shapes overlap by construction. ``own_links`` has one set of links for each arm, from its base to its tool. A
     pair with the other arm or with an obstacle always stays.
     """
-    distances = CoalDistances(model, geometry)
-    names = pair_names(geometry)
-    within_one_arm = [any(set(map(link_of, pair)) <= links for links in own_links) for pair in names]
-    touching = np.array(within_one_arm, dtype=bool)
+    touching = geometry.copy()
+    keep_pairs(touching, lambda a, b: any({link_of(a), link_of(b)} <= links for links in own_links))
+    distances = CoalDistances(model, touching)
     for q in postures:
-        touching &= distances.at(q) <= 0.0
-    removed = tuple(pair for pair, touches in zip(names, touching, strict=True) if touches)
-    keep_pairs(geometry, lambda a, b: (a, b) not in removed)
+        apart = np.flatnonzero(~(distances.at(q) <= 0.0))
+        if len(apart):  # At all other postures, only the few pairs that are left have to be measured.
+            names = pair_names(touching)
+            keep_pairs(touching, _not_among({names[pair] for pair in apart}))
+            distances = CoalDistances(model, touching)
+    removed = pair_names(touching)
+    keep_pairs(geometry, _not_among(removed))
     return removed
+
+
+def _not_among(pairs: Collection[tuple[str, str]]) -> Callable[[str, str], bool]:
+    return lambda a, b: (a, b) not in pairs
 
 
 def pair_names(geometry: pin.GeometryModel) -> tuple[tuple[str, str], ...]:
     """Return the names of both objects of each pair, in Pinocchio's order."""
-    objects = geometry.geometryObjects
-    return tuple((objects[pair.first].name, objects[pair.second].name) for pair in geometry.collisionPairs)
+    names = [item.name for item in geometry.geometryObjects]  # Looking each of them up again would take longer.
+    return tuple((names[pair.first], names[pair.second]) for pair in geometry.collisionPairs)
 
 
 def keep_pairs(geometry: pin.GeometryModel, wanted: Callable[[str, str], bool]) -> None:

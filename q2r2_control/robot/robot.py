@@ -7,6 +7,7 @@ import os
 import xml.etree.ElementTree as ET
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -96,7 +97,6 @@ class Robot:
         endless: True for each joint that turns on for ever (nv,).
         velocity_limit: The model's velocity limits (nv,) [rad/s].
         torque_limit: The model's torque limits (nv,) [Nm].
-        urdf: The whole cell as a text.
         following_links: The joint of an arm that a link beside the arm follows, by link. Such a link is watched only at
             its place at home.
         unchecked_links: Names of links without a collision shape, which by the user's choice are not watched.
@@ -116,7 +116,7 @@ class Robot:
         chains = {name: checked_chain(tree, name, frame, where) for name, frame in tool_frames.items()}
         parts = parts or KnownParts.carried_by(tree, chains)
         self.name: str = urdf.get("name", "robot")
-        self.urdf: str = ET.tostring(urdf, encoding="unicode")
+        self._urdf = urdf
         self.model, self.collision_model = build_models(urdf, chains, home, where)
         self.joint_names: tuple[str, ...] = tuple(self.model.names)[1:]
         self.arms: dict[str, Arm] = {
@@ -161,6 +161,11 @@ class Robot:
                 raise RobotError(f"{where}: unchecked_links: no link {link!r:.60}; links: {links}")
         self._data: pin.Data = self.model.createData()
         self._distances = CoalDistances(self.model, self.collision_model)
+
+    @cached_property
+    def urdf(self) -> str:
+        """The whole cell as a text."""
+        return ET.tostring(self._urdf, encoding="unicode")
 
     @classmethod
     def from_config(cls, config: Config) -> Robot:

@@ -74,11 +74,12 @@ def stop_torques(robot: Robot, acceleration: Array, postures: int = 5000, seed: 
     """
     random, data = np.random.default_rng(seed), robot.model.createData()
     samples = random.uniform(robot.position_lower, robot.position_upper, (postures, robot.model.nv))
-    gravity, inertial = np.empty_like(samples), np.empty_like(samples)  # Torques (postures, nv) [Nm].
+    masses, gravity = np.empty((postures, robot.model.nv, robot.model.nv)), np.empty_like(samples)  # [kg m^2], [Nm]
     for i, q in enumerate(samples):
-        upper = np.triu(pin.crba(robot.model, data, q))
-        inertial[i] = np.abs(upper + np.triu(upper, 1).T) @ acceleration
-        gravity[i] = np.abs(pin.computeGeneralizedGravity(robot.model, data, q))
+        masses[i] = pin.crba(robot.model, data, q)
+        gravity[i] = pin.computeGeneralizedGravity(robot.model, data, q)
+    upper = np.triu(masses)
+    inertial, gravity = np.abs(upper + np.triu(upper, 1).transpose(0, 2, 1)) @ acceleration, np.abs(gravity)
     bearable = (robot.torque_limit - gravity) / inertial
     return tuple(
         StopTorque(

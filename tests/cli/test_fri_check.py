@@ -6,9 +6,9 @@ import json
 from pathlib import Path
 
 import pytest
-import yaml
 
 from q2r2_control.cli.fri_check import cabinet_report
+from q2r2_control.config.yaml_text import read_yaml, yaml_of
 from q2r2_control.plants.fri.cabinet import Cabinet, CabinetSettings, StillArm
 from tests.cli.command import q2r2
 from tests.support.robotiq_gripper import SimulatedGripper
@@ -48,11 +48,11 @@ def test_the_messages_of_both_cabinets_are_described_and_a_cabinet_that_does_not
 @pytest.mark.slow
 @pytest.mark.usefixtures("cabinets")
 def test_a_line_says_whether_each_modbus_gripper_answers_and_none_is_moved(fri_cell: str) -> None:
-    cell = yaml.safe_load(Path(fri_cell).read_text(encoding="utf-8"))
+    cell = read_yaml(Path(fri_cell).read_text(encoding="utf-8"))
     with SimulatedGripper() as simulated:
         for arm, port in (("left", simulated.port), ("right", 1)):
             cell["fri"][arm]["gripper"] = {"modbus": f"127.0.0.1:{port}"}
-        Path(fri_cell).write_text(yaml.safe_dump(cell), encoding="utf-8")
+        Path(fri_cell).write_text(yaml_of(cell), encoding="utf-8")
         done = q2r2("fri-check", fri_cell, "--duration", "1", "--json")
     assert [note for note in json.loads(done.stdout)["notes"] if "gripper" in note] == [
         f"left: gripper 127.0.0.1:{simulated.port}, unit 9: not active until a run begins, position 120 of 255",

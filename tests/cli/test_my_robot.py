@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 
+from q2r2_control.config.yaml_text import read_yaml, yaml_of
 from tests.cli.command import q2r2
 from tests.config.cell_files import SHIPPED
 from tests.pipeline.test_plugins import merged
@@ -31,10 +31,10 @@ def test_the_yaml_and_commands_of_the_page_lead_from_a_urdf_to_arms_that_follow(
     assert written.exit_code == 0, written.output
     file = Path("my_cell.yaml")
     assert 15 <= len(file.read_text().splitlines()) <= 40
-    cell: Any = yaml.safe_load(file.read_text())
+    cell: Any = read_yaml(file.read_text())
     for block in blocks_of(PAGE, "yaml"):
-        cell = merged(cell, yaml.safe_load(block))
-    file.write_text(yaml.safe_dump(cell))
+        cell = merged(cell, read_yaml(block))
+    file.write_text(yaml_of(cell))
     checked = q2r2(*check)
     assert checked.exit_code == 0, checked.output
     assert "NOTE" not in checked.stdout

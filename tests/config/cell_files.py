@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 
 from q2r2_control.config.cell import Config, load_config
+from q2r2_control.config.yaml_text import read_yaml, yaml_of
 from q2r2_control.errors import ConfigError
 
 SHIPPED = Path(__file__).resolve().parents[2] / "config"
@@ -18,7 +18,7 @@ CELL = SHIPPED / "dual_iiwa7.yaml"
 
 def shipped() -> dict[str, Any]:
     """Return the text of the shipped cell of two iiwa 7."""
-    data: dict[str, Any] = yaml.safe_load(CELL.read_text(encoding="utf-8"))
+    data: dict[str, Any] = read_yaml(CELL.read_text(encoding="utf-8"))
     return data
 
 
@@ -42,10 +42,10 @@ def fault(tmp_path: Path, text: str | bytes) -> str:
 
 def changed(path: str, value: object, cell: Callable[[], dict[str, Any]] = shipped) -> str:
     """Return a cell as YAML with one value replaced or added; ``path`` is written with dots."""
-    data = yaml.safe_load(yaml.safe_dump(cell()))
+    data: Any = cell()
     *parents, key = path.split(".")
     place = data
     for parent in parents:
         place = place[int(parent)] if isinstance(place, list) else place.setdefault(parent, {})
     place[int(key) if isinstance(place, list) else key] = value
-    return yaml.safe_dump(data)
+    return yaml_of(data)

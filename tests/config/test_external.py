@@ -8,11 +8,11 @@ from textwrap import dedent
 
 import pinocchio as pin
 import pytest
-import yaml
 
 from q2r2_control import Robot
 from q2r2_control.config.cell import parse_config
 from q2r2_control.config.resources import find_resource
+from q2r2_control.config.yaml_text import read_yaml, yaml_of
 from tests.config.cell_files import changed, fault, loaded
 from tests.support.external_cell import external
 
@@ -49,30 +49,28 @@ def test_limits_of_targets_are_for_presets_that_take_targets(tmp_path: Path) -> 
     cell = external()
     cell["external"] |= {"preset": "jtc"}
     del cell["external"]["mode"]
-    loaded_cell = loaded(tmp_path, yaml.safe_dump(cell))
+    loaded_cell = loaded(tmp_path, yaml_of(cell))
     assert loaded_cell.external is not None
     assert loaded_cell.external.filtered, "who does not choose is protected"
     cell["external"]["mode"] = "raw"
-    assert fault(tmp_path, yaml.safe_dump(cell)).startswith("external: preset = 'jtc' with mode = 'raw'")
+    assert fault(tmp_path, yaml_of(cell)).startswith("external: preset = 'jtc' with mode = 'raw'")
     cell["external"]["mode"] = "filtered"
     cell["external"]["limits"]["max_velocity"] = 0.2
-    assert "preset jtc gets joint positions within the limits of the block control" in fault(
-        tmp_path, yaml.safe_dump(cell)
-    )
+    assert "preset jtc gets joint positions within the limits of the block control" in fault(tmp_path, yaml_of(cell))
 
 
 PAGE = (Path(__file__).resolve().parents[2] / "docs" / "kuka.md").read_text(encoding="utf-8")
 
 
 def test_the_blocks_of_the_page_about_kuka_are_valid_in_a_cell() -> None:
-    lbr, kuka_drivers = (yaml.safe_load(dedent(block)) for block in re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL))
-    cell = yaml.safe_load(find_resource("config/dual_iiwa14.yaml").read_text(encoding="utf-8"))
-    config = parse_config(yaml.safe_dump(cell | kuka_drivers), "cell.yaml")
+    lbr, kuka_drivers = (read_yaml(dedent(block)) for block in re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL))
+    cell = read_yaml(find_resource("config/dual_iiwa14.yaml").read_text(encoding="utf-8"))
+    config = parse_config(yaml_of(cell | kuka_drivers), "cell.yaml")
     assert config.external is not None
     assert config.external.topic("left") == "/left/joint_trajectory_controller/joint_trajectory"
     right = {key: value.replace("left", "right") for key, value in lbr["left"].items()}
     driven = {"preset": "lbr_position", "mode": "filtered", "arms": lbr | {"right": right}}
-    config = parse_config(yaml.safe_dump(cell | {"controller": "external", "external": driven}), "cell.yaml")
+    config = parse_config(yaml_of(cell | {"controller": "external", "external": driven}), "cell.yaml")
     assert config.external is not None
     assert config.external.topic("left") == "/left/command/lbr_joint_position_command"
 

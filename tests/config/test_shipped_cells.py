@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any, get_args
 
 import pytest
-import yaml
 from pydantic import BaseModel
 
 from q2r2_control.config.cell import Config, load_config
+from q2r2_control.config.yaml_text import read_yaml
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.robot import Robot
 from tests.config.cell_files import CELL, SHIPPED, changed
@@ -52,7 +52,7 @@ class TestTheShippedCellShowsAllThereIsToTune:
     @pytest.mark.parametrize("text", [external_text(), robot_text()], ids=["arms of their own", "one robot"])
     def test_every_key_is_written_and_commented(self, text: str) -> None:
         lines = text.splitlines()
-        for place, model, data in shown(Config, yaml.safe_load(text)):
+        for place, model, data in shown(Config, read_yaml(text)):
             if place == "arms.left" and "robot:" in text:
                 continue  # The arms are parts of the shared robot.
             for key in model.model_fields:
@@ -78,11 +78,11 @@ class TestTheShippedCellShowsAllThereIsToTune:
 
     def test_the_example_of_a_pair_by_name_exists_in_the_cell(self) -> None:
         (example,) = re.findall(r"names of the bodies, such as (\[.*?\}\])", CELL.read_text(encoding="utf-8"))
-        config = Config.model_validate(yaml.safe_load(changed("control.pairs", yaml.safe_load(example))))
+        config = Config.model_validate(read_yaml(changed("control.pairs", read_yaml(example))))
         kept = kept_distances(Robot.from_config(config), config.control)
         assert "pairs[0]" in kept.keys
 
     def test_the_example_of_a_real_camera_is_valid_and_the_cell_has_three_simulated_ones(self) -> None:
         (example,) = re.findall(r"# (\{front: \{topic.*\}\})\n", CELL.read_text(encoding="utf-8"))
-        assert not Config.model_validate(yaml.safe_load(changed("cameras", yaml.safe_load(example)))).simulated_cameras
+        assert not Config.model_validate(read_yaml(changed("cameras", read_yaml(example)))).simulated_cameras
         assert list(load_config(CELL).simulated_cameras) == ["above", "left_wrist", "right_wrist"]

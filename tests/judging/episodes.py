@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -21,10 +20,9 @@ from q2r2_control.judging.episode import Episode, Frames, Hand, Ticks
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.recording.about import LOOP
 from q2r2_control.recording.reader import Recording
-from q2r2_control.robot.robot import Robot
 from q2r2_control.types import SIDES, Array, Flags, HandInputs, HandSample
 from tests.recording.runs import file_of, record, rewrite
-from tests.support.processes import cell
+from tests.support.processes import cell, cell_robot, pipeline_of
 
 DT = 0.002  # Period of the loop [s].
 EVERY = 5  # Number of ticks per frame.
@@ -88,18 +86,13 @@ def episode(
         recording=cast(Recording, recording),
         config=(config or cell()).model_copy(update={"loop_rate_hz": 1.0 / DT}),
         ticks=replace(rows, **ticks),
-        robot=_robot(),
+        robot=cell_robot(),
         frames=Frames(frames, joints, targets, tools.copy(), joints, joints, openings, openings),
         tools=tools,
         hands=hands,
         events=list(events),
         damage=None,
     )
-
-
-@cache
-def _robot() -> Robot:
-    return Robot.from_config(cell())
 
 
 def frame_times(seconds: float = 4.0) -> Array:
@@ -206,10 +199,9 @@ def hands(
 
 def loop_of(source: PlayedInput, **changes: object) -> Pipeline:
     """Return a pipeline at :data:`RATE` with a kinematic plant."""
-    config = cell()
-    control = config.control.model_copy(update={"max_substep": 1.0 / RATE})
-    config = config.model_copy(update={"loop_rate_hz": RATE, "control": control, "cameras": {}, **changes})
-    return Pipeline.from_config(config, input=source, plant="kinematic")
+    control = cell().control.model_copy(update={"max_substep": 1.0 / RATE})
+    changes = {"loop_rate_hz": RATE, "control": control, "cameras": {}, **changes}
+    return pipeline_of(changes, source, "kinematic", "position")
 
 
 def record_episode(folder: Path, source: PlayedInput, duration: float = DURATION, **changes: object) -> Path:

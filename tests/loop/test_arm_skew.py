@@ -11,12 +11,11 @@ import pytest
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.drives.base import make_drive
 from q2r2_control.loop.control_loop import ControlLoop
-from q2r2_control.robot.robot import Robot
 from q2r2_control.supervision.joint_watch import watch_settings
 from q2r2_control.supervision.target_stream import StreamSettings
 from q2r2_control.types import SIDES, ArmTiming, Array, CommandMode, RobotState
 from tests.control.test_arm_skew import Ways, beside_each_other, swung
-from tests.support.processes import cell
+from tests.support.processes import cell, cell_robot
 
 DT, PERIOD, LAG = 0.005, 0.005, 0.04  # Periods of the loop and of the drivers' messages, and the lag of their arms [s].
 HAPPENS = 1.51  # At this time, both arms move to the left at their fastest [s].
@@ -26,7 +25,7 @@ class TwoDrivers:
     """Arms that swing together, near each other, each ``LAG`` behind the reference."""
 
     def __init__(self, are_watched: bool = True) -> None:
-        config, robot = cell(), Robot.from_config(cell())
+        config, robot = cell(), cell_robot()
         drive, watch = make_drive(CommandMode.POSITION, robot, config), watch_settings(config.supervision, False)
         self.controller = controller = CartesianController(robot, config.control.timed(realtime=False))
         self.robot, self.are_watched = robot, are_watched

@@ -12,13 +12,12 @@ from q2r2_control.drives.base import make_drive
 from q2r2_control.events import Reason
 from q2r2_control.loop.control_loop import ControlLoop, LoopStep, without_proof
 from q2r2_control.plants.fri.reasons import FriReason
-from q2r2_control.robot.robot import Robot
 from q2r2_control.ros.reasons import RosReason
 from q2r2_control.supervision.joint_watch import watch_settings
 from q2r2_control.supervision.supervisor import Phase
 from q2r2_control.supervision.target_stream import StreamSettings
 from q2r2_control.types import CommandMode, RobotState
-from tests.support.processes import cell
+from tests.support.processes import cell, cell_robot
 
 DT = 0.004
 
@@ -27,7 +26,7 @@ class Arms:
     """Both arms at home, as the plant of another program measures them."""
 
     def __init__(self, owns_plant: bool, obstacles: tuple[str, ...] = ()) -> None:
-        config, robot = cell(), Robot.from_config(cell())
+        config, robot = cell(), cell_robot()
         drive, watch = make_drive(CommandMode.POSITION, robot, config), watch_settings(config.supervision, False)
         settings = config.control.model_copy(update={"moving_obstacles": obstacles})
         controller = CartesianController(robot, settings)

@@ -9,26 +9,24 @@ from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.pipeline.loop_clock import LoopClock
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.kinematic import KinematicPlant
-from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.tick import Tick
 from q2r2_control.types import Command, RobotState
-from tests.support.processes import cell, speed
+from tests.support.processes import cell, cell_robot, pipeline_of, speed
 
 
 def pipeline(
     source: Input | None = None, plant: str = "kinematic", mode: str = "position", **changes: object
 ) -> Pipeline:
     """Return a pipeline at 500 Hz, the lowest rate with one substep per tick. Ticks take most of a test's time."""
-    config = cell().model_copy(update={"loop_rate_hz": 500.0, **changes})
     source = source or ScriptedInput("circle", frequency_hz=0.5)
-    return Pipeline.from_config(config, input=source, plant=plant, mode=mode)
+    return pipeline_of({"loop_rate_hz": 500.0, **changes}, source, plant, mode)
 
 
 class RecordingPlant(KinematicPlant):
     """A plant that keeps every command and counts calls of close. ``disturb`` makes its measured states."""
 
     def __init__(self) -> None:
-        super().__init__(Robot.from_config(cell()), cell())
+        super().__init__(cell_robot(), cell())
         self.closed = 0
         self.commands: list[Command] = []
         self.disturb: Callable[[RobotState], RobotState] = lambda state: state

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 
 from q2r2_control.config.cell import Config, load_config
 from q2r2_control.config.presets import preset_of
 from q2r2_control.config.resources import find_resource
+from q2r2_control.config.yaml_text import read_yaml, yaml_of
 from q2r2_control.errors import ConfigError
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.types import DeviceControls
@@ -45,14 +45,14 @@ def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     install(tmp_path, "my_package", "\n".join(blocks_of(PAGE, "python")), "\n".join(lines))
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "my_package", raising=False)
-    data = yaml.safe_load(find_resource(CELL).read_text(encoding="utf-8"))
+    data = read_yaml(find_resource(CELL).read_text(encoding="utf-8"))
     for block in blocks_of(PAGE, "yaml"):
-        data = merged(data, yaml.safe_load(block))
+        data = merged(data, read_yaml(block))
     return changed(tmp_path / "cell.yaml", data)
 
 
 def changed(file: Path, data: Any) -> Path:
-    file.write_text(yaml.safe_dump(merged(yaml.safe_load(file.read_text()) if file.exists() else {}, data)))
+    file.write_text(yaml_of(merged(read_yaml(file.read_text()) if file.exists() else {}, data)))
     return file
 
 

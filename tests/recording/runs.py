@@ -24,7 +24,7 @@ from q2r2_control.recording.messages import Message
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorder import ROOM, Recorder, RecordingSummary
 from q2r2_control.recording.tick_rows import tick_labels
-from tests.support.processes import cell
+from tests.support.processes import pipeline_of
 
 ROOT = Path(__file__).resolve().parents[2]
 ARMS = ("left", "right")
@@ -72,9 +72,8 @@ def pipeline(
     **changes: object,
 ) -> Pipeline:
     """Return a pipeline at :data:`RATE`. It has cameras only if they are given, because drawing takes long."""
-    config = cell().model_copy(update={"loop_rate_hz": RATE, "cameras": {}, **changes})
     hands = source or ScriptedInput(trajectory, human=human, seed=3, frequency_hz=0.5)
-    return Pipeline.from_config(config, input=hands, plant=plant, mode=mode)
+    return pipeline_of({"loop_rate_hz": RATE, "cameras": {}, **changes}, hands, plant, mode)
 
 
 def record(

@@ -41,12 +41,16 @@ def operator(toggled: tuple[float, ...], following: tuple[float, ...]) -> Callab
 
 
 def recorded(
-    folder: Path, toggled: tuple[float, ...], following: tuple[float, ...], names: tuple[str, ...] = NAMES
+    folder: Path,
+    toggled: tuple[float, ...],
+    following: tuple[float, ...],
+    names: tuple[str, ...] = NAMES,
+    duration: float = DURATION,
 ) -> Path:
     teleop = TeleopSettings.model_validate({"bindings": {"grip": "record_toggle", "trigger": "next_subtask"}})
     source = PlayedInput(step_of_the_hand, operator(toggled, following), {side: EvenSampling(100.0) for side in SIDES})
     loop = pipeline(source=source, teleop=teleop, recording=RecordingSettings(subtasks=names))
-    return file_of(record(folder, loop, DURATION))
+    return file_of(record(folder, loop, duration))
 
 
 @pytest.fixture(scope="module")
@@ -84,10 +88,8 @@ def test_number_and_name_of_each_subtask_are_in_the_file(file: Path) -> None:
 
 
 def test_a_press_in_the_last_subtask_is_refused_with_its_name(tmp_path: Path) -> None:
-    assert told_in(recorded(tmp_path, (), (0.4, 0.8), NAMES[:2]))[-1] == (
-        TeleopReason.LAST_SUBTASK,
-        {"name": "grasp the cube"},
-    )
+    file = recorded(tmp_path, (), (0.2, 0.4), NAMES[:2], duration=0.6)
+    assert told_in(file)[-1] == (TeleopReason.LAST_SUBTASK, {"name": "grasp the cube"})
 
 
 def test_each_episode_has_the_subtasks_that_were_begun_in_it(file: Path) -> None:
@@ -129,7 +131,7 @@ def test_each_exported_frame_has_the_subtask_of_its_time(file: Path) -> None:
 
 
 def test_subtasks_without_names_have_numbers_also_in_a_run_that_is_one_episode(tmp_path: Path) -> None:
-    file = recorded(tmp_path, (), (0.8, 1.6), ())
+    file = recorded(tmp_path, (), (0.5, 0.9), (), duration=1.2)
     (span,) = spans_to_export(file)
     (judged,) = judge(Recording(file))
     names = ("subtask 1", "subtask 2", "subtask 3")
@@ -138,7 +140,7 @@ def test_subtasks_without_names_have_numbers_also_in_a_run_that_is_one_episode(t
 
 
 def test_a_recording_in_which_nobody_told_of_subtasks_has_none(tmp_path: Path) -> None:
-    file = recorded(tmp_path, TOGGLED, (), ())
+    file = recorded(tmp_path, (0.2, 0.7), (), (), duration=1.0)
     for span, judged in zip(spans_to_export(file), judge(Recording(file)), strict=True):
         episode = make_episode(file, FrameSampling(), span)
         assert (episode.subtasks, episode.subtask, judged.figures.subtasks) == ((), (), [])

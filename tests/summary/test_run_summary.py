@@ -16,10 +16,9 @@ from q2r2_control.compliance.repulsion import WallReport
 from q2r2_control.events import CommonReason, Event, Reason
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.pipeline.pipeline import Pipeline
-from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.run_summary import EVENTS_KEPT, NOTHING_MEASURED, Histogram, RunStatistics, TorqueSummary
 from q2r2_control.types import SIDES, ArmTarget, StepReport, StepStatus, moved_by
-from tests.support.processes import cell
+from tests.support.processes import cell, cell_robot
 from tests.viewer.conftest import tick_at
 
 # Scripts and dashboards rely on these keys.
@@ -38,7 +37,7 @@ REPORT = StepReport(StepStatus.OK, (), (), ("left_a", "right_b"), 0.2, True, Fal
 
 @pytest.fixture
 def statistics() -> RunStatistics:
-    return RunStatistics(Robot.from_config(cell()), cell().control)
+    return RunStatistics(cell_robot(), cell().control)
 
 
 def add(
@@ -126,7 +125,7 @@ def test_changes_of_a_gripper_are_counted_but_not_its_first_opening(statistics: 
 
 def test_ratios_and_margin_are_the_worst_of_all_ticks_relative_to_the_limits_in_force() -> None:
     control = cell().control.model_copy(update={"velocity_scale": 0.5, "acceleration_limit": 4.0})
-    statistics = RunStatistics(Robot.from_config(cell()), control)
+    statistics = RunStatistics(cell_robot(), control)
     add(statistics, v=-0.25 * statistics.robot.velocity_limit, a=np.full(14, -3.0))
     near = statistics.robot.home.copy()
     near[3] = statistics.robot.position_lower[3] + control.position_margin + 0.02

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
-import yaml
 
 from q2r2_control import CartesianController, Robot, load_config
 from q2r2_control.config.cell import Config
 from q2r2_control.config.resources import find_resource
+from q2r2_control.config.yaml_text import read_yaml, yaml_of
 from q2r2_control.supervision.joint_watch import (
     ExternalArms,
     ExternalSettings,
@@ -54,10 +54,10 @@ def config(robot: Robot, tmp_path_factory: pytest.TempPathFactory) -> Config:
     data = robot.model.createData()
     pin.forwardKinematics(robot.model, data, swing(robot, POST)[-1])
     elbow = data.oMi[robot.model.getJointId("left_A4")].translation
-    cell = yaml.safe_load(find_resource(CONFIG).read_text())
+    cell = read_yaml(find_resource(CONFIG).read_text())
     cell["obstacles"]["post"] = {"shape": "sphere", "size": [RADIUS], "position": elbow.tolist()}
     file: Path = tmp_path_factory.mktemp("cell") / "post.yaml"
-    file.write_text(yaml.safe_dump(cell))
+    file.write_text(yaml_of(cell))
     return settings_for_external_arms(load_config(str(file)))
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import yaml
+from q2r2_control.config.yaml_text import read_yaml
 
 CELL = Path(__file__).resolve().parents[2] / "config" / "dual_iiwa7.yaml"
 
@@ -30,5 +30,5 @@ def _uncommented(key: str, text: str) -> str:
 
 def external() -> dict[str, Any]:
     """Return the text of the cell."""
-    data: dict[str, Any] = yaml.safe_load(external_text())
+    data: dict[str, Any] = read_yaml(external_text())
     return data

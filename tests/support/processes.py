@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cache
 
 import numpy as np
 
 from q2r2_control.config.cell import Config, load_config
 from q2r2_control.events import Event
+from q2r2_control.inputs.base import Input
 from q2r2_control.pipeline.pipeline import Pipeline
+from q2r2_control.plants.base import Plant, make_plant
+from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.tick import Tick
 from q2r2_control.verification.contract import Contract
 from tests.support.reasons import kinds
@@ -47,6 +50,28 @@ CELL = "config/dual_iiwa7.yaml"
 def cell() -> Config:
     """Return the shipped cell of two iiwa 7."""
     return load_config(CELL)
+
+
+@cache
+def cell_robot() -> Robot:
+    """Return the robot of :func:`cell`. No test changes this robot."""
+    return Robot.from_config(cell())
+
+
+# Blocks of a cell on which its robot does not depend.
+_OTHER_BLOCKS = {
+    *("loop_rate_hz", "control", "impedance", "admittance", "teleop", "supervision", "headset", "mujoco"),
+    *("cameras", "recording", "judge"),
+}
+
+
+def pipeline_of(changes: Mapping[str, object], source: Input, plant: Plant | str, mode: str) -> Pipeline:
+    """Return a pipeline for the shipped cell with other blocks. It shares the robot if that does not depend on them."""
+    config = cell().model_copy(update=dict(changes))
+    if not changes.keys() <= _OTHER_BLOCKS:
+        return Pipeline.from_config(config, input=source, plant=plant, mode=mode)
+    robot = cell_robot()
+    return Pipeline(config, robot, source, make_plant(plant, robot, config), mode)
 
 
 class Watch:

@@ -10,13 +10,13 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Mapping, Sequence
-from importlib.metadata import entry_points
 from typing import Any, Protocol
 
 import numpy as np
 
 from q2r2_control.control.answers import Answer, answer_of
 from q2r2_control.errors import ConfigError, shown
+from q2r2_control.plugins import points_of
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
@@ -57,11 +57,11 @@ def load_tasks(robot: Robot, wanted: Mapping[str, Mapping[str, Any]]) -> dict[st
     """
     if not wanted:
         return {}
-    installed = {entry.name: entry for entry in entry_points(group=GROUP)}
+    installed = points_of(GROUP)
     tasks: dict[str, Task] = {}
     for name, settings in wanted.items():
         if name not in installed:
-            raise ConfigError(f"control.tasks.{name}: installed tasks: {', '.join(sorted(installed)) or 'none'}")
+            raise ConfigError(f"control.tasks.{name}: installed tasks: {', '.join(installed) or 'none'}")
         made = installed[name].load()
         try:
             tasks[f"control.tasks.{name}"] = made(robot, **settings)

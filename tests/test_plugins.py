@@ -1,0 +1,33 @@
+"""Entry points of installed packages are read once, and again after a package was installed."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from q2r2_control import plugins
+from q2r2_control.plugins import INPUTS, names_of
+from tests.support.modules import install
+
+
+def test_packages_are_not_read_again_while_nothing_is_installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    names = names_of(INPUTS)
+    assert "scripted" in names
+
+    def unwanted(**group: str) -> None:
+        pytest.fail("read again")
+
+    monkeypatch.setattr(plugins, "entry_points", unwanted)
+    assert names_of(INPUTS) == names
+
+
+def test_a_package_that_is_installed_while_the_program_runs_is_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    os.utime(tmp_path, (0, 0))
+    assert "pedal" not in names_of(INPUTS)
+    install(tmp_path, "pedals", "", f"[{INPUTS}]\npedal = pedals:Pedal\n")
+    assert "pedal" in names_of(INPUTS)
