@@ -20,7 +20,7 @@ from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.judging.camera_figures import camera_figures
 from q2r2_control.judging.episode import read_episode
 from q2r2_control.recording.about import About
-from q2r2_control.recording.device_pictures import DevicePictures, LoopTimes, TickTime
+from q2r2_control.recording.device_pictures import DevicePictures
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorder import ROOM_WITH_PICTURES, Recorder, RecordingSummary
 from q2r2_control.recording.replay import replay
@@ -63,7 +63,7 @@ class RecordedRun:
             self.streams.streams["front"].hear(self._note)
             about = About.of(self.loop, True, {}, ("front",))
             self.recorder.begin(about, self.loop.robot)
-            with DevicePictures(self.streams, self.recorder, about, self._report) as devices:
+            with DevicePictures(self.streams, True, self._report, (self.recorder, about)) as devices:
                 self.loop.listeners += [self.recorder, devices, stop]
                 self.loop.run(realtime=True)
 
@@ -159,28 +159,3 @@ def test_a_camera_that_cannot_be_opened_is_named_before_the_run(tmp_path: Path) 
         pytest.raises(CameraError, match=r"cameras\.front\.device: .*none\.avi: no such file"),
     ):
         streams.wait_until_ready()
-
-
-class TestTimesOfTheLoop:
-    TICKS = ((10.0, 10.0), (10.01, 10.01), (10.05, 10.05))  # By the computer's clock and by that of the loop [s].
-
-    def times(self, ticks: tuple[tuple[float, float], ...] = TICKS) -> LoopTimes:
-        times = LoopTimes()
-        for number, (computer, loop) in enumerate(ticks):
-            times.add(TickTime(computer, loop, number))
-        return times
-
-    @pytest.mark.parametrize(("at", "number"), [(10.0, 0), (10.004, 0), (10.03, 1), (10.05, 2), (10.2, 2)])
-    def test_in_real_time_they_are_those_of_the_computer(self, at: float, number: int) -> None:
-        assert self.times().at(at) == pytest.approx((at, at, number))
-
-    def test_before_the_first_tick_they_pass_as_those_of_the_computer(self) -> None:
-        assert self.times(((10.0, 0.5), (10.1, 0.6))).at(9.99) == pytest.approx((9.99, 0.49, 0))
-
-    def test_in_slow_motion_they_pass_as_slowly_as_the_ticks(self) -> None:
-        slow = self.times(((10.0, 0.0), (10.1, 0.001), (10.2, 0.002)))
-        assert [slow.at(time) for time in (10.0005, 10.05, 10.1004)] == [
-            pytest.approx((10.0005, 0.0005, 0)),
-            pytest.approx((10.05, 0.001, 0)),
-            pytest.approx((10.1004, 0.0014, 1)),
-        ]
