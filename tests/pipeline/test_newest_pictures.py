@@ -134,15 +134,18 @@ def test_a_policy_that_reads_a_camera_that_has_stopped_stops_the_arms_with_one_l
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     policy, video = Reading(), write_video(tmp_path / "short.avi", range(5))
+
+    def told() -> list[str]:
+        return [line for line in caplog.messages if line.startswith("camera front: no picture for")]
+
+    def is_over(tick: Tick) -> bool:
+        return bool(policy.why and told()) and "policy" not in tick.states.values()
+
     with caplog.at_level(logging.WARNING):
-        run = Run(
-            front(video, repeat=False),
-            policy,
-            lambda tick: (bool(policy.why) and "policy" not in tick.states.values()) or tick.t > LONGEST,
-        )
+        run = Run(front(video, repeat=False), policy, lambda tick: is_over(tick) or tick.t > LONGEST)
     assert re.fullmatch(r"camera front: no picture for \d+\.\d s: the video has ended", policy.why)
     assert set([tick for tick in run.ticks if tick.following][-1].states.values()) == {"lost"}
-    assert sum(line.startswith("camera front: no picture for") for line in caplog.messages) == 1
+    assert len(told()) == 1
     assert not any("Traceback" in line for line in caplog.messages)
 
 
