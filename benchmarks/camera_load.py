@@ -17,7 +17,6 @@ import cv2
 import numpy as np
 from typer import Option, run
 
-from examples.policy import Circles
 from q2r2_control.cameras.camera_streams import CameraStreams
 from q2r2_control.cli.output import DEMO_CONFIG, Json, print_progress, print_report
 from q2r2_control.config.cell import Config, load_config
@@ -32,6 +31,7 @@ from q2r2_control.recording.recorder import ROOM_WITH_PICTURES, Recorder
 from q2r2_control.viewer.tables import record_table
 
 WIDTH, HEIGHT, RATE = 640, 480, 30  # [pixels], [pictures/s]
+POLICY = "examples.policy:Circles"
 _SECONDS = 4  # Duration of the video, which is repeated [s].
 NOTES = (
     "tick: from the inputs until the command is applied; late: of the beginnings of ticks, p99",
@@ -46,9 +46,9 @@ class RunFigures:
 
     name: str
     loop_rate_hz: float
-    tick_p50: float
-    tick_p99: float
-    late_p99: float
+    tick_p50: float | None
+    tick_p99: float | None
+    late_p99: float | None
     missed: int
     tracking_mm: float
     pictures: int
@@ -106,11 +106,12 @@ def main(
         folder = Path(kept)
         camera = CameraConfig(device=str(write_video(folder / "camera.avi")), width=WIDTH, height=HEIGHT, rate=RATE)
         cell = load_config(DEMO_CONFIG)
-        for leader, make in (("hands", lambda: ScriptedInput("circle")), ("policy", lambda: PolicyInput(Circles()))):
+        for leader in ("hands", "policy"):
             for count in (0, cameras):
                 config = cell.model_copy(update={"cameras": dict.fromkeys(map("c{}".format, range(count)), camera)})
                 title = f"{leader}, {count or 'no'} cameras"
-                figures.append(measure(title, config, make(), plant, duration, folder / "recordings"))
+                source = ScriptedInput("circle") if leader == "hands" else PolicyInput.from_config(config, POLICY)
+                figures.append(measure(title, config, source, plant, duration, folder / "recordings"))
     table = record_table(f"{cameras} cameras of {WIDTH}x{HEIGHT} at {RATE} pictures a second", figures, NOTES)
     print_report({"duration_s": duration, "runs": [asdict(each) for each in figures]}, (table,), json)
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from q2r2_control.cameras.camera_streams import CameraStreams
 from q2r2_control.cameras.camera_watch import CameraWatch
 from q2r2_control.events import Reason
-from q2r2_control.recording.messages import JpegPicture, Message
+from q2r2_control.recording.messages import CodedPicture, Message, coding_of_depth, depth_topic, picture_topic
 
 
 @dataclass(slots=True)
@@ -16,7 +16,7 @@ class DeviceMessages:
     """The open cameras of a recording. Times are those of the monotonic clock."""
 
     streams: CameraStreams
-    channels: Mapping[str, int]  # By camera, the channel of its messages.
+    channels: Mapping[str, int]  # By topic, the channel of its messages.
     day: Callable[[float], int]  # Returns the time of day [ns] at a time [s].
     begin: float  # Time at which the recording begins [s].
     _watches: dict[str, CameraWatch] = field(init=False)
@@ -39,8 +39,14 @@ class DeviceMessages:
                 if shot.time >= self.begin:
                     self._numbers[name] += 1
                     number, captured = self._numbers[name], self.day(shot.time)
-                    message = JpegPicture(self.channels[name], number, captured, name, shot.jpeg).message()
+                    channel = self.channels[picture_topic(name)]
+                    message = CodedPicture(channel, number, captured, name, shot.jpeg).message()
                     messages.append(message._replace(time=self.day(received)))
                     reasons += watch.add(shot.time, received, shot.width, shot.height)
             reasons += watch.look(now, stream.why_lost)
+            for depth in stream.take_depths():
+                if depth.time >= self.begin:
+                    channel, coding = self.channels[depth_topic(name)], coding_of_depth(depth.unit)
+                    message = CodedPicture(channel, 0, self.day(depth.time), name, depth.png, coding).message()
+                    messages.append(message._replace(time=self.day(now)))
         return messages, reasons

@@ -15,7 +15,7 @@ from q2r2_control.cameras.loop_times import LoopTimes, TickTime
 from q2r2_control.cameras.reasons import CameraReason
 from q2r2_control.events import Reason
 from q2r2_control.recording.about import About
-from q2r2_control.recording.messages import NANOSECONDS, JpegPicture, picture_topic
+from q2r2_control.recording.messages import JPEG, NANOSECONDS, CodedPicture, coding_of_depth, depth_topic, picture_topic
 from q2r2_control.recording.recorder import Recorder
 from q2r2_control.summary.tick import Tick
 from q2r2_control.wording import sentence
@@ -48,7 +48,7 @@ class DevicePictures(AbstractContextManager["DevicePictures"]):
         self._streams, self._realtime, self._report = streams.streams, realtime, report
         self._recording = recording
         topics = {} if recording is None else recording[1].topics()
-        self._channels = {name: topics[picture_topic(name)].channel for name in self._streams if topics}
+        self._channels = {name: topic.channel for name, topic in topics.items()}
         self._times = LoopTimes()
         self._watches: dict[str, CameraWatch] = {}
         self._before: dict[str, CameraShot] = {}  # The newest pictures before the first tick.
@@ -91,13 +91,19 @@ class DevicePictures(AbstractContextManager["DevicePictures"]):
                     self._record(name, before)
                 self._record(name, shot)
                 self._tell(self._watches[name].add(shot.time, received, shot.width, shot.height))
+        for depth in self._streams[name].take_depths():
+            if self._begin <= depth.time <= until:
+                self._record_data(depth_topic(name), name, depth.time, depth.png, coding_of_depth(depth.unit))
 
     def _record(self, name: str, shot: CameraShot) -> None:
+        self._record_data(picture_topic(name), name, shot.time, shot.jpeg)
+
+    def _record_data(self, topic: str, name: str, time: float, data: bytes, coding: str = JPEG) -> None:
         if self._recording is None:
             return
-        (recorder, about), at = self._recording, self._times.at(shot.time)
+        (recorder, about), at = self._recording, self._times.at(time)
         stamp = about.epoch + round((at.loop - self._start) * NANOSECONDS)
-        recorder.record_picture(JpegPicture(self._channels[name], at.number, stamp, name, shot.jpeg))
+        recorder.record_picture(CodedPicture(self._channels[topic], at.number, stamp, name, data, coding))
 
     def _tell(self, reasons: list[Reason]) -> None:
         for reason in reasons:

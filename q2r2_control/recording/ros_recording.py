@@ -102,7 +102,7 @@ class RosTicks:
         self._robot, self._epoch, self._joint_names = robot, epoch, robot.joint_names
         self._arms = arms = tuple(robot.arms)
         self._fields, self._type = names.tick_fields(arms), tick_type(len(arms), len(robot.joint_names))
-        self._types = {topic.name: topic.type for topic in names.ros_topics(arms, {})}
+        self._types = {topic.name: topic.type for topic in names.ros_topics(arms)}
         self.joints = np.full((3, len(robot.joint_names)), np.nan)  # The newest q, v and tau.
         self._known = np.zeros(len(robot.joint_names), dtype=bool)  # True for joints that were measured.
         self._flags = np.full((len(arms), len(names.ARM_FIELDS)), np.nan)

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import io
 import logging
 import os
 import signal
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
-from q2r2_control.cameras.camera_process import CameraShot
+from q2r2_control.cameras.camera_process import CameraShot, DepthShot, png_of
 from q2r2_control.cameras.camera_streams import CameraStreams
 from q2r2_control.cameras.reasons import CameraReason
 from q2r2_control.config.recording import CameraConfig
@@ -21,11 +24,13 @@ from q2r2_control.judging.camera_figures import camera_figures
 from q2r2_control.judging.episode import read_episode
 from q2r2_control.recording.about import About
 from q2r2_control.recording.device_pictures import DevicePictures
+from q2r2_control.recording.messages import PICTURE, STORE, depth_topic
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorder import ROOM_WITH_PICTURES, Recorder, RecordingSummary
 from q2r2_control.recording.replay import replay
 from q2r2_control.summary.tick import Tick
 from tests.cameras.videos import FPS, HEIGHT, WIDTH, number_of_jpeg, write_video
+from tests.cli.command import q2r2
 from tests.recording.runs import file_of, pipeline
 from tests.support.processes import alive, wait_until
 
@@ -43,8 +48,15 @@ def front(path: Path, **changes: object) -> CameraConfig:
 class RecordedRun:
     """A run in real time whose camera is a video file, until it has enough pictures or ``during`` returns True."""
 
-    def __init__(self, folder: Path, camera: CameraConfig, during: Callable[[RecordedRun], bool] | None = None) -> None:
-        self.loop = pipeline("circle", "kinematic", cameras={"front": camera})
+    def __init__(
+        self,
+        folder: Path,
+        camera: CameraConfig,
+        during: Callable[[RecordedRun], bool] | None = None,
+        in_cell: CameraConfig | None = None,
+    ) -> None:
+        """Play ``camera``, in the place of another one that the cell has if ``in_cell`` is given."""
+        self.loop = pipeline("circle", "kinematic", cameras={"front": in_cell or camera})
         self.shots: list[tuple[float, int]] = []  # The time of each capture [s], and the number in the picture.
         self.start = 0.0  # Of the loop's clock [s].
         self.reports: list[ReasonKind] = []
@@ -56,7 +68,7 @@ class RecordedRun:
                 self.loop.stop()
 
         with (
-            CameraStreams(self.loop.config.device_cameras) as self.streams,
+            CameraStreams({"front": camera}) as self.streams,
             Recorder(folder, "test", room=ROOM_WITH_PICTURES) as self.recorder,
         ):
             self.streams.wait_until_ready()
@@ -138,6 +150,39 @@ def test_a_camera_that_ends_is_told_of_once_and_marks_the_episode_and_the_run_go
     assert {event.kind for event in episode.events} >= {CameraReason.CAMERA_STOPPED}
     assert replay(file_of(done.summary)).difference is None, "the mark too"
     assert camera_figures(episode)["front"].missing_pictures == pytest.approx(done.summary.lost_pictures, abs=2)
+
+
+def test_depth_is_recorded_without_loss_and_left_out_of_datasets(tmp_path: Path) -> None:
+    deep = np.arange(WIDTH * HEIGHT, dtype=np.uint16).reshape(HEIGHT, WIDTH) * 21  # It needs all 16 bits.
+    count = 0
+
+    def with_depth(run: RecordedRun) -> bool:
+        """Give depth with each picture, as the process of a RealSense camera does."""
+        nonlocal count
+        for time, _ in run.shots[count:]:
+            run.streams.streams["front"]._on_answer(DepthShot(time, png_of(deep + np.uint16(count)), 1e-4))
+            count += 1
+        return run.recorder.device_pictures >= 2 * ENOUGH
+
+    played = front(write_video(tmp_path / "front.avi", range(COUNT)))
+    in_cell = front(Path("realsense:042"), depth=True)
+    done = RecordedRun(tmp_path / "recordings", played, with_depth, in_cell)
+    recording = Recording(file_of(done.summary))
+    assert recording.about.depth == ("front",)
+    found = [message for messages in recording.messages((depth_topic("front"),)) for message in messages]
+    assert len(found) >= ENOUGH // 2
+    stamps = {picture.time for picture in recording.pictures("front")}
+    for message in found:
+        decoded: Any = STORE.deserialize_cdr(message.payload, PICTURE)
+        assert decoded.format == "16UC1; png; unit 0.0001 m"
+        pixels = np.asarray(Image.open(io.BytesIO(bytes(decoded.data))))
+        np.testing.assert_array_equal(pixels - deep, pixels[0, 0])
+        assert message.time in stamps, "it has the time of its capture"
+    assert not read_episode(recording).pictures["front"].damaged.any()
+    assert replay(recording.file).difference is None
+    export = ("csv", str(recording.file), "--output", str(tmp_path / "dataset"), "--keep-discarded")
+    left_out = "depth of front is left out: no format has a place for it; the recordings have it\n"
+    assert left_out in q2r2("export", *export).stderr
 
 
 def test_when_the_process_of_a_camera_is_killed_the_run_goes_on(tmp_path: Path) -> None:

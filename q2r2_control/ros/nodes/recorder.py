@@ -35,6 +35,7 @@ from q2r2_control.recording.messages import (
     Message,
     Topic,
     arm_events,
+    depth_topic,
     heard_on,
     is_latched,
     is_reliable,
@@ -80,9 +81,8 @@ class RecorderNode(BaseNode):
         if not folder:
             raise ConfigError("parameter folder: empty; allowed: a folder")
         heard = {name: camera.topic for name, camera in config.cameras.items() if camera.topic is not None}
-        cameras = heard | {name: picture_topic(name) for name in config.device_cameras}
         streams = CameraStreams(config.device_cameras)
-        room = ROOM_WITH_PICTURES if cameras else ROOM
+        room = ROOM_WITH_PICTURES if heard or config.device_cameras else ROOM
         # The process of the recorder starts while this process makes the node.
         self._recorder = MessageRecorder(Path(folder), config.name, room)
         self._judge = EpisodeJudge(lambda: self._recorder.file, self._tell, timed=False)
@@ -93,7 +93,9 @@ class RecorderNode(BaseNode):
         self._served_last: Reason | None = None
         self._waiting: list[Message] = []
         self._events = self.create_publisher(String, self.name_in_set(RECORDER_EVENTS), RECORDED_QOS)
-        topics = ros_topics(tuple(robot.arms), cameras)
+        depth = tuple(name for name, camera in config.device_cameras.items() if camera.depth)
+        of_devices = {picture_topic(name) for name in config.device_cameras} | set(map(depth_topic, depth))
+        topics = ros_topics(tuple(robot.arms), [*heard.values(), *sorted(of_devices)])
         self._begun, self._epoch, self._looked = time.monotonic_ns(), time.time_ns(), 0
         about = About(
             arms=tuple(robot.arms),
@@ -104,7 +106,8 @@ class RecorderNode(BaseNode):
             realtime=True,
             cell=as_yaml(config.model_copy(update={"loop_rate_hz": rate})),
             robot=robot.urdf,
-            cameras=tuple(cameras),
+            cameras=(*heard, *config.device_cameras),
+            depth=depth,
             source=ROS,
             notes={**program(), **{name: text for name, text in notes.items() if text}},
         )
@@ -112,10 +115,9 @@ class RecorderNode(BaseNode):
             about = replace(about, notes=anonymous(about.notes))
         streams.wait_until_ready()
         channels = {topic.name: topic.channel for topic in topics}
-        of_devices = {name: channels[cameras[name]] for name in config.device_cameras}
-        self._devices = DeviceMessages(streams, of_devices, self._day_at, time.monotonic())
+        self._devices = DeviceMessages(streams, channels, self._day_at, time.monotonic())
         self._recorder.begin(about, topics)
-        taken = [topic for topic in topics if topic.channel not in of_devices.values()]
+        taken = [topic for topic in topics if topic.name not in of_devices]
         self._listen(taken, {arm_events(arm) for arm in robot.arms}, heard.values())
         for name, kind in _SERVICES.items():
             self.create_service(Trigger, f"~/{name}", partial(self._serve, kind))
