@@ -7,6 +7,7 @@ both arms round circles.
 
 from __future__ import annotations
 
+import time
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -35,6 +36,7 @@ POLICY = "examples.policy:Circles"
 _SECONDS = 4  # Duration of the video, which is repeated [s].
 NOTES = (
     "tick: from the inputs until the command is applied; late: of the beginnings of ticks, p99",
+    "cpu: processor time of the loop's thread from tick to tick, with its listeners, whatever else runs",
     "tracking: RMS of the worse tool behind its target; missed: ticks that the loop left out because it was late",
     "dropped: pictures that were due and are not in the file",
 )
@@ -49,6 +51,8 @@ class RunFigures:
     tick_p50: float | None
     tick_p99: float | None
     late_p99: float | None
+    cpu_p50: float
+    cpu_p99: float
     missed: int
     tracking_mm: float
     pictures: int
@@ -78,15 +82,18 @@ def measure(name: str, config: Config, source: Input, plant: str, duration: floa
         about = About.of(pipeline, True, {}, tuple(config.device_cameras))
         recorder.begin(about, pipeline.robot)
         devices = DevicePictures(streams, True, pipeline.record_outcome, (recorder, about))
-        pipeline.listeners += [recorder, stack.enter_context(devices)]
+        used: list[float] = []  # Processor time of the loop's thread up to each tick [s].
+        pipeline.listeners += [recorder, stack.enter_context(devices), lambda _: used.append(time.thread_time())]
         summary = pipeline.run(duration)
-    recording = recorder.summary
+    recording, per_tick = recorder.summary, 1e6 * np.diff(used)
     return RunFigures(
         name=name,
         loop_rate_hz=summary.loop_rate_hz,
         tick_p50=summary.tick_us.p50,
         tick_p99=summary.tick_us.p99,
         late_p99=summary.lateness_us.p99,
+        cpu_p50=float(np.median(per_tick)),
+        cpu_p99=float(np.percentile(per_tick, 99)),
         missed=summary.missed_ticks,
         tracking_mm=max(arm.position_error_mm_rms or 0.0 for arm in summary.arms.values()),
         pictures=recording.pictures,
