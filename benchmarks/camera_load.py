@@ -54,7 +54,7 @@ class RunFigures:
     cpu_p50: float
     cpu_p99: float
     missed: int
-    tracking_mm: float
+    tracking_mm: float | None  # None if no arm was engaged.
     pictures: int
     dropped: int
 
@@ -85,6 +85,7 @@ def measure(name: str, config: Config, source: Input, plant: str, duration: floa
         used: list[float] = []  # Processor time of the loop's thread up to each tick [s].
         pipeline.listeners += [recorder, stack.enter_context(devices), lambda _: used.append(time.thread_time())]
         summary = pipeline.run(duration)
+    errors = [arm.position_error_mm_rms for arm in summary.arms.values() if arm.position_error_mm_rms is not None]
     recording, per_tick = recorder.summary, 1e6 * np.diff(used)
     return RunFigures(
         name=name,
@@ -95,7 +96,7 @@ def measure(name: str, config: Config, source: Input, plant: str, duration: floa
         cpu_p50=float(np.median(per_tick)),
         cpu_p99=float(np.percentile(per_tick, 99)),
         missed=summary.missed_ticks,
-        tracking_mm=max(arm.position_error_mm_rms or 0.0 for arm in summary.arms.values()),
+        tracking_mm=max(errors, default=None),
         pictures=recording.pictures,
         dropped=recording.lost_pictures,
     )

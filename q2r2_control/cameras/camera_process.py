@@ -17,7 +17,9 @@ from q2r2_control.cameras.opening import open_device
 from q2r2_control.config.recording import CameraConfig
 from q2r2_control.errors import CameraError
 
-_NICENESS = 5  # The loop has priority. A picture that is received late would get a late time.
+# The loop has priority, also over ten of these processes together. On a computer that is too busy, a picture without a
+# stamp of its own is received late, and gets a late time.
+_NICENESS = 15
 _QUALITY = 90  # The quality of JPEG.
 _RETRY = 0.5  # Time between two attempts to open a camera that was lost [s].
 _EARLY = 0.4  # Share of a period by which a picture may come too early for its camera's rate.
