@@ -112,6 +112,7 @@ def test_the_process_of_a_camera_passes_depth_on_without_loss(clock: StoppedCloc
     shots = [one for one in answers if isinstance(one, CameraShot)]
     depths = [one for one in answers if isinstance(one, DepthShot)]
     assert [number_of_jpeg(shot.jpeg) for shot in shots] == [0, 1]
+    assert len(depths) == len(shots)
     for number, depth in enumerate(depths):
         pixels = np.asarray(Image.open(io.BytesIO(depth.png)))
         np.testing.assert_array_equal(pixels, DEEP + np.uint16(number))
