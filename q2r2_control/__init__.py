@@ -30,6 +30,7 @@ if TYPE_CHECKING:  # The word "as" tells type checkers that a name is public.
     from q2r2_control.control.tasks.named_tasks import RelativePose as RelativePose
     from q2r2_control.control.tasks.named_tasks import Upright as Upright
     from q2r2_control.device_words import DeviceWords as DeviceWords
+    from q2r2_control.errors import CameraError as CameraError
     from q2r2_control.errors import ConfigError as ConfigError
     from q2r2_control.errors import PlantError as PlantError
     from q2r2_control.errors import Q2R2Error as Q2R2Error
@@ -64,6 +65,7 @@ if TYPE_CHECKING:  # The word "as" tells type checkers that a name is public.
     from q2r2_control.types import HandSample as HandSample
     from q2r2_control.types import HapticFeedback as HapticFeedback
     from q2r2_control.types import Observation as Observation
+    from q2r2_control.types import ObservedPicture as ObservedPicture
     from q2r2_control.types import Reference as Reference
     from q2r2_control.types import RobotState as RobotState
     from q2r2_control.types import StepReport as StepReport
@@ -71,6 +73,7 @@ if TYPE_CHECKING:  # The word "as" tells type checkers that a name is public.
 _MODULES = {
     "ActionSpace": "inputs.policy",
     "Array": "types",
+    "CameraError": "errors",
     "CartesianController": "control.controller",
     "Command": "types",
     "CommandMode": "types",
@@ -93,6 +96,7 @@ _MODULES = {
     "LookAt": "control.tasks.named_tasks",
     "MovingObstacle": "config.moving_obstacle",
     "Observation": "types",
+    "ObservedPicture": "types",
     "ObstacleConfig": "config.cell",
     "Pipeline": "pipeline.pipeline",
     "Plant": "plants.base",

@@ -11,7 +11,7 @@ from base64 import b64decode, b64encode
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Any, NamedTuple, TypeGuard
+from typing import Any, NamedTuple, Protocol, TypeGuard
 
 import numpy as np
 import numpy.typing as npt
@@ -171,6 +171,18 @@ class Command:
     gravity_only: bool = False
 
 
+class ObservedPicture(Protocol):
+    """A picture of a camera, simulated or real."""
+
+    @property
+    def time(self) -> float:
+        """The time of its capture, by the loop's clock [s]."""
+
+    @property
+    def pixels(self) -> npt.NDArray[np.uint8]:
+        """The picture (height, width, 3), r g b. It is decoded or drawn when it is read for the first time."""
+
+
 @dataclass(frozen=True, slots=True)
 class Observation:
     """The data of one tick for a policy: the state before the command, with the time of the loop's clock."""
@@ -179,6 +191,8 @@ class Observation:
     state: RobotState
     openings: Mapping[str, float]  # Measured openings by arm, from 0 for closed to 1; only arms that measure them.
     tools: Mapping[str, pin.SE3]  # Measured poses of the tools, in the world frame.
+    # The newest picture of each camera of the cell. Reading that of a camera which gives none raises CameraError.
+    pictures: Mapping[str, ObservedPicture] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)

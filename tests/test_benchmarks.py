@@ -22,6 +22,7 @@ SCRIPTS = sorted(file.name for file in FOLDER.glob("*.py") if file.name not in S
 NEEDED = {
     "ros": ("rclpy", "quest2ros"),
     "page": ("viser", "websockets"),
+    "camera": ("cv2",),
     "qp": ("qpbenchmark",),
 }  # The keys are the beginnings of the scripts' names.
 

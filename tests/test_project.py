@@ -75,7 +75,7 @@ def imported(files: Iterable[Path]) -> set[str]:
 
 
 def test_every_dependency_is_imported_and_every_import_is_a_dependency() -> None:
-    optional = modules("bench", "xacro", "export", "gym", "lerobot", "modbus", "web", "cameras", "cluster")
+    optional = modules("bench", "xacro", "export", "gym", "lerobot", "modbus", "web", "cameras", "realsense", "cluster")
     assert modules() <= imported(OTHERS)
     assert imported(OTHERS) - modules() - optional - WITH_OTHERS == set()
     built = {file.parent.name for file in (ROS / "interfaces").glob("*/package.xml")}

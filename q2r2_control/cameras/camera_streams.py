@@ -6,8 +6,9 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, suppress
+from typing import TypeVar
 
-from q2r2_control.cameras.camera_process import CameraLost, CameraShot
+from q2r2_control.cameras.camera_process import Answer, CameraLost, CameraShot, DepthShot
 from q2r2_control.cameras.device import check_installed
 from q2r2_control.config.recording import CameraConfig
 from q2r2_control.errors import CameraError
@@ -15,6 +16,7 @@ from q2r2_control.process.helper_process import HelperProcess, reason_of
 
 _WAITING = 256  # Pictures of a camera that wait for a look. The oldest of more are lost.
 _READY = 120.0  # Longest time until a camera gives its first picture, on a computer that is busy [s].
+_Item = TypeVar("_Item")
 _LOOKS = 0.02  # Time between two checks for it [s].
 
 
@@ -27,6 +29,7 @@ class CameraStream:
         self.newest: CameraShot | None = None
         self._lost: CameraLost | None = None
         self._waiting: deque[tuple[float, CameraShot]] = deque(maxlen=_WAITING)
+        self._depths: deque[DepthShot] = deque(maxlen=_WAITING)
         self._hearers: list[Callable[[CameraShot], None]] = []
         try:
             check_installed(camera)
@@ -47,11 +50,11 @@ class CameraStream:
 
     def take(self) -> list[tuple[float, CameraShot]]:
         """Return the pictures since the last call, each with the time of its receipt [s]. It never waits."""
-        found = []
-        with suppress(IndexError):
-            while True:
-                found.append(self._waiting.popleft())
-        return found
+        return _taken(self._waiting)
+
+    def take_depths(self) -> list[DepthShot]:
+        """Return the pictures of depth since the last call. It never waits."""
+        return _taken(self._depths)
 
     def first_picture(self) -> CameraShot:
         """Wait until the camera has given a picture; raises :class:`CameraError` if it does not."""
@@ -71,14 +74,26 @@ class CameraStream:
                 return
             time.sleep(_LOOKS)
 
-    def _on_answer(self, answer: CameraShot | CameraLost) -> None:
+    def _on_answer(self, answer: Answer) -> None:
         if isinstance(answer, CameraLost):
             self._lost = answer
+            return
+        if isinstance(answer, DepthShot):
+            self._depths.append(answer)
             return
         self._lost, self.newest = None, answer
         self._waiting.append((time.monotonic(), answer))
         for hearer in self._hearers:
             hearer(answer)
+
+
+def _taken(waiting: deque[_Item]) -> list[_Item]:
+    """Take all items out of a queue to which another thread adds."""
+    found = []
+    with suppress(IndexError):
+        while True:
+            found.append(waiting.popleft())
+    return found
 
 
 class CameraStreams(AbstractContextManager["CameraStreams"]):

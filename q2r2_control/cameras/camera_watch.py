@@ -15,6 +15,11 @@ _NEARLY, _FORGETS = 0.3, 0.9  # A share of a period; what remains of a delay aft
 _SLOW, _FAST_ENOUGH = 0.8, 0.9  # Shares of the rate below which a camera is slow, and from which it no longer is.
 
 
+def longest_silence(camera: CameraConfig) -> float:
+    """Return the time without a picture after which a camera has stopped [s]."""
+    return max(_STOPPED_AFTER, _STOPPED_PERIODS / camera.rate)
+
+
 class MissingPictures:
     """Counts the pictures of a camera that are missing, by the times of those that came.
 
@@ -84,7 +89,7 @@ class CameraWatch:
         ``why`` is the camera's own reason, if it gives one.
         """
         age = now - self._received
-        if self.stopped or age < _STOPPED_AFTER or age * self._camera.rate < _STOPPED_PERIODS:
+        if self.stopped or age < longest_silence(self._camera):
             return []
         return self._tell(CameraReason.CAMERA_STOPPED, True, age=age, why=f": {why}" if why else "")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.util
 import os
 import re
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +17,8 @@ from q2r2_control.extras import install_line
 Pixels = npt.NDArray[np.uint8]  # (height, width, 3) b g r, as OpenCV has them.
 _PASSWORD = re.compile(r"(?<=://)[^/@]*@")
 _RIGHT_ANGLE = 90  # [deg]
+_OLDEST_STAMP = 1.0  # A driver's stamp that is older than this is by another clock [s].
+_Number = TypeVar("_Number", np.uint8, np.uint16)
 
 
 class Capture(NamedTuple):
@@ -24,11 +26,17 @@ class Capture(NamedTuple):
     pixels: Pixels
 
 
+class DepthCapture(NamedTuple):
+    time: float  # Time of the capture, by the monotonic clock of this computer [s].
+    pixels: npt.NDArray[np.uint16]  # (height, width) Depth in units; 0 where it is not known.
+    unit: float  # [m]
+
+
 class CameraDevice(Protocol):
     """An open camera."""
 
-    def read(self) -> Capture:
-        """Wait for the next picture.
+    def read(self) -> Capture | DepthCapture:
+        """Wait for the next picture, or for the next depth of a camera whose depth is recorded.
 
         Raises:
             CameraError: If no more pictures come.
@@ -40,6 +48,8 @@ class CameraDevice(Protocol):
 
 def check_installed(camera: CameraConfig) -> None:
     """Raise :class:`CameraError` if the Python package that reads the camera is not installed."""
+    if camera.device_kind == "realsense" and importlib.util.find_spec("pyrealsense2") is None:
+        raise CameraError(f"{shown_device(camera)}: needs pyrealsense2: {install_line('realsense')}")
     if importlib.util.find_spec("cv2") is None:
         raise CameraError(f"{shown_device(camera)}: needs OpenCV: {install_line('cameras')}")
 
@@ -60,7 +70,20 @@ def size_before_rotation(camera: CameraConfig) -> tuple[int, int]:
     return size[::-1] if camera.rotation % (2 * _RIGHT_ANGLE) else size
 
 
-def turned(pixels: Pixels, camera: CameraConfig) -> Pixels:
+def capture_time(received: float, stamp_ms: float, delay: float) -> float:
+    """Return when a picture was captured, by the monotonic clock [s].
+
+    Args:
+        received: Time of its receipt [s].
+        stamp_ms: Stamp of the driver by the same clock [ms]. V4L2 drivers stamp pictures by the monotonic clock;
+            others give 0, or the time since their stream began.
+        delay: From the capture to the receipt, where the stamp is not one of the monotonic clock [s].
+    """
+    stamp = stamp_ms / 1e3
+    return stamp if 0.0 <= received - stamp < _OLDEST_STAMP else received - delay
+
+
+def turned(pixels: npt.NDArray[_Number], camera: CameraConfig) -> npt.NDArray[_Number]:
     """Return a picture of the device turned clockwise by ``camera.rotation``."""
     return np.ascontiguousarray(np.rot90(pixels, -camera.rotation // _RIGHT_ANGLE))
 

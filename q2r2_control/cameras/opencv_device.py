@@ -9,6 +9,7 @@ import cv2
 from q2r2_control.cameras.device import (
     Capture,
     address_of,
+    capture_time,
     check_size,
     shown_device,
     size_before_rotation,
@@ -20,24 +21,10 @@ from q2r2_control.config.recording import CameraConfig
 from q2r2_control.errors import CameraError
 
 _PATIENCE_MS = 5000  # Longest wait for a network camera [ms].
-_OLDEST_STAMP = 1.0  # A driver's stamp that is older than this is by another clock [s].
 _ENOUGH = 0.9  # A device that says less than this share of the rate that the cell asks for is asked for MJPG.
 _EXPOSURE_UNIT = 1e-4  # V4L2_CID_EXPOSURE_ABSOLUTE counts in 100 us [s].
 _MANUAL_EXPOSURE = 1  # V4L2_EXPOSURE_MANUAL
 _MJPG = cv2.VideoWriter.fourcc(*"MJPG")
-
-
-def capture_time(received: float, stamp_ms: float, delay: float) -> float:
-    """Return when a picture was captured, by the monotonic clock [s].
-
-    Args:
-        received: Time of its receipt [s].
-        stamp_ms: Stamp of the driver by the same clock [ms]. V4L2 drivers stamp pictures by the monotonic clock;
-            others give 0, or the time since their stream began.
-        delay: From the capture to the receipt, where the stamp is not one of the monotonic clock [s].
-    """
-    stamp = stamp_ms / 1e3
-    return stamp if 0.0 <= received - stamp < _OLDEST_STAMP else received - delay
 
 
 class OpenCvDevice:

@@ -17,6 +17,10 @@ def open_device(camera: CameraConfig) -> CameraDevice:
         from q2r2_control.cameras.video_file import VideoFile  # OpenCV is imported in the process of a camera only.
 
         return VideoFile(camera)
+    if camera.device_kind == "realsense":
+        from q2r2_control.cameras.realsense import open_realsense
+
+        return open_realsense(camera)
     from q2r2_control.cameras.opencv_device import OpenCvDevice
 
     return OpenCvDevice(camera)

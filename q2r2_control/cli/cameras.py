@@ -12,11 +12,13 @@ from typer import Argument, Exit, Option
 
 from q2r2_control.cameras.camera_streams import CameraStream
 from q2r2_control.cameras.device import shown_device
+from q2r2_control.cameras.realsense import found_cameras, is_installed
 from q2r2_control.cameras.v4l2 import capture_devices, fault_of, formats_of
 from q2r2_control.cli.output import Json, as_json_text
 from q2r2_control.config.cell import load_config
-from q2r2_control.config.recording import CameraConfig
+from q2r2_control.config.recording import REALSENSE, CameraConfig
 from q2r2_control.errors import CameraError
+from q2r2_control.extras import install_line
 from q2r2_control.process.helper_process import reason_of
 from q2r2_control.process.scheduling import check_folder
 
@@ -26,9 +28,9 @@ _LONGEST = 5.0  # Longest time to wait for the pictures of that time [s].
 
 @dataclass(frozen=True, slots=True)
 class FoundDevice:
-    """A V4L2 device of this computer."""
+    """A V4L2 device or a RealSense camera of this computer."""
 
-    path: str
+    path: str  # As cameras.NAME.device has it.
     name: str
     formats: list[str]
     fault: str | None  # Why it cannot be opened.
@@ -80,6 +82,8 @@ def _found_devices() -> Iterator[FoundDevice]:
             except OSError as error:
                 fault = f"its formats cannot be listed: {error.strerror}"
         yield FoundDevice(path, name, formats, fault)
+    for camera, _ in found_cameras():
+        yield FoundDevice(f"{REALSENSE}{camera.serial}", camera.name, list(camera.formats), None)
 
 
 def _tried(name: str, camera: CameraConfig, folder: Path) -> TriedCamera:
@@ -109,6 +113,8 @@ def _print(found: list[FoundDevice], tried: list[TriedCamera], config: str | Non
             console.print(f"    {line}")
     if not found:
         console.print("no V4L2 camera on this computer")
+    if not is_installed():
+        console.print(f"RealSense cameras are listed as V4L2 devices only: {install_line('realsense')}")
     for one in tried:
         console.print(one.line, style="red" if one.fault else None)
     if config is not None and not tried:

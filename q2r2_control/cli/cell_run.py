@@ -27,7 +27,7 @@ from q2r2_control.config.external import ControllerKind
 from q2r2_control.config.recording import CameraConfig
 from q2r2_control.demo.assembly_tasks import AssemblyTask, TaskResult, TaskWatch, held_to_promises, note_on_parts
 from q2r2_control.errors import ConfigError, PlantError, RecordingError
-from q2r2_control.inputs.base import is_simulated, make_input
+from q2r2_control.inputs.base import PolicySource, is_simulated, make_input
 from q2r2_control.judging.episode_judge import EpisodeJudge
 from q2r2_control.judging.judge import Judged, judge, keep_verdicts
 from q2r2_control.pipeline.pipeline import Pipeline
@@ -157,9 +157,10 @@ def run_cell(config: Config, options: RunOptions) -> CellRun:
 
 
 def _watched_devices(config: Config, options: RunOptions) -> dict[str, CameraConfig]:
-    """Return the real cameras whose pictures are recorded or shown. Without anybody to see them they stay closed."""
-    displays = hasattr(load_class(INPUTS, options.input), DisplayInput.show_picture.__name__)
-    if options.fast or (options.record is None and options.page is None and not displays):
+    """Return the real cameras whose pictures are recorded, shown, or observed. Without such use they stay closed."""
+    source = load_class(INPUTS, options.input)
+    sees = any(hasattr(source, method.__name__) for method in (DisplayInput.show_picture, PolicySource.observe))
+    if options.fast or (options.record is None and options.page is None and not sees):
         return {}
     return config.device_cameras
 
@@ -327,6 +328,7 @@ def _run(
             # On a slow computer the motion may take minutes, in which nothing else is printed.
             say(f"{options.name}: begins, {options.duration:.0f} s of simulated time", console)
         streams.wait_until_ready()
+        pipeline.cameras = streams
         drawn = pipeline.config.simulated_cameras if isinstance(pipeline.plant, MujocoPlant) else {}
         for name, most, show, watched in _lookers(pipeline, page, [*drawn, *streams.streams]):
             if name in streams.streams:
@@ -336,6 +338,9 @@ def _run(
                 pipeline.listeners.append(stack.enter_context(pictures))
         if options.real_time and (refused := stack.enter_context(real_time())):
             say(refused, console, "yellow")
+        recording, sees = None, isinstance(pipeline.input, PolicySource)
+        if options.fast and (recorder is not None or sees) and (real := ", ".join(pipeline.config.device_cameras)):
+            say(f"no pictures of {real}: real cameras keep real time; allowed: without --fast", console, "yellow")
         if recorder is not None:
             cameras = tuple(pipeline.config.simulated_cameras)
             if cameras and isinstance(pipeline.plant, MujocoPlant):
@@ -345,8 +350,6 @@ def _run(
                 say(none, console, "yellow")
                 cameras = ()
             cameras += tuple(streams.streams)
-            if options.fast and (real := ", ".join(pipeline.config.device_cameras)):
-                say(f"no pictures of {real}: real cameras keep real time; allowed: without --fast", console, "yellow")
             recorder.record_outcome = pipeline.record_outcome
             notes = {"cell": pipeline.config.name, "input": options.input, **options.notes}
             given = options.input_options.items()
@@ -357,12 +360,13 @@ def _run(
                 about = replace(about, notes=anonymous(about.notes))
             recorder.begin(about, pipeline.robot, pipeline.config.recording.topic_rate)
             pipeline.listeners.append(recorder)
-            if streams.streams:
-                devices = DevicePictures(streams, recorder, about, pipeline.record_outcome)
-                pipeline.listeners.append(stack.enter_context(devices))
+            recording = recorder, about
             if any(map(pipeline.config.teleop.bindings.words_of, EpisodeMarks.actions)):
                 judge_now = EpisodeJudge(lambda: recorder.file, pipeline.record_outcome)
                 pipeline.listeners.append(stack.enter_context(judge_now))
+        if streams.streams:
+            devices = DevicePictures(streams, not options.simulated_time, pipeline.record_outcome, recording)
+            pipeline.listeners.append(stack.enter_context(devices))
         return pipeline.run(options.duration, realtime=not options.simulated_time, paced=not options.fast)
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from contextlib import ExitStack, closing
+from collections.abc import Iterable, Sequence
+from contextlib import ExitStack, closing, suppress
 from functools import partial
 from pathlib import Path
 from typing import Annotated, TypeVar
@@ -38,7 +38,7 @@ from q2r2_control.judging.judge import Judged, Judgement, Unreadable, discarded_
 from q2r2_control.judging.page import COLUMNS, page_of
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.process.places import chosen_place
-from q2r2_control.recording.reader import recordings_in
+from q2r2_control.recording.reader import Recording, recordings_in
 from q2r2_control.recording.replay import replay as replay_recording
 from q2r2_control.viewer.tables import figure_table, print_table
 from q2r2_control.viewer.web.playback import Playback
@@ -200,6 +200,14 @@ def report(
         raise Exit(2)
 
 
+def _cameras_with_depth(files: Iterable[Path]) -> tuple[str, ...]:
+    """Return the cameras whose depth is in the first recording that can be read. All of a dataset have the same."""
+    for file in files:
+        with suppress(RecordingError):
+            return Recording(file).about.depth
+    return ()
+
+
 def _thresholds(config: str | None) -> JudgeSettings | None:
     """Return the thresholds of the cell ``config``; None for those of each recorded cell."""
     return None if config is None else load_config(config).judge
@@ -274,6 +282,8 @@ def export(
     whole = len(made.kept) + len(made.left_out) + len(made.unreadable) == len(files)
     count = f"{len(made.kept)} of" if whole else f"{counted(len(made.kept), 'episode')} of"
     print(f"{output}: {count} {counted(len(files), 'recording')} at {fps} frames per second")
+    if sampling.pictures and (deep := _cameras_with_depth(files)):
+        say(f"depth of {', '.join(deep)} is left out: no format has a place for it; the recordings have it")
     if made.left_out:
         say(f"left out, since q2r2 judge discards them: {len(made.left_out)}; --keep-discarded exports them too")
     if chosen.advice is not None:

@@ -149,7 +149,8 @@ DeviceNumber = Annotated[int, Field(ge=0, le=255)]
 DeviceText = Annotated[LocalPath, Field(min_length=1, max_length=500)]
 _LEAST_DISTANCE = 1e-6  # [m]
 _PLACE = ("position", "look_at", "rpy")
-_OF_A_DEVICE = ("exposure", "rotation", "delay", "repeat")
+_OF_A_DEVICE = ("exposure", "rotation", "delay", "repeat", "depth")
+REALSENSE = "realsense:"  # The beginning of the device of a RealSense camera, before its serial number.
 
 
 class CameraConfig(StrictModel):
@@ -167,7 +168,8 @@ class CameraConfig(StrictModel):
     )
     device: DeviceNumber | DeviceText | None = Field(
         None,
-        description="real camera without ROS: V4L2 number or path, rtsp:// or http:// address, or a video file",
+        description="real camera without ROS: V4L2 number or path, realsense:SERIAL, rtsp:// or http:// address, or a "
+        "video file",
     )
     link: str | None = Field(
         None, description="link that carries the camera, such as left_hand_e_base; null: the world"
@@ -198,6 +200,7 @@ class CameraConfig(StrictModel):
         le=2,
         description="time from capture to receipt of a picture, for a device without stamps of its own [s]",
     )
+    depth: bool = Field(False, description="the depth of a RealSense camera is recorded too, without loss")
     repeat: bool = Field(True, description="a video file begins again at its end; false: the camera stops there")
 
     @model_validator(mode="after")
@@ -212,6 +215,8 @@ class CameraConfig(StrictModel):
             self._refuse(_PLACE, "without device, which is of a real camera")
             if self.exposure is not None and self.device_kind != "v4l2":
                 raise ValueError("exposure: allowed: of a V4L2 device")
+            if self.depth and self.device_kind != "realsense":
+                raise ValueError(f"depth: allowed: with device: {REALSENSE}SERIAL")
         else:
             self._check_place()
         return self
@@ -236,10 +241,12 @@ class CameraConfig(StrictModel):
         return self.topic is None and self.device is None
 
     @property
-    def device_kind(self) -> Literal["v4l2", "address", "file"] | None:
+    def device_kind(self) -> Literal["v4l2", "realsense", "address", "file"] | None:
         """The kind of the device; None if the camera is no device."""
         if self.device is None:
             return None
         if isinstance(self.device, int) or self.device.isdigit() or self.device.startswith("/dev/"):
             return "v4l2"
+        if self.device.startswith(REALSENSE):
+            return "realsense"
         return "address" if "://" in self.device else "file"

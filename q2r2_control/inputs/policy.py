@@ -21,7 +21,7 @@ import numpy.typing as npt
 import pinocchio as pin
 
 from q2r2_control.config.cell import Config
-from q2r2_control.errors import ConfigError, check_kind, shown
+from q2r2_control.errors import CameraError, ConfigError, check_kind, shown
 from q2r2_control.events import CommonReason, Reason
 from q2r2_control.inputs.base import Input, make_input
 from q2r2_control.inputs.policy_checks import PolicyErrors, UnusableError, check_finite, check_names, numbers_of
@@ -211,7 +211,7 @@ class PolicyInput:
             actions = np.atleast_2d(numbers_of("actions", answer))
             count = len(actions)
             self.send(actions, observation.time + self.period * np.arange(count))
-        except UnusableError as error:
+        except (UnusableError, CameraError) as error:
             self._chunks.append(self._fault(str(error)))
         except BaseException as error:  # The loop goes on after any error of a policy.
             if not isinstance(error, Exception) and threading.current_thread() is threading.main_thread():

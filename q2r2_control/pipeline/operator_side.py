@@ -20,6 +20,7 @@ from q2r2_control.control.controller import CartesianController
 from q2r2_control.events import CommonReason, Event, Reason, ReasonKind
 from q2r2_control.inputs.base import Input, PolicySource, check_samples
 from q2r2_control.loop.control_loop import ArmConditions
+from q2r2_control.pipeline.newest_pictures import NewestPictures
 from q2r2_control.pipeline.requests import change_of, changed
 from q2r2_control.summary.tick import Tick
 from q2r2_control.supervision.gripper_limiter import Grip
@@ -45,8 +46,10 @@ class OperatorSide:
         supervisor: Supervisor,
         controller: CartesianController,
         requests: deque[Reason | TeleopSettings],
+        pictures: NewestPictures,
         impedance: ImpedanceController | None = None,
     ) -> None:
+        self._pictures = pictures
         self._teleop, self._input, self._supervisor = teleop, source, supervisor
         self._policy = source if isinstance(source, PolicySource) else None
         self.chunks: list[ActionChunk] = []  # Chunks of a policy since the last poll.
@@ -100,7 +103,8 @@ class OperatorSide:
         """Send the vibrations of one tick to the hands, and give a policy the state that it may see."""
         now = tick.now
         if self._policy is not None:
-            self._policy.observe(Observation(now, tick.state, tick.openings, tick.tools))
+            pictures = self._pictures.at(now)
+            self._policy.observe(Observation(now, tick.state, tick.openings, tick.tools, pictures))
         if not self._feels:
             return
         for event in tick.events:

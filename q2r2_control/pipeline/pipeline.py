@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
+from q2r2_control.cameras.camera_streams import CameraStreams
 from q2r2_control.config.cell import AUTO, Config
 from q2r2_control.control.constraints import Constraint
 from q2r2_control.control.controller import CartesianController
@@ -25,6 +26,7 @@ from q2r2_control.inputs.base import Input, PolicySource, make_input
 from q2r2_control.loop.control_loop import ControlLoop, LoopStep
 from q2r2_control.pipeline.loop_clock import LoopClock, PlantClock, WallPace
 from q2r2_control.pipeline.loop_rate import FITTING_RATES_HZ, RateFit, largest_usual_time
+from q2r2_control.pipeline.newest_pictures import NewestPictures
 from q2r2_control.pipeline.operator_side import OperatorSide
 from q2r2_control.pipeline.requests import RequestedRun
 from q2r2_control.pipeline.run_recorder import RunRecorder
@@ -110,6 +112,7 @@ class Pipeline(RequestedRun):
         self.controller = CartesianController(robot, permitted(self.config.control, self.drive), **self._own)
         self._data = robot.model.createData()
         self.listeners: list[Callable[[Tick], None]] = []
+        self.cameras: CameraStreams | None = None  # The open real cameras, whose pictures a policy gets.
         # This is a plain flag, because a signal handler cannot take the lock of a threading.Event safely.
         self._stopping = False
         self._rested_since: float | None = None  # The end of the last run [s].
@@ -325,8 +328,10 @@ class Pipeline(RequestedRun):
         is_torque = self.drive.mode is CommandMode.TORQUE
         self._longest_advance = max(_MAX_TORQUE_HOLD_S, self._clock.period) if is_torque else LONGEST_DT
         self._recorder = RunRecorder(self.robot, self.config.control, self.listeners, self.stop, counts)
+        streams = {} if self.cameras is None else self.cameras.streams
+        pictures = NewestPictures(self.config, self.plant, streams, realtime)
         self._operator = OperatorSide(
-            self.teleop, self.input, self.supervisor, self.controller, self.requests, self.impedance
+            self.teleop, self.input, self.supervisor, self.controller, self.requests, pictures, self.impedance
         )
         self.teleop.marks.recorded = self._recorder.keeps_episodes
         self.teleop.marks.subtasks = self.config.recording.subtasks

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable
 from typing import Protocol, runtime_checkable
 
 import numpy as np
+import numpy.typing as npt
 
 from q2r2_control.config.cell import Config
 from q2r2_control.config.moving_obstacle import MovingObstacle
@@ -70,6 +71,18 @@ class WindowedPlant(Protocol):
 
     def viewer_sync(self, obstacles: Iterable[tuple[MovingObstacle, tuple[int, int, int]]] = ()) -> bool:
         """Show the plant and ``obstacles`` in colours r g b; returns False if the window was closed."""
+
+
+@runtime_checkable
+class PicturedPlant(Protocol):
+    """The additional method of a plant that draws what the simulated cameras of its cell see."""
+
+    def picture_of(self, camera: str) -> Callable[[], npt.NDArray[np.uint8]]:
+        """Return a function that draws what a camera saw at the last ``state``, at any time and in any thread.
+
+        It returns a picture (height, width, 3), r g b, or raises :class:`PlantError`. ``camera`` is one of the cell's
+        ``simulated_cameras``.
+        """
 
 
 @runtime_checkable

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
 
 import mujoco
 import numpy as np
+import numpy.typing as npt
 
 from q2r2_control.config.cell import Config
 from q2r2_control.config.moving_obstacle import MovingObstacle
 from q2r2_control.errors import PlantError
 from q2r2_control.plants.base import GripperMotion, check_command, check_duration, check_joints
-from q2r2_control.plants.mujoco_cameras import close_window, draw_obstacles, open_window
+from q2r2_control.plants.mujoco_cameras import ThreadPictures, close_window, draw_obstacles, open_window
 from q2r2_control.plants.mujoco_model import build_model, settle_mimics
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Command, CommandMode, RobotState
@@ -88,6 +90,7 @@ class MujocoPlant:
         self._inertial_torque = np.zeros(self.model.nv)
         # Positions of all moving bodies at the last :meth:`state` (model.nq,).
         self.observed_qpos: Array = self._qpos.copy()
+        self._pictures = ThreadPictures(self.model, config.simulated_cameras)
         self.reset()
         self._stiffness, self._damping = self._tuned(config)
 
@@ -168,6 +171,10 @@ class MujocoPlant:
         external = (data.qfrc_constraint + data.qfrc_smooth - data.qfrc_passive + self._bias).take(index) - tau
         q, v = self._qpos.take(self._q_index), self._qvel.take(index)
         return RobotState(q, v, tau, external, self._steps * self._timestep)
+
+    def picture_of(self, camera: str) -> Callable[[], npt.NDArray[np.uint8]]:
+        """See :meth:`PicturedPlant.picture_of`."""
+        return partial(self._pictures.take, camera, self.observed_qpos)  # Each ``state`` makes a new array.
 
     def gripper_openings(self) -> dict[str, float]:
         return {side: fingers.opening(self._qpos) for side, fingers in self._fingers.items()}

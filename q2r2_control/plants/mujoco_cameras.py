@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import threading
 import warnings
 from collections.abc import Iterable, Mapping
@@ -99,6 +100,22 @@ class CellPictures:
         renderer = self._renderers[camera]
         renderer.update_scene(self._data, camera)
         return np.asarray(renderer.render())
+
+
+class ThreadPictures:
+    """Takes pictures of a cell in any thread. Each thread gets a :class:`CellPictures` of its own when it needs one."""
+
+    def __init__(self, model: mujoco.MjModel, cameras: Mapping[str, CameraConfig]) -> None:
+        self._model, self._cameras, self._own = model, cameras, threading.local()
+
+    def take(self, camera: str, qpos: Array) -> npt.NDArray[np.uint8]:
+        """Return the picture (height, width, 3), r g b, of the cell at ``qpos``; raises :class:`PlantError`."""
+        if not hasattr(self._own, "cell"):
+            # A copy, because settings of the drawing change, which the window of the plant has too.
+            self._own.cell = CellPictures(copy.copy(self._model), self._cameras)
+        cell: CellPictures = self._own.cell
+        cell.place(qpos)
+        return cell.take(camera)
 
 
 def window_fault() -> str | None:

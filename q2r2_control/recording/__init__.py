@@ -8,12 +8,14 @@ from q2r2_control._lazy import lazy_exports
 
 if TYPE_CHECKING:
     from q2r2_control.recording.about import About as About
+    from q2r2_control.recording.device_pictures import DevicePictures as DevicePictures
     from q2r2_control.recording.reader import recordings_in as recordings_in
     from q2r2_control.recording.recorder import Recorder as Recorder
     from q2r2_control.recording.recorder import RecordingSummary as RecordingSummary
 
 _MODULES = {
     "About": "about",
+    "DevicePictures": "device_pictures",
     "Recorder": "recorder",
     "RecordingSummary": "recorder",
     "recordings_in": "reader",

@@ -44,6 +44,7 @@ class About:
     cameras: tuple[str, ...] = ()  # The cameras whose pictures are recorded.
     notes: dict[str, str] = field(default_factory=dict)  # Texts for people, such as program, machine and task.
     source: str = LOOP
+    depth: tuple[str, ...] = ()  # The cameras whose depth is recorded too.
 
     @classmethod
     def of(cls, pipeline: Pipeline, realtime: bool, notes: Mapping[str, str], cameras: Sequence[str] = ()) -> About:
@@ -69,11 +70,13 @@ class About:
             cell=as_yaml(pipeline.config),
             robot=pipeline.robot.urdf,
             cameras=tuple(cameras),
+            depth=tuple(name for name in cameras if pipeline.config.cameras[name].depth),
             notes={**program(), "plant": type(pipeline.plant).__name__, **notes},
         )
 
     def texts(self) -> dict[str, str]:
-        run = {name: value for name, value in vars(self).items() if name not in ("cell", "robot", "notes")}
+        left_out = ("cell", "robot", "notes") if self.depth else ("cell", "robot", "notes", "depth")
+        run = {name: value for name, value in vars(self).items() if name not in left_out}
         return {"format": FORMAT, "run": json.dumps(run), **self.notes}
 
     @classmethod
@@ -88,10 +91,11 @@ class About:
         run = json.loads(notes.pop("run"))
         for name in ("arms", "joints", "plant_modes", "cameras"):
             run[name] = tuple(run[name])
+        run["depth"] = tuple(run.get("depth", ()))
         return cls(**run, cell=cell, robot=robot, notes=notes)
 
     def topics(self) -> dict[str, Topic]:
-        return run_topics(self.arms, self.joints, self.cameras)
+        return run_topics(self.arms, self.joints, self.cameras, self.depth)
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ and show them.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -20,6 +20,7 @@ from q2r2_control.types import SIDES, Array
 
 STORE = message_types(Dialect.ROS2)
 ARRAY, TEXT, PICTURE = "std_msgs/msg/Float64MultiArray", "std_msgs/msg/String", "sensor_msgs/msg/CompressedImage"
+JPEG = "jpeg"  # The usual format of its messages.
 POSE, JOINTS = "geometry_msgs/msg/PoseStamped", "sensor_msgs/msg/JointState"
 TRAJECTORY, HAND_INPUTS = "trajectory_msgs/msg/JointTrajectory", "quest2ros/msg/OVR2ROSInputs"
 NANOSECONDS = 1_000_000_000
@@ -54,8 +55,10 @@ class Topic:
     labels: tuple[str, ...] = ()  # The names of an array's numbers, in their order.
 
 
-def run_topics(arms: Sequence[str], joints: Sequence[str], cameras: Sequence[str] = ()) -> dict[str, Topic]:
-    """Return the topics of a loop's run, by name."""
+def run_topics(
+    arms: Sequence[str], joints: Sequence[str], cameras: Sequence[str] = (), depth: Sequence[str] = ()
+) -> dict[str, Topic]:
+    """Return the topics of a loop's run, by name; ``depth`` are the cameras whose depth is recorded too."""
     types = {DESCRIPTION: TEXT, TICK: ARRAY, SAMPLES: ARRAY}
     for hand in SIDES:
         types |= {hand_pose(hand): POSE, hand_buttons(hand): HAND_INPUTS}
@@ -64,6 +67,7 @@ def run_topics(arms: Sequence[str], joints: Sequence[str], cameras: Sequence[str
         types |= {filtered_hand(arm): POSE, target(arm): POSE, safe_target(arm): POSE}
     types |= {REFERENCE: TRAJECTORY, JOINT_COMMANDS: JOINTS, STATE: TEXT}
     types |= {picture_topic(camera): PICTURE for camera in cameras}
+    types |= {depth_topic(camera): PICTURE for camera in depth}
     return _numbered(types, {TICK: tick_labels(arms, joints), SAMPLES: SAMPLE_FIELDS})
 
 
@@ -73,8 +77,8 @@ def loop_topics(arms: Sequence[str]) -> tuple[str, ...]:
     return (DESCRIPTION, TICK, JOINT_STATES, *safe_targets, REFERENCE, JOINT_COMMANDS, STATE)
 
 
-def ros_topics(arms: Sequence[str], cameras: Mapping[str, str]) -> tuple[Topic, ...]:
-    """Return the topics of a recording of the nodes; ``cameras`` has the topic of the pictures of each camera."""
+def ros_topics(arms: Sequence[str], pictures: Iterable[str] = ()) -> tuple[Topic, ...]:
+    """Return the topics of a recording of the nodes; ``pictures`` are those of the pictures of cameras."""
     types: dict[str, str] = {DESCRIPTION: TEXT, JOINT_STATES: JOINTS, "/mujoco_robot/external_torque": JOINTS}
     types |= {"/tf": _TRANSFORMS, "/tf_static": _TRANSFORMS, "/diagnostics": _DIAGNOSTICS}
     for hand in SIDES:
@@ -85,7 +89,7 @@ def ros_topics(arms: Sequence[str], cameras: Mapping[str, str]) -> tuple[Topic, 
         types |= {target(arm): POSE, safe_target(arm): POSE, f"/cartesian_controller/following/{arm}": _BOOL}
         types |= {arm_flags(arm): ARRAY, arm_events(arm): TEXT}
     types |= {f"/{node}/state": TEXT for node in (*_NODES, *(f"{arm}_q2r2_arm_controller" for arm in arms))}
-    types |= {topic: PICTURE if is_compressed(topic) else _IMAGE for topic in cameras.values()}
+    types |= {topic: PICTURE if is_compressed(topic) else _IMAGE for topic in pictures}
     labels = {CONTROLLER_TICK: tick_fields(arms)} | {arm_flags(arm): ARM_FIELDS for arm in arms}
     return tuple(_numbered(types, labels).values())
 
@@ -146,6 +150,15 @@ def picture_topic(camera: str) -> str:
     return f"/{camera}/image/compressed"
 
 
+def depth_topic(camera: str) -> str:
+    return f"/{camera}/depth/compressed"
+
+
+def coding_of_depth(unit: float) -> str:
+    """Return the format of a message of depth, whose numbers of 16 bits have this ``unit`` [m]."""
+    return f"16UC1; png; unit {unit:.6g} m"
+
+
 def heard_on(topic: str) -> str:
     """Return the topic that the recorder subscribes to for a recorded topic."""
     arm = topic.removeprefix("/q2r2/").split("/")[0]
@@ -179,21 +192,23 @@ class Message(NamedTuple):
         return len(self.payload)
 
 
-class JpegPicture(NamedTuple):
+class CodedPicture(NamedTuple):
     """A picture of a real camera, of which the writer makes a message."""
 
     channel: int
     number: int  # The number of the newest tick when it was captured.
     time: int  # The time of day of its capture [ns].
     camera: str
-    jpeg: bytes
+    data: bytes
+    coding: str = JPEG
 
     @property
     def size(self) -> int:
-        return len(self.jpeg)
+        return len(self.data)
 
     def message(self) -> Message:
-        return Message(self.channel, self.number, self.time, self.time, picture(self.camera, self.time, self.jpeg))
+        payload = picture(self.camera, self.time, self.data, self.coding)
+        return Message(self.channel, self.number, self.time, self.time, payload)
 
 
 class MessageTemplate:
@@ -282,9 +297,9 @@ def text(data: str) -> bytes:
     return serialized(TEXT, make(TEXT, data))
 
 
-def picture(camera: str, stamp: int, jpeg: bytes) -> bytes:
+def picture(camera: str, stamp: int, data: bytes, coding: str = JPEG) -> bytes:
     """Return a sensor_msgs/CompressedImage as CDR, whose frame is the name of the camera; ``stamp`` [ns]."""
-    return serialized(PICTURE, make(PICTURE, header(camera, stamp), "jpeg", np.frombuffer(jpeg, dtype=np.uint8)))
+    return serialized(PICTURE, make(PICTURE, header(camera, stamp), coding, np.frombuffer(data, dtype=np.uint8)))
 
 
 def data_of(payload: bytes, kind: str) -> Any:

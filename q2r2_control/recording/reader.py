@@ -78,11 +78,15 @@ class Recording:
         for messages in self.messages(names):
             for message in messages:
                 with self._faults():
-                    picture = Picture(message.time, message.number, bytes(data_of(message.payload, PICTURE)))
+                    picture = Picture(self._time_of(message), message.number, bytes(data_of(message.payload, PICTURE)))
                 yield names[self.topic(message)], picture
 
     def _topic_of(self, camera: str) -> str:
         return picture_topic(camera)
+
+    def _time_of(self, picture: Message) -> int:
+        """Return the time of day of the capture of a picture [ns]."""
+        return picture.time
 
     @cached_property
     def declared_topics(self) -> dict[int, Topic]:

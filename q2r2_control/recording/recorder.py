@@ -22,7 +22,7 @@ from q2r2_control.process.scheduling import new_folder
 from q2r2_control.recording.about import About, Conclusion
 from q2r2_control.recording.camera_recorder import CameraRecorder
 from q2r2_control.recording.mcap_file import McapFile
-from q2r2_control.recording.messages import JpegPicture, Message, Topic, run_topics
+from q2r2_control.recording.messages import CodedPicture, Message, Topic, run_topics
 from q2r2_control.recording.reader import BROKEN
 from q2r2_control.recording.tick_rows import PackedTick, TickPacker
 from q2r2_control.recording.writer import FLUSH_PERIOD, RecordedRobot, RecordingSetup, Written
@@ -82,7 +82,7 @@ class BaseRecorder:
         self.writer.send(RecordingSetup(self.file.absolute(), about, topics, robot, topic_rate))
         return True
 
-    def _send(self, batch: list[PackedTick] | list[Message] | list[JpegPicture], *, wait: bool = False) -> bool:
+    def _send(self, batch: list[PackedTick] | list[Message] | list[CodedPicture], *, wait: bool = False) -> bool:
         """Send a batch to the writer; returns False if there is no room for it now. With ``wait`` it waits for room."""
         if self.writer is None or self.fault is not None:
             return False
@@ -287,7 +287,7 @@ class Recorder(BaseRecorder, AbstractContextManager["Recorder"]):
         if self.writer is not None:
             self.writer.send([picture], picture.size, wait=True)
 
-    def record_picture(self, picture: JpegPicture) -> None:
+    def record_picture(self, picture: CodedPicture) -> None:
         """Send a picture of a real camera to the writer; it is lost, and counted, if there is no room for it."""
         self.device_pictures += 1
         self._send([picture])

@@ -10,7 +10,7 @@ import json
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -65,13 +65,24 @@ class RosRecording(Recording):
         yield ticks.rest(previous)
 
     def _topic_of(self, camera: str) -> str:
-        topic = parse_config(self.about.cell, f"{self.file}: its cell").cameras[camera].topic or ""
+        topic = parse_config(self.about.cell, f"{self.file}: its cell").cameras[camera].topic
+        if topic is None:  # A device, which the recorder has read itself.
+            return super()._topic_of(camera)
         if not names.is_compressed(topic):
             raise RecordingError(
                 f"{self.file}: pictures of camera {camera} are sensor_msgs/Image on {topic}; allowed to export: "
                 "CompressedImage; --no-pictures leaves them out"
             )
         return topic
+
+    def _time_of(self, picture: Message) -> int:
+        # The recorder has read devices itself. The clock of another sender may be a different one.
+        return picture.sent if self.topic(picture) in self._device_topics else picture.time
+
+    @cached_property
+    def _device_topics(self) -> set[str]:
+        cameras = parse_config(self.about.cell, f"{self.file}: its cell").device_cameras
+        return {names.picture_topic(camera) for camera in cameras}
 
 
 @dataclass(slots=True)
@@ -91,7 +102,7 @@ class RosTicks:
         self._robot, self._epoch, self._joint_names = robot, epoch, robot.joint_names
         self._arms = arms = tuple(robot.arms)
         self._fields, self._type = names.tick_fields(arms), tick_type(len(arms), len(robot.joint_names))
-        self._types = {topic.name: topic.type for topic in names.ros_topics(arms, {})}
+        self._types = {topic.name: topic.type for topic in names.ros_topics(arms)}
         self.joints = np.full((3, len(robot.joint_names)), np.nan)  # The newest q, v and tau.
         self._known = np.zeros(len(robot.joint_names), dtype=bool)  # True for joints that were measured.
         self._flags = np.full((len(arms), len(names.ARM_FIELDS)), np.nan)

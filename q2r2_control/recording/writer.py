@@ -20,7 +20,7 @@ import pinocchio as pin
 from q2r2_control.recording import messages
 from q2r2_control.recording.about import About, Conclusion
 from q2r2_control.recording.bag import BagWriter
-from q2r2_control.recording.messages import NANOSECONDS, JpegPicture, Message, MessageTemplate, Topic
+from q2r2_control.recording.messages import NANOSECONDS, CodedPicture, Message, MessageTemplate, Topic
 from q2r2_control.recording.tick_rows import POSE_FIELDS, SAMPLE_FIELDS, PackedTick, numbers_in, tick_type
 from q2r2_control.types import QUEST_CONTROLS, SIDES, Array
 
@@ -250,8 +250,8 @@ def main(requests: Iterator[Any], answer: Callable[[Written], None]) -> None:
         for request in requests:
             if isinstance(request, Conclusion):
                 conclusion = request
-            elif request and isinstance(request[0], Message | JpegPicture):
-                bag.write(one.message() if isinstance(one, JpegPicture) else one for one in request)
+            elif request and isinstance(request[0], Message | CodedPicture):
+                bag.write(one.message() if isinstance(one, CodedPicture) else one for one in request)
                 received = received._replace(messages=received.messages + len(request))
             elif request and encoder is not None:
                 bag.write(encoder.encode(request))

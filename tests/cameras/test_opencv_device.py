@@ -32,7 +32,7 @@ pytest.importorskip("cv2")
     ],
 )
 def test_a_picture_was_captured_when_its_driver_says_if_that_can_be(stamp_ms: float, captured: float) -> None:
-    from q2r2_control.cameras.opencv_device import capture_time
+    from q2r2_control.cameras.device import capture_time
 
     assert capture_time(100.0, stamp_ms, 0.1) == pytest.approx(captured)
 

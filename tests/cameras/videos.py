@@ -34,7 +34,7 @@ def numbered(number: int, size: tuple[int, int] = (WIDTH, HEIGHT)) -> npt.NDArra
     return np.repeat(np.tile(row, (size[1], 1))[:, :, None], 3, axis=2)
 
 
-def number_in(pixels: npt.NDArray[np.uint8]) -> int:
+def number_in(pixels: npt.NDArray[np.uint8] | npt.NDArray[np.uint16]) -> int:
     """Return the number that a picture (height, width, 3) shows."""
     blocks = pixels.mean(axis=(0, 2)).reshape(_BITS, -1).mean(axis=1)
     return sum(1 << bit for bit in range(_BITS) if blocks[bit] > _MIDDLE)

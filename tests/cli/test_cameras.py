@@ -6,18 +6,19 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 
-from tests.cameras.videos import FPS, HEIGHT, WIDTH, number_of_jpeg, write_video
+from tests.cameras.videos import FPS, HEIGHT, WIDTH, number_in, number_of_jpeg, write_video
 from tests.cli.command import one_object, q2r2
 
 CELL = Path("config/dual_iiwa7.yaml")
 
 
-def cell_with(folder: Path, cameras: dict[str, object]) -> Path:
-    data = yaml.safe_load(CELL.read_text(encoding="utf-8"))
-    file = folder / "cell.yaml"
+def cell_with(folder: Path, cameras: dict[str, object], cell: Path = CELL) -> Path:
+    data = yaml.safe_load(cell.read_text(encoding="utf-8"))
+    file = folder / "with_cameras.yaml"
     file.write_text(yaml.safe_dump({**data, "cameras": cameras}, sort_keys=False), encoding="utf-8")
     return file
 
@@ -66,6 +67,47 @@ def test_a_run_with_a_real_camera_is_judged_and_exported_without_a_simulator(tmp
 
     with h5py.File(tmp_path / "dataset/episode_0.hdf5") as episode:
         assert episode["observations/images/front"].shape[1:] == (HEIGHT, WIDTH, 3)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("cabinets")
+def test_a_run_of_arms_behind_cabinets_is_recorded_judged_and_exported_with_a_camera(
+    tmp_path: Path, fri_cell: str
+) -> None:
+    pytest.importorskip("cv2")
+    h5py = pytest.importorskip("h5py")
+    write_video(tmp_path / "front.avi", range(250))
+    size = {"width": WIDTH, "height": HEIGHT, "rate": FPS}
+    cell = str(cell_with(tmp_path, {"front": {"device": "front.avi", **size}}, Path(fri_cell)))
+    options = ("--input", "scripted", "--plant", "fri", "--i-know", "--full-speed", "--headless", "--duration", "2")
+    done = q2r2("run", cell, *options, "--json", "--record", str(tmp_path / "recordings"))
+    result = one_object(done.stdout)
+    assert (result["recording"]["fault"], result["recording"]["lost_pictures"]) == (None, 0)
+    (judged,) = result["judge"]
+    assert judged["figures"]["cameras"]["front"]["bad_pictures"] == 0
+    export = ("hdf5", str(tmp_path / "recordings"), "--output", str(tmp_path / "dataset"), "--fps", "25")
+    assert q2r2("export", *export, "--keep-discarded").exit_code == 0
+    with h5py.File(tmp_path / "dataset/episode_0.hdf5") as episode:
+        numbers = [number_in(pixels) for pixels in episode["observations/images/front"]]
+    assert len(numbers) > FPS
+    assert np.diff(numbers).min() >= 0, "the pictures are in the order of their capture"
+    assert set(np.diff(numbers)) <= {0, 1, 2}
+
+
+@pytest.mark.slow
+def test_a_policy_with_a_real_camera_ends_with_one_line_if_the_camera_gives_no_picture(tmp_path: Path) -> None:
+    pytest.importorskip("cv2")
+    size = {"width": WIDTH, "height": HEIGHT, "rate": FPS}
+    cell = str(cell_with(tmp_path, {"front": {"device": "none.avi", **size}}))
+    policy = ("--input", "policy", "--policy", "examples.policy:Circles", "--headless", "--duration", "0.2")
+    opened = q2r2("run", cell, *policy, "--plant", "kinematic")
+    assert opened.exit_code != 0
+    assert opened.stderr.splitlines()[-1].endswith(
+        "none.avi: no such file; allowed: a video, a device such as 0, an address"
+    )
+    fast = q2r2("run", cell, *policy, "--plant", "kinematic", "--fast")
+    assert fast.exit_code == 0
+    assert "no pictures of front: real cameras keep real time; allowed: without --fast\n" in fast.stderr
 
 
 def test_without_a_cell_the_devices_of_this_computer_are_listed() -> None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -14,6 +15,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
 
@@ -26,6 +28,8 @@ from lerobot.utils.import_utils import register_third_party_plugins
 
 from q2r2_control.export.episodes import FrameSampling, make_episode
 from q2r2_control.export.lerobot import write_shard
+from q2r2_control.recording.reader import Recording, recordings_in
+from tests.cameras.videos import FPS, HEIGHT, WIDTH, number_in, number_of_jpeg, write_video
 from tests.export.files import record_step
 from tests.lerobot.test_commands import write_cell
 from tests.plants.fri.conftest import free_ports
@@ -73,6 +77,45 @@ def test_a_cell_has_the_features_of_its_datasets_and_follows_actions(tmp_path: P
     finally:
         robot.disconnect()
     assert not robot.is_connected
+
+
+def test_pictures_of_a_real_camera_are_observed_and_recorded_until_it_stops(tmp_path: Path) -> None:
+    count, enough = 200, 12
+    video = write_video(tmp_path / "front.avi", range(count))
+    camera = {"device": str(video), "width": WIDTH, "height": HEIGHT, "rate": FPS}
+    changes = {"plant: mujoco": "plant: kinematic", "loop_rate_hz: auto": f"loop_rate_hz: {ROS_RATE}"}
+    cell = write_cell(tmp_path, changes, json.dumps({"front": camera}))
+    robot = made(tmp_path, cell=str(cell), record=str(tmp_path / "recordings"))
+    assert robot.observation_features["front"] == (HEIGHT, WIDTH, 3)
+    seen: list[int] = []
+
+    def look() -> None:
+        while True:
+            if (number := number_in(robot.get_observation()["front"])) not in seen[-1:]:
+                seen.append(number)
+            process = robot.pipeline.cameras.streams["front"].process
+            if len(seen) >= enough:
+                with suppress(ProcessLookupError):
+                    os.kill(process.pid, signal.SIGKILL)
+            time.sleep(0.01)
+
+    robot.connect()
+    try:
+        with pytest.raises(DeviceNotConnectedError, match=r"camera front: no picture for .* s: .* SIGKILL"):
+            look()
+    finally:
+        robot.disconnect()
+    (recording,) = recordings_in([tmp_path / "recordings"])
+    numbers = [number_of_jpeg(picture.jpeg) for picture in Recording(recording).pictures("front")]
+    np.testing.assert_array_equal(numbers, (numbers[0] + np.arange(len(numbers))) % count)
+    np.testing.assert_array_equal([number for number in numbers if number in seen], seen[-len(numbers) :])
+
+
+def test_in_simulated_time_a_robot_has_no_real_cameras(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    cell = write_cell(tmp_path, {}, "{front: {device: 0}}")
+    robot = made(tmp_path, cell=str(cell), simulated_time=True)
+    assert "front" not in robot.observation_features
+    assert "no pictures of front: real cameras keep real time; allowed: simulated_time=false" in caplog.messages
 
 
 def test_arms_behind_cabinets_follow_actions_like_simulated_ones(tmp_path: Path) -> None:

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import io
 import logging
 import os
 import signal
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
-from q2r2_control.cameras.camera_process import CameraShot
+from q2r2_control.cameras.camera_process import CameraShot, DepthShot, png_of
 from q2r2_control.cameras.camera_streams import CameraStreams
 from q2r2_control.cameras.reasons import CameraReason
 from q2r2_control.config.recording import CameraConfig
@@ -20,12 +23,14 @@ from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.judging.camera_figures import camera_figures
 from q2r2_control.judging.episode import read_episode
 from q2r2_control.recording.about import About
-from q2r2_control.recording.device_pictures import DevicePictures, LoopTimes, TickTime
+from q2r2_control.recording.device_pictures import DevicePictures
+from q2r2_control.recording.messages import PICTURE, STORE, depth_topic
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorder import ROOM_WITH_PICTURES, Recorder, RecordingSummary
 from q2r2_control.recording.replay import replay
 from q2r2_control.summary.tick import Tick
 from tests.cameras.videos import FPS, HEIGHT, WIDTH, number_of_jpeg, write_video
+from tests.cli.command import q2r2
 from tests.recording.runs import file_of, pipeline
 from tests.support.processes import alive, wait_until
 
@@ -43,8 +48,15 @@ def front(path: Path, **changes: object) -> CameraConfig:
 class RecordedRun:
     """A run in real time whose camera is a video file, until it has enough pictures or ``during`` returns True."""
 
-    def __init__(self, folder: Path, camera: CameraConfig, during: Callable[[RecordedRun], bool] | None = None) -> None:
-        self.loop = pipeline("circle", "kinematic", cameras={"front": camera})
+    def __init__(
+        self,
+        folder: Path,
+        camera: CameraConfig,
+        during: Callable[[RecordedRun], bool] | None = None,
+        in_cell: CameraConfig | None = None,
+    ) -> None:
+        """Play ``camera``, in the place of another one that the cell has if ``in_cell`` is given."""
+        self.loop = pipeline("circle", "kinematic", cameras={"front": in_cell or camera})
         self.shots: list[tuple[float, int]] = []  # The time of each capture [s], and the number in the picture.
         self.start = 0.0  # Of the loop's clock [s].
         self.reports: list[ReasonKind] = []
@@ -56,14 +68,14 @@ class RecordedRun:
                 self.loop.stop()
 
         with (
-            CameraStreams(self.loop.config.device_cameras) as self.streams,
+            CameraStreams({"front": camera}) as self.streams,
             Recorder(folder, "test", room=ROOM_WITH_PICTURES) as self.recorder,
         ):
             self.streams.wait_until_ready()
             self.streams.streams["front"].hear(self._note)
             about = About.of(self.loop, True, {}, ("front",))
             self.recorder.begin(about, self.loop.robot)
-            with DevicePictures(self.streams, self.recorder, about, self._report) as devices:
+            with DevicePictures(self.streams, True, self._report, (self.recorder, about)) as devices:
                 self.loop.listeners += [self.recorder, devices, stop]
                 self.loop.run(realtime=True)
 
@@ -140,6 +152,39 @@ def test_a_camera_that_ends_is_told_of_once_and_marks_the_episode_and_the_run_go
     assert camera_figures(episode)["front"].missing_pictures == pytest.approx(done.summary.lost_pictures, abs=2)
 
 
+def test_depth_is_recorded_without_loss_and_left_out_of_datasets(tmp_path: Path) -> None:
+    deep = np.arange(WIDTH * HEIGHT, dtype=np.uint16).reshape(HEIGHT, WIDTH) * 21  # It needs all 16 bits.
+    count = 0
+
+    def with_depth(run: RecordedRun) -> bool:
+        """Give depth with each picture, as the process of a RealSense camera does."""
+        nonlocal count
+        for time, _ in run.shots[count:]:
+            run.streams.streams["front"]._on_answer(DepthShot(time, png_of(deep + np.uint16(count)), 1e-4))
+            count += 1
+        return run.recorder.device_pictures >= 2 * ENOUGH
+
+    played = front(write_video(tmp_path / "front.avi", range(COUNT)))
+    in_cell = front(Path("realsense:042"), depth=True)
+    done = RecordedRun(tmp_path / "recordings", played, with_depth, in_cell)
+    recording = Recording(file_of(done.summary))
+    assert recording.about.depth == ("front",)
+    found = [message for messages in recording.messages((depth_topic("front"),)) for message in messages]
+    assert len(found) >= ENOUGH // 2
+    stamps = {picture.time for picture in recording.pictures("front")}
+    for message in found:
+        decoded: Any = STORE.deserialize_cdr(message.payload, PICTURE)
+        assert decoded.format == "16UC1; png; unit 0.0001 m"
+        pixels = np.asarray(Image.open(io.BytesIO(bytes(decoded.data))))
+        np.testing.assert_array_equal(pixels - deep, pixels[0, 0])
+        assert message.time in stamps, "it has the time of its capture"
+    assert not read_episode(recording).pictures["front"].damaged.any()
+    assert replay(recording.file).difference is None
+    export = ("csv", str(recording.file), "--output", str(tmp_path / "dataset"), "--keep-discarded")
+    left_out = "depth of front is left out: no format has a place for it; the recordings have it\n"
+    assert left_out in q2r2("export", *export).stderr
+
+
 def test_when_the_process_of_a_camera_is_killed_the_run_goes_on(tmp_path: Path) -> None:
     def killed(run: RecordedRun) -> bool:
         process = run.streams.streams["front"].process
@@ -159,28 +204,3 @@ def test_a_camera_that_cannot_be_opened_is_named_before_the_run(tmp_path: Path) 
         pytest.raises(CameraError, match=r"cameras\.front\.device: .*none\.avi: no such file"),
     ):
         streams.wait_until_ready()
-
-
-class TestTimesOfTheLoop:
-    TICKS = ((10.0, 10.0), (10.01, 10.01), (10.05, 10.05))  # By the computer's clock and by that of the loop [s].
-
-    def times(self, ticks: tuple[tuple[float, float], ...] = TICKS) -> LoopTimes:
-        times = LoopTimes()
-        for number, (computer, loop) in enumerate(ticks):
-            times.add(TickTime(computer, loop, number))
-        return times
-
-    @pytest.mark.parametrize(("at", "number"), [(10.0, 0), (10.004, 0), (10.03, 1), (10.05, 2), (10.2, 2)])
-    def test_in_real_time_they_are_those_of_the_computer(self, at: float, number: int) -> None:
-        assert self.times().at(at) == pytest.approx((at, at, number))
-
-    def test_before_the_first_tick_they_pass_as_those_of_the_computer(self) -> None:
-        assert self.times(((10.0, 0.5), (10.1, 0.6))).at(9.99) == pytest.approx((9.99, 0.49, 0))
-
-    def test_in_slow_motion_they_pass_as_slowly_as_the_ticks(self) -> None:
-        slow = self.times(((10.0, 0.0), (10.1, 0.001), (10.2, 0.002)))
-        assert [slow.at(time) for time in (10.0005, 10.05, 10.1004)] == [
-            pytest.approx((10.0005, 0.0005, 0)),
-            pytest.approx((10.05, 0.001, 0)),
-            pytest.approx((10.1004, 0.0014, 1)),
-        ]

@@ -53,7 +53,7 @@ class NodesOnFile:
             notes={"task": "to count"},
             source=ROS,
         )
-        topics = names.ros_topics(self.arms, {name: camera.topic or "" for name, camera in self.config.cameras.items()})
+        topics = names.ros_topics(self.arms, [camera.topic or "" for camera in self.config.cameras.values()])
         self.topics = {topic.name: topic for topic in topics}
         self.recorder.begin(about, topics)
         self._number = 0

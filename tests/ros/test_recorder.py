@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import platform
+import re
 import signal
 import sys
 import time
@@ -12,8 +13,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+from q2r2_control.cameras.reasons import CameraReason
 from q2r2_control.errors import NOT_RECORDED
 from q2r2_control.events import Event
 from q2r2_control.teleop.reasons import TeleopReason
@@ -31,12 +34,13 @@ from q2r2_control.errors import RecordingError
 from q2r2_control.judging.episode import read_episode
 from q2r2_control.judging.judge import judge
 from q2r2_control.recording.bag import METADATA_FILE
-from q2r2_control.recording.messages import RECORDER_EVENTS, arm_events
+from q2r2_control.recording.messages import RECORDER_EVENTS, TEXT, arm_events, data_of
 from q2r2_control.recording.reader import Recording, read_spans
 from q2r2_control.recording.ros_recording import open_recording
 from q2r2_control.ros.base_node import RECORDED_QOS, STREAM_QOS
 from q2r2_control.teleop.haptics import EPISODE_BEGINS, EPISODE_DISCARDED, EPISODE_ENDS, EPISODE_REJECTED, Pulse
-from tests.recording.runs import read_elsewhere
+from tests.cameras.videos import FPS, HEIGHT, WIDTH, number_of_jpeg, write_video
+from tests.recording.runs import ROOT, read_elsewhere
 from tests.ros.arm_rig import ArmRig
 from tests.ros.processes import States, call, wait_until
 from tests.support.processes import children
@@ -233,6 +237,40 @@ def test_an_anonymous_recording_names_neither_the_operator_nor_the_computer(
     assert "operator" not in about.notes
     assert platform.node() not in about.notes["machine"]
     assert "version" in about.notes
+
+
+def cell_with_camera(folder: Path, video: Path) -> Path:
+    text = (ROOT / CONFIG).read_text(encoding="utf-8")
+    camera = {"device": str(video), "width": WIDTH, "height": HEIGHT, "rate": FPS, "repeat": False}
+    text = re.sub(r"(?ms)^cameras:.*?(?=^judge:)", f"cameras: {json.dumps({'front': camera})}\n\n", text)
+    (file := folder / "cell.yaml").write_text(text, encoding="utf-8")
+    return file
+
+
+def test_pictures_of_a_device_are_recorded_with_the_time_of_their_capture(
+    node: Any, processes: Processes, tmp_path: Path
+) -> None:
+    cell = cell_with_camera(tmp_path, write_video(tmp_path / "front.avi", range(50)))
+    process = processes.start_node("recorder", f"config:={cell}", f"folder:={tmp_path / 'recordings'}")
+    process.wait_for("camera front: no picture for")
+    process.wait_for("the video has ended")
+    assert process.interrupt(60.0) == 0
+    recording = open_recording(tmp_path / "recordings")
+    assert recording.about.cameras == ("front",)
+    pictures = list(recording.pictures("front"))
+    numbers = np.array([number_of_jpeg(picture.jpeg) for picture in pictures])
+    np.testing.assert_array_equal(numbers, np.arange(numbers[0], 50))
+    times = np.array([picture.time - pictures[0].time for picture in pictures]) * 1e-9
+    np.testing.assert_allclose(times, (numbers - numbers[0]) / FPS, atol=1e-6)
+    (told,) = [message for messages in recording.messages((RECORDER_EVENTS,)) for message in messages]
+    assert CameraReason.CAMERA_STOPPED in data_of(told.payload, TEXT)
+
+
+def test_a_recorder_whose_camera_gives_no_picture_ends_with_one_line(processes: Processes, tmp_path: Path) -> None:
+    pytest.importorskip("cv2")
+    process = processes.start_node("recorder", f"config:={cell_with_camera(tmp_path, tmp_path / 'none.avi')}")
+    process.wait_for("recorder: cameras.front.device: ")
+    assert process.wait() == 2
 
 
 @pytest.mark.slow

@@ -6,6 +6,7 @@ Its features have the names and order of ``q2r2 export lerobot``, so a policy th
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +19,7 @@ from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnected
 from lerobot_robot_q2r2.hands import HandsDoor
 from q2r2_control import (
     ActionSpace,
+    CameraError,
     ConfigError,
     Pipeline,
     PolicyInput,
@@ -26,11 +28,13 @@ from q2r2_control import (
     action_names,
     load_commissioned,
 )
+from q2r2_control.cameras import CameraStreams
 from q2r2_control.export import POSITION
 from q2r2_control.plants import CellPictures, MujocoPlant
-from q2r2_control.recording import About, Recorder
+from q2r2_control.recording import About, DevicePictures, Recorder
 
 _logger = logging.getLogger(__name__)
+_ROOM = 64 << 20  # Size of pictures and ticks that may wait to be written [bytes].
 _BEGINS = 60.0  # how long the kernels of a new version take to compile at most, and more [s]
 
 
@@ -65,7 +69,11 @@ class Q2R2Cell(Robot):
         if faults := self.pipeline.preflight_faults():
             raise ConfigError(f"{cell.name}: {'; '.join(faults)}")
         self._robot, self._plant = self.pipeline.robot, self.pipeline.plant
-        self.cameras = cell.simulated_cameras if isinstance(self._plant, MujocoPlant) else {}
+        self._drawn = cell.simulated_cameras if isinstance(self._plant, MujocoPlant) else {}
+        self._devices = {} if config.simulated_time else cell.device_cameras
+        if left_out := ", ".join(cell.device_cameras.keys() - self._devices.keys()):
+            _logger.warning("no pictures of %s: real cameras keep real time; allowed: simulated_time=false", left_out)
+        self.cameras = self._drawn | self._devices
         joints = action_names(self._robot, ActionSpace.JOINTS)
         self._measured = tuple(arm for arm in self._robot.arms if arm in self._plant.gripper_openings())
         self._seen = (*joints, *(f"{arm}_gripper" for arm in self._measured))
@@ -77,7 +85,7 @@ class Q2R2Cell(Robot):
         self._fault: Q2R2Error | None = None
         self._steps, self._start = 0, 0.0  # of simulated time
         self._pictures: CellPictures | None = None
-        self._recording = ExitStack()
+        self._open = ExitStack()  # The open cameras and the recording.
         Q2R2Cell.newest = self
 
     @property
@@ -99,7 +107,11 @@ class Q2R2Cell(Robot):
             raise DeviceAlreadyConnectedError
         self._begun.clear()
         self._fault, self.hands.open = None, False
-        self._record()
+        try:
+            self._open_cameras_and_recording()
+        except Q2R2Error:
+            self._open.close()
+            raise
         if self.config.simulated_time:
             self.pipeline.begin()
             self._steps, self._start = 0, self.pipeline.tick().now
@@ -109,14 +121,25 @@ class Q2R2Cell(Robot):
         self._begun.wait(_BEGINS)
         self._check()
 
-    def _record(self) -> None:
-        if self.config.record is None:
-            return
-        simulated = self.config.simulated_time
-        recorder = self._recording.enter_context(Recorder(Path(self.config.record), self._cell.name, waits=simulated))
-        recorder.begin(About.of(self.pipeline, not simulated, {"cell": self._cell.name}), self._robot)
-        self.pipeline.listeners.append(recorder)
-        self._recording.callback(self.pipeline.listeners.remove, recorder)
+    def _open_cameras_and_recording(self) -> None:
+        realtime, recording = not self.config.simulated_time, None
+        streams = self.pipeline.cameras = self._open.enter_context(CameraStreams(self._devices))
+        streams.wait_until_ready()
+        if self.config.record is not None:
+            folder = Path(self.config.record)
+            recorder = Recorder(folder, self._cell.name, waits=not realtime, room=_ROOM)
+            self._open.enter_context(recorder)
+            about = About.of(self.pipeline, realtime, {"cell": self._cell.name}, tuple(self._devices))
+            recorder.begin(about, self._robot)
+            recording = recorder, about
+            self._listen(recorder)
+        if self._devices:
+            report = self.pipeline.record_outcome
+            self._listen(self._open.enter_context(DevicePictures(streams, realtime, report, recording)))
+
+    def _listen(self, listener: Callable[[Tick], None]) -> None:
+        self.pipeline.listeners.append(listener)
+        self._open.callback(self.pipeline.listeners.remove, listener)
 
     def _run(self) -> None:
         try:
@@ -124,7 +147,7 @@ class Q2R2Cell(Robot):
         except Q2R2Error as error:
             self._fault = error
         finally:
-            self._recording.close()
+            self._open.close()
             self._begun.set()
 
     def _see(self, tick: Tick) -> None:
@@ -149,11 +172,17 @@ class Q2R2Cell(Robot):
         # A gripper that was not heard of for a while is taken to be where it was sent.
         openings = [tick.openings.get(arm, tick.command.grippers[arm]) for arm in self._measured]
         seen = _named(self._seen, (*tick.state.q, *openings))
-        if self.cameras:
+        if self._drawn:
             assert isinstance(self._plant, MujocoPlant)
-            self._pictures = self._pictures or CellPictures(self._plant.model, self.cameras)
+            self._pictures = self._pictures or CellPictures(self._plant.model, self._drawn)
             self._pictures.place(self._plant.observed_qpos)
-            seen |= {name: self._pictures.take(name) for name in self.cameras}
+            seen |= {name: self._pictures.take(name) for name in self._drawn}
+        if self._devices:
+            assert self._policy.observation is not None
+            try:
+                seen |= {name: self._policy.observation.pictures[name].pixels for name in self._devices}
+            except CameraError as error:
+                raise DeviceNotConnectedError(f"{self}: {error}") from error
         return seen
 
     def send_action(self, action: dict[str, Any]) -> dict[str, Any]:
@@ -194,7 +223,7 @@ class Q2R2Cell(Robot):
             self._thread.join()
             self._thread = None
         self.pipeline.end()
-        self._recording.close()
+        self._open.close()
         self._tick = None
 
 

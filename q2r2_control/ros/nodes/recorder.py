@@ -22,20 +22,24 @@ from rclpy.serialization import deserialize_message
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
+from q2r2_control.cameras.camera_streams import CameraStreams
 from q2r2_control.config.bindings import Action
 from q2r2_control.config.cell import load_config
 from q2r2_control.errors import NOT_RECORDED, ConfigError
 from q2r2_control.events import Event, Reason, ReasonKind
 from q2r2_control.judging.episode_judge import EpisodeJudge
 from q2r2_control.recording.about import ROS, About, anonymous, as_yaml, program
+from q2r2_control.recording.device_messages import DeviceMessages
 from q2r2_control.recording.messages import (
     RECORDER_EVENTS,
     Message,
     Topic,
     arm_events,
+    depth_topic,
     heard_on,
     is_latched,
     is_reliable,
+    picture_topic,
     ros_topics,
 )
 from q2r2_control.recording.recorder import ROOM, ROOM_WITH_PICTURES, MessageRecorder
@@ -76,8 +80,9 @@ class RecorderNode(BaseNode):
         leaves_out = self.parameter("anonymous", False, "without the operator and the name of this computer")
         if not folder:
             raise ConfigError("parameter folder: empty; allowed: a folder")
-        cameras = {name: camera.topic for name, camera in config.cameras.items() if camera.topic is not None}
-        room = ROOM_WITH_PICTURES if cameras else ROOM
+        heard = {name: camera.topic for name, camera in config.cameras.items() if camera.topic is not None}
+        streams = CameraStreams(config.device_cameras)
+        room = ROOM_WITH_PICTURES if heard or config.device_cameras else ROOM
         # The process of the recorder starts while this process makes the node.
         self._recorder = MessageRecorder(Path(folder), config.name, room)
         self._judge = EpisodeJudge(lambda: self._recorder.file, self._tell, timed=False)
@@ -88,7 +93,9 @@ class RecorderNode(BaseNode):
         self._served_last: Reason | None = None
         self._waiting: list[Message] = []
         self._events = self.create_publisher(String, self.name_in_set(RECORDER_EVENTS), RECORDED_QOS)
-        topics = ros_topics(tuple(robot.arms), cameras)
+        depth = tuple(name for name, camera in config.device_cameras.items() if camera.depth)
+        of_devices = {picture_topic(name) for name in config.device_cameras} | set(map(depth_topic, depth))
+        topics = ros_topics(tuple(robot.arms), [*heard.values(), *sorted(of_devices)])
         self._begun, self._epoch, self._looked = time.monotonic_ns(), time.time_ns(), 0
         about = About(
             arms=tuple(robot.arms),
@@ -99,14 +106,19 @@ class RecorderNode(BaseNode):
             realtime=True,
             cell=as_yaml(config.model_copy(update={"loop_rate_hz": rate})),
             robot=robot.urdf,
-            cameras=tuple(cameras),
+            cameras=(*heard, *config.device_cameras),
+            depth=depth,
             source=ROS,
             notes={**program(), **{name: text for name, text in notes.items() if text}},
         )
         if leaves_out:
             about = replace(about, notes=anonymous(about.notes))
+        streams.wait_until_ready()
+        channels = {topic.name: topic.channel for topic in topics}
+        self._devices = DeviceMessages(streams, channels, self._day_at, time.monotonic())
         self._recorder.begin(about, topics)
-        self._listen(topics, {arm_events(arm) for arm in robot.arms}, cameras.values())
+        taken = [topic for topic in topics if topic.name not in of_devices]
+        self._listen(taken, {arm_events(arm) for arm in robot.arms}, heard.values())
         for name, kind in _SERVICES.items():
             self.create_service(Trigger, f"~/{name}", partial(self._serve, kind))
         self.create_tick(HANDOVER_PERIOD, self._write, clock=STEADY)
@@ -143,12 +155,21 @@ class RecorderNode(BaseNode):
         """Return the time of day [ns]. It goes on evenly if the computer's clock is set."""
         return self._epoch + time.monotonic_ns() - self._begun
 
+    def _day_at(self, monotonic: float) -> int:
+        """Return the time of day [ns] at a time of the monotonic clock [s]."""
+        return self._epoch + round(monotonic * 1e9) - self._begun
+
     def _write(self) -> None:
         """Pass on, in the order of receipt, the messages that were there at the last call.
 
         Topics are read one after the other. An older message of another topic may therefore arrive after a newer one,
         until the next call.
         """
+        pictures, reasons = self._devices.take(time.monotonic())
+        self._waiting += pictures
+        for reason in reasons:
+            self.get_logger().warning(sentence(reason))
+            self._tell(reason)
         until, self._looked = self._looked, self._day()
         self._recorder.record([one for one in self._waiting if one.time <= until])
         self._waiting = [one for one in self._waiting if one.time > until]
@@ -209,7 +230,8 @@ class RecorderNode(BaseNode):
         """Write all messages, and report the result of the recording. If it failed, the exit code shows it as well."""
         recorder = self._recorder
         self._judge.close()
-        recorder.record(self._waiting)
+        recorder.record([*self._waiting, *self._devices.take(time.monotonic())[0]])
+        self._devices.streams.close()
         recorder.finish()
         if recorder.fault is not None:
             self.exit_code = NOT_RECORDED

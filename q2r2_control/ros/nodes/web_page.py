@@ -99,7 +99,7 @@ class WebPage(BaseNode):
         self._requests = (*requests, *(_OF_RECORDER if recorded else ()))
         self._page.open(self._robot, self._cell, config.name, self._requests)
         shown = self._ticks.topics - {hand_pose(hand) for hand in SIDES}
-        for topic in ros_topics(tuple(self._robot.arms), {}):
+        for topic in ros_topics(tuple(self._robot.arms)):
             if topic.name in shown:
                 name, qos = self.name_in_set(heard_on(topic.name)), RECORDED_QOS if topic.type == TEXT else _STREAM_QOS
                 self._listen(name, topic.type, partial(self._take, topic), qos)

@@ -1,0 +1,43 @@
+"""Times of the computer's clock, by which cameras stamp their pictures, as times of the loop's clock."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import NamedTuple
+
+_KEPT = 8192  # Number of ticks whose times are known: 8 s of a loop at 1 kHz.
+
+
+class TickTime(NamedTuple):
+    computer: float  # By the monotonic clock [s].
+    loop: float  # By the loop's clock [s].
+    number: int
+
+
+class LoopTimes:
+    """Converts times of the computer's monotonic clock into times of the loop's clock.
+
+    In real time both are the same. In simulated time, a loop that is paced may be slower than the computer's clock, and
+    takes its ticks in bursts.
+    """
+
+    def __init__(self) -> None:
+        self._ticks: deque[TickTime] = deque(maxlen=_KEPT)
+
+    def add(self, tick: TickTime) -> None:
+        self._ticks.append(tick)
+
+    def at(self, computer: float) -> TickTime:
+        """Return the loop's time at a time of the computer's clock, with the number of the last tick up to then.
+
+        Before the first tick, the loop's time passes as the computer's, and the number is that of the first tick.
+        """
+        ahead = None
+        for tick in reversed(self._ticks):
+            if tick.computer <= computer:
+                passed = computer - tick.computer
+                longest = passed if ahead is None else ahead.loop - tick.loop
+                return TickTime(computer, tick.loop + min(passed, longest), tick.number)
+            ahead = tick
+        first = self._ticks[0]
+        return TickTime(computer, first.loop - (first.computer - computer), first.number)

@@ -1,0 +1,135 @@
+"""The newest picture of each camera at a tick, for a policy.
+
+The loop only hands over what a picture is made of: a JPEG that a camera's process sent, or the places of the simulated
+bodies. A policy that reads the pixels decodes or draws them, in its own thread.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import time
+from collections.abc import Callable, Mapping
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+from PIL import Image
+
+from q2r2_control.cameras.camera_streams import CameraStream
+from q2r2_control.cameras.camera_watch import longest_silence
+from q2r2_control.cameras.loop_times import LoopTimes, TickTime
+from q2r2_control.config.cell import Config
+from q2r2_control.config.recording import CameraConfig
+from q2r2_control.errors import CameraError, shown
+from q2r2_control.plants.base import PicturedPlant, Plant
+from q2r2_control.types import ObservedPicture
+
+Pixels = npt.NDArray[np.uint8]  # (height, width, 3) r g b.
+_ROUNDING = 1e-6  # Share of a period by which the rounding of times may make a picture seem to be not yet due.
+
+
+class ReadPicture:
+    """A picture of a real camera. Implements :class:`ObservedPicture`."""
+
+    def __init__(self, time: float, jpeg: bytes) -> None:
+        self.time, self.jpeg = time, jpeg
+
+    @cached_property
+    def pixels(self) -> Pixels:
+        return np.array(Image.open(io.BytesIO(self.jpeg)).convert("RGB"))
+
+
+class DrawnPicture:
+    """A picture of the simulated cell. Implements :class:`ObservedPicture`."""
+
+    def __init__(self, time: float, draw: Callable[[], Pixels]) -> None:
+        self.time, self._draw = time, draw
+
+    @cached_property
+    def pixels(self) -> Pixels:
+        return self._draw()
+
+
+class PicturesByCamera(dict[str, ObservedPicture]):
+    """Pictures by the name of their camera. A camera without one raises :class:`CameraError`, which says why."""
+
+    def __init__(self, pictures: Mapping[str, ObservedPicture], reasons: Mapping[str, str]) -> None:
+        super().__init__(pictures)
+        self._reasons = reasons
+
+    def __missing__(self, name: str) -> ObservedPicture:
+        known = ", ".join(sorted({*self, *self._reasons})) or "none, since the cell has no cameras"
+        why = self._reasons.get(name, f"no such camera; allowed: {known}")
+        raise CameraError(f"camera {name if name in self._reasons else shown(name)}: {why}")
+
+
+class NewestPictures:
+    """The newest pictures at each tick of one run."""
+
+    def __init__(self, config: Config, plant: Plant, streams: Mapping[str, CameraStream], realtime: bool) -> None:
+        """``streams`` are the open cameras. The loop's clock is that of the computer if ``realtime`` is True."""
+        self._streams = {name: streams[name] for name in config.device_cameras if name in streams}
+        self._realtime, self._times = realtime, LoopTimes()
+        self._devices: dict[str, ReadPicture] = {}  # The newest picture of each open camera.
+        self._drawn: dict[str, _DrawnCamera] = {}
+        if isinstance(plant, PicturedPlant):
+            drawn = config.simulated_cameras.items()
+            self._drawn = {name: _DrawnCamera(name, camera.rate, plant) for name, camera in drawn}
+        self._reasons = {
+            name: _why_without(camera)
+            for name, camera in config.cameras.items()
+            if name not in {*self._streams, *self._drawn}
+        }
+
+    def at(self, now: float) -> PicturesByCamera:
+        """Return the newest picture of each camera at a tick that is at ``now`` [s]. It never waits."""
+        found: dict[str, ObservedPicture] = {name: camera.at(now) for name, camera in self._drawn.items()}
+        if not self._streams:
+            return PicturesByCamera(found, self._reasons)
+        computer, reasons = now if self._realtime else time.monotonic(), dict(self._reasons)
+        self._times.add(TickTime(computer, now, 0))
+        for name, stream in self._streams.items():
+            if (why := self._why_lost(stream, computer)) is not None:
+                reasons[name] = why
+            else:
+                found[name] = self._devices[name]
+        return PicturesByCamera(found, reasons)
+
+    def _why_lost(self, stream: CameraStream, computer: float) -> str | None:
+        """Note the newest picture; return why there is none that a policy should act on, or None if there is one."""
+        if (shot := stream.newest) is None:
+            return f"no picture yet{_because(stream)}"
+        known = self._devices.get(stream.name)
+        if known is None or known.jpeg is not shot.jpeg:
+            self._devices[stream.name] = ReadPicture(self._times.at(shot.time).loop, shot.jpeg)
+        age = computer - shot.time - stream.camera.delay
+        return f"no picture for {age:.1f} s{_because(stream)}" if age >= longest_silence(stream.camera) else None
+
+
+def _because(stream: CameraStream) -> str:
+    return "" if stream.why_lost is None else f": {stream.why_lost}"
+
+
+def _why_without(camera: CameraConfig) -> str:
+    if camera.topic is not None:
+        return "its pictures are on a ROS topic; allowed: of simulated cameras, and of devices"
+    return "it is simulated, and this plant has no pictures" if camera.is_simulated else "this run has not opened it"
+
+
+class _DrawnCamera:
+    """One camera of a simulated cell, with a picture at each of its periods, as in a recording."""
+
+    def __init__(self, name: str, rate: float, plant: PicturedPlant) -> None:
+        self._name, self._rate, self._plant = name, rate, plant
+        self._start: float | None = None  # Time of the first tick [s].
+        self._number = 0  # Number of the newest picture.
+        self._newest: DrawnPicture | None = None
+
+    def at(self, now: float) -> DrawnPicture:
+        if self._start is None:
+            self._start = now
+        number = math.floor((now - self._start) * self._rate + _ROUNDING)
+        if self._newest is None or number > self._number:
+            self._number, self._newest = number, DrawnPicture(now, self._plant.picture_of(self._name))
+        return self._newest

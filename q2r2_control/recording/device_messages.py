@@ -1,0 +1,52 @@
+"""The pictures of real cameras as messages of a recording of the ROS nodes, and what happens to these cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+from q2r2_control.cameras.camera_streams import CameraStreams
+from q2r2_control.cameras.camera_watch import CameraWatch
+from q2r2_control.events import Reason
+from q2r2_control.recording.messages import CodedPicture, Message, coding_of_depth, depth_topic, picture_topic
+
+
+@dataclass(slots=True)
+class DeviceMessages:
+    """The open cameras of a recording. Times are those of the monotonic clock."""
+
+    streams: CameraStreams
+    channels: Mapping[str, int]  # By topic, the channel of its messages.
+    day: Callable[[float], int]  # Returns the time of day [ns] at a time [s].
+    begin: float  # Time at which the recording begins [s].
+    _watches: dict[str, CameraWatch] = field(init=False)
+    _numbers: dict[str, int] = field(init=False)  # By camera, the number of its last picture.
+
+    def __post_init__(self) -> None:
+        streams = self.streams.streams
+        self._watches = {name: CameraWatch(name, stream.camera, self.begin) for name, stream in streams.items()}
+        self._numbers = dict.fromkeys(streams, 0)
+
+    def take(self, now: float) -> tuple[list[Message], list[Reason]]:
+        """Return the pictures since the last call, and what is to be told.
+
+        A message is sent at the capture of its picture. It gets its place in the file by the time of its receipt.
+        """
+        messages, reasons = [], []
+        for name, stream in self.streams.streams.items():
+            watch = self._watches[name]
+            for received, shot in stream.take():
+                if shot.time >= self.begin:
+                    self._numbers[name] += 1
+                    number, captured = self._numbers[name], self.day(shot.time)
+                    channel = self.channels[picture_topic(name)]
+                    message = CodedPicture(channel, number, captured, name, shot.jpeg).message()
+                    messages.append(message._replace(time=self.day(received)))
+                    reasons += watch.add(shot.time, received, shot.width, shot.height)
+            reasons += watch.look(now, stream.why_lost)
+            for depth in stream.take_depths():
+                if depth.time >= self.begin:
+                    channel, coding = self.channels[depth_topic(name)], coding_of_depth(depth.unit)
+                    message = CodedPicture(channel, 0, self.day(depth.time), name, depth.png, coding).message()
+                    messages.append(message._replace(time=self.day(now)))
+        return messages, reasons

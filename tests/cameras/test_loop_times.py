@@ -1,0 +1,34 @@
+"""Times of the computer's clock become times of the loop's clock, in real time and in slow motion."""
+
+from __future__ import annotations
+
+import pytest
+
+from q2r2_control.cameras.loop_times import LoopTimes, TickTime
+
+TICKS = ((10.0, 10.0), (10.01, 10.01), (10.05, 10.05))  # By the computer's clock and by that of the loop [s].
+
+
+def times_of(ticks: tuple[tuple[float, float], ...] = TICKS) -> LoopTimes:
+    found = LoopTimes()
+    for number, (computer, loop) in enumerate(ticks):
+        found.add(TickTime(computer, loop, number))
+    return found
+
+
+@pytest.mark.parametrize(("at", "number"), [(10.0, 0), (10.004, 0), (10.03, 1), (10.05, 2), (10.2, 2)])
+def test_in_real_time_they_are_those_of_the_computer(at: float, number: int) -> None:
+    assert times_of().at(at) == pytest.approx((at, at, number))
+
+
+def test_before_the_first_tick_they_pass_as_those_of_the_computer() -> None:
+    assert times_of(((10.0, 0.5), (10.1, 0.6))).at(9.99) == pytest.approx((9.99, 0.49, 0))
+
+
+def test_in_slow_motion_they_pass_as_slowly_as_the_ticks() -> None:
+    slow = times_of(((10.0, 0.0), (10.1, 0.001), (10.2, 0.002)))
+    assert [slow.at(time) for time in (10.0005, 10.05, 10.1004)] == [
+        pytest.approx((10.0005, 0.0005, 0)),
+        pytest.approx((10.05, 0.001, 0)),
+        pytest.approx((10.1004, 0.0014, 1)),
+    ]
