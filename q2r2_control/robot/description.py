@@ -94,7 +94,7 @@ def load_description(
     else:
         text = _read(file)
     urdf = parse_urdf(text, str(file), file.parent, packages)
-    scale_to_metres(urdf)
+    scale_to_metres(urdf.iterfind("link/collision/geometry/mesh"))
     srdf = parse_srdf(_read(srdf_file), str(srdf_file)) if srdf_file is not None and srdf_file.is_file() else None
     return Description(urdf, srdf, file, tuple(notes_on(parse_srdf(text, str(file)))))
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import re
 import xml.etree.ElementTree as ET
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -56,12 +57,12 @@ def notes_on(root: ET.Element) -> list[str]:
     return notes
 
 
-def scale_to_metres(root: ET.Element) -> None:
-    """Scale collision meshes in place by the length unit of their files.
+def scale_to_metres(meshes: Iterable[ET.Element]) -> None:
+    """Scale the meshes of collision shapes in place by the length unit of their files.
 
     COLLADA files name a unit, which RViz applies and Pinocchio ignores.
     """
-    for mesh in root.iterfind("link/collision/geometry/mesh"):
+    for mesh in meshes:
         if (unit := _unit_of(mesh.get("filename", ""))) != 1.0:
             scale = [unit * float(part) for part in mesh.get("scale", "1 1 1").split()]
             mesh.set("scale", " ".join(map(repr, scale)))

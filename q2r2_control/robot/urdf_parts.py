@@ -10,6 +10,7 @@ from collections.abc import Callable, Collection, Sequence
 
 from q2r2_control.config.arms import PoseConfig
 from q2r2_control.config.cell import ObstacleConfig
+from q2r2_control.robot.urdf_forms import scale_to_metres
 
 WORLD = "world"  # The root link of every cell.
 
@@ -49,6 +50,7 @@ def shape_from_drawings(links: Sequence[ET.Element], names: Collection[str]) -> 
             for drawing in link.findall("visual"):
                 shape = ET.SubElement(link, "collision")
                 shape.extend(copy.deepcopy(part) for part in drawing if part.tag in ("origin", "geometry"))
+                scale_to_metres(shape.iter("mesh"))  # Drawings keep the units of their files, as RViz expects.
 
 
 def name_shapes(links: Sequence[ET.Element]) -> None:

@@ -14,6 +14,7 @@ from q2r2_control.errors import RobotError
 from q2r2_control.robot.description import load_description, parse_urdf
 from q2r2_control.robot.pinocchio_models import joint_origin, read_models
 from q2r2_control.robot.urdf_forms import notes_on
+from q2r2_control.robot.urdf_parts import shape_from_drawings
 
 ARM = """<robot name="arm"><link name="base"/><link name="hand">{link}</link>
 <joint name="turn" type="revolute"><parent link="base"/><child link="hand"/><origin xyz="0 0 1" {origin}/>
@@ -99,6 +100,16 @@ def with_mesh(folder: Path, name: str, content: bytes) -> ET.Element:
 def test_collision_meshes_in_millimetres_are_scaled_to_metres(tmp_path: Path) -> None:
     mesh = next(with_mesh(tmp_path, "hand.dae", COLLADA.encode()).iter("mesh"))
     assert [float(part) for part in mesh.get("scale", "").split()] == pytest.approx([2e-3, 1e-3, 1e-3])
+
+
+def test_a_drawing_in_millimetres_that_becomes_a_shape_is_scaled_to_metres(tmp_path: Path) -> None:
+    (tmp_path / "hand.dae").write_text(COLLADA)
+    drawn = f'<link name="hand"><visual><geometry><mesh filename="{tmp_path}/hand.dae"/></geometry></visual></link>'
+    link = ET.fromstring(drawn)
+    shape_from_drawings([link], ["hand"])
+    scales = [mesh.get("scale") for mesh in link.iter("mesh")]
+    assert scales[0] is None, "the drawing stays as it is"
+    assert [float(part) for part in (scales[1] or "").split()] == pytest.approx([1e-3] * 3)
 
 
 @pytest.mark.parametrize(
