@@ -96,6 +96,8 @@ class RosPlant:
         self._bad: Reason | None = None  # What is wrong with the newest joint states.
         self._fault: Reason | None = None  # Why nothing is commanded.
         self._joints.subscribe(self._take_state, self._take_fingers)
+        # Times of the newest joint states, and of the first receiver after none [s]. The clock is the computer's.
+        self._seen = self._received_since = -math.inf
         self._last = -math.inf  # Time of the last tick [s].
         self._command: Command | None = None  # The newest command.
         self._begins = True  # Whether the next command has to be at the arms' posture.
@@ -117,10 +119,12 @@ class RosPlant:
             return self._bad or Reason.of(SupervisionReason.NO_STATES_YET, source=_CURE)
         if not self._publisher.listeners:
             return Reason.of(RosReason.NO_SUBSCRIBER, topic=self._publisher.topic_name)
+        if self._seen <= self._received_since:  # The newest state is that of the robot before this one.
+            return Reason.of(SupervisionReason.NO_STATES_YET, source=_CURE)
         return self._bad
 
     def _take_state(self, state: RobotState | Reason, now: float) -> None:
-        self._bad = state if isinstance(state, Reason) else None
+        self._bad, self._seen = (state if isinstance(state, Reason) else None), time.monotonic()
 
     def _take_fingers(self, message: JointState | JointNumbers) -> None:
         self._openings |= self._fingers.openings(message)
@@ -130,6 +134,8 @@ class RosPlant:
         self._executor.spin_once(timeout_sec=0.0)
         gap, self._last = now - self._last, now
         before, self._listeners = self._listeners, self._publisher.listeners
+        if self._listeners and not before:
+            self._received_since = time.monotonic()
         new = self._listeners > before and self._command is not None and self._is_away(self._command)
         if self._begins:
             self._others.rest()

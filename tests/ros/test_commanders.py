@@ -60,7 +60,10 @@ def test_a_second_publisher_of_commands_stops_both_arms_and_is_named(driven: Dri
     long = 3.0 * NODE_RATE  # This is a number of commands. After it, earlier publishers are discovered.
     wait_until(lambda: driven.state("sent")[TOPIC] > long, "it has driven for some seconds")
     second = driven.node.create_publisher(JointTrajectory, TOPIC, 1)
-    assert "/test commands the arms on /joint_trajectory" in driven.wait_for_fault(RosReason.OTHER_COMMANDER)
+    found = driven.wait_for_fault(RosReason.OTHER_COMMANDER)
+    # The graph may know a publisher before it knows the name of its node. The arms do not wait for the name.
+    assert found.startswith(("/test commands the arms", "a node not known yet commands the arms")), found
+    assert "on /joint_trajectory" in found
     assert {driven.state(f"{arm}_state") for arm in driven.robot.arms} == {"stopped"}
     driven.end_streams()
 

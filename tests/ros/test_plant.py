@@ -98,12 +98,16 @@ def test_arms_rest_when_the_robot_ends_and_go_on_without_a_jump_from_the_posture
         wait_until(lambda: np.abs(cell.q - goal).max() < 5e-3, "the arms are there")
         cell.processes[0].end()
         wait_until(lambda: ticks[-1].states["left"] != "policy", "the policy has not the arms any more")
+        lost = len(ticks)
         start_robot(processes)  # The robot is at home again.
         cell.forget()
-        began = cell.joints.states[0].t
+        assert np.abs(cell.q - goal).max() > 0.9 * MOVED, "no command from before has moved it"
         wait_until(lambda: np.abs(cell.q - goal).max() < 5e-3, "the arms are there again")
+        # Commands are judged, and not how the robot moves: on a busy machine, two of them may arrive at a time.
+        again = [tick for tick in ticks[lost:] if tick.states["left"] == "policy"]
+        assert np.abs(again[0].command.q - again[0].state.q).max() < 0.03
         # The policy moves a joint by at most 0.05 rad, in a twentieth of a second.
-        assert cell.joints.fastest(began) < 1.0
+        assert max(np.abs(tick.reference.v).max() for tick in again) < 1.5
 
 
 def test_a_new_receiver_gets_no_commands_while_the_arms_are_elsewhere(
