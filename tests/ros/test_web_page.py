@@ -51,6 +51,8 @@ CHANGES = {
     "cartesian_controller": {"rate": RATE, "joint_state_timeout": 1.0, "target_timeout": 2.0, "listener_timeout": 3.0},
     "arm_controllers": {"rate": RATE, **PATIENT},
 }
+LENIENT = {"supervision": {"max_deviation": 0.5}}  # The arms of a starved robot are far behind their reference.
+CHANGES["mujoco_robot"]["max_jump"] = 1.0  # On a busy machine, commands may come late and several at a time.
 
 
 def url_of(process: RosProcess) -> str:
@@ -61,7 +63,9 @@ def url_of(process: RosProcess) -> str:
 def test_the_page_of_a_set_shows_its_arms_and_its_buttons_reach_the_nodes(
     node: Any, processes: Processes, tmp_path: Path
 ) -> None:
-    cell = changed_cell(tmp_path, cameras=CAMERA, control={"moving_obstacles": ["hand"], "tool_speed_limit": 0.25})
+    cell = changed_cell(
+        tmp_path, cameras=CAMERA, control={"moving_obstacles": ["hand"], "tool_speed_limit": 0.25}, **LENIENT
+    )
     up = processes.start(sys.executable, "-u", "-c", SET, cell, str(tmp_path), json.dumps(CHANGES), name="up")
     with PageClient(url_of(up)) as page:
         page.wait_until(lambda: page.row("state") == ["engaged", "engaged"])
