@@ -76,7 +76,7 @@ class PressFigures:
     largest_force: float  # Largest force of the whole run [N].
     bound: float  # Stiffness times the largest allowed depth of the reference [N].
     bounce_s: float  # Time without contact between the first touch and the slide [s].
-    lost_contact_s: float  # Time without contact between the begin of the slide and the lift [s].
+    lost_contact_s: float  # Time without contact between the start of the slide and the lift [s].
     slide_error_mm: float  # Distance of the tool behind its target along the table at the end of the slide [mm].
     friction_lag_mm: float  # Slide error that friction causes: friction times mean force divided by stiffness [mm].
     slide_force: float  # Mean force while the tool slides [N].

@@ -87,7 +87,7 @@ class HeldTargets:
 
 
 def _is_ordinary(pose: pin.SE3) -> bool:
-    """Return whether the poses between this pose and another such pose are valid poses."""
+    """Return whether the pose has finite numbers and a rotation, so that it can be interpolated."""
     rotation = pose.rotation
     if not (np.abs(rotation).max() < 2.0 and np.abs(pose.translation).max() < _FARTHEST):  # NaN fails too.
         return False

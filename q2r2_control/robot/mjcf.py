@@ -138,7 +138,7 @@ class _Writer:
         return joint
 
     def _add_moving_joint(self, j: int, parent: str, child: str, at: pin.SE3) -> None:
-        """Add joint ``j``. ``at`` is its pose at the position for which the file places its body."""
+        """Add the joint with the index ``j``. ``at`` is its pose where the file places its body."""
         model = self._model
         axis, there = model.jnt_axis[j], float(model.qpos0[model.jnt_qposadr[j]])
         turns, limited = model.jnt_type[j] == _Joint.mjJNT_HINGE, bool(model.jnt_limited[j])

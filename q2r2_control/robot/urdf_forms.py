@@ -17,8 +17,8 @@ import pinocchio as pin
 
 from q2r2_control.errors import RobotError
 
-_LARGEST_ANGLE = 6.0 * math.pi  # Greatest angle that a joint that counts its turns usually has [rad].
-_LARGEST_SPEED = 40.0  # Greatest speed that the joint of an arm usually has [rad/s].
+LARGEST_ANGLE = 6.0 * math.pi  # Greatest angle that a joint that counts its turns usually has [rad].
+LARGEST_SPEED = 40.0  # Greatest speed that the joint of an arm usually has [rad/s].
 _UNIT = re.compile(r"<unit\b[^>]*\bmeter\s*=\s*[\"']([0-9.eE+-]+)[\"']")
 _HEADER = 20_000  # Number of characters at the beginning of a COLLADA file in which its unit is searched.
 _UNIT_LENGTH = 1e-3  # Greatest difference of a quaternion's length from 1.
@@ -51,7 +51,7 @@ def notes_on(root: ET.Element) -> list[str]:
         if limit is None or joint.get("type") != "revolute":
             continue
         lower, upper, speed = (float(limit.get(what, "0")) for what in ("lower", "upper", "velocity"))
-        if max(-lower, upper) > _LARGEST_ANGLE or speed > _LARGEST_SPEED:
+        if max(-lower, upper) > LARGEST_ANGLE or speed > LARGEST_SPEED:
             limits = f"{lower:g} .. {upper:g} rad and {speed:g} rad/s"
             notes.append(f"{name} has limits of {limits}; a URDF has radians: are these degrees?")
     return notes

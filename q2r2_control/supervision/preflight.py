@@ -10,18 +10,17 @@ from q2r2_control.robot.kept_distances import kept_distances, too_close_at_home
 from q2r2_control.robot.robot import Robot
 from q2r2_control.robot.stop_torque import joints_that_cannot_hold
 from q2r2_control.robot.unchecked import unchecked_faults
+from q2r2_control.robot.urdf_forms import LARGEST_ANGLE, LARGEST_SPEED
 
 _NARROWEST = 1e-3  # Least range of a joint in which a home can be written down [rad or m].
-# Limits beyond both of these are those of a joint in degrees.
-_FARTHEST_RAD = 6.0 * np.pi  # Farthest position of a joint that counts its turns.
-_FASTEST_RAD_PER_S = 40.0  # Greatest speed of an arm's joint.
 
 
 def _in_degrees(robot: Robot) -> list[str]:
     """Return one line if limits of joints are those of an arm in degrees."""
     farthest = np.maximum(np.abs(robot.position_lower), np.abs(robot.position_upper))
-    turned = (farthest > _FARTHEST_RAD) & (farthest <= np.rad2deg(_FARTHEST_RAD))
-    found = np.flatnonzero(turned & (robot.velocity_limit > _FASTEST_RAD_PER_S)).tolist()
+    # A joint whose position and speed are both beyond the usual limits is given in degrees.
+    turned = (farthest > LARGEST_ANGLE) & (farthest <= np.rad2deg(LARGEST_ANGLE))
+    found = np.flatnonzero(turned & (robot.velocity_limit > LARGEST_SPEED)).tolist()
     if not found:
         return []
     names = ", ".join(robot.joint_names[i] for i in found)

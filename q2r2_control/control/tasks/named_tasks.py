@@ -26,7 +26,7 @@ _SOFT_EDGE = 0.05  # Angle beyond the cone over which the weight of ``upright`` 
 
 
 class _Cost:
-    """Computes H and g of a sum of  weight |J v - u|^2."""
+    """Computes H and g of the cost ``weight |J v - u|^2``, summed over the rows of J."""
 
     def __init__(self, nv: int) -> None:
         self.H, self.g = np.zeros((nv, nv)), np.zeros(nv)
