@@ -173,8 +173,9 @@ def main() -> None:
         with ThreadPoolExecutor(options.jobs) as pool:
             for result in pool.map(ask, chosen):
                 results.append(result)
-                if len(results) % 20 == 0:
-                    print(f"{len(results)} of {len(chosen)}", file=sys.stderr)
+                mutant, outcome = result  # Each result is shown at once, because all of them take hours.
+                place = f"{mutant.path}:{mutant.line} {mutant.operator.rpartition('/')[2]} {mutant.occurrence}"
+                print(f"{len(results)} of {len(chosen)}: {outcome}: {place}", file=sys.stderr, flush=True)
     counts = Counter(outcome for _mutant, outcome in results)
     if options.json:
         left = [asdict(mutant) for mutant, outcome in results if outcome == "survived"]
