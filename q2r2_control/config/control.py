@@ -18,6 +18,7 @@ Weights = tuple[_Weight, _Weight, _Weight]
 Distance = Annotated[float, Field(ge=0, le=0.2)]  # [m]
 # A negative distance is the allowed overlap of a box whose size is known only roughly [m].
 ObjectDistance = Annotated[float, Field(ge=-0.05, le=0.2)]
+JerkLimit = Annotated[float, Field(ge=200, le=1e6)]  # [rad/s^3]
 LinkPattern = Annotated[str, Field(min_length=1)]
 ObstacleName = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$", max_length=40)]
 
@@ -109,6 +110,11 @@ class ControllerSettings(StrictModel):
         le=3,
         description="no tool of the reference is ever faster, whatever the solver returns [m/s]; null: no such limit",
     )
+    jerk_limit: JerkLimit | tuple[JerkLimit, ...] | None = Field(
+        None,
+        description="largest change of acceleration of commanded positions and velocities: one number, or one for each "
+        "joint [rad/s^3]; null: no such limit",
+    )
     recovery_velocity: float = Field(
         0.2, gt=0, le=1, description="speed back inside of a joint that is outside its limits [rad/s]"
     )
@@ -188,6 +194,10 @@ class ControllerSettings(StrictModel):
     def without_contact(self) -> ControllerSettings:
         """Return the settings for modes in which the arms do not yield. ``contact_allowed`` is empty there."""
         return self.model_copy(update={"contact_allowed": ()}) if self.contact_allowed else self
+
+    def without_jerk_limit(self) -> ControllerSettings:
+        """Return the settings for modes whose commands are torques. ``jerk_limit`` is None there."""
+        return self if self.jerk_limit is None else self.model_copy(update={"jerk_limit": None})
 
     def with_solver(self, name: str | None) -> ControllerSettings:
         """Return the settings with the solver called ``name``; None keeps the solver.

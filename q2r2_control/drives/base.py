@@ -16,7 +16,9 @@ from q2r2_control.compliance.repulsion import MeasuredSeparation, WallReport
 from q2r2_control.config.cell import Config
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.config.moving_obstacle import MovingObstacle
+from q2r2_control.drives.command_average import CommandAverage
 from q2r2_control.errors import ConfigError
+from q2r2_control.robot.command_average import average_window
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Command, CommandMode, Interval, Reference, RobotState
 
@@ -63,6 +65,12 @@ class Drive(ABC):
                 according to the state must not push then.
         """
 
+    def average(self, period: float) -> None:  # noqa: B027
+        """Keep the limit of jerk by means of the newest references, in ticks of a ``period`` [s].
+
+        It is not called for a plant that is told the certified stop and averages by itself.
+        """
+
     def set_openings(self, openings: Mapping[str, Interval]) -> None:  # noqa: B027
         """Take the interval of openings of each arm's gripper that the controller has accepted."""
 
@@ -89,8 +97,11 @@ class Drive(ABC):
 
 
 def permitted(settings: ControllerSettings, drive: Drive) -> ControllerSettings:
-    """Return the controller's settings that a drive permits. Bodies may touch only if the arms are compliant."""
-    return settings if drive.yields else settings.without_contact()
+    """Return the controller's settings that a drive permits.
+
+    Bodies may touch only if the arms are compliant. A limit of jerk counts for commanded positions and velocities only.
+    """
+    return settings.without_jerk_limit() if drive.yields else settings.without_contact()
 
 
 def position_command(reference: Reference, grippers: Openings) -> Command:
@@ -111,16 +122,26 @@ _STILL = 1e-2  # An arm on its spring stands still if its joints are slower than
 
 
 class PositionDrive(Drive):
-    """Commands the positions of the reference. With an admittance, forces at the tools displace their targets."""
+    """Commands the positions of the reference. With an admittance, forces at the tools displace their targets.
+
+    With a limit of jerk, the commands are means of the newest references.
+    """
 
     mode = CommandMode.POSITION
 
     def __init__(self, robot: Robot, config: Config) -> None:
         self.admittance = Admittance(robot, config.admittance) if config.admittance.enabled else None
         self.report = DriveReport()
+        self._window = average_window(robot, config.control)
+        self._average: CommandAverage | None = None
+
+    def average(self, period: float) -> None:
+        self._average = CommandAverage(self._window, period) if self._window else None
 
     def reset(self, state: RobotState) -> None:
         self.report = DriveReport()
+        if self._average is not None:
+            self._average.reset(state.q)
         if self.admittance is None:
             return
         if state.tau_external is None:
@@ -137,7 +158,17 @@ class PositionDrive(Drive):
     def command(
         self, reference: Reference, state: RobotState, grippers: Openings, dt: float, trusted: bool = True
     ) -> Command:
-        return position_command(reference, grippers)
+        q, v = self._commanded(reference, dt)
+        return Command(self.mode, q, v, np.zeros_like(q), grippers)
+
+    def at_rest(self, state: RobotState) -> bool:
+        return self._average is None or self._average.settled
+
+    def _commanded(self, reference: Reference, dt: float) -> tuple[Array, Array]:
+        """Return the position [rad] and the velocity [rad/s] to be commanded, (nv,) each."""
+        if self._average is None:
+            return reference.q, reference.v
+        return self._average.update(reference.q, reference.v, dt)
 
 
 class VelocityDrive(PositionDrive):
@@ -161,13 +192,13 @@ class VelocityDrive(PositionDrive):
     def command(
         self, reference: Reference, state: RobotState, grippers: Openings, dt: float, trusted: bool = True
     ) -> Command:
-        v = reference.v
+        q, v = self._commanded(reference, dt)
         self._ticks = 0 if state.stamp != self._stamp else self._ticks + 1
         self._stamp = state.stamp
         if trusted and self._ticks <= _FRESH_TICKS and np.isfinite(state.q).all():
-            v = v + FEEDBACK_GAIN * (reference.q - state.q)
+            v = v + FEEDBACK_GAIN * (q - state.q)
         bounded = np.minimum(np.maximum(v, -self._limit), self._limit)
-        return Command(self.mode, reference.q, bounded, np.zeros_like(reference.q), grippers)
+        return Command(self.mode, q, bounded, np.zeros_like(q), grippers)
 
     def last_command(self, state: RobotState, grippers: Openings) -> Command | None:
         # Many plants go on at the last velocity after its sender has ended.

@@ -31,7 +31,7 @@ from q2r2_control.pipeline.operator_side import OperatorSide
 from q2r2_control.pipeline.requests import RequestedRun
 from q2r2_control.pipeline.run_recorder import RunRecorder
 from q2r2_control.pipeline.target_lead import TargetLead
-from q2r2_control.plants.base import Plant, SessionPlant, check_mode, check_state, make_plant
+from q2r2_control.plants.base import Plant, SessionPlant, check_mode, check_state, keeps_jerk_limit, make_plant
 from q2r2_control.process.scheduling import few_garbage_collections, stop_on_signals
 from q2r2_control.robot.robot import Robot
 from q2r2_control.robot.turns import TurnCounter
@@ -105,6 +105,8 @@ class Pipeline(RequestedRun):
         # A session has one mode: its arms cannot follow positions while torques are not safe.
         has_servos = CommandMode.POSITION in plant.modes and not isinstance(plant, SessionPlant)
         self.drive = make_drive(check_mode(mode, plant), robot, config, has_servos)
+        if config.control.jerk_limit is not None and not keeps_jerk_limit(plant, self.drive.mode):
+            raise ConfigError(f"control.jerk_limit: allowed: null, since {type(plant).__name__} does not keep it")
         if isinstance(solver, str):
             self.config = config.model_copy(update={"control": config.control.with_solver(solver)})
             solver = None
@@ -296,6 +298,8 @@ class Pipeline(RequestedRun):
         watch = watch_settings(self.config.supervision, self.drive.yields)
         streams = StreamSettings(linked=self.config.teleop.linked)
         period, delay = 1.0 / self.config.nominal_rate_hz, self.config.gripper_delay
+        if not isinstance(self.plant, SessionPlant):
+            self.drive.average(period)
         standstill = getattr(self.plant, "standstill", None)  # A plant has it if another process moves its arms.
         self.loop = ControlLoop(
             self.controller, self.drive, period, streams, watch, gripper_delay=delay, standstill=standstill

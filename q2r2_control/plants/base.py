@@ -148,6 +148,15 @@ def check_mode(mode: CommandMode | str, plant: Plant) -> CommandMode:
     return CommandMode(mode)
 
 
+def keeps_jerk_limit(plant: Plant, mode: CommandMode) -> bool:
+    """Return whether commands of ``mode`` reach the arms within ``control.jerk_limit``, where the limit counts.
+
+    Commands of most plants are averaged by their drive. A :class:`SessionPlant` executes the certified stop by itself,
+    and so it has to average what it sends, and says so by the attribute ``averages``.
+    """
+    return mode is CommandMode.TORQUE or not isinstance(plant, SessionPlant) or getattr(plant, "averages", False)
+
+
 def check_command(command: Command, robot: Robot, modes: tuple[CommandMode, ...]) -> None:
     """Raise :class:`PlantError` if a plant with ``modes`` cannot follow ``command``."""
     check_kind("command", command, Command, "a Command", PlantError)

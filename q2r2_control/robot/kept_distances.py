@@ -9,6 +9,7 @@ import numpy as np
 
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.errors import ConfigError
+from q2r2_control.robot.command_average import average_allowance
 from q2r2_control.robot.near_pairs import NearPair, remedy
 from q2r2_control.robot.obstacle_bodies import roles_with_obstacles, with_obstacle_bodies
 from q2r2_control.robot.pairs import LinkClass, Role, link_of, pair_names
@@ -30,8 +31,12 @@ class KeptDistances:
 def kept_distances(robot: Robot, settings: ControllerSettings) -> KeptDistances:
     """Return the distance that every monitored pair of ``robot`` has to keep.
 
+    With a limit of jerk it is larger by :func:`average_allowance`, because the commands are not exactly on the
+    reference's way.
+
     Raises:
-        ConfigError: If no monitored pair has a name in ``settings.pairs`` or ``settings.contact_allowed``.
+        ConfigError: If no monitored pair has a name in ``settings.pairs`` or ``settings.contact_allowed``, or if
+            ``settings.jerk_limit`` does not fit the robot.
     """
     return _of_all_pairs(robot, settings)[0]
 
@@ -68,7 +73,8 @@ def too_close_at_home(robot: Robot, kept: KeptDistances, *, remedies: bool = Fal
 
 def _of_all_pairs(robot: Robot, settings: ControllerSettings) -> tuple[KeptDistances, KeptDistances, KeptDistances]:
     """Return the distances of the monitored pairs, of the pairs of objects, and of those of moving obstacles."""
-    names = pair_names(with_obstacle_bodies(robot, settings.moving_obstacles))
+    geometry = with_obstacle_bodies(robot, settings.moving_obstacles)
+    names = pair_names(geometry)
     roles = roles_with_obstacles(robot, settings.moving_obstacles)
     keys = ["min_distance"] * len(names)
     values = np.full(len(names), settings.min_distance)
@@ -86,6 +92,7 @@ def _of_all_pairs(robot: Robot, settings: ControllerSettings) -> tuple[KeptDista
     for i, contact in enumerate(settings.contact_allowed):  # The classes of objects allow contact anyway.
         for p in _found(f"contact_allowed[{i}]", contact.pair, names[:count]):
             values[p], keys[p], speed[p] = -contact.depth, f"contact_allowed[{i}]", contact.speed
+    values += average_allowance(robot, settings, geometry)
     parts = slice(0, count), slice(count, last), slice(last, None)
     one, two, three = (KeptDistances(values[part], tuple(keys[part]), speed[part]) for part in parts)
     return one, two, three

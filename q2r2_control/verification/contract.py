@@ -18,6 +18,7 @@ from q2r2_control.control.controller import CartesianController
 from q2r2_control.control.safety.safety_data import ROUNDING
 from q2r2_control.robot.kept_distances import kept_by_objects, kept_distances
 from q2r2_control.types import LONGEST_DT, Array, Interval, Reference, StepReport, is_number
+from q2r2_control.verification.averaged_commands import AveragedCommands
 from q2r2_control.verification.promises import PROMISES, RELATIVE, Margin, MeasuredDistances
 from q2r2_control.verification.tool_speeds import MeasuredToolSpeeds
 
@@ -65,6 +66,7 @@ class Contract:
         self._ask(settings)
         self._measured = MeasuredDistances(robot, controller.kept_distances)
         self._tool_limit, self._tools = settings.tool_speed_limit, MeasuredToolSpeeds(robot)
+        self._commands = None if settings.jerk_limit is None else AveragedCommands(robot, settings, self._measured)
         self._substep = settings.max_substep
         self.start(robot.home if q is None else q, v)
 
@@ -74,6 +76,8 @@ class Contract:
         self._measured.kept = self._controller.kept_distances
         self._q, self._v, self._stop = q.copy(), v.copy(), self._controller.stop_deceleration
         self._measured.forget()
+        if self._commands is not None:
+            self._commands.start(q)
         self._outside = np.maximum(np.maximum(self._lower - q, q - self._upper), 0.0)
         self._excess = self._excess_of(v)
         self._can_stop = self._stops_inside(q, v)
@@ -94,6 +98,8 @@ class Contract:
         if before_step:
             self._stop = self._controller.stop_deceleration
         self._measured.set_openings(openings)
+        if self._commands is not None:
+            self._commands.bodies_changed()
 
     def _ask(self, settings: ControllerSettings) -> None:
         self._settings = settings
@@ -160,6 +166,9 @@ class Contract:
             stop = self._controller.stop_deceleration
             self._note("deceleration", float((stop / self._a).max()))
             self._note_objects()
+            if self._commands is not None:
+                for key, value in self._commands.update(q, v, h).items():
+                    self._note(key, value)
             self._sample(q, v, stop, h, report)
             self.fallbacks += report.fallback
             self.uncertified += not report.certified
@@ -268,6 +277,8 @@ class Contract:
                 self._note("coal", error)
             if not self._certain and self._apart.any():
                 self._note("bystanders", float(margins[self._apart].min()))
+            if self._commands is not None and self._certain and (least := self._commands.least_margin()) is not None:
+                self._note("command_distance", least)
             if self._certain and 0.0 < h <= self._substep:
                 times = h * self._random.random((_BETWEEN_SAMPLES, 1))
                 between, speeds = self._braked(self._q, self._v, self._stop, times)

@@ -114,6 +114,16 @@ def test_hostile_ticks_move_no_tool_faster_than_its_limit() -> None:
     assert margin.worst > 0.8, "the limit was never met"
 
 
+@pytest.mark.parametrize("jerk", [1000.0, 5000.0])
+def test_commands_of_hostile_ticks_keep_the_limit_of_jerk_and_all_distances(jerk: float) -> None:
+    limited = CONFIG.model_copy(update={"control": SETTINGS.model_copy(update={"jerk_limit": jerk})})
+    report = run_soak(limited, 3000, 3)
+    assert report.passed, report.broken
+    of = {margin.name.split(",")[-1].strip(): margin for margin in report.margins}
+    assert of["jerk of averaged commands / limit"].worst > 0.9, "the limit was never met"
+    assert of["averaged commands"].checked > 5
+
+
 class Garbage:
     """A solver whose answers are invalid in turns: no answer, wrong types, and numbers that resemble an answer."""
 

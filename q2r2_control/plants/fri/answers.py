@@ -22,6 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from q2r2_control.control.cubic import cubic
 from q2r2_control.types import Array
 
 CATCH_UP = 0.05  # Greatest additional rate of the even time.
@@ -44,12 +45,8 @@ class _Move(NamedTuple):
 
     def at(self, t: float) -> tuple[Array, Array]:
         """Return posture and velocity by the cubic through both ends, a parabola if the acceleration is constant."""
-        (q, end), (v, end_v), h = self.q, self.v, self.end - self.start
-        x = min(max((t - self.start) / h, 0.0), 1.0)
-        way = end - q
-        there = q + x * x * (3.0 - 2.0 * x) * way + x * (1.0 - x) * h * ((1.0 - x) * v - x * end_v)
-        speed = 6.0 * x * (1.0 - x) / h * way + (1.0 - x) * (1.0 - 3.0 * x) * v + x * (3.0 * x - 2.0) * end_v
-        return there, speed
+        h = self.end - self.start
+        return cubic(min(max((t - self.start) / h, 0.0), 1.0), h, self.q, self.v)
 
     @property
     def stop(self) -> _Stop:

@@ -93,6 +93,7 @@ class CartesianControllerNode(ManagedNode):
         )
         make_control_live(self, self._controller)
         self._obstacles = ObstacleIntake(self, self._controller)
+        self._output.drive.average(self._period)
         self._loop = ControlLoop(
             self._controller,
             self._output.drive,

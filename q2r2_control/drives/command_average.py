@@ -1,0 +1,73 @@
+"""Average the reference over the last ticks, so that commands keep the cell's limit of jerk."""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right
+
+import numpy as np
+
+from q2r2_control.control.cubic import cubic
+from q2r2_control.types import Array
+
+_ROUNDING = 1e-9  # Differences of times below this are rounding [s].
+_LATE = 1.5  # A tick that lasts longer, in periods, is not averaged.
+
+
+class CommandAverage:
+    """The mean of the references of a window, which commands follow instead of the newest one.
+
+    ``robot/command_average.py`` proves what the mean keeps: with regular ticks the limit of jerk, and always the other
+    limits and the distances. Ticks may be irregular: between two of them the reference is a cubic. The reference during
+    a tick of more than 1.5 periods is not known well enough. The mean then begins again at its end, as the reference
+    itself would be commanded.
+    """
+
+    def __init__(self, window: float, period: float) -> None:
+        """Make the average over a ``window`` [s], see ``average_window``, of ticks of a ``period`` [s]."""
+        count = max(math.ceil((window - _ROUNDING) / period), 1)
+        self._ages, self._longest = period * np.arange(count), _LATE * period
+        self._times: list[float] = []  # Times of the last ticks [s], with the reference of each.
+        self._path: list[tuple[Array, Array]] = []
+        self.settled = True  # Whether the last command was exactly the newest reference.
+
+    @property
+    def delay(self) -> float:
+        """How much older than the newest reference its mean is [s]."""
+        return 0.5 * float(self._ages[-1])
+
+    def reset(self, q: Array) -> None:
+        """Begin again with a reference that has rested at ``q`` (nv,) [rad]."""
+        self._times, self._path, self.settled = [0.0], [(q.copy(), np.zeros_like(q))], True
+
+    def update(self, q: Array, v: Array, dt: float) -> tuple[Array, Array]:
+        """Return position [rad] and velocity [rad/s] of the mean, ``dt`` [s] after the last tick, (nv,) each."""
+        if not self._path or dt > self._longest:
+            self.reset(q)
+            return q, v
+        if dt > 0.0:
+            self._times.append(self._times[-1] + dt)
+            self._path.append((q, v))
+        now = self._times[-1]
+        samples = [self._at(now - age) for age in self._ages]
+        oldest = bisect_right(self._times, now - self._ages[-1] - _ROUNDING) - 1
+        if oldest > 0:  # What is older is not needed any more. Small times are exact.
+            self._times = [time - self._times[oldest] for time in self._times[oldest:]]
+            del self._path[:oldest]
+        self.settled = all((sample[0] == q).all() for sample in samples)
+        if self.settled:
+            return q, v  # The mean of equal numbers may be another number, by rounding.
+        mean_q, mean_v = (np.mean([sample[i] for sample in samples], axis=0) for i in (0, 1))
+        return mean_q, mean_v
+
+    def _at(self, t: float) -> tuple[Array, Array]:
+        """Return position and velocity of the reference at ``t`` [s], by the cubic through both ends of its tick."""
+        after = bisect_right(self._times, t + _ROUNDING)
+        if after == 0:
+            return self._path[0][0], np.zeros_like(self._path[0][1])
+        (q, v), start = self._path[after - 1], self._times[after - 1]
+        if after == len(self._path) or t - start <= _ROUNDING:
+            return q, v
+        end, end_v = self._path[after]
+        h = self._times[after] - start
+        return cubic((t - start) / h, h, (q, end), (v, end_v))

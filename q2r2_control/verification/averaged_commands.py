@@ -1,0 +1,76 @@
+"""The promises about commands that are means of the references, for a cell with a limit of jerk."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from q2r2_control.config.control import ControllerSettings
+from q2r2_control.drives.command_average import CommandAverage
+from q2r2_control.robot.command_average import average_allowance, average_window
+from q2r2_control.robot.robot import Robot
+from q2r2_control.types import Array
+from q2r2_control.verification.promises import MeasuredDistances
+
+_PERIOD = 0.001  # Period of the checked commands [s]. Other ticks are not regular.
+_EXACT = 1e-12  # Differences of times below this are rounding [s].
+
+
+class AveragedCommands:
+    """Averages one reference after another, as a drive does, and measures the commands.
+
+    Jerk and acceleration are differences of commands in ticks of exactly one period. Distances are those of commands
+    whose whole window had the same bodies: fingers and objects that have just changed count for the newest reference.
+    """
+
+    def __init__(self, robot: Robot, settings: ControllerSettings, measured: MeasuredDistances) -> None:
+        self._average = CommandAverage(average_window(robot, settings), _PERIOD)
+        self._measured = measured
+        self._acceleration = robot.capped_acceleration(settings.acceleration_limit)
+        limit = settings.jerk_limit
+        self._jerk = np.broadcast_to(np.inf if limit is None else np.asarray(limit, float), self._acceleration.shape)
+        self._allowance = average_allowance(robot, settings, robot.collision_model)
+        self._window = 2 * round(self._average.delay / _PERIOD) + 1  # Number of references in a mean.
+        self._commands: deque[Array] = deque(maxlen=4)
+        self._kept: deque[Array] = deque(maxlen=self._window)
+        self._regular = 0  # Number of regular ticks in succession.
+
+    def start(self, q: Array) -> None:
+        """Begin again at ``q`` (nv,) [rad], after a reset."""
+        self._average.reset(q)
+        self._commands.clear()
+        self._kept.clear()
+        self._regular = 0
+
+    def bodies_changed(self) -> None:
+        """Note that the opening of a gripper, or what it holds, has changed."""
+        self._kept.clear()
+
+    def update(self, q: Array, v: Array, h: float) -> dict[str, float]:
+        """Average a reference ``h`` [s] after the last one; returns values of promises by key."""
+        if abs(h - _PERIOD) > _EXACT:
+            self._regular = 0
+            self._kept.clear()
+        else:
+            self._regular += 1
+            self._kept.append(self._measured.kept)
+        self._commands.append(self._average.update(q, v, h)[0])
+        if self._regular < self._window + 4:
+            return {}
+        change = np.diff(self._commands, n=2, axis=0) / _PERIOD**2
+        return {
+            "command_acceleration": float((np.abs(change) / self._acceleration).max()),
+            "jerk": float((np.abs(np.diff(change, axis=0)) / _PERIOD / self._jerk).max()),
+        }
+
+    def least_margin(self) -> float | None:
+        """Return the least distance of a pair at the newest command, minus its kept distance [m].
+
+        None if something has changed within its window.
+        """
+        if len(self._kept) < self._window:
+            return None
+        kept = np.min(self._kept, axis=0) - self._allowance
+        margins = self._measured.margins(self._commands[-1]) + self._measured.kept - kept
+        return float(margins.min(initial=np.inf))
