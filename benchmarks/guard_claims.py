@@ -325,3 +325,36 @@ TWO_ARMS = (
         "return None",
     ),
 )
+
+COMMANDS = (
+    Mutation(
+        "a mean has enough references for the limit of jerk",
+        "q2r2_control/drives/command_average.py",
+        "count = max(math.ceil((window - _ROUNDING) / period), 1)",
+        "count = max(math.floor(window / period) - 1, 1)",
+    ),
+    Mutation(
+        "a mean is not taken over a late tick",
+        "q2r2_control/drives/command_average.py",
+        "if not self._path or dt > self._longest:",
+        "if not self._path:",
+    ),
+    Mutation(
+        "the joint with the least limit decides the window",
+        "q2r2_control/robot/command_average.py",
+        "joint = int(np.argmax(windows))",
+        "joint = int(np.argmin(windows))",
+    ),
+    Mutation(
+        "pairs keep as much more distance as a mean may be off",
+        "q2r2_control/robot/command_average.py",
+        "off = 0.25 * window**2",
+        "off = 0.0 * window**2",
+    ),
+    Mutation(
+        "a plant that stops by itself and does not average is refused",
+        "q2r2_control/plants/base.py",
+        "return mode is CommandMode.TORQUE or not isinstance(plant, SessionPlant) or",
+        "return True or",
+    ),
+)

@@ -17,11 +17,11 @@ import sys
 import tempfile
 from pathlib import Path
 
-from guard_claims import AGES, CONTROL, TWO_ARMS, WATCHES
+from guard_claims import AGES, COMMANDS, CONTROL, TWO_ARMS, WATCHES
 from safety_claims import CERTIFICATE, SAFETY, Mutation
 
 ROOT = Path(__file__).resolve().parents[1]
-MUTATIONS = (*CERTIFICATE, *CONTROL, *AGES, *WATCHES, *TWO_ARMS)
+MUTATIONS = (*CERTIFICATE, *CONTROL, *AGES, *WATCHES, *TWO_ARMS, *COMMANDS)
 TESTS = {  # Tests that run for a row, by the folder of its line.
     SAFETY: (
         "tests/control/safety",
@@ -32,6 +32,9 @@ TESTS = {  # Tests that run for a row, by the folder of its line.
     "q2r2_control/control/": ("tests/control",),
     "q2r2_control/supervision/": ("tests/supervision", "tests/test_stalls.py"),
     "q2r2_control/teleop/": ("tests/teleop",),
+    "q2r2_control/drives/": ("tests/drives/test_command_average.py",),
+    "q2r2_control/plants/": ("tests/drives/test_command_average.py",),
+    "q2r2_control/robot/": ("tests/robot/test_command_average.py",),
     "q2r2_control/pipeline/": ("tests/pipeline/test_loop_clock.py", "tests/test_stalls.py"),
 }
 _TIMEOUT_S = 1800.0  # Timeout for a soak or the tests [s].
