@@ -43,7 +43,7 @@ def test_every_kind_has_a_sentence_and_every_fault_of_a_hand_is_a_kind() -> None
     assert {str(fault) for fault in HandFault} <= set(TeleopReason)
 
 
-def test_no_two_rooms_have_kinds_of_one_value() -> None:
+def test_no_two_rooms_have_kinds_of_reasons_with_the_same_value() -> None:
     assert not [kind for kind, count in Counter(str(kind) for room in ROOMS for kind in room).items() if count > 1]
 
 

@@ -82,7 +82,7 @@ def test_after_a_stall_no_joint_moves_farther_than_in_a_period(stall: float, mon
     assert all(event.reason.root.kind in expected for event in paused)
 
 
-def test_a_stall_before_the_first_tick_is_no_fault_of_the_plant(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stall_before_the_first_tick_does_not_count_as_a_fault_of_the_plant(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(loop_clock, "time", StallingClock(0.3, first=0.0))
     loop = swinging(RecordingPlant())
     watch = Watch(loop)

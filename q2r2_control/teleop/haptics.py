@@ -15,8 +15,8 @@ from q2r2_control.types import HapticFeedback
 class Pulse(NamedTuple):
     """One vibration."""
 
-    frequency: float  # 0 .. 1
-    amplitude: float  # 0 .. 1
+    frequency: float  # Relative frequency of the vibration, from 0 to 1.
+    amplitude: float  # Relative amplitude, from 0 to 1.
     duration: float  # [s]
     meaning: str
     strongest: float | None = None  # The amplitude to which it grows, if it grows.

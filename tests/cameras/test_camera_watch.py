@@ -72,7 +72,7 @@ def test_pictures_of_another_size_are_told_of_once() -> None:
     assert told(watched, every(0.05, 2.0, 3.0)) == []
 
 
-def test_pictures_that_are_received_late_but_steadily_are_no_stop() -> None:
+def test_pictures_that_are_received_late_but_steadily_do_not_count_as_a_stop() -> None:
     watched = watch()
     for time in every(0.05, 0.0, 3.0):
         assert watched.add(100.0 + time, 160.0 + time, 64, 48) == [] or time == 0.0

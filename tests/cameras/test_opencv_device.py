@@ -103,6 +103,6 @@ def test_no_message_has_the_password_of_an_address() -> None:
     assert "secret" not in str(error.value)
 
 
-def test_a_device_that_is_none_is_named_with_the_reason() -> None:
+def test_a_name_that_is_not_a_device_is_named_with_the_reason() -> None:
     assert str(fault_of("/dev/video250")).startswith("no such device; allowed: ")
     assert fault_of("/dev/null") == "no camera: it is no V4L2 device"

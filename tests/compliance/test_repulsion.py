@@ -173,7 +173,7 @@ def test_the_torque_grows_gradually_into_the_shell_while_closing() -> None:
     assert crossed >= 3
 
 
-def test_default_stiffness_is_never_scaled_down_but_that_of_stacked_pairs_of_a_hard_wall_is() -> None:
+def test_default_stiffness_is_never_scaled_down_but_a_hard_wall_scales_down_that_of_stacked_pairs() -> None:
     firm = {"maximum_force": 2000.0}
     stiffest = max(_postures(), key=lambda posture: len(posture[1].pressing))[0]
     for q, _ in _postures():

@@ -72,7 +72,7 @@ def test_a_frame_that_steps_by_less_than_all_gates_moves_no_arm() -> None:
     assert_still(run)
 
 
-def test_frozen_poses_with_live_buttons_pause_both_arms_and_engage_none() -> None:
+def test_frozen_poses_with_live_buttons_pause_both_arms_and_engage_no_arm() -> None:
     def script(op: Operator) -> Iterator[float]:
         yield from op.engage()
         yield from op.move((0.0, 0.05, 0.0), seconds=0.3)

@@ -112,7 +112,7 @@ def test_haptics_without_a_headset_or_a_subscription_do_nothing(server: HeadsetS
     server.send_haptic(HapticFeedback("left", 1.0, 1.0))
 
 
-def test_a_headset_that_does_not_read_gets_only_the_newest_vibration_and_the_next_headset_none(
+def test_a_headset_that_does_not_read_gets_only_the_newest_vibration_and_the_next_headset_gets_nothing(
     server: HeadsetServer,
 ) -> None:
     with registered(server) as headset:
@@ -139,7 +139,7 @@ def test_a_headset_that_does_not_read_gets_only_the_newest_vibration_and_the_nex
         assert next_topic(second) == "q2r_right_hand_haptic_feedback"
 
 
-def test_a_listener_gets_every_message_in_order_and_poll_gets_none(clock: HandClock) -> None:
+def test_a_listener_gets_every_message_in_order_and_poll_gets_no_message(clock: HandClock) -> None:
     heard: list[Watched] = []
     with running(HeadsetServer(port=0, clock=clock, listener=heard.append)) as server, connect(server) as headset:
         for index in range(100):
@@ -154,7 +154,7 @@ def test_a_listener_gets_every_message_in_order_and_poll_gets_none(clock: HandCl
         assert server.poll(0.0) == []
 
 
-def test_a_frozen_pose_has_its_fault_but_a_new_connection_has_none(server: HeadsetServer, clock: HandClock) -> None:
+def test_a_frozen_pose_has_its_fault_but_a_new_connection_has_no_fault(server: HeadsetServer, clock: HandClock) -> None:
     for expected in ([None, None, HandFault.FROZEN], [None, None]):
         with connect(server) as headset:
             assert faults(server, headset, len(expected), lambda: clock.advance(0.3)) == expected
@@ -247,7 +247,7 @@ def test_a_fault_drops_that_client_with_one_line_and_the_next_is_served(
     assert len(warnings(caplog)) == 1
 
 
-def test_a_connection_that_ends_between_frames_is_no_fault(
+def test_a_connection_that_ends_between_frames_is_not_a_fault(
     server: HeadsetServer, caplog: pytest.LogCaptureFixture
 ) -> None:
     assert_serves(server)

@@ -107,7 +107,7 @@ def test_unusable_actions_give_one_line_that_names_the_fault(
     assert "\n" not in text
 
 
-def test_a_quaternion_that_is_no_rotation_is_named() -> None:
+def test_a_quaternion_that_is_not_a_rotation_is_named() -> None:
     poses = np.tile([0.5, 0.2, 0.3, 0.0, 0.0, 0.0, 1.0], (1, 2))
     poses[0, 13] = 0.0
     chunk = sent(opened(ActionSpace.TOOL), poses, [0.0])
@@ -205,7 +205,7 @@ def test_a_policy_that_ends_its_thread_is_named_and_asked_again(error: BaseExcep
         policy.close()
 
 
-def test_a_signal_that_ends_the_program_is_no_fault_of_the_policy() -> None:
+def test_a_signal_that_ends_the_program_is_not_a_fault_of_the_policy() -> None:
     def interrupted(observation: Observation) -> Array:
         raise SystemExit
 

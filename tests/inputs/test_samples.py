@@ -173,7 +173,7 @@ def test_a_hand_does_not_wait_for_another_hand_that_is_absent() -> None:
 
 @pytest.mark.parametrize("begins", [-0.03, 0.0001, 0.02], ids=str)
 @pytest.mark.parametrize("first", SIDES)
-def test_an_alignment_is_no_fault_whether_buttons_or_poses_come_first(first: str, begins: float) -> None:
+def test_an_alignment_is_not_a_fault_whether_buttons_or_poses_come_first(first: str, begins: float) -> None:
     messages = [*moved(resting(), stepped(0.3, 60.0)), (STEP_AT + begins, first, CHORD)]
     messages.append((STEP_AT + begins + 0.15, first, RELEASED))
     watched = handed_on(sorted(messages, key=lambda message: message[0]))
@@ -230,7 +230,7 @@ def test_hands_that_start_as_fast_as_possible_with_samples_lost_and_late_are_not
     assert len(watched) >= len(samples) - 1
 
 
-def test_hands_that_start_together_while_samples_are_lost_are_no_frame() -> None:
+def test_hands_that_start_together_while_samples_are_lost_do_not_look_like_a_moved_frame() -> None:
     """The hands accelerate with 16 m/s^2 for 60 ms, without anything that distinguishes them from one rigid body."""
 
     def reach(t: float) -> pin.SE3:

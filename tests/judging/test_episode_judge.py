@@ -110,7 +110,7 @@ def test_no_episode_is_judged_before_it_is_completely_written(run: PatientRun, t
     assert len(whole.ticks.t) == pytest.approx(1.5 * RATE, abs=2)
 
 
-def test_an_episode_that_is_discarded_before_its_verdict_gets_none(run: PatientRun) -> None:
+def test_an_episode_that_is_discarded_before_its_verdict_gets_no_verdict(run: PatientRun) -> None:
     told: list[Reason] = []
     with EpisodeJudge(lambda: run.file, told.append) as judge_now:
         for t, kind in zip((1.0, 2.5, 2.6, 4.0, 6.0), (BEGINS, ENDS, DISCARDED, BEGINS, ENDS), strict=True):

@@ -152,7 +152,7 @@ def test_a_run_starts_paused_even_when_the_one_before_ended_engaged() -> None:
         loop.listeners.clear()
 
 
-def test_runs_in_real_time_keep_the_solvers_time_limit_and_simulated_runs_have_none() -> None:
+def test_runs_in_real_time_keep_the_solvers_time_limit_and_simulated_runs_have_no_limit() -> None:
     loop = pipeline()
     assert loop.config.control.solve_time_limit is not None
     for realtime, expected in ((False, None), (True, loop.config.control.solve_time_limit), (False, None)):

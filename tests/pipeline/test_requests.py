@@ -29,7 +29,7 @@ def test_a_pause_holds_both_arms_until_a_new_press() -> None:
 
 
 @pytest.mark.slow
-def test_a_press_of_a_program_engages_arms_with_present_hands_and_pauses_none() -> None:
+def test_a_press_by_a_program_engages_arms_with_present_hands_and_pauses_no_arm() -> None:
     loop = pipeline()
     loop.listeners.append(when_moving(loop.pause))
     pressed: list[Tick] = []

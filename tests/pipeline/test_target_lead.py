@@ -50,7 +50,7 @@ def test_a_motion_that_stops_suddenly_overshoots_only_for_a_moment() -> None:
     assert over[15] < 0.1 * over[0]
 
 
-def test_a_jump_of_the_target_is_no_motion() -> None:
+def test_a_jump_of_the_target_does_not_count_as_its_motion() -> None:
     lead = TargetLead()
     followed(lead, 0.0)
     assert followed(lead, 0.1).translation[0] == 0.1

@@ -135,7 +135,7 @@ def test_limits_and_distances_hold_at_every_tick_by_simple_arithmetic_and_coal(s
 
 
 @pytest.mark.parametrize("solver", each_solver())
-def test_joints_that_are_driven_beyond_their_limits_reach_each_limit_and_break_none(solver: str) -> None:
+def test_joints_that_are_driven_towards_their_limits_reach_each_limit_and_break_no_limit(solver: str) -> None:
     controller, last = controller_with(solver), [arm.joints[-1] for arm in ROBOT.arms.values()]
     limits, q = limits_of(controller), ROBOT.home.copy()
     q[last] = limits.upper[last] - 1.2

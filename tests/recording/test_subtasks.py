@@ -139,7 +139,7 @@ def test_subtasks_without_names_have_numbers_also_in_a_run_that_is_one_episode(t
     assert tuple(name for name, _ in subtasks_of(judged)) == names
 
 
-def test_a_recording_in_which_nobody_told_of_subtasks_has_none(tmp_path: Path) -> None:
+def test_a_recording_without_reports_of_subtasks_has_no_subtasks(tmp_path: Path) -> None:
     file = recorded(tmp_path, (0.2, 0.7), (), (), duration=1.0)
     for span, judged in zip(spans_to_export(file), judge(Recording(file)), strict=True):
         episode = make_episode(file, FrameSampling(), span)

@@ -63,7 +63,7 @@ def test_a_joint_with_a_motor_follows_no_other_joint() -> None:
     assert followers(*CHAIN, driven=("b",)) == {"c": Follower("b", -2.0, 0.1)}
 
 
-def test_a_fixed_joint_follows_none() -> None:
+def test_a_fixed_joint_follows_no_other_joint() -> None:
     assert followers(joint("b", "a 1 0", kind="fixed"), joint("a")) == {}
 
 

@@ -78,7 +78,7 @@ def assert_only_a_press_moves(moving: Cockpit, joints: JointRecorder) -> None:
     assert joints.fastest(began) < FAST
 
 
-def test_a_killed_node_stops_both_arms_and_its_restart_moves_none(moving: Cockpit) -> None:
+def test_a_killed_node_stops_both_arms_and_its_restart_moves_no_arm(moving: Cockpit) -> None:
     joints = stopped(moving, "controller killed", moving.signal(CONTROLLER, signal.SIGKILL))
     moving.restart(CONTROLLER)
     assert_only_a_press_moves(moving, joints)

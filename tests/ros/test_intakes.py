@@ -436,5 +436,5 @@ def test_a_pose_is_read_with_its_quaternion_normalized() -> None:
     ("position", "orientation"),
     [({"x": math.nan}, TURN), ({"y": math.inf}, TURN), ({}, {"w": 0.0}), ({}, {"w": 1.1}), ({}, {"w": math.nan})],
 )
-def test_numbers_that_are_not_a_pose_give_none(position: dict[str, float], orientation: dict[str, float]) -> None:
+def test_numbers_that_are_not_a_pose_give_no_pose(position: dict[str, float], orientation: dict[str, float]) -> None:
     assert pose_of(Pose(position=Point(**position), orientation=Quaternion(**orientation))) is None

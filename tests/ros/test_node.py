@@ -70,7 +70,7 @@ def test_ctrl_c_while_importing_ends_a_command_and_prints_nothing(name: str) -> 
     assert run.returncode == -signal.SIGINT
 
 
-def test_the_help_of_an_executable_describes_its_node_and_starts_none(tmp_path: Path) -> None:
+def test_the_help_of_an_executable_describes_its_node_and_starts_no_node(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "q2r2_control.ros.launch.executables", "recorder", "--help"]
     path = {"PYTHONPATH": os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))}
     run = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, env=os.environ | path)

@@ -163,7 +163,7 @@ def test_hand_and_services_know_each_others_episodes(node: Any, processes: Proce
     assert (kept.discarded, discarded.discarded) == (False, True)
 
 
-def test_hand_and_service_begin_subtasks_of_one_count(node: Any, processes: Processes, tmp_path: Path) -> None:
+def test_presses_and_the_service_count_the_same_subtasks(node: Any, processes: Processes, tmp_path: Path) -> None:
     rig = ArmRig(node)
     rig.start(processes, {"teleop.bindings.grip": "next_subtask"})
     recorder = late_recorder(rig, node, processes, tmp_path)

@@ -59,7 +59,7 @@ def test_rates_are_those_of_the_senders_and_only_states_are_listened_to(node: An
     node.destroy_publisher(sender)
 
 
-def test_a_watch_leaves_no_executor_for_the_end_of_python(node: Any, processes: Processes) -> None:
+def test_a_watch_shuts_its_executor_down_before_python_ends(node: Any, processes: Processes) -> None:
     # Python destroys in any order what is left then. rclpy prints a traceback if an executor comes after its parts.
     code = f"""
 import gc

@@ -44,7 +44,7 @@ def test_a_home_without_a_certified_stop_is_a_fault(robot: Robot, controller: Ca
     np.testing.assert_allclose(controller.step({}, 1e-3).q, robot.home, atol=1e-12)
 
 
-def test_limits_in_degrees_are_a_fault_and_a_joint_of_many_turns_is_none(
+def test_limits_in_degrees_are_a_fault_and_a_joint_of_many_turns_is_not_a_fault(
     robot: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     lower, upper, fastest = robot.position_lower.copy(), robot.position_upper.copy(), robot.velocity_limit.copy()

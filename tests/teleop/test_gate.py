@@ -98,7 +98,7 @@ def test_poses_too_far_apart_in_time_are_a_fault_even_if_they_arrive_together() 
     assert kinds(gate().receive(replace(GOOD, pose_stamp=1.2), 1.2)[1]) == "pose_gap"
 
 
-def test_before_any_pose_inputs_alone_are_no_fault_but_a_stamp_that_is_not_finite_is() -> None:
+def test_before_any_pose_inputs_alone_are_not_a_fault_but_a_stamp_that_is_not_finite_is_one() -> None:
     fresh = PoseGate(GateSettings())
     assert fresh.receive(replace(GOOD, pose_stamp=-math.inf, quaternion=np.zeros(4)), 1.0) == (False, None)
     assert fresh.receive(replace(GOOD, pose_stamp=math.nan), 1.0)[1] is not None
@@ -130,7 +130,7 @@ def test_a_hand_that_moves_faster_than_any_operator_is_a_fault(speed: float, tur
 
 
 @pytest.mark.parametrize("stall", [0.04, 0.08, 0.13])
-def test_samples_that_a_network_held_up_and_delivers_at_once_are_no_speed(stall: float) -> None:
+def test_samples_that_a_network_held_up_and_delivers_at_once_do_not_count_as_speed(stall: float) -> None:
     """The hand moves at 2 m/s. Samples of ``stall`` arrive within a millisecond: 26 mm in 0.1 ms."""
     end = EVEN[20] + stall
     receipts = [max(t, end + 1e-4 * (index - 20)) if t > EVEN[20] else t for index, t in enumerate(EVEN)]

@@ -66,7 +66,7 @@ NO_SOLUTIONS: dict[str, Any] = {
 
 
 @pytest.mark.parametrize("answer", NO_SOLUTIONS.values(), ids=NO_SOLUTIONS)
-def test_an_answer_that_is_no_solution_is_a_failed_solve_and_the_arms_stop(answer: Any) -> None:
+def test_an_answer_that_is_not_a_solution_is_a_failed_solve_and_the_arms_stop(answer: Any) -> None:
     controller = CartesianController(ROBOT, ControllerSettings(), solver=Answering(answer))
     reference = controller.step({arm: controller.tool_pose(arm) for arm in ROBOT.arms}, DT)
     assert reference.report.unsolved == 1

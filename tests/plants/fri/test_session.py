@@ -124,7 +124,7 @@ def test_commands_without_an_overlay_brake_for_as_long_as_they_come() -> None:
         assert answer.tau == pytest.approx((-4.0,) * 7)
 
 
-def test_a_measured_jump_is_no_velocity_beyond_the_limit() -> None:
+def test_a_measured_jump_does_not_count_as_a_velocity_beyond_the_limit() -> None:
     limits = np.full(7, 100.0), np.full(7, 2.0)
     cabinet = Cabinet(ArmSession("left", "cabinet", None, CommandKind.TORQUE, *limits))
     for q in (Q, np.add(Q, 0.5), np.add(Q, -0.5)):
