@@ -21,6 +21,8 @@ from q2r2_control.errors import Q2R2Error
 # Depending on its version, typer raises click's exceptions or its own copy of them. This is the base class of either.
 _BadUsage: type[Exception] = typer.BadParameter.__mro__[2]
 
+_PARTS = "q2r2_control."  # Parts of the package, some of which an installation may leave out.
+
 
 class ErrorHandlingGroup(TyperGroup):
     """All commands. Ctrl-C ends them with exit code 130, bad usage and :class:`Q2R2Error` with 2.
@@ -49,6 +51,10 @@ class ErrorHandlingGroup(TyperGroup):
             sys.exit(130)
         except Q2R2Error as error:
             messages = error.faults
+        except ModuleNotFoundError as error:
+            if not (error.name or "").startswith(_PARTS):
+                raise
+            messages = (f"this installation is without {error.name}, which the command needs",)
         except _BadUsage as error:
             context = getattr(error, "ctx", None)
             command = context.command_path if context else "q2r2"

@@ -7,6 +7,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
@@ -44,14 +45,16 @@ from q2r2_control.summary.run_summary import RunSummary
 from q2r2_control.summary.tick import Tick
 from q2r2_control.teleop.both_arms import EpisodeMarks
 from q2r2_control.viewer.episode_words import EpisodeWords
-from q2r2_control.viewer.headset_view import DisplayInput, HeadsetView
 from q2r2_control.viewer.live import LiveTable
 from q2r2_control.viewer.live_pictures import LivePictures, ShownPictures
 from q2r2_control.viewer.shown_robot import ShownRobot
 from q2r2_control.viewer.state_colours import obstacle_colour
 from q2r2_control.viewer.tables import print_table
-from q2r2_control.viewer.web.view import PageView
 
+if TYPE_CHECKING:
+    from q2r2_control.viewer.web.view import PageView
+
+_SHOWS_PICTURES = "show_picture"  # The method of inputs whose device shows the run, as a headset does.
 _PERIOD = 1.0 / 30.0  # Period at which the window is drawn [s].
 _ON_PAGE, _IN_HEADSET = 5.0, 30.0  # Pictures per second, of all cameras on a page and of one camera in a headset.
 
@@ -152,6 +155,8 @@ def run_cell(config: Config, options: RunOptions) -> CellRun:
     with CameraStreams(_watched_devices(config, options)) as streams:
         if options.page is None:
             return _run_recorded(config, options, None, streams)
+        from q2r2_control.viewer.web.view import PageView  # A run without a page needs no files of pages.
+
         with PageView(*options.page) as page:
             return _run_recorded(config, options, page, streams)
 
@@ -159,7 +164,7 @@ def run_cell(config: Config, options: RunOptions) -> CellRun:
 def _watched_devices(config: Config, options: RunOptions) -> dict[str, CameraConfig]:
     """Return the real cameras whose pictures are recorded, shown, or observed. Without such use they stay closed."""
     source = load_class(INPUTS, options.input)
-    sees = any(hasattr(source, method.__name__) for method in (DisplayInput.show_picture, PolicySource.observe))
+    sees = any(hasattr(source, method) for method in (_SHOWS_PICTURES, PolicySource.observe.__name__))
     if options.fast or (options.record is None and options.page is None and not sees):
         return {}
     return config.device_cameras
@@ -233,8 +238,11 @@ def _run_pipeline(
     if options.tasks and isinstance(pipeline.plant, MujocoPlant):
         watch = TaskWatch(options.tasks, pipeline.plant, pipeline.robot, config)
         pipeline.listeners.append(watch)
-    if isinstance(source, DisplayInput):
-        HeadsetView(source, pipeline, recorder is not None)
+    display: Any = source
+    if hasattr(display, _SHOWS_PICTURES):
+        from q2r2_control.viewer.headset_view import HeadsetView
+
+        HeadsetView(display, pipeline, recorder is not None)
     if page is not None:
         page.begin(pipeline, options.name, recorder is not None)
         for line in page.lines:
@@ -377,8 +385,8 @@ def _lookers(
 
     ``names`` are those of all cameras with pictures. A headset shows the first one.
     """
-    source = pipeline.input
-    if isinstance(source, DisplayInput):
+    source: Any = pipeline.input
+    if hasattr(source, _SHOWS_PICTURES):
         yield from ((name, _IN_HEADSET, source.show_picture, lambda: source.connected) for name in names[:1])
     if page is not None:
         yield from (

@@ -18,7 +18,6 @@ from typer import Argument, Exit, Option
 
 from q2r2_control.cli.cell_run import RunOptions, print_summary, run_cell
 from q2r2_control.cli.evaluate import print_trials
-from q2r2_control.cli.fri import rehearsal
 from q2r2_control.cli.output import (
     DEMO_CONFIG,
     Anonymous,
@@ -294,6 +293,8 @@ def demo(
         notes=notes_of(None, None, record, anonymous) | {"task": "; ".join(task.about for task in chosen)},
     )
     if plant == "fri":
+        from q2r2_control.cli.fri import rehearsal  # Only this demo needs the simulated cabinets.
+
         with rehearsal(_FRI_CONFIG, mode, chosen, period, rt=True) as results:
             done = run_cell(with_solver(with_controls(load_config(_FRI_CONFIG)), solver), options)
         done = replace(done, tasks=held_to_promises(results, done.summary))

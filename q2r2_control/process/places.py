@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Protocol, TypeVar
 
 from q2r2_control.errors import ConfigError
-from q2r2_control.process.cluster import Cluster
 from q2r2_control.process.pools import pool_of
 
 Job = TypeVar("Job")
@@ -103,5 +102,7 @@ def chosen_place(workers: int, cluster: str | None) -> JobPlace:
     if cluster is not None:
         if workers != 1:
             raise ConfigError("--workers cannot be used with --cluster, whose scheduler has the workers")
+        from q2r2_control.process.cluster import Cluster  # Work on this computer needs no cluster.
+
         return Cluster(cluster)
     return HERE if workers == 1 else Processes(workers)

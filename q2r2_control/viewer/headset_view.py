@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol
 
 from q2r2_control.inputs.base import Input
 from q2r2_control.inputs.webxr.exchange import Display
@@ -22,7 +22,6 @@ from q2r2_control.viewer.shown_robot import ShownRobot
 _PERIOD = 1.0 / 30.0  # Time between messages [s].
 
 
-@runtime_checkable
 class DisplayInput(Input, Protocol):
     """An input whose device shows the run, as a headset does."""
 
