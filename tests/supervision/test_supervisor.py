@@ -95,6 +95,14 @@ def test_nothing_is_commanded_before_joint_states_are_valid_and_at_rest(world: W
     assert np.allclose(first, world.q, atol=1e-9)
 
 
+def test_why_arms_cannot_be_activated_is_logged_once_for_each_reason(world: World) -> None:
+    gone, stalled = Reason(CommonReason.OTHER), Reason.of(CommonReason.LOOP_STALLED, duration=1.0)
+    for why in (gone, gone, stalled, stalled):
+        world.supervisor.update_state(why, world.now)
+        world.run(DT, sees=False)
+    assert list(map(kinds, world.supervisor.events)) == ["joint_states: other", "joint_states: loop_stalled"]
+
+
 def test_if_targets_of_one_linked_arm_end_both_hold_until_a_new_stream_of_each_begins(world: World) -> None:
     _, right = world.engage_both()
     world.run(0.3, right=raised(right, 0.01))
