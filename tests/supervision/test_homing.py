@@ -9,6 +9,7 @@ from unittest.mock import Mock
 
 import coal
 import numpy as np
+import pinocchio as pin
 import pytest
 
 from q2r2_control import CartesianController, Robot, load_config
@@ -16,7 +17,7 @@ from q2r2_control.config.moving_obstacle import MovingObstacle
 from q2r2_control.events import CommonReason, Reason
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.ros.reasons import RosReason
-from q2r2_control.supervision.homing import JointHoming
+from q2r2_control.supervision.homing import JointHoming, ToolHoming
 from q2r2_control.supervision.reasons import SupervisionReason
 from q2r2_control.supervision.supervisor import Supervisor
 from q2r2_control.supervision.target_stream import StreamSettings
@@ -172,6 +173,17 @@ def test_the_way_home_waits_for_an_arm_that_is_held_up_and_then_reports_it(robot
             break
     assert homing.outcome is CommonReason.HOMING_HELD_UP
     assert 0.05 < farthest < 0.13  # Otherwise, the arm would start fast when it is free again.
+
+
+def test_tools_that_are_held_up_end_their_way_home_five_seconds_after_they_were_due(robot: Robot) -> None:
+    home = robot.tool_pose(robot.home, "left")
+    stuck = pin.SE3(home.rotation, home.translation + np.array([0.0, 0.0, 0.2]))
+    homing, zero, outcomes = ToolHoming({"left": home}, lambda _arm: stuck), np.zeros_like(robot.home), []
+    for dt in (1.9, 0.2, 4.8, 0.2):  # The way takes 2 s at 0.1 m/s.
+        target = homing.step(robot.home, zero, dt).targets["left"]
+        assert target is not None
+        outcomes.append((target.isApprox(home, 1e-9), homing.outcome))
+    assert outcomes == [(False, None), (True, None), (True, None), (True, CommonReason.HOMING_HELD_UP)]
 
 
 class Beside(World):
