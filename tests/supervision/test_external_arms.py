@@ -8,8 +8,9 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from q2r2_control import CartesianController, Robot, load_config
+from q2r2_control import CartesianController, ControllerSettings, Robot, load_config
 from q2r2_control.config.cell import Config
+from q2r2_control.config.control import NamedPairDistance, SupervisionSettings
 from q2r2_control.config.resources import find_resource
 from q2r2_control.config.yaml_text import read_yaml, yaml_of
 from q2r2_control.supervision.joint_watch import (
@@ -109,6 +110,22 @@ def test_elbows_may_swing_while_the_tools_rest_but_not_too_close_to_other_bodies
     assert event.detail["pair"].endswith("|post_0")
     # The first state that is too close counts. The next one is nearer only by the elbow's motion in between.
     assert MIN_DISTANCE - TOLERANCE - 1e-3 < event.detail["distance"] <= MIN_DISTANCE - TOLERANCE
+
+
+def test_the_measured_pair_that_lacks_most_of_its_own_distance_is_named(robot: Robot) -> None:
+    """Another pair is closer, but may be."""
+    _, pair = sorted(robot.distances(robot.home), key=lambda pair: pair.distance)[:2]
+    kept = NamedPairDistance(pair=(pair.name_a, pair.name_b), distance=pair.distance + 0.03)
+    controller = CartesianController(robot, ControllerSettings(pairs=(kept,)))
+    watch = watch_settings(SupervisionSettings(), yields=False)
+    external = ExternalArms(robot, controller, ExternalSettings(tolerance=TOLERANCE), StreamSettings(), watch)
+    zero = np.zeros_like(robot.home)
+    reason = external.too_close(RobotState(robot.home, zero, zero, None, 0.0))
+    assert reason is not None
+    assert reason.detail["pair"] == f"{pair.name_a}|{pair.name_b}"
+    assert reason.detail["key"] == "pairs[0]"
+    assert reason.detail["distance"] == pytest.approx(pair.distance)
+    assert reason.detail["allowed"] == pytest.approx(pair.distance + 0.03 - TOLERANCE)
 
 
 def test_a_tool_that_is_away_from_its_reference_starts_over(world: World) -> None:
