@@ -53,6 +53,8 @@ def test_arms_are_slowed_while_their_lags_differ(found: dict[str, ArmTiming], ho
 def test_the_window_contains_the_allowed_skew_and_two_more_messages() -> None:
     found = timings()
     assert skew_window(found, 0.004) == pytest.approx(allowed_skew(found) + 2.0 * PERIOD + 0.004)
+    found["left"] = ArmTiming(0.0, 0.0, 2.0 * PERIOD)
+    assert skew_window(found, 0.004) == pytest.approx(0.001 + 8.0 * PERIOD + 0.004), "the slower messages count"
     assert skew_window({"left": found["left"]}, 0.004) == 0.0
 
 
@@ -107,3 +109,6 @@ def test_arms_that_stay_apart_are_activated_again_from_rest(robot: Robot, contro
         world.run(DT, raised(left, 0.05), right=raised(right, 0.05))
     assert SupervisionReason.ARMS_APART in {event.root.kind for event in world.supervisor.events}
     assert world.states != ["following"] * 2
+    world.supervisor.skew.observe(timings(), world.now)
+    world.run(1.0)
+    assert world.states == ["holding"] * 2
