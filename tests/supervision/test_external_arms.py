@@ -128,13 +128,16 @@ def test_the_measured_pair_that_lacks_most_of_its_own_distance_is_named(robot: R
     assert reason.detail["allowed"] == pytest.approx(pair.distance + 0.03 - TOLERANCE)
 
 
-def test_a_tool_that_is_away_from_its_reference_starts_over(world: World) -> None:
+@pytest.mark.parametrize(("joint", "by"), [(0, 0.1), (6, 0.4)], ids=["by a distance", "by an angle alone"])
+def test_a_tool_that_is_away_from_its_reference_starts_over(world: World, joint: int, by: float) -> None:
     moved = world.robot.home.copy()
-    # The distance is larger than a stream's beginning allows, but smaller than a joint's deviation allows.
-    moved[0] += 0.1
+    # This is more than a stream's beginning allows, but less than a joint's deviation allows.
+    moved[joint] += by
     steps = [world.robot.home + share * (moved - world.robot.home) for share in np.linspace(0.0, 1.0, 40)]
     world.show(steps + [moved] * round(0.4 / DT))
     assert world.supervisor.events == []
+    at_the_tool = world.supervisor.update_target("left", world.robot.tool_pose(moved, "left"), world.now)
+    assert kinds(at_the_tool) == "stream_away", "the reference would have to follow a jump"
     world.show([moved] * round(0.4 / DT))
     assert kinds(world.supervisor.events[0]) == "left_behind"
     world.show([moved] * 50)
