@@ -60,6 +60,21 @@ def test_a_joint_without_room_between_its_margins_is_a_fault(
         assert faults[0].startswith(f"left_A3: position_margin leaves {left} rad of its range; to change: ")
 
 
+@pytest.mark.parametrize(("by", "beyond"), [(0.01, 0), (-0.01, 0), (0.031, 1), (-0.031, 1)])
+def test_a_home_nearer_to_a_joint_limit_than_the_margin_is_a_fault(
+    robot: Robot, monkeypatch: pytest.MonkeyPatch, by: float, beyond: int
+) -> None:
+    lower, upper = robot.position_lower.copy(), robot.position_upper.copy()
+    lower[2], upper[2] = robot.home[2] - by - 0.05, robot.home[2] - by + 0.05
+    monkeypatch.setattr(robot, "position_lower", lower)
+    monkeypatch.setattr(robot, "position_upper", upper)
+    faults = preflight_faults(robot, ControllerSettings(position_margin=0.02), None)
+    assert len(faults) == beyond
+    for fault in faults:
+        allowed = f"{lower[2] + 0.02:g} .. {upper[2] - 0.02:g} rad, position_margin included"
+        assert fault == f"home: left_A3 = {robot.home[2]:g}; allowed: {allowed}"
+
+
 def test_limits_in_degrees_are_a_fault_and_a_joint_of_many_turns_is_none(
     robot: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
