@@ -134,6 +134,18 @@ def test_the_way_home_can_be_interrupted_and_the_arms_come_to_rest_where_they_ar
     assert np.abs(world.state.q - at).max() < 0.04
 
 
+def test_a_way_home_that_its_caller_ends_is_recorded_as_interrupted(
+    robot: Robot, controller: CartesianController
+) -> None:
+    world = World(robot, controller, robot.home + 0.05)
+    homing = world.supervisor.homing
+    assert world.supervisor.go_home() is None
+    world.run(0.1)
+    assert homing.hold() is None
+    assert not homing.active
+    assert kinds(homing.outcome) == "homing_interrupted"
+
+
 def test_while_no_way_is_known_the_arms_rest_and_a_tick_examines_at_most_two_samples(robot: Robot) -> None:
     distances = Mock(side_effect=chain([np.ones(3)], repeat(np.zeros(3))))  # Only the start is free.
     bounds = {"position_lower": robot.position_lower, "position_upper": robot.position_upper}
