@@ -41,6 +41,11 @@ def test_resting_and_reversing_arms_get_the_least_possible_difference_of_lags(ro
         assert abs(lags["left"] - lags["right"]) <= 0.011
 
 
+def test_an_arm_is_taken_for_at_most_0_4_s_behind(robot: Robot) -> None:
+    """An arm that is farther away was moved by something else."""
+    assert found(robot, dict.fromkeys(SIDES, 0.6), 1.2) == pytest.approx(dict.fromkeys(SIDES, 0.4), abs=0.011)
+
+
 def test_a_resting_arm_counts_as_far_behind_as_the_moving_arm(robot: Robot) -> None:
     """All lags explain where the resting arm is."""
     watch, left = MeasuredLags(robot), robot.arms["left"].joints
