@@ -173,6 +173,23 @@ def test_a_soft_controller_that_lags_is_followed_and_an_arm_that_runs_away_start
     assert world.supervisor.phase is Phase.BRAKING
 
 
+def test_an_arm_whose_targets_end_in_motion_comes_to_rest_without_going_back(world: World) -> None:
+    tool, heights = world.controller.tool_pose("left"), []
+    q = world.robot.home.copy()
+    for tick in range(round(1.5 / DT)):
+        if tick * DT < 0.5:
+            goal = pin.SE3(tool.rotation, tool.translation + np.array([0.0, 0.0, PACE * DT * tick]))
+            world.supervisor.update_target("left", goal, world.now)
+        else:
+            world.supervisor.targets.release("left")
+        reference = world.show([q])
+        assert reference is not None
+        q = reference.q  # The other controller follows at once.
+        heights.append(world.controller.tool_pose("left").translation[2])
+    assert heights[-1] > tool.translation[2] + 0.1
+    assert heights[-1] > max(heights) - 1e-4
+
+
 def test_the_way_home_leads_the_tools_until_they_arrive_and_accepts_no_targets(config: Config) -> None:
     world = World(config)
     q = world.robot.home.copy()
