@@ -101,7 +101,7 @@ class _Gripper:
         self.granted: float | None = None  # The opening that is commanded.
         self.asks_at = -math.inf
         self._wanted = math.nan
-        self._step = 1.0
+        self._step: float  # The farthest that the next opening may be from the commanded one. A new wish begins with 1.
         self._seen: list[Interval] = []  # The openings in this time span, and in the one before.
         self._since = -math.inf
 

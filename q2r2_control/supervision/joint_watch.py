@@ -261,7 +261,7 @@ class ExternalArms:
         """Return a reason if the tool of an arm without a target is away from its reference for too long, else None.
 
         The other controller does not move that arm to the reference. The operator could not engage it either, because
-        a stream of targets has to begin at the measured tool and at the reference's tool.
+        the operator's targets begin at the measured tool, and have to begin at the reference's tool.
         """
         holding = set(holding)
         for arm in self._robot.arms:

@@ -106,12 +106,10 @@ class PoseRateLimiter:
 
     def __init__(self, settings: GuardSettings, period: float) -> None:
         """``period`` is the time between two steps [s]."""
-        self.pose: pin.SE3 | None = None
         self.clipped = 0  # Number of steps since the start in which a limit held the pose back.
-        self._linear, self._angular = _Limited(), _Limited()
-        self._target: pin.SE3 | None = None
-        self._now, self._period = -math.inf, period
+        self._linear, self._angular, self._period = _Limited(), _Limited(), period
         self.change(settings)
+        self.reset(None, -math.inf)
 
     def change(self, settings: GuardSettings) -> None:
         """Change the limits from the next step on. A pose that is too fast then brakes at the acceleration limit."""
@@ -135,7 +133,9 @@ class PoseRateLimiter:
 
     def reset(self, pose: pin.SE3 | None, now: float) -> None:
         """Rest at ``pose`` from ``now`` [s] on; None if there is no pose yet."""
-        self.pose, self._target, self._now = pose, None, now
+        self.pose: pin.SE3 | None = pose
+        self._target: pin.SE3 | None = None
+        self._now = now
         self._linear.velocity = self._angular.velocity = np.zeros(3)
 
     def step(self, target: pin.SE3 | None, now: float) -> pin.SE3 | None:
@@ -179,9 +179,8 @@ class PoseRateLimiter:
 class _Limited:
     """The velocity of a position or a rotation, within limits of velocity and acceleration."""
 
-    def __init__(self) -> None:
-        self.limits = 0.0, 0.0  # The limits of velocity and acceleration.
-        self.velocity = np.zeros(3)
+    limits: tuple[float, float]  # The limits of velocity and acceleration.
+    velocity: Array  # (3,)
 
     @property
     def speed(self) -> float:

@@ -9,16 +9,19 @@ from q2r2_control import CartesianController, Robot
 from q2r2_control.supervision.arm_skew import SkewWatch, allowed_skew, skew_window
 from q2r2_control.supervision.reasons import SupervisionReason
 from q2r2_control.types import ArmTiming
+from q2r2_control.wording import sentence
 from tests.supervision.test_supervisor import DT, World, raised
 
 PERIOD = 0.005  # Period of the arms' messages [s].
 
 
-def timings(left: float = 0.0, right: float = 0.0, silent: tuple[float, float] = (0.0, 0.0)) -> dict[str, ArmTiming]:
-    """Return the timing of two arms with these lags, and with ``silent`` in periods."""
+def timings(
+    left: float = 0.0, right: float = 0.0, silent: tuple[float, float] = (0.0, 0.0), noise: float = 0.0
+) -> dict[str, ArmTiming]:
+    """Return the timing of two arms with these lags, with ``silent`` and ``noise`` in periods."""
     behind = {"left": left, "right": right}
     return {
-        arm: ArmTiming(PERIOD * lag, PERIOD * quiet, PERIOD)
+        arm: ArmTiming(PERIOD * lag, PERIOD * quiet, PERIOD, PERIOD * noise)
         for (arm, lag), quiet in zip(behind.items(), silent, strict=True)
     }
 
@@ -31,8 +34,11 @@ def timings(left: float = 0.0, right: float = 0.0, silent: tuple[float, float] =
         pytest.param(timings(left=1.0, silent=(1.0, 0.0)), False, id="one message lost"),
         pytest.param(timings(left=2.3), True, id="more than two periods apart"),
         pytest.param(timings(right=2.3), True, id="the other one behind"),
+        pytest.param(timings(left=2.8, noise=0.7), False, id="apart by no more than the lags are noisy"),
+        pytest.param(timings(left=3.0, noise=0.7), True, id="farther apart than the lags are noisy"),
         pytest.param(timings(left=1.5, silent=(1.9, 0.0)), True, id="behind, and a message is missing"),
-        pytest.param(timings(silent=(2.5, 0.1)), True, id="one silent for two periods"),
+        pytest.param(timings(silent=(2.2, 0.1)), False, id="one silent for two periods and its jitter"),
+        pytest.param(timings(silent=(2.4, 0.1)), True, id="one silent for longer than two periods"),
         pytest.param(timings(silent=(20.0, 20.0)), False, id="this loop stood still"),
         pytest.param({"left": ArmTiming(1.0, 1.0, PERIOD)}, False, id="a single arm"),
         pytest.param({}, False, id="arms that move as one"),
@@ -47,6 +53,8 @@ def test_arms_are_slowed_while_their_lags_differ(found: dict[str, ArmTiming], ho
 def test_the_window_contains_the_allowed_skew_and_two_more_messages() -> None:
     found = timings()
     assert skew_window(found, 0.004) == pytest.approx(allowed_skew(found) + 2.0 * PERIOD + 0.004)
+    found["left"] = ArmTiming(0.0, 0.0, 2.0 * PERIOD)
+    assert skew_window(found, 0.004) == pytest.approx(0.001 + 8.0 * PERIOD + 0.004), "the slower messages count"
     assert skew_window({"left": found["left"]}, 0.004) == 0.0
 
 
@@ -58,7 +66,15 @@ def test_after_a_long_difference_of_lags_the_arm_that_is_behind_is_named() -> No
     watch.observe(timings(right=4.0), 0.11)
     fault = watch.fault(0.11)
     assert fault is not None
-    assert (fault.kind, fault.detail["arm"]) == (SupervisionReason.ARMS_APART, "right")
+    assert sentence(fault) == "right: 20 ms behind the other arm; allowed: 11 ms"
+
+
+def test_arms_that_are_apart_from_the_beginning_are_stopped_after_a_tenth_of_a_second() -> None:
+    watch, found = SkewWatch(), []
+    for now in (5.0, 5.09, 5.11):
+        watch.observe(timings(left=4.0), now)
+        found.append(watch.fault(now) is not None)
+    assert found == [False, False, True]
 
 
 def test_both_arms_brake_while_one_is_behind_and_go_on_when_it_is_not(
@@ -93,3 +109,6 @@ def test_arms_that_stay_apart_are_activated_again_from_rest(robot: Robot, contro
         world.run(DT, raised(left, 0.05), right=raised(right, 0.05))
     assert SupervisionReason.ARMS_APART in {event.root.kind for event in world.supervisor.events}
     assert world.states != ["following"] * 2
+    world.supervisor.skew.observe(timings(), world.now)
+    world.run(1.0)
+    assert world.states == ["holding"] * 2

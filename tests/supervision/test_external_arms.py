@@ -8,8 +8,9 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from q2r2_control import CartesianController, Robot, load_config
+from q2r2_control import CartesianController, ControllerSettings, Robot, load_config
 from q2r2_control.config.cell import Config
+from q2r2_control.config.control import NamedPairDistance, SupervisionSettings
 from q2r2_control.config.resources import find_resource
 from q2r2_control.config.yaml_text import read_yaml, yaml_of
 from q2r2_control.supervision.joint_watch import (
@@ -111,13 +112,32 @@ def test_elbows_may_swing_while_the_tools_rest_but_not_too_close_to_other_bodies
     assert MIN_DISTANCE - TOLERANCE - 1e-3 < event.detail["distance"] <= MIN_DISTANCE - TOLERANCE
 
 
-def test_a_tool_that_is_away_from_its_reference_starts_over(world: World) -> None:
+def test_the_measured_pair_that_lacks_most_of_its_own_distance_is_named(robot: Robot) -> None:
+    """Another pair is closer, but may be."""
+    _, pair = sorted(robot.distances(robot.home), key=lambda pair: pair.distance)[:2]
+    kept = NamedPairDistance(pair=(pair.name_a, pair.name_b), distance=pair.distance + 0.03)
+    controller = CartesianController(robot, ControllerSettings(pairs=(kept,)))
+    watch = watch_settings(SupervisionSettings(), yields=False)
+    external = ExternalArms(robot, controller, ExternalSettings(tolerance=TOLERANCE), StreamSettings(), watch)
+    zero = np.zeros_like(robot.home)
+    reason = external.too_close(RobotState(robot.home, zero, zero, None, 0.0))
+    assert reason is not None
+    assert reason.detail["pair"] == f"{pair.name_a}|{pair.name_b}"
+    assert reason.detail["key"] == "pairs[0]"
+    assert reason.detail["distance"] == pytest.approx(pair.distance)
+    assert reason.detail["allowed"] == pytest.approx(pair.distance + 0.03 - TOLERANCE)
+
+
+@pytest.mark.parametrize(("joint", "by"), [(0, 0.1), (6, 0.4)], ids=["by a distance", "by an angle alone"])
+def test_a_tool_that_is_away_from_its_reference_starts_over(world: World, joint: int, by: float) -> None:
     moved = world.robot.home.copy()
-    # The distance is larger than a stream's beginning allows, but smaller than a joint's deviation allows.
-    moved[0] += 0.1
+    # This is more than a stream's beginning allows, but less than a joint's deviation allows.
+    moved[joint] += by
     steps = [world.robot.home + share * (moved - world.robot.home) for share in np.linspace(0.0, 1.0, 40)]
     world.show(steps + [moved] * round(0.4 / DT))
     assert world.supervisor.events == []
+    at_the_tool = world.supervisor.update_target("left", world.robot.tool_pose(moved, "left"), world.now)
+    assert kinds(at_the_tool) == "stream_away", "the reference would have to follow a jump"
     world.show([moved] * round(0.4 / DT))
     assert kinds(world.supervisor.events[0]) == "left_behind"
     world.show([moved] * 50)
@@ -151,6 +171,23 @@ def test_a_soft_controller_that_lags_is_followed_and_an_arm_that_runs_away_start
         assert ran < 1.0
     assert kinds(world.supervisor.events[0]) == "off_reference"
     assert world.supervisor.phase is Phase.BRAKING
+
+
+def test_an_arm_whose_targets_end_in_motion_comes_to_rest_without_going_back(world: World) -> None:
+    tool, heights = world.controller.tool_pose("left"), []
+    q = world.robot.home.copy()
+    for tick in range(round(1.5 / DT)):
+        if tick * DT < 0.5:
+            goal = pin.SE3(tool.rotation, tool.translation + np.array([0.0, 0.0, PACE * DT * tick]))
+            world.supervisor.update_target("left", goal, world.now)
+        else:
+            world.supervisor.targets.release("left")
+        reference = world.show([q])
+        assert reference is not None
+        q = reference.q  # The other controller follows at once.
+        heights.append(world.controller.tool_pose("left").translation[2])
+    assert heights[-1] > tool.translation[2] + 0.1
+    assert heights[-1] > max(heights) - 1e-4
 
 
 def test_the_way_home_leads_the_tools_until_they_arrive_and_accepts_no_targets(config: Config) -> None:

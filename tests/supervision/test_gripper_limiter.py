@@ -113,6 +113,16 @@ def test_without_a_trusted_measurement_a_gripper_keeps_its_command(gripper: Cell
     assert gripper.controller.openings == openings
 
 
+@pytest.mark.parametrize(("start", "wanted", "measured"), [(0.0, 1.0, -0.1), (1.0, 0.0, 1.1)])
+def test_a_finger_slightly_beyond_its_calibrated_end_can_still_be_moved(
+    gripper: Cell, start: float, wanted: float, measured: float
+) -> None:
+    gripper.run(start, 0.5)
+    for _ in range(50):
+        gripper.tick(wanted, {"left": measured})
+    assert gripper.granted["left"] == wanted
+
+
 def test_a_gripper_that_is_forced_into_another_body_is_named_and_may_close(gripper: Cell) -> None:
     gripper.run(0.0, 1.6, BESIDE)
     openings = gripper.controller.openings["left"]
@@ -239,6 +249,18 @@ def test_a_gripper_that_closes_fully_or_nearly_holds_no_object(hand: Hand, least
     assert not hand.run(0.0, 1.5, least=least)
 
 
+def test_an_object_of_2_5_mm_is_held_and_stays_held_while_it_is_squeezed_to_1_25_mm(hand: Hand) -> None:
+    assert hand.run(0.0, 1.0, least=0.1)
+    assert hand.run(0.0, 0.5, least=0.05)
+    assert not hand.run(0.0, 0.5, least=0.03), "0.75 mm are no object"
+
+
+def test_an_object_is_held_although_the_measured_opening_is_noisy(hand: Hand) -> None:
+    for noise in (0.25e-3 / STROKE, 0.0) * 30:
+        held = hand.run(0.0, TICK, measured=0.8 + noise)
+    assert held
+
+
 def test_a_slowly_closing_gripper_holds_no_object_on_the_way(hand: Hand) -> None:
     for step in range(100):
         assert not hand.run(0.0, TICK, least=1.0 - 0.01 * step)
@@ -258,7 +280,7 @@ def test_where_no_opening_is_measured_a_closed_gripper_holds() -> None:
     bare = type(BLOCK_CELL).model_validate(data)
     controller, held = CartesianController(Robot.from_config(bare), unhurried(bare)), []
     watch = GraspWatch(controller)
-    for wanted in (1.0, 0.0, 0.0, 1.0):
+    for wanted in (1.0, 0.0, 0.45, 0.55):
         watch.update({"left": wanted, "right": wanted}, {}, 0.0)
         held.append(controller.holding["left"])
     assert held == [False, True, True, False]

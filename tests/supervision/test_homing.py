@@ -9,6 +9,7 @@ from unittest.mock import Mock
 
 import coal
 import numpy as np
+import pinocchio as pin
 import pytest
 
 from q2r2_control import CartesianController, Robot, load_config
@@ -16,12 +17,13 @@ from q2r2_control.config.moving_obstacle import MovingObstacle
 from q2r2_control.events import CommonReason, Reason
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.ros.reasons import RosReason
-from q2r2_control.supervision.homing import JointHoming
+from q2r2_control.supervision.homing import JointHoming, ToolHoming
 from q2r2_control.supervision.reasons import SupervisionReason
 from q2r2_control.supervision.supervisor import Supervisor
 from q2r2_control.supervision.target_stream import StreamSettings
 from q2r2_control.types import Array, Reference, RobotState
 from q2r2_control.verification.contract import Contract
+from q2r2_control.wording import sentence
 from tests.control.test_moving_obstacles import Coal
 from tests.supervision.conftest import CONFIG, STRICT, unhurried
 from tests.support.reasons import kinds
@@ -132,6 +134,18 @@ def test_the_way_home_can_be_interrupted_and_the_arms_come_to_rest_where_they_ar
     assert np.abs(world.state.q - at).max() < 0.04
 
 
+def test_a_way_home_that_its_caller_ends_is_recorded_as_interrupted(
+    robot: Robot, controller: CartesianController
+) -> None:
+    world = World(robot, controller, robot.home + 0.05)
+    homing = world.supervisor.homing
+    assert world.supervisor.go_home() is None
+    world.run(0.1)
+    assert homing.hold() is None
+    assert not homing.active
+    assert kinds(homing.outcome) == "homing_interrupted"
+
+
 def test_while_no_way_is_known_the_arms_rest_and_a_tick_examines_at_most_two_samples(robot: Robot) -> None:
     distances = Mock(side_effect=chain([np.ones(3)], repeat(np.zeros(3))))  # Only the start is free.
     bounds = {"position_lower": robot.position_lower, "position_upper": robot.position_upper}
@@ -172,6 +186,39 @@ def test_the_way_home_waits_for_an_arm_that_is_held_up_and_then_reports_it(robot
             break
     assert homing.outcome is CommonReason.HOMING_HELD_UP
     assert 0.05 < farthest < 0.13  # Otherwise, the arm would start fast when it is free again.
+
+
+@pytest.mark.parametrize(
+    "away",
+    [
+        pytest.param(pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.2])), id="0.2 m away, at 0.1 m/s"),
+        pytest.param(pin.SE3(pin.exp3(np.array([0.0, 0.0, 0.6])), np.zeros(3)), id="0.6 rad away, at 0.3 rad/s"),
+    ],
+)
+def test_tools_that_are_held_up_end_their_way_home_five_seconds_after_they_were_due(
+    robot: Robot, away: pin.SE3
+) -> None:
+    home = robot.tool_pose(robot.home, "left")
+    homing, zero, outcomes = ToolHoming({"left": home}, lambda _arm: home * away), np.zeros_like(robot.home), []
+    for dt in (1.9, 0.2, 4.8, 0.2):  # The target takes 2 s.
+        target = homing.step(robot.home, zero, dt).targets["left"]
+        assert target is not None
+        outcomes.append((target.isApprox(home, 1e-9), homing.outcome))
+    assert outcomes == [(False, None), (True, None), (True, None), (True, CommonReason.HOMING_HELD_UP)]
+
+
+def test_the_fastest_joint_goes_home_at_0_3_rad_per_second(robot: Robot) -> None:
+    homing = JointHoming(robot, lambda: (lambda q: np.ones(3), np.full(3, 0.02)), robot.home)
+    q, speeds = robot.home + 0.1, []
+    q[2] += 0.3
+    while homing.outcome is None:
+        at = homing.step(q, np.zeros_like(q), DT).joints
+        assert at is not None
+        speeds.append(np.abs(at - q).max() / DT)
+        q = at.copy()  # The arms follow at once.
+    assert homing.outcome is CommonReason.HOMING_ARRIVED
+    assert max(speeds) == pytest.approx(0.3)
+    assert sum(speeds) * DT == pytest.approx(0.4)
 
 
 class Beside(World):
@@ -231,5 +278,7 @@ def test_a_moving_obstacle_that_enters_the_way_home_holds_the_arms_up_until_the_
     box = MovingObstacle(shape="box", size=(0.1, 0.1, 0.3), position=tuple(middle.tolist()), speed=0.0)
     world = Beside(controller, turned, box, begin=0.5)
     assert world.go_home() == "homing_held_up"
+    assert world.supervisor.homing.outcome is not None
+    assert "thing" in sentence(world.supervisor.homing.outcome)
     assert np.abs(world.state.v).max() < 0.02
     assert np.abs(world.state.q - turned).max() > 0.1

@@ -28,7 +28,7 @@ def found(robot: Robot, lags: dict[str, float], now: float) -> dict[str, float]:
     return watch.behind(q, dict.fromkeys(SIDES, now))
 
 
-@pytest.mark.parametrize("lags", [(0.03, 0.03), (0.03, 0.1), (0.2, 0.05)])
+@pytest.mark.parametrize("lags", [(0.03, 0.03), (0.03, 0.1), (0.38, 0.05)])
 def test_the_lags_of_moving_arms_are_found_exactly(robot: Robot, lags: tuple[float, float]) -> None:
     wanted = dict(zip(SIDES, lags, strict=True))
     assert found(robot, wanted, 0.8) == pytest.approx(wanted, abs=0.011)
@@ -39,6 +39,33 @@ def test_resting_and_reversing_arms_get_the_least_possible_difference_of_lags(ro
     for now in (-0.1, 0.5 * np.pi, np.pi):
         lags = found(robot, same, float(now))
         assert abs(lags["left"] - lags["right"]) <= 0.011
+
+
+def test_an_arm_is_taken_for_at_most_0_4_s_behind(robot: Robot) -> None:
+    """An arm that is farther away was moved by something else."""
+    assert found(robot, dict.fromkeys(SIDES, 0.6), 1.2) == pytest.approx(dict.fromkeys(SIDES, 0.4), abs=0.011)
+
+
+def test_a_resting_arm_counts_as_far_behind_as_the_moving_arm(robot: Robot) -> None:
+    """All lags explain where the resting arm is."""
+    watch, left = MeasuredLags(robot), robot.arms["left"].joints
+
+    def at(t: float) -> Array:
+        q = robot.home.copy()
+        q[left] = swing(robot, t)[left]
+        return q
+
+    for t in np.arange(0.0, 0.8, DT):
+        watch.note(at(t), float(t))
+    assert watch.behind(at(0.7), dict.fromkeys(SIDES, 0.8)) == pytest.approx(dict.fromkeys(SIDES, 0.1), abs=0.011)
+
+
+def test_a_reference_that_begins_again_has_no_lag_from_its_past(robot: Robot) -> None:
+    watch = MeasuredLags(robot)
+    watch.note(swing(robot, 0.7), 0.7)
+    watch.restart()
+    watch.note(swing(robot, 0.9), 0.8)
+    assert watch.behind(swing(robot, 0.7), dict.fromkeys(SIDES, 0.8)) == dict.fromkeys(SIDES, 0.0)
 
 
 def test_without_a_reference_no_arm_has_a_lag(robot: Robot) -> None:

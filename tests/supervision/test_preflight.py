@@ -38,10 +38,41 @@ def test_a_home_without_a_certified_stop_is_a_fault(robot: Robot, controller: Ca
     asking_for_more = CartesianController(robot, ControllerSettings(min_distance=nearest + 0.01))
     (fault,) = preflight_faults(robot, SETTINGS, asking_for_more)
     assert "no certified stop" in fault
+    assert fault.endswith(", -10.0 mm farther apart than it has to be")
     controller.reset(robot.home + 0.05)
     assert preflight_faults(robot, SETTINGS, controller) == ()
 
     np.testing.assert_allclose(controller.step({}, 1e-3).q, robot.home, atol=1e-12)
+
+
+@pytest.mark.parametrize(("room", "left"), [(0.3, None), (0.2005, "0.0005"), (0.1, "0")])
+def test_a_joint_without_room_between_its_margins_is_a_fault(
+    robot: Robot, monkeypatch: pytest.MonkeyPatch, room: float, left: str | None
+) -> None:
+    lower, upper = robot.position_lower.copy(), robot.position_upper.copy()
+    lower[2], upper[2] = robot.home[2] - 0.5 * room, robot.home[2] + 0.5 * room
+    monkeypatch.setattr(robot, "position_lower", lower)
+    monkeypatch.setattr(robot, "position_upper", upper)
+    faults = preflight_faults(robot, ControllerSettings(position_margin=0.1), None)
+    if left is None:
+        assert faults == ()
+    else:
+        assert faults[0].startswith(f"left_A3: position_margin leaves {left} rad of its range; to change: ")
+
+
+@pytest.mark.parametrize(("by", "beyond"), [(0.01, 0), (-0.01, 0), (0.031, 1), (-0.031, 1)])
+def test_a_home_nearer_to_a_joint_limit_than_the_margin_is_a_fault(
+    robot: Robot, monkeypatch: pytest.MonkeyPatch, by: float, beyond: int
+) -> None:
+    lower, upper = robot.position_lower.copy(), robot.position_upper.copy()
+    lower[2], upper[2] = robot.home[2] - by - 0.05, robot.home[2] - by + 0.05
+    monkeypatch.setattr(robot, "position_lower", lower)
+    monkeypatch.setattr(robot, "position_upper", upper)
+    faults = preflight_faults(robot, ControllerSettings(position_margin=0.02), None)
+    assert len(faults) == beyond
+    for fault in faults:
+        allowed = f"{lower[2] + 0.02:g} .. {upper[2] - 0.02:g} rad, position_margin included"
+        assert fault == f"home: left_A3 = {robot.home[2]:g}; allowed: {allowed}"
 
 
 def test_limits_in_degrees_are_a_fault_and_a_joint_of_many_turns_is_not_a_fault(

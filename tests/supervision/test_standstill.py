@@ -116,6 +116,15 @@ def test_an_arm_that_lags_is_not_reported_as_standing_when_it_starts_or_reverses
     assert list(findings(limits, swinging(speed, hertz), seconds=6.0, delay=delay, lag=lag)) == []
 
 
+def test_a_late_controller_may_begin_late_again_after_a_rest() -> None:
+    motion = swinging(0.6, 1.0)
+
+    def asked(t: float) -> Array:
+        return motion(min(t, 1.0)) if t < 2.0 else motion(t - 2.0)
+
+    assert list(findings(LAGGING_JOINTS, asked, seconds=3.0, delay=0.3, lag=0.03)) == []
+
+
 def test_nothing_is_judged_where_the_loop_or_the_states_have_a_gap() -> None:
     """A loop that stood still sent no commands to follow. Nothing is known about an arm that is not heard."""
 

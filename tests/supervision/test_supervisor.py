@@ -29,6 +29,7 @@ class World:
         self.streams = StreamSettings()
         self.supervisor, self.tool = Supervisor(robot, controller, self.streams, STRICT), controller.tool_pose
         self.q, self.now, self.blocked = robot.home.copy(), 0.0, False
+        self._robot = robot
         self.v, self.lag = np.zeros_like(self.q), DT  # Lag of the arms [s].
         self.commanded: list[Array | None] = []
 
@@ -36,6 +37,9 @@ class World:
     def states(self) -> list[str]:
         """Return the activities of the left arm and the right one."""
         return [self.supervisor.arm_state(arm) for arm in ("left", "right")]
+
+    def measured_tool(self, arm: str) -> pin.SE3:
+        return self._robot.tool_pose(self.q, arm)
 
     def engage(self, by: float = 0.0, seconds: float = 0.3) -> pin.SE3:
         """Let the left arm follow and move up ``by`` [m]. Return where it begins."""
@@ -95,6 +99,47 @@ def test_nothing_is_commanded_before_joint_states_are_valid_and_at_rest(world: W
     assert np.allclose(first, world.q, atol=1e-9)
 
 
+def test_why_arms_cannot_be_activated_is_logged_once_for_each_reason(world: World) -> None:
+    gone, stalled = Reason(CommonReason.OTHER), Reason.of(CommonReason.LOOP_STALLED, duration=1.0)
+    for why in (gone, gone, stalled, stalled):
+        world.supervisor.update_state(why, world.now)
+        world.run(DT, sees=False)
+    assert list(map(kinds, world.supervisor.events)) == ["joint_states: other", "joint_states: loop_stalled"]
+
+
+def test_arms_that_were_stopped_before_their_activation_are_activated_only_after_a_reset(world: World) -> None:
+    world.supervisor.stop(Reason(CommonReason.OTHER))
+    world.run(0.5)
+    assert world.states == ["stopped"] * 2
+    assert world.supervisor.reset() is None
+    world.run(0.2)
+    assert world.states == ["holding"] * 2
+
+
+def test_the_first_reference_is_where_the_drives_hold_the_arms(world: World) -> None:
+    """The measured arms sag. A reference that began there would let them sag again and again."""
+    held, zero = world.q + 0.02, np.zeros_like(world.q)
+    references: list[Array] = []
+    while not references:
+        world.now += DT
+        world.supervisor.update_state(RobotState(world.q, zero, zero, None, world.now, held=held), world.now)
+        if (reference := world.supervisor.tick(world.now, DT)) is not None:
+            references.append(reference.q)
+        assert world.now < 1.0
+    np.testing.assert_allclose(references[0], held, atol=1e-6)
+
+
+def test_an_arm_that_was_pushed_away_from_its_reference_is_engaged_where_it_is(world: World) -> None:
+    world.run(0.2)
+    world.blocked = True
+    world.q = world.q + np.eye(len(world.q))[0] * 0.08
+    world.run(0.02)
+    pushed = world.measured_tool("left")
+    assert np.linalg.norm(pushed.translation - world.tool("left").translation) > world.streams.engage_distance
+    assert world.supervisor.update_target("left", pushed, world.now) is None
+    assert world.states == ["following", "holding"]
+
+
 def test_if_targets_of_one_linked_arm_end_both_hold_until_a_new_stream_of_each_begins(world: World) -> None:
     _, right = world.engage_both()
     world.run(0.3, right=raised(right, 0.01))
@@ -120,8 +165,8 @@ def test_a_target_just_after_the_timeout_does_not_hide_that_targets_had_ended(wo
 
 def test_two_publishers_for_one_linked_arm_stop_both_arms(world: World) -> None:
     left, _ = world.engage_both()
-    for number in (100, 5):
-        world.supervisor.update_target("left", left, world.now, number)
+    found = [kinds(world.supervisor.update_target("left", left, world.now, number)) for number in (900, 5, 901, 6)]
+    assert found == ["", "publisher_changed", "two_publishers", "two_publishers"]
     assert world.states == ["holding"] * 2
 
 
@@ -147,6 +192,16 @@ def test_a_loop_that_stood_still_commands_nothing_and_follows_no_old_target(worl
     world.run(1.0, raised(waited, 0.01))
     assert world.states == ["holding"] * 2
     assert np.allclose(world.q, rest, atol=1e-9)
+
+
+def test_arms_that_were_stopped_stay_stopped_after_the_loop_stood_still(world: World) -> None:
+    world.engage(by=0.1)
+    world.supervisor.stop(Reason(CommonReason.OTHER))
+    world.now += 1.0
+    world.supervisor.stalled(1.0, world.now)
+    world.run(0.5)
+    assert world.states == ["stopped"] * 2
+    assert kinds(world.supervisor.fault) == "other"
 
 
 def test_lost_joint_states_brake_the_arms_and_their_return_moves_nothing(world: World) -> None:
@@ -266,8 +321,10 @@ def test_braking_arms_go_on_braking_when_their_receiver_is_gone(world: World) ->
     assert kinds(world.supervisor.reset()) == "arms_braking"
     world.run(DT)
     assert world.commanded[-1] is not None
+    trusted = [world.supervisor.trusted]
     world.run(0.5)
     assert world.states == ["stopped"] * 2
+    assert [*trusted, world.supervisor.trusted] == [True, False], "drives of torques brake by the measured states"
     assert kinds(world.supervisor.fault) == "other"
 
 

@@ -84,6 +84,16 @@ def test_one_publisher_may_lose_numbers_and_a_new_publisher_is_one_break_that_is
     assert found[-1] == 0
 
 
+@pytest.mark.parametrize(("number", "found"), [(190, 0), (220, 1)], ids=["its own number", "another's number"])
+def test_a_publisher_may_have_sent_for_a_tenth_of_a_second_before_its_next_message_arrives(
+    number: int, found: int
+) -> None:
+    """The publisher sends at most 2000 messages in a second. All but the newest were lost while the network stalled."""
+    watch = SequenceWatch()
+    watch.take(1, 0.0, STREAM_TIMEOUT)
+    assert watch.take(number, 0.001, STREAM_TIMEOUT) == found
+
+
 def test_a_break_counts_for_one_second_and_a_repeated_message_is_one_break() -> None:
     watch = SequenceWatch()
     found = [watch.take(number, now, STREAM_TIMEOUT) for number, now in ((5, 0.0), (5, 0.1), (6, 0.2), (6, 0.3))]
