@@ -25,7 +25,9 @@ from q2r2_franka.stream import SMOOTHING_DELAY
 # Time from the decision about the reference's end until the sessions have it: usually, and after commands that came too
 # late [s]. The reference then goes farther ahead by the difference.
 _MARGIN, _LONGEST_MARGIN = 0.002, 0.016
-_SHORTEST = 0.5  # Shortest step of the reference, as a share of a period.
+# Shortest step of the reference, as a share of a period. The steps are shorter than a period if the robots' time passes
+# more slowly than the loop's.
+_SHORTEST = 0.1
 _FORGETTING = 0.01  # Share of the longest recent tick and margin that each tick forgets.
 _NO_COMMANDS = 0.1  # Time without a command in time, after which this is reported [s].
 _BRAKING_TIME = 0.03  # Time constant with which an arm loses its speed if no torques come [s].

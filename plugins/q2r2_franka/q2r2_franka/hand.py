@@ -1,8 +1,8 @@
 """A Franka Hand in a process of its own, because a call of its library waits until the fingers have arrived.
 
-The hand takes whole motions, not a stream: ``move`` to a width, and ``grasp`` with a force. A command is an opening from
-0 to 1. The fingers move to the newest one when the motion before it has ended, so that they follow a trigger in steps. A
-command to close is a grasp, which holds with its force whatever is between the fingers.
+The hand takes whole motions, not a stream: ``move`` to a width, and ``grasp`` with a force. A command is an opening,
+from 0 to 1. The fingers move to the newest one when the motion before it has ended, so that they follow a trigger in
+steps. A command to close is a grasp, which holds with its force whatever is between the fingers.
 """
 
 from __future__ import annotations

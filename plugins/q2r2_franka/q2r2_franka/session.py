@@ -106,7 +106,7 @@ class ArmSession:
 
     def hear(self, measured: Measured, now: float) -> None:
         """Take a state that came at ``now`` [s]."""
-        self.state.newest, self.state.arrival, self.state.took = measured, now, None
+        self.state.hear(measured, now)
 
     def answer(self, now: float, ahead: float) -> Array:
         """Return the command for the newest state: positions [rad] or torques [Nm] (7,).

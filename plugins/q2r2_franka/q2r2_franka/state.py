@@ -14,7 +14,9 @@ from q2r2_franka.reasons import FrankaReason
 Joints = tuple[float, ...]
 NONE: Joints = (0.0,) * JOINTS
 _SILENT = 0.1  # A robot without a state for longer than this has gone [s].
-_LATE = 0.005  # Time by which states of one arm may come later than those of the other on a busy computer [s].
+# Bounds of the usual time between two states, which is the longest recent one. A state forgets this share of it. The
+# controller keeps the arms apart for the time in which one of them may be ahead [s].
+_LONGEST_USUAL, _FORGETTING = 0.02, 0.002
 
 
 class Mode(StrEnum):
@@ -53,6 +55,7 @@ class SessionState:
     wanted: CommandMode = CommandMode.POSITION
     newest: Measured | None = None
     arrival: float = -math.inf  # Arrival of the newest state.
+    usual: float = PERIOD  # Usual time between two states.
     controlled: bool = False  # True while commands move the robot.
     following: bool = False  # True while the arm follows the reference.
     ended: int = 0  # Number of times that the arm ceased to follow because the robot ended the motion.
@@ -67,10 +70,16 @@ class SessionState:
     def is_silent(self, now: float) -> bool:
         return now - self.arrival > _SILENT
 
+    def hear(self, measured: Measured, now: float) -> None:
+        """Take a state that came at ``now`` [s]."""
+        passed = min(now - self.arrival, _LONGEST_USUAL)
+        self.usual = max(passed, (1.0 - _FORGETTING) * self.usual, PERIOD)
+        self.newest, self.arrival, self.took = measured, now, None
+
     def timing(self, now: float) -> ArmTiming:
         """Return the timing of the arm relative to its reference, at ``now`` [s]."""
         behind = self.behind if self.wanted is CommandMode.POSITION else 0.0
-        return ArmTiming(behind, now - self.arrival, PERIOD, noise=_LATE)
+        return ArmTiming(behind, now - self.arrival, self.usual)
 
     def latest(self, t: float) -> float:
         """Return the latest time of the reference for which there may be a command until ``t`` [s]."""
