@@ -10,7 +10,6 @@ import os
 import pickle
 import select
 import socket
-import struct
 import time
 from collections.abc import Mapping
 from contextlib import ExitStack, suppress
@@ -30,7 +29,10 @@ from q2r2_control.process import (
     start_python,
     thread_priority,
 )
+from q2r2_franka.check import ARMS
+from q2r2_franka.limits import JOINTS
 from q2r2_franka.link import ERRORS, ArmLink
+from q2r2_franka.record import Entry, write_entry
 from q2r2_franka.session import ArmSession, ahead_of_others, follow
 from q2r2_franka.settings import FrankaSettings
 from q2r2_franka.state import ArmCommand, Mode, SessionState
@@ -42,8 +44,6 @@ _POLL = 0.01  # Longest time between two looks at all sessions [s].
 _PATIENCE = 5.0  # Time to wait until the process ends [s].
 _LONGEST_WORD = 5.0  # Time to wait for the reply to commands. A robot may be connected or recovered meanwhile [s].
 _AGAIN = 0.5  # Time from the end of a motion, or from a failed attempt, until the next attempt [s].
-# A record of one command: arm (0 left, 1 right), 1 with torques, periods since the last command, time [s], values.
-RECORD = struct.Struct("<BBHd7d")
 
 
 class AnsweringProcess:
@@ -200,17 +200,18 @@ class _Answering:
                 values = session.answer(came, ahead_of_others(self._sessions, arm, came))
                 link.write(values.tolist())
                 session.state.took = time.monotonic() - came
-                self._write_record(arm, session, came, values)
+                self._write(arm, values)
         except ERRORS as error:
             self._lost(arm, error)
         self._tell(arm)
 
-    def _write_record(self, arm: str, session: ArmSession, came: float, values: Array) -> None:
-        if self._record is not None:
-            assert session.state.newest is not None
-            cycles = min(session.state.newest.cycles, 0xFFFF)
+    def _write(self, arm: str, values: Array, begins: bool = False) -> None:
+        """Add a command, or what a robot holds at the beginning of a motion, to the record."""
+        newest = self._sessions[arm].state.newest
+        if self._record is not None and newest is not None:
             is_torque = self._mode is CommandMode.TORQUE
-            self._record.write(RECORD.pack(arm == "right", is_torque, cycles, came, *values))
+            entry = Entry(ARMS.index(arm), begins, is_torque, newest.cycles, time.monotonic(), values)
+            write_entry(self._record, entry)
 
     def _tell(self, arm: str) -> None:
         with suppress(OSError):  # A loop that stands still gets a later state.
@@ -261,6 +262,7 @@ class _Answering:
                     session.hear(measured, time.monotonic())
                     values = session.answer(time.monotonic(), 0.0)
                     self._links[arm].write(values.tolist(), finished=True)
+                    self._write(arm, values)
                     session.end(session.state.problem)
                 except ERRORS as error:
                     self._lost(arm, error)
@@ -293,7 +295,12 @@ class _Answering:
                 session = self._sessions[arm]
                 session.hear(measured, came)
                 session.begin(np.array(measured.held), came)
-                link.write(session.answer(came, 0.0).tolist())
+                self._write(
+                    arm, np.array(measured.held) if self._mode is CommandMode.POSITION else np.zeros(JOINTS), True
+                )
+                values = session.answer(came, 0.0)
+                link.write(values.tolist())
+                self._write(arm, values)
         except ERRORS as error:
             self._lost(arm, error)
         for arm in self._sessions:
