@@ -1,10 +1,9 @@
 """Serve one simulated FR3 by franka-sim, which runs in an environment of its own: it needs older packages than ours.
 
-    python simulated_arm.py 127.0.0.11 build/fr3.xml 4
+    python simulated_arm.py 127.0.0.11 build/fr3.xml 0 0 0 -1.57 0 1.57 0.785
 
-The last number is the slowness of its clock: with 4, the robot's millisecond takes 4 ms, so that a busy computer keeps
-up. A line on standard input changes what the robot does: ``reflex``, ``user stop`` or ``user stop ends``. It ends
-at the end of standard input. Its standard output says what it does.
+The numbers are the posture in which it starts [rad]. A line on standard input changes what the robot does: ``reflex``,
+``user stop`` or ``user stop ends``. It ends at the end of standard input. Its standard output says what it does.
 """
 
 from __future__ import annotations
@@ -13,15 +12,11 @@ import logging
 import os
 import sys
 import threading
-import time
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import mujoco
-
-if TYPE_CHECKING:
-    from franka_sim import FrankaSimServer
+from franka_sim import FrankaSimServer, mujoco_franka_sim
 
 # Rotor inertia [kg m^2] and dry friction [Nm] of the joints, as the FR3 of MuJoCo Menagerie (franka_fr3/fr3.xml) has
 # them. The URDF of franka-sim has neither.
@@ -30,14 +25,6 @@ FRICTION = (1.137, 1.137, 1.137, 1.137, 0.763, 0.44, 0.248)
 OBJECT_WIDTH = 0.04  # Width of the object between the fingers of the hand [m].
 IDLE, USER_STOPPED = 1, 5  # Modes of the robot.
 REFLEX = 3  # The number of a measured joint velocity above its limit, one of the errors that end in a reflex.
-
-
-def slow_down(slowness: float) -> None:
-    """Let the clock of this process run more slowly. It has to be called before franka-sim is imported."""
-    sleep, perf_counter, monotonic = time.sleep, time.perf_counter, time.monotonic
-    time.sleep = lambda duration: sleep(slowness * duration)
-    time.perf_counter = lambda: perf_counter() / slowness
-    time.monotonic = lambda: monotonic() / slowness
 
 
 def write_model(urdf: Path, path: Path) -> None:
@@ -61,7 +48,7 @@ def obey(server: FrankaSimServer) -> None:
         if asked == "reflex":
             server._abort_with_error(REFLEX, "asked for by a test")
         elif asked == "user stop":
-            server._abort_with_error(REFLEX, "user stop")
+            server._abort_with_error(REFLEX, "user stop asked for by a test")
             state["robot_mode"] = USER_STOPPED
             state["errors"] = [False] * len(state["errors"])
         elif asked == "user stop ends":
@@ -70,10 +57,8 @@ def obey(server: FrankaSimServer) -> None:
     os._exit(0)
 
 
-def main(host: str, model: str, slowness: str) -> None:
-    slow_down(float(slowness))
-    from franka_sim import FrankaSimServer
-
+def main(host: str, model: str, *posture: str) -> None:
+    mujoco_franka_sim.ARM_INITIAL_Q[:] = [float(angle) for angle in posture]
     write_model(FrankaSimServer.DEFAULT_ARM_URDF, Path(model))
     os.environ["FR3_MJCF"] = model
     server = FrankaSimServer(

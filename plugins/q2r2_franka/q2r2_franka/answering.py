@@ -161,6 +161,7 @@ class _Answering:
             arm: ArmSession(arm, its.address, mode, torque_limits[arm]) for arm, its in settings.arms.items()
         }
         self._next_attempt = 0.0
+        self._refused: set[str] = set()  # Arms whose robots refused a motion, such as for an error of an earlier one.
         self._loop_ended = False
 
     def run(self) -> None:
@@ -278,7 +279,10 @@ class _Answering:
                     link.open()
                     session.hear(link.read(), time.monotonic())
                 newest = session.state.newest
-                if newest is not None and (newest.mode is Mode.REFLEX or (newest.errors and newest.mode is Mode.IDLE)):
+                if newest is not None and (
+                    newest.mode is Mode.REFLEX or (arm in self._refused and newest.mode is Mode.IDLE)
+                ):
+                    self._refused.discard(arm)
                     link.recover()
                     session.hear(link.read(), time.monotonic())
         except (*ERRORS, PlantError) as error:
@@ -302,6 +306,7 @@ class _Answering:
                 link.write(values.tolist())
                 self._write(arm, values)
         except ERRORS as error:
+            self._refused.add(arm)
             self._lost(arm, error)
         for arm in self._sessions:
             self._tell(arm)
