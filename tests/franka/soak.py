@@ -22,7 +22,7 @@ from pathlib import Path
 
 from q2r2_control.config.cell import Config, load_config
 from q2r2_control.errors import PlantError
-from q2r2_control.inputs.scripted import ScriptedInput
+from q2r2_control.inputs.scripted import ScriptedInput, trajectory_named
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import SIDES, CommandMode, HandInputs, HandSample
@@ -118,7 +118,7 @@ def cell(record: Path, mode: CommandMode) -> Config:
 
 
 def run(
-    sessions: int, mode: CommandMode, ends: tuple[str, ...], seed: int, slowness: float, folder: Path
+    sessions: int, mode: CommandMode, ends: tuple[str, ...], seed: int, slowness: float, folder: Path, trajectory: str
 ) -> dict[str, object]:
     """Run the sessions, and return what happened as JSON."""
     from q2r2_franka.check import check_commands
@@ -132,12 +132,16 @@ def run(
         plant = FrankaPlant(robot, config)
         plant.longest_wait = plant.longest_session_wait = 60.0
         operator = Operator(dict(arms), sessions, ends, seed)
-        operator.pipeline = pipeline = Pipeline(config, robot, operator, plant, mode)
+        source = ScriptedInput(trajectory) if trajectory else operator
+        operator.pipeline = pipeline = Pipeline(config, robot, source, plant, mode)
+        duration = trajectory_named(trajectory).duration if trajectory else None
         try:
-            summary = pipeline.run(realtime=True)
+            summary = pipeline.run(duration, realtime=True)
             distance = summary.min_distance_mm
+            errors = {arm: its.position_error_mm_rms for arm, its in summary.arms.items()}
+            engaged = {arm: its.engaged_s for arm, its in summary.arms.items()}
         except PlantError as error:
-            operator.report.failure, distance = str(error), None
+            operator.report.failure, distance, errors, engaged = str(error), None, {}, {}
     finally:
         for arm in arms.values():
             arm.kill()
@@ -150,6 +154,8 @@ def run(
         "lost_commands": sum(_LOST in line for line in reflexes),
         "reflexes": [line for line in reflexes if _LOST not in line],
         "min_distance_mm": distance,
+        "position_error_mm_rms": errors,
+        "engaged_s": engaged,
         "commands": {arm: its.commands for arm, its in checked.items()},
         "motions": {arm: its.motions for arm, its in checked.items()},
         "shares": {arm: its.shares for arm, its in checked.items()},
@@ -174,6 +180,7 @@ def main() -> None:
     parser.add_argument("--sessions", type=int, default=1000)
     parser.add_argument("--mode", type=CommandMode, default=CommandMode.TORQUE, choices=["torque", "position"])
     parser.add_argument("--ends", nargs="+", default=ENDS, choices=ENDS)
+    parser.add_argument("--trajectory", default="", help="scripted hands that are followed once, in place of sessions")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--slowness", type=float, default=1.0, help="seconds that a second of all clocks takes")
     parser.add_argument("--json", action="store_true", help="run at once, with the clock as it is")
@@ -186,7 +193,7 @@ def main() -> None:
         return
     slowness = float(os.environ.get("SLOWNESS", "1"))
     with tempfile.TemporaryDirectory() as folder:
-        found = run(given.sessions, given.mode, tuple(given.ends), given.seed, slowness, Path(folder))
+        found = run(given.sessions, given.mode, tuple(given.ends), given.seed, slowness, Path(folder), given.trajectory)
     print(json.dumps(found))
 
 

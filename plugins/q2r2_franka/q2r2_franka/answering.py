@@ -275,6 +275,8 @@ class _Answering:
         try:
             for arm, link in self._links.items():
                 session = self._sessions[arm]
+                if link.is_open and session.state.is_silent(now) and not select.select([link.file], (), (), 0)[0]:
+                    link.lose()  # The robot's control has lost its power, or its network.
                 if not link.is_open:
                     link.open()
                     session.hear(link.read(), time.monotonic())

@@ -87,9 +87,8 @@ def main(arguments: list[str]) -> int:
     checked = check_commands(entries_of(Path(arguments[0])))
     for arm, its in checked.items():
         shares = ", ".join(f"{name} {100.0 * share:.1f} %" for name, share in its.shares.items())
-        print(
-            f"{arm}: {its.commands} commands, {its.motions} motions, {its.lost} periods without one; of limits: {shares}"
-        )
+        print(f"{arm}: {its.commands} commands, {its.motions} motions, {its.lost} periods without a command")
+        print(f"{arm}: of the limits: {shares}")
     return int(any(its.violated for its in checked.values()))
 
 
