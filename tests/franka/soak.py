@@ -17,6 +17,7 @@ import tempfile
 import threading
 import time
 from collections import Counter
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -49,7 +50,7 @@ class Report:
 class Operator(ScriptedInput):
     """Hands that move in circles. Their operator presses again after a pause, and ends each session in some way."""
 
-    def __init__(self, arms: dict[str, SimulatedArm], sessions: int, ends: tuple[str, ...], seed: int) -> None:
+    def __init__(self, arms: Mapping[str, SimulatedArm], sessions: int, ends: tuple[str, ...], seed: int) -> None:
         super().__init__("circle", frequency_hz=0.5)
         self.pipeline: Pipeline | None = None
         self.report = Report()
@@ -98,13 +99,23 @@ class Operator(ScriptedInput):
             arm.ask("reflex")
         elif how == "user stop":
             arm.ask("user stop")
-            threading.Timer(0.0, lambda: (time.sleep(_STOPPED), arm.ask("user stop ends"))).start()
+            _later(_STOPPED, lambda: arm.ask("user stop ends"))
         elif how == "robot freezes":
             os.kill(arm.pid, signal.SIGSTOP)
-            threading.Timer(0.0, lambda: (time.sleep(stall), os.kill(arm.pid, signal.SIGCONT))).start()
+            _later(stall, lambda: os.kill(arm.pid, signal.SIGCONT))
         else:
             arm.kill()
             threading.Thread(target=arm.start).start()
+
+
+def _later(wait: float, do: Callable[[], None]) -> None:
+    """Call ``do`` in another thread after a ``wait`` [s] by the slow clock."""
+
+    def run() -> None:
+        time.sleep(wait)
+        do()
+
+    threading.Thread(target=run).start()
 
 
 def cell(record: Path, mode: CommandMode) -> Config:
@@ -126,12 +137,12 @@ def run(
     from q2r2_franka.record import entries_of
 
     config = cell(folder / "commands.bin", mode)
-    arms = {arm: SimulatedArm(arm, its.home, folder, slowness) for arm, its in config.arms.items()}
+    arms = {str(arm): SimulatedArm(arm, its.home, folder, slowness) for arm, its in config.arms.items()}
     try:
         robot = Robot.from_config(config)
         plant = FrankaPlant(robot, config)
         plant.longest_wait = plant.longest_session_wait = 60.0
-        operator = Operator(dict(arms), sessions, ends, seed)
+        operator = Operator(arms, sessions, ends, seed)
         source = ScriptedInput(trajectory) if trajectory else operator
         operator.pipeline = pipeline = Pipeline(config, robot, source, plant, mode)
         duration = trajectory_named(trajectory).duration if trajectory else None

@@ -224,10 +224,14 @@ class _Answering:
         session.end(reason_of(error))
         link.drop_motion()
         if type(error).__name__ == "NetworkException":
-            link.lose()
-            if session.state.newest is not None:
-                session.state.newest.mode = Mode.ABSENT
+            self._lose(arm)
         self._brake_all()
+
+    def _lose(self, arm: str) -> None:
+        """Forget a lost connection. The last state stays, because the loop needs one at every tick."""
+        self._links[arm].lose()
+        if (newest := self._sessions[arm].state.newest) is not None:
+            newest.mode = Mode.ABSENT
 
     def _brake_all(self) -> None:
         now = time.monotonic()
@@ -276,7 +280,7 @@ class _Answering:
             for arm, link in self._links.items():
                 session = self._sessions[arm]
                 if link.is_open and session.state.is_silent(now) and not select.select([link.file], (), (), 0)[0]:
-                    link.lose()  # The robot's control has lost its power, or its network.
+                    self._lose(arm)  # The robot's control has lost its power, or its network.
                 if not link.is_open:
                     link.open()
                     session.hear(link.read(), time.monotonic())
@@ -317,6 +321,5 @@ class _Answering:
         session = self._sessions[arm]
         session.state.problem = reason_of(error)
         if type(error).__name__ == "NetworkException":
-            self._links[arm].lose()
-            session.state.newest = None
+            self._lose(arm)
         self._tell(arm)

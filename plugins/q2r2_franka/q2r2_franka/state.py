@@ -95,18 +95,22 @@ class SessionState:
 
     def fault(self, now: float) -> Reason | None:
         """Return why the arm cannot be commanded at ``now`` [s], or None."""
-        whose = {"arm": self.arm, "address": self.address}
+        arm, address = self.arm, self.address
         newest = self.newest
         if newest is None or newest.mode is Mode.ABSENT:
-            return Reason.of(FrankaReason.FRANKA_UNREACHABLE, **whose, text=self.problem or "it is not tried yet")
+            return Reason.of(
+                FrankaReason.FRANKA_UNREACHABLE, arm=arm, address=address, text=self.problem or "it is not tried yet"
+            )
         if self.is_silent(now):
-            return Reason.of(FrankaReason.FRANKA_SILENT, **whose)
+            return Reason.of(FrankaReason.FRANKA_SILENT, arm=arm, address=address)
         if self.controlled:
             return None
         if newest.mode not in (Mode.IDLE, Mode.MOVE) or newest.errors:
             errors = newest.errors or "none"
-            return Reason.of(FrankaReason.FRANKA_NOT_READY, **whose, mode=str(newest.mode), errors=errors)
-        return Reason.of(FrankaReason.FRANKA_STARTING, **whose)
+            return Reason.of(
+                FrankaReason.FRANKA_NOT_READY, arm=arm, address=address, mode=str(newest.mode), errors=errors
+            )
+        return Reason.of(FrankaReason.FRANKA_STARTING, arm=arm, address=address)
 
 
 @dataclass(slots=True)

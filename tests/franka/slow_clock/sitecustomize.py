@@ -12,6 +12,6 @@ import time
 _SLOWNESS = float(os.environ.get("SLOWNESS", "1"))
 if _SLOWNESS != 1.0:
     _sleep, _perf_counter, _monotonic = time.sleep, time.perf_counter, time.monotonic
-    time.sleep = lambda duration: _sleep(_SLOWNESS * duration)
+    time.sleep = lambda duration: _sleep(_SLOWNESS * float(duration))
     time.perf_counter = lambda: _perf_counter() / _SLOWNESS
     time.monotonic = lambda: _monotonic() / _SLOWNESS
