@@ -27,6 +27,7 @@ from q2r2_control.inputs.scripted import ScriptedInput, trajectory_named
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import SIDES, CommandMode, HandInputs, HandSample
+from q2r2_control.wording import sentence
 from tests.franka.simulated_arms import ADDRESSES, ROOT, SimulatedArm, why_not
 
 CELL = ROOT / "plugins/q2r2_franka/dual_fr3.yaml"
@@ -50,8 +51,11 @@ class Report:
 class Operator(ScriptedInput):
     """Hands that move in circles. Their operator presses again after a pause, and ends each session in some way."""
 
-    def __init__(self, arms: Mapping[str, SimulatedArm], sessions: int, ends: tuple[str, ...], seed: int) -> None:
-        super().__init__("circle", frequency_hz=0.5)
+    def __init__(
+        self, arms: Mapping[str, SimulatedArm], sessions: int, ends: tuple[str, ...], seed: int, trajectory: str
+    ) -> None:
+        super().__init__(trajectory or "circle", frequency_hz=0.5)
+        self._only_follows = bool(trajectory)
         self.pipeline: Pipeline | None = None
         self.report = Report()
         self._arms, self._sessions, self._ends, self._random = arms, sessions, ends, random.Random(seed)
@@ -61,13 +65,13 @@ class Operator(ScriptedInput):
 
     def poll(self, now: float) -> list[HandSample]:
         self._operate(now)
-        return [replace(sample, inputs=self._buttons(sample.hand, now)) for sample in super().poll(now)]
+        return [replace(sample, inputs=self._pressed(sample, now)) for sample in super().poll(now)]
 
-    def _buttons(self, hand: str, now: float) -> HandInputs:
+    def _pressed(self, sample: HandSample, now: float) -> HandInputs:
         assert self.pipeline is not None
-        if self.pipeline.teleop.engaged[hand]:
-            self._paused[hand] = now
-        return HandInputs(button_lower=(now - self._paused[hand]) % 0.4 > 0.2)
+        if self.pipeline.teleop.engaged[sample.hand]:
+            self._paused[sample.hand] = now
+        return replace(sample.inputs, button_lower=(now - self._paused[sample.hand]) % 0.4 > 0.2)
 
     def _operate(self, now: float) -> None:
         assert self.pipeline is not None
@@ -80,7 +84,7 @@ class Operator(ScriptedInput):
             return
         self._last_good = now
         self._moves_since = now if self._moves_since is None else self._moves_since
-        if now - self._moves_since < _MOVES:
+        if self._only_follows or now - self._moves_since < _MOVES:
             return
         if self.report.sessions == self._sessions:
             self.pipeline.stop()
@@ -142,17 +146,18 @@ def run(
         robot = Robot.from_config(config)
         plant = FrankaPlant(robot, config)
         plant.longest_wait = plant.longest_session_wait = 60.0
-        operator = Operator(arms, sessions, ends, seed)
-        source = ScriptedInput(trajectory) if trajectory else operator
-        operator.pipeline = pipeline = Pipeline(config, robot, source, plant, mode)
+        operator = Operator(arms, sessions, ends, seed, trajectory)
+        operator.pipeline = pipeline = Pipeline(config, robot, operator, plant, mode)
         duration = trajectory_named(trajectory).duration if trajectory else None
         try:
             summary = pipeline.run(duration, realtime=True)
             distance = summary.min_distance_mm
             errors = {arm: its.position_error_mm_rms for arm, its in summary.arms.items()}
+            pauses = Counter(sentence(event.reason) for event in summary.events if event.source == "engaged")
             engaged = {arm: its.engaged_s for arm, its in summary.arms.items()}
         except PlantError as error:
             operator.report.failure, distance, errors, engaged = str(error), None, {}, {}
+            pauses = Counter[str]()
     finally:
         for arm in arms.values():
             arm.kill()
@@ -167,6 +172,7 @@ def run(
         "min_distance_mm": distance,
         "position_error_mm_rms": errors,
         "engaged_s": engaged,
+        "pauses": dict(pauses),
         "commands": {arm: its.commands for arm, its in checked.items()},
         "motions": {arm: its.motions for arm, its in checked.items()},
         "shares": {arm: its.shares for arm, its in checked.items()},
