@@ -129,7 +129,7 @@ FRANKA := .venv-franka
 FRANKA_SIM := .venv-franka-sim
 
 test-franka: $(FRANKA)/.installed $(FRANKA_SIM)/.installed
-	FRANKA_SIM_PYTHON=$(FRANKA_SIM)/bin/python $(FRANKA)/bin/python -m pytest tests/franka
+	FRANKA_SIM_PYTHON=$(CURDIR)/$(FRANKA_SIM)/bin/python $(FRANKA)/bin/python -m pytest tests/franka
 
 $(FRANKA)/.installed: pyproject.toml setup.py plugins/q2r2_franka/pyproject.toml
 	$(PYTHON) -m venv $(FRANKA)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import subprocess
-import sys
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
@@ -82,7 +81,3 @@ class SimulatedArm:
     def reflexes(self) -> list[str]:
         """The lines about reflexes for which nobody asked."""
         return [line for line in self.lines if _ABORTED in line and _ASKED not in line]
-
-
-if __name__ == "__main__":
-    sys.exit(why_not())

@@ -13,10 +13,7 @@ from q2r2_control.types import CommandMode
 from tests.franka.simulated_arms import ADDRESSES, SimulatedArm, why_not
 from tests.franka.soak import CELL, ENDS, run_slowly
 
-pytestmark = [
-    pytest.mark.skipif(why_not() is not None, reason=f"no arm can be simulated: {why_not()}"),
-    pytest.mark.xdist_group("franka_sim"),
-]
+pytestmark = pytest.mark.skipif(why_not() is not None, reason=f"no arm can be simulated: {why_not()}")
 SLOWNESS = 3.0
 PATIENCE = 60.0  # [s]
 
