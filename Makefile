@@ -6,7 +6,7 @@ BIN    := $(VENV)/bin
 # Only one call of pip runs at a time, even if make runs with -j.
 PIP    := flock $(VENV) $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
-.PHONY: setup demo test test-slow test-ros test-ros-slow test-soak lerobot lerobot-ros test-lerobot test-lerobot-ros test-learning test-web web-setup chromium lint lint-page bench docs picture page-picture soak wheel release-check arena clean
+.PHONY: setup demo test test-slow test-ros test-ros-slow test-soak lerobot lerobot-ros test-lerobot test-lerobot-ros test-learning test-franka test-web web-setup chromium lint lint-page bench docs picture page-picture soak wheel release-check arena clean
 .DEFAULT_GOAL := setup
 
 setup: $(VENV)/.installed-dev
@@ -123,6 +123,23 @@ test-lerobot: lerobot
 
 test-lerobot-ros: lerobot-ros
 	$(IN_LEROBOT) -m pytest tests/lerobot -k behind_ros
+
+# Real client library of Franka, and simulated robots, which need older packages in an environment of their own.
+FRANKA := .venv-franka
+FRANKA_SIM := .venv-franka-sim
+
+test-franka: $(FRANKA)/.installed $(FRANKA_SIM)/.installed
+	FRANKA_SIM_PYTHON=$(CURDIR)/$(FRANKA_SIM)/bin/python $(FRANKA)/bin/python -m pytest tests/franka
+
+$(FRANKA)/.installed: pyproject.toml setup.py plugins/q2r2_franka/pyproject.toml
+	$(PYTHON) -m venv $(FRANKA)
+	$(FRANKA)/bin/python -m pip install --quiet --editable . --editable plugins/q2r2_franka 'pytest>=8' 'hypothesis>=6.100'
+	touch $@
+
+$(FRANKA_SIM)/.installed:
+	$(PYTHON) -m venv $(FRANKA_SIM)
+	$(FRANKA_SIM)/bin/python -m pip install --quiet 'franka-sim==1.1.7'
+	touch $@
 
 # This trains a policy that grasps from scripted hands. It takes about ten minutes if nothing else runs.
 test-learning: $(LEROBOT)/.installed

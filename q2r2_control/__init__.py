@@ -1,9 +1,9 @@
 """Bimanual VR teleoperation and Cartesian control with a safe QP controller.
 
 The names of this package are the fixed API, and so are those of the sub-packages that ``docs/api.md`` lists:
-``inputs``, ``plants``, ``recording``, ``export``, ``judging``, ``demo``, ``viewer``, ``gym`` and ``ros``. Everything
-else may move between versions. A name is imported when it is first used, so that a ROS node that only passes messages
-on need not wait for the solver and its compiled kernels.
+``inputs``, ``plants``, ``process``, ``recording``, ``export``, ``judging``, ``demo``, ``viewer``, ``gym`` and ``ros``.
+Everything else may move between versions. A name is imported when it is first used, so that a ROS node that only passes
+messages on need not wait for the solver and its compiled kernels.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ if TYPE_CHECKING:  # The word "as" tells type checkers that a name is public.
     from q2r2_control.config.cell import load_config as load_config
     from q2r2_control.config.control import ControllerSettings as ControllerSettings
     from q2r2_control.config.moving_obstacle import MovingObstacle as MovingObstacle
+    from q2r2_control.config.strict import StrictModel as StrictModel
     from q2r2_control.control.constraints import Constraint as Constraint
     from q2r2_control.control.controller import CartesianController as CartesianController
     from q2r2_control.control.qp import QpProblem as QpProblem
@@ -119,6 +120,7 @@ _MODULES = {
     "SampledTargets": "loop.sampled_targets",
     "Solver": "control.qp",
     "StepReport": "types",
+    "StrictModel": "config.strict",
     "SupervisionReason": "supervision.reasons",
     "Task": "control.tasks.external",
     "TeleopReason": "teleop.reasons",

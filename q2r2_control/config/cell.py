@@ -188,6 +188,9 @@ class Config(StrictModel):
     )
     input: str = Field("scripted", min_length=1, description="input device, if no --input is given")
     plant: str = Field("mujoco", min_length=1, description="plant, if no --plant is given")
+    plant_settings: dict[str, dict[str, Any]] = Field(
+        {}, description="settings of plants of other packages, by their entry point's name; each checks its own"
+    )
     controller: ControllerKind = Field(ControllerKind.BUILTIN, description="builtin, or external: for q2r2 ros up")
     external: ExternalConfig | None = Field(
         None, description="controllers of other packages; only with controller: external"

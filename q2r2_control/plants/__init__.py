@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from q2r2_control.plants.base import SessionPlant as SessionPlant
     from q2r2_control.plants.base import WaitingPlant as WaitingPlant
     from q2r2_control.plants.base import WindowedPlant as WindowedPlant
+    from q2r2_control.plants.base import check_command as check_command
+    from q2r2_control.plants.fri.answers import ReferencePath as ReferencePath
     from q2r2_control.plants.fri.reasons import FriReason as FriReason
     from q2r2_control.plants.mujoco import MujocoPlant as MujocoPlant
     from q2r2_control.plants.mujoco_cameras import CellPictures as CellPictures
@@ -24,9 +26,11 @@ _MODULES = {
     "CellPictures": "mujoco_cameras",
     "FriReason": "fri.reasons",
     "MujocoPlant": "mujoco",
+    "ReferencePath": "fri.answers",
     "SessionPlant": "base",
     "WaitingPlant": "base",
     "WindowedPlant": "base",
+    "check_command": "base",
 }
 __all__ = list(_MODULES)
 __getattr__, __dir__ = lazy_exports(__name__, _MODULES)

@@ -219,5 +219,6 @@ def _requests() -> Iterator[Any]:
 
 
 def reason_of(error: BaseException) -> str:
+    """Return what an exception says, in one line."""
     reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error) or repr(error)
     return " ".join(reason.split())

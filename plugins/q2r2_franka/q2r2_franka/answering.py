@@ -1,0 +1,325 @@
+"""Answer the robots in a process of its own, so that no tick of the loop makes a robot wait.
+
+The loop sends commands to this process, and gets back whether they came in time. After each state of a robot it gets
+the state of the session. If the loop ends in any way, the process goes on until the arms rest on their certified stop.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import select
+import socket
+import time
+from collections.abc import Mapping
+from contextlib import ExitStack, suppress
+from subprocess import TimeoutExpired
+from typing import BinaryIO
+
+import numpy as np
+
+from q2r2_control import Array, CommandMode, PlantError
+from q2r2_control.process import (
+    few_garbage_collections,
+    how_it_ended,
+    leave_signals_to_the_run,
+    real_time,
+    reason_of,
+    reserve,
+    start_python,
+    thread_priority,
+)
+from q2r2_franka.check import ARMS
+from q2r2_franka.limits import JOINTS
+from q2r2_franka.link import ERRORS, ArmLink
+from q2r2_franka.record import Entry, write_entry
+from q2r2_franka.session import ArmSession, ahead_of_others, follow
+from q2r2_franka.settings import FrankaSettings
+from q2r2_franka.state import ArmCommand, Mode, SessionState
+
+_TAKEN, _TOO_LATE, _BEGUN = b"1", b"0", b"2"  # The replies to commands, and the first reply.
+_RESERVED = 0.0006, 0.001  # Processor time that is reserved for answers in each interval [s].
+_LARGEST = 1 << 16  # Largest datagram between the processes [bytes].
+_POLL = 0.01  # Longest time between two looks at all sessions [s].
+_PATIENCE = 5.0  # Time to wait until the process ends [s].
+_LONGEST_WORD = 5.0  # Time to wait for the reply to commands. A robot may be connected or recovered meanwhile [s].
+_AGAIN = 0.5  # Time from the end of a motion, or from a failed attempt, until the next attempt [s].
+
+
+class AnsweringProcess:
+    """The loop's end of the connection to the process."""
+
+    def __init__(self, settings: FrankaSettings, mode: CommandMode, torque_limits: Mapping[str, Array]) -> None:
+        """Start the process. It connects to the robots afterwards.
+
+        Raises:
+            PlantError: If the process cannot begin.
+        """
+        # States that nobody reads may fill their connection. Replies to commands must not wait for that.
+        self._commands, commands = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._states, states = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._states.setblocking(False)
+        links = commands.fileno(), states.fileno()
+        with commands, states:
+            self._process = start_python(f"from {__name__} import main; main{links}", {}, files=links)
+        self.pid = self._process.pid
+        priority = thread_priority()
+        self._commands.send(pickle.dumps((priority and priority + 1, settings, mode, dict(torque_limits))))
+        word = b""
+        with suppress(ConnectionError):
+            word = self._commands.recv(_LARGEST)
+        if word != _BEGUN:
+            raise self._end(word)
+        self._commands.settimeout(_LONGEST_WORD)
+
+    def send(self, commands: dict[str, ArmCommand]) -> bool:
+        """Send a command for each arm; returns whether all of them came in time. If not, none of them is followed.
+
+        Raises:
+            PlantError: If the process has ended, or does not reply.
+        """
+        try:
+            self._commands.send(pickle.dumps(commands))
+            word = self._commands.recv(_LARGEST)
+        except TimeoutError as error:
+            raise PlantError(f"the process that answers the robots says nothing for {_LONGEST_WORD:g} s") from error
+        except ConnectionError:
+            word = b""
+        if word not in (_TAKEN, _TOO_LATE):
+            raise self._end(word)
+        return word == _TAKEN
+
+    def receive(self) -> list[SessionState]:
+        """Return each arm's newest state since the last call.
+
+        Raises:
+            PlantError: If the process has ended.
+        """
+        newest: dict[int, bytes] = {}
+        with suppress(BlockingIOError):
+            while said := self._states.recv(_LARGEST):
+                newest[said[0]] = said  # After a late tick only the newest state is decoded.
+            raise self._end()
+        return [pickle.loads(said[1:]) for said in newest.values()]
+
+    def _end(self, last_word: bytes = b"") -> PlantError:
+        """Return an error that says how the process has ended."""
+        if not last_word:
+            with suppress(OSError):
+                last_word = self._commands.recv(_LARGEST)
+        if last_word:
+            return PlantError(f"the robots are answered no more: {last_word.decode()}")
+        return PlantError(how_it_ended("the process that answers the robots", self._process.wait(_PATIENCE)))
+
+    def close(self) -> None:
+        """Let the process end as soon as the arms stand still."""
+        self._commands.close()
+        try:
+            self._process.wait(_PATIENCE)
+        except TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._states.close()
+
+
+def main(commands: int, states: int) -> None:
+    """Run in the process: answer until the loop has ended and the arms stand still."""
+    leave_signals_to_the_run()
+    with socket.socket(fileno=commands) as from_loop, socket.socket(fileno=states) as to_loop:
+        try:
+            priority, settings, mode, torque_limits = pickle.loads(from_loop.recv(_LARGEST))
+            from_loop.setblocking(False)
+            to_loop.setblocking(False)
+            with ExitStack() as stack:
+                if priority:
+                    stack.enter_context(real_time(priority))
+                    reserve(*_RESERVED)
+                stack.enter_context(few_garbage_collections())
+                record = stack.enter_context(open(settings.record, "wb")) if settings.record else None
+                _Answering(from_loop, to_loop, settings, mode, torque_limits, record).run()
+        except Exception as error:
+            with suppress(OSError):
+                from_loop.send(reason_of(error).encode())
+    os._exit(0)  # The library's destructors would wait for robots that have gone.
+
+
+class _Answering:
+    def __init__(
+        self,
+        commands: socket.socket,
+        states: socket.socket,
+        settings: FrankaSettings,
+        mode: CommandMode,
+        torque_limits: Mapping[str, Array],
+        record: BinaryIO | None,
+    ) -> None:
+        self._commands, self._states, self._mode, self._record = commands, states, mode, record
+        self._arms = list(settings.arms)
+        enforces = settings.real_time == "enforce"
+        self._links = {arm: ArmLink(its, enforces) for arm, its in settings.arms.items()}
+        self._sessions = {
+            arm: ArmSession(arm, its.address, mode, torque_limits[arm]) for arm, its in settings.arms.items()
+        }
+        self._next_attempt = 0.0
+        self._refused: set[str] = set()  # Arms whose robots refused a motion, such as for an error of an earlier one.
+        self._loop_ended = False
+
+    def run(self) -> None:
+        self._commands.send(_BEGUN)
+        while True:
+            files = {link.file: arm for arm, link in self._links.items() if link.is_open}
+            waits = [*files] if self._loop_ended else [*files, self._commands.fileno()]
+            ready = select.select(waits, (), (), _POLL)[0]
+            if not self._loop_ended and not self._take_commands():
+                self._loop_ended = True
+                self._brake_all()
+            for file in ready:
+                if file in files:
+                    self._answer(files[file])
+            if self._tend(time.monotonic()):
+                return
+
+    def _take_commands(self) -> bool:
+        """Take all commands before an answer; returns whether the loop is still there."""
+        try:
+            while said := self._commands.recv(_LARGEST):
+                self._commands.send(_TAKEN if follow(self._sessions, pickle.loads(said)) else _TOO_LATE)
+        except BlockingIOError:
+            return True
+        except ConnectionError:
+            pass
+        return False
+
+    def _answer(self, arm: str) -> None:
+        """Read the newest state of a robot, and send its command."""
+        session, link = self._sessions[arm], self._links[arm]
+        came = time.monotonic()
+        try:
+            measured = link.read()
+            session.hear(measured, came)
+            if session.state.controlled:
+                values = session.answer(came, ahead_of_others(self._sessions, arm, came))
+                link.write(values.tolist())
+                session.state.took = time.monotonic() - came
+                self._write(arm, values)
+        except ERRORS as error:
+            self._lost(arm, error)
+        self._tell(arm)
+
+    def _write(self, arm: str, values: Array, begins: bool = False) -> None:
+        """Add a command, or what a robot holds at the beginning of a motion, to the record."""
+        newest = self._sessions[arm].state.newest
+        if self._record is not None and newest is not None:
+            is_torque = self._mode is CommandMode.TORQUE
+            entry = Entry(ARMS.index(arm), begins, is_torque, newest.cycles, time.monotonic(), values)
+            write_entry(self._record, entry)
+
+    def _tell(self, arm: str) -> None:
+        with suppress(OSError):  # A loop that stands still gets a later state.
+            self._states.send(bytes([self._arms.index(arm)]) + pickle.dumps(self._sessions[arm].state))
+
+    def _lost(self, arm: str, error: Exception) -> None:
+        """Take note that the robot has ended the motion, or that its connection is lost."""
+        link, session = self._links[arm], self._sessions[arm]
+        session.end(reason_of(error))
+        link.drop_motion()
+        if type(error).__name__ == "NetworkException":
+            self._lose(arm)
+        self._brake_all()
+
+    def _lose(self, arm: str) -> None:
+        """Forget a lost connection. The last state stays, because the loop needs one at every tick."""
+        self._links[arm].lose()
+        if (newest := self._sessions[arm].state.newest) is not None:
+            newest.mode = Mode.ABSENT
+
+    def _brake_all(self) -> None:
+        now = time.monotonic()
+        self._next_attempt = now + _AGAIN
+        for session in self._sessions.values():
+            session.brake(now)
+
+    def _tend(self, now: float) -> bool:
+        """Bring sessions forward; returns whether everything has ended."""
+        for arm, session in self._sessions.items():
+            if session.state.controlled and session.state.is_silent(now):
+                session.end("no state for a while")
+                self._links[arm].drop_motion()
+                self._brake_all()
+        controlled = [session.state.controlled for session in self._sessions.values()]
+        if all(controlled) and not self._loop_ended:
+            return False
+        if not all(session.is_still(now) for session in self._sessions.values()):
+            return False
+        self._finish()
+        if self._loop_ended:
+            return True
+        if now >= self._next_attempt:
+            self._begin(now)
+        return False
+
+    def _finish(self) -> None:
+        """End the motions of arms that rest, so that their robots hold them."""
+        for arm, session in self._sessions.items():
+            if session.state.controlled:
+                try:
+                    measured = self._links[arm].read()
+                    session.hear(measured, time.monotonic())
+                    values = session.answer(time.monotonic(), 0.0)
+                    self._links[arm].write(values.tolist(), finished=True)
+                    self._write(arm, values)
+                    session.end(session.state.problem)
+                except ERRORS as error:
+                    self._lost(arm, error)
+                self._tell(arm)
+
+    def _begin(self, now: float) -> None:
+        """Connect, recover and start robots. Nothing moves meanwhile, so that these calls may wait."""
+        self._next_attempt = now + _AGAIN
+        try:
+            for arm, link in self._links.items():
+                session = self._sessions[arm]
+                if link.is_open and session.state.is_silent(now) and not select.select([link.file], (), (), 0)[0]:
+                    self._lose(arm)  # The robot's control has lost its power, or its network.
+                if not link.is_open:
+                    link.open()
+                    session.hear(link.read(), time.monotonic())
+                newest = session.state.newest
+                if newest is not None and (
+                    newest.mode is Mode.REFLEX or (arm in self._refused and newest.mode is Mode.IDLE)
+                ):
+                    self._refused.discard(arm)
+                    link.recover()
+                    session.hear(link.read(), time.monotonic())
+        except (*ERRORS, PlantError) as error:
+            self._fail(arm, error)
+            return
+        if not all(
+            its.state.newest is not None and its.state.newest.mode is Mode.IDLE for its in self._sessions.values()
+        ):
+            return
+        try:
+            for arm, link in self._links.items():
+                measured = link.start(self._mode)
+                came = time.monotonic()
+                session = self._sessions[arm]
+                session.hear(measured, came)
+                session.begin(np.array(measured.held), came)
+                self._write(
+                    arm, np.array(measured.held) if self._mode is CommandMode.POSITION else np.zeros(JOINTS), True
+                )
+                values = session.answer(came, 0.0)
+                link.write(values.tolist())
+                self._write(arm, values)
+        except ERRORS as error:
+            self._refused.add(arm)
+            self._lost(arm, error)
+        for arm in self._sessions:
+            self._tell(arm)
+
+    def _fail(self, arm: str, error: Exception) -> None:
+        session = self._sessions[arm]
+        session.state.problem = reason_of(error)
+        if type(error).__name__ == "NetworkException":
+            self._lose(arm)
+        self._tell(arm)

@@ -1,0 +1,96 @@
+"""Check recorded commands against the published limits: ``python -m q2r2_franka.check FILE``.
+
+The commands are differenced 1 ms apart, as the robot sees them. For a period without a command, the robot goes on with
+the last acceleration, and so does the check.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from q2r2_control import Array
+from q2r2_franka import limits
+from q2r2_franka.limits import PERIOD
+from q2r2_franka.record import Entry, entries_of
+
+ARMS = "left", "right"
+# A robot rounds positions to doubles; the third difference of this rounding is far below this share of a limit.
+_ROUNDING = 1e-3
+
+
+@dataclass
+class Checked:
+    """The result for one arm."""
+
+    commands: int = 0
+    motions: int = 0
+    lost: int = 0  # Number of periods without a command.
+    # The greatest share of each limit. A share above 1 violates the limit.
+    shares: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def violated(self) -> list[str]:
+        return [name for name, share in self.shares.items() if share > 1.0 + _ROUNDING]
+
+    def see(self, name: str, share: Array | float) -> None:
+        self.shares[name] = max(self.shares.get(name, 0.0), float(np.max(share)))
+
+
+def check_commands(entries: Iterable[Entry]) -> dict[str, Checked]:
+    """Return the result for each arm of which there are commands."""
+    checked: dict[str, Checked] = {}
+    histories: dict[str, list[Array]] = {}
+    for entry in entries:
+        arm = ARMS[entry.arm]
+        result = checked.setdefault(arm, Checked())
+        if entry.begins:
+            result.motions += 1
+            histories[arm] = [entry.values] * 4
+            continue
+        result.commands += 1
+        result.lost += entry.cycles - 1
+        history = histories[arm]
+        if entry.is_torque:
+            result.see("torque", np.abs(entry.values) / limits.TORQUE)
+            result.see("torque rate", np.abs(entry.values - history[-1]) / (limits.TORQUE_RATE * PERIOD))
+            history[:] = [*history[1:], entry.values]
+            continue
+        for _ in range(entry.cycles - 1):
+            history[:] = [*history[1:], 3.0 * history[-1] - 3.0 * history[-2] + history[-3]]
+        history[:] = [*history[1:], entry.values]
+        _check_positions(result, history)
+    return checked
+
+
+def _check_positions(result: Checked, history: list[Array]) -> None:
+    """Check the newest of four positions (7,) [rad], which are 1 ms apart."""
+    oldest, older, before, newest = history
+    centre, half = 0.5 * (limits.UPPER + limits.LOWER), 0.5 * (limits.UPPER - limits.LOWER)
+    result.see("position", np.abs(newest - centre) / half)
+    velocity = (newest - before) / PERIOD
+    least, greatest = limits.velocity_limits(before)
+    result.see("velocity", np.where(velocity < 0.0, velocity / (least - 1e-9), velocity / (greatest + 1e-9)))
+    result.see("acceleration", np.abs(newest - 2.0 * before + older) / PERIOD**2 / limits.ACCELERATION)
+    result.see("jerk", np.abs(newest - 3.0 * before + 3.0 * older - oldest) / PERIOD**3 / limits.JERK)
+
+
+def main(arguments: list[str]) -> int:
+    """Print the greatest share of each limit; returns 1 if one is violated."""
+    if len(arguments) != 1 or not Path(arguments[0]).is_file():
+        print("usage: python -m q2r2_franka.check FILE, a file of plant_settings.franka.record", file=sys.stderr)
+        return 2
+    checked = check_commands(entries_of(Path(arguments[0])))
+    for arm, its in checked.items():
+        shares = ", ".join(f"{name} {100.0 * share:.1f} %" for name, share in its.shares.items())
+        print(f"{arm}: {its.commands} commands, {its.motions} motions, {its.lost} periods without a command")
+        print(f"{arm}: of the limits: {shares}")
+    return int(any(its.violated for its in checked.values()))
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,128 @@
+"""The connection to one robot by pylibfranka, whose calls this module alone makes.
+
+pylibfranka keeps Python's global lock while it waits for a state. Two threads with an arm each would make each other
+late. The process therefore waits for the sockets of all robots at once by ``select``, and reads a state only when it is
+there. pylibfranka does not name its socket, so that it is found among the files that a connection opens.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+from collections.abc import Sequence
+from typing import Any
+
+import pylibfranka
+
+from q2r2_control import CommandMode, PlantError
+from q2r2_franka.limits import PERIOD
+from q2r2_franka.settings import FrankaArmSettings, LoadSettings
+from q2r2_franka.state import Measured, Mode
+
+ERRORS = (RuntimeError, pylibfranka.FrankaException)
+_FILES = "/proc/self/fd"
+# A robot's own controller of positions may filter the commands in Desk's settings. Its stiffness stays as it is.
+_CONTROLLER = pylibfranka.ControllerMode.JointImpedance
+_kept: list[Any] = []  # A motion whose connection is lost may not be destroyed, because that ends the process.
+
+
+class ArmLink:
+    """The connection to one robot. Each method may raise one of ``ERRORS``."""
+
+    def __init__(self, settings: FrankaArmSettings, enforces_real_time: bool) -> None:
+        self._settings = settings
+        self._real_time = (
+            pylibfranka.RealtimeConfig.kEnforce if enforces_real_time else pylibfranka.RealtimeConfig.kIgnore
+        )
+        self._robot: Any = None
+        self._motion: Any = None
+        self._last = 0.0  # Time of the newest state by the robot's clock [s].
+        self.file = -1  # File descriptor of the socket for states; -1 without a connection.
+
+    @property
+    def is_open(self) -> bool:
+        return self._robot is not None
+
+    def open(self) -> None:
+        """Connect, and set what the cell says of collisions and the load."""
+        before = _datagram_sockets()
+        robot = pylibfranka.Robot(self._settings.address, self._real_time)
+        opened = _datagram_sockets() - before
+        if len(opened) != 1:
+            raise PlantError(f"pylibfranka opened {len(opened)} sockets for states; allowed: one")
+        collision, load = self._settings.collision, self._settings.load
+        torques, forces = list(collision.torques), list(collision.forces)
+        robot.set_collision_behavior(torques, torques, forces, forces)
+        if load is not None:
+            robot.set_load(load.mass, list(load.centre), _matrix(load))
+        self._robot, self.file = robot, opened.pop()
+
+    def lose(self) -> None:
+        """Forget a connection that is lost."""
+        _kept.extend(one for one in (self._motion, self._robot) if one is not None)
+        self._robot = self._motion = None
+        self.file = -1
+
+    def read(self) -> Measured:
+        """Return the newest state. It waits if there is none."""
+        state = self._robot.read_once() if self._motion is None else self._motion.readOnce()[0]
+        now = state.time.to_sec()
+        cycles, self._last = max(round((now - self._last) / PERIOD), 1), now
+        return Measured(
+            mode=Mode(state.robot_mode.name),
+            errors="" if not state.current_errors else str(state.current_errors).strip("[]"),
+            cycles=cycles,
+            q=tuple(state.q),
+            v=tuple(state.dq),
+            tau=tuple(state.tau_J),
+            external=tuple(state.tau_ext_hat_filtered),
+            held=tuple(state.q_d),
+        )
+
+    def start(self, mode: CommandMode) -> Measured:
+        """Begin a motion, and return the first state of it."""
+        if mode is CommandMode.TORQUE:
+            self._motion = self._robot.start_torque_control()
+        else:
+            self._motion = self._robot.start_joint_position_control(_CONTROLLER)
+        self._mode = mode
+        return self.read()
+
+    def write(self, values: Sequence[float], finished: bool = False) -> None:
+        """Send positions [rad] or torques [Nm]. With ``finished`` the motion ends, and the robot holds the arm."""
+        kind = pylibfranka.Torques if self._mode is CommandMode.TORQUE else pylibfranka.JointPositions
+        command = kind(list(values))
+        command.motion_finished = finished
+        self._motion.writeOnce(command)
+        if finished:
+            self._motion = None
+
+    def drop_motion(self) -> None:
+        """Take note that the robot has ended the motion."""
+        if self._motion is not None:
+            _kept.append(self._motion)
+            self._motion = None
+
+    def recover(self) -> None:
+        """Clear the errors of a reflex. The robot holds the arm."""
+        _kept.clear()
+        self._robot.automatic_error_recovery()
+
+
+def _matrix(load: LoadSettings) -> list[float]:
+    xx, xy, xz, yy, yz, zz = load.inertia
+    return [xx, xy, xz, xy, yy, yz, xz, yz, zz]
+
+
+def _datagram_sockets() -> set[int]:
+    found = set()
+    for name in os.listdir(_FILES):
+        try:
+            if not os.readlink(f"{_FILES}/{name}").startswith("socket:"):
+                continue
+            with socket.socket(fileno=os.dup(int(name))) as one:
+                if one.family in (socket.AF_INET, socket.AF_INET6) and one.type == socket.SOCK_DGRAM:
+                    found.add(int(name))
+        except OSError:  # The file was closed meanwhile.
+            continue
+    return found

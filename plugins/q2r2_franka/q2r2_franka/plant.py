@@ -1,0 +1,157 @@
+"""One or two Franka arms. A process answers the robots, and gets the arms' motion from the loop."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+from q2r2_control import Array, Command, CommandMode, Config, ConfigError, PlantError, Reason, Robot, RobotState
+from q2r2_control.plants import ArmTiming, check_command
+from q2r2_franka.answering import AnsweringProcess
+from q2r2_franka.cell import FrankaCell
+from q2r2_franka.hand import Hand
+from q2r2_franka.limits import JOINTS
+from q2r2_franka.settings import franka_settings
+from q2r2_franka.state import SessionState
+
+_LOOKS = 0.01  # Time between two looks at the robots during a wait [s].
+
+
+class FrankaPlant:
+    """A plant whose arms start where they stand, also after each motion that a robot has ended."""
+
+    modes: tuple[CommandMode, ...] = (CommandMode.TORQUE, CommandMode.POSITION)
+    realtime_only = True
+    # Times that a reset waits for a state of each robot, and for all motions [s]. Without all motions a run begins
+    # nevertheless.
+    longest_wait = longest_session_wait = 10.0
+
+    def __init__(self, robot: Robot, config: Config) -> None:
+        """Make the plant.
+
+        Raises:
+            ConfigError: If an arm lacks a robot or does not have seven joints, or if a late tick would be split.
+        """
+        self._settings = franka_settings(config)
+        for arm, its in robot.arms.items():
+            if arm not in self._settings.arms:
+                raise ConfigError(
+                    f"plant_settings.franka.{arm}: missing; allowed: the robot of each arm, as {{address: 172.16.0.2}}"
+                )
+            if len(its.joints) != JOINTS:
+                raise ConfigError(
+                    f"plant_settings.franka.{arm}: the arm has {len(its.joints)} joints; allowed: {JOINTS}"
+                )
+        self._robot = robot
+        self._period, self._longest = 1.0 / config.nominal_rate_hz, config.control.max_substep
+        if self._longest < 2.0 * self._period:
+            allowed = "allowed with robots: two ticks of loop_rate_hz or more, such as 0.01"
+            raise ConfigError(f"control.max_substep = {self._longest:g}: {allowed}")
+        self.begin(CommandMode.POSITION)
+        self._answering: AnsweringProcess | None = None
+        self._hands: dict[str, Hand] = {}
+
+    @classmethod
+    def from_config(cls, robot: Robot, config: Config) -> FrankaPlant:
+        return cls(robot, config)
+
+    def begin(self, mode: CommandMode, stopped: Callable[[], bool] = lambda: False) -> None:
+        """See :meth:`SessionPlant.begin`."""
+        self._mode, self._stopped = mode, stopped
+
+    def reset(self, q: Array | None = None) -> None:
+        """Connect to the robots, and begin their motions.
+
+        Raises:
+            PlantError: If a robot is not reached, or if ``q`` is given, because real arms cannot be placed.
+        """
+        if q is not None:
+            raise PlantError("reset q: a real arm starts where it stands")
+        self.close()
+        states = [SessionState(arm, its.address, self._mode) for arm, its in self._settings.arms.items()]
+        self.cell = FrankaCell(self._robot, states, self._period, self._longest)
+        limits = {arm: self._robot.torque_limit[self._robot.arms[arm].joints] for arm in self._settings.arms}
+        self._answering = AnsweringProcess(self._settings, self._mode, limits)
+        self._hands = {
+            arm: Hand(arm, its.address, its.hand) for arm, its in self._settings.arms.items() if its.hand is not None
+        }
+        try:
+            self._wait()
+        except PlantError:
+            self.close()
+            raise
+
+    def _wait(self) -> None:
+        """Wait for the robots; raises :class:`PlantError` if one is not reached."""
+        began = time.monotonic()
+        while not self.cell.is_heard or self._looks_for_fault() is not None:
+            passed = time.monotonic() - began
+            if self._stopped() or passed >= (self.longest_session_wait if self.cell.is_heard else self.longest_wait):
+                break
+            time.sleep(_LOOKS)
+            self.due(time.monotonic())
+        if not self.cell.is_heard:
+            problem = self._looks_for_fault()
+            why = "" if problem is None else problem.kind.template.format(**problem.detail)
+            raise PlantError(f"{why}; waited for {time.monotonic() - began:.1f} s")
+
+    def _looks_for_fault(self) -> Reason | None:
+        return next((why for its in self.cell.states.values() if (why := its.fault(time.monotonic()))), None)
+
+    def due(self, now: float) -> tuple[float, float]:
+        """See :meth:`SessionPlant.due`; raises :class:`PlantError` if nothing answers the robots any more."""
+        assert self._answering is not None
+        for state in self._answering.receive():
+            self.cell.update(state)
+        return self.cell.due(now)
+
+    def withdraws(self) -> bool:
+        """See :meth:`SessionPlant.withdraws`."""
+        return self.cell.withdraws()
+
+    def delay(self) -> float:
+        """See :meth:`SessionPlant.delay`."""
+        return self.cell.delay()
+
+    def timings(self) -> dict[str, ArmTiming]:
+        """See :meth:`SessionPlant.timings`."""
+        return self.cell.timings()
+
+    def lead(self) -> float:
+        """See :meth:`SessionPlant.lead`."""
+        return self.cell.lead()
+
+    def fault(self) -> Reason | None:
+        """See :meth:`SessionPlant.fault`."""
+        return self.cell.fault()
+
+    def sessions(self) -> dict[str, str]:
+        return {arm: state.words for arm, state in self.cell.states.items()}
+
+    def apply(self, command: Command) -> None:
+        check_command(command, self._robot, self.modes)
+        assert self._answering is not None
+        self.cell.sent(self._answering.send(self.cell.apply(command)))
+        for arm, hand in self._hands.items():
+            if arm in command.grippers:
+                hand.command(float(command.grippers[arm]))
+
+    def advance(self, dt: float) -> None:
+        """Do nothing, because the time of real arms passes by itself."""
+
+    def state(self) -> RobotState:
+        return self.cell.state()
+
+    def gripper_openings(self) -> dict[str, float]:
+        """See :meth:`Plant.gripper_openings`. Before a run, hands that will be measured count as open."""
+        if self._answering is None:
+            return {arm: 1.0 for arm, its in self._settings.arms.items() if its.hand is not None}
+        return {arm: opening for arm, hand in self._hands.items() if (opening := hand.opening) is not None}
+
+    def close(self) -> None:
+        if self._answering is not None:
+            self._answering.close()
+            self._answering = None
+            for hand in self._hands.values():
+                hand.close()
+            self._hands = {}

@@ -1,0 +1,161 @@
+"""Keep the session with one robot: a state goes in, and its command comes out. The caller gives the time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from q2r2_control import Array, CommandMode
+from q2r2_control.plants import ReferencePath
+from q2r2_franka.limits import JOINTS, PERIOD
+from q2r2_franka.state import ArmCommand, Joints, Measured, SessionState
+from q2r2_franka.stream import PositionStream, TorqueStream
+
+_AT_REST = 1e-9  # Greatest distance from the end of the path at which the arm counts as resting [rad].
+_STILL = 0.02  # Greatest velocity of an arm with torques that counts as resting [rad/s].
+# Greatest distance of a reference at its beginning from where the arm is held, or with torques is measured [rad].
+_SAME, _NEAR = 1e-6, 0.02
+_FROM_REST = 20.0  # A bound above the acceleration of a joint in the first tick [rad/s^2].
+_TORQUE_LASTS = 0.02  # A torque that is not updated for longer is replaced by one that brakes [s].
+_BRAKES = 1.0  # Longest time that an arm with torques is braked. Then its robot holds it [s].
+# An arm whose time is ahead of the other's waits: its time passes more slowly by this share at most, and the share
+# changes by this much in a second. The robot sees at most the acceleration a + _WAITING_RAMP v.
+_WAITING, _WAITING_RAMP, _WAITING_GAIN = 0.1, 0.4, 10.0
+_MOST_CYCLES = 100  # After more lost periods than this, the robot has ended the motion anyway.
+
+
+class ArmSession:
+    """The session of one arm. While it follows, its commands are on the reference's path; else the arm is held."""
+
+    def __init__(self, arm: str, address: str, wanted: CommandMode, torque_limit: Array) -> None:
+        """Make the session of one arm; ``torque_limit`` is the greatest torque of its joints (7,) [Nm]."""
+        self.state, self._torque_limit = SessionState(arm, address, wanted), torque_limit
+        self._tau: Array | None = None
+        self._tau_came = self._ceased = -math.inf
+        self._damping = np.zeros(JOINTS)
+        self.begin(np.zeros(JOINTS), 0.0)
+        self.state.controlled = False
+
+    def begin(self, q: Array, now: float) -> None:
+        """Let commands begin at ``now`` [s]. The robot holds the arm at ``q`` (7,) [rad]."""
+        self.path, self._positions = ReferencePath(now, q), PositionStream(q)
+        self._torques = TorqueStream(self._torque_limit)
+        self._rate, self._tau = 1.0, None
+        self._ceased = -math.inf
+        state = self.state
+        state.controlled, state.following, state.answered, state.behind = True, False, now, 0.0
+        state.rest = tuple(map(float, q))
+
+    def end(self, problem: str) -> None:
+        """Take note that commands move the arm no more, because of ``problem``."""
+        self.state.ended += self.state.following
+        self.state.controlled = self.state.following = False
+        self.state.problem = problem
+
+    def brake(self, now: float) -> None:
+        """Let the arm follow its certified stop, or with torques a damping, from ``now`` [s] on."""
+        if self.state.following:
+            self.state.following, self._ceased = False, now
+            self.path.brake(self.state.answered)
+            self.state.rest = tuple(map(float, self.path.rest))
+
+    def is_still(self, now: float) -> bool:
+        """Return whether nothing moves the arm at ``now`` [s] if no more commands come."""
+        if not self.state.controlled or self.state.is_silent(now):
+            return True
+        if self.state.wanted is CommandMode.TORQUE:
+            newest = self.state.newest
+            rests = newest is not None and max(map(abs, newest.v)) < _STILL
+            return not self.state.following and (rests or now - self._ceased > _BRAKES)
+        return not self.state.following and self._rests(self.state.answered)
+
+    def _rests(self, t: float) -> bool:
+        """Return whether the path has come to its end at ``t`` [s]."""
+        return bool(np.abs(self.path.at(t) - self.path.rest).max() <= _AT_REST)
+
+    def has_passed(self, command: ArmCommand) -> bool:
+        """Return whether a command has already followed the earlier stop at a time for which ``command`` is."""
+        return self.state.following and self.state.answered > command.start
+
+    def follow(self, command: ArmCommand) -> None:
+        """Take the command of a tick, which the session has not passed."""
+        state = self.state
+        if not state.following and state.controlled and self._begins(command):
+            state.following = state.fault(command.now) is None
+            self.path = ReferencePath(command.start, self.path.rest)
+        if state.following and command.end > self.path.end:
+            there, speed, deceleration = map(np.array, (command.q, command.v, command.deceleration))
+            self.path.extend(command.end, there, speed, deceleration, command.start)
+            state.rest = tuple(map(float, self.path.rest))
+        if command.damping is not None:
+            self._tau = None if command.tau is None else np.array(command.tau)
+            self._damping, self._tau_came = np.array(command.damping), command.now
+
+    def _begins(self, command: ArmCommand) -> bool:
+        """Return whether the reference was at rest a tick ago, at the place of the arm."""
+        state, step = self.state, command.end - command.start
+        has_torques = state.wanted is CommandMode.TORQUE and state.newest is not None
+        if not has_torques and not self._rests(state.answered):
+            return False
+        there: Joints | Array = state.newest.q if has_torques and state.newest is not None else self.path.rest
+        allowed = _NEAR if has_torques else _SAME
+        way, speed = np.abs(np.subtract(command.q, there)), np.abs(command.v)
+        return bool((speed <= _FROM_REST * step).all() and (way <= speed * step + allowed).all())
+
+    def hear(self, measured: Measured, now: float) -> None:
+        """Take a state that came at ``now`` [s]."""
+        self.state.hear(measured, now)
+
+    def answer(self, now: float, ahead: float) -> Array:
+        """Return the command for the newest state: positions [rad] or torques [Nm] (7,).
+
+        Args:
+            now: The time [s].
+            ahead: Time by which this arm is ahead of the other one [s].
+        """
+        state = self.state
+        assert state.newest is not None
+        cycles = min(max(state.newest.cycles, 1), _MOST_CYCLES)
+        state.lost += cycles - 1
+        wanted = 1.0 - min(max(_WAITING_GAIN * ahead, 0.0), _WAITING)
+        rests = not state.following and self._rests(state.answered)
+        path = []
+        for _ in range(cycles):
+            ramp = _WAITING_RAMP * PERIOD
+            self._rate = min(max(wanted, self._rate - ramp), self._rate + ramp)
+            state.answered = max(state.answered, now) if rests else state.answered + self._rate * PERIOD
+            path.append(self.path.at(state.answered))
+        if state.wanted is CommandMode.POSITION:
+            return self._positions.next(path)
+        tau = self._tau
+        if tau is None or not state.following or now - self._tau_came > _TORQUE_LASTS:
+            tau = -self._damping * np.array(state.newest.v)
+        return self._torques.next(tau)
+
+
+def follow(sessions: Mapping[str, ArmSession], commands: Mapping[str, ArmCommand]) -> bool:
+    """Let every arm take its command. If one of them came too late, no arm takes its own, and False is returned."""
+    if any(sessions[arm].has_passed(command) for arm, command in commands.items()):
+        return False
+    for arm, command in commands.items():
+        sessions[arm].follow(command)
+    return True
+
+
+def ahead_of_others(sessions: Mapping[str, ArmSession], arm: str, now: float) -> float:
+    """Return the time by which an arm is ahead of the slowest other arm that follows [s]; at least 0.
+
+    It also writes into each state how far that arm is behind.
+    """
+    state = sessions[arm].state
+    others = [session.state for name, session in sessions.items() if name != arm and session.state.following]
+    if not state.following or not others:
+        state.behind = 0.0
+        return 0.0
+    # Between its states, an arm's time is thought to go on for one period at most.
+    times = [other.answered + min(max(now - other.arrival, 0.0), PERIOD) for other in others]
+    own = state.answered + min(now - state.arrival, PERIOD)
+    state.behind = max(max(times) - own, 0.0)
+    return max(own - min(times), 0.0)

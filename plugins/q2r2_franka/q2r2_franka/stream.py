@@ -1,0 +1,99 @@
+"""Compute what an arm gets every millisecond, within the limits of its motion. Nothing here knows a robot or a clock.
+
+**Jerk.** Between two ticks the reference has a constant acceleration, and the certified stop has one as well. Where one
+follows the other, the acceleration jumps by up to twice its limit, and a robot that compares commands 1 ms apart sees a
+jerk of 2 a / 1 ms. :class:`PositionStream` therefore sends the mean of the last n positions on the path. The third
+difference of these means is the difference of two second differences of the path, divided by n. So the jerk is at most
+2 a / (n 1 ms), whatever the path does and wherever its ticks are: with a = 10 rad/s^2 and n = 5, 4,000 rad/s^3.
+
+**Lost commands.** If a command does not arrive in time, the robot goes on with the last acceleration, and is then away
+from the path. The difference goes to zero by a polynomial of fifth degree, which begins with the difference's own
+velocity and acceleration.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+
+import numpy as np
+
+from q2r2_control import Array
+from q2r2_franka.limits import JOINTS, PERIOD, TORQUE_RATE
+
+MEANS = 5  # Number of positions of which each command is the mean.
+SMOOTHING_DELAY = 0.5 * (MEANS - 1) * PERIOD  # Time by which a mean is behind the path [s].
+_RETURN = 0.1  # Time in which a difference to the path goes to zero [s].
+_RATE_MARGIN = 0.999  # A robot computes the rate of torques from rounded numbers.
+
+
+class PositionStream:
+    """The positions that one arm is sent to."""
+
+    def __init__(self, q: Array) -> None:
+        """Make the stream of an arm that rests at ``q`` (7,) [rad]."""
+        self._path = deque([q] * MEANS, maxlen=MEANS)
+        self._means = deque([q] * 3, maxlen=3)  # The last three means, and the last three positions at the robot.
+        self._sent = deque([q] * 3, maxlen=3)
+        self._difference = np.zeros((6, JOINTS))  # Coefficients of the polynomial over the time since it began.
+        self._since = _RETURN
+
+    def next(self, path: Sequence[Array]) -> Array:
+        """Return the position to send now (7,) [rad].
+
+        Args:
+            path: Positions on the path, 1 ms apart, since the last call. If there are several, the robot got no command
+                for all but the last.
+        """
+        for q in path[:-1]:
+            self._advance(q)
+            newest, before, oldest = self._sent[-1], self._sent[-2], self._sent[-3]
+            self._sent.append(3.0 * newest - 3.0 * before + oldest)  # With the last acceleration.
+        if len(path) > 1:
+            self._begin_return()
+        mean = self._advance(path[-1])
+        position = mean + self._along(self._since)
+        self._sent.append(position)
+        return position
+
+    def _advance(self, q: Array) -> Array:
+        self._path.append(q)
+        mean: Array = np.mean(self._path, axis=0)
+        self._means.append(mean)
+        self._since = min(self._since + PERIOD, _RETURN)
+        return mean
+
+    def _along(self, t: float) -> Array:
+        if t >= _RETURN:
+            return np.zeros(JOINTS)
+        difference: Array = t ** np.arange(6.0) @ self._difference
+        return difference
+
+    def _begin_return(self) -> None:
+        """Let the difference between robot and means go to zero from now on."""
+        d = [sent - mean for sent, mean in zip(self._sent, self._means, strict=True)]
+        acceleration = (d[2] - 2.0 * d[1] + d[0]) / PERIOD**2
+        velocity = (d[2] - d[1]) / PERIOD + 0.5 * PERIOD * acceleration
+        T = _RETURN
+        ends = np.array([[T**3, T**4, T**5], [3 * T**2, 4 * T**3, 5 * T**4], [6 * T, 12 * T**2, 20 * T**3]])
+        left = -np.array([d[2] + velocity * T + 0.5 * acceleration * T**2, velocity + acceleration * T, acceleration])
+        self._difference = np.vstack([d[2], velocity, 0.5 * acceleration, np.linalg.solve(ends, left)])
+        self._since = 0.0
+
+
+class TorqueStream:
+    """The torques that one arm gets."""
+
+    def __init__(self, limit: Array) -> None:
+        """``limit`` is the greatest torque of each joint (7,) [Nm]."""
+        self._limit, self._sent = limit, np.zeros(JOINTS)
+
+    def next(self, wanted: Array) -> Array:
+        """Return the torque to send now (7,) [Nm]: ``wanted`` as far as the limits allow.
+
+        A robot that got no command for some time has kept the last torque, so that this time permits no larger change.
+        """
+        change = _RATE_MARGIN * TORQUE_RATE * PERIOD
+        wanted = np.clip(wanted, -self._limit, self._limit)
+        self._sent = np.clip(wanted, self._sent - change, self._sent + change)
+        return self._sent

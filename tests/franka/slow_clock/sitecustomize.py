@@ -1,0 +1,17 @@
+"""Let the clock of every Python process run more slowly whose path has this folder: ``SLOWNESS`` seconds for a second.
+
+A busy computer then has this many times as long for each tick of a loop and for each answer, and everything else is as
+with real clocks.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+
+_SLOWNESS = float(os.environ.get("SLOWNESS", "1"))
+if _SLOWNESS != 1.0:
+    _sleep, _perf_counter, _monotonic = time.sleep, time.perf_counter, time.monotonic
+    time.sleep = lambda duration: _sleep(_SLOWNESS * float(duration))
+    time.perf_counter = lambda: _perf_counter() / _SLOWNESS
+    time.monotonic = lambda: _monotonic() / _SLOWNESS
