@@ -5,14 +5,17 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
+import numpy as np
+
 from q2r2_control import Array, Command, CommandMode, Config, ConfigError, PlantError, Reason, Robot, RobotState
 from q2r2_control.plants import ArmTiming, check_command
 from q2r2_franka.answering import AnsweringProcess
 from q2r2_franka.cell import FrankaCell
 from q2r2_franka.hand import Hand
-from q2r2_franka.limits import JOINTS
+from q2r2_franka.limits import JOINTS, PERIOD
 from q2r2_franka.settings import franka_settings
 from q2r2_franka.state import SessionState
+from q2r2_franka.stream import MEANS
 
 _LOOKS = 0.01  # Time between two looks at the robots during a wait [s].
 
@@ -22,6 +25,7 @@ class FrankaPlant:
 
     modes: tuple[CommandMode, ...] = (CommandMode.TORQUE, CommandMode.POSITION)
     realtime_only = True
+    averages = True  # Each position is the mean of MEANS positions of the path, and so control.jerk_limit is kept here.
     # Times that a reset waits for a state of each robot, and for all motions [s]. Without all motions a run begins
     # nevertheless.
     longest_wait = longest_session_wait = 10.0
@@ -30,7 +34,8 @@ class FrankaPlant:
         """Make the plant.
 
         Raises:
-            ConfigError: If an arm lacks a robot or does not have seven joints, or if a late tick would be split.
+            ConfigError: If an arm lacks a robot or does not have seven joints, if a late tick would be split, or if the
+                limit of jerk is too low.
         """
         self._settings = franka_settings(config)
         for arm, its in robot.arms.items():
@@ -47,6 +52,13 @@ class FrankaPlant:
         if self._longest < 2.0 * self._period:
             allowed = "allowed with robots: two ticks of loop_rate_hz or more, such as 0.01"
             raise ConfigError(f"control.max_substep = {self._longest:g}: {allowed}")
+        limit = config.control.jerk_limit
+        kept = 2.0 * robot.capped_acceleration(config.control.acceleration_limit) / (MEANS * PERIOD)
+        if limit is not None and bool((np.asarray(limit) < kept).any()):
+            raise ConfigError(
+                f"control.jerk_limit = {limit}: allowed with robots: {kept.max():.0f} rad/s^3 or more, which the mean of "
+                f"{MEANS} positions keeps with the acceleration limits of this cell"
+            )
         self.begin(CommandMode.POSITION)
         self._answering: AnsweringProcess | None = None
         self._hands: dict[str, Hand] = {}

@@ -1,0 +1,17 @@
+"""The plant refuses cells whose limits it cannot keep."""
+
+from __future__ import annotations
+
+import pytest
+
+from q2r2_control import ConfigError, Robot, load_config
+from q2r2_franka.plant import FrankaPlant
+
+
+def test_a_limit_of_jerk_that_five_means_do_not_keep_is_refused() -> None:
+    config = load_config("plugins/q2r2_franka/dual_fr3.yaml")
+    robot = Robot.from_config(config)
+    assert FrankaPlant(robot, config).averages
+    stricter = config.model_copy(update={"control": config.control.model_copy(update={"jerk_limit": 1900.0})})
+    with pytest.raises(ConfigError, match=r"control.jerk_limit = 1900.0: allowed with robots: 1920 rad/s\^3 or more"):
+        FrankaPlant(robot, stricter)
