@@ -5,10 +5,12 @@ from __future__ import annotations
 import pytest
 
 from q2r2_control import ConfigError, Robot, load_config
-from q2r2_franka.plant import FrankaPlant
 
 
 def test_a_limit_of_jerk_that_five_means_do_not_keep_is_refused() -> None:
+    pytest.importorskip("pylibfranka", reason="pip install -e plugins/q2r2_franka")
+    from q2r2_franka.plant import FrankaPlant
+
     config = load_config("plugins/q2r2_franka/dual_fr3.yaml")
     robot = Robot.from_config(config)
     assert FrankaPlant(robot, config).averages

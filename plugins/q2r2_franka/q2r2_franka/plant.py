@@ -56,8 +56,8 @@ class FrankaPlant:
         kept = 2.0 * robot.capped_acceleration(config.control.acceleration_limit) / (MEANS * PERIOD)
         if limit is not None and bool((np.asarray(limit) < kept).any()):
             raise ConfigError(
-                f"control.jerk_limit = {limit}: allowed with robots: {kept.max():.0f} rad/s^3 or more, which the mean of "
-                f"{MEANS} positions keeps with the acceleration limits of this cell"
+                f"control.jerk_limit = {limit}: allowed with robots: {kept.max():.0f} rad/s^3 or more, which the mean "
+                f"of {MEANS} positions keeps with the acceleration limits of this cell"
             )
         self.begin(CommandMode.POSITION)
         self._answering: AnsweringProcess | None = None
