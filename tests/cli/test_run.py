@@ -239,6 +239,26 @@ def test_a_plant_without_pictures_is_named_and_recorded_without_them(tmp_path: P
     assert Recording(Path(one_object(result.stdout)["recording"]["file"])).about.cameras == ()
 
 
+@pytest.mark.parametrize(
+    ("policy", "code", "told"),
+    [
+        ("json:dumps", 1, "actions of the policy that cannot be used: the policy raised TypeError"),
+        ("sys:exit", 2, "the run was ended by SystemExit("),
+    ],
+    ids=["raises", "exits"],
+)
+def test_a_policy_that_fails_makes_the_run_fail(policy: str, code: int, told: str) -> None:
+    result = q2r2("run", CELL, *OPTIONS, "--input", "policy", "--policy", policy)
+    assert result.exit_code == code
+    assert told in " ".join([result.stdout, result.stderr])
+
+
+def test_simulated_time_is_refused_at_once_for_a_plant_that_keeps_real_time() -> None:
+    result = q2r2("demo", "grasp", "--plant", "fri", "--fast", "--headless")
+    told = "q2r2: --fast cannot be used with --plant fri, which keeps real time\n"
+    assert (result.exit_code, result.stderr) == (2, told)
+
+
 POLICY = """
 class Still:
     rate = 20.0
