@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -27,7 +28,7 @@ from q2r2_control.robot.description import LinkTree, joint_limits, load_descript
 from q2r2_control.robot.floor import FLOOR
 from q2r2_control.robot.home_search import find_home, mirrored_home
 from q2r2_control.robot.kept_distances import kept_distances
-from q2r2_control.robot.model_survey import CapsuleFit, capsule_fits, gripper_of, lacks_of, tip_of, tips_by_side
+from q2r2_control.robot.model_survey import CapsuleFit, capsule_fits, gripper_of, limits_lacking, tip_of, tips_by_side
 from q2r2_control.robot.near_pairs import spreads_of
 from q2r2_control.robot.pairs import CLEARANCE, link_of, links_moved_by, pair_names
 from q2r2_control.robot.reachability import nearest_approaches, srdf_text
@@ -50,12 +51,11 @@ Tip = Annotated[str | None, Option(metavar="LINK", help="Last link of that arm, 
 
 @dataclass
 class _Draft:
-    """The unfinished cell as data of its YAML, with notes and faults."""
+    """The unfinished cell as data of its YAML, with notes."""
 
     file: Path
     data: dict[str, Any]
     notes: list[str] = field(default_factory=list)  # Notes about guessed values.
-    faults: list[str] = field(default_factory=list)  # Faults for which q2r2 check does not look.
     fits: dict[str, list[CapsuleFit]] = field(default_factory=dict)  # By model.
     always: list[tuple[str, str]] = field(default_factory=list)  # Pairs of links that overlap by construction.
     xacro_args: dict[str, str] = field(default_factory=dict)  # Arguments of each xacro model.
@@ -140,7 +140,7 @@ def new_cell(
         draft.data["srdf"] = srdf.name
     file.write_text(commented_yaml(draft.data, cell), encoding="utf-8")
     result = check_cell(load_config(file))
-    notes, faults = [*draft.notes, *result.notes], [*draft.faults, *result.faults]
+    notes, faults = [*draft.notes, *result.notes], result.faults
     if json:
         print(as_json_text({"file": str(file), "capsules": draft.fits, "notes": notes, "faults": faults}))
     else:
@@ -174,13 +174,8 @@ def _survey(draft: _Draft, models: dict[str, str], tips: dict[str, str | None], 
             ]
             but = f"; {', '.join(mimics):.200}, so that it ends the arm like a gripper's" if mimics else ""
             raise ConfigError(f"{models[side]!r:.120}: {moves}; allowed: an arm, of {_LEAST_JOINTS} or more{but}")
-        limits, masses = lacks_of(described[side], tree, tip)
-        if limits:
+        if limits := limits_lacking(tree, tip):
             lacks.append(f"{models[side]}: {', '.join(limits)}")
-        if masses:
-            draft.faults.append(
-                f"{side} arm: links that move without a mass, which simulation needs: {', '.join(masses)}"
-            )
     if lacks:
         raise ConfigError(f"{'; '.join(dict.fromkeys(lacks))}; to change: the <limit> of these joints in the model")
     if shared is not None:
@@ -318,7 +313,7 @@ def _limit_acceleration(draft: _Draft, robot: Robot, config: Config) -> None:
         draft.data.setdefault("control", {})["acceleration_limit"] = math.floor(10.0 * cap * share) / 10.0
 
 
-def _print(draft: _Draft, notes: list[str], faults: list[str]) -> None:
+def _print(draft: _Draft, notes: Sequence[str], faults: Sequence[str]) -> None:
     console = Console(highlight=False, soft_wrap=True)
     for model, fits in draft.fits.items():
         rows = (

@@ -65,7 +65,9 @@ def test_links_without_masses_are_left_to_do() -> None:
     Path("arm.urdf").write_text(re.sub(r"<inertial>.*?</inertial>", "", IIWA, flags=re.DOTALL))
     result = q2r2("new-cell", "cell", "--left", "arm.urdf", "--yes", "--samples", "100")
     assert result.exit_code == 1
-    assert "FAULT left arm: links that move without a mass, which simulation needs: link_1, link_2" in result.stdout
+    told = "links that move without a mass, which simulation needs: left_link_1, left_link_2"
+    assert result.stdout.count("FAULT") == 2  # The fault, and the line that says what is left to do.
+    assert told in result.stdout
     assert "left to do" in result.stdout
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import platform
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -17,6 +18,7 @@ from typer import Exit
 
 from q2r2_control.cli.cell_run import CellRun, RunOptions, run_cell
 from q2r2_control.config.cell import Config, load_config, parse_config
+from q2r2_control.config.resources import find_resource
 from q2r2_control.extras import install_line
 from q2r2_control.recording.about import About
 from q2r2_control.recording.reader import Recording
@@ -34,8 +36,20 @@ def test_a_cell_that_check_refuses_is_refused_with_the_same_lines(tmp_path: Path
     faults = one_object(q2r2("check", file, "--json").stdout)["faults"]
     assert faults
     *lines, allowed = refused.stderr.splitlines()
-    assert [line.partition("dual_iiwa7: ")[2] for line in lines] == faults
+    assert [line.partition("dual_iiwa7: FAULT ")[2] for line in lines] == faults
     assert allowed == "q2r2: dual_iiwa7: --force runs it all the same"
+
+
+def test_links_without_a_mass_are_all_named_by_the_check_and_by_a_run(tmp_path: Path) -> None:
+    urdf = find_resource("robots/iiwa7.urdf").read_text(encoding="utf-8")
+    inertials = re.compile(r"<inertial>.*?</inertial>", re.DOTALL)
+    (tmp_path / "arm.urdf").write_text(inertials.sub("", urdf, count=4))
+    file = changed_cell(tmp_path, "model: iiwa7", f"model: {tmp_path / 'arm.urdf'}")
+    (fault,) = one_object(q2r2("check", file, "--json").stdout)["faults"]
+    assert "links that move without a mass, which simulation needs: left_link_1, left_link_2, left_link_3; " in fault
+    assert f"allowed: <inertial> with a mass in {tmp_path / 'arm.urdf'}, iiwa7" in fault
+    refused = q2r2("run", file, "--headless", "--duration", "0.1", "--fast")
+    assert (refused.exit_code, refused.stderr) == (2, f"q2r2: dual_iiwa7: FAULT {fault}\n")
 
 
 def test_without_the_parts_of_a_task_a_note_says_that_the_hands_move_without_them(tmp_path: Path) -> None:
