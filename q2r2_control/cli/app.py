@@ -46,6 +46,7 @@ class ErrorHandlingGroup(TyperGroup):
             code = super().main(*args, **extra)
             sys.exit(code if isinstance(code, int) else 0)
         except (KeyboardInterrupt, typer.Abort):
+            print("q2r2: interrupted", file=sys.stderr)
             sys.exit(130)
         except Q2R2Error as error:
             messages = error.faults

@@ -329,9 +329,11 @@ def _run(
             )
             pipeline.listeners.append(table)
             stack.enter_context(table.shown(console))
-        elif options.simulated_time and options.duration is not None:
+        else:
             # On a slow computer the motion may take minutes, in which nothing else is printed.
-            say(f"{options.name}: begins, {options.duration:.0f} s of simulated time", console)
+            kind = "simulated time" if options.simulated_time else "real time"
+            lasts = "until Ctrl-C" if options.duration is None else f"{options.duration:g} s"
+            say(f"{options.name}: begins, {lasts}, in {kind}", console)
         streams.wait_until_ready()
         pipeline.cameras = streams
         drawn = pipeline.config.simulated_cameras if isinstance(pipeline.plant, MujocoPlant) else {}

@@ -103,7 +103,8 @@ def new_cell(
         raise ConfigError(f"NAME = {name!r:.60}: allowed: letters, digits, _ and -; the file is written here")
     for one in (file, srdf):
         if one.exists():
-            raise ConfigError(f"{one}: exists; give another name")
+            goes_on = f"q2r2 check {file} is enough if only the model has changed" if file.exists() else "delete it"
+            raise ConfigError(f"{one}: exists; allowed: another name; {goes_on}")
     if (robot is None) == (left is None and right is None):
         raise ConfigError("--left, --right or --robot: allowed: a model for each arm, or one that holds both")
     draft = _Draft(file, {"name": name}, xacro_args=named_values(xacro_arg or []))

@@ -155,7 +155,9 @@ def run(
     asked |= {"human": human or None, "seed": seed or None, "fast": fast or None}
     given = {option: value for option, value in asked.items() if value is not None}
     if unfit := [option for option in given if option not in options_of(source)]:
-        raise ConfigError(f"--{unfit[0]} cannot be used with --input {source}")
+        cure = "; add --input policy" if unfit[0] in ("policy", "takeover") else ""
+        usual = "" if input is not None else ", which is the cell's input"
+        raise ConfigError(f"--{unfit[0]} cannot be used with --input {source}{usual}{cure}")
     if fast and duration is None:
         raise ConfigError("--fast needs --duration, since simulated time has no end of its own")
     _check_times(fast, rt, plant or cell.plant)

@@ -267,6 +267,12 @@ def test_a_policy_that_fails_makes_the_run_fail(policy: str, code: int, told: st
     assert told in " ".join([result.stdout, result.stderr])
 
 
+def test_a_policy_without_its_input_is_refused_with_the_missing_option() -> None:
+    result = q2r2("run", CELL, *OPTIONS, "--policy", "json:dumps")
+    told = "--policy cannot be used with --input scripted, which is the cell's input; add --input policy\n"
+    assert (result.exit_code, result.stderr) == (2, f"q2r2: {told}")
+
+
 def test_simulated_time_is_refused_at_once_for_a_plant_that_keeps_real_time() -> None:
     result = q2r2("demo", "grasp", "--plant", "fri", "--fast", "--headless")
     told = "q2r2: --fast cannot be used with --plant fri, which keeps real time\n"
