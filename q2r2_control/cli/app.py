@@ -53,11 +53,23 @@ class ErrorHandlingGroup(TyperGroup):
         except _BadUsage as error:
             context = getattr(error, "ctx", None)
             command = context.command_path if context else "q2r2"
-            message = error.format_message()  # type: ignore[attr-defined]
-            messages = (f"{message.rstrip('.')}; see {command} --help",)
+            messages = (f"{_usage_fault(error).rstrip('.')}; see {command} --help",)
         for message in messages:
             print(f"q2r2: {' '.join(message.split())}", file=sys.stderr)
         sys.exit(2)
+
+
+def _usage_fault(error: Any) -> str:
+    """Return what is wrong with an option or an argument, in the form that messages about a cell have."""
+    if not hasattr(error.__cause__, "errors"):  # Only an error of pydantic, which checks values, has them.
+        return str(error.format_message())
+    from q2r2_control.config.strict import allowed_instead  # This import takes as long as the rest of the help.
+
+    fault = error.__cause__.errors()[0]
+    _, is_choice, choices = fault["msg"].partition(" is not one of ")
+    allowed = f"allowed: {choices.replace(chr(39), '')}" if is_choice else allowed_instead(fault)
+    name = error.param.opts[-1] if error.param.opts[-1].startswith("-") else error.param.human_readable_name
+    return f"{name} = {fault['input']!r:.60}: {allowed}"
 
 
 app = typer.Typer(

@@ -104,7 +104,7 @@ def test_check_and_run_list_all_faults_of_a_file(tmp_path: Path) -> None:
         encoding="utf-8",
     )
     lines = [
-        f"q2r2: {file}: control.solvr = 'daqp': unknown key; allowed here: acceleration_limit, ",
+        f"q2r2: {file}: control.solvr = 'daqp': unknown key; did you mean solver? allowed here: ",
         f"q2r2: {file}: arms.left.home.6 = 'up': allowed: a number",
         f"q2r2: {file}: floor = 'low': allowed: a number",
         f"q2r2: {file}: control.min_distance = -1: allowed: 0 or more",
@@ -252,7 +252,8 @@ def test_a_stop_that_needs_too_much_torque_is_a_note_and_no_fault(tmp_path: Path
     (note,) = (line for line in result.stdout.splitlines() if line.startswith("NOTE "))
     assert re.search(
         r"^NOTE left arm: in a full stop .* left_A2 needs up to 1\.09 times its torque limit; some joint needs too "
-        r"much in 9\.\d % of 5000 random postures. To change: arms\.left\.acceleration_limit: {A1: 8\.\d+, A2: 8\.\d+, .*}$",
+        r"much in 9\.\d % of 5000 random postures. To change: arms\.left\.acceleration_limit: "
+        r"{A1: 8\.\d+, A2: 8\.\d+, .*}$",
         note,
     )
     assert result.exit_code == 0
