@@ -329,7 +329,11 @@ def _print(draft: _Draft, notes: Sequence[str], faults: Sequence[str]) -> None:
         if fits:
             meshes = counted(len(fits), "mesh", "meshes")
             title = f"{model}: capsules around {meshes}, each with the whole mesh inside; the worst first"
-            print_table(figure_table(title, columns, rows), console)
+            notes_on_columns = (
+                "beyond the mesh: how far a capsule stands out; empty: its share that holds none of the mesh; better: the",
+                "number of smaller capsules that the cell gets instead; then empty: the share with these",
+            )
+            print_table(figure_table(title, columns, rows, notes_on_columns), console)
     for note in notes:
         say(f"NOTE {note}", console)
     for fault in faults:
