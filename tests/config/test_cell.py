@@ -51,7 +51,7 @@ def test_an_unknown_key_is_named_with_those_allowed_there(tmp_path: Path, path: 
 )
 def test_the_keys_of_a_gripper_are_those_of_its_kind(tmp_path: Path, gripper: dict[str, Any], allowed: str) -> None:
     message = fault(tmp_path, changed("fri.left.gripper", gripper))
-    assert message.startswith(f"fri.left.gripper.units = 9: unknown key; ")
+    assert message.startswith("fri.left.gripper.units = 9: unknown key; ")
     assert f"allowed here: {allowed}" in message
 
 

@@ -277,7 +277,7 @@ def test_a_reason_that_concerns_a_camera_says_how_many_of_its_pictures_are_missi
 def test_cameras_with_the_same_finding_are_named_together_after_the_other_reasons() -> None:
     figures = changed("camera", missing_pictures=12, rate_share=0.5, longest_gap_periods=13.0)
     (camera,) = figures.cameras.values()
-    figures = replace(figures, cameras={"above": camera, "front": camera}, faults=(JUMP,))
+    figures = replace(figures, cameras={"above": camera, "front": camera}, faults=[JUMP])
     fault, *of_cameras = verdict_of(figures, JudgeSettings(max_faults=0)).findings
     assert fault.startswith("fault: ")
     assert of_cameras == [
