@@ -330,8 +330,8 @@ def _print(draft: _Draft, notes: Sequence[str], faults: Sequence[str]) -> None:
             meshes = counted(len(fits), "mesh", "meshes")
             title = f"{model}: capsules around {meshes}, each with the whole mesh inside; the worst first"
             notes_on_columns = (
-                "beyond the mesh: how far a capsule stands out; empty: its share that holds none of the mesh; better: the",
-                "number of smaller capsules that the cell gets instead; then empty: the share with these",
+                "beyond the mesh: how far a capsule stands out; empty: its share that holds none of the mesh; better:",
+                "the number of smaller capsules that the cell gets instead; then empty: the share with these",
             )
             print_table(figure_table(title, columns, rows, notes_on_columns), console)
     for note in notes:
