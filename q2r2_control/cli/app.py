@@ -21,6 +21,8 @@ from q2r2_control.errors import Q2R2Error
 # Depending on its version, typer raises click's exceptions or its own copy of them. This is the base class of either.
 _BadUsage: type[Exception] = typer.BadParameter.__mro__[2]
 
+_INTERRUPTED = 130  # Exit code after Ctrl-C.
+
 
 class ErrorHandlingGroup(TyperGroup):
     """All commands. Ctrl-C ends them with exit code 130, bad usage and :class:`Q2R2Error` with 2.
@@ -44,19 +46,20 @@ class ErrorHandlingGroup(TyperGroup):
         extra["standalone_mode"] = False
         try:
             code = super().main(*args, **extra)
-            sys.exit(code if isinstance(code, int) else 0)
+            if code != _INTERRUPTED:
+                sys.exit(code if isinstance(code, int) else 0)
+            messages = ("interrupted",)  # Newer versions of typer return this code.
         except (KeyboardInterrupt, typer.Abort):
-            print("q2r2: interrupted", file=sys.stderr)
-            sys.exit(130)
+            code, messages = _INTERRUPTED, ("interrupted",)
         except Q2R2Error as error:
-            messages = error.faults
+            code, messages = 2, error.faults
         except _BadUsage as error:
             context = getattr(error, "ctx", None)
             command = context.command_path if context else "q2r2"
-            messages = (f"{_usage_fault(error).rstrip('.')}; see {command} --help",)
+            code, messages = 2, (f"{_usage_fault(error).rstrip('.')}; see {command} --help",)
         for message in messages:
             print(f"q2r2: {' '.join(message.split())}", file=sys.stderr)
-        sys.exit(2)
+        sys.exit(code)
 
 
 def _usage_fault(error: Any) -> str:

@@ -191,7 +191,7 @@ def _stop_note(stop: StopTorque, shared: bool) -> str:
         each = ", ".join(f"{joint}: {limit}" for joint, limit in limits.items())
         helps = f"arms.{stop.arm}.acceleration_limit: {{{each}}}"
         if len(set(limits.values())) == 1:
-            helps = f"control.acceleration_limit: {next(iter(limits.values()))}"
+            helps += f", or control.acceleration_limit: {next(iter(limits.values()))}"
     return (
         f"{stop.arm} arm: {where} {worst.joint} needs up to {worst.ratio:.2f} times its torque limit; some joint needs "
         f"too much in {100 * worst.share_over:.1f} % of {stop.postures} random postures. To change: {helps}"

@@ -253,7 +253,7 @@ def test_a_stop_that_needs_too_much_torque_is_a_note_and_no_fault(tmp_path: Path
     assert re.search(
         r"^NOTE left arm: in a full stop .* left_A2 needs up to 1\.09 times its torque limit; some joint needs too "
         r"much in 9\.\d % of 5000 random postures. To change: arms\.left\.acceleration_limit: "
-        r"{A1: 8\.\d+, A2: 8\.\d+, .*}$",
+        r"{A1: 8\.\d+, A2: 8\.\d+, .*}, or control\.acceleration_limit: 8\.\d+$",
         note,
     )
     assert result.exit_code == 0

@@ -281,7 +281,7 @@ def test_cameras_with_the_same_finding_are_named_together_after_the_other_reason
     fault, *of_cameras = verdict_of(figures, JudgeSettings(max_faults=0)).findings
     assert fault.startswith("fault: ")
     assert of_cameras == [
-        "cameras above, front: 12 pictures missing, there are 50.0 % of the pictures that were due (at least 95)",
+        "cameras above, front: 12 pictures missing, there are 50.0 % of the pictures that were due (at least 80)",
         "cameras above, front: no picture for 13.0 of its periods (at most 2.5)",
     ]
 
