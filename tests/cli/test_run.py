@@ -141,7 +141,9 @@ def test_with_rt_one_line_names_the_refusals_of_the_system_and_the_run_goes_on(m
     assert result.exit_code == 0
     assert [line for line in result.stderr.splitlines() if "real time" in line] == [refusal]
     assert one_object(result.stdout)["ticks"] == 101
-    assert "real time" not in q2r2(*options).stderr
+    told = q2r2(*options).stderr
+    assert "real time" not in told
+    assert "dual_iiwa7: begins, 0.1 s, in simulated time\n" in told
 
 
 CAMERAS = ["above", "left_wrist", "right_wrist"]
