@@ -14,7 +14,7 @@ setup: $(VENV)/.installed-dev
 # The package is installed again when its dependencies change. It is editable, so changes of its code need no installation.
 $(VENV)/.installed: pyproject.toml setup.py
 	@$(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(not (3, 11) <= v[:2] < (3, 15) and f"q2r2_control needs Python 3.11 to 3.14, and this is {v[0]}.{v[1]}: make PYTHON=python3.12 ...")'
-	@echo 'installing packages into $(VENV), some 700 MB: this takes minutes ...'
+	@echo 'installing packages into $(VENV), some 700 MB to download and 1.6 GB on disk: this takes minutes ...'
 	@$(PYTHON) -m venv $(VENV)
 	@$(PIP) --editable .
 	@touch $@

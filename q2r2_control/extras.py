@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import shlex
+import sys
 from pathlib import Path
 
 _CHECKOUT = Path(__file__).resolve().parents[1]
@@ -10,8 +13,15 @@ _CHECKOUT = Path(__file__).resolve().parents[1]
 def install_line(extra: str) -> str:
     """Return the pip command that installs an ``extra`` of this package, from any working directory.
 
-    The package is on no package index, so a checkout is named by its folder.
+    The package is on no package index, so a checkout is named by its folder. Lerobot gets an environment of its own in
+    a checkout, because of its size. If the environment of this Python is not activated, the line names the Python.
     """
-    if (_CHECKOUT / "pyproject.toml").is_file():
-        return f"pip install -e '{_CHECKOUT}[{extra}]'"
-    return f"pip install 'q2r2_control[{extra}]'"
+    is_checkout = (_CHECKOUT / "pyproject.toml").is_file()
+    if extra == "lerobot" and is_checkout:
+        folder = shlex.quote(str(_CHECKOUT))
+        return f"make -C {folder} lerobot, which makes {folder}/.venv-lerobot of some gigabytes"
+    is_active = sys.prefix == sys.base_prefix or os.environ.get("VIRTUAL_ENV") == sys.prefix
+    pip = "pip" if is_active else f"{shlex.quote(sys.executable)} -m pip"
+    if is_checkout:
+        return f"{pip} install -e '{_CHECKOUT}[{extra}]'"
+    return f"{pip} install 'q2r2_control[{extra}]'"

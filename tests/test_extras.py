@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import tomllib
 from pathlib import Path
 
@@ -13,13 +14,27 @@ from q2r2_control.extras import install_line
 ROOT = Path(__file__).resolve().parents[1]
 
 
+@pytest.fixture(autouse=True)
+def activated(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "prefix", "/venv")
+    monkeypatch.setenv("VIRTUAL_ENV", "/venv")
+
+
 def test_in_a_checkout_the_line_names_its_folder_so_that_it_works_from_any_folder() -> None:
     assert install_line("web") == f"pip install -e '{ROOT}[web]'"
+    assert install_line("lerobot") == f"make -C {ROOT} lerobot, which makes {ROOT}/.venv-lerobot of some gigabytes"
 
 
 def test_elsewhere_the_line_names_the_package(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(extras, "_CHECKOUT", tmp_path)
     assert install_line("web") == "pip install 'q2r2_control[web]'"
+    assert install_line("lerobot") == "pip install 'q2r2_control[lerobot]'"
+
+
+def test_the_line_names_the_python_of_an_environment_that_is_not_activated(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("VIRTUAL_ENV")
+    monkeypatch.setattr(sys, "executable", "/venv/bin/python")
+    assert install_line("web") == f"/venv/bin/python -m pip install -e '{ROOT}[web]'"
 
 
 def test_every_extra_in_a_message_exists_in_the_package() -> None:

@@ -22,6 +22,7 @@ from q2r2_control.errors import Q2R2Error
 _BadUsage: type[Exception] = typer.BadParameter.__mro__[2]
 
 _PARTS = "q2r2_control."  # Parts of the package, some of which an installation may leave out.
+_INTERRUPTED = 130  # Exit code after Ctrl-C.
 
 
 class ErrorHandlingGroup(TyperGroup):
@@ -46,23 +47,37 @@ class ErrorHandlingGroup(TyperGroup):
         extra["standalone_mode"] = False
         try:
             code = super().main(*args, **extra)
-            sys.exit(code if isinstance(code, int) else 0)
+            if code != _INTERRUPTED:
+                sys.exit(code if isinstance(code, int) else 0)
+            messages = ("interrupted",)  # Newer versions of typer return this code.
         except (KeyboardInterrupt, typer.Abort):
-            sys.exit(130)
+            code, messages = _INTERRUPTED, ("interrupted",)
         except Q2R2Error as error:
-            messages = error.faults
+            code, messages = 2, error.faults
         except ModuleNotFoundError as error:
             if not (error.name or "").startswith(_PARTS):
                 raise
-            messages = (f"this installation is without {error.name}, which the command needs",)
+            code, messages = 2, (f"this installation is without {error.name}, which the command needs",)
         except _BadUsage as error:
             context = getattr(error, "ctx", None)
             command = context.command_path if context else "q2r2"
-            message = error.format_message()  # type: ignore[attr-defined]
-            messages = (f"{message.rstrip('.')}; see {command} --help",)
+            code, messages = 2, (f"{_usage_fault(error).rstrip('.')}; see {command} --help",)
         for message in messages:
             print(f"q2r2: {' '.join(message.split())}", file=sys.stderr)
-        sys.exit(2)
+        sys.exit(code)
+
+
+def _usage_fault(error: Any) -> str:
+    """Return what is wrong with an option or an argument, in the form that messages about a cell have."""
+    if not hasattr(error.__cause__, "errors"):  # Only an error of pydantic, which checks values, has them.
+        return str(error.format_message())
+    from q2r2_control.config.strict import allowed_instead  # This import takes as long as the rest of the help.
+
+    fault = error.__cause__.errors()[0]
+    _, is_choice, choices = fault["msg"].partition(" is not one of ")
+    allowed = f"allowed: {choices.replace(chr(39), '')}" if is_choice else allowed_instead(fault)
+    name = error.param.opts[-1] if error.param.opts[-1].startswith("-") else error.param.human_readable_name
+    return f"{name} = {fault['input']!r:.60}: {allowed}"
 
 
 app = typer.Typer(

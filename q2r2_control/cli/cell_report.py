@@ -127,7 +127,7 @@ def check_cell(config: Config) -> CellCheck:
         stop_torques=stops,
         driven={} if config.external is None else describe(config.external),
         controls=config.teleop.bindings.meanings(),
-        notes=notes + [_stop_note(stop) for stop in stops if stop.stop.ratio > 1.0],
+        notes=notes + [_stop_note(stop, shared=config.robot is not None) for stop in stops if stop.stop.ratio > 1.0],
         verdict=verdict_on(faults),
     )
 
@@ -173,19 +173,28 @@ def _capsules_note(config: Config, robot: Robot) -> str:
     return f"capsules: shapes of {shapes}; {cost}"
 
 
-def _stop_note(stop: StopTorque) -> str:
-    """Return which joint of an arm needs more torque than its limit, how often, and how to change that."""
+def _stop_note(stop: StopTorque, shared: bool) -> str:
+    """Return which joint of an arm needs more torque than its limit, how often, and how to change that.
+
+    ``shared`` is True if one model has all arms, so that its joints have no prefix of the arm.
+    """
     if stop.gravity.ratio > 1.0:
         worst, where = stop.gravity, "at rest, by gravity alone"
         helps = "the model's torque limits, masses and position limits"
     else:
         worst, where = stop.stop, "in a full stop from low speed, with the worst signs"
-        share = f"{math.floor(100 * stop.bearable) / 100:.2f}"
-        helps = f"{share} times these limits in arms.{stop.arm}.acceleration_limit or control.acceleration_limit"
+        prefix = "" if shared else f"{stop.arm}_"
+        limits = {
+            joint.joint.removeprefix(prefix): f"{math.floor(100 * stop.bearable * joint.acceleration) / 100:g}"
+            for joint in stop.joints
+        }
+        each = ", ".join(f"{joint}: {limit}" for joint, limit in limits.items())
+        helps = f"arms.{stop.arm}.acceleration_limit: {{{each}}}"
+        if len(set(limits.values())) == 1:
+            helps += f", or control.acceleration_limit: {next(iter(limits.values()))}"
     return (
-        f"{stop.arm} arm: {where} {worst.joint} needs up to {worst.ratio:.2f} times its torque limit, at "
-        f"{_numbers(worst.posture, '.2f')} rad; some joint does in {100 * worst.share_over:.1f} % of {stop.postures} "
-        f"random postures (seed {stop.seed}); to change: {helps}"
+        f"{stop.arm} arm: {where} {worst.joint} needs up to {worst.ratio:.2f} times its torque limit; some joint needs "
+        f"too much in {100 * worst.share_over:.1f} % of {stop.postures} random postures. To change: {helps}"
     )
 
 

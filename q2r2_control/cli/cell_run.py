@@ -192,7 +192,12 @@ def _run_cell(
     console = Console(stderr=True)
     source = make_input(options.input, config, say=partial(say, console=console), **options.input_options)
     robot = Robot.from_config(config)
-    plant = make_plant(options.plant, robot, config)
+    try:
+        plant = make_plant(options.plant, robot, config)
+    except PlantError as error:
+        if options.plant != "mujoco":  # Only of a simulation, q2r2 check says that it cannot be built.
+            raise
+        raise PlantError(f"{config.name}: FAULT plant {options.plant}: {error}") from error
     if isinstance(plant, WaitingPlant):
         plant.longest_wait = plant.longest_session_wait = options.longest_wait
     try:
@@ -226,7 +231,7 @@ def _run_pipeline(
     config, source = pipeline.config, pipeline.input
     if faults and not options.force:
         allowed = "--force runs it all the same"
-        lines = [f"{config.name}: {fault}" for fault in faults]
+        lines = [f"{config.name}: FAULT {fault}" for fault in faults]
         raise ConfigError(f"{config.name}: {'; '.join(faults)}; {allowed}", [*lines, f"{config.name}: {allowed}"])
     for fault in faults:
         say(f"FAULT {fault}", console, "red")
@@ -332,9 +337,11 @@ def _run(
             )
             pipeline.listeners.append(table)
             stack.enter_context(table.shown(console))
-        elif options.simulated_time and options.duration is not None:
+        else:
             # On a slow computer the motion may take minutes, in which nothing else is printed.
-            say(f"{options.name}: begins, {options.duration:.0f} s of simulated time", console)
+            kind = "simulated time" if options.simulated_time else "real time"
+            lasts = "until Ctrl-C" if options.duration is None else f"{options.duration:g} s"
+            say(f"{options.name}: begins, {lasts}, in {kind}", console)
         streams.wait_until_ready()
         pipeline.cameras = streams
         drawn = pipeline.config.simulated_cameras if isinstance(pipeline.plant, MujocoPlant) else {}

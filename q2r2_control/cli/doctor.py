@@ -133,7 +133,11 @@ def _ports(cell: Config) -> Iterator[Finding]:
 def _display(environment: Mapping[str, str]) -> Iterator[Finding]:
     """Yield a finding if there is no display. Only MuJoCo's window needs one."""
     if not has_display(environment):
-        yield Finding(False, "no display: no --viewer", "log in on the desktop or by ssh -X; a run without needs none")
+        yield Finding(
+            False,
+            "no display: no --viewer",
+            "work at the computer's desktop or by ssh -X; runs without --viewer need no display",
+        )
 
 
 def _what_and_cure(note: str) -> tuple[str, str]:

@@ -148,10 +148,22 @@ def _written(file: Path, robot: Robot) -> Array:
     joints = np.concatenate([robot.arms[arm].joints for arm in SIDES])
     allowed = f"lines of {len(joints)} numbers in radians: {', '.join(robot.joint_names[joint] for joint in joints)}"
     try:
-        lines = [line.replace(",", " ").split() for line in file.read_text(encoding="utf-8").splitlines()]
-        values = np.array([[float(word) for word in words] for words in lines if words and words[0][0] != "#"])
+        lines = file.read_text(encoding="utf-8").splitlines()
     except (OSError, ValueError) as error:
-        raise ConfigError(f"--postures {file}: {error}; allowed: {allowed}") from error
+        why = error.strerror if isinstance(error, OSError) else "not a text in UTF-8"
+        raise ConfigError(f"--postures {file}: {why}; allowed: a file with {allowed}") from error
+    postures_read = []
+    for number, line in enumerate(lines, 1):
+        words = line.replace(",", " ").split()
+        if not words or words[0].startswith("#"):
+            continue
+        try:
+            postures_read.append([float(word) for word in words])
+        except ValueError as error:
+            raise ConfigError(f"--postures {file}: line {number}: {error}; allowed: {allowed}") from error
+        if len(words) != len(joints):
+            raise ConfigError(f"--postures {file}: line {number} has {len(words)} numbers; allowed: {allowed}")
+    values = np.array(postures_read)
     if values.ndim != 2 or values.shape[1] != len(joints) or not np.isfinite(values).all():
         raise ConfigError(f"--postures {file}: allowed: {allowed}")
     if len(values) < _FEWEST:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -27,7 +28,7 @@ from q2r2_control.robot.description import LinkTree, joint_limits, load_descript
 from q2r2_control.robot.floor import FLOOR
 from q2r2_control.robot.home_search import find_home, mirrored_home
 from q2r2_control.robot.kept_distances import kept_distances
-from q2r2_control.robot.model_survey import CapsuleFit, capsule_fits, gripper_of, lacks_of, tip_of, tips_by_side
+from q2r2_control.robot.model_survey import CapsuleFit, capsule_fits, gripper_of, limits_lacking, tip_of, tips_by_side
 from q2r2_control.robot.near_pairs import spreads_of
 from q2r2_control.robot.pairs import CLEARANCE, link_of, links_moved_by, pair_names
 from q2r2_control.robot.reachability import nearest_approaches, srdf_text
@@ -50,12 +51,11 @@ Tip = Annotated[str | None, Option(metavar="LINK", help="Last link of that arm, 
 
 @dataclass
 class _Draft:
-    """The unfinished cell as data of its YAML, with notes and faults."""
+    """The unfinished cell as data of its YAML, with notes."""
 
     file: Path
     data: dict[str, Any]
     notes: list[str] = field(default_factory=list)  # Notes about guessed values.
-    faults: list[str] = field(default_factory=list)  # Faults for which q2r2 check does not look.
     fits: dict[str, list[CapsuleFit]] = field(default_factory=dict)  # By model.
     always: list[tuple[str, str]] = field(default_factory=list)  # Pairs of links that overlap by construction.
     xacro_args: dict[str, str] = field(default_factory=dict)  # Arguments of each xacro model.
@@ -103,7 +103,8 @@ def new_cell(
         raise ConfigError(f"NAME = {name!r:.60}: allowed: letters, digits, _ and -; the file is written here")
     for one in (file, srdf):
         if one.exists():
-            raise ConfigError(f"{one}: exists; give another name")
+            goes_on = f"q2r2 check {file} is enough if only the model has changed" if file.exists() else "delete it"
+            raise ConfigError(f"{one}: exists; allowed: another name; {goes_on}")
     if (robot is None) == (left is None and right is None):
         raise ConfigError("--left, --right or --robot: allowed: a model for each arm, or one that holds both")
     draft = _Draft(file, {"name": name}, xacro_args=named_values(xacro_arg or []))
@@ -140,7 +141,7 @@ def new_cell(
         draft.data["srdf"] = srdf.name
     file.write_text(commented_yaml(draft.data, cell), encoding="utf-8")
     result = check_cell(load_config(file))
-    notes, faults = [*draft.notes, *result.notes], [*draft.faults, *result.faults]
+    notes, faults = [*draft.notes, *result.notes], result.faults
     if json:
         print(as_json_text({"file": str(file), "capsules": draft.fits, "notes": notes, "faults": faults}))
     else:
@@ -174,13 +175,8 @@ def _survey(draft: _Draft, models: dict[str, str], tips: dict[str, str | None], 
             ]
             but = f"; {', '.join(mimics):.200}, so that it ends the arm like a gripper's" if mimics else ""
             raise ConfigError(f"{models[side]!r:.120}: {moves}; allowed: an arm, of {_LEAST_JOINTS} or more{but}")
-        limits, masses = lacks_of(described[side], tree, tip)
-        if limits:
+        if limits := limits_lacking(tree, tip):
             lacks.append(f"{models[side]}: {', '.join(limits)}")
-        if masses:
-            draft.faults.append(
-                f"{side} arm: links that move without a mass, which simulation needs: {', '.join(masses)}"
-            )
     if lacks:
         raise ConfigError(f"{'; '.join(dict.fromkeys(lacks))}; to change: the <limit> of these joints in the model")
     if shared is not None:
@@ -318,7 +314,7 @@ def _limit_acceleration(draft: _Draft, robot: Robot, config: Config) -> None:
         draft.data.setdefault("control", {})["acceleration_limit"] = math.floor(10.0 * cap * share) / 10.0
 
 
-def _print(draft: _Draft, notes: list[str], faults: list[str]) -> None:
+def _print(draft: _Draft, notes: Sequence[str], faults: Sequence[str]) -> None:
     console = Console(highlight=False, soft_wrap=True)
     for model, fits in draft.fits.items():
         rows = (
@@ -333,7 +329,11 @@ def _print(draft: _Draft, notes: list[str], faults: list[str]) -> None:
         if fits:
             meshes = counted(len(fits), "mesh", "meshes")
             title = f"{model}: capsules around {meshes}, each with the whole mesh inside; the worst first"
-            print_table(figure_table(title, columns, rows), console)
+            notes_on_columns = (
+                "beyond the mesh: how far a capsule stands out; empty: its share that holds none of the mesh; better:",
+                "the number of smaller capsules that the cell gets instead; then empty: the share with these",
+            )
+            print_table(figure_table(title, columns, rows, notes_on_columns), console)
     for note in notes:
         say(f"NOTE {note}", console)
     for fault in faults:

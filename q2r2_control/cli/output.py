@@ -216,6 +216,7 @@ def recording_line(recording: RecordingSummary) -> str:
 
 
 def verdict_markup(verdict: Verdict) -> str:
-    """Return one line of markup that says whether an episode is kept, and if not, why."""
-    colour = "green" if verdict.keep else "red"
-    return f"[{colour}]{verdict.word}[/]{escape(verdict.line.removeprefix(verdict.word))}"
+    """Return markup that says whether an episode is kept, and if not, why. Several reasons have a line each."""
+    word = f"[{'green' if verdict.keep else 'red'}]{verdict.word}[/]"
+    found = [escape(finding) for finding in verdict.findings]
+    return f"{word}: {found[0]}" if len(found) == 1 else "\n    ".join([f"{word}:" if found else word, *found])

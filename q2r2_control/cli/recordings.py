@@ -109,15 +109,15 @@ def replay(
         summary = None if result.summary is None else result.summary.as_json()
         print(as_json_text({**data, **difference, **arms, "summary": summary}))
     else:
+        for name, arm in result.arms.items():
+            off = f"{arm.position_mm_rms:.3f} mm RMS, {arm.position_mm_max:.3f} mm and {arm.rotation_deg_max:.3f} deg"
+            print(f"{name} arm: tool {off} at most from where it was when recorded")
         if compare:
             print("identical" if result.difference is None else f"first difference at {result.difference}")
         elif result.summary is not None:
             console = Console()
             console.print(verdict_line(result.summary), soft_wrap=True, highlight=False)
             print_table(summary_table(result.summary, verbose), console)
-        for name, arm in result.arms.items():
-            off = f"{arm.position_mm_rms:.3f} mm RMS, {arm.position_mm_max:.3f} mm and {arm.rotation_deg_max:.3f} deg"
-            print(f"{name} arm: tool {off} at most from where it was when recorded")
     if compare and result.difference is not None:
         raise Exit(1)
 

@@ -53,7 +53,7 @@ from q2r2_control.demo.assembly_tasks import (
     with_parts_at,
 )
 from q2r2_control.demo.trials import try_task, try_tasks
-from q2r2_control.errors import NOT_RECORDED, ConfigError
+from q2r2_control.errors import NOT_RECORDED, ConfigError, InputError
 from q2r2_control.extras import install_line
 from q2r2_control.inputs.base import adapted, make_input, options_of
 from q2r2_control.inputs.headset_check import watch_headset
@@ -133,8 +133,9 @@ def run(
     cell with real cabinets that is not commissioned is refused too, unless --i-know is given. The joints of real
     cabinets move at a tenth of their speed, unless --full-speed is given.
     Exit code 1 if a tool is more than 100 mm from its reference at the end, if an arm refused every press that engages
-    it, if measured links met in torque mode, if a tick had no certificate, or if an arm still moves at the end. Exit
-    code 3 if there is no such fault, but the recording ended before the run, as with a full disk or a killed writer.
+    it, if measured links met in torque mode, if a tick had no certificate, if a policy raised an error or gave actions
+    that cannot be used, or if an arm still moves at the end. Exit code 3 if there is no such fault, but the recording
+    ended before the run, as with a full disk or a killed writer.
     With the headset, one line on stderr says which address was bound: "headset: listening on HOST:PORT".
     """
     cell = with_solver(load_config(config), solver)
@@ -153,10 +154,12 @@ def run(
     asked |= {"human": human or None, "seed": seed or None, "fast": fast or None}
     given = {option: value for option, value in asked.items() if value is not None}
     if unfit := [option for option in given if option not in options_of(source)]:
-        raise ConfigError(f"--{unfit[0]} cannot be used with --input {source}")
+        cure = "; add --input policy" if unfit[0] in ("policy", "takeover") else ""
+        usual = "" if input is not None else ", which is the cell's input"
+        raise ConfigError(f"--{unfit[0]} cannot be used with --input {source}{usual}{cure}")
     if fast and duration is None:
         raise ConfigError("--fast needs --duration, since simulated time has no end of its own")
-    _check_times(fast, rt)
+    _check_times(fast, rt, plant or cell.plant)
     if wait is not None and not hasattr(load_class(PLANTS, plant or cell.plant), "longest_wait"):
         raise ConfigError(f"--wait cannot be used with --plant {plant or cell.plant}, which waits for nobody")
     options = RunOptions(
@@ -177,7 +180,10 @@ def run(
         notes=notes_of(task, operator, record, anonymous),
         longest_wait=longest_wait(wait),
     )
-    done = run_cell(cell, options)
+    try:
+        done = run_cell(cell, options)
+    except SystemExit as error:  # With --fast, a policy is called in this thread, and would end the command with 0.
+        raise InputError(f"the run was ended by SystemExit({error.code}); allowed: a policy that returns") from error
     print_summary(done, json, verbose)
     if done.summary.broken:
         raise Exit(1)
@@ -242,9 +248,9 @@ def demo(
     With --record, the recording says whether all tasks succeeded, and q2r2 report makes plots of it. Exit code 3 if the
     recording ended before the run. With --seeds, exit code 1 if a task succeeded in less than 19 of 20 trials.
     """
-    _check_times(fast, rt)
     if plant not in ("mujoco", "fri"):
         raise ConfigError(f"--plant {plant!r:.40}: allowed: mujoco, fri")
+    _check_times(fast, rt, plant)
     if hands not in (None, "careful", "shaky"):
         raise ConfigError(f"--hands {hands!r:.40}: allowed: careful, shaky")
     shaky = hands == "shaky"
@@ -325,9 +331,11 @@ def _try_tasks(
         raise Exit(1)
 
 
-def _check_times(fast: bool, rt: bool) -> None:
+def _check_times(fast: bool, rt: bool, plant: str) -> None:
     if fast and rt:
         raise ConfigError("--rt and --fast exclude each other, since simulated time is never late")
+    if fast and getattr(load_class(PLANTS, plant), "realtime_only", False):
+        raise ConfigError(f"--fast cannot be used with --plant {plant}, which keeps real time")
 
 
 def _shows_table(headless: bool, viewer: bool) -> bool:

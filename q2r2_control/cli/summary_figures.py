@@ -73,7 +73,7 @@ def _result(summary: RunSummary) -> Iterator[tuple[str, str]]:
     if summary.min_distance_mm is not None and summary.closest_pair is not None:
         yield "nearest pair", f"{summary.min_distance_mm:.1f} mm, {' | '.join(summary.closest_pair)}"
     if summary.missed_ticks:
-        late = f"the loop was late by {summary.stretched_s:.2f} s in all, by which every motion waited"
+        late = f"the motion paused for them, {summary.stretched_s:.2f} s in all"
         yield "ticks missed", f"{summary.missed_ticks} of {summary.missed_ticks + summary.ticks}; {late}"
     for name, event in _last_faults(summary).items():
         label = f"{name} arm" if event.kind is TeleopReason.NOT_ENGAGED else f"{name} arm paused by"

@@ -38,6 +38,8 @@ def find_resource(path: str | os.PathLike[str]) -> Path:
         for candidate in chain([wanted], (root / wanted for root in roots)):
             if candidate.is_file():
                 return candidate
+        if str(path) and wanted.is_dir():
+            raise ConfigError(f"{path}: a folder; allowed: the path of a file")
     except (OSError, ValueError, RuntimeError) as error:
         # The name is too long, a folder may not be entered, or the user of a home folder is not known.
         raise ConfigError(f"{path!s:.120}: cannot be looked up: {error!s:.120}") from error

@@ -110,17 +110,22 @@ def _line(key: str, fault: ErrorDetails, model: type[BaseModel]) -> str:
     if fault["type"] == "missing":
         has = "allowed: a list with one more entry" if isinstance(fault["loc"][-1], int) else "and has no default"
         return f"{key}: missing, {has}"
-    allowed = fault["msg"].removeprefix("Value error, ")
-    if (words := _ALLOWED.get(fault["type"])) is not None:
-        allowed = f"allowed: {words.format(**fault.get('ctx', {}))}"
+    allowed = allowed_instead(fault)
     if fault["type"] == "extra_forbidden":
         keys = _keys_at(fault["loc"][:-1], model)
         meant = get_close_matches(str(fault["loc"][-1]), keys, n=1)
-        allowed = f"unknown key; allowed here: {', '.join(keys)}" + (f"; did you mean {meant[0]}?" if meant else "")
+        allowed = f"unknown key; {f'did you mean {meant[0]}? ' if meant else ''}allowed here: {', '.join(keys)}"
     # For a whole block, the text itself names the keys that do not fit together.
     is_block = fault["type"] == "value_error" and isinstance(fault["input"], dict)
     value = "" if is_block else f" = {shown(fault['input'])}"
     return f"{key}{value}: {allowed}"
+
+
+def allowed_instead(fault: ErrorDetails) -> str:
+    """Return what is allowed instead of a value, in the words of this package if pydantic's kind of fault has some."""
+    words = _ALLOWED.get(fault["type"])
+    text = fault["msg"].removeprefix("Value error, ")
+    return text if words is None else f"allowed: {words.format(**fault.get('ctx', {}))}"
 
 
 def _keys_at(location: tuple[int | str, ...], root: type[BaseModel]) -> list[str]:

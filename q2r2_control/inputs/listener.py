@@ -15,6 +15,7 @@ from ipaddress import ip_address
 from typing import TypeVar
 
 from q2r2_control.config.strict import Network
+from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.addresses import reachable_addresses
 
 LINES_PERIOD = 1.0  # Time between two lines about one host [s].
@@ -157,6 +158,22 @@ def written(host: str, port: int) -> str:
 def why_not_bound(error: Exception) -> str:
     """Return why an address cannot be bound. An OSError's own text repeats the address."""
     return os.strerror(error.errno) if isinstance(error, OSError) and error.errno else str(error)
+
+
+def listening_socket(host: str, port: int, option: str) -> socket.socket:
+    """Return a socket of a page that listens on ``host`` and ``port``; a port of 0 stands for any free one.
+
+    Raises:
+        ConfigError: If the address cannot be bound. The message begins with ``option``.
+    """
+    try:
+        ipv6 = ":" in host
+        family, both = (socket.AF_INET6, socket.has_dualstack_ipv6()) if ipv6 else (socket.AF_INET, False)
+        return socket.create_server((host, port), family=family, dualstack_ipv6=both)
+    except (OSError, OverflowError) as error:
+        message = f"{option}: cannot listen on {host} port {port}: {why_not_bound(error)}; allowed: a free port"
+        cure = f"{'--web-port' if option == '--web' else '--port'} 0 takes any free one"
+        raise ConfigError(f"{message}; {cure}") from error
 
 
 def app_settings(host: str, port: int) -> str:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import http
 import re
 import secrets
-import socket
 import ssl
 from collections.abc import Sequence
 from urllib.parse import parse_qs, urlsplit
@@ -15,7 +14,7 @@ from websockets.http11 import Request, Response
 
 from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.addresses import reachable_addresses
-from q2r2_control.inputs.listener import is_loopback, why_not_bound, written
+from q2r2_control.inputs.listener import is_loopback, listening_socket, written
 
 _LOOPBACK = ("localhost", "127.0.0.1", "[::1]")
 _PORT = re.compile(r":\d{1,5}$")
@@ -85,13 +84,7 @@ class PageDoor:
             ConfigError: If the address cannot be bound, or if the certificate cannot be used.
         """
         self.tls = tls_context(certificate)
-        try:
-            ipv6 = ":" in host
-            family, both = (socket.AF_INET6, socket.has_dualstack_ipv6()) if ipv6 else (socket.AF_INET, False)
-            self.socket = socket.create_server((host, port), family=family, dualstack_ipv6=both)
-        except (OSError, OverflowError) as error:
-            message = f"{option}: cannot listen on {host} port {port}: {why_not_bound(error)}; allowed: a free port"
-            raise ConfigError(message) from error
+        self.socket = listening_socket(host, port, option)
         self.port: int = self.socket.getsockname()[1]
         self._scheme = "http" if certificate is None else "https"
         self._names = {*_LOOPBACK, host.lower()}

@@ -113,13 +113,22 @@ class PolicyInput:
 
     @classmethod
     def from_config(
-        cls, config: Config, policy: str | None = None, takeover: str | None = None, **options: object
+        cls,
+        config: Config,
+        policy: str | None = None,
+        takeover: str | None = None,
+        *,
+        named: str = "--policy",
+        **options: object,
     ) -> PolicyInput:
-        """Make an input. ``policy`` is "module:name" of a policy or its class; ``takeover`` is the name of an input."""
+        """Make an input. ``policy`` is "module:name" of a policy or its class; ``takeover`` is the name of an input.
+
+        Errors about the policy begin with ``named``.
+        """
         if policy is None:
             raise ConfigError("input policy: --policy MODULE:NAME is missing, which names the policy")
         operator = None if takeover is None else make_input(takeover, config, **options)
-        return cls(_loaded(policy), operator=operator)
+        return cls(_loaded(policy, named), operator=operator)
 
     @property
     def connected(self) -> bool:
@@ -289,18 +298,24 @@ class PolicyInput:
         return tools
 
 
-def _loaded(where: str) -> Policy:
-    """Return the policy at "module:name", from this folder or installed; raises :class:`ConfigError` without one."""
-    check_kind("--policy", where, str, "MODULE:NAME")
+def _loaded(where: str, named: str) -> Policy:
+    """Return the policy at "module:name", from this folder or installed; raises :class:`ConfigError` without one.
+
+    ``named`` is what the command line calls it.
+    """
+    check_kind(named, where, str, "MODULE:NAME")
     module, _, name = where.partition(":")
     if (here := str(Path.cwd())) not in sys.path:
         sys.path.insert(0, here)
     try:
         found = getattr(importlib.import_module(module), name)
         found = found() if isinstance(found, type) else found
+    except ModuleNotFoundError as error:
+        looked = f"modules are looked for in the working directory, {here}, and among installed packages"
+        raise ConfigError(f"{named} {where}: {error}; {looked}") from error
     except Exception as error:  # The module may raise any error.
-        raise ConfigError(f"--policy {where}: {type(error).__name__}: {error}"[:200]) from error
+        raise ConfigError(f"{named} {where}: {type(error).__name__}: {error}"[:200]) from error
     if not callable(found):
-        raise ConfigError(f"--policy {where}: allowed: MODULE:NAME of a function of an Observation, or a class of such")
+        raise ConfigError(f"{named} {where}: allowed: MODULE:NAME of a function of an Observation, or a class of such")
     loaded: Policy = found
     return loaded

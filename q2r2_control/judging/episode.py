@@ -114,7 +114,7 @@ class Episode:
         """Return whether the run came to its end and the file was closed, or the operator ended the episode before."""
         if self.ended_by_operator:
             return True
-        return self.recording.closed and bool(len(self.ticks.t)) and not self.ticks.following[-1]
+        return self.recording.closed and not self.ticks.following[-1:].any()
 
 
 def read_episode(recording: Recording, *, pictures: bool = True) -> Episode:

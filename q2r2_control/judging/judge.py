@@ -15,17 +15,17 @@ import numpy as np
 
 from q2r2_control.config.recording import JudgeSettings
 from q2r2_control.errors import Q2R2Error, RecordingError
-from q2r2_control.judging.camera_figures import CameraFigures
 from q2r2_control.judging.contradictions import contradictions
 from q2r2_control.judging.episode import Episode, Hand, read_episode
 from q2r2_control.judging.figures import EpisodeFigures, figures_of
 from q2r2_control.judging.thresholds import THRESHOLDS, Rejection
 from q2r2_control.process.helper_process import reason_of
-from q2r2_control.recording.reader import BROKEN, EpisodeSpan, Recording, spans_of
+from q2r2_control.recording.reader import BROKEN, NO_END, EpisodeSpan, Recording, spans_of
 from q2r2_control.recording.ros_recording import open_recording
 
 VERDICT_FILE = "verdict.json"
 _FORMAT = 2
+_OF_CAMERAS = {threshold.name for threshold in THRESHOLDS if threshold.of == "camera"}
 _LONGEST_REASON = 300  # The longest reason why a file cannot be read [characters].
 
 
@@ -48,6 +48,20 @@ class Verdict:
         reasons = "; ".join(reason.text for reason in self.reasons)
         return f"{self.word}: {reasons}" if reasons else self.word
 
+    @property
+    def findings(self) -> tuple[str, ...]:
+        """The texts of the reasons. Cameras with the same finding share a text, and come after all other reasons."""
+        others = list[str]()
+        cameras: dict[str, list[str]] = {}
+        for reason in self.reasons:
+            if reason.name in _OF_CAMERAS:
+                whose, _, finding = reason.text.partition(": ")
+                cameras.setdefault(finding, []).append(whose.removeprefix("camera "))
+            else:
+                others.append(reason.text)
+        joined = (f"camera{'s' * (len(names) > 1)} {', '.join(names)}: {what}" for what, names in cameras.items())
+        return (*others, *joined)
+
 
 def verdict_of(figures: EpisodeFigures, settings: JudgeSettings) -> Verdict:
     """Compare an episode's numbers with thresholds; a number that is None is not judged."""
@@ -58,27 +72,27 @@ def verdict_of(figures: EpisodeFigures, settings: JudgeSettings) -> Verdict:
         "hand": {f"{name} hand: ": hand for name, hand in figures.hands.items()},
         "arm": {f"{name} arm: ": arm for name, arm in figures.arms.items()},
         "measured": {f"{name} arm: ": arm for name, arm in figures.measured.items()},
-        "camera": {_whose(name, camera): camera for name, camera in figures.cameras.items()},
+        "camera": {f"camera {name}: ": camera for name, camera in figures.cameras.items()},
         "subtask": {f"subtask {number}, {one.name}: ": one for number, one in enumerate(figures.subtasks, 1)},
         "episode": {"": figures},
         "timing": {"": figures.timing},
     }
+    told = set[str]()
     for threshold in THRESHOLDS:
         limit = getattr(settings, threshold.name)
         for whose, found in groups[threshold.of].items():
-            if (reason := threshold.reason(getattr(found, threshold.figure), limit, whose)) is not None:
+            # The first reason about a camera has the number of its missing pictures, and no other one repeats it.
+            missing = 0 if whose in told else getattr(found, "missing_pictures", 0)
+            says = f"{whose}{missing} pictures missing, " if missing else whose
+            if (reason := threshold.reason(getattr(found, threshold.figure), limit, says)) is not None:
                 reasons.append(reason)
+                told.add(whose)
     if settings.max_faults is not None and len(figures.faults) > settings.max_faults:
         first = figures.faults[0]
         also = f", and {len(figures.faults) - 1} more" if len(figures.faults) > 1 else ""
         what = f"fault: {first.arm} arm at {first.t:.2f} s: {first.reason}{also} (at most {settings.max_faults})"
         reasons.append(Rejection("max_faults", what))
     return Verdict((*reasons, *contradictions(figures, settings)))
-
-
-def _whose(name: str, camera: CameraFigures) -> str:
-    missing = f", {camera.missing_pictures} of its pictures missing" if camera.missing_pictures else ""
-    return f"camera {name}{missing}: "
 
 
 def _unreadable(figures: EpisodeFigures, settings: JudgeSettings) -> Iterator[Rejection]:
@@ -92,10 +106,11 @@ def _unreadable(figures: EpisodeFigures, settings: JudgeSettings) -> Iterator[Re
         yield Rejection("ended_by", f"a fault ended the run: {figures.ended_by}")
     if figures.damage is not None:
         yield Rejection("damaged", f"after {figures.duration_s:.2f} s {figures.damage}")
-    elif not figures.timing.ticks:
+        return
+    if not figures.timing.ticks:
         yield Rejection("no_ticks", "no tick of a controller was recorded")
-    elif settings.needs_end and not figures.timing.ended:
-        yield Rejection("needs_end", "the recording has no end: its process was killed, or the disk was full")
+    if settings.needs_end and not figures.timing.ended:
+        yield Rejection("needs_end", NO_END)
 
 
 def parts_of(episode: Episode) -> list[Episode]:

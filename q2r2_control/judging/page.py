@@ -129,6 +129,7 @@ def draw_episode(judged: Judged) -> str:
         axes.set_title(title)
         axes.set_ylabel(unit)
         axes.grid(alpha=0.3)
+        axes.tick_params(labelbottom=True)
         axes.set_xlim(0.0, max(end, 1e-3))
         if axes.get_legend_handles_labels()[0]:
             axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=8, frameon=False)
@@ -167,9 +168,10 @@ def _draw_speed(axes: Axes, judged: Judged) -> None:
 def _draw_errors(axes: Axes, judged: Judged) -> None:
     for index, arm in enumerate(judged.episode.arms):
         _draw(axes, arm, judged.episode.frame_t, 1e3 * tracking_errors(judged.episode, index)[0])
+    highest = max(1.0, axes.get_ylim()[1])  # The limit may be far above all errors, which would be a flat line then.
     if (limit := judged.settings.max_position_error_p99) is not None:
-        axes.axhline(1e3 * limit, label="p99 at most", **_LIMIT)
-    axes.set_ylim(bottom=0.0)
+        axes.axhline(1e3 * limit, label=f"p99 at most {1e3 * limit:g}", **_LIMIT)
+    axes.set_ylim(0.0, highest)
 
 
 def _draw_hands(axes: Axes, judged: Judged) -> None:

@@ -55,6 +55,10 @@ _ROUNDING_S = 1e-9
 _MAX_TORQUE_HOLD_S = 0.005  # A torque that a late tick held for 0.1 s would drive the arms into each other.
 _LATE_LOOP = "the loop falls behind: of its %.0f ticks a second more than a tenth come late; %s"
 _CURES = "close other programs, give it priority with --rt, or set a lower loop_rate_hz in the cell"
+_CURES_OF_FITTED_RATE = (
+    "close other programs, or give it priority with --rt. The rate was chosen at the start, when the computer had time "
+    "for it, and stays while arms may move: a new run measures again, and loop_rate_hz in the cell sets another"
+)
 _CURES_AT_LOWEST_RATE = "close other programs, or give it priority with --rt"
 _logger = logging.getLogger(__name__)
 
@@ -118,6 +122,7 @@ class Pipeline(RequestedRun):
         # This is a plain flag, because a signal handler cannot take the lock of a threading.Event safely.
         self._stopping = False
         self._rested_since: float | None = None  # The end of the last run [s].
+        self._rate_was_fitted = False  # Whether :meth:`fit_rate` chose the rate of the loop.
         self._pace: WallPace | None = None  # If given, simulated time must not be faster than the clock.
         self._set_up()
 
@@ -273,6 +278,7 @@ class Pipeline(RequestedRun):
                     break
         finally:
             self.listeners = listeners
+        self._rate_was_fitted = True
         _logger.info(str(fit))
         return fit
 
@@ -381,7 +387,8 @@ class Pipeline(RequestedRun):
         if self._clock.falls_behind() and not self._told_late:
             self._told_late = True
             rate = 1.0 / self._clock.period
-            _logger.warning(_LATE_LOOP, rate, _CURES if rate > min(FITTING_RATES_HZ) else _CURES_AT_LOWEST_RATE)
+            cures = _CURES_OF_FITTED_RATE if self._rate_was_fitted else _CURES
+            _logger.warning(_LATE_LOOP, rate, cures if rate > min(FITTING_RATES_HZ) else _CURES_AT_LOWEST_RATE)
         braked, dt = (0.0, self.loop.pace(gap)) if self._sessions is None else self._sessions.due(now)
         began = time.perf_counter()
         samples = self._operator.poll(now) if self._following else []

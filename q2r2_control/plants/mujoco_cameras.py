@@ -121,7 +121,8 @@ class ThreadPictures:
 def window_fault() -> str | None:
     """Return why no window can be opened; None if one can. MuJoCo would wait for ever for a window that cannot open."""
     if not has_display():
-        return "MuJoCo's window needs a display: neither DISPLAY nor WAYLAND_DISPLAY is set; run headless"
+        lacks = "neither DISPLAY nor WAYLAND_DISPLAY is set"
+        return f"MuJoCo's window needs a display: {lacks}; --web shows the arms in a browser"
     import glfw
 
     with warnings.catch_warnings():

@@ -78,9 +78,23 @@ def build_model(robot: Robot, config: Config) -> mujoco.MjModel:
         let_objects_yield(spec, config)
         add_cameras(spec, config.simulated_cameras)
         furnish(spec, floor=config.floor is not None)
+        if massless := _moving_without_mass(spec):
+            models = ", ".join(dict.fromkeys(map(config.model_of, robot.arms)))
+            what = f"links that move without a mass, which simulation needs: {', '.join(massless)}"
+            raise PlantError(f"{robot.name}: {what}; allowed: <inertial> with a mass in {models}")
         return spec.compile()
     except (ValueError, RuntimeError, mujoco.FatalError) as error:
         raise PlantError(f"{robot.name}: MuJoCo cannot make a model of it: {' '.join(str(error).split())}") from error
+
+
+def _moving_without_mass(spec: mujoco.MjSpec) -> list[str]:
+    """Return all moving bodies to which neither they nor bodies fixed to them give a mass. MuJoCo would name one."""
+
+    def mass(body: mujoco.MjsBody) -> float:
+        fixed = (mass(child) for child in body.bodies if not child.joints)
+        return float(body.mass) + sum(geom.mass for geom in body.geoms if geom.mass > 0.0) + sum(fixed)
+
+    return [body.name for body in spec.bodies if body.joints and not mass(body) > 0.0]
 
 
 def _readable_urdf(urdf: str) -> str:

@@ -40,6 +40,9 @@ class Picture:
     jpeg: bytes
 
 
+NO_END = "the recording has no end: its process was killed, or the disk was full"
+
+
 class Recording:
     """A file that ``q2r2 run --record`` wrote. Raises :class:`RecordingError`, of one line, for any other file."""
 
@@ -159,6 +162,8 @@ class Recording:
             raise RecordingError(f"{self.file}: cannot be read: {error.strerror}") from error
         except BROKEN as error:
             raise RecordingError(f"{self.file}: not an MCAP file, or damaged: {reason_of(error):.200}") from error
+        if not self.file.stat().st_size:
+            raise RecordingError(f"{self.file}: the file is empty; allowed: a recording of q2r2 run --record")
         if not texts:
             raise RecordingError(f"{self.file}: not a recording of q2r2 run --record: no metadata {ABOUT}")
         try:

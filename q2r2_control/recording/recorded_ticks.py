@@ -12,7 +12,7 @@ import numpy as np
 from q2r2_control.config.cell import Config, parse_config
 from q2r2_control.errors import Q2R2Error, RecordingError
 from q2r2_control.events import Event
-from q2r2_control.recording.reader import Recording
+from q2r2_control.recording.reader import NO_END, Recording
 from q2r2_control.recording.tick_chunks import TickChunk
 from q2r2_control.recording.tick_rows import HAND_FAULTS, NOT_MEASURED, SAMPLE_FIELDS, PackedTick
 from q2r2_control.recording.writer import RecordedRobot
@@ -50,7 +50,8 @@ class RecordedTicks:
         self.current: RecordedTick | None = None
         self.next = next(self._ticks, None)
         if self.next is None or not self._starts:
-            raise RecordingError(f"{recording.file}: no tick was recorded")
+            why = "" if recording.closed else f"; {NO_END}"
+            raise RecordingError(f"{recording.file}: no tick was recorded{why}")
         self.start = self._starts[0]
 
     def advance(self) -> RecordedTick:

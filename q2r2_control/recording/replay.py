@@ -22,8 +22,9 @@ from q2r2_control.pipeline.loop_clock import LoopClock, WallPace
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.pipeline.requests import REPEATED
 from q2r2_control.plants.base import make_plant
+from q2r2_control.plugins import PLANTS, load_class
 from q2r2_control.recording.about import ROS, About, changes
-from q2r2_control.recording.reader import Recording
+from q2r2_control.recording.reader import NO_END, Recording
 from q2r2_control.recording.recorded_ticks import NoMoreTicksError, RecordedTick, RecordedTicks, cell_and_robot_of
 from q2r2_control.recording.tick_rows import NOT_REPLAYED, TickPacker, tick_labels
 from q2r2_control.robot.robot import Robot
@@ -51,10 +52,13 @@ class ArmDifference:
     rotation_deg_max: float
 
 
+_REPEATABLE = ("mujoco", "kinematic")  # Plants that can move in a replay.
+
+
 @dataclass(frozen=True, slots=True)
 class Replay:
     ticks: int
-    summary: RunSummary | None  # None if the recording has no end, or if a fault ended the run.
+    summary: RunSummary | None  # None if the run ended before its first tick.
     ended_by: str | None  # That fault, or the reason why the replay ended too early.
     difference: str | None  # The first difference; None if there is none.
     notes: list[str]  # The changes since the run was recorded.
@@ -87,15 +91,17 @@ def replay(
             "nothing to replay to the bit; ros2 bag play plays it, q2r2 judge and q2r2 export read it"
         )
     cell, robot = cell_and_robot_of(recording, config)
+    if plant is not None and getattr(load_class(PLANTS, plant), "realtime_only", False):
+        raise ConfigError(f"--plant {plant}: it keeps real time; allowed in a replay: {', '.join(_REPEATABLE)}")
     ticks = RecordedTicks(recording)
     pipeline = ReplayPipeline(cell, robot, ticks, about, plant)
     comparison = _Comparison(about, ticks) if compare or plant is None else None
     if comparison is not None:
         recorded = about.notes.get("plant", "another plant")
         if plant is not None and recorded != type(pipeline.plant).__name__:
-            raise ConfigError(
-                f"--plant {plant}: recorded with {recorded}; --compare is allowed with the recorded plant"
-            )
+            names = {load_class(PLANTS, name).__name__: name for name in _REPEATABLE}
+            allowed = f"--plant {names[recorded]}, or none" if recorded in names else "no --plant"
+            raise ConfigError(f"--plant {plant}: recorded with {recorded}; allowed with --compare: {allowed}")
         pipeline.listeners.append(comparison)
     difference = _PlantDifference(robot, ticks)
     if plant is not None:
@@ -109,9 +115,11 @@ def replay(
         if ticks.missing:
             ended_by = f"{ticks.missing} ticks were lost here when it was recorded"
         elif ticks.current is not None and ticks.current.following:
-            ended_by = "the recording has no end: its process was killed, or the disk was full"
+            ended_by = NO_END
     except PlantError as error:
         ended_by = str(error)
+    if summary is None and ticks.current is not None:
+        summary = pipeline.summary_so_far()
     found = None if comparison is None else comparison.finish()
     count = 0 if ticks.current is None else ticks.current.number + 1
     return Replay(count, summary, ended_by, found, changes(about, cell, robot), difference.arms())
@@ -132,6 +140,10 @@ class ReplayPipeline(Pipeline):
 
     def make_clock(self, realtime: bool) -> LoopClock:
         return _Clock(1.0 / self.config.nominal_rate_hz, self._recorded, self._pace)
+
+    def summary_so_far(self) -> RunSummary:
+        """Return the summary of the ticks up to now. A run that has begun is needed."""
+        return self._recorder.finish(self._clock, self.loop.pacer)
 
     def _ask_again(self, tick: RecordedTick) -> None:
         """Repeat the requests of a program at this tick: they are events of both arms that change no state."""

@@ -71,9 +71,9 @@ def _tips(tree: LinkTree, key: str) -> list[str]:
     return [end_of(tree, end, key) for end in named or ends]
 
 
-def lacks_of(description: Description, tree: LinkTree, tip: str) -> tuple[list[str], list[str]]:
-    """Return a line for each joint of the arm that lacks limits, and the names of moving links without a mass."""
-    limits, masses, links = [], [], description.urdf.findall("link")
+def limits_lacking(tree: LinkTree, tip: str) -> list[str]:
+    """Return a line for each joint of the arm that lacks limits."""
+    limits = []
     for joint in tree.chain(tip):
         limit, name = joint.find("limit"), joint.get("name", "")
         if (kind := joint.get("type")) in ("floating", "planar"):
@@ -84,11 +84,7 @@ def lacks_of(description: Description, tree: LinkTree, tip: str) -> tuple[list[s
         lower, upper = joint_limits(joint)
         lacking += [] if lower < upper else ["lower and upper"]
         limits += [f"{name} has no {' and no '.join(lacking)} limit"] if lacking else []
-        body = set(tree.fixed_to(child := joint_end(joint, "child")))
-        of_body = [mass for link in links if link.get("name") in body for mass in link.findall("inertial/mass")]
-        if not any(float(mass.get("value", "0")) > 0.0 for mass in of_body):
-            masses.append(child)
-    return limits, masses
+    return limits
 
 
 def gripper_of(description: Description, tree: LinkTree, tip: str) -> dict[str, Any]:

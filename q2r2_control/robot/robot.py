@@ -9,6 +9,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 import numpy.typing as npt
@@ -101,6 +102,14 @@ class Robot:
             its place at home.
         unchecked_links: Names of links without a collision shape, which by the user's choice are not watched.
     """
+
+    def __new__(cls, urdf: ET.Element | None = None, *_: object, **__: object) -> Self:
+        """Refuse what is no parsed URDF before Python counts the arguments. A copy is made without any argument."""
+        if not isinstance(urdf, ET.Element | None):
+            raise RobotError(
+                f"Robot({shown(urdf)}, ...): allowed: Robot.from_config(config), Robot.from_urdf(file, ...)"
+            )
+        return super().__new__(cls)
 
     def __init__(
         self,

@@ -13,7 +13,7 @@ import numpy as np
 from q2r2_control.compliance.impedance import ImpedanceReport
 from q2r2_control.compliance.repulsion import WallReport
 from q2r2_control.config.control import ControllerSettings
-from q2r2_control.events import Event
+from q2r2_control.events import CommonReason, Event
 from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.tick import Tick
 from q2r2_control.teleop.reasons import TeleopReason
@@ -167,6 +167,9 @@ class RunSummary:
             broken.append(f"measured {met} met: {self.torque.min_measured_distance_mm:.1f} mm")
         if self.uncertified_ticks:
             broken.append(f"{self.uncertified_ticks} ticks without a certificate")
+        # Both arms report one error of a policy, which is named once.
+        roots = (event.reason.root for event in self.events)
+        broken += dict.fromkeys(sentence(root) for root in roots if root.kind is CommonReason.POLICY_UNUSABLE)
         if not self.at_rest:
             broken.append("arms move at the end")
         return tuple(broken)

@@ -59,8 +59,10 @@ def test_the_version_is_that_of_the_installed_package() -> None:
             ((*command, "--solver", "simplex"), "control.solver = 'simplex': installed: clarabel, daqp")
             for command in (("run", CELL), ("demo",), ("bench",), ("soak",))
         ),
-        (("soak", "--ticks", "99"), "'--ticks'"),
-        (("soak", "--seed", "-1"), "'--seed'"),
+        (("soak", "--ticks", "99"), "--ticks = '99': allowed: 100 or more; see"),
+        (("soak", "--seed", "-1"), "--seed = '-1': allowed: 0 or more; see"),
+        (("run", CELL, "--mode", "tork"), "--mode = 'tork': allowed: position, velocity, torque; see"),
+        (("export", "csv", "x", "--output", "y", "--fps", "abc"), "--fps = 'abc': allowed: a whole number; see"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, tuple) else "",
 )

@@ -74,7 +74,8 @@ def test_a_policy_that_does_as_scripted_hands_did_grasps_and_one_that_rests_does
 def test_a_policy_that_cannot_be_loaded_is_one_line_before_any_trial() -> None:
     result = q2r2("evaluate", "nowhere:Policy", "grasp")
     assert result.exit_code == 2
-    assert result.stderr.startswith("q2r2: --policy nowhere:Policy: ModuleNotFoundError")
+    assert result.stderr.startswith("q2r2: MODULE:NAME nowhere:Policy: No module named 'nowhere'; ")
+    assert f"in the working directory, {Path.cwd()}, and among installed packages" in result.stderr
     assert len(result.stderr.splitlines()) == 1
 
 

@@ -101,7 +101,8 @@ def test_an_interrupted_export_leaves_no_half_files_and_the_next_export_complete
     arguments = ("export", "csv", *map(str, recordings), "--output")
     with monkeypatch.context() as patch:
         patch.setitem(FORMATS, "csv", ExportFormat(write_table, interrupted))
-        assert q2r2(*arguments, str(tmp_path / "out")).exit_code == 130
+        interrupted_export = q2r2(*arguments, str(tmp_path / "out"))
+    assert (interrupted_export.exit_code, interrupted_export.stderr) == (130, "q2r2: interrupted\n")
     assert [path.name for path in tmp_path.iterdir()] == ["out.partial"]
     for name in ("out", "at_once"):
         assert q2r2(*arguments, str(tmp_path / name)).exit_code == 0

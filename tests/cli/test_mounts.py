@@ -60,9 +60,9 @@ def test_written_postures_give_the_mount_of_arms_without_cabinets(tmp_path: Path
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("0 0 0", "allowed: lines of 12 numbers in radians: left_shoulder_pan_joint"),
-        (12 * "0 " + "\n" + 11 * "0 ", "allowed: lines of 12 numbers"),
-        ("a" + 11 * " 0", "could not convert string to float: 'a'; allowed: lines of 12"),
+        ("0 0 0", "line 1 has 3 numbers; allowed: lines of 12 numbers in radians: left_shoulder_pan_joint"),
+        (12 * "0 " + "\n" + 11 * "0 ", "line 2 has 11 numbers; allowed: lines of 12 numbers"),
+        ("# joints\na" + 11 * " 0", "line 2: could not convert string to float: 'a'; allowed: lines of 12"),
         (11 * "0 " + "nan", "allowed: lines of 12 numbers"),
         (2 * (12 * "0 " + "\n"), "2 points; allowed: 3 or more"),
         ("", "allowed: lines of 12 numbers"),
@@ -77,6 +77,11 @@ def test_postures_that_determine_no_mount_are_refused(tmp_path: Path, text: str,
     assert done.exit_code == 2
     assert says in done.stderr
     assert done.stderr.count("\n") == 1
+
+
+def test_a_missing_file_of_postures_is_one_line_without_numbers_of_the_system() -> None:
+    done = q2r2("mounts", "config/dual_ur5.yaml", "--postures", "nope.txt")
+    assert done.stderr.startswith("q2r2: --postures nope.txt: No such file or directory; allowed: a file with lines of")
 
 
 def test_tips_that_did_not_touch_the_same_points_give_no_mount(tmp_path: Path) -> None:

@@ -11,10 +11,12 @@ from rich.table import Table
 
 from q2r2_control import Pipeline, RunSummary
 from q2r2_control.cli.cell_run import CellRun, print_summary
-from q2r2_control.cli.output import late_line
+from q2r2_control.cli.output import late_line, verdict_markup
 from q2r2_control.cli.summary_figures import summary_table, verdict_line
 from q2r2_control.demo.assembly_tasks import TaskResult, held_to_promises
 from q2r2_control.events import CommonReason, Event, Reason
+from q2r2_control.judging.judge import Verdict
+from q2r2_control.judging.thresholds import Rejection
 from q2r2_control.summary.run_summary import Percentiles, TorqueSummary
 from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.viewer.tables import figure_table, print_table
@@ -101,6 +103,13 @@ def test_an_arm_that_refused_every_press_is_a_fault(summary: RunSummary) -> None
     assert replace(never, arms=engaged_later).broken == ()
 
 
+def test_several_reasons_of_a_verdict_have_a_line_each() -> None:
+    late, idle = Rejection("max_delay", "late [s]"), Rejection("max_idle_share", "idle")
+    assert verdict_markup(Verdict((late, idle))) == "[red]discard[/]:\n    late \\[s]\n    idle"
+    assert verdict_markup(Verdict((late,))) == "[red]discard[/]: late \\[s]"
+    assert verdict_markup(Verdict(())) == "[green]keep[/]"
+
+
 def test_the_output_of_a_run_begins_with_its_verdict_and_those_of_its_tasks(
     summary: RunSummary, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -164,7 +173,7 @@ def test_late_and_missed_ticks_and_the_pair_that_held_a_gripper_are_printed(summ
     held = replace(summary.arms["left"], gripper_held_s=1.25, gripper_held_by=("left_finger_0", "block_0"))
     late = replace(summary, lateness_us=Percentiles(60.0, 310.0, 1204.0), overruns=3, missed_ticks=7, stretched_s=0.123)
     text = text_of(replace(late, arms=summary.arms | {"left": held}))
-    assert f"7 of {summary.ticks + 7}; the loop was late by 0.12 s in all, by which every motion waited" in text
+    assert f"7 of {summary.ticks + 7}; the motion paused for them, 0.12 s in all" in text
     assert "median 60 us, p99 310, max 1204; 3 by more than a period" in text
     (row,) = (line for line in text.splitlines() if "left gripper held for" in line)
     assert "1.25 s, by left_finger_0 | block_0" in row

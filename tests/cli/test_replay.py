@@ -61,7 +61,8 @@ def test_on_another_plant_replay_prints_the_distances_of_the_tools(recorded: Pat
             "--viewer: without --plant there is no window; allowed: a plant that has one, as --plant mujoco",
         ),
         (("--plant", "kinematic", "--viewer"), "--viewer: the kinematic plant has no window"),
-        (("--plant", "mujoco", "--compare"), "recorded with KinematicPlant"),
+        (("--plant", "mujoco", "--compare"), "recorded with KinematicPlant; allowed with --compare: --plant kinematic"),
+        (("--plant", "fri"), "--plant fri: it keeps real time; allowed in a replay: mujoco, kinematic"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, tuple) else "",
 )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import platform
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -17,6 +18,7 @@ from typer import Exit
 
 from q2r2_control.cli.cell_run import CellRun, RunOptions, run_cell
 from q2r2_control.config.cell import Config, load_config, parse_config
+from q2r2_control.config.resources import find_resource
 from q2r2_control.extras import install_line
 from q2r2_control.recording.about import About
 from q2r2_control.recording.reader import Recording
@@ -34,8 +36,20 @@ def test_a_cell_that_check_refuses_is_refused_with_the_same_lines(tmp_path: Path
     faults = one_object(q2r2("check", file, "--json").stdout)["faults"]
     assert faults
     *lines, allowed = refused.stderr.splitlines()
-    assert [line.partition("dual_iiwa7: ")[2] for line in lines] == faults
+    assert [line.partition("dual_iiwa7: FAULT ")[2] for line in lines] == faults
     assert allowed == "q2r2: dual_iiwa7: --force runs it all the same"
+
+
+def test_links_without_a_mass_are_all_named_by_the_check_and_by_a_run(tmp_path: Path) -> None:
+    urdf = find_resource("robots/iiwa7.urdf").read_text(encoding="utf-8")
+    inertials = re.compile(r"<inertial>.*?</inertial>", re.DOTALL)
+    (tmp_path / "arm.urdf").write_text(inertials.sub("", urdf, count=4))
+    file = changed_cell(tmp_path, "model: iiwa7", f"model: {tmp_path / 'arm.urdf'}")
+    (fault,) = one_object(q2r2("check", file, "--json").stdout)["faults"]
+    assert "links that move without a mass, which simulation needs: left_link_1, left_link_2, left_link_3; " in fault
+    assert f"allowed: <inertial> with a mass in {tmp_path / 'arm.urdf'}, iiwa7" in fault
+    refused = q2r2("run", file, "--headless", "--duration", "0.1", "--fast")
+    assert (refused.exit_code, refused.stderr) == (2, f"q2r2: dual_iiwa7: FAULT {fault}\n")
 
 
 def test_without_the_parts_of_a_task_a_note_says_that_the_hands_move_without_them(tmp_path: Path) -> None:
@@ -127,7 +141,9 @@ def test_with_rt_one_line_names_the_refusals_of_the_system_and_the_run_goes_on(m
     assert result.exit_code == 0
     assert [line for line in result.stderr.splitlines() if "real time" in line] == [refusal]
     assert one_object(result.stdout)["ticks"] == 101
-    assert "real time" not in q2r2(*options).stderr
+    told = q2r2(*options).stderr
+    assert "real time" not in told
+    assert "dual_iiwa7: begins, 0.1 s, in simulated time\n" in told
 
 
 CAMERAS = ["above", "left_wrist", "right_wrist"]
@@ -237,6 +253,32 @@ def test_a_plant_without_pictures_is_named_and_recorded_without_them(tmp_path: P
     assert result.exit_code == 0
     assert "no pictures are recorded: the kinematic plant has none; allowed: --plant mujoco\n" in result.stderr
     assert Recording(Path(one_object(result.stdout)["recording"]["file"])).about.cameras == ()
+
+
+@pytest.mark.parametrize(
+    ("policy", "code", "told"),
+    [
+        ("json:dumps", 1, "actions of the policy that cannot be used: the policy raised TypeError"),
+        ("sys:exit", 2, "the run was ended by SystemExit("),
+    ],
+    ids=["raises", "exits"],
+)
+def test_a_policy_that_fails_makes_the_run_fail(policy: str, code: int, told: str) -> None:
+    result = q2r2("run", CELL, *OPTIONS, "--input", "policy", "--policy", policy)
+    assert result.exit_code == code
+    assert told in " ".join([result.stdout, result.stderr])
+
+
+def test_a_policy_without_its_input_is_refused_with_the_missing_option() -> None:
+    result = q2r2("run", CELL, *OPTIONS, "--policy", "json:dumps")
+    told = "--policy cannot be used with --input scripted, which is the cell's input; add --input policy\n"
+    assert (result.exit_code, result.stderr) == (2, f"q2r2: {told}")
+
+
+def test_simulated_time_is_refused_at_once_for_a_plant_that_keeps_real_time() -> None:
+    result = q2r2("demo", "grasp", "--plant", "fri", "--fast", "--headless")
+    told = "q2r2: --fast cannot be used with --plant fri, which keeps real time\n"
+    assert (result.exit_code, result.stderr) == (2, told)
 
 
 POLICY = """

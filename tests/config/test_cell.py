@@ -33,11 +33,11 @@ ARM = {"model": "iiwa7", "home": [0] * 7, "tip": "link_ee"}
 def test_an_unknown_key_is_named_with_those_allowed_there(tmp_path: Path, path: str) -> None:
     cell = external if path.startswith("external") else shipped
     message = fault(tmp_path, changed(path, 1.5, cell))
-    assert message.startswith(f"{path} = 1.5: unknown key; allowed here: ")
+    assert message.startswith(f"{path} = 1.5: unknown key; ")
     data: Any = cell()
     for parent in path.split(".")[:-1]:
         data = data.get(parent, {})
-    allowed = message.partition("allowed here: ")[2].partition(" (and")[0].partition("; did")[0].split(", ")
+    allowed = message.partition("allowed here: ")[2].partition(" (and")[0].split(", ")
     assert set(data) <= set(allowed)
     assert allowed
 
@@ -51,7 +51,8 @@ def test_an_unknown_key_is_named_with_those_allowed_there(tmp_path: Path, path: 
 )
 def test_the_keys_of_a_gripper_are_those_of_its_kind(tmp_path: Path, gripper: dict[str, Any], allowed: str) -> None:
     message = fault(tmp_path, changed("fri.left.gripper", gripper))
-    assert message.startswith(f"fri.left.gripper.units = 9: unknown key; allowed here: {allowed}")
+    assert message.startswith("fri.left.gripper.units = 9: unknown key; ")
+    assert f"allowed here: {allowed}" in message
 
 
 def test_the_motion_that_a_cabinet_sees_while_answers_catch_up_is_within_the_velocity_limits(tmp_path: Path) -> None:
@@ -73,8 +74,7 @@ def test_a_gripper_by_modbus_has_a_host_or_a_serial_device(tmp_path: Path) -> No
 
 def test_a_misspelt_key_is_named_before_the_missing_one(tmp_path: Path) -> None:
     message = fault(tmp_path, CELL.read_text().replace("shape: box", "shapes: box"))
-    assert message.startswith("obstacles.table.shapes = 'box': unknown key; allowed here: colour, ")
-    assert "; did you mean shape?" in message
+    assert message.startswith("obstacles.table.shapes = 'box': unknown key; did you mean shape? allowed here: colour, ")
 
 
 @pytest.mark.parametrize(

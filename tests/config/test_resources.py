@@ -44,6 +44,11 @@ def test_a_name_that_is_not_a_file_gives_one_line(path: str) -> None:
         assert "config/dual_iiwa14.yaml, config/dual_iiwa7.yaml" in str(caught.value)
 
 
+def test_a_folder_is_named_as_a_folder(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=f"{tmp_path}: a folder; allowed: the path of a file"):
+        find_resource(tmp_path)
+
+
 def test_every_file_of_config_and_robots_is_part_of_the_installation() -> None:
     project = tomllib.loads((CHECKOUT / "pyproject.toml").read_text(encoding="utf-8"))
     patterns = project["tool"]["setuptools"]["data-files"]

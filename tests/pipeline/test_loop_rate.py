@@ -116,8 +116,20 @@ def test_a_loop_that_falls_behind_says_so_once_and_names_the_cure(
     monkeypatch.setattr(pipeline_module.LoopClock, "falls_behind", lambda self: True)
     pipeline().run(0.1, realtime=False)
     (line,) = (record.getMessage() for record in caplog.records if "falls behind" in record.getMessage())
-    for cure in ("close other programs", "--rt", "loop_rate_hz"):
+    for cure in ("close other programs", "--rt", "or set a lower loop_rate_hz"):
         assert cure in line
+
+
+def test_a_measured_rate_that_turns_out_too_high_is_explained(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(Pipeline, "_resting_ticks", lambda self: iter([1e-5] * 1000))
+    monkeypatch.setattr(pipeline_module.LoopClock, "falls_behind", lambda self: True)
+    loop = pipeline(loop_rate_hz=AUTO)
+    loop.fit_rate()
+    loop.run(0.1, realtime=False)
+    (line,) = (record.getMessage() for record in caplog.records if "falls behind" in record.getMessage())
+    assert "The rate was chosen at the start" in line
 
 
 def error_in_free_air(rate: float, mode: str) -> float:

@@ -18,7 +18,7 @@ from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.judging.judge import judge
 from q2r2_control.plants.kinematic import KinematicPlant
 from q2r2_control.recording.messages import SAMPLES, STATE, TICK, Message
-from q2r2_control.recording.reader import Recording
+from q2r2_control.recording.reader import NO_END, Recording
 from q2r2_control.recording.recorder import Recorder
 from q2r2_control.recording.replay import replay
 from q2r2_control.recording.tick_rows import SAMPLE_FIELDS
@@ -226,6 +226,19 @@ def test_a_flipped_bit_is_the_first_difference(
     assert rest.startswith(said)
 
 
+def _cut(file: Path, target: Path, ticks: int) -> Path:
+    return rewrite(file, target, lambda _, message: message if message.number < ticks else None, whole=False)
+
+
+def test_a_recording_that_was_cut_has_the_summary_of_its_ticks(circle: Path, tmp_path: Path) -> None:
+    result = replay(_cut(circle, tmp_path / "cut.mcap", 400))
+    assert (result.ticks, result.ended_by) == (400, NO_END)
+    assert result.summary is not None
+    assert result.summary.ticks == 400
+    with pytest.raises(RecordingError, match=f"no tick was recorded; {NO_END}"):
+        replay(_cut(circle, tmp_path / "no_tick.mcap", 0))
+
+
 def test_a_file_that_is_not_a_recording_or_belongs_to_another_cell_gives_one_line(tmp_path: Path, circle: Path) -> None:
     data = circle.read_bytes()
     damaged = bytearray(data)
@@ -234,7 +247,7 @@ def test_a_file_that_is_not_a_recording_or_belongs_to_another_cell_gives_one_lin
     contents = {
         "damaged": (bytes(damaged), "damaged: "),
         "text": (b"nothing of the kind", "not an MCAP file"),
-        "empty": (b"", "not a recording"),
+        "empty": (b"", "the file is empty"),
         "other": (data.replace(b"q2r2_control", b"q9r9_control"), "not a recording of q2r2 run --record"),
     }
     for name, (content, _) in contents.items():

@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+import re
+from copy import copy
+
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -69,6 +72,12 @@ def test_the_urdf_it_carries_loads_to_the_same_robot(dual_iiwa7: Robot, dual_iiw
         again.tool_pose(dual_iiwa7.home, "left").homogeneous,
         dual_iiwa7.tool_pose(dual_iiwa7.home, "left").homogeneous,
     )
+
+
+def test_a_file_in_the_place_of_a_urdf_tree_is_refused_with_the_ways_to_make_a_robot(dual_iiwa7: Robot) -> None:
+    with pytest.raises(RobotError, match=re.escape("Robot('arm.urdf', ...): allowed: Robot.from_config(config), Rob")):
+        Robot("arm.urdf")  # type: ignore[call-arg, arg-type]
+    assert copy(dual_iiwa7).joint_names == dual_iiwa7.joint_names
 
 
 def test_one_of_two_arms_may_be_left_out(dual_iiwa7_cell: ComposedCell) -> None:

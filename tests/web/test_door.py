@@ -22,6 +22,7 @@ from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.page_door import is_loopback
 from q2r2_control.inputs.webxr.certificate import own_certificate
 from q2r2_control.viewer.web.door import Door
+from q2r2_control.viewer.web.page import Page
 from q2r2_control.viewer.web.page_file import PageFile
 
 
@@ -138,8 +139,12 @@ def test_from_other_machines_the_page_comes_by_tls_and_is_neither_cached_nor_fra
 
 def test_a_port_that_another_program_uses_gives_one_clear_line() -> None:
     door = Door("127.0.0.1", 0)
-    with pytest.raises(ConfigError, match=f"cannot listen on 127.0.0.1 port {door.port}: .*allowed: a free port"):
+    with pytest.raises(
+        ConfigError, match=f"cannot listen on 127.0.0.1 port {door.port}: .*allowed: a free port; --web-port 0 "
+    ):
         Door("127.0.0.1", door.port)
+    with pytest.raises(ConfigError, match="cannot listen on"):  # A run finds it before it builds its controller.
+        Page("127.0.0.1", door.port, print)
     door.socket.close()
 
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import re
+import tomllib
+from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from importlib.util import find_spec
 from pathlib import Path
-from typing import cast
 from urllib.error import HTTPError
 from urllib.parse import urlsplit
 from urllib.request import urlopen
@@ -17,10 +18,11 @@ from cryptography.x509 import SubjectAlternativeName, load_pem_x509_certificate
 from q2r2_control.errors import ConfigError, InputError
 from q2r2_control.extras import install_line
 from q2r2_control.inputs.webxr.certificate import own_certificate
-from q2r2_control.inputs.webxr.exchange import Display
-from q2r2_control.inputs.webxr.webxr import WebXrInput
+from q2r2_control.inputs.webxr.webxr import _PACKAGES, WebXrInput
 from tests.support.processes import cell
 from tests.web.headset_page import Listen, refused
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_only_our_own_page_connects_and_from_other_machines_only_with_the_token(
@@ -130,17 +132,21 @@ def test_hosts_outside_the_allowed_networks_get_nothing(listen: Listen) -> None:
     assert refused(source)
 
 
-@pytest.mark.parametrize(("package", "shows"), [("websockets", False), ("trimesh", True)])
+@pytest.mark.parametrize("make", [lambda: WebXrInput().start(), lambda: WebXrInput.from_config(cell())])
+@pytest.mark.parametrize("package", _PACKAGES)
 def test_a_missing_package_is_named_with_the_extra_that_has_it(
-    package: str, shows: bool, monkeypatch: pytest.MonkeyPatch
+    package: str, make: Callable[[], object], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    found = {name: find_spec(name) for name in ("websockets", "trimesh") if name != package}
+    found = {name: find_spec(name) for name in _PACKAGES if name != package}
     monkeypatch.setattr("q2r2_control.inputs.webxr.webxr.find_spec", found.get)
-    source = WebXrInput()
-    if shows:
-        source.show_on(cast(Display, object()), {})
     with pytest.raises(InputError, match=re.escape(f"--input webxr needs {package}: {install_line('web')}")):
-        source.start()
+        make()
+
+
+def test_the_extra_of_the_page_names_all_of_its_packages() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    named = {re.split("[<>=]", line)[0] for line in project["optional-dependencies"]["web"]}
+    assert named.issuperset(_PACKAGES)
 
 
 def test_a_used_port_and_a_cable_to_another_address_give_one_clear_line(

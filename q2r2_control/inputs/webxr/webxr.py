@@ -50,6 +50,15 @@ _ROOM = 2  # Number of messages that may wait for the process. The newest data m
 _LOG = logging.getLogger(__name__)
 
 
+_PACKAGES = ("websockets", "trimesh")  # Packages of the page. The extra `web` names them.
+
+
+def _check_packages() -> None:
+    """Raise :class:`InputError` with all packages of the page that are not installed."""
+    if missing := [package for package in _PACKAGES if find_spec(package) is None]:
+        raise InputError(f"--input webxr needs {' and '.join(missing)}: {install_line('web')}")
+
+
 class WebXrInput:
     """Gives the hands of a headset's browser. Implements :class:`~q2r2_control.inputs.base.Input`.
 
@@ -98,7 +107,9 @@ class WebXrInput:
 
         Raises:
             ConfigError: If the host is not allowed.
+            InputError: If a package of the page is not installed.
         """
+        _check_packages()  # The check comes before slow work, such as measuring the loop's rate.
         headset = HeadsetConfig(**(config.headset.model_dump() | ({} if host is None else {"host": host})))
         if usb and not is_loopback(headset.host):
             raise ConfigError(f"--usb with --host {headset.host}: allowed: 127.0.0.1, which the cable leads to")
@@ -129,9 +140,7 @@ class WebXrInput:
         """Serve the page; raises :class:`InputError` or :class:`ConfigError` if that is not possible."""
         if self._process is not None:
             raise InputError(f"webxr: already serving {self.url}")
-        for package in ("websockets", *(("trimesh",) if self._display is not None else ())):
-            if find_spec(package) is None:
-                raise InputError(f"--input webxr needs {package}: {install_line('web')}")
+        _check_packages()
         host, port = self.address
         certificate, token, addresses = None, "", reachable_addresses(host)
         if not is_loopback(host):  # A browser trusts localhost without a certificate.

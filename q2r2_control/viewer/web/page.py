@@ -16,7 +16,7 @@ from q2r2_control.device_words import QUEST_WORDS, DeviceWords
 from q2r2_control.errors import ConfigError, InputError
 from q2r2_control.extras import install_line
 from q2r2_control.inputs.addresses import reachable_addresses
-from q2r2_control.inputs.listener import is_loopback
+from q2r2_control.inputs.listener import is_loopback, listening_socket
 from q2r2_control.inputs.webxr.certificate import installation_folder, own_certificate
 from q2r2_control.process.helper_process import HelperProcess, reason_of
 from q2r2_control.robot.robot import Robot
@@ -37,12 +37,13 @@ class Page:
     """A page and the process that serves it, as a context. No browser can keep the caller's process waiting."""
 
     def __init__(self, host: str, port: int, on_answer: Callable[[Any], None], certificate: Path | None = None) -> None:
-        """Start the process, which takes a second; raises :class:`ConfigError` if viser is not installed.
+        """Start the process, which takes a second; raises :class:`ConfigError` without viser or a free port.
 
         ``on_answer`` gets the requests of browsers, in a thread of its own. Other computers get the page by HTTPS, with
         your own ``certificate`` or else with the certificate of the headset's page.
         """
         check_viser()
+        listening_socket(host, port, "--web").close()  # A port in use is found before slow work, such as compiling.
         self._host, self._port, self._on_request = host, port, on_answer
         self._ready = Flag()
         self.urls: tuple[str, ...] = ()  # One for each address of this computer; empty before :meth:`open`.

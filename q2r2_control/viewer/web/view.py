@@ -51,7 +51,7 @@ class PageView(Page):
             certificate: A PEM file with a certificate and its key, with which the page comes over https.
 
         Raises:
-            ConfigError: If viser is not installed.
+            ConfigError: If viser is not installed, or if the address cannot be bound.
         """
         self._due = 0.0  # Time of the next frame, by the monotonic clock [s].
         self._events: list[Event] = []
