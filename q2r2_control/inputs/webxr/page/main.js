@@ -1,12 +1,14 @@
-// The page: enters VR or AR, sends the hands once a frame, shows what the run says.
+// The page: enters VR or AR or flies a hand by keys, sends the hands, shows what the run says.
 
 import { Drawing, eyesOf } from "./draw.js";
 import { Flying, HELP } from "./fly.js";
 import { Hands } from "./hands.js";
 import { Link } from "./link.js";
+import { Pace } from "./pace.js";
 import { Panel } from "./panel.js";
 import { nextOf, worded } from "./words.js";
 
+const SENDING = 16; // between flown hands, however slowly the page draws [ms]
 const MOVED = 300; // a frame that moved is told for this long, twice the time that pauses an arm [ms]
 /** @type {XRSessionMode[]} */
 const MODES = ["immersive-ar", "immersive-vr"];
@@ -22,6 +24,7 @@ let hands = new Hands();
 let session = null;
 /** @type {Flying | null} */
 let flying = null; // hands that keys or a gamepad move
+let pace = new Pace(); // of flying
 /** @type {ShownState | null} */
 let state = null; // of the run, as it came last
 let movedUntil = 0;
@@ -111,16 +114,34 @@ function fly() {
   }
   const begun = new Flying();
   flying = begun;
+  const kept = new Pace();
+  pace = kept;
   link.drive();
   element("fly").blur();
   element("advice").textContent = HELP;
   const onFrame = () => {
     if (flying !== begun) return;
     requestAnimationFrame(onFrame);
-    if (link.send(begun.read(), true)) begun.told();
-    drawing.drawOnPage(state);
+    const now = performance.now();
+    if (!drawing.drawOnPage(state)) return;
+    if (kept.isSlow(now)) drawing.coarsen();
+    kept.noteDrawn(now);
   };
   requestAnimationFrame(onFrame);
+  // A page that draws slowly sends as often as any other one. A page that is hidden, has no focus, or stands still sends
+  // nothing, so that its arms stop.
+  const sending = setInterval(() => {
+    if (flying !== begun) {
+      clearInterval(sending);
+      return;
+    }
+    const now = performance.now();
+    if (document.hidden || !document.hasFocus()) kept.rest();
+    else if (!kept.isBlind(now) && link.send(begun.read(), true)) {
+      begun.told();
+      kept.noteSent(now);
+    }
+  }, SENDING);
 }
 
 // No hand is flown any more, which stops the arms.
@@ -152,10 +173,19 @@ function rowOf(name, arm) {
   return row;
 }
 
+// Why keys move nothing, although the page flies.
+function slowness() {
+  if (!document.hasFocus()) return "Keys do not reach this page: click on it, then engage again.";
+  if (!link.open || !drawing.scene) return "";
+  const silent = Object.values(state?.arms ?? {}).some((arm) => arm.silent);
+  return pace.keptAdvice(performance.now(), drawing.scene.timeout, silent);
+}
+
 function show() {
   const age = Number.isFinite(link.age) ? `, ${link.age.toFixed(0)} ms` : "";
   const lost = link.open && !link.watching ? `${age}, ${(100 * link.loss).toFixed(0)} % left out` : "";
   element("link").textContent = `${link.text}${lost}`;
+  element("slow").textContent = flying ? slowness() : "";
   element("leave").hidden = session === null;
   element("fly").hidden = session !== null;
   element("stand").hidden = flying !== null || link.watching;
@@ -196,6 +226,9 @@ button("fly").onclick = fly;
 });
 document.addEventListener("visibilitychange", () => {
   if (document.hidden) land();
+});
+addEventListener("blur", () => {
+  if (flying) link.sendLost(flying.lost(), true);
 });
 setInterval(show, 200);
 offer();
