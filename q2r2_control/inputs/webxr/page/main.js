@@ -1,7 +1,7 @@
 // The page: enters VR or AR or flies a hand by keys, sends the hands, shows what the run says.
 
 import { Drawing, eyesOf } from "./draw.js";
-import { Flying, HELP } from "./fly.js";
+import { Flying } from "./fly.js";
 import { Hands } from "./hands.js";
 import { Link } from "./link.js";
 import { Pace } from "./pace.js";
@@ -45,7 +45,8 @@ const link = new Link({
     panel.picture = picture;
   },
   closed: () => {
-    state = null;
+    if (link.over) land(); // the last picture stays
+    else state = null;
   },
   drives: () => session !== null || flying !== null,
 });
@@ -118,7 +119,6 @@ function fly() {
   pace = kept;
   link.drive();
   element("fly").blur();
-  element("advice").textContent = HELP;
   const onFrame = () => {
     if (flying !== begun) return;
     requestAnimationFrame(onFrame);
@@ -150,7 +150,6 @@ function land() {
   link.sendLost(flying.lost(), true);
   flying.end();
   flying = null;
-  element("advice").textContent = "";
 }
 
 /**
@@ -169,7 +168,8 @@ function rowOf(name, arm) {
   const next = document.createElement("div");
   next.className = "next";
   next.textContent = nextOf(arm, { flying, inSession: session !== null, bare: hands.bare, watching: link.watching });
-  words.append(said, ` ${worded(arm.why, flying?.device ?? (hands.bare ? "fingers" : arm.hand))}`, next);
+  const why = /^\{\w+\}$/.test(arm.why) ? `by ${arm.why}` : arm.why; // a control that was pressed
+  words.append(said, why === arm.state ? "" : ` ${worded(why, flying?.device ?? (hands.bare ? "fingers" : arm.hand))}`, next);
   return row;
 }
 
@@ -189,11 +189,15 @@ function show() {
   element("leave").hidden = session === null;
   element("fly").hidden = session !== null;
   element("stand").hidden = flying !== null || link.watching;
-  element("fly").textContent = flying ? `Land; the ${flying.hand} hand moves` : "Fly by keyboard or gamepad";
+  element("fly").textContent = flying ? "Stop keyboard and gamepad" : link.watching ? "Fly, when the other page rests" : "Fly by keyboard or gamepad";
+  element("flown").textContent = flying ? `The ${flying.hand} hand moves.` : "";
+  element("keys").hidden = flying === null;
   button("stop").disabled = !link.open;
-  button("home").disabled = !link.open || link.watching;
-  element("arms").replaceChildren(...Object.entries(state?.arms ?? {}).map(([name, arm]) => rowOf(name, arm)));
-  element("recording").textContent = state?.recording ?? "";
+  button("home").disabled = button("pause").disabled = !link.open;
+  element("home").hidden = element("pause").hidden = link.watching;
+  button("fly").disabled = flying === null && !link.open;
+  element("arms").replaceChildren(...Object.entries((!link.over && state?.arms) || {}).map(([name, arm]) => rowOf(name, arm)));
+  element("recording").textContent = (!link.over && state?.recording) || "";
   if (session === null && flying === null) drawing.drawOnPage(state);
 }
 
@@ -213,12 +217,12 @@ async function offer() {
         element("advice").textContent = String(error);
       });
   });
-  if (!supported.includes(true)) element("advice").textContent = "This device offers no immersive session.";
+  if (!supported.includes(true)) element("advice").textContent = "This device shows no VR or AR.";
 }
 
 button("leave").onclick = () => session?.end();
 button("fly").onclick = fly;
-/** @type {HeadsetRequest[]} */ (["stop", "home"]).forEach((request) => {
+/** @type {HeadsetRequest[]} */ (["stop", "pause", "home"]).forEach((request) => {
   button(request).onclick = () => {
     button(request).blur(); // or Space, which engages, would press it again
     link.ask(request);
