@@ -142,6 +142,7 @@ function fly() {
       kept.noteSent(now);
     }
   }, SENDING);
+  show();
 }
 
 // No hand is flown any more, which stops the arms.
