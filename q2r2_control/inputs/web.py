@@ -20,7 +20,9 @@ _BINDINGS = BindingSettings(
     device={"drag": Action.DEAD_MAN, "gripper": Action.GRIPPER_TOGGLE},
 )
 _WORDS = DeviceWords(
-    nouns={"drag": "a tool's arrows or rings", "gripper": "the gripper's button"}, verbs={"drag": "drag"}, absent=""
+    nouns={"drag": "a tool's arrows or rings", "gripper": '"close or open the gripper"'},
+    verbs={"drag": "drag"},
+    absent="",
 )
 _MOTION = ("stance", "axes", "position_scale", "rotation_scale", "axis_scales", "rotation_frame")
 

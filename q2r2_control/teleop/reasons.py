@@ -104,5 +104,7 @@ _NOT_RECORDED = {_K.NO_RECORDING, _K.RECORDING_ENDED, _K.NO_EPISODE, _K.NO_OPEN_
 REFUSALS: frozenset[ReasonKind] = frozenset({*_NOT_DONE, *_NOT_RECORDED})
 _C = CommonReason
 _WAY_HOME = {_C.HOMING, _C.HOMING_ARRIVED, _C.HOMING_HELD_UP, _C.HOMING_NO_WAY, _C.HOMING_INTERRUPTED, _C.HOMING_ENDED}
+# The hand's data did not come in time.
+SILENCES: frozenset[ReasonKind] = frozenset({_K.POSE_SILENT, _K.POSE_GAP, _K.INPUTS_SILENT})
 # Requests to hold, and the results of a way home.
 HOLD_REQUESTS: frozenset[ReasonKind] = frozenset({_K.PAUSE_SERVICE, _K.RESET_SERVICE, *_WAY_HOME})

@@ -12,7 +12,7 @@ from q2r2_control.device_words import NO_WORDS, DeviceWords
 from q2r2_control.events import Event, Reason
 from q2r2_control.summary.tick import Tick
 from q2r2_control.teleop.arm_states import ArmState, is_refusal
-from q2r2_control.teleop.reasons import TeleopReason
+from q2r2_control.teleop.reasons import SILENCES, TeleopReason
 from q2r2_control.types import ActiveLimit, LimitKind
 from q2r2_control.wording import sentence
 
@@ -82,6 +82,11 @@ class ArmWords:
             return _FOLLOWS_WHAT.get(tick.states[arm], "follows the hand")
         held_by = _held_by(tick, arm, self._joints[arm], binding)
         return held_by or ("catches up" if np.isfinite(distance) else "holds")
+
+    def is_silent(self, tick: Tick, arm: str) -> bool:
+        """Return whether ``arm`` is lost because the data of its hand did not come in time."""
+        change = self.told.get(arm, Told()).change
+        return tick.states[arm] == ArmState.LOST and change is not None and change.kind in SILENCES
 
     def _sentence(self, reason: Reason) -> str:
         if reason.kind is TeleopReason.DEAD_MAN_RELEASED and (control := self._bindings.words_of(Action.DEAD_MAN)):

@@ -35,7 +35,10 @@ class EpisodeWords:
 
     @property
     def text(self) -> str:
-        episode = f"records episode {self._episodes}" if self._open else f"records; {self._episodes} episodes so far"
+        count = f"{self._episodes} episode{'' if self._episodes == 1 else 's'}"
+        episode = f"records episode {self._episodes}" if self._open else f"records; {count} so far"
+        if not self._episodes:
+            episode = "records this run as one episode"
         if not self._shows_subtask or not (self._open or not self._episodes):
             return episode
         name = subtask_name(self._names, self._subtask)

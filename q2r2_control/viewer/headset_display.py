@@ -69,6 +69,7 @@ class RunDisplay:
                 for name in self._parts
             },
             "floor": self._run.config.floor or 0.0,
+            "timeout": self._run.config.teleop.gate.timeout,
         }
 
     def _joints_of_tool(self, joints: Array) -> list[int]:
@@ -88,6 +89,7 @@ class RunDisplay:
                 "next": words.next_press(tick, arm),
                 "colour": state_colour(tick.states[arm]),
                 "hand": shown.hands[arm],
+                "silent": words.is_silent(tick, arm),
                 "tool": _rounded(tool),
                 "target": None if (target := tick.targets[arm].pose) is None else _rounded(target),
             }

@@ -48,7 +48,12 @@ class HeadsetView:
         self._plant = pipeline.plant if isinstance(pipeline.plant, MujocoPlant) else None
         robot, parts = pipeline.robot, places_of_parts(pipeline.plant, pipeline.config)
         display = RunDisplay(ShownRobot.of(robot, pipeline.config), robot.model, robot.collision_model, parts)
-        source.show_on(display, {HeadsetRequest.STOP: pipeline.stop, HeadsetRequest.HOME: pipeline.go_home})
+        requests = {
+            HeadsetRequest.STOP: pipeline.stop,
+            HeadsetRequest.HOME: pipeline.go_home,
+            HeadsetRequest.PAUSE: pipeline.pause,
+        }
+        source.show_on(display, requests)
         pipeline.listeners.append(self)
 
     def __call__(self, tick: Tick) -> None:

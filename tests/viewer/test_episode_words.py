@@ -19,14 +19,14 @@ BEGINS, ENDS, DISCARDED = (
 @pytest.mark.parametrize(
     ("names", "told", "text"),
     [
-        ((), [], "records; 0 episodes so far"),
+        ((), [], "records this run as one episode"),
         ((), [BEGINS], "records episode 1"),
-        ((), [BEGINS, ENDS], "records; 1 episodes so far"),
+        ((), [BEGINS, ENDS], "records; 1 episode so far"),
         (("reach", "grasp"), [], "records, subtask 1: reach"),
         (("reach", "grasp"), [SECOND], "records, subtask 2: grasp"),
         (("reach", "grasp"), [BEGINS, SECOND], "records episode 1, subtask 2: grasp"),
         (("reach", "grasp"), [BEGINS, SECOND, ENDS, BEGINS], "records episode 2, subtask 1: reach"),
-        (("reach", "grasp"), [BEGINS, SECOND, DISCARDED], "records; 1 episodes so far"),
+        (("reach", "grasp"), [BEGINS, SECOND, DISCARDED], "records; 1 episode so far"),
         ((), [BEGINS, SECOND], "records episode 1, subtask 2"),
     ],
 )

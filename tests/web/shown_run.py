@@ -16,6 +16,7 @@ def arm(hand: str, state: str = "lost", why: str = "no pose for 0.15 s") -> Show
         "why": why,
         "next": "press {lower} to engage, press {upper} to close the gripper",
         "hand": hand,
+        "silent": state == "lost",
         "tool": (0.5, 0.2, 0.4, 0.0, 0.0, 0.0, 1.0),
         "target": (0.5, 0.3, 0.4, 0.0, 0.0, 0.0, 1.0),
     }
@@ -42,6 +43,7 @@ class GivenDisplay:
             "hands": {"left": [0], "right": [0]},
             "parts": {"block": {"size": (0.06, 0.06, 0.06), "colour": (230, 40, 40)}},
             "floor": 0.0,
+            "timeout": 0.15,
         }
 
     def message(self, shown: ShownState) -> ShownState:

@@ -20,11 +20,11 @@ STICK_FORWARD = """navigator.getGamepads = () => [{
 # Presses the key in ``window.pressed`` before each look of the page at its keys, so that the key is held however slowly
 # the page draws and sends.
 HOLDING = """() => {
-    const look = requestAnimationFrame.bind(window);
-    window.requestAnimationFrame = (then) => look((time) => {
+    const look = setInterval.bind(window);
+    window.setInterval = (then, period) => look(() => {
         if (window.pressed) dispatchEvent(new KeyboardEvent("keydown", { code: window.pressed }));
-        then(time);
-    });
+        then();
+    }, period);
 }"""
 
 
@@ -140,3 +140,84 @@ def test_a_tap_between_two_messages_is_in_the_next_one_which_comes_soon_and_only
     assert held(down, up, ("keydown", {"code": "Digit2"})) == 0
     assert held(down, ("keydown", {"code": "Digit2"})) == 0  # The same holds while it is held.
     assert held(down, up, ("keydown", {"code": "KeyW", "ctrlKey": True})) == 0
+
+
+# The page draws only when the test calls ``draw``, and its messages are kept.
+STANDING = """(() => {
+    const { now } = performance;
+    window.later = 0;
+    performance.now = () => now.call(performance) + window.later;
+    window.requestAnimationFrame = (then) => { window.draw = () => then(performance.now()); return 0; };
+    window.hands = [];
+    const { send } = WebSocket.prototype;
+    WebSocket.prototype.send = function (text) {
+        const message = JSON.parse(text);
+        if (message.hands.left) window.hands.push(message.hands.left);
+        return send.call(this, text);
+    };
+})()"""
+
+
+def sent(page: Page) -> int:
+    return int(page.evaluate("window.hands.length"))
+
+
+def falls_silent(page: Page) -> None:
+    """Check that the page sends no hand any more."""
+    before = sent(page)
+    page.wait_for_timeout(500)
+    assert sent(page) == before
+
+
+def test_hands_do_not_wait_for_the_drawing_but_end_when_nothing_is_drawn_for_long(
+    open_page: Open, listen: Listen
+) -> None:
+    page = open_page(str(listen().url), STANDING)
+    wait_until(lambda: "connected" in page.inner_text("#link"))
+    page.click("#fly")
+    page.evaluate("draw()")
+    before = sent(page)
+    wait_until(lambda: sent(page) >= before + 3)  # The same picture stands meanwhile.
+    page.evaluate("window.later = 600")  # The picture is now older than it may be.
+    falls_silent(page)
+    wait_until(lambda: page.evaluate("draw() || 1") and sent(page) > before + 10)
+
+
+def test_hands_are_lost_when_the_page_loses_the_focus_and_only_the_focus_brings_them_back(
+    open_page: Open, listen: Listen
+) -> None:
+    page = open_page(str(listen().url), STANDING)
+    wait_until(lambda: "connected" in page.inner_text("#link"))
+    page.click("#fly")
+    page.evaluate("draw()")
+    wait_until(lambda: sent(page) > 0)
+    page.evaluate("() => { document.hasFocus = () => false; dispatchEvent(new Event('blur')); }")
+    wait_until(lambda: page.evaluate("window.hands.at(-1).pose") is None)
+    falls_silent(page)
+    wait_until(lambda: "click on it" in page.inner_text("#slow"))
+    page.evaluate("() => { document.hasFocus = () => true; later = 0; draw(); }")
+    wait_until(lambda: page.evaluate("draw() || window.hands.at(-1).pose"))
+
+
+ADVICE = """async ([times, now, silent]) => {
+    const { Pace } = await import("/pace.js");
+    const pace = new Pace();
+    for (const time of times) {
+        pace.noteSent(time);
+        pace.noteDrawn(time);
+    }
+    return [pace.keptAdvice(now, 0.15, silent), pace.keptAdvice(now + 5000, 0.15, silent), pace.isSlow(now)];
+}"""
+
+
+def test_a_slow_browser_is_named_with_its_rate_and_the_cure(open_page: Open, listen: Listen) -> None:
+    page = open_page(str(listen().url), "")
+    fast = [20 * tick for tick in range(100)]
+    assert page.evaluate(ADVICE, [fast, 2000, False])[0] == ""
+    slow = [250 * tick for tick in range(10)]
+    words, _, coarser = page.evaluate(ADVICE, [slow, 2350, False])
+    assert "no hand for 0.25 s, and arms stop after 0.15 s. It draws 4 pictures a second" in words
+    assert "Make this window smaller" in words
+    assert coarser
+    # An arm that is lost for missing hands keeps the advice, and the browser is not blamed if it was fast enough.
+    assert "came too late, although this browser" in page.evaluate(ADVICE, [fast, 2000, True])[0]

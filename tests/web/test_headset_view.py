@@ -49,13 +49,15 @@ def test_stop_and_home_are_buttons_and_reach_the_run(run: ShownRun, open_page: O
     page = opened(run, open_page)
     page.click("#home")
     wait_until(lambda: run.asked == ["home"])
+    page.click("#pause")
+    wait_until(lambda: run.asked == ["home", "pause"])
     page.click("#stop")
-    wait_until(lambda: run.asked == ["home", "stop"])
+    wait_until(lambda: run.asked == ["home", "pause", "stop"])
     # The space key, which engages a flown hand, presses neither button again.
     page.click("#fly")
     page.keyboard.press("Space")
     page.wait_for_timeout(500)
-    assert run.asked == ["home", "stop"]
+    assert run.asked == ["home", "pause", "stop"]
 
 
 def test_a_state_has_its_colour_and_the_tab_the_name_of_the_cell(run: ShownRun, open_page: Open) -> None:
@@ -89,7 +91,17 @@ def test_no_element_covers_another_one_on_a_phone(run: ShownRun, open_page: Open
     if flies:
         page.click("#fly")
     shows(run, page, lambda: page.locator("#scene").evaluate("scene => scene.width") == 390)
-    names = ["#view", "#name", "#link", "#stop", "#home", "#arms", "#fly", *(["#advice"] if flies else ["#stand"])]
+    names = [
+        "#view",
+        "#name",
+        "#link",
+        "#stop",
+        "#pause",
+        "#home",
+        "#arms",
+        "#fly",
+        *(["#keys"] if flies else ["#stand"]),
+    ]
     boxes = {name: page.locator(name).bounding_box() for name in names}
     for (one, first), (other, second) in combinations(boxes.items(), 2):
         assert first is not None
@@ -114,10 +126,14 @@ def test_a_watching_page_sees_the_driver_and_the_state_and_may_only_stop(run: Sh
     driver = opened(run, open_page)
     other = opened(run, open_page, ANOTHER_BROWSER)
     assert f"{run.source.statistics.peer} drives" in other.inner_text("#link")
-    assert other.locator("#home").is_disabled()
+    assert "can only stop the run" in other.inner_text("#link")
+    assert other.locator("#home").is_hidden()
+    assert other.locator("#pause").is_hidden()
     other.evaluate("""() => {
-        document.getElementById("home").disabled = false;
-        document.getElementById("home").click();
+        for (const name of ["home", "pause"]) {
+            document.getElementById(name).disabled = false;
+            document.getElementById(name).click();
+        }
         document.getElementById("stop").click();
     }""")
     wait_until(lambda: run.asked == ["stop"])
@@ -127,12 +143,26 @@ def test_a_watching_page_sees_the_driver_and_the_state_and_may_only_stop(run: Sh
 
 def test_a_run_that_is_over_says_so_on_its_page(run: ShownRun, open_page: Open) -> None:
     page = opened(run, open_page)
+    page.click("#fly")
+    assert page.locator("#keys").is_visible()
+    assert page.inner_text("#flown") == "The left hand moves."
     run.source.close()
     wait_until(lambda: "The run is over" in page.inner_text("#link"))
     page.wait_for_timeout(2500)  # In this time, the page tries to connect again.
     assert "The run is over" in page.inner_text("#link")
     assert page.locator("#stop").is_disabled()
     assert page.inner_text("#arms") == ""
+    assert count(pixels(page), (230.0, 40.0, 40.0)) > 20  # The last picture stays.
+    assert page.locator("#fly").is_disabled()
+    assert page.locator("#keys").is_hidden()
+    # The page tries again at once when somebody looks at it.
+    page.evaluate("""() => {
+        window.tries = 0;
+        const Socket = WebSocket;
+        window.WebSocket = class extends Socket { constructor(url) { super(url); window.tries += 1; } };
+    }""")
+    page.evaluate("dispatchEvent(new Event('focus'))")
+    assert page.evaluate("window.tries") == 1
 
 
 BOARD = """async (state) => {

@@ -33,6 +33,7 @@ class HeadsetRequest(StrEnum):
 
     STOP = "stop"  # Bring the arms to rest, and end the run.
     HOME = "home"
+    PAUSE = "pause"  # Let both arms hold until a new press.
 
 
 _Hand = Literal["left", "right"]

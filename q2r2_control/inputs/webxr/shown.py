@@ -38,12 +38,14 @@ class ShownScene(TypedDict):
     hands: dict[str, list[int]]  # Joints that move with the tool, by arm.
     parts: dict[str, ShownPart]
     floor: float  # [m]
+    timeout: float  # An arm stops if no hand comes for this time [s].
 
 
 class ShownArm(TypedDict):
     """An arm. In ``why`` and ``next``, a control has its name in braces, since only the page knows the device.
 
-    ``hand`` is the hand that drives the arm, and ``colour`` is that of the state.
+    ``hand`` is the hand that drives the arm, ``colour`` is that of the state, and ``silent`` says that the arm stopped
+    because the data of its hand did not come in time.
     """
 
     state: str
@@ -51,6 +53,7 @@ class ShownArm(TypedDict):
     why: str
     next: str
     hand: str
+    silent: bool
     tool: Seven
     target: Seven | None
 

@@ -12,6 +12,7 @@ import viser
 
 from q2r2_control.viewer.web.exchange import Frame, PageHand, PageLost, PageSetup
 from q2r2_control.viewer.web.figure import place
+from q2r2_control.viewer.web.pace import BrowserPace
 
 _SIZE = 0.22  # Size of a gizmo [m].
 _PERIOD = 0.02  # Time between samples [s].
@@ -28,6 +29,7 @@ class Driving:
 
     def __init__(self, server: viser.ViserServer, setup: PageSetup, answer: Callable[[Any], None]) -> None:
         self._server, self._arms, self._answer = server, tuple(setup.joints), answer
+        self._pace = BrowserPace(setup.config.teleop.gate.timeout)
         self._lock = RLock()
         self._gizmos: dict[int, tuple[viser.ClientHandle, _Gizmos]] = {}  # By page.
         self._driver: int | None = None
@@ -40,13 +42,21 @@ class Driving:
     def words(self) -> str:
         """The page that drives, in words."""
         driver = self._driver
-        return "drag a tool's arrows or rings to move it" if driver is None else f"page {driver} drives"
+        return "drag a tool's arrows or rings to move it" if driver is None else f"page {driver + 1} drives"
+
+    def next_step(self, arm: str, moves: bool) -> str:
+        """Return what to do next with an arm that is dragged although it does not move; empty otherwise."""
+        return "let go, then drag again to engage" if arm in self._dragged and not moves else ""
+
+    def slowness(self, silent: bool) -> str:
+        """Return why the hands of the page that drives come too late; see :meth:`BrowserPace.advice`."""
+        return self._pace.advice(silent)
 
     def add_buttons(self, gui: viser.GuiApi) -> None:
         """Add a button for each gripper."""
         for arm in self._arms:
 
-            @gui.add_button(f"Close or open the {arm} gripper").on_click
+            @gui.add_button(f"{arm}: close or open the gripper").on_click
             def _(event: viser.GuiEvent, arm: str = arm) -> None:
                 with self._lock:
                     if self._driver in (None, event.client_id):
@@ -65,7 +75,7 @@ class Driving:
 
     async def _connect(self, client: viser.ClientHandle) -> None:
         page, gizmos = client.client_id, _Gizmos()
-        client.gui.add_html(f"<div style='font-size:12px;padding:0 0.6em'>this is page {page}</div>")
+        client.gui.add_html(f"<div style='font-size:12px;padding:0 0.6em'>this is page {page + 1}</div>")
         for arm in self._arms:
             gizmos[arm] = client.scene.add_transform_controls(f"/gizmos/{arm}", scale=_SIZE, depth_test=False)
 
@@ -91,6 +101,7 @@ class Driving:
                 for held in (False, True):  # A control has to be released before a press counts.
                     self._send(arm, drag=held)
                 if begins:
+                    self._pace.begin()
                     Thread(target=self._ask, args=(page,), daemon=True).start()
             elif self._driver == page and event.phase == "end" and page not in self._server.get_clients():
                 self._lose()  # viser ends the drag of a page that has gone.
@@ -99,7 +110,9 @@ class Driving:
                 self._send(arm, drag=event.phase != "end")
                 if event.phase == "end":
                     del self._dragged[arm]
-                    self._driver = page if self._dragged else None
+                    if not self._dragged:
+                        self._driver = None
+                        self._pace.end()
 
     def _ask(self, page: int) -> None:
         """Ask the page that drives for answers, each of which is a sample."""
@@ -117,12 +130,15 @@ class Driving:
                         self._lose()
                 return
             with self._lock:
+                if self._driver == page:
+                    self._pace.note()
                 for arm in self._dragged if self._driver == page else ():
                     self._send(arm)
             time.sleep(max(began + _PERIOD - time.monotonic(), 0.0))
 
     def _lose(self) -> None:
         self._driver = None
+        self._pace.end()
         self._dragged.clear()
         self._answer(PageLost())
 

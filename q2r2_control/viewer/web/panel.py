@@ -14,6 +14,7 @@ import pinocchio as pin
 import viser
 
 from q2r2_control.summary.tick import Tick
+from q2r2_control.teleop.arm_states import ArmState
 from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.types import ActiveLimit
 from q2r2_control.viewer.state_colours import AMBER, GREEN, RED, state_colour
@@ -99,12 +100,12 @@ class Panel:
         self._banner = gui.add_html("", visible=False, order=-1.0)
         self._table = gui.add_html("")
         self._episodes = gui.add_html("", visible=False)
+        if driving is not None:
+            with gui.add_folder("Grippers"):
+                driving.add_buttons(gui)
         self._cameras = gui.add_html("", visible=False)
         self._pictures: Mapping[str, bytes] = {}  # The newest pictures by camera.
         self._pictured: Mapping[str, bytes] = self._pictures  # The pictures that are shown.
-        if driving is not None:
-            with gui.add_folder("Grippers", expand_by_default=False):
-                driving.add_buttons(gui)
         if setup.changes and not setup.replayed:
             self._add_settings(gui)
         if not setup.replayed:
@@ -214,7 +215,9 @@ class Panel:
                 self._episodes.content, self._episodes.visible = table(self._told[-_EPISODES:]), True
             if (pictures := self._pictures) is not self._pictured:
                 self._pictured, self._cameras.visible = pictures, True
-                self._cameras.content = "".join(image(name, picture) for name, picture in pictures.items())
+                cameras = [*self._setup.config.cameras]  # Their order is that of the cell.
+                names = sorted(pictures, key=lambda name: cameras.index(name) if name in cameras else len(cameras))
+                self._cameras.content = "".join(image(name, pictures[name]) for name in names)
             if (line := self._time_line) is not None and frame.tick.t != line.value:
                 line.max = max(frame.end, line.max)
                 line.value = frame.tick.t
@@ -229,7 +232,7 @@ class Panel:
             ("", [f"<b>{escape(arm)}</b>" for arm in arms]),
             ("state", [coloured(tick.states[arm], state_colour(tick.states[arm])) for arm in arms]),
             ("why", [escape(frame.why.get(arm) or self._words.why(tick, arm, binding)) for arm in arms]),
-            ("next", [escape(self._words.next_press(tick, arm)) for arm in arms]),
+            ("next", [escape(self._next(tick, arm)) for arm in arms]),
             ("off its target", [distance(tick.tracking_error(arm)[0]) for arm in arms]),
             ("hand's age", [milliseconds(frame.ages.get(arm)) for arm in arms]),
             ("tool speed [m/s]", [self._tool_speed(tick, arm) for arm in arms]),
@@ -250,23 +253,33 @@ class Panel:
         )
         return f"<div style='{STYLE}'><table style='width:100%'>{cells}</table>{self._below(frame, over)}</div>"
 
+    def _next(self, tick: Tick, arm: str) -> str:
+        """Return what the operator of an arm can do next."""
+        moves = tick.states[arm] in (ArmState.ENGAGED, ArmState.PAUSING)
+        dragged = "" if self._driving is None else self._driving.next_step(arm, moves)
+        return dragged or self._words.next_press(tick, arm)
+
     def _below(self, frame: Frame, over: bool) -> str:
         """Return lines and plots about the whole robot."""
         tick, report = frame.tick, frame.tick.reference.report
         certified = coloured("certified", GREEN) if report.certified else coloured("not certified", RED)
-        lines = [f"{tick.t:.1f} s", f"tightest pair: {escape(' | '.join(report.tightest_pair))}"]
+        pair = escape(" | ".join(report.tightest_pair))
+        lines = [f"{tick.t:.1f} s", f"tightest pair (the two bodies with the least room between them): {pair}"]
         plots: list[str] = []
         if not over:
             lines.append(f"a stop is {certified}; status {escape(str(report.status))}")
             driver = self._driving.words if self._driving is not None else frame.driver
             if driver:
                 lines.insert(0, escape(driver))
+            silent = any(self._words.is_silent(tick, arm) for arm in tick.tools)
+            if self._driving is not None and (slowness := self._driving.slowness(silent)):
+                lines.insert(0, coloured(slowness, RED))
             if frame.notice:
                 lines.insert(0, coloured(frame.notice, RED))
         if not over and not self._setup.replayed:
             rate, top = self._rates[-1], self._setup.config.nominal_rate_hz
             plots.append(plot(f"loop, {rate:.0f} Hz", self._rates, 1.2 * top))
-            plots.append(plot(f"slowest tick, {self._times[-1]:.0f} us", self._times, 1e6 / top))
+            plots.append(plot(f"slowest tick, {self._times[-1]:.0f} us", self._times, max(1e6 / top, *self._times)))
         return "<br>".join(lines) + "".join(plots)
 
     def _tool_speed(self, tick: Tick, arm: str) -> str:

@@ -9,6 +9,7 @@ from html import escape
 import numpy as np
 
 STYLE = "font-size:12px;line-height:1.35;padding:0 0.6em 0.4em"
+_GONE = 2.0  # A hand without poses for this time is not there any more [s].
 HISTORY = 150  # Count of values in a plot.
 
 
@@ -21,7 +22,8 @@ def distance(metres: float) -> str:
 
 
 def milliseconds(age: float | None) -> str:
-    return "-" if age is None else f"{1e3 * age:.0f} ms"
+    """Return the ``age`` of a hand's newest pose [s], or nothing if there is no hand any more."""
+    return "" if age is None or age > _GONE else f"{1e3 * age:.0f} ms"
 
 
 def table(rows: Iterable[tuple[str, str]]) -> str:

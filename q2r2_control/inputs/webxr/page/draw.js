@@ -21,6 +21,7 @@ const BEHIND = new Float32Array([
   1, 0, 0, 0, 0, ACROSS, DOWN, 0, 0, -DOWN, ACROSS, 0,
   0, -1.6 * ACROSS + 1.2 * DOWN, -1.6 * DOWN - 1.2 * ACROSS, 1,
 ]);
+const [COARSER, COARSEST] = [0.8, 0.3]; // of the pixels along a side, where drawing is slow
 const [AR_OPACITY, GHOST_OPACITY] = [0.45, 0.35]; // of the robot in the operator's own room, and of a target's ghost
 
 const SHAPES = {
@@ -88,6 +89,9 @@ export class Drawing {
     this.robot = [];
     /** @type {Mesh | null} */
     this.grid = null;
+    /** @type {WebGLSync | null} */
+    this.busy = null; // until the last picture on the page is drawn
+    this.sharpness = 1; // pixels of a picture on the page for each of the screen, along a side
   }
 
   /**
@@ -158,16 +162,27 @@ export class Drawing {
   }
 
   /**
-   * On the page itself, as seen from behind the robot. Words stand beside it.
+   * On the page itself, as seen from behind the robot, and return whether it is drawn: while the last picture is not
+   * finished, this would keep the page from its keys. Words stand beside it.
    * @param {ShownState | null} state
    */
   drawOnPage(state) {
-    if (!this.gl) return;
-    const canvas = /** @type {HTMLCanvasElement} */ (this.gl.canvas);
-    const [width, height] = [canvas.clientWidth, canvas.clientHeight];
+    const { gl } = this;
+    if (!gl || (this.busy && gl.getSyncParameter(this.busy, gl.SYNC_STATUS) !== gl.SIGNALED)) return false;
+    const canvas = /** @type {HTMLCanvasElement} */ (gl.canvas);
+    const [width, height] = [canvas.clientWidth, canvas.clientHeight].map((side) => Math.ceil(this.sharpness * side));
     if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];
     const view = times(projection(width / height, FIELD_OF_VIEW), BEHIND);
     this.draw(null, [{ x: 0, y: 0, width, height, view }], state, null, [], false);
+    gl.deleteSync(this.busy);
+    this.busy = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    gl.flush();
+    return true;
+  }
+
+  // A picture that takes long gets fewer pixels from now on, since a processor may be drawing it.
+  coarsen() {
+    this.sharpness = Math.max(COARSER * this.sharpness, COARSEST);
   }
 
   /**

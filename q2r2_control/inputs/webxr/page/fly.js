@@ -25,10 +25,6 @@ const BUTTONS = [LOWER, UPPER];
 const MODIFIERS = ["Control", "Meta", "Alt"];
 const PAD = { a: 0, b: 1, bumpers: { left: 4, right: 5 }, tilt: [[12, 4, 1], [13, 4, -1], [14, 3, -1], [15, 3, 1]] };
 
-export const HELP =
-  "1, 2: left or right hand. Space: engage or pause. W S A D E Q: move. I K J L U O: turn. G: gripper. Shift: slowly. " +
-  "Gamepad: sticks move, and turn about the vertical; cross tilts; bumpers choose the hand; A engages, B is the gripper.";
-
 /** @param {KeyboardEvent} event */
 const isModified = ({ ctrlKey, metaKey, altKey, key }) => ctrlKey || metaKey || altKey || MODIFIERS.includes(key);
 

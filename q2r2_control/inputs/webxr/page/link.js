@@ -1,6 +1,6 @@
 // The socket to the run. The newest hands win: what would wait in the browser is left out, and never sent late.
 
-const RETRY = 2000; // after a closed socket [ms]
+const [RETRY, SELDOM] = [2000, 10000]; // after a closed socket, and after the end of a run [ms]
 const ALIVE = 500; // between messages without hands [ms]
 const AGAIN = 10; // after what must not be left out had to wait [ms]
 const REMEMBERED = 64; // messages whose time of sending is known
@@ -38,7 +38,14 @@ export class Link {
     /** @type {Map<number, number>} */
     this.sent = new Map(); // number of a message -> when it was sent [ms]
     this.last = 0; // when one was sent [ms]
+    /** @type {number | undefined} */
+    this.retry = undefined;
     this.socket = this.connect();
+    addEventListener("focus", () => {
+      if (this.socket.readyState !== WebSocket.CLOSED) return;
+      clearTimeout(this.retry); // somebody looks: a run may have begun
+      this.connect();
+    });
     setInterval(() => {
       if (performance.now() - this.last > ALIVE) this.send({});
     }, ALIVE);
@@ -73,11 +80,11 @@ export class Link {
     this.over ||= code === OVER;
     // A page that may not drive looks on. One with hands tries again: its poses may count more than another page.
     this.watching = code === REFUSED && !this.watching && !this.handlers.drives();
-    if (this.over) this.text = "The run is over. The next one at this address shows up here.";
+    if (this.over) this.text = "The run is over. The picture is its last moment. The next run at this address shows up here.";
     else this.text = reason || "not connected; the run may have ended, or its URL is an old one";
     this.age = NaN;
     if (code !== FREE && !this.watching) this.handlers.closed();
-    setTimeout(() => this.connect(), this.watching ? 0 : RETRY);
+    this.retry = setTimeout(() => this.connect(), this.watching ? 0 : this.over ? SELDOM : RETRY);
   }
 
   // Somebody here wants to drive, which a page that watches cannot.
@@ -136,7 +143,7 @@ export class Link {
     const message = JSON.parse(data);
     if (message.scene) this.handlers.scene(message.scene);
     if (message.vibration) this.handlers.vibration(message.vibration);
-    if (message.driver) this.text = `${message.driver} drives; this page watches`;
+    if (message.driver) this.text = `${message.driver} drives; this page watches, and can only stop the run`;
     if (message.state) {
       const sent = this.sent.get(message.acknowledged ?? -1);
       this.age = sent === undefined ? NaN : performance.now() - sent;

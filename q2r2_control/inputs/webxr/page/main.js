@@ -1,12 +1,14 @@
-// The page: enters VR or AR, sends the hands once a frame, shows what the run says.
+// The page: enters VR or AR or flies a hand by keys, sends the hands, shows what the run says.
 
 import { Drawing, eyesOf } from "./draw.js";
-import { Flying, HELP } from "./fly.js";
+import { Flying } from "./fly.js";
 import { Hands } from "./hands.js";
 import { Link } from "./link.js";
+import { Pace } from "./pace.js";
 import { Panel } from "./panel.js";
 import { nextOf, worded } from "./words.js";
 
+const SENDING = 16; // between flown hands, however slowly the page draws [ms]
 const MOVED = 300; // a frame that moved is told for this long, twice the time that pauses an arm [ms]
 /** @type {XRSessionMode[]} */
 const MODES = ["immersive-ar", "immersive-vr"];
@@ -22,6 +24,7 @@ let hands = new Hands();
 let session = null;
 /** @type {Flying | null} */
 let flying = null; // hands that keys or a gamepad move
+let pace = new Pace(); // of flying
 /** @type {ShownState | null} */
 let state = null; // of the run, as it came last
 let movedUntil = 0;
@@ -42,7 +45,8 @@ const link = new Link({
     panel.picture = picture;
   },
   closed: () => {
-    state = null;
+    if (link.over) land(); // the last picture stays
+    else state = null;
   },
   drives: () => session !== null || flying !== null,
 });
@@ -111,16 +115,34 @@ function fly() {
   }
   const begun = new Flying();
   flying = begun;
+  const kept = new Pace();
+  pace = kept;
   link.drive();
   element("fly").blur();
-  element("advice").textContent = HELP;
   const onFrame = () => {
     if (flying !== begun) return;
     requestAnimationFrame(onFrame);
-    if (link.send(begun.read(), true)) begun.told();
-    drawing.drawOnPage(state);
+    const now = performance.now();
+    if (!drawing.drawOnPage(state)) return;
+    if (kept.isSlow(now)) drawing.coarsen();
+    kept.noteDrawn(now);
   };
   requestAnimationFrame(onFrame);
+  // A page that draws slowly sends as often as any other one. A page that is hidden, has no focus, or stands still sends
+  // nothing, so that its arms stop.
+  const sending = setInterval(() => {
+    if (flying !== begun) {
+      clearInterval(sending);
+      return;
+    }
+    const now = performance.now();
+    if (document.hidden || !document.hasFocus()) kept.rest();
+    else if (!kept.isBlind(now) && link.send(begun.read(), true)) {
+      begun.told();
+      kept.noteSent(now);
+    }
+  }, SENDING);
+  show();
 }
 
 // No hand is flown any more, which stops the arms.
@@ -129,7 +151,6 @@ function land() {
   link.sendLost(flying.lost(), true);
   flying.end();
   flying = null;
-  element("advice").textContent = "";
 }
 
 /**
@@ -148,22 +169,36 @@ function rowOf(name, arm) {
   const next = document.createElement("div");
   next.className = "next";
   next.textContent = nextOf(arm, { flying, inSession: session !== null, bare: hands.bare, watching: link.watching });
-  words.append(said, ` ${worded(arm.why, flying?.device ?? (hands.bare ? "fingers" : arm.hand))}`, next);
+  const why = /^\{\w+\}$/.test(arm.why) ? `by ${arm.why}` : arm.why; // a control that was pressed
+  words.append(said, why === arm.state ? "" : ` ${worded(why, flying?.device ?? (hands.bare ? "fingers" : arm.hand))}`, next);
   return row;
+}
+
+// Why keys move nothing, although the page flies.
+function slowness() {
+  if (!document.hasFocus()) return "Keys do not reach this page: click on it, then engage again.";
+  if (!link.open || !drawing.scene) return "";
+  const silent = Object.values(state?.arms ?? {}).some((arm) => arm.silent);
+  return pace.keptAdvice(performance.now(), drawing.scene.timeout, silent);
 }
 
 function show() {
   const age = Number.isFinite(link.age) ? `, ${link.age.toFixed(0)} ms` : "";
   const lost = link.open && !link.watching ? `${age}, ${(100 * link.loss).toFixed(0)} % left out` : "";
   element("link").textContent = `${link.text}${lost}`;
+  element("slow").textContent = flying ? slowness() : "";
   element("leave").hidden = session === null;
   element("fly").hidden = session !== null;
   element("stand").hidden = flying !== null || link.watching;
-  element("fly").textContent = flying ? `Land; the ${flying.hand} hand moves` : "Fly by keyboard or gamepad";
+  element("fly").textContent = flying ? "Stop keyboard and gamepad" : link.watching ? "Fly, when the other page rests" : "Fly by keyboard or gamepad";
+  element("flown").textContent = flying ? `The ${flying.hand} hand moves.` : "";
+  element("keys").hidden = flying === null;
   button("stop").disabled = !link.open;
-  button("home").disabled = !link.open || link.watching;
-  element("arms").replaceChildren(...Object.entries(state?.arms ?? {}).map(([name, arm]) => rowOf(name, arm)));
-  element("recording").textContent = state?.recording ?? "";
+  button("home").disabled = button("pause").disabled = !link.open;
+  element("home").hidden = element("pause").hidden = link.watching;
+  button("fly").disabled = flying === null && !link.open;
+  element("arms").replaceChildren(...Object.entries((!link.over && state?.arms) || {}).map(([name, arm]) => rowOf(name, arm)));
+  element("recording").textContent = (!link.over && state?.recording) || "";
   if (session === null && flying === null) drawing.drawOnPage(state);
 }
 
@@ -183,12 +218,12 @@ async function offer() {
         element("advice").textContent = String(error);
       });
   });
-  if (!supported.includes(true)) element("advice").textContent = "This device offers no immersive session.";
+  if (!supported.includes(true)) element("advice").textContent = "This device shows no VR or AR.";
 }
 
 button("leave").onclick = () => session?.end();
 button("fly").onclick = fly;
-/** @type {HeadsetRequest[]} */ (["stop", "home"]).forEach((request) => {
+/** @type {HeadsetRequest[]} */ (["stop", "pause", "home"]).forEach((request) => {
   button(request).onclick = () => {
     button(request).blur(); // or Space, which engages, would press it again
     link.ask(request);
@@ -196,6 +231,9 @@ button("fly").onclick = fly;
 });
 document.addEventListener("visibilitychange", () => {
   if (document.hidden) land();
+});
+addEventListener("blur", () => {
+  if (flying) link.sendLost(flying.lost(), true);
 });
 setInterval(show, 200);
 offer();

@@ -1,0 +1,53 @@
+"""The rate at which the browser that drives sends positions, and what to do if it is too low."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+
+_TOLD = 10.0  # Time for which a pause of the browser is told [s].
+_CURE = (
+    "Let go, then drag again. If it happens often, make the window smaller, close other programs, or open the page on "
+    "another computer."
+)
+
+
+class BrowserPace:
+    """Notes the positions that a browser sends. Arms stop if none comes for ``allowed`` [s]; ``clock`` is in s."""
+
+    def __init__(self, allowed: float, clock: Callable[[], float] = time.monotonic) -> None:
+        self._allowed, self._clock = allowed, clock
+        self.begin()
+
+    def begin(self) -> None:
+        """Forget everything: a drag begins."""
+        self._heard: float | None = self._clock()  # Time of the newest position; None after the drag.
+        self._silence, self._ended = 0.0, -math.inf  # The longest recent time without a position, and its end [s].
+
+    def note(self) -> None:
+        """Note that a position has come."""
+        now = self._clock()
+        silence = 0.0 if self._heard is None else now - self._heard
+        self._heard = now
+        if now - self._ended > _TOLD or silence > self._silence:
+            self._silence, self._ended = silence, now
+
+    def end(self) -> None:
+        """Note that the drag is over, so that no more positions come."""
+        self._heard = None
+
+    def advice(self, silent: bool) -> str:
+        """Return the cause and the cure of positions that come too late; empty if they come in time.
+
+        An arm is ``silent`` if it is lost because its hand did not come in time. The advice stays as long as it is.
+        """
+        now, allowed = self._clock(), self._allowed
+        silence = max(self._silence, 0.0 if self._heard is None else now - self._heard)
+        is_recent = now - self._ended < _TOLD or silence > self._silence
+        if silence > allowed and (silent or is_recent):
+            return (
+                f"The browser is too slow: it sent no position for {silence:.2f} s, which is {1.0 / silence:.1f} "
+                f"positions a second. Arms stop without at least {1.0 / allowed:.0f} a second. {_CURE}"
+            )
+        return f"The positions of the dragged tool came too late. {_CURE}" if silent else ""

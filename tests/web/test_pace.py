@@ -1,0 +1,61 @@
+"""The advice for a browser that sends the positions of a dragged tool too slowly."""
+
+from __future__ import annotations
+
+import pytest
+
+from q2r2_control.viewer.web.pace import BrowserPace
+
+
+class Browser:
+    """A pace by a clock that the test sets."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+        self.pace = BrowserPace(0.15, lambda: self.now)
+
+    def send(self, period: float, count: int = 5) -> None:
+        for _ in range(count):
+            self.now += period
+            self.pace.note()
+
+
+@pytest.fixture
+def browser() -> Browser:
+    return Browser()
+
+
+def test_a_browser_in_time_is_not_blamed_even_after_the_drag(browser: Browser) -> None:
+    browser.send(0.02)
+    assert browser.pace.advice(silent=False) == ""
+    browser.pace.end()
+    browser.now += 5.0
+    assert browser.pace.advice(silent=False) == ""
+    assert browser.pace.advice(silent=True).startswith("The positions of the dragged tool came too late. Let go, then")
+
+
+def test_a_slow_browser_is_named_with_its_rate_the_needed_one_and_the_cure(browser: Browser) -> None:
+    browser.send(0.02)
+    browser.send(0.5, 1)
+    browser.send(0.02)
+    words = browser.pace.advice(silent=False)
+    assert "no position for 0.50 s, which is 2.0 positions a second" in words
+    assert "at least 7 a second. Let go, then drag again" in words
+    assert "smaller" in words
+    # The advice ends after some time, unless the arm is still lost.
+    browser.send(1.0 / 8.0, 100)
+    assert browser.pace.advice(silent=False) == ""
+    browser.pace.begin()
+    assert browser.pace.advice(silent=False) == ""
+
+
+def test_a_browser_that_sends_nothing_at_all_is_named_while_it_is_silent(browser: Browser) -> None:
+    browser.now += 0.4
+    assert "no position for 0.40 s" in browser.pace.advice(silent=False)
+
+
+def test_the_advice_stays_while_the_arm_is_lost(browser: Browser) -> None:
+    browser.send(0.5, 1)
+    browser.pace.end()
+    browser.now += 60.0
+    assert "no position for 0.50 s" in browser.pace.advice(silent=True)
