@@ -45,13 +45,13 @@ class ErrorHandlingGroup(TyperGroup):
     def main(self, *args: Any, **extra: Any) -> Any:
         """Run the command line; leaves by :class:`SystemExit`."""
         extra["standalone_mode"] = False
+        messages: tuple[str, ...] = ("interrupted",)
         try:
             code = super().main(*args, **extra)
             if code != _INTERRUPTED:
                 sys.exit(code if isinstance(code, int) else 0)
-            messages = ("interrupted",)  # Newer versions of typer return this code.
         except (KeyboardInterrupt, typer.Abort):
-            code, messages = _INTERRUPTED, ("interrupted",)
+            code = _INTERRUPTED  # Newer versions of typer return it.
         except Q2R2Error as error:
             code, messages = 2, error.faults
         except ModuleNotFoundError as error:
