@@ -140,7 +140,7 @@ def test_a_run_uses_the_solver_of_its_option(command: tuple[str, ...], monkeypat
         raise ConfigError("seen")
 
     monkeypatch.setattr("q2r2_control.cli.run.run_cell", run_cell)
-    monkeypatch.setattr("q2r2_control.cli.run.rehearsal", lambda *given, **named: nullcontext([]))
+    monkeypatch.setattr("q2r2_control.cli.fri.rehearsal", lambda *given, **named: nullcontext([]))
     for option in ((), ("--solver", "osqp")):
         assert "seen" in q2r2(*command, *option).stderr
     assert chosen == ["daqp", "osqp"]
