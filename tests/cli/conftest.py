@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import socket
 import subprocess
 import sys
@@ -16,6 +17,12 @@ import pytest
 def _no_notice_of_compiling(monkeypatch: pytest.MonkeyPatch) -> None:
     """Any test may have to compile kernels, so notices about this are switched off."""
     monkeypatch.setattr("q2r2_control.cli.output.compiling", nullcontext)
+
+
+@pytest.fixture(autouse=True)
+def _no_lines_of_progress(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A busy computer may take so long for a command that it would print lines about its progress."""
+    monkeypatch.setattr("q2r2_control.cli.output._BETWEEN_LINES_S", math.inf)
 
 
 @pytest.fixture
