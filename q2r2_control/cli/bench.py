@@ -18,6 +18,7 @@ from q2r2_control.benchmark.work_motions import TIMED_MOTIONS, WORK_MOTIONS, mot
 from q2r2_control.cli.output import (
     DEMO_CONFIG,
     ClusterAddress,
+    ConfigFile,
     Json,
     Solver,
     Workers,
@@ -146,6 +147,7 @@ def _cells(row: BenchRow, figures: MotionFigures) -> tuple[Cell, ...]:
 
 
 def soak(
+    cell: ConfigFile = DEMO_CONFIG,
     ticks: Annotated[int, Option(min=100, help="Number of ticks.")] = 1_000_000,
     contact: Annotated[bool, Option("--contact", help="Allow fingers to touch the table and each other.")] = False,
     policy: Annotated[
@@ -158,12 +160,12 @@ def soak(
     solver: Solver = None,
     json: Json = False,
 ) -> None:
-    """Check every promise of the controller under random hostile targets, ticks, starts and solver failures.
+    """Check every promise of a cell's controller under random hostile targets, ticks, starts and solver failures.
 
     At ticks without a solver failure, the solver that --solver names is used. The worst margin of each promise is
     printed. Exit code 1 if a promise was broken.
     """
-    config = with_solver(load_config(DEMO_CONFIG), solver)
+    config = with_solver(load_config(cell), solver)
     config = with_contact(config, FINGERS) if contact else config
     place = chosen_place(workers, cluster)
     with notice_of_compiling():
@@ -173,17 +175,14 @@ def soak(
             report = PolicySoak(config, seed).run(ticks, print_progress)
         else:
             report = run_soak(config, ticks, seed, print_progress)
+    options = f"{'--policy ' * policy}{'--contact ' * contact}"
+    options = f"{'' if cell == DEMO_CONFIG else f'{cell} '}{options}{'' if solver is None else f'--solver {solver} '}"
     table = figure_table(
         f"{report.cell}: {report.ticks} hostile ticks, {report.simulated_s:.0f} s, {_seeds_of(report)}, "
         f"{report.solver}",
         ("promise", "worst", "allowed", "checked", "broken"),
         _soak_rows(report),
-        list(
-            _soak_notes(
-                report,
-                f"{'--policy ' * policy}{'--contact ' * contact}{'' if solver is None else f'--solver {solver} '}",
-            )
-        ),
+        list(_soak_notes(report, options)),
     )
     print_report(report.as_json(), (table,), json)
     raise Exit(0 if report.passed else 1)

@@ -150,7 +150,7 @@ COMMANDS = (
     ListedCommand(
         "soak",
         "bench:soak",
-        "Check every promise of the controller under random hostile targets, ticks, starts and solver failures.",
+        "Check every promise of a cell's controller under random hostile targets, ticks, starts and solver failures.",
         "Measure",
         "q2r2 soak --ticks 100000 --contact",
     ),

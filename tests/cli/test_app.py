@@ -172,6 +172,16 @@ def test_a_soak_prints_every_promise_and_exits_with_0_if_all_were_kept() -> None
     assert "acceleration / limit" in q2r2("soak", "--ticks", "100").stdout
 
 
+def test_a_soak_of_another_cell_names_it_and_checks_what_only_this_cell_promises(tmp_path: Path) -> None:
+    cell = tmp_path / "cell.yaml"
+    text = Path(CELL).read_text(encoding="utf-8").replace("jerk_limit: null", "jerk_limit: 5000.0")
+    cell.write_text(text.replace("name: dual_iiwa7", "name: limited"), encoding="utf-8")
+    report = one_object(q2r2("soak", str(cell), "--ticks", "400", "--json").stdout)
+    checked = {margin["name"]: margin["checked"] for margin in report["margins"]}
+    assert (report["cell"], report["passed"]) == ("limited", True)
+    assert checked["jerk of averaged commands / limit"] > 0
+
+
 def test_a_soak_that_finds_a_broken_promise_exits_with_1(monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(*arguments: Any) -> SoakReport:
         report = run_soak(*arguments)
