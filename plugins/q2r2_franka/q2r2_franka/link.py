@@ -46,7 +46,11 @@ class ArmLink:
     def open(self) -> None:
         """Connect, and set what the cell says of collisions and the load."""
         before = _datagram_sockets()
-        robot = pylibfranka.Robot(self._settings.address, self._real_time)
+        try:
+            robot = pylibfranka.Robot(self._settings.address, self._real_time)
+        except pylibfranka.RealtimeException as error:
+            cure = "a kernel with PREEMPT_RT, or plant_settings.franka.real_time: ignore for a first look"
+            raise PlantError(f"{str(error).rstrip('.')}; allowed: {cure}") from error
         opened = _datagram_sockets() - before
         if len(opened) != 1:
             raise PlantError(f"pylibfranka opened {len(opened)} sockets for states; allowed: one")
