@@ -69,7 +69,7 @@ class ErrorHandlingGroup(TyperGroup):
 
 def _usage_fault(error: Any) -> str:
     """Return what is wrong with an option or an argument, in the form that messages about a cell have."""
-    if not hasattr(error.__cause__, "errors"):  # Only an error of pydantic, which checks values, has them.
+    if not hasattr(error.__cause__, "errors"):  # Only pydantic's errors about values have this method.
         return str(error.format_message())
     from q2r2_control.config.strict import allowed_instead  # This import takes as long as the rest of the help.
 

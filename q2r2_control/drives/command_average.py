@@ -51,7 +51,7 @@ class CommandAverage:
         now = self._times[-1]
         samples = [self._at(now - age) for age in self._ages]
         oldest = bisect_right(self._times, now - self._ages[-1] - _ROUNDING) - 1
-        if oldest > 0:  # What is older is not needed any more. Small times are exact.
+        if oldest > 0:  # Older references are not used again. Times restart at 0, since rounding grows with them.
             self._times = [time - self._times[oldest] for time in self._times[oldest:]]
             del self._path[:oldest]
         self.settled = all((sample[0] == q).all() for sample in samples)

@@ -60,7 +60,7 @@ class FrankaCell:
         self.states[state.arm] = state
 
     def due(self, now: float) -> tuple[float, float]:
-        """Return the durations for which the reference brakes first, and moves then, in the tick at ``now`` [s]."""
+        """Return two durations for the tick at ``now`` [s]: of braking along the stop, and of the motion after it."""
         following = [state for state in self.states.values() if state.following]
         late = now - self._now if following else 0.0
         self._now, before = now, self._end

@@ -1,4 +1,4 @@
-"""The data between the loop and the process that answers the robots."""
+"""The messages between the loop and the process that answers the robots."""
 
 from __future__ import annotations
 
