@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from q2r2_control._lazy import lazy_exports
 
 if TYPE_CHECKING:
+    from q2r2_control.process.answering_process import AnsweringProcess as AnsweringProcess
     from q2r2_control.process.helper_process import leave_signals_to_the_run as leave_signals_to_the_run
     from q2r2_control.process.helper_process import reason_of as reason_of
     from q2r2_control.process.helper_process import start_python as start_python
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from q2r2_control.process.scheduling import thread_priority as thread_priority
 
 _MODULES = {
+    "AnsweringProcess": "answering_process",
     "few_garbage_collections": "scheduling",
     "how_it_ended": "scheduling",
     "leave_signals_to_the_run": "helper_process",

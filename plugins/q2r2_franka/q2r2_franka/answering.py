@@ -13,21 +13,18 @@ import socket
 import time
 from collections.abc import Mapping
 from contextlib import ExitStack, suppress
-from subprocess import TimeoutExpired
 from typing import BinaryIO
 
 import numpy as np
 
 from q2r2_control import Array, CommandMode, PlantError
 from q2r2_control.process import (
+    AnsweringProcess,
     few_garbage_collections,
-    how_it_ended,
     leave_signals_to_the_run,
     real_time,
     reason_of,
     reserve,
-    start_python,
-    thread_priority,
 )
 from q2r2_franka.check import ARMS
 from q2r2_franka.limits import JOINTS
@@ -35,18 +32,15 @@ from q2r2_franka.link import ERRORS, ArmLink
 from q2r2_franka.record import Entry, write_entry
 from q2r2_franka.session import ArmSession, ahead_of_others, follow
 from q2r2_franka.settings import FrankaSettings
-from q2r2_franka.state import ArmCommand, Mode, SessionState
+from q2r2_franka.state import Mode, SessionState
 
-_TAKEN, _TOO_LATE, _BEGUN = b"1", b"0", b"2"  # The replies to commands, and the first reply.
 _RESERVED = 0.0006, 0.001  # Processor time that is reserved for answers in each interval [s].
-_LARGEST = 1 << 16  # Largest datagram between the processes [bytes].
 _POLL = 0.01  # Longest time between two looks at all sessions [s].
-_PATIENCE = 5.0  # Time to wait until the process ends [s].
 _LONGEST_WORD = 5.0  # Time to wait for the reply to commands. A robot may be connected or recovered meanwhile [s].
 _AGAIN = 0.5  # Time from the end of a motion, or from a failed attempt, until the next attempt [s].
 
 
-class AnsweringProcess:
+class RobotAnswers(AnsweringProcess):
     """The loop's end of the connection to the process."""
 
     def __init__(self, settings: FrankaSettings, mode: CommandMode, torque_limits: Mapping[str, Array]) -> None:
@@ -55,39 +49,7 @@ class AnsweringProcess:
         Raises:
             PlantError: If the process cannot begin.
         """
-        # States that nobody reads may fill their connection. Replies to commands must not wait for that.
-        self._commands, commands = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        self._states, states = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        self._states.setblocking(False)
-        links = commands.fileno(), states.fileno()
-        with commands, states:
-            self._process = start_python(f"from {__name__} import main; main{links}", {}, files=links)
-        self.pid = self._process.pid
-        priority = thread_priority()
-        self._commands.send(pickle.dumps((priority and priority + 1, settings, mode, dict(torque_limits))))
-        word = b""
-        with suppress(ConnectionError):
-            word = self._commands.recv(_LARGEST)
-        if word != _BEGUN:
-            raise self._end(word)
-        self._commands.settimeout(_LONGEST_WORD)
-
-    def send(self, commands: dict[str, ArmCommand]) -> bool:
-        """Send a command for each arm; returns whether all of them came in time. If not, none of them is followed.
-
-        Raises:
-            PlantError: If the process has ended, or does not reply.
-        """
-        try:
-            self._commands.send(pickle.dumps(commands))
-            word = self._commands.recv(_LARGEST)
-        except TimeoutError as error:
-            raise PlantError(f"the process that answers the robots says nothing for {_LONGEST_WORD:g} s") from error
-        except ConnectionError:
-            word = b""
-        if word not in (_TAKEN, _TOO_LATE):
-            raise self._end(word)
-        return word == _TAKEN
+        super().__init__(__name__, "the robots", (settings, mode, dict(torque_limits)), _LONGEST_WORD)
 
     def receive(self) -> list[SessionState]:
         """Return each arm's newest state since the last call.
@@ -95,31 +57,8 @@ class AnsweringProcess:
         Raises:
             PlantError: If the process has ended.
         """
-        newest: dict[int, bytes] = {}
-        with suppress(BlockingIOError):
-            while said := self._states.recv(_LARGEST):
-                newest[said[0]] = said  # After a late tick only the newest state is decoded.
-            raise self._end()
+        newest = {said[0]: said for said in self.said()}  # After a late tick only the newest state is decoded.
         return [pickle.loads(said[1:]) for said in newest.values()]
-
-    def _end(self, last_word: bytes = b"") -> PlantError:
-        """Return an error that says how the process has ended."""
-        if not last_word:
-            with suppress(OSError):
-                last_word = self._commands.recv(_LARGEST)
-        if last_word:
-            return PlantError(f"the robots are answered no more: {last_word.decode()}")
-        return PlantError(how_it_ended("the process that answers the robots", self._process.wait(_PATIENCE)))
-
-    def close(self) -> None:
-        """Let the process end as soon as the arms stand still."""
-        self._commands.close()
-        try:
-            self._process.wait(_PATIENCE)
-        except TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
-        self._states.close()
 
 
 def main(commands: int, states: int) -> None:
@@ -127,7 +66,7 @@ def main(commands: int, states: int) -> None:
     leave_signals_to_the_run()
     with socket.socket(fileno=commands) as from_loop, socket.socket(fileno=states) as to_loop:
         try:
-            priority, settings, mode, torque_limits = pickle.loads(from_loop.recv(_LARGEST))
+            priority, settings, mode, torque_limits = pickle.loads(from_loop.recv(RobotAnswers.LARGEST))
             from_loop.setblocking(False)
             to_loop.setblocking(False)
             with ExitStack() as stack:
@@ -165,7 +104,7 @@ class _Answering:
         self._loop_ended = False
 
     def run(self) -> None:
-        self._commands.send(_BEGUN)
+        self._commands.send(RobotAnswers.BEGUN)
         while True:
             files = {link.file: arm for arm, link in self._links.items() if link.is_open}
             waits = [*files] if self._loop_ended else [*files, self._commands.fileno()]
@@ -182,8 +121,10 @@ class _Answering:
     def _take_commands(self) -> bool:
         """Take all commands before an answer; returns whether the loop is still there."""
         try:
-            while said := self._commands.recv(_LARGEST):
-                self._commands.send(_TAKEN if follow(self._sessions, pickle.loads(said)) else _TOO_LATE)
+            while said := self._commands.recv(RobotAnswers.LARGEST):
+                self._commands.send(
+                    RobotAnswers.TAKEN if follow(self._sessions, pickle.loads(said)) else RobotAnswers.TOO_LATE
+                )
         except BlockingIOError:
             return True
         except ConnectionError:

@@ -9,7 +9,7 @@ import numpy as np
 
 from q2r2_control import Array, Command, CommandMode, Config, ConfigError, PlantError, Reason, Robot, RobotState
 from q2r2_control.plants import ArmTiming, check_command
-from q2r2_franka.answering import AnsweringProcess
+from q2r2_franka.answering import RobotAnswers
 from q2r2_franka.cell import FrankaCell
 from q2r2_franka.hand import Hand
 from q2r2_franka.limits import JOINTS, PERIOD
@@ -60,7 +60,7 @@ class FrankaPlant:
                 f"of {MEANS} positions keeps with the acceleration limits of this cell"
             )
         self.begin(CommandMode.POSITION)
-        self._answering: AnsweringProcess | None = None
+        self._answering: RobotAnswers | None = None
         self._hands: dict[str, Hand] = {}
 
     @classmethod
@@ -83,7 +83,7 @@ class FrankaPlant:
         states = [SessionState(arm, its.address, self._mode) for arm, its in self._settings.arms.items()]
         self.cell = FrankaCell(self._robot, states, self._period, self._longest)
         limits = {arm: self._robot.torque_limit[self._robot.arms[arm].joints] for arm in self._settings.arms}
-        self._answering = AnsweringProcess(self._settings, self._mode, limits)
+        self._answering = RobotAnswers(self._settings, self._mode, limits)
         self._hands = {
             arm: Hand(arm, its.address, its.hand) for arm, its in self._settings.arms.items() if its.hand is not None
         }

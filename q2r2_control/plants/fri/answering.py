@@ -16,21 +16,16 @@ from collections.abc import Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from ipaddress import ip_address
-from subprocess import TimeoutExpired
 
-from q2r2_control.errors import PlantError
 from q2r2_control.plants.fri.session import ArmSession, answer, follow
-from q2r2_control.plants.fri.session_state import ArmCommand, SessionState
+from q2r2_control.plants.fri.session_state import SessionState
 from q2r2_control.plants.fri.wire import LONGEST, read_monitoring
-from q2r2_control.process.helper_process import leave_signals_to_the_run, reason_of, start_python
-from q2r2_control.process.scheduling import few_garbage_collections, how_it_ended, real_time, reserve, thread_priority
+from q2r2_control.process.answering_process import AnsweringProcess
+from q2r2_control.process.helper_process import leave_signals_to_the_run, reason_of
+from q2r2_control.process.scheduling import few_garbage_collections, real_time, reserve
 
-_TAKEN, _TOO_LATE = b"1", b"0"  # The replies to commands.
 _RESERVED = 0.0015, 0.002  # Processor time that is reserved for answers in each interval [s]. An answer takes 0.2 ms.
-_BEGUN = b"2"  # The first reply, which says that the process hears the cabinets.
-_LARGEST = 1 << 16  # Largest datagram between the processes [bytes].
 _POLL = 0.05  # After the loop has ended, time between two looks whether the arms stand still [s].
-_PATIENCE = 5.0  # Time to wait until the process ends [s].
 _LONGEST_WORD = 1.0  # Time to wait for the reply to commands. Arms brake meanwhile [s].
 # Linux stamps arriving datagrams by its real-time clock (SO_TIMESTAMPNS). A longer wait is a jump of that clock [s].
 _TIMESTAMP, _TIMESPEC, _EXTRA, _LONGEST_WAIT = 35, struct.Struct("@qq"), 64, 0.1
@@ -46,52 +41,17 @@ class Line:
     newest: bytes | None = None  # The newest message of the cabinet, which the process passes on without decoding it.
 
 
-class AnsweringProcess:
+class CabinetAnswers(AnsweringProcess):
     """The loop's end of the connection to the process."""
 
     def __init__(self, lines: Sequence[Line]) -> None:
         """Start the process, with a line to each cabinet. The caller may close its own sockets then.
 
-        It returns when the process hears the cabinets, which takes seconds on a busy computer.
-
         Raises:
             PlantError: If the process cannot begin.
         """
-        # States that nobody reads may fill their connection. Replies to commands must not wait for that.
-        self._commands, commands = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        self._states, states = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        self._states.setblocking(False)
-        links = commands.fileno(), states.fileno()
-        with commands, states:
-            code, files = f"from {__name__} import main; main{links}", [*links, *(line.file for line in lines)]
-            self._process = start_python(code, {}, files=files)
-        self.pid = self._process.pid
-        # If the loop has a real-time priority, answers come before it.
-        priority = thread_priority()
-        self._commands.send(pickle.dumps((priority and priority + 1, list(lines))))
-        word = b""
-        with suppress(ConnectionError):
-            word = self._commands.recv(_LARGEST)
-        if word != _BEGUN:
-            raise self._end(word)
-        self._commands.settimeout(_LONGEST_WORD)
-
-    def send(self, commands: dict[str, ArmCommand]) -> bool:
-        """Send a command for each arm; returns whether all of them came in time. If not, none of them is followed.
-
-        Raises:
-            PlantError: If the process has ended, or does not reply.
-        """
-        try:
-            self._commands.send(pickle.dumps(commands))
-            word = self._commands.recv(_LARGEST)
-        except TimeoutError as error:
-            raise PlantError(f"the process that answers the cabinets says nothing for {_LONGEST_WORD:g} s") from error
-        except ConnectionError:
-            word = b""
-        if word not in (_TAKEN, _TOO_LATE):
-            raise self._end(word)
-        return word == _TAKEN
+        files = [line.file for line in lines]
+        super().__init__(__name__, "the cabinets", (list(lines),), _LONGEST_WORD, files)
 
     def receive(self) -> tuple[list[SessionState], list[tuple[float, float]]]:
         """Return each arm's newest state since the last call, and for each message its arrival and answer time [s].
@@ -100,33 +60,12 @@ class AnsweringProcess:
             PlantError: If the process has ended.
         """
         newest, answers = {}, []
-        with suppress(BlockingIOError):
-            while said := self._states.recv(_LARGEST):
-                values, datagram = pickle.loads(said)
-                newest[values["arm"]] = values, datagram  # After a late tick only the newest message is decoded.
-                if values["took"] is not None:
-                    answers.append((values["arrival"], values["took"]))
-            raise self._end()
+        for said in self.said():
+            values, datagram = pickle.loads(said)
+            newest[values["arm"]] = values, datagram  # After a late tick only the newest message is decoded.
+            if values["took"] is not None:
+                answers.append((values["arrival"], values["took"]))
         return [SessionState(**its | {"newest": raw and read_monitoring(raw)}) for its, raw in newest.values()], answers
-
-    def _end(self, last_word: bytes = b"") -> PlantError:
-        """Return an error that says how the process has ended."""
-        if not last_word:
-            with suppress(OSError):
-                last_word = self._commands.recv(_LARGEST)
-        if last_word:
-            return PlantError(f"the cabinets are answered no more: {last_word.decode()}")
-        return PlantError(how_it_ended("the process that answers the cabinets", self._process.wait(_PATIENCE)))
-
-    def close(self) -> None:
-        """Let the process end as soon as the arms stand still."""
-        self._commands.close()
-        try:
-            self._process.wait(_PATIENCE)
-        except TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
-        self._states.close()
 
 
 def main(commands: int, states: int) -> None:
@@ -134,7 +73,7 @@ def main(commands: int, states: int) -> None:
     leave_signals_to_the_run()
     with socket.socket(fileno=commands) as from_loop, socket.socket(fileno=states) as to_loop:
         try:
-            priority, lines = pickle.loads(from_loop.recv(_LARGEST))
+            priority, lines = pickle.loads(from_loop.recv(CabinetAnswers.LARGEST))
             from_loop.setblocking(False)
             to_loop.setblocking(False)
             with ExitStack() as stack:
@@ -159,7 +98,7 @@ class _Answering:
             with suppress(OSError):
                 while True:  # Messages that came while this process started are too old to be answered.
                     opened.recv(LONGEST + 1)
-        self._commands.send(_BEGUN)
+        self._commands.send(CabinetAnswers.BEGUN)
         ended = False
         while not (ended and all(session.is_still(time.monotonic()) for session in self._sessions.values())):
             for file in select.select(files, (), (), _POLL)[0]:
@@ -172,8 +111,10 @@ class _Answering:
     def _take_commands(self) -> bool:
         """Take all commands before an answer; returns whether the loop is still there."""
         try:
-            while said := self._commands.recv(_LARGEST):
-                self._commands.send(_TAKEN if follow(self._sessions, pickle.loads(said)) else _TOO_LATE)
+            while said := self._commands.recv(CabinetAnswers.LARGEST):
+                self._commands.send(
+                    CabinetAnswers.TAKEN if follow(self._sessions, pickle.loads(said)) else CabinetAnswers.TOO_LATE
+                )
         except BlockingIOError:
             return True
         except ConnectionError:

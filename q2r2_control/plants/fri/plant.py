@@ -12,7 +12,7 @@ from q2r2_control.config.fri import GripperIoConfig, ModbusGripperConfig
 from q2r2_control.errors import ConfigError, PlantError
 from q2r2_control.events import Reason
 from q2r2_control.plants.base import check_command
-from q2r2_control.plants.fri.answering import AnsweringProcess, Line, open_socket
+from q2r2_control.plants.fri.answering import CabinetAnswers, Line, open_socket
 from q2r2_control.plants.fri.cell import FriCell
 from q2r2_control.plants.fri.session import ArmSession
 from q2r2_control.plants.fri.session_state import SessionState
@@ -56,7 +56,7 @@ class FriPlant:
         self._torque_rate_limit = config.impedance.torque_rate_limit
         self.begin(CommandMode.POSITION)
         self.grippers = self._modbus_grippers()
-        self._answering: AnsweringProcess | None = None
+        self._answering: CabinetAnswers | None = None
         # For the newest messages, the arrival by the monotonic clock, and the time until the answer was sent [s].
         self.answers: deque[tuple[float, float]] = deque(maxlen=_KEPT)
 
@@ -86,7 +86,7 @@ class FriPlant:
         grippers = {arm: its.gripper for arm, its in self._cabinets.items() if isinstance(its.gripper, GripperIoConfig)}
         self.cell = FriCell(self._robot, [line.session.state for line in lines], self._period, self._longest, grippers)
         try:
-            self._answering = AnsweringProcess(lines)
+            self._answering = CabinetAnswers(lines)
         finally:
             for line in lines:
                 socket.close(line.file)  # The process has a copy of it.

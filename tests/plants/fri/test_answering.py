@@ -12,7 +12,7 @@ from dataclasses import replace
 import pytest
 
 from q2r2_control.errors import PlantError
-from q2r2_control.plants.fri.answering import AnsweringProcess, Line, open_socket
+from q2r2_control.plants.fri.answering import CabinetAnswers, Line, open_socket
 from q2r2_control.plants.fri.session import ArmSession
 from q2r2_control.plants.fri.session_state import ArmCommand, SessionState
 from q2r2_control.plants.fri.wire import FriCommand, Monitoring, Quality, Session, read_command, write_monitoring
@@ -56,7 +56,7 @@ class Between:
         ours = open_socket("127.0.0.1", 0)
         self.address, self.sent = ours.getsockname(), 0
         file = ours.detach()
-        self.process = AnsweringProcess([Line(session, "127.0.0.1", file)])
+        self.process = CabinetAnswers([Line(session, "127.0.0.1", file)])
         socket.close(file)
         self.states: list[SessionState] = []
         self.cabinet.settimeout(20.0)
@@ -93,7 +93,7 @@ def test_the_process_has_begun_as_soon_as_the_loop_has_it(between: Between) -> N
 
 def test_a_process_that_cannot_begin_gives_the_reason() -> None:
     with open_socket("127.0.0.1", 0) as ours, pytest.raises(PlantError, match="answered no more: it came broken"):
-        AnsweringProcess([Line(BrokenOnTheWay("left", "cabinet"), "127.0.0.1", ours.fileno())])
+        CabinetAnswers([Line(BrokenOnTheWay("left", "cabinet"), "127.0.0.1", ours.fileno())])
 
 
 def test_the_loop_gets_the_state_after_each_message_and_answers_use_only_earlier_commands(
