@@ -52,7 +52,8 @@ COMMAND_QOS = QoSProfile(depth=1)
 # was down for a while. An old target would be a jump. The lifespan is measured by the sender's clock, and the clock of
 # the receiver may differ.
 SENT_COMMAND_QOS = QoSProfile(depth=1, lifespan=Duration(seconds=0.1))
-# The profile of streams of a headset or of joint states, in which a late message is worth less than the next one.
+# The profile of streams of a headset, of joint states or of nodes' reports, in which a late message is worth less than
+# the next one. A reliable subscription delivers in order, and lets the next one wait up to 3 s for one that was lost.
 STREAM_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 # The profile of messages that are only recorded. All of them count, and nobody waits for them.
 RECORDED_QOS = QoSProfile(depth=200)

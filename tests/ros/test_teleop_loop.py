@@ -16,6 +16,7 @@ from tests.support.reasons import kinds
 need_ros()
 
 from rclpy.parameter import Parameter
+from rclpy.qos import ReliabilityPolicy
 
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.errors import ConfigError
@@ -130,3 +131,10 @@ def test_a_parameter_of_the_teleoperation_that_is_set_in_one_node_is_set_in_both
         assert left.get_parameter(name).value == value
     assert left.parameters.teleop == right.parameters.teleop == left.loop.teleop.settings
     assert (left.hand, right.hand) == ("right", "left")
+
+
+def test_a_lost_report_does_not_hold_back_the_next_ones(both: tuple[Any, Any]) -> None:
+    # A reliable subscription delivers in order. After a process was frozen, reports waited 3 s for a lost one.
+    reports = [one for node in both for one in node.subscriptions if one.topic_name.endswith("/state")]
+    assert {one.topic_name for one in reports} == {"/cartesian_controller/state", "/recorder/state"}
+    assert {one.qos_profile.reliability for one in reports} == {ReliabilityPolicy.BEST_EFFORT}

@@ -15,7 +15,7 @@ from q2r2_control.config.presets import BUILTIN, POSE, TWIST, Mode
 from q2r2_control.config.teleop import GuardSettings
 from q2r2_control.errors import ConfigError
 from q2r2_control.events import Reason
-from q2r2_control.ros.base_node import LATCHED_QOS, BaseNode
+from q2r2_control.ros.base_node import LATCHED_QOS, STREAM_QOS, BaseNode
 from q2r2_control.ros.bridge.frames import PoseTopic
 from q2r2_control.ros.bridge.parameters import ArmParameters
 from q2r2_control.ros.bridge.target_output import TargetOutput
@@ -212,7 +212,7 @@ class FollowWatch:
         self.homing_outcome: Reason | None = None  # How the last way home ended, if nobody interrupted it.
         self.gripper_held = ""  # The pair of bodies that stops the gripper.
         node.create_subscription(Bool, self._topic, self._on_following, LATCHED_QOS)
-        node.create_subscription(String, self._state_topic, self._on_state, 1)
+        node.create_subscription(String, self._state_topic, self._on_state, STREAM_QOS)
 
     @property
     def unready(self) -> Reason | None:

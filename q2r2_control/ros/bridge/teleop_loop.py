@@ -16,7 +16,7 @@ from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.errors import ConfigError
 from q2r2_control.events import CommonReason, Event, Reason
 from q2r2_control.recording.messages import RECORDER
-from q2r2_control.ros.base_node import STEADY, BaseNode
+from q2r2_control.ros.base_node import STEADY, STREAM_QOS, BaseNode
 from q2r2_control.ros.reasons import RosReason
 from q2r2_control.teleop.arm_states import HOLDING
 from q2r2_control.teleop.both_arms import EpisodeMarks
@@ -115,7 +115,7 @@ class RecorderLink:
         self._served: int | None = None  # Number of service calls that the node has answered.
         self._reasons: list[Reason] = []
         self._topic = f"{node.name_in_set(RECORDER)}/state"
-        node.create_subscription(String, self._topic, self._on_state, 10)
+        node.create_subscription(String, self._topic, self._on_state, STREAM_QOS)
 
     def update(self, marks: EpisodeMarks) -> list[Reason]:
         """Update the marks before the teleoperation of a tick; returns the reasons of new events of its services."""
