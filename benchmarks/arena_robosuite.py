@@ -13,7 +13,7 @@ import robosuite
 
 from arena_hands import Ask, Judge, backed, looking_down, shifted
 from arena_robot import ArmModel, robot_of, tool_pose
-from q2r2_control.config.cell import load_config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.robot.robot import Robot

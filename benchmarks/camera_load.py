@@ -20,7 +20,8 @@ from typer import Option, run
 
 from q2r2_control.cameras.camera_streams import CameraStreams
 from q2r2_control.cli.output import DEMO_CONFIG, Json, print_progress, print_report
-from q2r2_control.config.cell import Config, load_config
+from q2r2_control.config.cell import Config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.config.recording import CameraConfig
 from q2r2_control.inputs.base import Input
 from q2r2_control.inputs.policy import PolicyInput

@@ -19,7 +19,8 @@ import pinocchio as pin
 import typer
 
 from q2r2_control.cli.output import DEMO_CONFIG, Json, print_progress, print_report
-from q2r2_control.config.cell import Config, load_config
+from q2r2_control.config.cell import Config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.config.teleop import FilterSettings
 from q2r2_control.inputs.played import HandButtons, HeadsetSampling, PlayedInput
 from q2r2_control.inputs.scripted import HANDS_AT_REST

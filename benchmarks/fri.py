@@ -21,7 +21,7 @@ import numpy as np
 import typer
 
 from q2r2_control.cli.output import Json, notice_of_compiling, print_report
-from q2r2_control.config.cell import load_config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.fri.plant import FriPlant

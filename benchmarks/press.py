@@ -17,7 +17,8 @@ import pinocchio as pin
 import typer
 
 from q2r2_control.cli.output import DEMO_CONFIG, Json, print_progress, print_report
-from q2r2_control.config.cell import Config, load_config
+from q2r2_control.config.cell import Config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.drives.base import TorqueDrive
 from q2r2_control.errors import ConfigError

@@ -15,7 +15,8 @@ import typer
 
 from q2r2_control.benchmark.motion_run import JOLT, OwnController, count_jolts, rest_acceleration
 from q2r2_control.cli.output import DEMO_CONFIG, Json, print_progress, print_report
-from q2r2_control.config.cell import Config, load_config
+from q2r2_control.config.cell import Config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 from q2r2_control.viewer.tables import record_table

@@ -18,7 +18,7 @@ from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory
 
 from q2r2_control.cli.output import DEMO_CONFIG, Json, print_progress, print_report
-from q2r2_control.config.cell import load_config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.errors import Q2R2Error
 from q2r2_control.ros.executor import TickExecutor, TickGroup
 from q2r2_control.ros.launch.processes import NodeProcess, nodes_of

@@ -18,7 +18,7 @@ import numpy as np
 from typer import Option, run
 
 from q2r2_control.cli.output import DEMO_CONFIG, Json, print_report
-from q2r2_control.config.cell import load_config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.inputs.samples import HandsWatch
 from q2r2_control.inputs.webxr.webxr import WebXrInput
 from q2r2_control.pipeline.pipeline import Pipeline

@@ -19,7 +19,8 @@ import typer
 from q2r2_control.benchmark.motion_run import arrival_time, nearest_pair, without_pairs
 from q2r2_control.benchmark.work_motions import ARMS, WORK_MOTIONS, WorkMotion, motions_named
 from q2r2_control.cli.output import DEMO_CONFIG, Json, print_progress, print_report
-from q2r2_control.config.cell import Config, load_config
+from q2r2_control.config.cell import Config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.errors import PlantError
 from q2r2_control.events import Event
 from q2r2_control.pipeline.pipeline import Pipeline

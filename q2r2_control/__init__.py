@@ -15,7 +15,7 @@ from q2r2_control._lazy import lazy_exports
 if TYPE_CHECKING:  # The word "as" tells type checkers that a name is public.
     from q2r2_control.config.cell import Config as Config
     from q2r2_control.config.cell import ObstacleConfig as ObstacleConfig
-    from q2r2_control.config.cell import load_config as load_config
+    from q2r2_control.config.cell_file import load_config as load_config
     from q2r2_control.config.control import ControllerSettings as ControllerSettings
     from q2r2_control.config.moving_obstacle import MovingObstacle as MovingObstacle
     from q2r2_control.config.strict import StrictModel as StrictModel
@@ -128,7 +128,7 @@ _MODULES = {
     "Upright": "control.tasks.named_tasks",
     "action_names": "inputs.policy",
     "load_commissioned": "robot.commissioned",
-    "load_config": "config.cell",
+    "load_config": "config.cell_file",
 }
 __all__ = list(_MODULES)
 __getattr__, __dir__ = lazy_exports(__name__, _MODULES)

@@ -16,7 +16,8 @@ from itertools import combinations
 from pathlib import Path
 
 from q2r2_control.config.arms import ArmConfig, PoseConfig
-from q2r2_control.config.cell import Config, load_config
+from q2r2_control.config.cell import Config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.cell_parts import load_flange, load_model, name_of_stack
 from q2r2_control.robot.compose import compose

@@ -32,6 +32,6 @@ def _seeded_pinocchio() -> None:
 def robot() -> Robot:
     """Return two iiwa 7 as in the shipped cell. No test changes this robot."""
     from q2r2_control import Robot  # The import is here because some tests check that nothing heavy is imported.
-    from q2r2_control.config.cell import load_config
+    from q2r2_control.config.cell_file import load_config
 
     return Robot.from_config(load_config("config/dual_iiwa7.yaml"))

@@ -67,13 +67,13 @@ def test_the_code_on_a_page_imports_public_names_only(page: Path) -> None:
     ("code", "told"),
     [
         pytest.param(
-            "import numpy\nfrom q2r2_control.config.cell import load_config",
-            ["a.py:2: from q2r2_control.config.cell import load_config; allowed: from q2r2_control import load_config"],
+            "import numpy\nfrom q2r2_control.config.cell import Config",
+            ["a.py:2: from q2r2_control.config.cell import Config; allowed: from q2r2_control import Config"],
             id="an inner module with a public name",
         ),
         pytest.param(
-            "if True:\n    from q2r2_control.config.cell import parse_config",
-            ["a.py:2: from q2r2_control.config.cell import parse_config; allowed: the names in docs/api.md"],
+            "if True:\n    from q2r2_control.config.cell_file import parse_config",
+            ["a.py:2: from q2r2_control.config.cell_file import parse_config; allowed: the names in docs/api.md"],
             id="a name that is not public, inside a block",
         ),
         pytest.param(

@@ -27,7 +27,7 @@ from q2r2_control.cli.output import (
     print_report,
     with_solver,
 )
-from q2r2_control.config.cell import load_config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.errors import ConfigError
 from q2r2_control.process.places import HERE, chosen_place
 from q2r2_control.verification.fault_injection import FINGERS, with_contact

@@ -15,7 +15,7 @@ from q2r2_control.cameras.device import shown_device
 from q2r2_control.cameras.realsense import found_cameras, is_installed
 from q2r2_control.cameras.v4l2 import capture_devices, fault_of, formats_of
 from q2r2_control.cli.output import Json, as_json_text
-from q2r2_control.config.cell import load_config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.config.recording import REALSENSE, CameraConfig
 from q2r2_control.errors import CameraError
 from q2r2_control.extras import install_line

@@ -14,7 +14,8 @@ from typer import Exit, Option
 
 from q2r2_control.cli.cell_report import CellCheck, check_cell, verdict_on
 from q2r2_control.cli.output import ConfigFile, Json, as_json_text, counting, print_report, say
-from q2r2_control.config.cell import Config, load_config
+from q2r2_control.config.cell import Config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.errors import ConfigError, Q2R2Error
 from q2r2_control.robot.reachability import PairReach, Progress, nearest_approaches, srdf_of
 from q2r2_control.robot.robot import Robot

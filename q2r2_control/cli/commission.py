@@ -19,7 +19,7 @@ from typer import Exit, Option
 from q2r2_control.cli.fri_check import listen
 from q2r2_control.cli.mounts import Tip, measure_mount, postures_over
 from q2r2_control.cli.output import ConfigFile, Json, as_json_text, notice_of_compiling, say
-from q2r2_control.config.cell import load_config, parse_config
+from q2r2_control.config.cell_file import load_config, parse_config
 from q2r2_control.config.mount_text import with_mount
 from q2r2_control.config.resources import find_resource
 from q2r2_control.errors import ConfigError, PlantError, Q2R2Error

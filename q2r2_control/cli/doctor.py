@@ -16,7 +16,8 @@ from typer import Argument, Exit
 
 from q2r2_control.cli.output import DEMO_CONFIG, Json, as_json_text
 from q2r2_control.cli.ros import print_findings
-from q2r2_control.config.cell import Config, load_config
+from q2r2_control.config.cell import Config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.extras import install_line
 from q2r2_control.inputs.listener import access_lines
 from q2r2_control.plugins import INPUTS, PLANTS, load_class

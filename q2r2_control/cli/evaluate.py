@@ -19,7 +19,7 @@ from q2r2_control.cli.output import (
     notice_of_compiling,
     print_progress,
 )
-from q2r2_control.config.cell import load_config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.demo.assembly_tasks import tasks_named
 from q2r2_control.demo.trials import TrialReport, try_policy, try_tasks
 from q2r2_control.inputs.policy import PolicyInput

@@ -19,7 +19,7 @@ from rich.console import Console
 from typer import Option
 
 from q2r2_control.cli.output import ConfigFile, Json, RealTime, positive, print_report, say
-from q2r2_control.config.cell import load_config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.config.fri import GripperIoConfig
 from q2r2_control.demo.assembly_tasks import AssemblyTask, TaskResult, TaskWatch, tasks_named
 from q2r2_control.errors import ConfigError, PlantError

@@ -12,7 +12,7 @@ from rich.table import Table
 from typer import Exit, Option
 
 from q2r2_control.cli.output import ConfigFile, Json, Wait, longest_wait, print_report
-from q2r2_control.config.cell import load_config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.events import Reason
 from q2r2_control.plants.fri.plant import FriPlant
 from q2r2_control.plants.fri.wire import Monitoring, in_words

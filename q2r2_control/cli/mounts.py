@@ -15,7 +15,8 @@ from rich.table import Table
 from typer import Option
 
 from q2r2_control.cli.output import ConfigFile, Json, Wait, longest_wait, print_report, say
-from q2r2_control.config.cell import Config, load_config
+from q2r2_control.config.cell import Config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.errors import ConfigError, PlantError
 from q2r2_control.plants.fri.plant import FriPlant
 from q2r2_control.robot.mounts import fit_move

@@ -20,7 +20,8 @@ from q2r2_control.cli.cell_report import check_cell
 from q2r2_control.cli.cell_yaml import commented_yaml
 from q2r2_control.cli.model_arguments import SPEEDS, named_values, without_mjcf
 from q2r2_control.cli.output import Json, as_json_text, counted, counting, say
-from q2r2_control.config.cell import Config, load_config, parse_config
+from q2r2_control.config.cell import Config
+from q2r2_control.config.cell_file import load_config, parse_config
 from q2r2_control.config.yaml_text import yaml_of
 from q2r2_control.errors import ConfigError, Q2R2Error
 from q2r2_control.robot.compose import compose

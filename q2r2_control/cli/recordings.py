@@ -29,7 +29,7 @@ from q2r2_control.cli.output import (
     verdict_markup,
 )
 from q2r2_control.cli.summary_figures import summary_table, verdict_line
-from q2r2_control.config.cell import load_config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.config.recording import JudgeSettings
 from q2r2_control.errors import ConfigError, RecordingError
 from q2r2_control.export.episodes import FASTEST, FrameSampling, Output, keep_episodes

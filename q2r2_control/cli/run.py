@@ -41,7 +41,7 @@ from q2r2_control.cli.output import (
     say,
     with_solver,
 )
-from q2r2_control.config.cell import load_config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.config.resources import find_resource
 from q2r2_control.demo.assembly_tasks import (
     ALL_TASKS,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from difflib import get_close_matches
 from ipaddress import IPv4Network, IPv6Network, ip_network
 from typing import Any, Self, TypeVar, get_args
@@ -89,12 +90,18 @@ def validated(model: type[Model], where: str, values: object, *, as_json: bool =
     return made
 
 
-def config_error(error: ValidationError, model: type[BaseModel]) -> ConfigError:
-    """Return an error with all faults in a ``model``. Its message has the first fault and the number of others."""
+def config_error(
+    error: ValidationError, model: type[BaseModel], place: Callable[[Sequence[int | str]], str] = lambda location: ""
+) -> ConfigError:
+    """Return an error with all faults in a ``model``. Its message has the first fault and the number of others.
+
+    Each line begins with ``place`` of its key, whose parts are given from the outermost one.
+    """
     # If a key is misspelt, the right key is missing too. The misspelt key comes first, because it explains the fault.
     found = sorted(error.errors(), key=lambda fault: fault["type"] != "extra_forbidden")
     # A value that fits none of several types has one fault for each of them. Only the first is kept.
-    faults = list({key: _line(key, fault, model) for fault in reversed(found) for key in [_key(fault)]}.values())[::-1]
+    lines = {_key(fault): place(fault["loc"]) + _line(fault, model) for fault in reversed(found)}
+    faults = list(lines.values())[::-1]
     more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
     return ConfigError(faults[0] + more, faults)
 
@@ -105,8 +112,9 @@ def _key(fault: ErrorDetails) -> str:
     return " ".join(key.split())[:300] or "(top level)"
 
 
-def _line(key: str, fault: ErrorDetails, model: type[BaseModel]) -> str:
+def _line(fault: ErrorDetails, model: type[BaseModel]) -> str:
     """Return one line about a ``fault`` in a ``model``: key, value, and what is allowed."""
+    key = _key(fault)
     if fault["type"] == "missing":
         has = "allowed: a list with one more entry" if isinstance(fault["loc"][-1], int) else "and has no default"
         return f"{key}: missing, {has}"
@@ -115,8 +123,8 @@ def _line(key: str, fault: ErrorDetails, model: type[BaseModel]) -> str:
         keys = _keys_at(fault["loc"][:-1], model)
         meant = get_close_matches(str(fault["loc"][-1]), keys, n=1)
         allowed = f"unknown key; {f'did you mean {meant[0]}? ' if meant else ''}allowed here: {', '.join(keys)}"
-    # For a whole block, the text itself names the keys that do not fit together.
-    is_block = fault["type"] == "value_error" and isinstance(fault["input"], dict)
+    # An unknown block is named by its key alone. For a known one, the text names the keys that do not fit together.
+    is_block = fault["type"] in ("value_error", "extra_forbidden") and isinstance(fault["input"], dict)
     value = "" if is_block else f" = {shown(fault['input'])}"
     return f"{key}{value}: {allowed}"
 

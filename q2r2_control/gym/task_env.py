@@ -14,7 +14,8 @@ import numpy.typing as npt
 import pinocchio as pin
 from gymnasium.spaces import Box, Dict
 
-from q2r2_control.config.cell import Config, load_config
+from q2r2_control.config.cell import Config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.config.recording import CameraConfig
 from q2r2_control.demo.assembly_tasks import TaskWatch, tasks_named
 from q2r2_control.errors import ConfigError, PlantError, shown

@@ -9,7 +9,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from q2r2_control.config.cell import Config, parse_config
+from q2r2_control.config.cell import Config
+from q2r2_control.config.cell_file import parse_config
 from q2r2_control.errors import Q2R2Error, RecordingError
 from q2r2_control.events import Event
 from q2r2_control.recording.reader import NO_END, Recording

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from q2r2_control.config.cell import parse_config
+from q2r2_control.config.cell_file import parse_config
 from q2r2_control.config.external import ControllerKind
 from q2r2_control.config.strict import STREAM_TIMEOUT
 from q2r2_control.errors import RecordingError

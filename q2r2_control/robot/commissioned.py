@@ -8,7 +8,8 @@ import os
 from ipaddress import ip_address
 from pathlib import Path
 
-from q2r2_control.config.cell import Config, load_config
+from q2r2_control.config.cell import Config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.config.control import LIVE
 from q2r2_control.config.resources import find_resource
 from q2r2_control.errors import ConfigError

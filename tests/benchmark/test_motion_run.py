@@ -22,7 +22,7 @@ from q2r2_control.benchmark.motion_run import (
 )
 from q2r2_control.benchmark.peers.base import INSTALL, PEERS, Leading
 from q2r2_control.benchmark.work_motions import WORK_MOTIONS, motions_named
-from q2r2_control.config.cell import load_config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 

@@ -18,7 +18,7 @@ from q2r2_control.benchmark.peers.base import (
     make_peer,
 )
 from q2r2_control.benchmark.work_motions import WORK_MOTIONS
-from q2r2_control.config.cell import load_config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.robot.robot import Robot
 
 DT = 0.001

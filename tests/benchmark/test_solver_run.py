@@ -9,7 +9,7 @@ import pytest
 from q2r2_control.benchmark import solver_run
 from q2r2_control.benchmark.solver_run import CONTACT, run_solvers
 from q2r2_control.cli.bench import solver_table
-from q2r2_control.config.cell import load_config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.control.qp import QpProblem, QpSolution
 
 CONFIG = load_config("config/dual_iiwa7.yaml")

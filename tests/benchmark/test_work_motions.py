@@ -7,7 +7,7 @@ import pinocchio as pin
 import pytest
 
 from q2r2_control.benchmark.work_motions import ARMS, REST, WORK_MOTIONS, WorkMotion, motions_named
-from q2r2_control.config.cell import load_config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array

@@ -10,7 +10,8 @@ from typing import Any
 
 import pytest
 
-from q2r2_control.config.cell import Config, load_config
+from q2r2_control.config.cell import Config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.errors import ConfigError
 from q2r2_control.verification.soak import SoakReport, run_soak
 from tests.cli.command import CELL, FAST, changed_cell, external_cell, one_object, q2r2

@@ -12,7 +12,7 @@ import pytest
 
 from q2r2_control.cli.cell_report import check_cell
 from q2r2_control.config.bindings import Action, BindingSettings
-from q2r2_control.config.cell import load_config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.config.resources import find_resource
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.robot.description import load_description
@@ -104,10 +104,10 @@ def test_check_and_run_list_all_faults_of_a_file(tmp_path: Path) -> None:
         encoding="utf-8",
     )
     lines = [
-        f"q2r2: {file}: control.solvr = 'daqp': unknown key; did you mean solver? allowed here: ",
-        f"q2r2: {file}: arms.left.home.6 = 'up': allowed: a number",
-        f"q2r2: {file}: floor = 'low': allowed: a number",
-        f"q2r2: {file}: control.min_distance = -1: allowed: 0 or more",
+        f"q2r2: {file}, line 4: control.solvr = 'daqp': unknown key; did you mean solver? allowed here: ",
+        f"q2r2: {file}, line 2: arms.left.home.6 = 'up': allowed: a number",
+        f"q2r2: {file}, line 3: floor = 'low': allowed: a number",
+        f"q2r2: {file}, line 4: control.min_distance = -1: allowed: 0 or more",
     ]
     checked, ran = q2r2("check", str(file)), q2r2("run", str(file), "--headless")
     data = q2r2("check", str(file), "--json")

@@ -16,7 +16,8 @@ import pytest
 
 from q2r2_control.cli.commission import _Commissioning
 from q2r2_control.cli.fri_check import CabinetReport, Heard
-from q2r2_control.config.cell import Config, load_config
+from q2r2_control.config.cell import Config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.config.resources import find_resource
 from q2r2_control.pipeline.commissioning import _SPREAD, JointMotion, LoadSurvey, StopReport
 from q2r2_control.pipeline.slow_run import SlowRun

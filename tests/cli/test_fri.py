@@ -14,7 +14,7 @@ import pytest
 from rich.console import Console
 
 from q2r2_control.cli.fri import Pendant, rehearsal, wait_for_states
-from q2r2_control.config.cell import load_config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.errors import PlantError
 from q2r2_control.plants.fri.cabinet import Cabinet, CabinetSettings, StillArm, Trip
 from q2r2_control.plants.fri.plant import FriPlant

@@ -9,7 +9,7 @@ import pinocchio as pin
 import pytest
 
 from q2r2_control.cli.mounts import mount_report
-from q2r2_control.config.cell import load_config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.robot.robot import Robot
 from tests.cli.command import one_object, q2r2
 

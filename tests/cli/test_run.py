@@ -17,7 +17,8 @@ import pytest
 from typer import Exit
 
 from q2r2_control.cli.cell_run import CellRun, RunOptions, run_cell
-from q2r2_control.config.cell import Config, load_config, parse_config
+from q2r2_control.config.cell import Config
+from q2r2_control.config.cell_file import load_config, parse_config
 from q2r2_control.config.resources import find_resource
 from q2r2_control.extras import install_line
 from q2r2_control.recording.about import About

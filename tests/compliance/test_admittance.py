@@ -10,7 +10,7 @@ import pinocchio as pin
 import pytest
 
 from q2r2_control.compliance.admittance import Admittance, estimate_wrench, oscillate
-from q2r2_control.config.cell import load_config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.config.control import AdmittanceSettings
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.control.tasks.frame import ROTATION_LENGTH

@@ -15,7 +15,7 @@ from q2r2_control.compliance.impedance_law import (
     inertia_and_damping,
     limit_repulsion,
 )
-from q2r2_control.config.cell import load_config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.config.control import ImpedanceSettings
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, RobotState

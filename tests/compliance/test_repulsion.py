@@ -11,7 +11,7 @@ import pinocchio as pin
 import pytest
 
 from q2r2_control.compliance.repulsion import MeasuredSeparation, WallReport
-from q2r2_control.config.cell import load_config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.config.control import ControllerSettings, WallSettings
 from q2r2_control.config.moving_obstacle import MovingObstacle
 from q2r2_control.control.controller import CartesianController

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from q2r2_control.config.cell import Config, load_config
+from q2r2_control.config.cell import Config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.config.yaml_text import read_yaml, yaml_of
 from q2r2_control.errors import ConfigError
 
@@ -30,14 +32,14 @@ def loaded(tmp_path: Path, text: str | bytes) -> Config:
 
 
 def fault(tmp_path: Path, text: str | bytes) -> str:
-    """Return the text of the one line after the file's name."""
+    """Return the text of the one line after the file's name and the number of the line."""
     with pytest.raises(ConfigError) as caught:
         loaded(tmp_path, text)
     message = str(caught.value)
-    assert message.startswith(f"{tmp_path / 'cell.yaml'}: ")
-    assert len(message.splitlines()) == 1
+    found = re.fullmatch(re.escape(str(tmp_path / "cell.yaml")) + r"(, line \d+)?: (.*)", message)
+    assert found is not None
     assert len(message) < 700
-    return message.removeprefix(f"{tmp_path / 'cell.yaml'}: ")
+    return found[2]
 
 
 def changed(path: str, value: object, cell: Callable[[], dict[str, Any]] = shipped) -> str:

@@ -10,7 +10,9 @@ from typing import Any
 
 import pytest
 
+from q2r2_control.config.cell_file import parse_config
 from q2r2_control.config.fri import ModbusGripperConfig
+from q2r2_control.errors import ConfigError
 from q2r2_control.plants.fri.answers import CATCH_UP
 from tests.config.cell_files import CELL, changed, fault, loaded, shipped
 from tests.support.external_cell import external
@@ -147,7 +149,8 @@ def test_a_bad_value_is_named_with_what_is_allowed(tmp_path: Path, path: str, va
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("", "expected a mapping of keys such as name, arms"),
+        ("", "the file is empty; allowed: a cell's YAML"),
+        ("# nothing\n", "the file is empty"),
         ("- name\n- arms\n", "expected a mapping"),
         ("name: x\n", "arms: missing"),
         ("name: x\narms:\n\tleft: {}\n", "not YAML: .* in line 3, column 1$"),
@@ -167,6 +170,41 @@ def test_a_bad_value_is_named_with_what_is_allowed(tmp_path: Path, path: str, va
 )
 def test_a_file_that_is_not_a_cell_gives_one_line(tmp_path: Path, text: str | bytes, says: str) -> None:
     assert re.search(says, fault(tmp_path, text))
+
+
+def test_each_fault_in_a_file_is_named_with_its_line(tmp_path: Path) -> None:
+    text = (
+        "name: x\n"
+        "arms:\n"
+        "  left: &arm\n"
+        "    model: iiwa7\n"
+        "    home:\n"
+        "      - 0\n"
+        "      - up\n"
+        "  right:\n"
+        "    <<: *arm\n"
+        "    home: [0]\n"
+        "    tool: {}\n"
+        "    gripper: {width: wide}\n"
+        "obstacles:\n"
+        "  table:\n"
+        "    pose: {}\n"
+        "colour: {red: 1}\n"
+    )
+    with pytest.raises(ConfigError) as caught:
+        loaded(tmp_path, text)
+    said = [re.fullmatch(r".*cell.yaml, line (\d+): ([\w.]+).*", line) for line in caught.value.faults]
+    assert [(int(one[1]), one[2]) for one in said if one is not None] == [
+        (12, "arms.right.gripper.width"),
+        (15, "obstacles.table.pose"),
+        (16, "colour"),
+        (7, "arms.left.home.1"),
+        (14, "obstacles.table.shape"),  # It is missing. The line is that of the table.
+        (14, "obstacles.table.size"),
+    ]
+    with pytest.raises(ConfigError) as of_no_file:
+        parse_config(text, "its cell")
+    assert not any(", line " in fault for fault in of_no_file.value.faults)
 
 
 def test_the_message_contains_the_number_of_further_faults(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import pinocchio as pin
 import pytest
 
 from q2r2_control import Robot
-from q2r2_control.config.cell import parse_config
+from q2r2_control.config.cell_file import parse_config
 from q2r2_control.config.resources import find_resource
 from q2r2_control.config.yaml_text import read_yaml, yaml_of
 from tests.config.cell_files import changed, fault, loaded

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from q2r2_control.config.cell import Config, load_config
+from q2r2_control.config.cell import Config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.errors import Q2R2Error
 from q2r2_control.robot.robot import Robot
 from tests.config.cell_files import changed, loaded

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from q2r2_control.config.cell import load_config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.config.resources import find_resource
 from q2r2_control.errors import ConfigError
 
@@ -65,7 +65,7 @@ def test_installed_beside_the_package_they_are_found_without_the_checkout(tmp_pa
         shutil.copytree(CHECKOUT / folder, tmp_path / "share" / "q2r2_control" / folder)
     script = (
         f"import sys; sys.path.insert(0, {str(tmp_path)!r})\n"
-        "from q2r2_control.config.cell import load_config\n"
+        "from q2r2_control.config.cell_file import load_config\n"
         "from q2r2_control.robot.robot import Robot\n"
         "from q2r2_control.config.resources import find_resource\n"
         "Robot.from_config(load_config('config/dual_iiwa7.yaml'))\n"

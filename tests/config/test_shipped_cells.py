@@ -10,7 +10,8 @@ from typing import Any, get_args
 import pytest
 from pydantic import BaseModel
 
-from q2r2_control.config.cell import Config, load_config
+from q2r2_control.config.cell import Config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.config.yaml_text import read_yaml
 from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.robot import Robot

@@ -7,7 +7,8 @@ from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 
-from q2r2_control.config.cell import Config, load_config
+from q2r2_control.config.cell import Config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.geometry.collision import (
     CollisionBodies,

@@ -10,7 +10,7 @@ import coal
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control.config.cell import load_config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.config.moving_obstacle import MovingObstacle
 from q2r2_control.control.controller import CartesianController

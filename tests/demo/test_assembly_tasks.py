@@ -7,7 +7,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from q2r2_control.config.cell import Config, load_config
+from q2r2_control.config.cell import Config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.demo.assembly_tasks import TASKS, TaskWatch, tasks_named, with_controls
 from q2r2_control.demo.part_judges import TouchWatch
 from q2r2_control.errors import ConfigError

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from q2r2_control.config.cell import Config, load_config
+from q2r2_control.config.cell import Config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.drives.base import make_drive
 from q2r2_control.drives.command_average import CommandAverage

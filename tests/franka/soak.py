@@ -21,7 +21,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from q2r2_control.config.cell import Config, load_config
+from q2r2_control.config.cell import Config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.errors import PlantError
 from q2r2_control.inputs.scripted import ScriptedInput, trajectory_named
 from q2r2_control.pipeline.pipeline import Pipeline

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from q2r2_control.config.cell import load_config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.types import CommandMode
 from tests.franka.simulated_arms import ADDRESSES, SimulatedArm, why_not
 from tests.franka.soak import CELL, ENDS, run_slowly

@@ -13,7 +13,7 @@ from unittest.mock import MagicMock
 
 import pytest
 
-from q2r2_control.config.cell import load_config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.errors import InputError
 from q2r2_control.inputs.base import make_input
 from q2r2_control.inputs.connections import MAX_FRAMES_PER_SECOND

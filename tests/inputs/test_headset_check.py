@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from q2r2_control.config.cell import Config, load_config
+from q2r2_control.config.cell import Config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.config.teleop import Stance
 from q2r2_control.inputs.headset import HeadsetServer
 from q2r2_control.inputs.headset_check import (

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from q2r2_control.config.cell import Config, load_config
+from q2r2_control.config.cell import Config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.errors import PlantError
 from q2r2_control.pipeline.commissioning import JointMotion, let_go_report, measure_joint, measure_stop
 from q2r2_control.pipeline.slow_run import Moment

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from q2r2_control.config.cell import Config, load_config
+from q2r2_control.config.cell import Config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.config.fri import CabinetConfig
 from q2r2_control.errors import PlantError
 from q2r2_control.pipeline import killed_run

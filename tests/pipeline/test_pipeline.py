@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from q2r2_control.config.cell import load_config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.config.control import ContactPair
 from q2r2_control.control.qp import QpProblem, QpSolution
 from q2r2_control.control.solvers.daqp import DaqpSolver

@@ -10,7 +10,8 @@ from typing import Any
 
 import pytest
 
-from q2r2_control.config.cell import Config, load_config
+from q2r2_control.config.cell import Config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.config.presets import preset_of
 from q2r2_control.config.resources import find_resource
 from q2r2_control.config.yaml_text import read_yaml, yaml_of

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from q2r2_control.config.cell import load_config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.inputs.scripted import ScriptedInput
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.supervision.preflight import preflight_faults

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from q2r2_control.config.cell import Config, load_config
+from q2r2_control.config.cell import Config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.errors import PlantError
 from q2r2_control.pipeline.slow_run import SPEED
 from tests.pipeline.slow_cell import PendantCabinets, StuckArm, slow_run

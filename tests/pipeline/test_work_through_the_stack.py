@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from q2r2_control.benchmark.work_motions import WORK_MOTIONS, WorkMotion, carry
-from q2r2_control.config.cell import load_config
+from q2r2_control.config.cell_file import load_config
 from work_through_stack import Stack
 
 pytestmark = pytest.mark.slow

@@ -8,7 +8,8 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from q2r2_control.config.cell import Config, MujocoConfig, ObjectConfig, ObstacleConfig, load_config
+from q2r2_control.config.cell import Config, MujocoConfig, ObjectConfig, ObstacleConfig
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Command, CommandMode

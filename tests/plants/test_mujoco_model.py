@@ -8,7 +8,8 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from q2r2_control.config.cell import Config, MujocoConfig, ObjectConfig, ObstacleConfig, load_config
+from q2r2_control.config.cell import Config, MujocoConfig, ObjectConfig, ObstacleConfig
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.errors import PlantError
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.plants.mujoco_model import build_model

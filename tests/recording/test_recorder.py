@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 import yaml
 
-from q2r2_control.config.cell import parse_config
+from q2r2_control.config.cell_file import parse_config
 from q2r2_control.config.recording import TOPIC_RATE
 from q2r2_control.errors import RecordingError
 from q2r2_control.recording.about import ABOUT, About

@@ -14,7 +14,8 @@ import pytest
 import yaml
 
 from q2r2_control import Robot
-from q2r2_control.config.cell import Config, parse_config
+from q2r2_control.config.cell import Config
+from q2r2_control.config.cell_file import parse_config
 from q2r2_control.config.recording import CameraConfig
 from q2r2_control.config.strict import STREAM_TIMEOUT
 from q2r2_control.errors import RecordingError

@@ -6,7 +6,8 @@ from typing import Any
 
 import pytest
 
-from q2r2_control.config.cell import Config, load_config
+from q2r2_control.config.cell import Config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.robot.compose import ComposedCell, compose
 from q2r2_control.robot.robot import Robot
 from tests.control.cells import pandas

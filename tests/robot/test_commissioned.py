@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from q2r2_control.config.cell import Config, load_config, parse_config
+from q2r2_control.config.cell import Config
+from q2r2_control.config.cell_file import load_config, parse_config
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.commissioned import fingerprint, load_commissioned, not_commissioned, sign_off_file, slowed
 

@@ -11,7 +11,8 @@ import pinocchio as pin
 import pytest
 import yaml
 
-from q2r2_control.config.cell import Config, parse_config
+from q2r2_control.config.cell import Config
+from q2r2_control.config.cell_file import parse_config
 from q2r2_control.errors import ConfigError, RobotError
 from q2r2_control.robot.description import load_description
 from q2r2_control.robot.enclose import enclose_shapes, enclosing_capsule

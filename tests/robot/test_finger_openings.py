@@ -6,7 +6,8 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from q2r2_control.config.cell import Config, load_config
+from q2r2_control.config.cell import Config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.robot.finger_bodies import FingerBody, collision_model_at
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import ALL_OF_THE_WAY, Array, Interval

@@ -6,7 +6,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from q2r2_control.config.cell import load_config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.errors import RobotError
 from q2r2_control.robot.load import MODEL, PENDANT, LoadReport, identify_load
 from q2r2_control.robot.robot import Robot

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from q2r2_control.config.cell import load_config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.errors import ConfigError, Q2R2Error
 from q2r2_control.extras import install_line
 from q2r2_control.robot.compose import compose

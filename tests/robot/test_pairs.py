@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from q2r2_control.config.cell import load_config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.config.resources import find_resource
 from q2r2_control.robot.compose import compose
 from q2r2_control.robot.pairs import CLEARANCE, link_of, pair_names

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from q2r2_control.cli.check import PairsWritten, write_pairs
-from q2r2_control.config.cell import Config, load_config
+from q2r2_control.config.cell import Config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.pairs import link_of
 from q2r2_control.robot.robot import Robot

@@ -15,7 +15,8 @@ import yaml
 from typer.testing import CliRunner
 
 from q2r2_control.cli.app import app
-from q2r2_control.config.cell import Config, load_config
+from q2r2_control.config.cell import Config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.compose import compose
 from q2r2_control.robot.description import load_description

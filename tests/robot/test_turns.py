@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from q2r2_control.config.cell import load_config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.robot.robot import Robot
 from q2r2_control.robot.turns import TurnCounter
 from q2r2_control.types import Array, RobotState

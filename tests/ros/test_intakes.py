@@ -13,7 +13,7 @@ import pinocchio as pin
 import pytest
 
 from q2r2_control import Robot
-from q2r2_control.config.cell import load_config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.errors import ConfigError
 from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.ros.reasons import RosReason

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from q2r2_control import Robot
-from q2r2_control.config.cell import load_config, parse_config
+from q2r2_control.config.cell_file import load_config, parse_config
 from q2r2_control.config.resources import find_resource
 from q2r2_control.drives.base import make_drive
 from q2r2_control.errors import ConfigError

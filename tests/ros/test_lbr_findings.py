@@ -10,7 +10,8 @@ from typing import Any
 
 import pytest
 
-from q2r2_control.config.cell import Config, load_config
+from q2r2_control.config.cell import Config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.plants.fri.wire import CommandKind, Session
 from q2r2_control.ros.watching.findings import Finding, examine_environment
 from q2r2_control.ros.watching.set_view import DriverView, NodeView, SetView

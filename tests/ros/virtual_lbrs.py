@@ -25,7 +25,7 @@ from rclpy.logging import LoggingSeverity
 from rclpy.time import Time
 
 from q2r2_control import Robot
-from q2r2_control.config.cell import load_config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.robot.compose import WORLD
 from q2r2_control.ros.bridge import joint_outputs
 from q2r2_control.ros.bridge.messages import stamped_pose

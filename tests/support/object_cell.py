@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control.config.cell import Config, load_config
+from q2r2_control.config.cell import Config
+from q2r2_control.config.cell_file import load_config
 
 TABLE = 0.2  # Height of the table's top [m].
 # This is a block of the demo, gripped 13 mm above its middle.

@@ -8,7 +8,8 @@ from functools import cache
 
 import numpy as np
 
-from q2r2_control.config.cell import Config, load_config
+from q2r2_control.config.cell import Config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.events import Event
 from q2r2_control.inputs.base import Input
 from q2r2_control.pipeline.pipeline import Pipeline

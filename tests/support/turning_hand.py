@@ -13,7 +13,8 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control.config.cell import Config, load_config
+from q2r2_control.config.cell import Config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.robot.enclose import enclose_shapes
 from q2r2_control.robot.pairs import link_of
 from q2r2_control.robot.robot import Robot

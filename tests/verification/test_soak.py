@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 import qpsolvers
 
-from q2r2_control.config.cell import Config, load_config
+from q2r2_control.config.cell import Config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.config.control import ControllerSettings
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.control.qp import QpProblem, QpSolution

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 
 from q2r2_control import Robot
-from q2r2_control.config.cell import load_config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.viewer.joint_tree import JointTree
 from q2r2_control.viewer.shown_robot import ShownRobot
 from tests.config.cell_files import CELL

@@ -9,7 +9,7 @@ from typing import Any
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from q2r2_control.config.cell import load_config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.config.external import GripperSettings, GuardLimits
 from q2r2_control.config.presets import BUILTIN, Mode, Preset, preset_of
 from q2r2_control.config.strict import STREAM_TIMEOUT, Model, validated

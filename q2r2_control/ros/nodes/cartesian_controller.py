@@ -16,7 +16,7 @@ from typing import Any
 
 from std_srvs.srv import SetBool, Trigger
 
-from q2r2_control.config.cell import load_config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.drives.base import TorqueDrive, permitted
 from q2r2_control.events import Reason

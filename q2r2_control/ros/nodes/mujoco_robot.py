@@ -30,7 +30,7 @@ from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage
 from trajectory_msgs.msg import JointTrajectory
 
-from q2r2_control.config.cell import load_config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.config.strict import STREAM_TIMEOUT
 from q2r2_control.plants.simulated_cell import SimulatedCell
 from q2r2_control.robot.robot import Robot

@@ -24,7 +24,7 @@ from std_srvs.srv import Trigger
 
 from q2r2_control.cameras.camera_streams import CameraStreams
 from q2r2_control.config.bindings import Action
-from q2r2_control.config.cell import load_config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.errors import NOT_RECORDED, ConfigError
 from q2r2_control.events import Event, Reason, ReasonKind
 from q2r2_control.judging.episode_judge import EpisodeJudge

@@ -8,7 +8,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from q2r2_control.config.cell import load_config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.inputs.base import make_input
 from q2r2_control.inputs.messages import HandTwist, MessageType
 from q2r2_control.inputs.scripted import FIRST_PRESS, START, TRAJECTORIES, ScriptedInput

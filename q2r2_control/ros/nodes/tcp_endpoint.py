@@ -10,7 +10,8 @@ from typing import Any
 from rich.console import Console
 from rich.live import Live
 
-from q2r2_control.config.cell import HeadsetConfig, load_config
+from q2r2_control.config.cell import HeadsetConfig
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.config.strict import network_of
 from q2r2_control.errors import ConfigError
 from q2r2_control.events import Reason

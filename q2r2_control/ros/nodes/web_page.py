@@ -21,7 +21,7 @@ from rosbags.serde import SerdeError
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import Marker
 
-from q2r2_control.config.cell import load_config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.config.moving_obstacle import MovingObstacle, ObstacleReport, check_obstacle
 from q2r2_control.errors import ConfigError, Q2R2Error
 from q2r2_control.events import Event

@@ -7,7 +7,7 @@ import pinocchio as pin
 import pytest
 
 from q2r2_control import CartesianController, QpProblem, QpSolution, Robot, Solver
-from q2r2_control.config.cell import load_config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.control.safety.stop_rollout import SHAPES
 from q2r2_control.control.safety.tool_speed import fastest_tool
 from q2r2_control.types import Array, LimitKind

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control.config.cell import Config, load_config
+from q2r2_control.config.cell import Config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.inputs.scripted import START, HandTrajectory, ScriptedInput
 from q2r2_control.plants.fri.cabinet_server import settings_of

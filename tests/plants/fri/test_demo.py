@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from q2r2_control.config.cell import load_config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.config.fri import GripperIoConfig
 from q2r2_control.demo.assembly_tasks import TaskWatch, tasks_named
 from q2r2_control.inputs.scripted import ScriptedInput, trajectory_named
