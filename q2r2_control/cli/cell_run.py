@@ -341,7 +341,9 @@ def _run(
             # On a slow computer the motion may take minutes, in which nothing else is printed.
             kind = "simulated time" if options.simulated_time else "real time"
             lasts = "until Ctrl-C" if options.duration is None else f"{options.duration:g} s"
-            say(f"{options.name}: begins, {lasts}, in {kind}", console)
+            is_shown = options.window or page is not None or options.input == "webxr"
+            unseen = "" if is_shown else "; --web shows the arms in a browser"
+            say(f"{options.name}: begins, {lasts}, in {kind}{unseen}", console)
         streams.wait_until_ready()
         pipeline.cameras = streams
         drawn = pipeline.config.simulated_cameras if isinstance(pipeline.plant, MujocoPlant) else {}

@@ -21,6 +21,7 @@ from q2r2_control.export.episodes import SUBTASK, EpisodeVectors
 from q2r2_control.export.export_format import ExportFormat
 from q2r2_control.export.lerobot import join_shards, require_lerobot, write_shard
 from q2r2_control.export.lerobot_v21 import join_v21, openpi_config, require_v21, write_v21
+from q2r2_control.export.sampling import units_of
 from q2r2_control.extras import install_line
 from q2r2_control.plugins import EXPORTS, load_class, names_of
 
@@ -32,6 +33,7 @@ _DATA = (
 )
 _COMPRESSION = 1  # The fastest level of gzip.
 ROBOMIMIC = "robomimic.h5"  # The name does not end with .hdf5, because some trainers of ACT read all such files.
+UNITS = "units.json"  # The file beside the tables with the unit of each column of numbers.
 # The names that robomimic reads in a demonstration, and the data that they link to, which is stored once.
 _LINKS = {
     **{"actions": "action", "rewards": "rewards", "dones": "dones"},
@@ -60,16 +62,22 @@ def write_table(episode: EpisodeVectors, path: Path) -> None:
 
 
 def gather_tables(files: Sequence[Path], folder: Path) -> None:
-    """Move tables into a new ``folder``. They have the names of the recordings.
+    """Move tables into a new ``folder``, with the names of the recordings, and write the units of their columns.
 
     Raises :class:`RecordingError` if two recordings have the same name.
     """
     folder.mkdir()
+    units = {"timestamp": "s"}
     for file in files:
+        with file.open(newline="", encoding="utf-8") as stream:
+            columns = [column.rpartition(".") for column in next(csv.reader(stream))]
+        numbers = [(feature, label) for feature, _, label in columns if feature not in ("", "next")]
+        units |= {f"{feature}.{label}": units_of({feature: (label,)})[feature][0] for feature, label in numbers}
         path = folder / f"{file.stem}.csv"
         if path.exists():
             raise RecordingError(f"{file.stem}.mcap: two recordings have this name; allowed: each one once")
         file.replace(path)
+    (folder / UNITS).write_text(json.dumps(units, indent=2) + "\n", encoding="utf-8")
 
 
 def require_h5py() -> Any:

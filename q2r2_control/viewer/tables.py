@@ -51,13 +51,21 @@ def figure_table(
 
 
 def print_table(table: Table, console: Console) -> None:
-    """Print a table without cutting figures off. Its lines may be longer than those of the console."""
+    """Print a table without cutting figures off. Its lines may be longer than those of the console.
+
+    A terminal folds the notes below the table to the table's width. A file or another program gets a line a note.
+    """
     of_title, table.min_width = table.min_width, None
     widths = Measurement.get(console, console.options.update(max_width=_WIDEST), table)
     # A file or another program gets whole cells. On a terminal, a folded cell is easier to read than a wrapped line.
     needed = widths.minimum if console.is_terminal else widths.maximum
     table.min_width, table.width = of_title, needed if needed > console.width else None
+    notes = table.caption
+    if not console.is_terminal:
+        table.caption = None
     console.print(table, soft_wrap=False, crop=False)
+    if notes is not None and table.caption is None:
+        console.print(notes, soft_wrap=True, highlight=False)
 
 
 def record_table(title: str, records: Sequence[Any], notes: Sequence[str] = ()) -> Table:

@@ -73,7 +73,7 @@ def test_a_bad_recording_is_left_out_and_changes_the_exit_code_unless_it_is_skip
         assert result.exit_code == code
         assert f"{tmp_path / 'notes.mcap'}: discard: unreadable, not an MCAP file" in result.stderr
         assert result.stdout == f"{tmp_path / name}: 1 of 2 recordings at 30 frames per second\n"
-        assert set(contents(tmp_path / name)) == {f"{recordings[1].stem}.csv"}
+        assert set(contents(tmp_path / name)) == {f"{recordings[1].stem}.csv", "units.json"}
     result = q2r2("export", "csv", str(tmp_path / "notes.mcap"), "--output", str(tmp_path / "none"), "--skip-bad")
     assert result.exit_code == 2
     assert "none of the recordings can be exported" in result.stderr
@@ -85,11 +85,11 @@ def test_discarded_episodes_are_left_out_unless_an_option_keeps_them(
     file = rewrite(recordings[0], tmp_path / "lost.mcap", lambda _, one: None if 100 <= one.number < 120 else one)
     arguments = ("export", "csv", str(file), str(recordings[1]), "--output")
     result = q2r2(*arguments, str(tmp_path / "out"), "--fps", "10")
-    assert (result.exit_code, set(contents(tmp_path / "out"))) == (0, {f"{recordings[1].stem}.csv"})
+    assert (result.exit_code, set(contents(tmp_path / "out"))) == (0, {f"{recordings[1].stem}.csv", "units.json"})
     assert f"{file}: discard: ticks lost in the recording" in result.stderr
     assert "left out, since q2r2 judge discards them: 1; --keep-discarded exports them too" in result.stderr
     result = q2r2(*arguments, str(tmp_path / "both"), "--fps", "10", "--keep-discarded")
-    assert set(contents(tmp_path / "both")) == {f"{recordings[1].stem}.csv", "lost.csv"}
+    assert set(contents(tmp_path / "both")) == {f"{recordings[1].stem}.csv", "lost.csv", "units.json"}
 
 
 def test_an_interrupted_export_leaves_no_half_files_and_the_next_export_completes_it(

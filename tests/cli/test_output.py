@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from dataclasses import replace
+from functools import partial
 
 import pytest
 from rich.console import Console
@@ -43,6 +44,13 @@ def test_figures_names_units_and_notes_are_complete_in_80_columns() -> None:
     assert "…" not in text
     first = "".join(line[1:].split(" ")[0] for line in text.splitlines())
     assert f"{LINK}_{LINK}" in first
+
+
+def test_a_note_is_folded_on_a_terminal_only() -> None:
+    note = "nothing arrives for 2 s, although the address and the port are those of the app"
+    table = partial(figure_table, "hands", ("hand", "rate [Hz]"), [("left", 0.0)], [note])
+    assert note not in printed(table())
+    assert note in printed(table(), terminal=False).splitlines()
 
 
 def test_no_figure_is_cut_however_narrow_the_console_is() -> None:

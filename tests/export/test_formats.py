@@ -46,7 +46,7 @@ def export(name: str, episodes: Sequence[EpisodeVectors], folder: Path, recordin
 
 def test_each_recording_has_a_table_with_a_line_for_each_frame(tmp_path: Path) -> None:
     made = export("csv", EPISODES, tmp_path, ["run-1", "run-2", "run-3"])
-    assert sorted(file.name for file in made.iterdir()) == ["run-1.csv", "run-2.csv", "run-3.csv"]
+    assert sorted(file.name for file in made.iterdir()) == ["run-1.csv", "run-2.csv", "run-3.csv", "units.json"]
     rows = read(made / "run-2.csv")
     values = [[row[f"action.{name}"] for name in NAMES["action"]] for row in rows]
     np.testing.assert_array_equal(np.array(values, dtype=np.float32), EPISODES[1].vectors["action"])
@@ -55,6 +55,17 @@ def test_each_recording_has_a_table_with_a_line_for_each_frame(tmp_path: Path) -
     assert rows[-1]["next.done"] == "True"
     succeeded = [row["next.success"] for row in read(made / "run-1.csv")]
     assert [frame for frame, said in enumerate(succeeded) if said == "True"] == [EPISODES[0].frames - 1]
+
+
+def test_the_unit_of_each_column_of_numbers_is_beside_the_tables(tmp_path: Path) -> None:
+    units = json.loads((export("csv", EPISODES, tmp_path, ["run-1"]) / "units.json").read_text())
+    numbers = {
+        f"{feature}.{name}": unit
+        for feature, names in EPISODES[0].units.items()
+        for name, unit in zip(NAMES[feature], names, strict=True)
+    }
+    assert units == {"timestamp": "s"} | numbers
+    assert {"rad", "0 closed .. 1 open"} <= set(units.values())
 
 
 def test_two_recordings_with_one_name_are_refused(tmp_path: Path) -> None:
