@@ -282,8 +282,8 @@ def export(
     whole = len(made.kept) + len(made.left_out) + len(made.unreadable) == len(files)
     count = f"{len(made.kept)} of" if whole else f"{counted(len(made.kept), 'episode')} of"
     print(f"{output}: {count} {counted(len(files), 'recording')} at {fps} frames per second")
-    if sampling.pictures and (deep := _cameras_with_depth(files)):
-        say(f"depth of {', '.join(deep)} is left out: no format has a place for it; the recordings have it")
+    if sampling.pictures and not chosen.has_depth and (deep := _cameras_with_depth(files)):
+        say(f"depth of {', '.join(deep)} is left out: {name} has no place for it; allowed: hdf5, zarr")
     if made.left_out:
         say(f"left out, since q2r2 judge discards them: {len(made.left_out)}; --keep-discarded exports them too")
     if chosen.advice is not None:

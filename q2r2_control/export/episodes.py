@@ -34,7 +34,7 @@ from q2r2_control.recording.ros_recording import open_recording
 FASTEST = 1000  # The highest rate of frames [Hz].
 _OUTPUT = "allowed: a new folder where you may write"
 SUBTASK = "subtask_index"  # The name of the column with the index of a frame's subtask, as lerobot names it.
-_FORMAT = 8  # The version of kept episodes. Episodes of another version are made again.
+_FORMAT = 9  # The version of kept episodes. Episodes of another version are made again.
 
 
 @dataclass(frozen=True)
@@ -73,6 +73,7 @@ class EpisodeVectors:
     ahead: int = 0  # Row k has the actions that are positions of frame k + ahead.
     part: int = 0  # The number of the episode in the file, from 1 on; 0 for the whole file.
     cameras: Mapping[str, CameraFrames] = field(default_factory=dict)  # By camera, one picture for each frame.
+    depths: Mapping[str, CameraFrames] = field(default_factory=dict)  # The same of cameras with recorded depth.
     subtasks: tuple[str, ...] = ()  # The names of its subtasks, in their order; empty if nobody told of any.
     subtask: tuple[int, ...] = ()  # The index in ``subtasks`` of each frame; empty if there are no subtasks.
 
@@ -118,7 +119,12 @@ def make_episode(file: Path, sampling: FrameSampling, span: EpisodeSpan | None =
     notes = dict(recording.about.notes)
     notes = anonymous(notes) if sampling.anonymous else notes
     task = notes.pop("task", "")
-    cameras, stamps = recording.about.cameras if sampling.pictures else (), frames["stamp"].tolist()
+    stamps = frames["stamp"].tolist()
+
+    def pictures(names: Sequence[str], is_depth: bool) -> dict[str, CameraFrames]:
+        shown = names if sampling.pictures else ()
+        return {name: CameraFrames(recording, name, cell.cameras[name], stamps, is_depth) for name in shown}
+
     # The same limits of times as those of the judge, which are since the run began.
     passed = (frames["stamp"] - recording.about.epoch) / NANOSECONDS
     subtasks = subtask_names(cell.recording.subtasks, len(span.subtask_starts))
@@ -134,7 +140,8 @@ def make_episode(file: Path, sampling: FrameSampling, span: EpisodeSpan | None =
         success=span.success,
         ahead=sampling.ahead,
         part=span.number,
-        cameras={name: CameraFrames(recording, name, cell.cameras[name], stamps) for name in cameras},
+        cameras=pictures(recording.about.cameras, is_depth=False),
+        depths=pictures(recording.about.depth, is_depth=True),
         subtasks=subtasks,
         subtask=tuple(number.tolist()) if subtasks else (),
     )

@@ -23,4 +23,5 @@ class ExportFormat:
     join: Callable[[Sequence[Path], Path], None]
     require: Callable[[], object] = lambda: None  # Raises ConfigError if a package is not installed.
     advice: Callable[[Path], str] | None = None  # Returns a text that tells how to train on the output.
+    has_depth: bool = False  # Whether it stores the depth of cameras, ``EpisodeVectors.depths``.
     ahead: int = 0  # The number of frames by which actions come earlier if --ahead is not given.

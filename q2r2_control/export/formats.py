@@ -21,7 +21,7 @@ from q2r2_control.export.episodes import SUBTASK, EpisodeVectors
 from q2r2_control.export.export_format import ExportFormat
 from q2r2_control.export.lerobot import join_shards, require_lerobot, write_shard
 from q2r2_control.export.lerobot_v21 import join_v21, openpi_config, require_v21, write_v21
-from q2r2_control.export.sampling import units_of
+from q2r2_control.export.sampling import CameraFrames, units_of
 from q2r2_control.extras import install_line
 from q2r2_control.plugins import EXPORTS, load_class, names_of
 
@@ -31,6 +31,7 @@ _DATA = (
     ("observations/qvel", "observation.velocity"),
     ("action", "action"),
 )
+_AXES = ("frame", "row", "column")
 _COMPRESSION = 1  # The fastest level of gzip.
 ROBOMIMIC = "robomimic.h5"  # The name does not end with .hdf5, because some trainers of ACT read all such files.
 UNITS = "units.json"  # The file beside the tables with the unit of each column of numbers.
@@ -112,12 +113,22 @@ def write_hdf5(episode: EpisodeVectors, path: Path) -> None:
             file.create_dataset(SUBTASK, data=np.array(episode.subtask)).attrs["names"] = list(episode.subtasks)
         images = file.create_group("observations/images")
         for camera, pictures in episode.cameras.items():
-            # Each picture is compressed by itself, so that one can be read without the others.
-            packing = {"chunks": (1, *pictures.size), "compression": "gzip", "compression_opts": _COMPRESSION}
-            data = images.create_dataset(camera, (episode.frames, *pictures.size), "uint8", **packing)
-            data.attrs["axes"] = ["frame", "row", "column", "r g b"]
-            for number, pixels in enumerate(pictures):
-                data[number] = pixels
+            _write_pictures(images, camera, pictures, episode.frames).attrs["axes"] = [*_AXES, "r g b"]
+        if episode.depths:
+            depths = file.create_group("observations/depth")
+            for camera, pictures in episode.depths.items():
+                made = _write_pictures(depths, camera, pictures, episode.frames)
+                made.attrs["axes"], made.attrs["unit"] = list(_AXES), pictures.unit
+
+
+def _write_pictures(group: Any, camera: str, pictures: CameraFrames, frames: int) -> Any:
+    """Write the pictures of a camera into a group of an HDF5 file, and return the dataset."""
+    # Each picture is compressed by itself, so that one can be read without the others.
+    packing = {"chunks": (1, *pictures.size), "compression": "gzip", "compression_opts": _COMPRESSION}
+    data = group.create_dataset(camera, (frames, *pictures.size), pictures.dtype, **packing)
+    for number, pixels in enumerate(pictures):
+        data[number] = pixels
+    return data
 
 
 def gather_hdf5(files: Sequence[Path], folder: Path) -> None:
@@ -146,7 +157,7 @@ def gather_hdf5(files: Sequence[Path], folder: Path) -> None:
 FORMATS = {
     "lerobot": ExportFormat(write_shard, join_shards, require_lerobot),
     "lerobot-v2.1": ExportFormat(write_v21, join_v21, require_v21, openpi_config),
-    "hdf5": ExportFormat(write_hdf5, gather_hdf5, require_h5py, ahead=1),
+    "hdf5": ExportFormat(write_hdf5, gather_hdf5, require_h5py, has_depth=True, ahead=1),
     "csv": ExportFormat(write_table, gather_tables),
 }
 

@@ -78,7 +78,8 @@ def write_v21(episode: EpisodeVectors, folder: Path) -> None:
     for camera, shown in episode.cameras.items():
         key = video_key(names[camera])
         stats[key] = _write_video(shown, episode.fps, folder / f"{key}.mp4")
-        features[key] = _video_feature(shown.size, episode.fps)
+        height, width, _ = shown.size
+        features[key] = _video_feature(height, width, episode.fps)
     about = {
         "robot_type": episode.cell,
         "fps": episode.fps,
@@ -234,11 +235,10 @@ def _modality(names: Names, cameras: Sequence[str]) -> dict[str, dict[str, Any]]
     return {**parts, "video": shown}
 
 
-def _video_feature(size: tuple[int, int, int], fps: int) -> dict[str, Any]:
-    height, width, channels = size
-    about = {"height": height, "width": width, "channels": channels, "fps": fps, "codec": "h264", "pix_fmt": "yuv420p"}
+def _video_feature(height: int, width: int, fps: int) -> dict[str, Any]:
+    about = {"height": height, "width": width, "channels": 3, "fps": fps, "codec": "h264", "pix_fmt": "yuv420p"}
     info = {f"video.{what}": value for what, value in about.items()} | {"video.is_depth_map": False, "has_audio": False}
-    return {"dtype": "video", "shape": list(size), "names": ["height", "width", "channels"], "info": info}
+    return {"dtype": "video", "shape": [height, width, 3], "names": ["height", "width", "channels"], "info": info}
 
 
 def _write_video(shown: CameraFrames, fps: int, path: Path) -> dict[str, Any]:

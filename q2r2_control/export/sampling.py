@@ -32,7 +32,7 @@ from q2r2_control.types import Array
 Columns = dict[str, npt.NDArray[Any]]
 Vectors = dict[str, npt.NDArray[np.float32]]
 Names = dict[str, tuple[str, ...]]
-Pixels = npt.NDArray[np.uint8]  # (height, width, 3) r g b.
+Pixels = npt.NDArray[np.uint8 | np.uint16]  # (height, width, 3) r g b, or depth (height, width).
 
 OBSERVED = ("position", "velocity", "effort", "opening")
 COMMANDED = ("reference", "gripper", "target", "reference_tool", "intervention")
@@ -246,20 +246,31 @@ def _to_next(poses: Array) -> Array:
 
 @dataclass(frozen=True)
 class CameraFrames:
-    """The pictures of one camera, one for each frame of an episode."""
+    """The pictures of one camera, one for each frame of an episode: colours, or depth, where 0 is unknown."""
 
     recording: Recording
     name: str
     config: CameraConfig
     stamps: Sequence[int]  # Ascending times of day of the frames [ns].
+    is_depth: bool = False
 
     @property
-    def size(self) -> tuple[int, int, int]:
-        return (self.config.height, self.config.width, 3)
+    def size(self) -> tuple[int, ...]:
+        height, width = self.config.height, self.config.width
+        return (height, width) if self.is_depth else (height, width, 3)
+
+    @property
+    def dtype(self) -> str:
+        return "uint16" if self.is_depth else "uint8"
+
+    @property
+    def unit(self) -> float:
+        """Return the unit of depth [m]."""
+        return self.recording.depth_unit(self.name)
 
     def __iter__(self) -> Iterator[Pixels]:
         """Yield each frame's newest picture. Raises :class:`RecordingError` if it is older than two camera periods."""
-        pictures = self.recording.pictures(self.name)
+        pictures = self.recording.depths(self.name) if self.is_depth else self.recording.pictures(self.name)
         newest, coming = None, next(pictures, None)
         pixels: Pixels | None = None
         for stamp in self.stamps:
@@ -269,7 +280,7 @@ class CameraFrames:
             if newest is None or age is None or age * self.config.rate > _OLDEST:
                 what = "no picture yet" if age is None else f"a picture {age:.3f} s old"
                 raise RecordingError(
-                    f"{self.recording.file}: camera {self.name} has {what} at "
+                    f"{self.recording.file}: {self._label} has {what} at "
                     f"{(stamp - self.recording.about.epoch) / NANOSECONDS:.3f} s; allowed: at most two of its periods, "
                     f"{_OLDEST / self.config.rate:.3f} s; --no-pictures leaves them out"
                 )
@@ -277,12 +288,17 @@ class CameraFrames:
                 pixels = self._decoded(newest)
             yield pixels
 
+    @property
+    def _label(self) -> str:
+        return f"{'depth of ' if self.is_depth else ''}camera {self.name}"
+
     def _decoded(self, picture: Picture) -> Pixels:
-        damaged = f"{self.recording.file}: damaged: a picture of camera {self.name}"
+        damaged = f"{self.recording.file}: damaged: a picture of {self._label}"
         try:
-            pixels = np.asarray(Image.open(io.BytesIO(picture.jpeg)).convert("RGB"))
+            image = Image.open(io.BytesIO(picture.jpeg))
+            pixels = np.asarray(image if self.is_depth else image.convert("RGB"))
         except (UnidentifiedImageError, OSError) as error:
-            raise RecordingError(f"{damaged} is no JPEG") from error
+            raise RecordingError(f"{damaged} cannot be decoded") from error
         if pixels.shape != self.size:
             raise RecordingError(f"{damaged} has a size that the cell has not")
         return pixels

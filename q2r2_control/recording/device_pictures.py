@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 
-from q2r2_control.cameras.camera_process import CameraShot
+from q2r2_control.cameras.camera_process import CameraShot, DepthShot
 from q2r2_control.cameras.camera_streams import CameraStreams
 from q2r2_control.cameras.camera_watch import CameraWatch
 from q2r2_control.cameras.loop_times import LoopTimes, TickTime
@@ -52,6 +52,7 @@ class DevicePictures(AbstractContextManager["DevicePictures"]):
         self._times = LoopTimes()
         self._watches: dict[str, CameraWatch] = {}
         self._before: dict[str, CameraShot] = {}  # The newest pictures before the first tick.
+        self._depth_before: dict[str, DepthShot] = {}
         self._count = 0
         self._begin = 0.0  # Time of the first tick, by the monotonic clock [s].
         self._start = 0.0  # Time of the run's start, by the loop's clock [s].
@@ -92,11 +93,18 @@ class DevicePictures(AbstractContextManager["DevicePictures"]):
                 self._record(name, shot)
                 self._tell(self._watches[name].add(shot.time, received, shot.width, shot.height))
         for depth in self._streams[name].take_depths():
-            if self._begin <= depth.time <= until:
-                self._record_data(depth_topic(name), name, depth.time, depth.png, coding_of_depth(depth.unit))
+            if depth.time < self._begin:
+                self._depth_before[name] = depth
+            elif depth.time <= until:
+                if (earlier := self._depth_before.pop(name, None)) is not None:
+                    self._record_depth(name, earlier)
+                self._record_depth(name, depth)
 
     def _record(self, name: str, shot: CameraShot) -> None:
         self._record_data(picture_topic(name), name, shot.time, shot.jpeg)
+
+    def _record_depth(self, name: str, shot: DepthShot) -> None:
+        self._record_data(depth_topic(name), name, shot.time, shot.png, coding_of_depth(shot.unit))
 
     def _record_data(self, topic: str, name: str, time: float, data: bytes, coding: str = JPEG) -> None:
         if self._recording is None:

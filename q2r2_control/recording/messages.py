@@ -159,6 +159,12 @@ def coding_of_depth(unit: float) -> str:
     return f"16UC1; png; unit {unit:.6g} m"
 
 
+def unit_of_depth(payload: bytes) -> float:
+    """Return the unit [m] of a message of depth. Raises :class:`ValueError` if its format has none."""
+    coding = str(STORE.deserialize_cdr(payload, PICTURE).format)  # type: ignore[attr-defined]
+    return float(coding.removeprefix("16UC1; png; unit ").removesuffix(" m"))
+
+
 def heard_on(topic: str) -> str:
     """Return the topic that the recorder subscribes to for a recorded topic."""
     arm = topic.removeprefix("/q2r2/").split("/")[0]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import struct
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -22,7 +22,17 @@ from q2r2_control.events import Event
 from q2r2_control.process.helper_process import reason_of
 from q2r2_control.recording.about import ABOUT, CELL, CONCLUSION, LOOP, ROBOT, About, Conclusion
 from q2r2_control.recording.mcap_file import McapFile
-from q2r2_control.recording.messages import PICTURE, STATE, TEXT, Message, Topic, data_of, picture_topic
+from q2r2_control.recording.messages import (
+    PICTURE,
+    STATE,
+    TEXT,
+    Message,
+    Topic,
+    data_of,
+    depth_topic,
+    picture_topic,
+    unit_of_depth,
+)
 from q2r2_control.recording.tick_chunks import TickAssembly, TickChunk
 from q2r2_control.teleop.reasons import TeleopReason
 
@@ -37,7 +47,7 @@ BROKEN = (
 class Picture:
     time: int  # The time of day of the tick that the picture shows [ns].
     tick: int  # The number of that tick.
-    jpeg: bytes
+    jpeg: bytes  # Of depth: a PNG of 16 bits.
 
 
 NO_END = "the recording has no end: its process was killed, or the disk was full"
@@ -76,8 +86,23 @@ class Recording:
         return (picture for _, picture in self.pictures_of((camera,)))
 
     def pictures_of(self, cameras: Iterable[str]) -> Iterator[tuple[str, Picture]]:
-        """Yield all pictures of some cameras, with the name of the camera; those of each are in the order of time."""
-        names = {self._topic_of(camera): camera for camera in cameras}
+        """Return all pictures of some cameras, with the name of the camera; those of each are in the order of time."""
+        return self._coded({self._topic_of(camera): camera for camera in cameras})
+
+    def depths(self, camera: str) -> Iterator[Picture]:
+        """Return all pictures of a camera's depth, in the order of time."""
+        return (picture for _, picture in self._coded({depth_topic(camera): camera}))
+
+    def depth_unit(self, camera: str) -> float:
+        """Return the unit [m] of a camera's depth; raises :class:`RecordingError` if none was recorded."""
+        for messages in self.messages((depth_topic(camera),)):
+            for message in messages:
+                with self._faults():
+                    return unit_of_depth(message.payload)
+        raise RecordingError(f"{self.file}: depth of camera {camera}: no picture was recorded")
+
+    def _coded(self, names: Mapping[str, str]) -> Iterator[tuple[str, Picture]]:
+        """Yield all pictures of some topics, with the ``names`` of these."""
         for messages in self.messages(names):
             for message in messages:
                 with self._faults():

@@ -82,7 +82,7 @@ class RosRecording(Recording):
     @cached_property
     def _device_topics(self) -> set[str]:
         cameras = parse_config(self.about.cell, f"{self.file}: its cell").device_cameras
-        return {names.picture_topic(camera) for camera in cameras}
+        return {topic(camera) for camera in cameras for topic in (names.picture_topic, names.depth_topic)}
 
 
 @dataclass(slots=True)

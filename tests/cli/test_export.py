@@ -30,7 +30,7 @@ def test_a_folder_of_recordings_is_a_folder_of_tables_with_or_without_the_time_b
     for name, options in (("whole", ()), ("trimmed", ("--trim",))):
         out, folder = tmp_path / name, str(recordings[0].parent.parent)
         assert q2r2("export", "csv", folder, "--output", str(out), "--fps", "100", *options).exit_code == 0
-        assert set(contents(out)) == {f"{file.stem}.csv" for file in recordings}
+        assert set(contents(out)) == {"units.json", *(f"{file.stem}.csv" for file in recordings)}
         with (out / f"{recordings[0].stem}.csv").open(newline="") as stream:
             rows = list(csv.DictReader(stream))
         assert {row["task"] for row in rows} == {"a test"}

@@ -7,6 +7,7 @@ import pickle
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -148,13 +149,15 @@ class Waves:
     frames: int
     seed: int
     size: tuple[int, int, int] = (HEIGHT, WIDTH, 3)
+    dtype: str = "uint8"
+    unit: float = 1e-3
     config: CameraConfig = field(default_factory=lambda: CameraConfig(position=(1, 0, 1), rpy=(0, 0, 0)))
 
     def __iter__(self) -> Iterator[Pixels]:
         y, x = np.mgrid[:HEIGHT, :WIDTH]
         for frame in range(self.frames):
             waves = [np.sin(0.1 * x + 0.07 * (channel + 1) * y + 0.3 * frame + self.seed) for channel in range(3)]
-            yield (128 + 100 * np.stack(waves, axis=-1)).astype(np.uint8)
+            yield (128 + 100 * np.stack(waves, axis=-1)).astype(self.dtype)
 
 
 def with_subtasks(plain: EpisodeVectors, *lengths: tuple[str, int]) -> EpisodeVectors:
@@ -173,12 +176,13 @@ TOLD = (
 
 
 def with_pictures(plain: EpisodeVectors, seed: int) -> EpisodeVectors:
-    return replace(plain, cameras={CAMERA: Waves(plain.frames, seed)})  # type: ignore[dict-item]
+    pictures: Any = Waves(plain.frames, seed)
+    return replace(plain, cameras={CAMERA: pictures}, depths={CAMERA: replace(pictures, dtype="uint16")})
 
 
 def write_vectors(episode: EpisodeVectors, path: Path) -> None:
     """Keep an episode, like the formats do."""
-    path.write_bytes(pickle.dumps(replace(episode, cameras={})))
+    path.write_bytes(pickle.dumps(replace(episode, cameras={}, depths={})))
 
 
 def load_vectors(path: Path) -> EpisodeVectors:

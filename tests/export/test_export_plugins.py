@@ -91,6 +91,10 @@ def test_pictures_of_a_store_are_pixels_frame_by_frame(tmp_path: Path) -> None:
     assert arrays[CAMERA].dtype == np.uint8
     np.testing.assert_array_equal(arrays[CAMERA][: ends[0]], list(episodes[0].cameras[CAMERA]))
     np.testing.assert_array_equal(arrays[CAMERA][ends[0] :], list(episodes[1].cameras[CAMERA]))
+    depth = f"{CAMERA}_depth"
+    assert arrays[depth].dtype == np.uint16
+    np.testing.assert_array_equal(arrays[depth][ends[0] :], list(episodes[1].depths[CAMERA]))
+    assert zarr.open_group(str(tmp_path / "store"), mode="r")["data"][depth].attrs["unit"] == 1e-3
 
 
 def test_a_store_has_the_subtask_of_each_frame_and_the_names_by_episode(tmp_path: Path) -> None:

@@ -152,7 +152,7 @@ def test_a_camera_that_ends_is_told_of_once_and_marks_the_episode_and_the_run_go
     assert camera_figures(episode)["front"].missing_pictures == pytest.approx(done.summary.lost_pictures, abs=2)
 
 
-def test_depth_is_recorded_without_loss_and_left_out_of_datasets(tmp_path: Path) -> None:
+def test_depth_is_recorded_and_exported_without_loss(tmp_path: Path) -> None:
     deep = np.arange(WIDTH * HEIGHT, dtype=np.uint16).reshape(HEIGHT, WIDTH) * 21  # It needs all 16 bits.
     count = 0
 
@@ -180,9 +180,20 @@ def test_depth_is_recorded_without_loss_and_left_out_of_datasets(tmp_path: Path)
         assert message.time in stamps, "it has the time of its capture"
     assert not read_episode(recording).pictures["front"].damaged.any()
     assert replay(recording.file).difference is None
-    export = ("csv", str(recording.file), "--output", str(tmp_path / "dataset"), "--keep-discarded")
-    left_out = "depth of front is left out: no format has a place for it; the recordings have it\n"
-    assert left_out in q2r2("export", *export).stderr
+
+    def told(name: str, *options: str) -> str:
+        folder = str(tmp_path / name)
+        return q2r2("export", name, str(recording.file), "--output", folder, "--keep-discarded", *options).stderr
+
+    assert "depth of front is left out: csv has no place for it; allowed: hdf5, zarr\n" in told("csv")
+    h5py = pytest.importorskip("h5py")
+    assert "left out" not in told("hdf5", "--fps", "10")
+    with h5py.File(tmp_path / "hdf5" / "episode_0.hdf5") as episode:
+        data, pictures = episode["observations/depth/front"], episode["observations/images/front"]
+        assert (data.dtype, data.attrs["unit"]) == (np.uint16, 1e-4)
+        assert data.shape == pictures.shape[:3]
+        np.testing.assert_array_equal(data[()] - deep, np.broadcast_to((data[()] - deep)[:, :1, :1], data.shape))
+        assert len(np.unique(data[:, 0, 0])) > 1, "pictures follow each other"
 
 
 def test_when_the_process_of_a_camera_is_killed_the_run_goes_on(tmp_path: Path) -> None:

@@ -44,9 +44,17 @@ def write_episode(episode: EpisodeVectors, path: Path) -> None:
     if episode.subtasks:
         _create(data, "subtask_index", np.array(episode.subtask)[0]).append(np.array(episode.subtask))
     for camera, pictures in episode.cameras.items():
-        made = _create(data, camera, np.empty(pictures.size, dtype=np.uint8))
-        for pixels in pictures:
-            made.append(pixels[None])
+        _append_pictures(data, camera, pictures)
+    for camera, pictures in episode.depths.items():
+        _append_pictures(data, f"{camera}_depth", pictures).attrs["unit"] = pictures.unit
+
+
+def _append_pictures(data: Any, name: str, pictures: Any) -> Any:
+    """Append the pictures of a camera to a new array, and return it."""
+    made = _create(data, name, np.empty(pictures.size, dtype=pictures.dtype))
+    for pixels in pictures:
+        made.append(pixels[None])
+    return made
 
 
 def join_episodes(files: Sequence[Path], folder: Path) -> None:
@@ -80,4 +88,4 @@ def _create(group: Any, name: str, row: Any) -> Any:
     return group.create_array(name, shape=(0, *row.shape), chunks=(rows, *row.shape), dtype=row.dtype)
 
 
-ZARR = ExportFormat(write_episode, join_episodes, ahead=1)
+ZARR = ExportFormat(write_episode, join_episodes, has_depth=True, ahead=1)
