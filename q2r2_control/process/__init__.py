@@ -1,4 +1,4 @@
-"""Start, schedule and end processes: the one that runs a loop, and those beside it."""
+"""Start, schedule and end processes: the process that runs a loop, and the processes beside it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The loop's end of the connection to a process that answers robots, so that no tick makes a robot wait."""
+"""Connect the loop to a process that answers robots, so that no robot waits for a tick."""
 
 from __future__ import annotations
 
@@ -17,11 +17,12 @@ _PATIENCE = 5.0  # Time to wait until the process ends [s].
 
 
 class AnsweringProcess:
-    """Starts a process by the function ``main(commands, states)`` of a module, whose arguments are two sockets' files.
+    """Starts a process that calls the function ``main(commands, states)`` of a module.
 
-    Through the first one the process gets its priority with ``given``, replies ``BEGUN``, and then replies to commands
-    by ``TAKEN`` or ``TOO_LATE``. An error's text may take the place of each reply. Through the second one it sends
-    states, and never waits for the loop.
+    Both arguments are file descriptors of sockets. Through the socket ``commands``, the process receives its priority
+    and ``given``, and replies ``BEGUN``. It then replies to each command by ``TAKEN`` or ``TOO_LATE``. If it fails, it
+    replies with the text of the error instead. Through the socket ``states`` it sends states, without waiting for the
+    loop.
     """
 
     TAKEN, TOO_LATE, BEGUN = b"1", b"0", b"2"  # The replies to commands, and the first reply.
@@ -34,16 +35,16 @@ class AnsweringProcess:
 
         Args:
             module: The module with ``main``.
-            robots: What the process answers, in words, such as "the cabinets".
-            given: What the process gets after its priority, which is above that of the loop, or None.
-            longest_word: Time to wait for the reply to commands [s].
-            files: Files that the process inherits.
+            robots: The robots that the process answers, in words, such as "the cabinets".
+            given: Objects that the process receives after its priority.
+            longest_word: Longest time to wait for the reply to a command [s].
+            files: File descriptors that the process inherits.
 
         Raises:
             PlantError: If the process cannot begin.
         """
         self._robots, self._longest_word = robots, longest_word
-        # States that nobody reads may fill their connection. Replies to commands must not wait for that.
+        # States that nobody reads may fill their connection. Commands and replies therefore have another one.
         self._commands, commands = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._states, states = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._states.setblocking(False)
@@ -51,7 +52,7 @@ class AnsweringProcess:
         with commands, states:
             self._process = start_python(f"from {module} import main; main{links}", {}, files=[*links, *files])
         self.pid = self._process.pid
-        # If the loop has a real-time priority, answers come before it.
+        # If the loop has a real-time priority, the process has a higher one. Otherwise, the number is 0.
         priority = thread_priority()
         self._commands.send(pickle.dumps((priority and priority + 1, *given)))
         word = b""

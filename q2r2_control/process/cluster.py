@@ -1,4 +1,4 @@
-"""Runs jobs on the workers of a scheduler of dask.distributed, which somebody else has started."""
+"""Runs jobs on the workers of a dask.distributed scheduler, which the user has started."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from q2r2_control.extras import install_line
 from q2r2_control.process.cluster_worker import Call, Needs, hash_of_sources, look
 
 _CONNECT_S = 20.0  # Longest time to connect to the scheduler [s].
-_LOOK_S = 2.0  # Time between two looks for workers while no job finishes [s].
+_LOOK_S = 2.0  # While no job finishes, time between two checks whether any worker is left [s].
 # Packages whose version may change a number of a result.
 _COMPARED = (
     *("q2r2_control", "dask", "distributed", "numpy", "scipy", "pin", "numba", "daqp", "osqp", "qpsolvers"),
@@ -36,7 +36,7 @@ _logger = logging.getLogger(__name__)
 class Cluster:
     """The workers of a scheduler as a :class:`~q2r2_control.process.places.JobPlace`.
 
-    The scheduler gives the jobs of a killed worker to another one. A job whose result has arrived is not done again.
+    The scheduler gives the jobs of a killed worker to another worker. A job whose result has arrived is not done again.
     """
 
     def __init__(self, address: str) -> None:
@@ -124,7 +124,7 @@ class Cluster:
             for due in range(len(calls)):
                 while due not in outcomes:
                     number = self._next(client, finished)
-                    # The future goes with its result: the scheduler would repeat a job whose future is kept.
+                    # The future is dropped together with its result. Otherwise the scheduler might repeat the job.
                     outcomes[number] = self._outcome(waiting.pop(number))
                 result, error = outcomes.pop(due)
                 if error is not None:
@@ -134,7 +134,7 @@ class Cluster:
             executor.shutdown(wait=False)
 
     def _next(self, client: Any, finished: SimpleQueue[int]) -> int:
-        """Return the number of the next job that has ended. A line says so if no worker is left meanwhile."""
+        """Return the number of the next job that has ended. If no worker is left meanwhile, log one line."""
         told = False
         while True:
             try:
@@ -170,7 +170,10 @@ def _tell(finished: SimpleQueue[int], number: int, future: Future[Any]) -> None:
 
 
 def _other_version(here: Any, there: Any) -> str | None:
-    """Return the first version of a worker that differs, or None. Both are what dask says of a process."""
+    """Return the first version of a worker that differs from ours, or None if all are equal.
+
+    ``here`` and ``there`` are dask's descriptions of this process and of the worker.
+    """
     ours, its = here["host"]["python"], there["host"]["python"]
     if ours != its:
         return f"Python {its}, and here is {ours}"
@@ -183,7 +186,7 @@ def _other_version(here: Any, there: Any) -> str | None:
 
 @contextmanager
 def _probe(folder: Path | None) -> Iterator[str | None]:
-    """Make a file in ``folder`` by which a worker knows the folder, and remove it afterwards."""
+    """Make a file in ``folder``, and remove it afterwards. A worker that sees this file has the same folder."""
     if folder is None:
         yield None
         return
@@ -196,7 +199,7 @@ def _probe(folder: Path | None) -> Iterator[str | None]:
 
 
 def _silence() -> None:
-    """Keep what dask logs and warns of off the terminal: each fault is one line of this package."""
+    """Keep dask's log and warnings off the terminal, because this package reports each fault in one line."""
     warnings.filterwarnings("ignore", module=r"distributed(\..*)?")
     for name in tuple(logging.root.manager.loggerDict):
         if name.partition(".")[0] == "distributed":

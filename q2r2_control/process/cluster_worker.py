@@ -1,4 +1,4 @@
-"""The part of a cluster's work that its workers do: they compare what they have with the sender's, and run jobs."""
+"""Run jobs in a worker of a cluster. The worker first compares its code and files with those of the sender."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _SHARED = "allowed: a folder that all machines share, under the same path"
 
 @dataclass(frozen=True)
 class Needs:
-    """What a worker needs to have as the computer that sends the jobs has it. All paths are absolute."""
+    """What a worker must have exactly as the computer that sends the jobs. All paths are absolute."""
 
     sources: str  # The result of :func:`hash_of_sources`.
     folder: str | None = None  # The working directory, from which relative paths begin; None if no files are read.
@@ -29,14 +29,14 @@ class Needs:
 
 @dataclass(frozen=True)
 class Call:
-    """One job with its work and what it needs. Calling it returns the name of the machine, and the result."""
+    """One job, the function that does it, and what it needs. A call returns the machine's name and the result."""
 
     work: Callable[[Any], Any]
     job: Any
     needs: Needs
 
     def __call__(self) -> tuple[str, Any]:
-        # This worker may have joined after the others were asked. A file that it cannot see must not become a result.
+        # This worker may have joined after all others were compared. If it cannot see a file, the job must not run.
         if (fault := fault_of(self.needs)) is not None:
             raise ConfigError(f"worker on {platform.node()}: {fault}")
         if self.needs.folder is None:
@@ -56,12 +56,12 @@ def hash_of_sources() -> str:
 
 
 def look(needs: Needs, work: Callable[[Any], Any]) -> str | None:
-    """Return what this worker lacks, or None. It could not even be called if ``work`` could not be imported here."""
+    """Return what this worker lacks, or None. If the worker cannot import ``work``, the call itself fails."""
     return fault_of(needs)
 
 
 def fault_of(needs: Needs) -> str | None:
-    """Return in words what this process lacks of ``needs``; None if it lacks nothing."""
+    """Return in words which of the ``needs`` this process does not have; None if it has all."""
     if needs.sources != hash_of_sources():
         return "another q2r2_control than here; allowed: the same code, and workers that began after its last change"
     if needs.folder is not None and not Path(needs.folder).is_dir():

@@ -1,9 +1,9 @@
-"""Run a process beside the loop, which gets requests on its standard input and answers on its standard output.
+"""Run a process beside the loop. It gets requests on its standard input, and answers on its standard output.
 
-A thread would take Python's interpreter from the loop for milliseconds. ``multiprocessing`` was measured as well. If a
-run was killed while it sent 1 MB, 8 of 8 processes with a ``Queue`` waited for the rest for ever, and closed no file. A
-``Pipe`` makes the loop wait while it is full, and so needs the same threads. It also runs scripts without a main guard
-again.
+A thread would take Python's interpreter from the loop for milliseconds. ``multiprocessing`` was tried as well, and has
+three problems. If the run was killed while it sent 1 MB, 8 of 8 processes with a ``Queue`` waited for the rest for
+ever, and closed no file. A ``Pipe`` makes the loop wait while it is full, so it needs the same threads as this module.
+And ``multiprocessing`` runs a user's script again if the script has no main guard.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from typing import Any
 
 from q2r2_control.process.scheduling import how_it_ended
 
-_LOOKS = 0.1  # Time between two looks at the progress of a process that is to end [s].
+_LOOKS = 0.1  # While a process is ending, time between two checks of its progress [s].
 _AFTER_KILL = 1.0  # Time for the code that handles the last answer [s].
 _NO_ROOM = 1e-3  # Time between two attempts to send [s].
 
 
 class HelperProcess:
-    """A process that starts at once. :meth:`finish` or :meth:`kill` ends it, and so does the end of this process.
+    """A process that starts at once. It ends by :meth:`finish`, by :meth:`kill`, or when this process ends.
 
     Two threads pass requests and answers on, so that neither :meth:`send` nor the process waits for the other.
     """
@@ -50,10 +50,10 @@ class HelperProcess:
         Args:
             module: Name of the module.
             what: What the process does, for messages about faults.
-            on_answer: Gets each answer, in a thread of its own.
-            room: For requests that wait [bytes].
+            on_answer: A function that gets each answer. It is called in a separate thread.
+            room: Largest size of all requests that wait [bytes].
             idle: If no request comes for this time, the process gets None as a request [s].
-            environment: Variables that are added where this process does not have them.
+            environment: Environment variables of the process. Variables of this process override them.
 
         Raises:
             OSError: If the process cannot be started.
@@ -77,7 +77,10 @@ class HelperProcess:
         return self._listener.is_alive()
 
     def send(self, request: Any, size: int = 0, *, wait: bool = False) -> bool:
-        """Queue a request. Without room for its ``size`` [bytes], it waits with ``wait``, and returns False without."""
+        """Queue a request of ``size`` [bytes], and return whether it was queued.
+
+        If there is no room for the request, it is not queued; with ``wait``, this method waits for room.
+        """
         while self.alive:
             with self._lock:
                 if self._put + size - self._sent <= self._room:
@@ -113,7 +116,8 @@ class HelperProcess:
     def kill(self) -> None:
         """End the process and all processes that it has started, at once. This is not a fault.
 
-        A process that it has started would otherwise keep files and ports, and the pipe that shows its end.
+        Otherwise, a process that it has started would keep files and ports open. It would also keep the pipe open whose
+        end shows that the process has ended.
         """
         self._killed = True
         if self._process.returncode is None:  # Otherwise, another process may have its number by now.
@@ -169,9 +173,10 @@ class HelperProcess:
 def start_python(
     code: str, environment: dict[str, str], stdout: int = subprocess.DEVNULL, files: Sequence[int] = ()
 ) -> subprocess.Popen[bytes]:
-    """Start a process that runs ``code`` with this one's modules and open ``files``, and gets input by a pipe.
+    """Start a process that runs the Python ``code`` and reads its input from a pipe.
 
-    ``environment``: variables, where this process does not have them.
+    The process finds the same modules as this process, and inherits the open ``files``. ``environment`` has variables
+    for it. Variables of this process override them.
     """
     paths = {"PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path))}
     return subprocess.Popen(
@@ -197,7 +202,7 @@ def run_helper(module: str) -> None:
     After a failure, the last answer is a RuntimeError with the reason.
     """
     leave_signals_to_the_run()
-    stream, sys.stdout = sys.stdout.buffer, sys.stderr  # Output that a library prints is no answer.
+    stream, sys.stdout = sys.stdout.buffer, sys.stderr  # What a library prints must not be taken for an answer.
     lock = Lock()  # Several threads may send answers.
 
     def answer(content: Any) -> None:

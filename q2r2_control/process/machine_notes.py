@@ -46,11 +46,11 @@ def machine_notes() -> list[str]:
 def fair_server_notes(release: str, folder: Path) -> list[str]:
     """Return notes about the processor time that Linux 6.12 and later keep for other programs.
 
-    The kernel halts real-time threads for it.
+    The kernel halts real-time threads to keep this time.
 
     Args:
         release: Release of the kernel.
-        folder: Has the share of each processor. Only root may read it.
+        folder: The kernel's folder with the kept time of each processor. Only root may read it.
     """
     major, minor, *_ = *map(int, re.findall(r"\d+", release)[:2]), 0, 0
     shares = [_text(file) for file in folder.glob("cpu*/runtime")]
@@ -63,7 +63,7 @@ def fair_server_notes(release: str, folder: Path) -> list[str]:
 
 
 def network_notes(addresses: Iterable[str]) -> list[str]:
-    """Return notes about the network cards by which ``addresses`` are reached. Own addresses have no card."""
+    """Return notes about the network cards that lead to ``addresses``. This computer's own addresses need no card."""
     if sys.platform != "linux":
         return []
     routes = (_output("ip", "-j", "route", "get", address) for address in sorted(set(addresses)))

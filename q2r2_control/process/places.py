@@ -21,7 +21,7 @@ class JobPlace(Protocol):
 
     @property
     def where(self) -> str:
-        """Return what a line of progress adds: how many jobs each machine has done, or "" on this computer."""
+        """Return a text for lines of progress: how many jobs each machine has done, or "" on this computer."""
 
     def results(
         self,
@@ -30,10 +30,10 @@ class JobPlace(Protocol):
         reads: Callable[[Job], Path] | None = None,
         writes: Path | None = None,
     ) -> Generator[Result]:
-        """Yield the results of ``work`` for all ``jobs``, in their order. They do not depend on the place.
+        """Yield the results of ``work`` for all ``jobs``, in the order of the jobs. They are the same at every place.
 
         Args:
-            work: A function of a module, or a ``functools.partial`` of one, since other processes call it.
+            work: A function at the top level of a module, or a ``functools.partial`` of one. Other processes import it.
             jobs: The arguments of the calls.
             reads: Returns the file that a job reads; None if jobs read no files.
             writes: The folder into which jobs write; None if they write no files.
@@ -65,7 +65,7 @@ HERE = ThisProcess()
 
 @dataclass(frozen=True)
 class Processes:
-    """Runs jobs in at most ``most`` processes of this computer. They are killed if their results are not awaited."""
+    """Runs jobs in at most ``most`` processes of this computer. If the caller stops early, they are killed."""
 
     most: int
     where = ""
@@ -98,7 +98,7 @@ class Processes:
 
 
 def chosen_place(workers: int, cluster: str | None) -> JobPlace:
-    """Return the place that a user chose by ``--workers`` and ``--cluster``. Raises :class:`ConfigError` for both."""
+    """Return the place that a user chose by ``--workers`` or ``--cluster``; raises :class:`ConfigError` for both."""
     if cluster is not None:
         if workers != 1:
             raise ConfigError("--workers cannot be used with --cluster, whose scheduler has the workers")

@@ -10,7 +10,7 @@ from threading import Thread
 
 
 def pool_of(workers: int) -> ProcessPoolExecutor:
-    """Return a pool of ``workers``. They are spawned, not forked, since this process may have threads.
+    """Return a pool of ``workers`` processes. They are spawned, not forked, because this process may have threads.
 
     Ctrl-C reaches all processes, and this process ends the workers.
     """

@@ -20,15 +20,15 @@ from tempfile import TemporaryFile
 
 from q2r2_control.errors import ConfigError
 
-# Below 50, the priority of the interrupts that the loop itself waits for under Linux with PREEMPT_RT.
+# Under Linux with PREEMPT_RT, interrupts have the priority 50. The loop waits for some of them, so it must be below.
 _PRIORITY = 40
 LONGEST_END = 5  # Time that a process may take to end after it has closed everything. SIGALRM ends it then [s].
 _LEAST_ROOM = 1 << 16  # Free space that a folder for recordings must have [bytes].
 _CURRENT, _FUTURE = 1, 2  # Flags of mlockall on Linux.
-# For sched_setattr on Linux: its number by machine, and the layout of its structure: size, policy, flags, nice,
-# priority, runtime, deadline, period [ns].
+# The system call sched_setattr of Linux: its number on each machine, and the layout of its structure, which has size,
+# policy, flags, nice, priority, runtime [ns], deadline [ns] and period [ns].
 _SET_ATTRIBUTES, _ATTRIBUTES = {"x86_64": 314, "aarch64": 274}, struct.Struct("=IIQiIQQQ")
-_DEADLINE, _RESET_ON_FORK = 6, 1  # A policy and a flag.
+_DEADLINE, _RESET_ON_FORK = 6, 1  # SCHED_DEADLINE as the policy, and the flag SCHED_FLAG_RESET_ON_FORK.
 _ADVICE = (
     "to permit it, give the user 'rtprio 40' and 'memlock unlimited' in /etc/security/limits.conf and log in anew, or "
     "a container --cap-add SYS_NICE --cap-add IPC_LOCK --ulimit memlock=-1"
@@ -117,7 +117,7 @@ def _schedule_first(threads: Iterable[int], priority: int) -> str | None:
 
 
 def _schedule_as_others(threads: Iterable[int]) -> None:
-    # Only a privileged process may take the flag back; others keep it, where it does nothing more.
+    # Only a privileged process may take back the flag RESET_ON_FORK. Other processes keep it, without further effect.
     for thread in threads:
         for policy in (os.SCHED_OTHER | os.SCHED_RESET_ON_FORK, os.SCHED_OTHER):
             with suppress(OSError):
@@ -160,8 +160,8 @@ def check_folder(folder: Path, what: str) -> None:
 class StopRequest:
     """A flag that a signal handler sets and a loop reads.
 
-    It is a plain attribute. With the lock of a ``threading.Event``, a signal within another one's handler would wait
-    for ever.
+    The flag is a plain attribute. A ``threading.Event`` has a lock. If a second signal interrupted a handler that holds
+    this lock, its own handler would wait for ever.
     """
 
     asked = False
@@ -195,7 +195,7 @@ def how_it_ended(what: str, code: int) -> str:
 def few_garbage_collections() -> Iterator[None]:
     """Exclude all existing objects from garbage collection, which would take several ticks each time.
 
-    A program that has frozen its objects itself keeps them frozen, and no time is spent on a collection.
+    If the program has already frozen objects itself, they stay frozen, and this function does nothing.
     """
     if gc.get_freeze_count():
         yield
