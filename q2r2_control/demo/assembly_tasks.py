@@ -100,7 +100,7 @@ def tasks_named(names: Iterable[str]) -> tuple[AssemblyTask, ...]:
         names: The names of tasks, such as ``grasp``, or ``all``.
 
     Returns:
-        The tasks, each once, in an order in which one can follow the other.
+        The tasks, each once, in an order in which they can be done one after the other.
 
     Raises:
         ConfigError: If a name is unknown.
@@ -121,7 +121,7 @@ def note_on_parts(motion: str, config: Config) -> str | None:
 
 
 def with_controls(config: Config) -> Config:
-    """Return the cell with the tasks' controls for ``carry`` and ``precision``, if the cell binds none to them."""
+    """Return the cell with controls for ``carry`` and ``precision``, which tasks need. Bindings of the cell stay."""
     bindings = config.teleop.bindings
     given = {control: action for control, action in _TASK_CONTROLS.items() if bindings.words_of(action) is None}
     teleop = config.teleop.model_copy(update={"bindings": bindings.model_copy(update=given)})
@@ -129,7 +129,7 @@ def with_controls(config: Config) -> Config:
 
 
 def with_parts_at(config: Config, tasks: Iterable[AssemblyTask], place: tuple[float, float]) -> Config:
-    """Return the cell with all parts of ``tasks`` moved by the same ``place`` along x and y [m]."""
+    """Return the cell, in which all parts of ``tasks`` are displaced by ``place`` (x, y) [m]."""
     parts = {part for task in tasks for part in task.parts}
     objects = {
         name: item.model_copy(
@@ -143,7 +143,7 @@ def with_parts_at(config: Config, tasks: Iterable[AssemblyTask], place: tuple[fl
 
 
 def held_to_promises(results: Iterable[TaskResult], summary: RunSummary) -> tuple[TaskResult, ...]:
-    """Return the ``results``, but all failed if the run broke a promise."""
+    """Return the ``results``. If the run broke a promise, all of them are failures."""
     results = tuple(results)
     if not summary.broken:
         return results
@@ -152,7 +152,7 @@ def held_to_promises(results: Iterable[TaskResult], summary: RunSummary) -> tupl
 
 
 class TaskWatch:
-    """A listener of a run that judges tasks by the simulation's own state."""
+    """A listener of a run that judges tasks from the state of the simulation."""
 
     def __init__(self, tasks: Iterable[AssemblyTask], plant: MujocoPlant, robot: Robot, config: Config) -> None:
         """Prepare to judge a run.
@@ -181,14 +181,14 @@ class TaskWatch:
         self.look(tick.t, tick.dt)
 
     def look(self, t: float, dt: float) -> None:
-        """Look at the parts at ``t`` [s], ``dt`` [s] after the last time."""
+        """Look at the parts at time ``t`` [s]. The last call was ``dt`` [s] earlier."""
         parts = self._touches.look(t)
         for judges in self._judges.values():
             for judge in judges:
                 judge.see(dt, parts)
 
     def results(self) -> tuple[TaskResult, ...]:
-        """Return the results of all tasks. All fail if an arm touches anything except with its fingers on a part."""
+        """Return the results of all tasks. All fail if an arm touched anything, except a part with its fingers."""
         touches = [f"{one} touched {other} at {t:.1f} s" for (one, other), t in self._touches.forbidden.items()]
         results = []
         for name, judges in self._judges.items():

@@ -1,4 +1,4 @@
-"""Judges of tasks in which a force or a fit counts."""
+"""Judges of tasks that depend on a force or on a tight fit."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from q2r2_control.demo.part_judges import FINGERS, HELD_TIME, Judge, PartState, 
 
 _FORCE = (5.0, 15.0)  # The least and the largest force [N].
 _MEAN_TIME = 0.05  # The time constant of the mean force [s].
-_WIPED, _ASTRAY = 0.3, 0.1  # The least path with that force [m], and the largest other path as a share of it.
+# Least length of the path with that force [m], and largest length of the path with another force, as a share of it.
+_WIPED, _ASTRAY = 0.3, 0.1
 _DEEP, _BESIDE = 0.003, 0.001  # The largest distance from the bottom of the hole, and from its middle [m].
 _STRAIGHT = math.radians(3.0)
 
@@ -19,7 +20,7 @@ class WipeJudge(Judge):
 
     def __init__(self, part: str) -> None:
         super().__init__(part)
-        self._place: tuple[float, float] | None = None  # The last place at which it was pressed.
+        self._place: tuple[float, float] | None = None  # Last position, if held and on the table [m].
         self._force = self._most = self._wiped = self._astray = 0.0
 
     def see(self, dt: float, parts: Mapping[str, PartState]) -> None:
@@ -56,9 +57,9 @@ class PegJudge(Judge):
     """A part stands straight at the bottom of the hole of another part, without a finger on it, for the last second."""
 
     def __init__(self, parts: Mapping[str, float]) -> None:
-        """``parts`` are the peg and the part with the hole, and the heights of the peg and of the hole's bottom [m]."""
+        """``parts`` has the height of the peg and then that of the hole's bottom, by name of the part [m]."""
         super().__init__(*parts)
-        self._rest = 0.5 * sum(parts.values())  # The distance from centre to centre [m].
+        self._rest = 0.5 * sum(parts.values())  # Vertical distance of the centres when the peg is at the bottom [m].
         self._stood = self._beside = self._above = self._tilt = 0.0
 
     def see(self, dt: float, parts: Mapping[str, PartState]) -> None:

@@ -1,4 +1,4 @@
-"""Judges of tasks in simulation. They look only at the parts, so an operator with a headset is judged like a script."""
+"""Judges of simulated tasks. They look only at the parts, so an operator is judged in the same way as a script."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from q2r2_control.robot.robot import Robot
 
 
 class Toucher:
-    """Bodies that may touch a part, as flags."""
+    """Kinds of bodies that can touch a part, as flags."""
 
     NOTHING = 0
     SURROUNDINGS = 1  # The table, the floor, and everything else that stands still.
@@ -34,7 +34,7 @@ _ROBOT = Toucher.ARM | FINGERS
 class PartState:
     """One loose part at one time."""
 
-    place: tuple[float, float, float]  # The place of its centre in the world [m].
+    place: tuple[float, float, float]  # The position of its centre in the world [m].
     tilt: float  # The angle between its z axis and that of the world [rad].
     touched: int  # The bodies that touch it, as flags of :class:`Toucher`.
     pressed: float = 0.0  # The force on the surroundings, if it is measured [N].
@@ -51,7 +51,7 @@ class TouchWatch:
         objects: Sequence[str],
         pressed: Sequence[str] = (),
     ) -> None:
-        """Watch ``parts``, and also the force of those in ``pressed``. Fingers may touch all ``objects``.
+        """Watch ``parts``, and measure the force on the parts in ``pressed``. Fingers may touch all ``objects``.
 
         All are names of ``mujoco.objects``.
         """
@@ -65,7 +65,7 @@ class TouchWatch:
         self._is_grasp = [
             not both & _ROBOT or (both & ~FINGERS) == Toucher.PART for both in range(2 * Toucher.RIGHT_FINGER)
         ]
-        self.forbidden: dict[tuple[str, str], float] = {}  # By names of two bodies, the first touch [s].
+        self.forbidden: dict[tuple[str, str], float] = {}  # Time of the first forbidden touch of two bodies [s].
 
     def look(self, t: float) -> dict[str, PartState]:
         """Return the state of every part at ``t`` [s], as it was after the last physics step."""
@@ -75,7 +75,7 @@ class TouchWatch:
             one, other = kinds[first], kinds[second]
             touched[body[first]] |= other
             touched[body[second]] |= one
-            # A finger may touch a part. No other touch of an arm is allowed, also not of itself or of the other arm.
+            # An arm may touch parts with its fingers. It must touch nothing else, not even itself or the other arm.
             if not self._is_grasp[one | other]:
                 pair = self._model.body(body[first]).name, self._model.body(body[second]).name
                 self.forbidden.setdefault(pair, t)
@@ -92,7 +92,7 @@ class TouchWatch:
         }
 
     def _kind(self, body: int, robot: Robot) -> int:
-        """Return the flag of a body that is not a part, by the joints that move it, from its own up to the world."""
+        """Return the flag of a body that is not a part. The nearest joint between body and world decides."""
         above = body
         while above:
             for arm, finger in _FINGERS_OF.items():
@@ -128,7 +128,7 @@ class Judge:
         self._fell = dict.fromkeys(parts, 0.0)  # The deepest fall of each part [m].
 
     def see(self, dt: float, parts: Mapping[str, PartState]) -> None:
-        """Take the state of all parts, ``dt`` [s] after the last one."""
+        """Take the new state of all parts. The last call was ``dt`` [s] earlier."""
         for name in self.parts:
             height = parts[name].place[2]
             if parts[name].touched & FINGERS:
@@ -136,18 +136,18 @@ class Judge:
             self._fell[name] = max(self._fell[name], self._held_at.get(name, height) - height)
 
     def measured(self) -> dict[str, float]:
-        """Return the figures so far, by name; each name ends with the unit."""
+        """Return the measured figures so far, by name. Each name ends with the unit."""
         return {"fall_mm": 1e3 * max(self._fell.values())}
 
     def faults(self) -> list[str]:
-        """Return the reasons so far why the task is not done; the list is empty after success."""
+        """Return why the task is not done yet. The list is empty after success."""
         return [f"{name}: fell {1e3 * depth:.0f} mm" for name, depth in self._fell.items() if depth > _FALL]
 
 
 class LiftJudge(Judge):
     """A part is lifted, held up for a second and put back to where it lay, without a fall.
 
-    After it has lain there for a second, the judge does not watch it any more, since another task may use the part.
+    After the part has lain there for a second, the judge ignores it, because another task may use it.
     """
 
     _wanted = f"held {1e3 * _LIFT:.0f} mm up"
@@ -193,7 +193,7 @@ class LiftJudge(Judge):
 
 
 class CarryJudge(LiftJudge):
-    """The same as :class:`LiftJudge`, with both hands at once, 100 mm away, and always tilted less than 5 degrees."""
+    """As :class:`LiftJudge`, but both hands hold the part, 100 mm away, and it never tilts by 5 degrees or more."""
 
     _wanted = f"held by both hands, {1e3 * _LIFT:.0f} mm up and {1e3 * _CARRY:.0f} mm away,"
 
@@ -222,7 +222,7 @@ class StackJudge(Judge):
     def __init__(self, parts: Mapping[str, float]) -> None:
         """``parts`` are the parts from the lowest to the highest, with their heights [m]."""
         super().__init__(*parts)
-        self._rest = [0.5 * (low + high) for low, high in pairwise(parts.values())]  # Between centres [m].
+        self._rest = [0.5 * (low + high) for low, high in pairwise(parts.values())]  # Distances of centres [m].
         self._stood = self._sideways = self._tilt = 0.0
 
     def see(self, dt: float, parts: Mapping[str, PartState]) -> None:
@@ -249,13 +249,13 @@ class StackJudge(Judge):
 
 
 class HandoverJudge(Judge):
-    """One hand holds a part in the air, then both, then the other one alone, 100 mm away for a second."""
+    """One hand holds a part in the air, then both hands do, then the other hand alone, 100 mm away for a second."""
 
     def __init__(self, part: str, giver: int, taker: int) -> None:
         super().__init__(part)
         self._giver, self._taker = giver, taker
         self._by_giver = self._by_both = self._alone = self._longest = self._farthest = 0.0
-        self._given: tuple[float, float, float] | None = None  # The place where the giver let go.
+        self._given: tuple[float, float, float] | None = None  # The position at which the giver let go [m].
 
     def see(self, dt: float, parts: Mapping[str, PartState]) -> None:
         super().see(dt, parts)

@@ -26,7 +26,8 @@ from q2r2_control.process.places import JobPlace
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import CommandMode
 
-# Makes one trial with the name of a task and a seed, and returns why it failed, or ""; importable by processes.
+# A function that makes one trial, with the name of a task and a seed. It returns why the trial failed, or "" after
+# success. Other processes have to be able to import it.
 Trial = Callable[[tuple[str, int]], str]
 _WANTED = 0.95  # The share of trials that have to succeed.
 
@@ -57,9 +58,9 @@ def try_tasks(
     progress: Callable[[str], None] = lambda line: None,
     reads: Path | None = None,
 ) -> list[TrialReport]:
-    """Make a ``trial`` of each task by itself with each of ``seeds`` seeds. The reports are the same at any ``place``.
+    """Try each task alone with the seeds 0 .. ``seeds`` - 1. The reports are the same at any ``place``.
 
-    ``reads`` is a file that trials read, if any.
+    ``reads`` is the file that trials read; None if they read no file.
     """
     jobs = [(task.name, seed) for task in tasks for seed in range(seeds)]
     failures: dict[str, dict[int, str]] = {task.name: {} for task in tasks}
@@ -83,7 +84,7 @@ def try_task(config: Config, mode: CommandMode, shaky: bool, job: tuple[str, int
 def try_policy(config: Config, mode: CommandMode, policy: str, spread: float, job: tuple[str, int]) -> str:
     """Let the ``policy`` MODULE:NAME try the task and the seed of ``job``, in the time that scripted hands take.
 
-    The seed lays the parts up to ``spread`` [m] from their places along x and y. Returns why it failed, or "".
+    The seed displaces the parts along x and along y by up to ``spread`` [m]. Returns why the task failed, or "".
     """
     name, seed = job
     config = with_parts_at(config, tasks_named([name]), place_of(seed, spread))
@@ -92,7 +93,7 @@ def try_policy(config: Config, mode: CommandMode, policy: str, spread: float, jo
 
 
 def _failure_of(config: Config, source: Input, mode: CommandMode, task: str, duration: float | None) -> str:
-    """Return why a task fails if ``source`` drives the arms for ``duration`` [s], or "" if it succeeds."""
+    """Return why a task fails if ``source`` moves the arms for ``duration`` [s], or "" if it succeeds."""
     robot = Robot.from_config(config)
     plant = MujocoPlant(robot, config)
     pipeline = Pipeline(config, robot, source, plant, mode)
