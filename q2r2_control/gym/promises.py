@@ -13,9 +13,9 @@ class StepPromises:
     """A listener of a run. Call :meth:`begin` at the beginning of each step."""
 
     def __init__(self) -> None:
-        self._why: dict[str, str] = {}  # By arm, its last event.
-        self._held: dict[str, None] = {}  # The arms and grippers that did less in this step, in the order of time.
-        self._limits: dict[str, dict[str, None]] = {}  # By kind of limit, the joints or pairs that reached it.
+        self._why: dict[str, str] = {}  # The reason of each arm's last event.
+        self._held: dict[str, None] = {}  # Arms and grippers that did less than asked in this step, with reasons.
+        self._limits: dict[str, dict[str, None]] = {}  # The joints or pairs that reached a limit, by kind of limit.
         self.begin()
 
     def begin(self) -> None:

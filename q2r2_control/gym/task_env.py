@@ -45,17 +45,19 @@ class TaskEnv(gymnasium.Env):
     Observations and actions have the numbers of the datasets' features, in their order. ``action_names`` has the names
     of the numbers of the ``space``, followed by the openings of grippers. An action is followed for 1 / ``rate`` [s],
     and the observation after n steps is frame n of a dataset at this rate. An untrained agent can move the arms in the
-    default space, ``action.tool_delta``. In the others it would command jumps, which are refused.
+    default space, ``action.tool_delta``. In the other spaces it would command jumps, which are refused.
 
     ``spread`` [m] is the largest random offset of the task's parts, along x and along y; the seed decides it. With
-    ``pictures``, observations have those of the cell's cameras, or of one in front of the cell. ``loop_rate`` [Hz] is
-    the rate of the control loop; None stands for that of the cell. A step at 100 Hz takes a quarter of the time that it
-    takes at 1 kHz. The physics have the steps of the cell at every rate.
+    ``pictures``, observations contain pictures of the cell's simulated cameras. If the cell has none, a camera in front
+    of the cell takes them. ``loop_rate`` [Hz] is the rate of the control loop; None stands for the cell's rate. At 100
+    Hz, a step of the environment needs a quarter of the computing time that it needs at 1 kHz. The step of the physics
+    is that of the cell at every rate.
 
-    No action breaks a limit or a distance. ``info["promises"]`` describes a step: ``nearest_distance`` [m] of any pair,
-    ``nearest_pair``, ``margin`` [m] to the distance that a pair keeps, ``certified``, and ``held_back``: why arms or
-    grippers did less than was asked, and which limits were reached. ``info["measured"]`` has the figures of the judge,
-    and ``info["reason"]`` says why the task is not done. A fault that stops the arms ends the episode, with its reason.
+    No action breaks a limit or a distance. ``info["promises"]`` describes a step. ``nearest_distance`` [m] is the
+    smallest distance of any pair, and ``nearest_pair`` is this pair. ``margin`` [m] is the smallest distance of a pair
+    minus its kept distance. ``certified`` is True if all ticks were. ``held_back`` says why arms or grippers did less
+    than was asked, and which limits were reached. ``info["measured"]`` has the figures of the judge, and
+    ``info["reason"]`` says why the task is not done. A fault that stops the arms ends the episode, with its reason.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 30}  # noqa: RUF012
@@ -94,7 +96,7 @@ class TaskEnv(gymnasium.Env):
         self._pipeline = Pipeline(config, self._robot, self._policy, self._plant)
         self._camera: CellPictures | None = None
         self._tools: Array | None = (
-            None  # (arms, 7) Tools of the last observation, which give the signs of the next quaternions.
+            None  # Tool poses (arms, 7) of the last observation. The next quaternions get the same signs.
         )
         grippers = tuple(f"{arm}_gripper" for arm in self._robot.arms if arm in self._plant.gripper_openings())
         self.action_names = (*action_names(self._robot, self._policy.space), *grippers)
@@ -104,7 +106,7 @@ class TaskEnv(gymnasium.Env):
     def reset(
         self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[Observed, dict[str, Any]]:
-        """Move both arms home, and put the parts to the places that the seed decides."""
+        """Move both arms home, and put the parts at positions that the seed decides."""
         super().reset(seed=seed)
         self._pipeline.end()
         self._watch = TaskWatch(self.tasks, self._plant, self._robot, self._config)
@@ -203,7 +205,7 @@ class TaskEnv(gymnasium.Env):
 
 
 def _with_loop_rate(config: Config, rate: float) -> Config:
-    """Return the cell with another ``rate`` of its loop [Hz]; the controller does not split the longer steps."""
+    """Return the cell with another ``rate`` of its loop [Hz]. The controller does not cut longer ticks into steps."""
     if not is_number(rate) or not _LOOP_RATES[0] <= rate <= _LOOP_RATES[1]:
         raise ConfigError(f"loop_rate = {shown(rate)}: allowed: {_LOOP_RATES[0]:g} to {_LOOP_RATES[1]:g} Hz, or None")
     control = config.control.model_copy(update={"max_substep": max(config.control.max_substep, 1.0 / rate)})
