@@ -1,4 +1,4 @@
-"""An obstacle in the way of a target. The arm does not go through it."""
+"""An obstacle between a tool and its target. The arm does not go through it."""
 
 import numpy as np
 import pinocchio as pin

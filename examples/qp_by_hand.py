@@ -23,7 +23,7 @@ left, right = controller.tool_pose("left"), controller.tool_pose("right")
 targets = {"left": pin.SE3(left.rotation, right.translation), "right": pin.SE3(right.rotation, left.translation)}
 
 speeds, differences, margins = [], [], []
-for _ in range(1000):  # Each tool is sent to the other tool's place.
+for _ in range(1000):  # Each tool is sent to the position of the other tool.
     problem = controller.problem(targets, DT)  # Its variable is x = [v; s]: joint velocities, and a slack for each row.
     own_row = -np.eye(1, len(problem.q), joint)  # The row -v <= 0.1 lets left_A1 turn back at 0.1 rad/s at most.
     problem.G = own_row if problem.G is None else np.vstack([problem.G, own_row])

@@ -2,8 +2,9 @@
 
     python examples/learning/ahead.py datasets/circle datasets/circle_ahead [--frames 1]
 
-This is for datasets of lerobot-record, which has no such option. The command q2r2 export has --ahead. The first actions
-of an episode are dropped and its last one is repeated, so the statistics of the dataset are kept as they are.
+This is for datasets of lerobot-record, which has no such option. For q2r2 export, use --ahead instead. The first
+actions of an episode are dropped and its last action is repeated. As only these few rows change, the statistics of the
+dataset are kept as they are.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ ACTION, EPISODE = "action", "episode_index"
 
 
 def shifted(table: pa.Table, frames: int) -> pa.Table:
-    """Return the ``table`` with the action of ``frames`` later in each row, or else the last action of its episode."""
+    """Return the ``table`` whose row k has the action of row k + ``frames``. An episode's last action is repeated."""
     episodes = np.asarray(table[EPISODE])
     last = np.searchsorted(episodes, episodes, side="right") - 1
     later = np.minimum(np.arange(len(episodes)) + frames, last)

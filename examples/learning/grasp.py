@@ -2,9 +2,9 @@
 
     .venv-lerobot/bin/python examples/learning/grasp.py FOLDER [--episodes 50] [--steps 3000] [--seeds 20]
 
-The block lies at a different place in each attempt, and the policy gets this place as an input. The policy is a small
-ACT of lerobot, which is trained from scratch on a CPU. It is compared with a policy that always plays the mean episode.
-The actions of both policies go through the same policy input of the control loop.
+The block lies at a different position in each attempt, and the policy gets this position as an input. The policy is a
+small ACT of lerobot, which is trained from scratch on a CPU. It is compared with a policy that always plays the mean
+episode. The actions of both policies go through the same policy input of the control loop.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ from q2r2_control.recording import About, Recorder
 
 TASK = tasks_named(["grasp"])[0]
 BLOCK, MAX_DISPLACEMENT = "flat_block", 0.03  # Block, and its largest displacement along x and y [m].
-FPS, CHUNK = 10, 100  # Number of actions per second [Hz], and of one chunk, which is the whole motion.
-PLACE = "observation.environment_state"  # lerobot's name of the block's place, x y [m].
+FPS, CHUNK = 10, 100  # Actions per second [Hz], and number of actions in a chunk, which is the whole motion.
+PLACE = "observation.environment_state"  # lerobot's name for the input with the block's displacement, x y [m].
 STATE, ACTION = "observation.state", "action"
 ACT_SETTINGS: dict[str, Any] = {"dim_model": 64, "n_heads": 4, "dim_feedforward": 256, "n_encoder_layers": 2}
 ACT_SETTINGS |= {"use_vae": False, "dropout": 0.0, "chunk_size": CHUNK, "n_action_steps": CHUNK, "device": "cpu"}
@@ -62,7 +62,7 @@ class Whole:
 
 
 def learned(folder: Path, place: Array) -> Callable[[Observation], Array]:
-    """Return a function for the motion of the policy in ``folder`` if the block lies at ``place`` (2,) [m]."""
+    """Return a function that asks the policy in ``folder`` for a motion. The block is displaced by ``place`` [m]."""
     policy = ACTPolicy.from_pretrained(folder)
     before, after = make_pre_post_processors(policy.config, str(folder))
 
@@ -84,12 +84,12 @@ def coarse(cell: Config) -> Config:
 
 
 def place_of(seed: int) -> Array:
-    """Return the block's displacement (2,) from its place in the cell in the attempt with this ``seed`` [m]."""
+    """Return the displacement (2,) [m] of the block in the attempt with this ``seed``."""
     return np.random.default_rng([seed, 7]).uniform(-MAX_DISPLACEMENT, MAX_DISPLACEMENT, 2)
 
 
 def attempt(cell: Config, source: Input, place: Array, recorder: Recorder | None = None, seconds: float = 11.0) -> str:
-    """Grasp the block at ``place``, from the cell's place on; returns what fell short, empty: it succeeded."""
+    """Try to grasp the block, displaced by ``place`` (2,) [m]; returns why this failed, or "" after success."""
     block = cell.mujoco.objects[BLOCK]
     x, y, z = block.position
     moved = block.model_copy(update={"position": (x + place[0], y + place[1], z)})
@@ -111,7 +111,7 @@ def attempt(cell: Config, source: Input, place: Array, recorder: Recorder | None
 
 
 def record(cell: Config, episodes: int, folder: Path) -> None:
-    """Record hands that grasp the block wherever it lies. They tremble, and their samples are late or lost."""
+    """Record scripted hands that grasp the block. They tremble, and some of their samples are late or lost."""
     failed = 0
     for seed in range(episodes):
         place = place_of(seed)
@@ -123,7 +123,7 @@ def record(cell: Config, episodes: int, folder: Path) -> None:
 
 
 def export(recordings: Path, folder: Path) -> LeRobotDataset:
-    """Return the dataset of q2r2 export lerobot, with the block's place in each episode."""
+    """Return the dataset of q2r2 export lerobot, to which the block's displacement in each episode is added."""
     plain = folder.with_name("exported")
     command = [sys.executable, "-m", "q2r2_control", "export", "lerobot", recordings, "--output", plain]
     subprocess.run([*map(str, command), "--fps", str(FPS), "--trim", "--no-pictures"], check=True)
@@ -185,7 +185,7 @@ def column(dataset: LeRobotDataset, name: str) -> Array:
 
 
 def mean_episode(dataset: LeRobotDataset) -> Array:
-    """Return the actions (n, size) of the mean of all episodes, for the length of a policy's chunk."""
+    """Return the mean of all episodes, as many actions (n, size) as a chunk of the policy has."""
     actions, frames = actions_of(dataset), column(dataset, "frame_index")
     return np.array([actions[frames == frame].mean(axis=0) for frame in range(CHUNK)])
 
