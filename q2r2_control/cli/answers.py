@@ -1,4 +1,4 @@
-"""Answers to the questions of a command. They are kept until it succeeds, so that the next try offers them again."""
+"""Ask the questions of a command. Answers are kept until the command succeeds, and the next try offers them again."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class RememberedAnswers:
     """Asks at a terminal, and keeps the answers that differ from the proposed ones in a ``file``.
 
     ``about`` names the subject of the questions, such as models. Kept answers about another subject are not offered.
-    With ``yes`` nothing is asked, offered or kept.
+    With ``yes``, each proposed answer is taken, and nothing is asked, offered or kept.
     """
 
     def __init__(self, file: Path, about: Mapping[str, str], yes: bool = False) -> None:
@@ -54,7 +54,7 @@ class RememberedAnswers:
             self._keep()
 
     def forget(self) -> None:
-        """Remove the file, because the command succeeded. With ``yes`` it stays, because none of it was used."""
+        """Remove the file, because the command succeeded. With ``yes`` it stays, because its answers were not used."""
         if not self._yes:
             with suppress(OSError):
                 self.file.unlink(missing_ok=True)

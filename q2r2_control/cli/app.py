@@ -18,15 +18,15 @@ from typer.core import TyperGroup
 from q2r2_control.cli.commands import COMMANDS, CommandOnDemand
 from q2r2_control.errors import Q2R2Error
 
-# Depending on its version, typer raises click's exceptions or its own copy of them. This is the base class of either.
+# Depending on its version, typer raises click's exceptions or its own copy of them. This is the base class of them.
 _BadUsage: type[Exception] = typer.BadParameter.__mro__[2]
 
-_PARTS = "q2r2_control."  # Parts of the package, some of which an installation may leave out.
+_PARTS = "q2r2_control."  # Beginning of the names of modules, some of which an installation may leave out.
 _INTERRUPTED = 130  # Exit code after Ctrl-C.
 
 
 class ErrorHandlingGroup(TyperGroup):
-    """All commands. Ctrl-C ends them with exit code 130, bad usage and :class:`Q2R2Error` with 2.
+    """All commands. Ctrl-C ends a command with exit code 130, and bad usage or a :class:`Q2R2Error` with 2.
 
     Each fault is one line on stderr.
     """
@@ -71,7 +71,7 @@ def _usage_fault(error: Any) -> str:
     """Return what is wrong with an option or an argument, in the form that messages about a cell have."""
     if not hasattr(error.__cause__, "errors"):  # Only pydantic's errors about values have this method.
         return str(error.format_message())
-    from q2r2_control.config.strict import allowed_instead  # This import takes as long as the rest of the help.
+    from q2r2_control.config.strict import allowed_instead  # This import would double the time of the help.
 
     fault = error.__cause__.errors()[0]
     _, is_choice, choices = fault["msg"].partition(" is not one of ")
@@ -98,7 +98,7 @@ class _StderrHandler(logging.Handler):
 
 def _print_version(asked: bool) -> None:
     if asked:
-        from importlib.metadata import version  # This import takes as long as the rest of the help.
+        from importlib.metadata import version  # This import would double the time of the help.
 
         print(f"q2r2 {version('q2r2_control')}")
         raise typer.Exit
@@ -110,7 +110,7 @@ def main(
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
     ] = False,
 ) -> None:
-    """Let a thread write what is logged: a control loop must not wait for a terminal."""
+    """Let a thread write the log, because a control loop must not wait for a terminal."""
     logger = logging.getLogger("q2r2_control")
     if not logger.handlers:
         records: queue.SimpleQueue[logging.LogRecord] = queue.SimpleQueue()

@@ -87,7 +87,7 @@ def bench(
 
 
 def bench_table(report: BenchReport) -> Table:
-    """Return a table with a row for each controller under each motion."""
+    """Return a table with a heading for each motion and, below it, a row for each controller."""
     return figure_table(
         f"{report.cell}: ticks of 1 ms, {report.pairs} pairs, rounds: {report.rounds}",
         (
@@ -205,7 +205,7 @@ def _soak_rows(report: SoakReport) -> Iterator[tuple[Cell, ...]]:
 
 
 def _soak_notes(report: SoakReport, options: str) -> Iterator[str]:
-    """Yield counts, the first break of each promise, and the command with ``options`` that repeats the first one."""
+    """Yield counts, each promise's first violation, and the command with ``options`` that repeats the earliest one."""
     counted = COUNTED if "resets" in report.counts else POLICY_COUNTED
     yield ", ".join(f"{report.counts[name]} {what}" for name, what in counted.items())
     for found in report.broken:

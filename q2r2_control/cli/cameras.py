@@ -1,4 +1,4 @@
-"""``q2r2 cameras``: list the cameras that are there, and take a picture with each one of a cell."""
+"""``q2r2 cameras``: list the cameras of this computer, and take a picture with each camera of a cell."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from q2r2_control.process.helper_process import reason_of
 from q2r2_control.process.scheduling import check_folder
 
 _MEASURED = 1.0  # Time over which the rate of a camera is measured [s].
-_LONGEST = 5.0  # Longest time to wait for the pictures of that time [s].
+_LONGEST = 5.0  # Longest time to wait for the pictures of the time ``_MEASURED`` [s].
 
 
 @dataclass(frozen=True, slots=True)
 class FoundDevice:
     """A V4L2 device or a RealSense camera of this computer."""
 
-    path: str  # As cameras.NAME.device has it.
+    path: str  # The value for cameras.NAME.device.
     name: str
     formats: list[str]
     fault: str | None  # Why it cannot be opened.
@@ -38,14 +38,14 @@ class FoundDevice:
 
 @dataclass(frozen=True, slots=True)
 class TriedCamera:
-    """A camera of the cell, and what came of it."""
+    """A camera of the cell, and the result of the attempt to take a picture with it."""
 
     name: str
     device: str
     picture: str | None = None  # The file with its picture.
     width: int | None = None  # [pixels]
     height: int | None = None  # [pixels]
-    rate: float | None = None  # [pictures/s], by the times of their capture.
+    rate: float | None = None  # [pictures/s], from the times of their capture.
     fault: str | None = None  # Why there is no picture.
 
     @property

@@ -1,4 +1,4 @@
-"""Report the parts of a cell and its faults before anything moves."""
+"""Report the parts of a cell and its faults, before anything moves."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class ArmCheck:
     tool_frame: str
     tool_position: list[float]
     joints: list[dict[str, Any]]  # The figures of _JOINT by name.
-    object: str | None  # The object that its gripper shall hold, as a part of the tool.
+    object: str | None  # The object that counts as part of the tool while the gripper holds it.
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +62,7 @@ class KeptPair(PairDistance):
 
 @dataclass(frozen=True, slots=True)
 class CellCheck:
-    """A cell as the controller sees it. Distances are in metres, at home; ``faults`` are empty for a good cell."""
+    """A cell as the controller sees it. Distances are those at home [m]. A good cell has no ``faults``."""
 
     name: str
     arms: list[ArmCheck]
@@ -74,9 +74,9 @@ class CellCheck:
     contacts: tuple[ContactPair, ...]  # Pairs that may touch in torque mode.
     nearest: list[KeptPair]  # The nearest pairs, the nearest first.
     faults: tuple[str, ...]
-    remedies: list[str]  # Lines to paste into the YAML for these pairs, with comments that say where.
+    remedies: list[str]  # Lines for pairs that are too close at home: what to paste, and into which file.
     stop_torques: tuple[StopTorque, ...]  # One for each arm.
-    driven: dict[str, str]  # By arm, the output to an external controller; empty for the built-in controller.
+    driven: dict[str, str]  # The output to each arm's external controller; empty for the built-in controller.
     controls: dict[str, str]  # The actions of each hand's controls.
     notes: list[str]  # Lines that a user should know, but that are not faults.
     verdict: str  # One line that says whether the cell can run.
@@ -85,12 +85,12 @@ class CellCheck:
 def check_cell(config: Config) -> CellCheck:
     """Build the cell and check it at home; raises :class:`Q2R2Error` if it cannot be built."""
     controls = getattr(load_class(INPUTS, config.input), "controls", None)
-    if isinstance(controls, DeviceControls):  # Other devices know their controls only when connected.
+    if isinstance(controls, DeviceControls):  # Other devices know their controls only when they are connected.
         config.teleop.bindings.check_device(controls)
     load_class(PLANTS, config.plant)
     robot = Robot.from_config(config)
-    # The settings include pairs that may touch, so that each name and number is checked. Kept distances are those of
-    # position mode.
+    # The settings are checked with their pairs that may touch, so that each name and number is checked. The kept
+    # distances below are those of position mode, in which no pair may touch.
     check_settings(robot, config.control)
     settings = config.control.without_contact()
     kept = kept_distances(robot, settings)
@@ -157,10 +157,10 @@ def _notes_on_models(config: Config) -> list[str]:
 
 
 def _capsules_note(config: Config, robot: Robot) -> str:
-    """Return how many shapes replace the meshes of some links, and their cost in pairs and in time of a tick."""
+    """Return a note about links with several shapes: their number, and what they cost in pairs and in time."""
     names = [link_of(item.name) for item in robot.collision_model.geometryObjects]
     shapes = ", ".join(f"{link} {names.count(link)}" for link in config.capsules)
-    settings = config.control.model_copy(update={"pairs": ()})  # These may be no pairs without the shapes.
+    settings = config.control.model_copy(update={"pairs": ()})  # Some pairs exist only with the shapes.
     costs = []
     for its in (robot, Robot.from_config(config.model_copy(update={"capsules": {}, "control": settings}))):
         with notice_of_compiling():
@@ -174,9 +174,9 @@ def _capsules_note(config: Config, robot: Robot) -> str:
 
 
 def _stop_note(stop: StopTorque, shared: bool) -> str:
-    """Return which joint of an arm needs more torque than its limit, how often, and how to change that.
+    """Return a note: which joint of an arm needs more torque than its limit, how often, and how to change that.
 
-    ``shared`` is True if one model has all arms, so that its joints have no prefix of the arm.
+    ``shared`` is True if one model contains all arms. The names of joints then do not begin with the arm.
     """
     if stop.gravity.ratio > 1.0:
         worst, where = stop.gravity, "at rest, by gravity alone"

@@ -1,4 +1,4 @@
-"""A run as the command line offers it, with pipeline, live table, window and recording."""
+"""Run a cell from the command line, with pipeline, live table, window and recording."""
 
 from __future__ import annotations
 
@@ -54,9 +54,9 @@ from q2r2_control.viewer.tables import print_table
 if TYPE_CHECKING:
     from q2r2_control.viewer.web.view import PageView
 
-_SHOWS_PICTURES = "show_picture"  # The method of inputs whose device shows the run, as a headset does.
+_SHOWS_PICTURES = "show_picture"  # An input has this method if its device can show the run, as a headset can.
 _PERIOD = 1.0 / 30.0  # Period at which the window is drawn [s].
-_ON_PAGE, _IN_HEADSET = 5.0, 30.0  # Pictures per second, of all cameras on a page and of one camera in a headset.
+_ON_PAGE, _IN_HEADSET = 5.0, 30.0  # Pictures per second: of all cameras together on a page; of one in a headset.
 
 
 def check_window(plant: str | None) -> None:
@@ -90,7 +90,7 @@ def show_window(pipeline: Pipeline) -> None:
     pipeline.listeners.append(show)
 
 
-_EARLY = 0.1  # A run that ends earlier than this before its time was stopped [s].
+_EARLY = 0.1  # A run counts as stopped if it ends more than this before its planned end [s].
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +110,7 @@ class RunOptions:
     force: bool = False  # Whether to run although q2r2 check finds faults.
     tasks: tuple[AssemblyTask, ...] = ()  # Tasks to be judged.
     steps: tuple[tuple[float, str], ...] = ()  # Steps of scripted work, each with its begin [s] and its name.
-    record: Path | None = None  # Folder of recordings.
+    record: Path | None = None  # Folder of recordings; None for no recording.
     notes: Mapping[str, str] = field(default_factory=dict)  # Notes for the recording, by name.
     anonymous: bool = False  # Whether the recording leaves out the operator and the computer's name.
     longest_wait: float = SCRIPTS_WAIT_S  # Longest wait of a plant for a person, such as one at a cabinet [s].
@@ -131,11 +131,11 @@ class CellRun:
     summary: RunSummary
     tasks: tuple[TaskResult, ...] = ()
     recording: RecordingSummary | None = None
-    planned: float | None = None  # How long the run was to last [s]; None without an end.
+    planned: float | None = None  # Planned duration of the run [s]; None for a run until Ctrl-C.
 
     @property
     def cut_short(self) -> bool:
-        """Whether somebody ended the run before its time, so that a task may not be over."""
+        """Whether somebody ended the run before its planned end, so that a task may be unfinished."""
         return self.planned is not None and self.summary.duration_s < self.planned - _EARLY
 
     @property
@@ -162,7 +162,7 @@ def run_cell(config: Config, options: RunOptions) -> CellRun:
 
 
 def _watched_devices(config: Config, options: RunOptions) -> dict[str, CameraConfig]:
-    """Return the real cameras whose pictures are recorded, shown, or observed. Without such use they stay closed."""
+    """Return the real cameras whose pictures are recorded, shown or observed. Other cameras stay closed."""
     source = load_class(INPUTS, options.input)
     sees = any(hasattr(source, method) for method in (_SHOWS_PICTURES, PolicySource.observe.__name__))
     if options.fast or (options.record is None and options.page is None and not sees):
@@ -195,7 +195,7 @@ def _run_cell(
     try:
         plant = make_plant(options.plant, robot, config)
     except PlantError as error:
-        if options.plant != "mujoco":  # Only of a simulation, q2r2 check says that it cannot be built.
+        if options.plant != "mujoco":  # For the simulation only, q2r2 check reports the same fault.
             raise
         raise PlantError(f"{config.name}: FAULT plant {options.plant}: {error}") from error
     if isinstance(plant, WaitingPlant):
@@ -208,7 +208,7 @@ def _run_cell(
             faults = pipeline.preflight_faults()
         return _run_pipeline(pipeline, faults, options, recorder, page, streams, console)
     finally:
-        plant.close()  # Also if no run began: an open window would crash the process at its end.
+        plant.close()  # This is necessary even if no run began: an open window would crash the process at its end.
 
 
 def _open_window(plant: Plant) -> None:
@@ -262,7 +262,7 @@ def _run_pipeline(
 
 
 def print_summary(run: CellRun, json: bool, verbose: bool = False) -> None:
-    """Print the verdicts on a run, its tasks and its recording, and its figures, on stdout; or one JSON object."""
+    """Print the verdicts on a run, its tasks and its recording, and the summary, on stdout; or one JSON object."""
     if json:
         data = run.summary.as_json()
         if run.tasks:
@@ -338,7 +338,7 @@ def _run(
             pipeline.listeners.append(table)
             stack.enter_context(table.shown(console))
         else:
-            # On a slow computer the motion may take minutes, in which nothing else is printed.
+            # On a slow computer, the run may take minutes, in which nothing else is printed.
             kind = "simulated time" if options.simulated_time else "real time"
             lasts = "until Ctrl-C" if options.duration is None else f"{options.duration:g} s"
             is_shown = options.window or page is not None or options.input == "webxr"
@@ -390,9 +390,9 @@ def _run(
 def _lookers(
     pipeline: Pipeline, page: PageView | None, names: Sequence[str]
 ) -> Iterator[tuple[str, float, Callable[[bytes], object], Callable[[], bool]]]:
-    """Yield each shown camera, its most pictures per second, where to show them, and whether somebody looks.
+    """Yield a viewer of a camera: camera, most pictures per second, function to show one, and whether somebody looks.
 
-    ``names`` are those of all cameras with pictures. A headset shows the first one.
+    ``names`` are the names of all cameras with pictures. A headset shows only the first camera.
     """
     source: Any = pipeline.input
     if hasattr(source, _SHOWS_PICTURES):

@@ -11,7 +11,7 @@ from typer.main import get_command
 
 
 class ListedCommand(NamedTuple):
-    """A command as the help of ``q2r2`` lists it, with the place of its function."""
+    """A command as the help of ``q2r2`` lists it, and where its function is."""
 
     name: str
     at: str  # Module in this package, and the name of the function or Typer in it.
@@ -158,7 +158,7 @@ COMMANDS = (
 
 
 class CommandOnDemand(TyperCommand):
-    """A command of which the help knows only its line in the table. Its module is imported to parse arguments."""
+    """A command whose module is imported only to parse its arguments. The help needs only its line in the table."""
 
     def __init__(self, command: ListedCommand) -> None:
         super().__init__(command.name, help=command.about)
@@ -170,7 +170,7 @@ class CommandOnDemand(TyperCommand):
 
 
 def load(command: ListedCommand) -> Any:
-    """Import a command, and return it as click's type of command."""
+    """Import a command, and return it as a command object of click."""
     module, _, name = command.at.partition(":")
     found = getattr(import_module(f"{__package__}.{module}"), name)
     if not isinstance(found, Typer):

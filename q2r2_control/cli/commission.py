@@ -36,12 +36,12 @@ from q2r2_control.viewer.tables import figure_table, print_table, record_table
 
 _MOST_LOST = 0.01  # Largest share of a cabinet's messages that may be lost.
 _POINTS = 3  # Number of points that both tips touch.
-_GUIDED = 1.0  # A joint that was guided by hand has moved by more than this [deg].
+_GUIDED = 1.0  # A joint counts as guided by hand if it has moved by more than this [deg].
 _Measured = TypeVar("_Measured")
 
 
 class _Commissioning:
-    """The dialogue with the operator. Each step returns its figures; raises :class:`Q2R2Error` if it is not passed."""
+    """The dialogue with the operator. Each step returns its figures, or raises :class:`Q2R2Error` if it fails."""
 
     def __init__(self, file: Path, duration: float, tip: tuple[float, float, float]) -> None:
         self.file, self.config = file, load_config(file)
@@ -211,7 +211,7 @@ class _Commissioning:
         return [asdict(report) for report in reports]
 
     def _resting(self) -> Array:
-        """Return the posture (nv,) [rad] of arms that nothing commands; raises :class:`PlantError` if they move."""
+        """Return the posture (nv,) [rad] of arms without commands; raises :class:`PlantError` if they move."""
         self._plant.reset()
         try:
             seen = postures_over(self._plant, REST)
@@ -235,7 +235,7 @@ class _Commissioning:
                 self._repeats += 1
 
     def _ask(self, question: str, *allowed: str) -> str:
-        """Ask a person, and return the line, which is one of ``allowed`` if any are given."""
+        """Ask the operator a question, and return the answer: one of ``allowed``, or any line if none is given."""
         say(f"{question} [{'/'.join(allowed)}]" if allowed else question, self._console)
         while line := sys.stdin.readline():
             answer = line.strip()
@@ -265,7 +265,7 @@ def commission(
         with ExitStack() as stack:
             stack.callback(logger.setLevel, logger.level)
             logger.setLevel(logging.ERROR)  # The steps report what went wrong.
-            # Without real-time priority this thread could hold Python's global lock while the loop waits for it.
+            # With an ordinary priority, this thread could hold Python's global lock while the loop waits for the lock.
             stack.enter_context(real_time())
             work.run(stack)
         signed = work.signed()

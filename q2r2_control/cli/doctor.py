@@ -78,7 +78,7 @@ def doctor(
 
 
 def _packages(required: Iterable[str]) -> Iterator[Finding]:
-    """Yield the requirements in ``required`` that are not met. Those of extras do not count."""
+    """Yield the requirements in ``required`` that are not met. Requirements of extras do not count."""
     for requirement, found in _unmet(required):
         what = f"{requirement.name}: {found} is installed; needed: {requirement.specifier}"
         yield error(what, f"{sys.executable} -m pip install '{requirement.name}{requirement.specifier}'")
@@ -93,11 +93,11 @@ def _extras(required: Iterable[str]) -> Iterator[Finding]:
 
 
 def _unmet(required: Iterable[str], extra: str = "") -> Iterator[tuple[Requirement, str]]:
-    """Yield each requirement of the package, or of its ``extra``, that is not met, with the version that is there."""
+    """Yield each unmet requirement of the package, or of its ``extra``, with the installed version."""
     for requirement in map(Requirement, required):
         marker = requirement.marker
         needed_by = [name for name in ("", extra) if marker is None or marker.evaluate({"extra": name})]
-        if needed_by[:1] != [extra]:  # A requirement of the package itself is none of an extra.
+        if needed_by[:1] != [extra]:  # A requirement of the package itself does not count for an extra.
             continue
         try:
             found = version(requirement.name)

@@ -32,14 +32,14 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import CommandMode
 from q2r2_control.viewer.tables import figure_table
 
-_JUDGED_EVERY = 0.005  # Time between two judgements of tasks. No cabinet becomes late by them [s].
-_LOOKS, _LONGEST_LINES = 0.05, 1 << 16  # Time between two reads of the cabinets' lines [s], their size [B].
+_JUDGED_EVERY = 0.005  # Time between two judgements of tasks. They are too rare to make a cabinet late [s].
+_LOOKS, _LONGEST_LINES = 0.05, 1 << 16  # Time between two reads of printed lines [s], largest size of these [B].
 _SAFETY_STOP = 1.0  # Duration of a safety stop [s].
 _KINDS = {CommandMode.POSITION: CommandKind.POSITION, CommandMode.TORQUE: CommandKind.TORQUE}
 
 
 class Pendant:
-    """The operator at the cabinets: starts their overlays, stops the first one at times, and prints their states."""
+    """The operator at the cabinets: starts the overlays, sometimes stops the first cabinet, and prints the states."""
 
     def __init__(
         self,
@@ -91,7 +91,7 @@ class Pendant:
 
 
 def _enter_pressed() -> bool:
-    """Return whether a line was entered. In the background nothing is read, because reading would stop the process."""
+    """Return whether a line was entered. A background process must not read: the terminal would stop it."""
     try:
         is_ours = os.tcgetpgrp(0) == os.getpgrp()
     except OSError:  # There is no terminal.
@@ -204,11 +204,11 @@ def fri_cabinet(
 
 
 def wait_for_states(child: subprocess.Popen[str], lines: int, count: int) -> None:
-    """Read the file ``lines`` until the cabinets' process has printed for ``count`` arms that they send.
+    """Wait until the process of the cabinets has printed, for ``count`` arms, that it sends messages.
 
-    Raises :class:`PlantError` if the process has ended instead.
+    ``lines`` is the descriptor of the file into which it prints. Raises :class:`PlantError` if the process ends before.
     """
-    said = ""  # Read at a fixed position, because the process writes at the position of the open file.
+    said = ""  # The file is read at position 0, because a normal read would move the position of the process.
     while said.count(in_words(Session.MONITORING_WAIT)) < count:
         if child.poll() is not None:
             raise PlantError(f"the cabinets that stand in have ended: {said.strip() or 'without a word'}")
@@ -220,10 +220,10 @@ def wait_for_states(child: subprocess.Popen[str], lines: int, count: int) -> Non
 def rehearsal(
     config: str, mode: CommandMode, tasks: Sequence[AssemblyTask], period: float, rt: bool
 ) -> Iterator[list[TaskResult]]:
-    """Run the cabinets of a cell in a process of their own, which send messages when the context begins.
+    """Run the cabinets of a cell in a separate process. The context begins when all of them send messages.
 
-    At the end, the yielded list holds the results of the ``tasks`` that the cabinets measured. ``period`` is the time
-    between two messages [ms].
+    At the end, the yielded list contains the results of the ``tasks``, which the cabinets measured. ``period`` is the
+    time between two messages [ms].
 
     Raises:
         PlantError: If the cabinets cannot begin, ended a session or gave no result.

@@ -29,7 +29,7 @@ _LARGE_JITTER = 0.5  # Jitter that causes a note, as a share of the period.
 
 @dataclass(frozen=True, slots=True)
 class CabinetReport:
-    """Figures of one cabinet's messages, and the states in the newest message in words."""
+    """Figures of one cabinet's messages, and the states in its newest message, in words."""
 
     arm: str
     fri_version: int
@@ -48,7 +48,7 @@ class CabinetReport:
 
 
 def cabinet_report(arm: str, heard: Sequence[tuple[Monitoring, float]], lost: int) -> CabinetReport:
-    """Return the report on at least one message, each with its time of arrival [s], in the order of their counters."""
+    """Return the report on the messages ``heard``: at least one, each with its time of arrival [s], in their order."""
     newest = heard[-1][0]
     counters = np.array([message.counter for message, _ in heard])
     late = np.abs(np.diff([came for _, came in heard]) - np.diff(counters) * newest.period)

@@ -15,7 +15,7 @@ SPEEDS = 0.01, 10.0  # Allowed range of a joint's speed limit [rad/s].
 
 
 def named_values(given: list[str]) -> dict[str, str]:
-    """Return the values of texts NAME=VALUE by name; raises :class:`ConfigError`."""
+    """Return the values of texts NAME=VALUE, by name; raises :class:`ConfigError` if a text has another form."""
     for text in given:
         if not text.partition("=")[0].strip() or "=" not in text:
             raise ConfigError(f"--xacro-arg {text!r:.80}: allowed: NAME=VALUE")
@@ -25,7 +25,7 @@ def named_values(given: list[str]) -> dict[str, str]:
 def without_mjcf(
     models: dict[str, str], name: str, velocity: float | None, yes: bool, answers: RememberedAnswers
 ) -> dict[str, str]:
-    """Write a URDF for each MJCF file, and return the models with it in place; raises :class:`Q2R2Error`."""
+    """Write a URDF for each MJCF file; return the models with the URDF in its place; raises :class:`Q2R2Error`."""
     sides = {model: side for side, model in reversed(models.items()) if model.endswith(MJCF_ENDS)}
     files = {model: Path(f"{name}_{side}.urdf") for model, side in sides.items()}
     for model, file in files.items():

@@ -64,9 +64,9 @@ class MountReport:
 
 
 def mount_report(config: Config, points: Array, touched: Array) -> MountReport:
-    """Fit the right arm's mount, so that ``touched`` (n, 3) by the right tip match ``points`` (n, 3) by the left one.
+    """Fit the right arm's mount. With it, the positions ``touched`` of the right tip match ``points`` of the left tip.
 
-    Both are in the world frame of the cell [m].
+    Both arrays (n, 3) are in the world frame of the cell [m].
     """
     move, off = fit_move(points, touched)
     before = next(arm.mount for side, arm in config.arms.items() if side == SIDES[1])

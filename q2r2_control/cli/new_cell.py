@@ -40,10 +40,10 @@ from q2r2_control.robot.urdf_parts import mimic_of
 from q2r2_control.types import Array
 from q2r2_control.viewer.tables import figure_table, print_table
 
-_ANSWERS = Path("new-cell.answers.json")  # In the folder of the new cell.
-_FITS = 8  # Number of capsules in the table.
+_ANSWERS = Path("new-cell.answers.json")  # File of the answers, in the folder of the new cell.
+_FITS = 8  # Largest number of rows in the printed table of capsules.
 _LEAST_JOINTS = 3  # Least number of joints of an arm.
-_OFF_FLOOR = 0.03  # Distance from the floor that each link can reach in some posture [m].
+_OFF_FLOOR = 0.03  # In some posture, each link must be at least this far from the floor [m].
 _BARELY = 0.003  # A pair that cannot get this much farther apart than its kept distance gets an exception [m].
 
 Model = Annotated[str | None, Option(metavar="MODEL", help="URDF, xacro, MJCF, package:// or example-robot-data:NAME.")]
@@ -52,17 +52,17 @@ Tip = Annotated[str | None, Option(metavar="LINK", help="Last link of that arm, 
 
 @dataclass
 class _Draft:
-    """The unfinished cell as data of its YAML, with notes."""
+    """The unfinished cell: the data of its YAML, and notes."""
 
     file: Path
     data: dict[str, Any]
     notes: list[str] = field(default_factory=list)  # Notes about guessed values.
-    fits: dict[str, list[CapsuleFit]] = field(default_factory=dict)  # By model.
+    fits: dict[str, list[CapsuleFit]] = field(default_factory=dict)  # Capsules around the meshes of each model.
     always: list[tuple[str, str]] = field(default_factory=list)  # Pairs of links that overlap by construction.
     xacro_args: dict[str, str] = field(default_factory=dict)  # Arguments of each xacro model.
 
     def part(self, model: str) -> dict[str, Any]:
-        """Return the block of a model, which is still mounted at the world's origin."""
+        """Return the YAML block of a model. Its mount is still at the world's origin."""
         args = {"xacro_args": self.xacro_args} if self.xacro_args and model.endswith(".xacro") else {}
         return {"model": model, **args, "mount": {"position": [0.0, 0.0, 0.0]}}
 
@@ -263,7 +263,7 @@ def _stand(robot: Robot, has_feet: bool) -> float:
 
 
 def _place(draft: _Draft, answers: RememberedAnswers) -> None:
-    """Find a home for each arm. Pairs that never get far enough apart get a distance of their own, or none."""
+    """Find a home for each arm. Pairs that never get far enough apart get their own kept distance, or are ignored."""
     config = draft.config()
     robot = Robot.from_config(config)
     least = config.control.min_distance

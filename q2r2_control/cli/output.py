@@ -26,7 +26,7 @@ from q2r2_control.recording.recorder import RecordingSummary
 from q2r2_control.summary.run_summary import RunSummary
 from q2r2_control.viewer.tables import print_table
 
-# A loop that is late by _LATE [us], or by more than a period in a larger share of ticks than _OFTEN, may fail a task.
+# A task may fail because the loop was late: once by _LATE [us], or by more than a period in a share _OFTEN of ticks.
 _LATE, _OFTEN = 2e4, 0.2
 # Time until the first line about compiled kernels, and time between two such lines [s].
 _SILENT_S, _BETWEEN_LINES_S = 3.0, 5.0
@@ -96,7 +96,7 @@ def say(line: str, console: Console | None = None, style: str = "") -> None:
 def counting(what: str = "") -> Iterator[Callable[[str, int, int], None]]:
     """Show the progress of long work: a bar if stderr is a terminal, or else a line every few seconds.
 
-    The yielded function takes a text, done and total.
+    The yielded function takes a text, the number of finished items, and the number of all items.
     """
     console = Console(stderr=True)
     if not console.is_terminal:
@@ -130,7 +130,7 @@ class _CompilingLines:
         self._due = 0.0
 
     def __call__(self, done: int, total: int) -> None:
-        """Print a line if one is due. Its remaining time assumes that each kernel takes as long as those before."""
+        """Print a line if it is due. Its remaining time assumes that all kernels take equally long."""
         now = time.monotonic()
         if self._start is None:
             self._start, self._due = now, now + _SILENT_S
@@ -149,7 +149,7 @@ def notice_of_compiling() -> Iterator[None]:
 
 
 def notes_of(task: str | None, operator: str | None, record: object, anonymous: bool) -> dict[str, str]:
-    """Return the notes for a recording; raises :class:`ConfigError` if there is none, or if a note has no text."""
+    """Return the notes for a recording; raises :class:`ConfigError` for an empty note, or if nothing is recorded."""
     if anonymous and record is None:
         raise ConfigError("--anonymous needs --record")
     notes = {name: text for name, text in (("task", task), ("operator", operator)) if text is not None}
@@ -216,7 +216,7 @@ def recording_line(recording: RecordingSummary) -> str:
 
 
 def verdict_markup(verdict: Verdict) -> str:
-    """Return markup that says whether an episode is kept, and if not, why. Several reasons have a line each."""
+    """Return markup that says whether an episode is kept, and why not. Each of several reasons has its own line."""
     word = f"[{'green' if verdict.keep else 'red'}]{verdict.word}[/]"
     found = [escape(finding) for finding in verdict.findings]
     return f"{word}: {found[0]}" if len(found) == 1 else "\n    ".join([f"{word}:" if found else word, *found])

@@ -151,7 +151,7 @@ def judge(
 
 
 def _print_verdicts(judged: Sequence[Judgement], unreadable: Sequence[Unreadable]) -> None:
-    # A column shows the worst number of several hands or arms.
+    # If a figure exists for several hands or arms, its column shows the worst one.
     columns = [column for column in COLUMNS if column.name in _SHOWN]
     console = Console()
     kept = sum(one.verdict.keep for one in judged)
@@ -201,7 +201,7 @@ def report(
 
 
 def _cameras_with_depth(files: Iterable[Path]) -> tuple[str, ...]:
-    """Return the cameras whose depth is in the first recording that can be read. All of a dataset have the same."""
+    """Return the cameras with depth in the first readable file. All recordings of a dataset have the same cameras."""
     for file in files:
         with suppress(RecordingError):
             return Recording(file).about.depth

@@ -42,12 +42,12 @@ from q2r2_control.viewer.web.page import check_viser
 
 _COLOURS = {"ok": "green", "warn": "yellow", "error": "red"}
 _ROS_ARGUMENTS = "--ros-args"
-_ONCE = 3.0  # Time to find a running set of nodes, and to get several messages of each node [s].
-_TIME = 4.0  # Time to find a running set of nodes, and also a second publisher of a topic [s].
+_ONCE = 3.0  # Time in which a running set of nodes is found, and each node sends several messages [s].
+_TIME = 4.0  # Time in which a running set of nodes is found, and a second publisher of a topic as well [s].
 
 
 def set_tables(view: SetView, domain: str) -> Group:
-    """Return tables with the state of each arm and its reason, the message of each node, and the rate of each topic."""
+    """Return tables with each arm's state and its reason, each node's message, and each topic's rate."""
     title = f"ROS domain {domain}: {len(view.nodes)} nodes of a set"
     arms = figure_table(title, ("arm", "state", "controller", "why"), map(_arm_cells, view.arms))
     if not view.nodes:

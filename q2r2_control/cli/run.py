@@ -67,8 +67,8 @@ from q2r2_control.teleop.crossed_hands import CrossedHands
 from q2r2_control.types import CommandMode
 from q2r2_control.viewer.headset_table import headset_display, headset_table
 
-LARGEST_SPREAD = 0.03  # Up to this displacement of the parts, all tasks reach them [m].
-_PORT = 8080  # The port of the page, if no other one is given.
+LARGEST_SPREAD = 0.03  # Largest displacement of the parts with which the arms reach them in all tasks [m].
+_PORT = 8080  # The port of the page, unless an option names another port.
 _FRI_CONFIG = "config/dual_iiwa7_fri.yaml"
 _TASKS = f"[{'|'.join((*TASKS, ALL_TASKS))}]..."
 _ABOUT = "; ".join(f"{task.name}: {task.about}" for task in TASKS.values())
@@ -182,7 +182,7 @@ def run(
     )
     try:
         done = run_cell(cell, options)
-    except SystemExit as error:  # With --fast, a policy is called in this thread, and would end the command with 0.
+    except SystemExit as error:  # With --fast, the policy runs in this thread. Its exit could end the command with 0.
         raise InputError(f"the run was ended by SystemExit({error.code}); allowed: a policy that returns") from error
     print_summary(done, json, verbose)
     if done.summary.broken:
@@ -275,7 +275,7 @@ def demo(
     usual_port = _PORT
     if table and plant == "mujoco" and not (viewer or web or fast):
         viewer = window_fault() is None
-        web, usual_port = not viewer and find_spec("viser") is not None, 0  # Another program may have the usual one.
+        web, usual_port = not viewer and find_spec("viser") is not None, 0  # Another program may use the usual port.
         if not (viewer or web):
             say(f"--web shows the arms in a browser: {install_line('web')}")
     given: dict[str, object] = {"trajectory": trajectory, "human": human or hands is not None, "seed": seed}
@@ -291,7 +291,7 @@ def demo(
         table=table,
         window=viewer,
         page=(web_host, usual_port if web_port is None else web_port, None) if web else None,
-        real_time=rt or plant == "fri",  # A cabinet does not wait for a late answer of a busy computer.
+        real_time=rt or plant == "fri",  # A cabinet does not wait if a busy computer answers late.
         tasks=chosen,
         steps=work.steps,
         record=record,
@@ -372,7 +372,7 @@ def headset_check(
     cell = adapted(input, load_config(config))
     options = {"host": host, "port": port, "usb": usb, "certificate": certificate, "say": partial(say, console=console)}
     server: Any = make_input(input, cell, **options)
-    # Signals are caught from before the announcement on. A KeyboardInterrupt in a finaliser would be lost.
+    # Signals are caught before the server announces its address. A KeyboardInterrupt in a finaliser would be lost.
     with stop_on_signals(stop.ask):
         server.start()
         try:

@@ -19,8 +19,8 @@ from q2r2_control.wording import sentence
 def verdict_line(summary: RunSummary, failed: Iterable[str] = (), stopped: str | None = None) -> str:
     """Return one line of markup that says whether the promises were kept and the arms followed, or else the faults.
 
-    ``failed`` names further failures, such as tasks. ``stopped`` is the line where there is no failure, but the run was
-    stopped before its tasks were over.
+    ``failed`` names further failures, such as tasks. ``stopped`` is given if the run was stopped before its tasks were
+    over; it is the returned line unless there is a failure.
     """
     wrong = [*summary.broken, *failed]
     if wrong:
@@ -38,7 +38,7 @@ def verdict_line(summary: RunSummary, failed: Iterable[str] = (), stopped: str |
 
 
 def _last_faults(summary: RunSummary) -> dict[str, Event]:
-    """Return the last event of each arm that was paused, or not engaged, by something other than its button."""
+    """Return the last event of each arm, if something other than its button paused it or kept it from engaging."""
     between = (ArmState.PAUSING, ArmState.ALIGNING)
     last = {event.arm: event for event in summary.events if event.destination not in between}
     return {name: event for name, event in last.items() if is_fault(event)}
