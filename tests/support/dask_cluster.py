@@ -14,7 +14,7 @@ from tests.support.modules import ROOT
 
 
 class DaskCluster:
-    """The processes are ended by their ids."""
+    """A scheduler and workers as processes. :meth:`close` ends only these processes."""
 
     def __init__(self, folder: Path) -> None:
         self._folder, self._processes = folder, list[subprocess.Popen[bytes]]()
@@ -59,7 +59,7 @@ class DaskCluster:
 
 
 def _wait(process: subprocess.Popen[bytes], condition: Callable[[], bool]) -> None:
-    """Wait until ``condition`` holds, however long the process takes; fail if it ends before."""
+    """Wait until ``condition`` holds, however long the process takes; fail if the process ends before."""
     while not condition():
         assert process.poll() is None, f"{process.args!r} ended"
         time.sleep(0.05)
@@ -78,7 +78,7 @@ def dask_cluster(folder: Path, workers: int = 2) -> Iterator[DaskCluster]:
 
 
 def die_once(folder: Path) -> None:
-    """End the calling process at once, unless that has been done before, as a file in ``folder`` says."""
+    """End the calling process at once. Later calls do nothing: a file in ``folder`` remembers the first call."""
     try:
         (folder / "died").touch(exist_ok=False)
     except FileExistsError:

@@ -1,4 +1,4 @@
-"""A controller in a run from a start on, with its contract checked at every tick."""
+"""Run a controller from a given start, and check its contract at every tick."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from q2r2_control.types import Array, Reference
 from q2r2_control.verification.contract import Contract
 
 Targets = Mapping[str, pin.SE3 | None]
-# The arguments are the time since the start [s] and the tools at the start.
+# The arguments are the time since the start [s] and the tool poses at the start, by arm.
 Scenario = Callable[[float, Mapping[str, pin.SE3]], Targets]
 
 
 class Driven:
-    """A run that starts at home or at ``q`` and ``v``; ``options`` are those of the contract."""
+    """A run that starts at home, or at ``q`` and ``v``; ``options`` are passed to the contract."""
 
     def __init__(
         self,
@@ -37,7 +37,7 @@ class Driven:
         self.q, self.v, self.a = q, np.zeros_like(q) if v is None else v, np.zeros_like(q)
 
     def drive(self, seconds: float, towards: Scenario | Targets | None = None) -> Reference:
-        """Return the reference after ``seconds`` towards targets that stay or move."""
+        """Step for ``seconds`` [s] towards fixed or moving targets, and return the last reference."""
         for _ in range(max(round(seconds / self.dt), 1)):
             targets = towards(self.ticks * self.dt, self.start) if callable(towards) else towards or {}
             reference = self.controller.step(targets, self.dt)
@@ -47,7 +47,7 @@ class Driven:
         return reference
 
     def set_opening(self, arm: str, least: float, greatest: float) -> tuple[str, str] | None:
-        """Call the method of the controller, and tell the contract."""
+        """Call this method of the controller, and give the new openings to the contract."""
         refused = self.controller.set_opening(arm, least, greatest)
         self.contract.set_openings(self.controller.openings)
         return refused

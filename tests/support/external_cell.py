@@ -29,6 +29,6 @@ def _uncommented(key: str, text: str) -> str:
 
 
 def external() -> dict[str, Any]:
-    """Return the text of the cell."""
+    """Return the data of :func:`external_text`."""
     data: dict[str, Any] = read_yaml(external_text())
     return data

@@ -9,11 +9,11 @@ import numpy as np
 from q2r2_control.quaternions import rotation_of
 from q2r2_control.types import QUEST_CONTROLS, SIDES, Array, HandInputs, HandSample, HapticFeedback
 
-PERIOD = 1.0 / 75.0  # [s]
-PRESSED, RELEASED = 0.1, 0.2  # [s]
+PERIOD = 1.0 / 75.0  # Time between two samples [s].
+PRESSED, RELEASED = 0.1, 0.2  # Times at which the lower buttons are pressed and released [s].
 ENGAGED = 0.3  # From this time on, both arms follow their hands [s].
 
-# A function of time [s] that returns position [m] and rotation vector [rad] of a hand (6,).
+# A function of the time [s] that returns the position [m] and the rotation vector [rad] of a hand, together (6,).
 Path = Callable[[float], Array]
 
 

@@ -1,7 +1,7 @@
-"""An operator whose headset sends over TCP in simulated time. All data of a tick have arrived at its poll.
+"""An operator whose headset sends over TCP in simulated time. When a tick polls its input, all data have arrived.
 
-Outcomes then do not depend on how fast the machine is. A script is a generator that changes the operator and yields the
-times to wait [s]; the run ends with it.
+Results therefore do not depend on the speed of the machine. A script is a generator that changes the operator and
+yields the times to wait [s]. The run ends with the script.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ Sender = Callable[[str, Array, Array], bytes | None]  # The arguments are hand, 
 
 
 class Operator:
-    """The operator whom the script changes. Hands are at ``hands`` in a frame that is at ``frame``."""
+    """The operator, whom the script changes. ``hands`` are poses in a frame whose own pose is ``frame``."""
 
     def __init__(self, server: HeadsetServer, plant: MujocoPlant) -> None:
         self.plant = plant
@@ -114,9 +114,9 @@ class Operator:
     def move(
         self, way: Iterable[float], turn: Iterable[float] = (0.0, 0.0, 0.0), seconds: float = 0.6
     ) -> Iterator[float]:
-        """Move both hands as people reach.
+        """Move both hands by ``way`` [m] and ``turn`` [rad], as smoothly as people reach for something.
 
-        The right hand moves by 0.9 of the way, because human hands are never rigid.
+        The right hand moves by 0.9 of that, because two human hands never move exactly alike.
         """
         steps, starts = max(round(seconds / PERIOD), 1), dict(self.hands)
         whole = pin.Motion(np.array(list(way)), np.array(list(turn)))
@@ -177,7 +177,7 @@ class HeadsetInStep:
 
 
 class InStepRun:
-    """A whole run of a script with its ticks and events. The contract held at every tick, and no arm caught up."""
+    """A whole run of a script, with its ticks and events. It checks the contract, and that no arm catches up."""
 
     def __init__(
         self,
@@ -202,7 +202,7 @@ class InStepRun:
 
     @property
     def ticks(self) -> list[Tick]:
-        """Return the ticks of the script, without the way to rest after it."""
+        """Return the ticks of the script, without those after it in which the arms come to rest."""
         return [tick for tick in self.watch.ticks if tick.following]
 
     def tool(self, arm: str) -> Array:
@@ -219,7 +219,7 @@ class InStepRun:
         return [event for tick in self.ticks for event in tick.events]
 
     def reasons(self, destination: str) -> list[str]:
-        """Return the kinds of the reasons for a state of an arm, or for refusals in that state."""
+        """Return the kinds of the reasons why an arm got into a state, or refused a press in that state."""
         return [kinds(event.reason) for event in self.events if event.destination == destination]
 
 

@@ -31,7 +31,7 @@ class HandClock:
     def advance(self, seconds: float) -> None:
         """Advance, and return when the server's thread has begun to wait for the network at the new time.
 
-        It reads the clock before it waits and behind that, so that one of three readings is the first of these.
+        The thread reads the clock before and after each wait. After three readings, a wait has begun at the new time.
         """
         self.now += seconds
         read = self._readings
@@ -48,7 +48,7 @@ def running(server: HeadsetServer) -> Iterator[HeadsetServer]:
 
 
 def eventually(condition: Callable[[], object], what: str = "") -> None:
-    """Wait for the other thread, with a timeout far longer than it needs."""
+    """Wait until ``condition`` holds. The timeout is far longer than the other thread needs."""
     deadline = time.monotonic() + 30.0
     while not condition():
         assert time.monotonic() < deadline, f"never happened: {what or condition}"

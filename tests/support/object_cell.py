@@ -1,6 +1,6 @@
-"""The shipped cell with objects that its grippers hold.
+"""Cells for tests of grippers: the shipped cell with objects to hold, and ``CELL`` with a block on the table.
 
-Or, as ``CELL``, with a block on the table, so near beside the left tool that its gripper opens about half there.
+The block stands so near to the pose ``BESIDE`` of the left tool that the gripper can open only about half there.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ def at(z: float, y: float = 0.25, x: float = 0.5) -> pin.SE3:
     return pin.SE3(_DOWN, np.array([x, y, z]))
 
 
-_FRAME_TO_TIPS = 0.013  # [m]
+_FRAME_TO_TIPS = 0.013  # Distance from the tool frame to the tips of the fingers [m].
 
-# The nearest face is 35 mm from the tool's middle. A finger's outer side is at 22 mm when closed and 47 mm when open.
+# Its nearest face is 35 mm from the tool's middle. The outer side of a finger is at 22 mm if closed, at 47 mm if open.
 _BLOCK = {"shape": "box", "size": (0.1, 0.04, 0.015), "position": (0.5, 0.25 + 0.055, TABLE + 0.0075)}
 _DATA = load_config("config/dual_iiwa7.yaml").model_dump()
 _DATA["obstacles"]["block"] = _BLOCK
@@ -44,7 +44,7 @@ SETTINGS = CELL.control.model_copy(update={"solve_time_limit": None})  # No resu
 
 
 def tips_at(y: float, tips: float) -> pin.SE3:
-    """Return a pose of the left tool, which points down with its tips this far above the table [m]."""
+    """Return a pose of the left tool, which points down. Its tips are ``tips`` [m] above the table."""
     return at(TABLE + _FRAME_TO_TIPS + tips, y)
 
 

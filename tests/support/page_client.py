@@ -25,16 +25,16 @@ _PATIENCE = 120.0  # Timeout far above any usual duration [s].
 
 
 class PageClient:
-    """A context manager for viser's protocol: lengths, packed messages, and arrays, which are not read."""
+    """A client of viser's protocol, as a context manager. It reads packed messages, and ignores arrays."""
 
     def __init__(self, url: str) -> None:
         host = urlsplit(url).netloc
         protocol = [Subprotocol(f"viser-v{viser.__version__}")]
         self._socket = connect(f"ws://{host}", origin=Origin(f"http://{host}"), subprotocols=protocol, max_size=None)
-        self._contents: dict[str, str] = {}  # Contents of the panel's pieces of HTML.
+        self._contents: dict[str, str] = {}  # The HTML elements of the panel, by identifier.
         self.buttons: dict[str, str] = {}  # Identifiers of buttons by label.
         self.drawn: set[str] = set()  # Names of drawn meshes.
-        self.pictures: list[bytes] = []  # Pictures of cameras as they came.
+        self.pictures: list[bytes] = []  # Pictures of cameras, in the order of their arrival.
         # The page ignores presses of a browser that has not sent its camera.
         self.send("ViewerCameraMessage", **_CAMERA)
 

@@ -1,4 +1,4 @@
-"""Processes by their ids, including those that are not children of this process."""
+"""Helpers of many tests: processes by their ids, the shipped cell, and a listener that checks the contract."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ _OTHER_BLOCKS = {
 
 
 def pipeline_of(changes: Mapping[str, object], source: Input, plant: Plant | str, mode: str) -> Pipeline:
-    """Return a pipeline for the shipped cell with other blocks. It shares the robot if that does not depend on them."""
+    """Return a pipeline for the shipped cell with ``changes`` of blocks. It shares the robot if it does not change."""
     config = cell().model_copy(update=dict(changes))
     if not changes.keys() <= _OTHER_BLOCKS:
         return Pipeline.from_config(config, input=source, plant=plant, mode=mode)

@@ -15,7 +15,7 @@ from q2r2_control.types import Array, Command, CommandMode, Reference, StepRepor
 
 
 def pose_error(wanted: pin.SE3, pose: pin.SE3) -> Array:
-    """Return the way (6,) from ``pose`` to ``wanted``: position [m] and rotation vector [rad], in world axes."""
+    """Return ``wanted`` minus ``pose`` (6,): position [m] and rotation vector [rad], in world axes."""
     return np.concatenate([wanted.translation - pose.translation, pin.log3(wanted.rotation @ pose.rotation.T)])
 
 

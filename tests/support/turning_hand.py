@@ -1,8 +1,8 @@
-"""A hand with turning fingers like those of a Robotiq 2F-85, on both arms of the shipped cell, and its real position.
+"""A hand with turning fingers like those of a Robotiq 2F-85, on both arms of the shipped cell.
 
 Each finger hangs on a knuckle that the gripper turns by 0.8 rad. Its tip turns back by as much, so that it stays
-parallel, and a second knuckle follows. The tips are 14 mm farther out when the hand is closed. Axes are where the
-published drawings of that gripper have them; shapes are simple ones of about its size.
+parallel, and a second knuckle follows. The tips are 14 mm farther out when the hand is closed. The axes are where the
+published drawings of that gripper have them. The shapes are simple and have about its size.
 """
 
 from __future__ import annotations
@@ -78,12 +78,12 @@ def turning_cell(folder: Path, **obstacles: object) -> Config:
 
 
 def above_table(tips: float) -> pin.SE3:
-    """Return a pose of the left tool, which points down with its open tips this far above the table [m]."""
+    """Return a pose of the left tool, which points down. Its open tips are ``tips`` [m] above the table."""
     return pin.SE3(pin.rpy.rpyToMatrix(np.pi, 0.0, np.pi), np.array([0.5, 0.25, _TABLE + _FRAME_TO_OPEN_TIPS + tips]))
 
 
 class RealHands:
-    """Drawn shapes, enclosed but not swept, with fingers where the joints of the URDF put them."""
+    """The real shapes of both hands. Each finger is where the joints of the URDF put it, and sweeps no space."""
 
     def __init__(self, robot: Robot) -> None:
         self._robot, self._model = robot, pin.buildModelFromXML(robot.urdf)

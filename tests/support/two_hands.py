@@ -22,8 +22,8 @@ Motion = Callable[[float], pin.SE3]  # The common motion as a function of time, 
 class TwoHands:
     """Both hands on one moving object. Each sways on its own, trembles, and is measured with noise.
 
-    ``sway``: RMS of what each hand does on its own at 0.4 .. 2 Hz, along each axis [m] and about it [rad]. Hands on a
-    box of cardboard, in which grips give way, do some millimetres and degrees.
+    ``sway``: RMS of each hand's own motion at 0.4 .. 2 Hz, along each axis [m] and about each axis [rad]. Hands that
+    hold a cardboard box, which yields under the grips, sway by some millimetres and degrees.
     """
 
     def __init__(
@@ -49,7 +49,7 @@ class TwoHands:
         return self._sampling[hand].measured(pin.SE3(rotation, position), t)
 
     def samples(self, duration: float) -> Iterator[tuple[float, str, HandPose]]:
-        """Return receipt time, hand and pose of each sample, left before right."""
+        """Yield the receipt time [s], hand and pose of each sample, left before right."""
         for index in range(int(duration / PERIOD)):
             for place, hand in enumerate(SIDES):
                 yield index * PERIOD + 2e-4 * place, hand, hand_pose(self.pose(hand, index * PERIOD))
