@@ -27,7 +27,7 @@ def square(number: int) -> int:
 
 
 def square_or_die(folder: Path, number: int) -> int:
-    """The fourth job ends its worker once."""
+    """Return the square. The fourth job ends its worker once."""
     if number == 3:
         die_once(folder)
     return number * number
@@ -44,7 +44,7 @@ def fail_from_two_on(number: int) -> int:
 
 
 def name_in_folder(file: Path) -> str:
-    """A relative path is one of the sender's working directory."""
+    """Return the file's text. A relative path begins at the sender's working directory."""
     return f"{file}: {file.read_text()}"
 
 
@@ -56,7 +56,7 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[DaskCluster]:
 
 
 def fault_of(place: Cluster, **options: object) -> str:
-    """The one line that refuses jobs before any has begun."""
+    """Return the line that refuses the jobs before any of them has begun."""
     with pytest.raises(ConfigError) as fault:
         list(place.results(square, JOBS, **options))  # type: ignore[arg-type]
     assert "\n" not in str(fault.value)
@@ -65,7 +65,7 @@ def fault_of(place: Cluster, **options: object) -> str:
 
 
 @pytest.mark.slow
-def test_jobs_of_a_killed_worker_run_on_the_other_one_and_each_result_comes_once_and_in_order(tmp_path: Path) -> None:
+def test_jobs_of_a_killed_worker_run_on_the_other_worker_and_each_result_comes_once_in_order(tmp_path: Path) -> None:
     pytest.importorskip("distributed", reason="the extra cluster is not installed")
     with dask_cluster(tmp_path) as cluster:
         place = Cluster(cluster.address)
@@ -107,7 +107,7 @@ def test_a_relative_path_means_the_same_file_as_here(
 
 
 @pytest.mark.slow
-def test_another_version_of_this_package_or_of_python_on_a_worker_is_one_line(
+def test_a_worker_with_another_version_of_this_package_or_of_python_is_refused_in_one_line(
     cluster: DaskCluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as changed:
@@ -127,7 +127,9 @@ def test_another_version_of_this_package_or_of_python_on_a_worker_is_one_line(
 
 
 @pytest.mark.slow
-def test_a_scheduler_that_cannot_do_the_work_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_scheduler_that_cannot_do_the_work_is_refused_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pytest.importorskip("distributed", reason="the extra cluster is not installed")
     with dask_cluster(tmp_path, workers=0) as cluster:
         assert "it has no workers" in fault_of(Cluster(cluster.address))
@@ -138,7 +140,7 @@ def test_a_scheduler_that_cannot_do_the_work_is_one_line(tmp_path: Path, monkeyp
 
 
 class _Answers(logging.Handler):
-    """Starts another worker as soon as a line says that none is left."""
+    """Starts another worker as soon as a logged line says that none is left."""
 
     def __init__(self, cluster: DaskCluster) -> None:
         super().__init__()

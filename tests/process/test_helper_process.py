@@ -1,4 +1,4 @@
-"""A process beside the loop, or one that it has started, never keeps the run from ending."""
+"""A process beside the loop, or a child of this process, never keeps the run from ending."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="only asked for 
 
 
 class FakeSystem:
-    """A replacement for Linux that grants what it is told to, and keeps all requests."""
+    """A replacement for Linux that grants only the given kinds of requests, and keeps a list of all requests."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, grants_memory: bool, grants_scheduler: bool) -> None:
         self.calls: list[tuple[object, ...]] = []
@@ -121,12 +121,12 @@ def test_a_reservation_is_requested_in_nanoseconds_and_a_refusal_is_reported(
     assert attributes == (48, 6, 1, 0, 0, 1_500_000, 2_000_000, 2_000_000)
 
 
-def test_a_machine_without_a_known_call_has_no_reservations(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_machine_whose_system_call_is_unknown_gets_no_reservation(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(platform, "machine", lambda: "riscv64")
     assert not reserve(0.001, 0.002)
 
 
-def test_only_the_calling_thread_is_scheduled_first_and_normally_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_the_calling_thread_gets_a_priority_and_loses_it_again(monkeypatch: pytest.MonkeyPatch) -> None:
     system = FakeSystem(monkeypatch, grants_memory=True, grants_scheduler=True)
     ended = threading.Event()
     thread = threading.Thread(target=ended.wait)
@@ -142,7 +142,7 @@ def test_only_the_calling_thread_is_scheduled_first_and_normally_again(monkeypat
     assert (schedule_thread_first(38) or "").startswith("no SCHED_FIFO: Operation not permitted; to permit it")
 
 
-# A signal is sent at every line of the first signal's handler, so that another handler interrupts each of them.
+# At every line of the first signal's handler, another signal is sent, so that its handler interrupts that line.
 SCRIPT = """
 import os, signal, sys
 from q2r2_control.process.scheduling import StopRequest
@@ -160,7 +160,7 @@ print(stop.asked, len(sent) > 0)
 """
 
 
-def test_a_signal_during_another_ones_handler_does_not_wait_for_it() -> None:
+def test_a_signal_that_interrupts_the_handler_of_another_signal_does_not_wait_for_ever() -> None:
     done = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, timeout=60)
     assert done.stdout.split() == ["True", "True"], done.stderr
 
