@@ -1,4 +1,4 @@
-"""Tasks as environments: the seed makes them repeatable, the demo's work solves them, and all promises hold."""
+"""Tasks as environments: a seed makes them repeatable, the motion of the demo solves them, and all promises hold."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def shared() -> TaskEnv:
     return make(space=ActionSpace.JOINTS)
 
 
-def test_every_task_is_registered_and_lasts_as_long_as_its_work() -> None:
+def test_every_task_is_registered_and_an_episode_is_long_enough_for_its_work() -> None:
     assert set(gym.TASKS) == set(TASKS)
     for task in gym.TASKS:
         spec = gymnasium.spec(f"q2r2/{task.capitalize()}-v0")
@@ -65,7 +65,7 @@ def test_the_checks_of_gymnasium_pass(space: ActionSpace) -> None:
 
 
 def script(task: str, env: TaskEnv, step: int) -> npt.NDArray[np.float32]:
-    """Return the work of the demo's hands as tool poses and openings."""
+    """Return the action of a step that does the same as the demo's hands: tool poses and openings."""
     work, t, poses, openings = WORKS[task], step / RATE, [], []
     for arm in SIDES:
         points = work.tools.get(arm, ((1.0, *HOME[arm], 0.0, 0.0),))
@@ -77,7 +77,7 @@ def script(task: str, env: TaskEnv, step: int) -> npt.NDArray[np.float32]:
 
 
 @pytest.mark.slow
-def test_the_work_of_the_demo_earns_the_reward_and_keeps_every_promise() -> None:
+def test_the_motion_of_the_demo_earns_the_reward_and_keeps_every_promise() -> None:
     env = make("grasp", space="action.tool", spread=0.0)
     env.reset(seed=0)
     rewards, held = [], set()
@@ -192,7 +192,7 @@ def test_steps_end_at_frames_of_a_dataset_at_the_given_rate() -> None:
 
 
 @pytest.mark.slow
-def test_the_example_of_the_page_runs_as_it_stands(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_example_of_docs_policies_runs_unchanged(capsys: pytest.CaptureFixture[str]) -> None:
     found = re.search(r"```python\n(import gymnasium.*?)```", (ROOT / "docs/policies.md").read_text(), re.DOTALL)
     assert found is not None
     exec(found[1], {})
