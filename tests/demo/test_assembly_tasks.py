@@ -21,7 +21,7 @@ from tests.support.processes import Watch, assert_torque_bounds
 
 pytestmark = pytest.mark.slow
 
-# The tasks that are shown, by mode, and their ticks [s]. No task needs 1 kHz, and the tests have to be fast.
+# The tasks that are played in each mode, and the period of a tick. No task needs 1 kHz, and the tests have to be fast.
 SHOWN = {CommandMode.POSITION: "meet+grasp+carry+handover+stack", CommandMode.TORQUE: "handover+stack"}
 PERIODS = {CommandMode.POSITION: 0.01, CommandMode.TORQUE: 0.005}  # [s]
 
@@ -35,7 +35,7 @@ def coarse(mode: CommandMode = CommandMode.POSITION) -> Config:
 
 
 class Played:
-    """Tasks in simulated time until their end, with the contract checked at every tick."""
+    """A run of tasks in simulated time until their end. The contract is checked at every tick."""
 
     def __init__(self, names: str, mode: CommandMode) -> None:
         config, self.mode = coarse(mode), mode
@@ -76,7 +76,7 @@ def test_the_arms_follow_the_hands_within_a_millimetre_or_so_and_need_no_fallbac
     assert played.summary.at_rest
     for arm in played.summary.arms.values():
         assert arm.position_error_mm_rms is not None
-        # With two arms that carry, the led tool corrects the lag of the other one.
+        # While two arms carry, the led tool also corrects the lag of the leading tool.
         assert arm.position_error_mm_rms < (1.5 if "carry" in played.results else 1.0)
     if played.mode is CommandMode.TORQUE:
         assert_torque_bounds(played.pipeline, played.ticks)
@@ -98,7 +98,7 @@ def test_arms_that_yield_press_with_the_wanted_force_and_find_the_hole(name: str
 
 
 @pytest.mark.parametrize("mode", list(SHOWN))
-def test_arms_that_hands_lead_into_each_other_refuse_without_a_touch(mode: CommandMode) -> None:
+def test_arms_whose_hands_ask_for_one_place_stop_before_they_touch(mode: CommandMode) -> None:
     played = Played("clash", mode)
     assert played.results["clash"].reason == ""
     led = [[tick.targets[arm].pose for arm in ("left", "right")] for tick in played.ticks]
@@ -129,7 +129,7 @@ def test_arms_that_touch_other_bodies_spoil_the_task_and_are_named(q: list[float
     assert set(touches.forbidden.values()) == {0.5}
 
 
-def test_tasks_come_in_an_order_in_which_they_can_follow_each_other() -> None:
+def test_tasks_are_put_in_an_order_in_which_they_can_be_done_one_after_the_other() -> None:
     assert [task.name for task in tasks_named(["stack", "meet", "stack"])] == ["meet", "stack"]
     assert tasks_named(["all"]) == tuple(TASKS.values())
     with pytest.raises(

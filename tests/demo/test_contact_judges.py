@@ -1,4 +1,4 @@
-"""Judges of pressing and fitting, which get simulated measurements of parts."""
+"""Judges of wiping and of a peg in a hole, which get invented states of parts."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SETTLES = 0.3  # Time after which the mean of the force has settled [s].
 
 
 def wiped(strokes: Sequence[tuple[float, float]], touched: int = LEFT | TABLE) -> WipeJudge:
-    """Return a judge after strokes of a length [m] at 0.1 m/s, with a force [N]."""
+    """Return a wipe judge that has seen ``strokes``. Each has a length [m] and a force [N], and a speed of 0.1 m/s."""
     judge, y = WipeJudge("part"), 0.0
     for length, force in strokes:
         for step in range(round(SETTLES / DT) + round(length / 0.1 / DT)):

@@ -1,4 +1,4 @@
-"""Judges of assembly work, which get simulated measurements of parts."""
+"""Judges of assembly work, which get invented states of parts."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from q2r2_control.demo.part_judges import (
 DT = 0.1
 LEFT, RIGHT, TABLE = Toucher.LEFT_FINGER, Toucher.RIGHT_FINGER, Toucher.SURROUNDINGS
 
-# Time [s], y and z [m], and the bodies that touch the part.
+# Duration [s], y and z of the part [m], and the bodies that touch the part.
 Phase = tuple[float, float, float, int]
 
 

@@ -1,4 +1,4 @@
-"""Tasks of the demo are tried with several trembling hands."""
+"""Tasks of the demo are tried with scripted hands that tremble, in a different way for each seed."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ def test_every_seed_is_tried_and_failed_seeds_have_reasons() -> None:
 
 
 @pytest.mark.slow
-def test_shaky_hands_that_are_lost_for_a_second_move_arms_that_yield_through_a_task() -> None:
+def test_arms_that_yield_do_a_task_with_shaky_hands_that_are_lost_for_a_second() -> None:
     assert try_task(coarse(CommandMode.TORQUE), CommandMode.TORQUE, True, ("grasp", 0)) == ""
 
 
 @pytest.fixture
 def demo() -> Iterator[subprocess.Popen[str]]:
-    """Return a demo that tries a task twice."""
+    """Start a demo that tries a task twice."""
     if sys.platform != "linux":
         pytest.skip("looks into /proc")
     command = (sys.executable, "-m", "q2r2_control", "demo", "grasp", "--seeds", "2")
@@ -77,7 +77,7 @@ def test_ctrl_c_does_not_wait_for_trials(demo: subprocess.Popen[str]) -> None:
 
 
 @pytest.mark.slow
-def test_trials_end_with_a_demo_that_is_killed(demo: subprocess.Popen[str]) -> None:
+def test_trials_end_when_their_demo_is_killed(demo: subprocess.Popen[str]) -> None:
     wait_until(lambda: len(trials_of(demo)) == min(2, os.cpu_count() or 1))
     trials = trials_of(demo)
     demo.kill()
@@ -85,6 +85,6 @@ def test_trials_end_with_a_demo_that_is_killed(demo: subprocess.Popen[str]) -> N
 
 
 @pytest.mark.parametrize(("failed", "reliable"), [(0, True), (1, True), (2, False)])
-def test_nineteen_successes_of_twenty_are_reliable(failed: int, reliable: bool) -> None:
+def test_a_task_is_reliable_if_nineteen_of_twenty_trials_succeed(failed: int, reliable: bool) -> None:
     report = TrialReport("stack", 20, dict.fromkeys(range(failed), "fell"))
     assert report.is_reliable is reliable
