@@ -27,7 +27,7 @@ def _no_lines_of_progress(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def fri_cell(tmp_path: Path) -> str:
-    """The shipped cell on free ports."""
+    """Return the shipped cell with cabinets, on free ports."""
     text = Path("config/dual_iiwa7_fri.yaml").read_text(encoding="utf-8")
     for port in ("30200", "30201"):
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
@@ -39,7 +39,7 @@ def fri_cell(tmp_path: Path) -> str:
 
 @pytest.fixture
 def cabinets(fri_cell: str) -> Iterator[None]:
-    """Simulated cabinets of ``fri_cell``, in their own process."""
+    """Run the simulated cabinets of ``fri_cell`` in a separate process."""
     command = (sys.executable, "-m", "q2r2_control", "fri-cabinet", fri_cell)
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
     assert process.stderr is not None

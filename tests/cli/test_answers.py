@@ -19,7 +19,7 @@ def file(tmp_path: Path) -> Path:
 
 
 def offered(monkeypatch: pytest.MonkeyPatch, *typed: Any) -> list[Any]:
-    """Return the defaults that are offered from now on, while ``typed`` is answered. None accepts each default."""
+    """Answer the next questions by ``typed``, where None accepts the default. Return a list that gets the defaults."""
     seen: list[Any] = []
     left = list(typed)
 

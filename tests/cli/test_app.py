@@ -1,4 +1,4 @@
-"""The q2r2 command, as a user or a script meets it."""
+"""The q2r2 command, as a user or a script calls it."""
 
 from __future__ import annotations
 
@@ -173,7 +173,7 @@ def test_a_soak_prints_every_promise_and_exits_with_0_if_all_were_kept() -> None
     assert "acceleration / limit" in q2r2("soak", "--ticks", "100").stdout
 
 
-def test_a_soak_of_another_cell_names_it_and_checks_what_only_this_cell_promises(tmp_path: Path) -> None:
+def test_a_soak_of_another_cell_names_the_cell_and_checks_its_additional_promises(tmp_path: Path) -> None:
     cell = tmp_path / "cell.yaml"
     text = Path(CELL).read_text(encoding="utf-8").replace("jerk_limit: null", "jerk_limit: 5000.0")
     cell.write_text(text.replace("name: dual_iiwa7", "name: limited"), encoding="utf-8")

@@ -116,7 +116,7 @@ def test_without_a_cell_the_devices_of_this_computer_are_listed() -> None:
     assert result.stdout.startswith(("/dev/video", "no V4L2 camera on this computer\n"))
 
 
-def test_opencv_is_imported_by_nothing_that_uses_no_camera() -> None:
+def test_opencv_is_not_imported_before_a_camera_is_used() -> None:
     code = (
         "import sys, q2r2_control.cli.cell_run, q2r2_control.cli.cameras, q2r2_control.recording.writer;"
         "sys.exit('cv2' in sys.modules)"

@@ -33,7 +33,7 @@ class PlantWithWindow(RecordingPlant):
 
 
 @pytest.mark.slow
-def test_a_window_shows_moving_obstacles_and_its_end_is_the_end_of_the_run() -> None:
+def test_the_window_shows_moving_obstacles_and_closing_it_ends_the_run() -> None:
     config = cell()
     control = config.control.model_copy(update={"moving_obstacles": ("hand",)})
     plant = PlantWithWindow(looks=5)

@@ -122,7 +122,7 @@ def test_check_and_run_list_all_faults_of_a_file(tmp_path: Path) -> None:
     assert found["verdict"] == "this cell cannot run: 4 faults"
 
 
-def test_a_model_that_cannot_be_read_gets_a_verdict_too(tmp_path: Path) -> None:
+def test_check_prints_a_verdict_for_a_model_that_cannot_be_read_too(tmp_path: Path) -> None:
     result = q2r2("check", changed_cell(tmp_path, "model: iiwa7", "model: iiwa8"))
     assert (result.exit_code, result.stdout) == (2, "this cell cannot run: 1 fault\n")
     assert "iiwa8" in result.stderr
@@ -265,7 +265,7 @@ def test_a_stop_that_needs_too_much_torque_is_a_note_and_no_fault(tmp_path: Path
 
 def test_if_gravity_alone_needs_too_much_torque_the_note_does_not_advise_slower_stops(tmp_path: Path) -> None:
     urdf = find_resource("robots/iiwa7.urdf").read_text(encoding="utf-8")
-    assert urdf.count('velocity="2.268928" effort="110"') == 1  # The line is that of A4.
+    assert urdf.count('velocity="2.268928" effort="110"') == 1  # Only A4 has this line.
     (tmp_path / "arm.urdf").write_text(urdf.replace('velocity="2.268928" effort="110"', 'velocity="2.2" effort="12"'))
     (note,) = check_cell(one_arm(model=str(tmp_path / "arm.urdf"))).notes
     assert re.search(

@@ -1,4 +1,4 @@
-"""Commands on a cluster of two workers, of which one is killed in the middle, print and write what one process does."""
+"""Commands on a cluster do the same as in one process, even if one of its two workers is killed in the middle."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def cluster(tmp_path: Path) -> Iterator[DaskCluster]:
 
 @pytest.fixture(scope="module")
 def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with six recordings, and a file that is none."""
+    """Return a folder with six recordings, and a file that is not a recording."""
     folder = tmp_path_factory.mktemp("recordings")
     file = record_step(folder / "run").file
     first = file.rename(folder / "a0.mcap")
@@ -44,21 +44,21 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def judge_or_die(settings: JudgeSettings | None, file: Path) -> Sequence[Judgement | Unreadable]:
-    """The third recording ends its worker once."""
+    """Judge a recording. The third recording ends its worker once."""
     if file.stem == "a2":
         die_once(file.parent)
     return judgements_of(settings, file)
 
 
 def write_or_die(episode: EpisodeVectors, path: Path) -> None:
-    """The third episode ends its worker once, when a part of it is written."""
+    """Write an episode. The third episode ends its worker once, after a part of its file is written."""
     if episode.recording == "a2.mcap":
         path.write_text("a part")
         die_once(path.parents[2])
     write_table(episode, path)
 
 
-def test_judge_says_the_same_of_recordings_that_a_cluster_judges(
+def test_judge_on_a_cluster_prints_the_same_as_in_one_process(
     recordings: Path, cluster: DaskCluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     alone = q2r2("judge", str(recordings), "--json")
@@ -69,7 +69,7 @@ def test_judge_says_the_same_of_recordings_that_a_cluster_judges(
     assert len(json.loads(alone.stdout)["episodes"]) == 7
 
 
-def test_export_writes_the_same_files_by_a_cluster(
+def test_export_on_a_cluster_writes_the_same_files_as_in_one_process(
     recordings: Path, cluster: DaskCluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
@@ -85,7 +85,7 @@ def test_export_writes_the_same_files_by_a_cluster(
     assert [path.name for path in tmp_path.iterdir() if path.name.endswith(".partial")] == []
 
 
-def test_soaks_and_trials_of_a_cluster_are_those_of_this_computer(
+def test_soaks_and_trials_on_a_cluster_give_the_same_results_as_on_this_computer(
     cluster: DaskCluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("q2r2_control.cli.run.load_config", lambda name: coarse())
@@ -98,7 +98,7 @@ def test_soaks_and_trials_of_a_cluster_are_those_of_this_computer(
 
 
 def report_of(*command: str) -> Any:
-    """The JSON of a command without the growth of memory, which is measured."""
+    """Return the JSON of a command without the growth of memory, which is measured and differs from run to run."""
     report = json.loads(q2r2(*command, "--json").stdout)
     if isinstance(report, dict):
         del report["memory_growth_mb"]

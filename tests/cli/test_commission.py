@@ -32,7 +32,7 @@ from tests.plants.fri.conftest import free_ports
 from tests.plants.fri.waiting_cabinets import waiting_cabinets
 
 MODULE = "q2r2_control.cli.commission"
-GUIDED = ["", "y", "", "y"]  # Answers after both arms were guided and the joints were right.
+GUIDED = ["", "y", "", "y"]  # Answers of an operator who guides both arms and sees the right joints move.
 TO_THE_END = [*GUIDED, "keep", "", "", "Ada"]
 GOOD = CabinetReport(
     "left", 2, 10.0, 100, 0, 0.1, 0.1, "monitoring ready", "excellent", "normal", "t1", "off", [0.0] * 7, 0.0
@@ -43,7 +43,7 @@ GOOD = CabinetReport(
 def cell(tmp_path: Path) -> Path:
     """Return a cell with real cabinets that do not answer.
 
-    It has few ticks per second, because ticks take most of the time.
+    It has few ticks per second, because ticks take most of the time of a test.
     """
     text = find_resource("config/dual_iiwa7_fri.yaml").read_text(encoding="utf-8").replace("127.0.0.2", "192.0.2.1")
     text = text.replace("loop_rate_hz: 500.0", "loop_rate_hz: 250.0")
@@ -84,7 +84,7 @@ def commission(cell: Path, answers: list[str], *options: str) -> tuple[int, list
 
 
 def refused(cell: Path, answers: list[str]) -> str:
-    """Return the only line about a commissioning that fails and leaves no sign-off."""
+    """Return the only line about the failure of a commissioning, which must leave no sign-off."""
     code, lines, _ = commission(cell, answers)
     assert code == 1
     assert lines[-1].startswith("q2r2: ")
@@ -124,7 +124,7 @@ def test_a_cell_that_passes_all_steps_is_signed_off_and_may_run(
 
 
 @pytest.mark.slow
-def test_a_commissioning_goes_through_all_steps_by_sockets_and_processes(
+def test_a_commissioning_over_real_sockets_and_processes_goes_through_all_steps(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     text = find_resource("config/dual_iiwa7_fri.yaml").read_text(encoding="utf-8")
@@ -154,7 +154,7 @@ def test_a_commissioning_goes_through_all_steps_by_sockets_and_processes(
         assert stop["tool_speed_mm_s"] > 10.0
 
 
-def test_a_user_who_knows_runs_a_cell_without_a_sign_off(cell: Path) -> None:
+def test_with_i_know_a_cell_runs_without_a_sign_off(cell: Path) -> None:
     done = q2r2("run", str(cell), "--input", "scripted", "--trajectory", "nowhere", "--i-know")
     assert "nowhere" in done.stderr
 
@@ -175,7 +175,7 @@ def test_simulated_cabinets_need_no_sign_off() -> None:
     ],
     ids=["poor connection", "lost messages", "safety stop"],
 )
-def test_the_operator_may_repeat_the_step_of_a_cabinet_that_is_not_heard_well(
+def test_the_operator_may_repeat_the_step_cabinets_after_a_poor_connection_or_a_safety_stop(
     cell: Path, virtual: Callable[..., None], report: CabinetReport, told: str
 ) -> None:
     virtual(report=report)
@@ -191,7 +191,7 @@ def test_joints_that_an_operator_does_not_recognise_end_the_commissioning(
     assert "the right arm's joints are not those that moved" in refused(cell, ["", "y", "", "n"])
 
 
-def test_an_arm_that_was_not_moved_needs_another_answer(cell: Path, virtual: Callable[..., None]) -> None:
+def test_an_arm_that_was_not_guided_needs_the_answer_confirm(cell: Path, virtual: Callable[..., None]) -> None:
     virtual(guided=0.0)
     code, lines, _ = commission(cell, ["", "y", "confirm", "", "again", "", "n"])
     assert code == 1

@@ -19,7 +19,7 @@ from q2r2_control.types import Array, CommandMode
 from tests.cli.command import q2r2
 from tests.demo.test_assembly_tasks import coarse
 
-RATE = 30.0  # Of the actions [Hz].
+RATE = 30.0  # Rate of the actions [Hz].
 POLICY = f"""
 import numpy as np
 
@@ -42,7 +42,7 @@ class Resting(Replayed):
 
 
 def rows_of_scripted_hands(task: str) -> Array:
-    """Joints of the reference and openings, at the rate of the actions."""
+    """Return joint positions of the reference and openings (n, size), at the rate of the actions."""
     config = coarse()
     robot, rows = Robot.from_config(config), list[Array]()
     pipeline = Pipeline(config, robot, ScriptedInput(task), MujocoPlant(robot, config), CommandMode.POSITION)
@@ -57,7 +57,7 @@ def rows_of_scripted_hands(task: str) -> Array:
 
 
 @pytest.mark.slow
-def test_a_policy_that_does_as_scripted_hands_did_grasps_and_one_that_rests_does_not(
+def test_a_policy_that_repeats_scripted_hands_grasps_and_a_policy_that_rests_does_not(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "replayed_policy.py").write_text(POLICY)
@@ -71,7 +71,7 @@ def test_a_policy_that_does_as_scripted_hands_did_grasps_and_one_that_rests_does
     assert rests.stdout.startswith("grasp: 0 of 1; seed 0: flat_block: held")
 
 
-def test_a_policy_that_cannot_be_loaded_is_one_line_before_any_trial() -> None:
+def test_a_policy_that_cannot_be_loaded_is_refused_in_one_line_before_any_trial() -> None:
     result = q2r2("evaluate", "nowhere:Policy", "grasp")
     assert result.exit_code == 2
     assert result.stderr.startswith("q2r2: MODULE:NAME nowhere:Policy: No module named 'nowhere'; ")

@@ -23,7 +23,7 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> Sequence[Path]:
 
 
 @pytest.mark.slow
-def test_a_folder_of_recordings_is_a_folder_of_tables_with_or_without_the_time_before_the_first_engagement(
+def test_a_folder_of_recordings_becomes_tables_and_trim_leaves_out_the_time_before_the_engagement(
     recordings: Sequence[Path], tmp_path: Path
 ) -> None:
     lengths = []

@@ -71,7 +71,7 @@ def test_enter_at_the_terminal_stops_all_overlays_and_starts_them_again(fri_cell
     os.close(theirs)
 
 
-def test_overlays_that_the_pendant_stopped_start_only_at_its_next_key() -> None:
+def test_overlays_that_the_pendant_stopped_start_only_after_its_next_key_press() -> None:
     ones = (1.0,) * 7
     settings = CabinetSettings(ones, ones, ones, ones, ones)
     cabinets = {arm: Cabinet(settings, StillArm((0.0,) * 7)) for arm in ("left", "right")}

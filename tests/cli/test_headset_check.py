@@ -28,7 +28,7 @@ def process(*arguments: str) -> Iterator[subprocess.Popen[str]]:
 
 
 def bound_port(running: subprocess.Popen[str]) -> int:
-    """Return the text of the documented line on stderr."""
+    """Return the port that the documented line on stderr names."""
     assert running.stderr is not None
     for line in running.stderr:
         if line.startswith("headset: listening on "):

@@ -1,4 +1,4 @@
-"""``q2r2 mounts``, with which an operator measures the place of the right arm's base."""
+"""``q2r2 mounts``, with which an operator measures the pose of the right arm's base."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def test_the_printed_mount_puts_the_right_tip_where_the_left_tip_was() -> None:
 
 
 def test_written_postures_give_the_mount_of_arms_without_cabinets(tmp_path: Path) -> None:
-    """The right arm's base differs from its cell, and the arm touches the same points with a tip beyond its tool."""
+    """The right base is not where the cell has it. Both arms touch the same points with tips beyond their tools."""
     tip, off = np.array([0.0, 0.0, 0.02]), np.array([0.012, -0.03, 0.004])
     robot = Robot.from_config(load_config("config/dual_ur5.yaml"))
     data = robot.model.createData()
@@ -79,7 +79,7 @@ def test_postures_that_determine_no_mount_are_refused(tmp_path: Path, text: str,
     assert done.stderr.count("\n") == 1
 
 
-def test_a_missing_file_of_postures_is_one_line_without_numbers_of_the_system() -> None:
+def test_a_missing_file_of_postures_gives_one_line_without_the_number_of_the_error() -> None:
     done = q2r2("mounts", "config/dual_ur5.yaml", "--postures", "nope.txt")
     assert done.stderr.startswith("q2r2: --postures nope.txt: No such file or directory; allowed: a file with lines of")
 

@@ -1,4 +1,4 @@
-"""q2r2 new-cell: cells for models that no shipped one names, and what it says of models that are no arms."""
+"""q2r2 new-cell writes cells for models that no shipped cell has, and refuses models that are not arms."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_a_model_that_makes_no_cell_gets_one_line_and_no_file(text: str, argumen
     assert not Path("cell.yaml").exists()
 
 
-def test_a_file_that_is_there_is_kept() -> None:
+def test_an_existing_file_is_not_overwritten() -> None:
     Path("cell.yaml").write_text("mine")
     told = "cell.yaml: exists; allowed: another name; q2r2 check cell.yaml is enough if only the model has changed"
     assert told in q2r2("new-cell", "cell", "--left", "iiwa7", "--yes").stderr
@@ -62,7 +62,7 @@ def test_a_file_that_is_there_is_kept() -> None:
 
 
 @pytest.mark.slow
-def test_links_without_masses_are_left_to_do() -> None:
+def test_links_without_masses_are_reported_as_left_to_do() -> None:
     Path("arm.urdf").write_text(re.sub(r"<inertial>.*?</inertial>", "", IIWA, flags=re.DOTALL))
     result = q2r2("new-cell", "cell", "--left", "arm.urdf", "--yes", "--samples", "100")
     assert result.exit_code == 1
@@ -85,7 +85,7 @@ def test_links_that_are_drawn_and_have_no_shape_are_watched_by_capsules_around_t
 
 
 @pytest.mark.slow
-def test_answers_are_those_of_the_user(tmp_path: Path) -> None:
+def test_the_answers_of_the_user_are_written_into_the_cell(tmp_path: Path) -> None:
     typed = "0.9\n0.1\n0 0.4 0 -1.6 0 1.1 0\n\n"
     models = ("--left", "iiwa7", "--right", "iiwa7")
     result = q2r2("new-cell", "cell", *models, "--samples", "100", typed=typed)
@@ -96,7 +96,7 @@ def test_answers_are_those_of_the_user(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_try_that_was_interrupted_leaves_its_answers_to_the_next_one() -> None:
+def test_the_answers_of_an_interrupted_try_are_offered_in_the_next_try() -> None:
     command = ("new-cell", "cell", "--left", "iiwa7", "--right", "iiwa7", "--samples", "100")
     interrupted = q2r2(*command, typed="0.9\n0.1\n")  # the terminal ends at the third question
     assert interrupted.exit_code != 0
@@ -175,7 +175,7 @@ def test_both_arms_of_one_model_are_found_with_their_fingers(tmp_path: Path) -> 
 
 
 @pytest.mark.slow
-def test_links_of_several_shapes_are_left_out_only_where_all_of_these_overlap(tmp_path: Path) -> None:
+def test_two_links_are_not_monitored_only_if_all_pairs_of_their_shapes_overlap(tmp_path: Path) -> None:
     ball = '<collision><origin xyz="0 0 0.2"/><geometry><sphere radius="0.17"/></geometry></collision></link>'
     head, tail = re.split(r"</link>\s*(?=<joint name=\"A2\")", IIWA)
     Path("arm.urdf").write_text(f"{head}{ball}{tail}")
@@ -186,7 +186,7 @@ def test_links_of_several_shapes_are_left_out_only_where_all_of_these_overlap(tm
 
 
 @pytest.mark.slow
-def test_meshes_that_one_capsule_holds_badly_get_several_and_the_tools_follow(tmp_path: Path) -> None:
+def test_meshes_that_one_capsule_fits_badly_get_several_capsules_and_the_tools_follow(tmp_path: Path) -> None:
     model = "example-robot-data:ur5"
     made = one_object(
         q2r2("new-cell", "cell", "--left", model, "--right", model, "--yes", "--samples", "100", "--json").stdout

@@ -66,7 +66,7 @@ def test_no_figure_is_cut_however_narrow_the_console_is() -> None:
     assert text.count("-2.967") == 2
 
 
-def test_another_program_gets_cells_that_no_line_break_divides() -> None:
+def test_cells_of_a_table_have_no_line_break_if_another_program_reads_them() -> None:
     pair = "left_hand_e_base | right_hand_e_base"
     table = figure_table("pairs", ("pair", "why", "other pair"), [(pair, "keep", pair)])
     assert pair not in printed(table, 50)

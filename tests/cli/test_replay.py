@@ -27,7 +27,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return Path(recording["file"]).parent
 
 
-def test_an_equal_replay_prints_identical_and_exits_with_0(recorded: Path) -> None:
+def test_a_replay_without_a_difference_prints_identical_and_exits_with_0(recorded: Path) -> None:
     for file in (recorded, *recorded.glob("*.mcap")):
         result = q2r2("replay", str(file), "--compare")
         assert (result.exit_code, result.stdout, result.stderr) == (0, "identical\n", "")

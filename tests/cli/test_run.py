@@ -186,7 +186,7 @@ def about_of(folder: Path) -> About:
 
 
 @pytest.mark.slow
-def test_a_demo_lays_the_parts_of_its_task_where_the_seed_has_them(tmp_path: Path) -> None:
+def test_the_seed_of_a_demo_displaces_only_the_parts_of_its_task(tmp_path: Path) -> None:
     shipped, places = load_config(CELL).mujoco.objects, []
     for seed in ("3", "4"):
         options = ("--spread", "0.03", "--seed", seed, "--fast", "--headless", "--duration", "0.05")
@@ -218,7 +218,7 @@ def test_an_anonymous_recording_names_neither_the_operator_nor_the_computer(tmp_
 
 
 @pytest.mark.slow
-def test_an_episode_of_the_demo_has_pictures_that_an_export_makes_videos_of(tmp_path: Path) -> None:
+def test_the_pictures_of_a_demo_become_videos_in_an_export(tmp_path: Path) -> None:
     needs_opengl()
     pytest.importorskip("av", reason="the extra export is not installed")
     options = ("--fast", "--json", "--headless", "--duration", "0.5", "--record", str(tmp_path / "recordings"))
