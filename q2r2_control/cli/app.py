@@ -18,7 +18,7 @@ from typer.core import TyperGroup
 from q2r2_control.cli.commands import COMMANDS, CommandOnDemand
 from q2r2_control.errors import Q2R2Error
 
-# Depending on its version, typer raises click's exceptions or its own copy of them. This is the base class of them.
+# Depending on its version, typer raises click's exceptions or its own copy of them. This is the base class of both.
 _BadUsage: type[Exception] = typer.BadParameter.__mro__[2]
 
 _PARTS = "q2r2_control."  # Beginning of the names of modules, some of which an installation may leave out.

@@ -90,7 +90,7 @@ def check_cell(config: Config) -> CellCheck:
     load_class(PLANTS, config.plant)
     robot = Robot.from_config(config)
     # The settings are checked with their pairs that may touch, so that each name and number is checked. The kept
-    # distances below are those of position mode, in which no pair may touch.
+    # distances below are those of position mode, in which these pairs must not touch.
     check_settings(robot, config.control)
     settings = config.control.without_contact()
     kept = kept_distances(robot, settings)

@@ -390,7 +390,7 @@ def _run(
 def _lookers(
     pipeline: Pipeline, page: PageView | None, names: Sequence[str]
 ) -> Iterator[tuple[str, float, Callable[[bytes], object], Callable[[], bool]]]:
-    """Yield a viewer of a camera: camera, most pictures per second, function to show one, and whether somebody looks.
+    """Yield, for each view: camera, most pictures per second, function that shows one, and whether somebody looks.
 
     ``names`` are the names of all cameras with pictures. A headset shows only the first camera.
     """

@@ -208,7 +208,7 @@ def wait_for_states(child: subprocess.Popen[str], lines: int, count: int) -> Non
 
     ``lines`` is the descriptor of the file into which it prints. Raises :class:`PlantError` if the process ends before.
     """
-    said = ""  # The file is read at position 0, because a normal read would move the position of the process.
+    said = ""  # The file is read at position 0: a normal read would move the position at which the process writes.
     while said.count(in_words(Session.MONITORING_WAIT)) < count:
         if child.poll() is not None:
             raise PlantError(f"the cabinets that stand in have ended: {said.strip() or 'without a word'}")

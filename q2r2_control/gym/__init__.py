@@ -48,5 +48,5 @@ def make_env(
     EnvHub passes; it is not used.
     """
     made = [partial(gymnasium.make, f"{__name__}:q2r2/{task.capitalize()}-v0", space=space, **options)] * n_envs
-    # The processes are spawned, since a forked process would share the graphics of this one.
+    # The processes are spawned, because a forked process would share the graphics context of this process.
     return AsyncVectorEnv(made, context="spawn") if use_async_envs else SyncVectorEnv(made)

@@ -175,7 +175,7 @@ def test_both_arms_of_one_model_are_found_with_their_fingers(tmp_path: Path) -> 
 
 
 @pytest.mark.slow
-def test_two_links_are_not_monitored_only_if_all_pairs_of_their_shapes_overlap(tmp_path: Path) -> None:
+def test_two_links_are_ignored_only_if_all_pairs_of_their_shapes_overlap(tmp_path: Path) -> None:
     ball = '<collision><origin xyz="0 0 0.2"/><geometry><sphere radius="0.17"/></geometry></collision></link>'
     head, tail = re.split(r"</link>\s*(?=<joint name=\"A2\")", IIWA)
     Path("arm.urdf").write_text(f"{head}{ball}{tail}")

@@ -83,7 +83,7 @@ def above_table(tips: float) -> pin.SE3:
 
 
 class RealHands:
-    """The real shapes of both hands. Each finger is where the joints of the URDF put it, and sweeps no space."""
+    """The shapes of both hands where the URDF puts them at an opening, and not the space that they sweep."""
 
     def __init__(self, robot: Robot) -> None:
         self._robot, self._model = robot, pin.buildModelFromXML(robot.urdf)
