@@ -47,13 +47,20 @@ def domain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def precedence() -> None:
+def precedence() -> Iterator[None]:
     """Give this process and its children priority over all others, if that is permitted."""
     # No process of a test has priority over another one, as on a machine without other load.
     with suppress(OSError):
         os.setpriority(os.PRIO_PROCESS, 0, _NICE)
+    # On Linux, nice levels count only within a session, and the session of a terminal goes on after the tests.
+    of_session, before = Path("/proc/self/autogroup"), ""
     with suppress(OSError):
-        Path("/proc/self/autogroup").write_text(str(_NICE))  # On Linux, nice levels count only within a session.
+        before = of_session.read_text().split()[-1]
+        of_session.write_text(str(_NICE))
+    yield
+    if before:
+        with suppress(OSError):
+            of_session.write_text(before)
 
 
 @pytest.fixture(scope="session", autouse=True)
