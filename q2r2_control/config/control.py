@@ -72,7 +72,7 @@ _LONGEST_SOLVE = 0.005  # Default of solve_time_limit in real time [s].
 
 
 class ControllerSettings(StrictModel):
-    """Settings of :class:`CartesianController`; every range is checked when the object is made."""
+    """Settings of :class:`CartesianController`; every range is checked when an instance is created."""
 
     solver: str = Field(
         "daqp",
@@ -211,8 +211,8 @@ class ControllerSettings(StrictModel):
     def timed(self, realtime: bool) -> ControllerSettings:
         """Return the settings with a ``solve_time_limit`` in real time, and without one in simulated time.
 
-        A repeatable run must not depend on the speed of the computer, on which it depends whether a solution is late.
-        In real time, the arms must not wait for a solver that blocks.
+        Whether a solution is late depends on the speed of the computer, and a repeatable run must not depend on it. In
+        real time, the arms must not wait for a solver that blocks.
         """
         limit = (self.solve_time_limit or _LONGEST_SOLVE) if realtime else None
         return self.model_copy(update={"solve_time_limit": limit})

@@ -136,7 +136,7 @@ def subtask_name(names: Sequence[str], number: int) -> str:
 
 
 def subtask_names(names: Sequence[str], presses: int) -> tuple[str, ...]:
-    """Return the names of the subtasks that an episode has begun, or nothing if nobody told of subtasks.
+    """Return the names of the subtasks that an episode has begun, or nothing if the episode has no subtasks.
 
     ``names`` are those of ``recording.subtasks``, and ``presses`` is how often the operator began another subtask.
     """
