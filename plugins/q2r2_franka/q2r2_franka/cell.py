@@ -3,9 +3,9 @@
 **The loop's time and the robots' time.** The time of the reference passes with the states of the robots, so that each
 robot gets a command for the next millisecond with every state, whatever the clocks are. Each tick of the loop moves the
 reference so far ahead that no robot passes its end before the next tick has come, unless this tick is later than usual.
-If the loop is so late that a robot would pass the end of the
-reference, the robots get the certified stop. :meth:`FrankaCell.due` then lets the reference follow the same stop first.
-If a robot passes the end in the middle of a tick, the sessions refuse the command of this tick, and it is withdrawn.
+If the loop is so late that a robot would pass the end of the reference, the robots get the certified stop.
+:meth:`FrankaCell.due` then lets the reference follow the same stop first. If a robot passes the end in the middle of a
+tick, the sessions refuse the command of this tick, and it is withdrawn.
 """
 
 from __future__ import annotations
