@@ -106,7 +106,7 @@ class SessionPlant(Protocol):
         """
 
     def withdraws(self) -> bool:
-        """Return whether the newest command came too late, so that the arms follow the stop of the command before it."""
+        """Return whether the newest command came too late. The arms then follow the stop of the command before it."""
 
     def delay(self) -> float:
         """Return the time from when a command is due until the arms are measured there [s]."""
@@ -115,7 +115,10 @@ class SessionPlant(Protocol):
         """Return the timing of each arm that follows the reference on its own; empty if all arms move as one."""
 
     def lead(self) -> float:
-        """Return by how much the end of a tick's command is at most ahead of the posture that arms are sent [s]."""
+        """Return the longest time by which commands are ahead of the arms [s].
+
+        It is the time of the end of a tick's command, minus the time of the posture that the arms are sent.
+        """
 
     def fault(self) -> Reason | None:
         """Return why the arms cannot be commanded now, or could not since the last call; None if they can."""

@@ -17,8 +17,8 @@ import pinocchio as pin
 
 from q2r2_control.errors import RobotError
 
-# Greatest usual limits of a joint that counts its turns [rad], and of the speed of an arm's joint [rad/s]. Larger limits
-# are probably in degrees.
+# Greatest usual limits of the angle of a joint that counts its turns [rad], and of the speed of an arm's joint [rad/s].
+# Larger limits are probably in degrees.
 LARGEST_ANGLE = 6.0 * math.pi
 LARGEST_SPEED = 40.0
 _UNIT = re.compile(r"<unit\b[^>]*\bmeter\s*=\s*[\"']([0-9.eE+-]+)[\"']")
