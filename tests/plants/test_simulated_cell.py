@@ -19,7 +19,7 @@ def cell(robot: Robot, config: Config) -> SimulatedCell:
 
 
 def push(cell: SimulatedCell, now: float) -> None:
-    """Return a torque that bears the arms and turns one joint."""
+    """Command torques that bear the arms and turn one joint."""
     robot = cell.robot
     tau = pin.computeGeneralizedGravity(robot.model, robot.model.createData(), cell.plant.state().q)
     tau[5] += 5.0

@@ -10,7 +10,7 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_measured_arms_keep_their_distance_in_every_case_of_one_of_them(case: str) -> None:
+def test_measured_arms_keep_their_distance_in_every_incident_of_one_arm(case: str) -> None:
     found = Case(case, 0.5).run()
     assert found.speed > 0.35
     assert found.margin >= 0.0

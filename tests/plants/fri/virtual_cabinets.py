@@ -46,8 +46,8 @@ class VirtualCabinets:
     ) -> None:
         """Make cabinets for a loop with this ``period`` and ``longest`` step [s].
 
-        The clocks of the cabinets ``drift`` apart, and messages are up to ``jitter`` [s] late.
-        Without ``arms`` they are where they are commanded to be, and torques do not move them.
+        The clocks of the cabinets ``drift`` apart by this share, and messages are up to ``jitter`` [s] late. Without
+        ``arms``, each arm is always at its commanded position, and torques do not move it.
         """
         self._robot, self._period, self._longest, self._random = robot, period, longest, np.random.default_rng(seed)
         self._jitter, self._loss = jitter, loss
