@@ -45,9 +45,9 @@ def shown(model: type[BaseModel], data: dict[str, Any], place: str = "") -> Iter
 
 
 class TestTheShippedCellShowsAllThereIsToTune:
-    # The value is not the default, and a comment in the file says so.
+    # Keys whose value is not the default, which a comment in the file says.
     CHOSEN = ("control.solve_time_limit", "control.distances", "mujoco.objects")
-    # A placement, such as an arm's mount, shows its keys.
+    # Blocks whose keys another block of the same kind shows, such as an arm's mount.
     SHOWN_ELSEWHERE = ("arms.left.tool.mount", "obstacles.table.rpy", "robot.mount.rpy", "external")
 
     @pytest.mark.parametrize("text", [external_text(), robot_text()], ids=["arms of their own", "one robot"])
