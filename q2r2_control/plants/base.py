@@ -121,7 +121,7 @@ class SessionPlant(Protocol):
         """
 
     def fault(self) -> Reason | None:
-        """Return why the arms cannot be commanded now, or could not since the last call; None if they can."""
+        """Return why the arms cannot be commanded, or could not at some time since the last call; otherwise None."""
 
     def sessions(self) -> dict[str, str]:
         """Return the state of each arm's session in words."""
@@ -219,7 +219,7 @@ def check_duration(dt: float) -> None:
 
 
 class GripperMotion:
-    """Simulated openings of grippers, which move to the commanded ones at the configured speed."""
+    """Simulated openings of grippers, which move to the commanded openings at the configured speed."""
 
     def __init__(self, config: Config) -> None:
         self._rate: dict[str, float] = {

@@ -88,7 +88,7 @@ def _add_lights(spec: mujoco.MjSpec) -> None:
 # Priorities of contacts. The shape with the larger priority decides: first gripper pads, then obstacles.
 PAD_PRIORITY, _OBSTACLE_PRIORITY = 1, 2
 
-# Torsion [m] and rolling [m] of a contact of about a square centimetre.
+# Torsional and rolling friction [m] of a contact of about one square centimetre.
 TORSION, ROLLING = 0.02, 0.001
 
 # Time constant of contacts in the normal direction [s], which is MuJoCo's default, and the damping ratio. With the

@@ -202,7 +202,8 @@ class AnswerTimes:
         if self._begin is None:
             self._begin = counter, _Answer(wanted - self._period, 1.0)
         first, standing = self._begin
-        # The time goes on from the answer that the cabinet has heard, because it has not followed any later one.
+        # The time goes on from the answer that the cabinet has heard, because the cabinet has not followed any later
+        # answer.
         before = standing if heard < first or newest is None else self._heard(heard)
         lag = (wanted - before.time) / self._period - 1.0  # The lag as a number of answers.
         ramp = CATCH_UP_RAMP * self._period

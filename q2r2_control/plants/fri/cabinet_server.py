@@ -33,7 +33,7 @@ from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Command, CommandMode
 
-# After a stall of this process up to this time, all messages are sent late [s]. The rest of a longer stall counts as a
+# If this process stalls for up to this time, it sends all messages late [s]. The rest of a longer stall counts as a
 # silence of the cabinets.
 _LONGEST_STALL = 1.0
 _LONGEST_CATCH_UP = 0.05  # Longest time that the simulation catches up at once [s]. More is dropped.
@@ -95,7 +95,7 @@ class SimulatedArm:
     def wanted(self, t: float) -> tuple[Array, Array]:
         """Return the wanted position of the drives at ``t`` [s], and their velocity."""
         share, way = (t - self._began) / self._lasts, np.subtract(self._to, self._from)
-        if share > 1.0 + _ROUNDING:  # At a share of 1, which every message in time finds, the drives still move.
+        if share > 1.0 + _ROUNDING:  # A message in time finds a share of 1, at which the drives still move.
             return np.array(self._to), np.zeros(JOINTS)
         return np.add(self._from, max(share, 0.0) * way), way / self._lasts
 

@@ -135,7 +135,10 @@ class FriCell:
         return sent
 
     def fault(self) -> Reason | None:
-        """Return why the arms cannot be commanded at the newest tick, or could not since the last call; else None."""
+        """Return why the arms cannot be commanded at the newest tick.
+
+        The result is also a reason if they could not be commanded at some time since the last call; otherwise None.
+        """
         told, self._told = self._told, self._ends()
         for arm, state in self.states.items():
             dropped = self._told[arm] > told[arm]
@@ -165,7 +168,7 @@ class FriCell:
         return self._longest_tick + self._margin - _MARGIN
 
     def withdraws(self) -> bool:
-        """Return whether the newest command came too late for an answer, so that the arms follow the stop before it."""
+        """Return whether the newest command came too late. The arms then follow the stop of the command before it."""
         return self._withdraws
 
     def delay(self) -> float:

@@ -33,7 +33,7 @@ _MOST_AHEAD = 20  # Number of messages that may come at once after a gap.
 # Times after which a torque that is not updated is replaced [s]. A torque that nobody updates would push for ever. It
 # is replaced by a torque that brakes, and later by no answer, so that the cabinet ends the session.
 _TORQUE_LASTS, _TORQUE_GONE = 0.02, 0.1
-# A lower limit of the torques' rate is raised to this value, because the damping would come too late [Nm/s].
+# A lower limit of the torques' rate is raised to this value [Nm/s]. With the lower limit, damping would come too late.
 _BRAKING_RATE = 5000.0
 # Greatest distance between a reference at its beginning and the arm [rad]: the position in which the arm is held, or,
 # with torques, its measured position.

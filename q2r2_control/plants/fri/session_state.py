@@ -37,8 +37,9 @@ class SessionState:
     ended: int = 0  # Number of times that the arm ceased to follow because its cabinet ended the session.
     answered: float = -math.inf  # The latest time for which there was an answer.
     expected: float = -math.inf  # The time at which the message of that answer would have come without delay.
-    lag: float = 0.0  # Time by which the newest answer is for a time that is too early, by the arrival of its question.
-    behind: float = 0.0  # The same, by the expected time of the question, so that delays of the network do not count.
+    lag: float = 0.0  # By how much the time of the newest answer is too early, judged by the arrival of its question.
+    # The same, judged by the expected time of the question, so that delays of the network do not count.
+    behind: float = 0.0
     took: float | None = None  # Time from the newest message until its answer was sent; None if it got no answer.
     lost: int = 0  # Number of lost messages of the cabinet.
     unreadable: int = 0  # Number of unreadable messages.

@@ -150,7 +150,7 @@ class FriCommand:
 
 
 def read_monitoring(datagram: bytes) -> Monitoring:
-    """Return a cabinet's message; raises :class:`ProtocolError` if the bytes are not one."""
+    """Return a cabinet's message; raises :class:`ProtocolError` if the bytes are no such message."""
     version, message = _parsed(datagram, MonitoringMessage, _MONITORING)
     data, connection, ipo, robot = message.data, message.connection, message.ipo, message.robot
     if (q := _joints(data, "q")) is None:
