@@ -46,7 +46,7 @@ _SCALARS = {
 
 @dataclass(frozen=True, slots=True)
 class Description:
-    """One robot model: its URDF tree with absolute paths of meshes, its SRDF tree if it has one, and its origin."""
+    """One robot model: its URDF tree with absolute paths of meshes, its SRDF tree if it has one, and its file."""
 
     urdf: ET.Element
     srdf: ET.Element | None
@@ -119,7 +119,8 @@ def parse_urdf(
     """Parse a URDF, check that it is one tree with unique names and finite numbers, and make mesh paths absolute.
 
     Continuous joints become revolute joints with :data:`CONTINUOUS_RANGE` in each direction, because the controller's
-    guarantees need a bound. If other joints mimic a joint, its limits are narrowed so that they keep their own limits.
+    guarantees need a bound. If other joints mimic a joint, its limits are narrowed so that these joints keep their own
+    limits.
 
     Args:
         text: The URDF.

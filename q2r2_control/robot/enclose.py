@@ -248,7 +248,7 @@ def _around_cylinder(radius: float, half_length: float, box_allowed: bool) -> co
 
 
 def capsule_between(radius: float, start: Array, end: Array) -> tuple[coal.CollisionGeometry, pin.SE3]:
-    """Return Coal's capsule from ``start`` to ``end``, and its placement. Its own frame has z along its axis."""
+    """Return Coal's capsule from ``start`` to ``end``, and the pose of its middle, whose z is along the capsule."""
     length = float(np.linalg.norm(end - start))
     along = (end - start) / length if length > 0 else np.array([0.0, 0.0, 1.0])
     rotation = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), along).matrix()

@@ -49,7 +49,10 @@ class FingerBody:
 
 
 def part_of_segment(start: Array, end: Array, part: tuple[float, float]) -> tuple[Array, Array]:
-    """Return both ends (3,) of a part of the segment from ``start`` to ``end`` (3,). For (0, 1) they are exact."""
+    """Return both ends (3,) of a part of the segment from ``start`` to ``end`` (3,).
+
+    For (0, 1) these are exactly ``start`` and ``end``.
+    """
     along = end - start
     return start + part[0] * along, end - (1.0 - part[1]) * along
 

@@ -71,7 +71,8 @@ def remove_unreachable_floor_pairs(model: pin.Model, geometry: pin.GeometryModel
     """Remove each pair of the floor and a body that provably cannot come near to it.
 
     There are two kinds of such bodies. Some turn about vertical axes only, as the first link of an arm does, and keep
-    their height. Others are carried by a joint that can tip them, but do not reach from it to within :data:`CLEARANCE`.
+    their height. Others are carried by a joint that can tip them, but do not reach from it to within :data:`CLEARANCE`
+    of the floor.
     """
     data = model.createData()
     pin.computeJointJacobians(model, data, pin.neutral(model))
@@ -101,7 +102,7 @@ def _top(floor: pin.GeometryObject) -> float:
 def _lowest(model: pin.Model, data: pin.Data, item: pin.GeometryObject) -> float | None:
     """Return the least height of any point of a capsule or sphere [m]; None if no joint changes its height.
 
-    Joints that turn about vertical axes or slide along level ones do not change heights. The origin of the first other
+    Joints that turn about vertical axes or slide along level axes do not change heights. The origin of the first other
     joint therefore keeps its height, and the bodies that this joint carries lie in a ball around it. ``data`` has the
     frames and Jacobians at the neutral posture.
     """

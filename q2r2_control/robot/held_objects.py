@@ -130,7 +130,7 @@ class _Pairs:
 
 
 def _watched(geometry: pin.GeometryModel, roles: Mapping[str, Role], held: HeldObject) -> list[str]:
-    """Return the bodies with which the object's link has pairs, without hands that hold or may take the object."""
+    """Return the bodies with which the object has pairs: no hand that holds it, and no fingers that may take it."""
     items = geometry.geometryObjects
     # All obstacles count, also those that the hand itself cannot reach, because an object reaches farther.
     found = dict.fromkeys(item.name for item in items if roles[link_of(item.name)].part is LinkClass.OBSTACLE)

@@ -52,7 +52,7 @@ def find_home(
         q: The positions of all other joints (nv,) [rad].
         kept: The distance that each pair keeps (pairs,) [m].
         placed: Arms whose home is known. Pairs with other arms do not count.
-            like: Positions of an equal arm (n,) [rad]. They are returned if they meet all requirements.
+        like: Positions of an equal arm (n,) [rad]. They are returned if they meet all requirements.
     """
     search = _HomeSearch(robot, arm, q, kept, placed)
     if like is not None and search.cost(like) < _FAULTY:

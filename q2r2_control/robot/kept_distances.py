@@ -90,7 +90,7 @@ def _of_all_pairs(robot: Robot, settings: ControllerSettings) -> tuple[KeptDista
     speed = np.full(len(names), np.inf)
     count = len(robot.collision_model.collisionPairs)
     last = count + len(robot.objects.holders)
-    for i, contact in enumerate(settings.contact_allowed):  # The classes of objects allow contact anyway.
+    for i, contact in enumerate(settings.contact_allowed):  # Distances of held objects may be negative anyway.
         for p in _found(f"contact_allowed[{i}]", contact.pair, names[:count]):
             values[p], keys[p], speed[p] = -contact.depth, f"contact_allowed[{i}]", contact.speed
     values += average_allowance(robot, settings, geometry)

@@ -117,8 +117,8 @@ def hand_links(tree: LinkTree, finger_joints: Iterable[str]) -> set[str]:
 # Links that always stay farther apart than this distance need no watching. It is more than twice the distance that is
 # usually kept [m].
 CLEARANCE = 0.05
-# Links and shapes whose names end in this way stand for a whole tool at every opening. Their distances are watched, and
-# they take part in no contact.
+# Links and shapes whose names end in this way stand for a whole tool at every opening. Their distances are watched, but
+# they have no contacts in the simulation.
 ENVELOPE = "_envelope"
 
 

@@ -27,10 +27,8 @@ def joint_origin(joint: ET.Element) -> pin.SE3:
 def lock_joints(robot: ET.Element, movable: Collection[str], positions: Mapping[str, float]) -> None:
     """Fix in place every joint of the URDF ``robot`` except the ``movable`` ones.
 
-    All programs that read this URDF then have the same fixed joints.
-
-    A joint with one axis is fixed at its value in ``positions`` [rad or m], or at 0 if it has none. A planar or
-    floating joint is fixed at its origin.
+    All programs that read this URDF then have the same fixed joints. A joint with one axis is fixed at its value in
+    ``positions`` [rad or m], or at 0 if it has none. A planar or floating joint is fixed at its origin.
     """
     for joint in robot.findall("joint"):
         name, kind = joint.get("name", ""), joint.get("type")

@@ -81,7 +81,7 @@ def moving_links(robot: Robot) -> list[MovingLink]:
 
 
 def unchecked_faults(robot: Robot, in_cell: bool = True) -> list[str]:
-    """Return one line for each link or arm that is kept apart from nothing, unless ``unchecked_links`` names it.
+    """Return one line for each link or arm that keeps no distance to others, unless ``unchecked_links`` names it.
 
     With ``in_cell`` the lines name keys of the cell's YAML as remedies, and without it arguments of
     :meth:`Robot.from_urdf`.

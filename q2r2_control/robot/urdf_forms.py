@@ -1,4 +1,4 @@
-"""Handle parts of a URDF that different readers understand in different ways.
+"""Handle parts of a URDF that different programs understand in different ways.
 
 Each part is brought to one form, refused, or reported. Readers of URDF silently skip elements that they do not know. In
 their models, a hand, a mass or half of a joint's range could be missing.
