@@ -99,7 +99,10 @@ class FrankaCell:
         return sent
 
     def fault(self) -> Reason | None:
-        """Return why the arms cannot be commanded at the newest tick, or could not since the last call; else None."""
+        """Return why the arms cannot be commanded at the newest tick.
+
+        The result is also a reason if they could not be commanded at some time since the last call; otherwise None.
+        """
         told, self._told = self._told, self._ends()
         for arm, state in self.states.items():
             fault = state.fault(self._now)
@@ -123,7 +126,7 @@ class FrankaCell:
             self._end, self._margin = self._start, min(2.0 * self._margin, _LONGEST_MARGIN)
 
     def withdraws(self) -> bool:
-        """Return whether the newest command came too late for an arm, so that the arms follow the stop before it."""
+        """Return whether the newest command came too late. The arms then follow the stop of the command before it."""
         return self._withdraws
 
     def delay(self) -> float:

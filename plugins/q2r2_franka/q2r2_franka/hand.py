@@ -102,7 +102,7 @@ def _move(loop: socket.socket, gripper: Any, settings: HandSettings) -> bool:
 
 
 def _newest(loop: socket.socket, before: float, wait: float) -> tuple[float, bool]:
-    """Return the newest commanded opening within ``wait`` [s], and whether the loop is still there."""
+    """Return the newest commanded opening within ``wait`` [s], and True if the loop has not ended."""
     loop.settimeout(wait)
     try:
         while said := loop.recv(_LARGEST):

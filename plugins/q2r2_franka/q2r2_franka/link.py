@@ -1,4 +1,4 @@
-"""The connection to one robot by pylibfranka. Only this module and the hand's call this library.
+"""The connection to one robot by pylibfranka. Only this module and hand.py call this library.
 
 pylibfranka keeps Python's global lock while it waits for a state. Two threads with an arm each would make each other
 late. The process therefore waits for the sockets of all robots at once by ``select``, and reads a state only when it
@@ -22,7 +22,7 @@ from q2r2_franka.state import Measured, Mode
 
 ERRORS = (RuntimeError, pylibfranka.FrankaException)
 _FILES = "/proc/self/fd"
-# The robot's own controller of joint positions. Desk's settings may let it filter the commands. Its stiffness is kept.
+# The robot's own controller of joint positions. Desk's settings may let it filter the commands. Its stiffness stays.
 _CONTROLLER = pylibfranka.ControllerMode.JointImpedance
 # Objects of lost connections. They may not be destroyed, because that would end the process.
 _kept: list[Any] = []

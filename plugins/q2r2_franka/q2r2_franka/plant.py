@@ -17,7 +17,7 @@ from q2r2_franka.settings import franka_settings
 from q2r2_franka.state import SessionState
 from q2r2_franka.stream import MEANS
 
-_LOOKS = 0.01  # Time between two looks at the robots during a wait [s].
+_LOOKS = 0.01  # Time between two checks of the robots during a wait [s].
 
 
 class FrankaPlant:
