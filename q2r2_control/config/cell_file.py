@@ -68,8 +68,8 @@ def parse_config(
         return f"{path}: " if number is None else f"{path}, line {number}: "
 
     try:
-        # The check is strict, because `off` would otherwise count as 0.0. The data pass through JSON, so that sequences
-        # may become tuples, and names enums, in spite of the strict check.
+        # The check is strict, because `off` would otherwise count as 0.0. The data pass through JSON, so that lists
+        # may become tuples, and names may become enums, in spite of the strict check.
         content = json.dumps(data, default=str)
         config = Config.__pydantic_validator__.validate_json(content, strict=True, context={"folder": folder})
         return _within_driver_limits(config)
@@ -108,7 +108,7 @@ def _within_driver_limits(config: Config) -> Config:
 
 
 def _line_number(text: str, location: Sequence[int | str]) -> int | None:
-    """Return the line of a key in a YAML, or of the deepest block around it that is written there; None if none is."""
+    """Return the line of a key in a YAML, or of the deepest block around the key that the YAML has; None if it has none."""
     node, line = yaml.compose(text, Loader=_Loader), None
     for part in location:
         if isinstance(node, yaml.MappingNode):

@@ -25,7 +25,7 @@ class Hold(StrEnum):
     SILENCE = "silence"  # No messages. The controller then holds the arm by itself, and stops for an old target.
 
 
-# For controllers without limits of their own.
+# Limits of targets for controllers that have no limits.
 _CAREFUL = GuardSettings()
 # The built-in controller keeps its own limits, which are narrower. These limits only prevent jumps of a target.
 _WIDE = GuardSettings(

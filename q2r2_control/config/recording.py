@@ -154,7 +154,7 @@ REALSENSE = "realsense:"  # The beginning of the device of a RealSense camera, b
 
 
 class CameraConfig(StrictModel):
-    """A camera of the simulated cell, one whose pictures come on a ROS topic, or a device that this computer opens.
+    """A camera of the simulated cell, a real camera on a ROS topic, or a device that this computer opens.
 
     The simulated camera is fixed in the world or on a link. In its own frame, x is the direction of view, and z points
     up in the picture.
