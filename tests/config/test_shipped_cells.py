@@ -68,7 +68,7 @@ class TestTheShippedCellShowsAllThereIsToTune:
     @pytest.mark.parametrize(
         "place", ["headset", "control", "impedance", "admittance", "supervision", "teleop", "mujoco", "judge"]
     )
-    def test_what_is_written_is_the_default(self, place: str) -> None:
+    def test_the_written_values_are_the_defaults(self, place: str) -> None:
         written = getattr(load_config(CELL), place)
         default = type(written)()
         for key in type(written).model_fields:

@@ -46,7 +46,9 @@ def test_fingers_are_locked_open(dual_iiwa7: Robot) -> None:
 
 
 @pytest.mark.parametrize(("side", "sign"), [("left", 1), ("right", -1)])
-def test_at_home_the_tools_point_straight_down_mirrored_and_clear(dual_iiwa: Robot, side: str, sign: int) -> None:
+def test_at_home_the_tools_point_down_mirrored_and_far_from_other_bodies(
+    dual_iiwa: Robot, side: str, sign: int
+) -> None:
     pose = dual_iiwa.tool_pose(dual_iiwa.home, side)
     np.testing.assert_allclose(pose.translation, [0.5, 0.25 * sign, 0.38], atol=2e-4)
     np.testing.assert_allclose(pose.rotation, np.diag([-1.0, 1.0, -1.0]), atol=2e-4)

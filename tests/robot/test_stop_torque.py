@@ -37,7 +37,7 @@ def test_the_torque_is_the_largest_over_all_signs_of_the_decelerations(robot: Ro
     assert (stop.gravity.ratio, stop.gravity.posture) == (pytest.approx(at_rest.max()), stop.stop.posture)
 
 
-def test_the_share_and_the_bearable_deceleration_agree(robot: Robot) -> None:
+def test_share_over_is_zero_exactly_for_bearable_decelerations(robot: Robot) -> None:
     (stop,) = stop_torques(robot, FAST, postures=1000)
     assert 0.05 < stop.stop.share_over < 0.15
     assert 0.0 < stop.bearable < 1.0

@@ -96,7 +96,7 @@ def test_a_process_that_cannot_begin_gives_the_reason() -> None:
         CabinetAnswers([Line(BrokenOnTheWay("left", "cabinet"), "127.0.0.1", ours.fileno())])
 
 
-def test_the_loop_gets_the_state_after_each_message_and_an_answer_uses_the_command_before_it(
+def test_the_loop_gets_the_state_after_each_message_and_an_answer_uses_the_last_command(
     between: Between,
 ) -> None:
     between.ask()

@@ -117,7 +117,7 @@ def test_a_cabinet_without_the_grippers_output_is_named_once_and_gets_no_write(
         pytest.param({"drift": -200e-6, "jitter": 0.0005, "loss": 0.005}, id="loss"),
     ],
 )
-def test_a_bad_network_trips_no_guard(config: Config, network: dict[str, Any]) -> None:
+def test_a_network_with_drift_jitter_and_loss_ends_no_session(config: Config, network: dict[str, Any]) -> None:
     pipeline = make_loop(config, (0.005, 0.002), **network)
     plant = started(pipeline)
     summary = pipeline.run(2.5, realtime=False)
@@ -344,7 +344,7 @@ def test_sessions_end_in_every_way_without_a_jump_and_begin_again(config: Config
     assert soak.faults == []
 
 
-def test_the_first_command_of_a_session_is_where_the_cabinet_holds_its_arm(config: Config) -> None:
+def test_the_first_command_of_a_session_is_the_posture_in_which_the_cabinet_holds_its_arm(config: Config) -> None:
     pipeline = make_loop(config)
     plant = started(pipeline)
     assert pipeline.run(0.6, realtime=False).at_rest

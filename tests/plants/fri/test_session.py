@@ -63,7 +63,7 @@ def test_only_outputs_that_the_cabinet_has_are_written_in_its_own_type(message: 
     assert isinstance(answer.io["open"], bool)
 
 
-def test_every_multiplier_th_message_is_answered() -> None:
+def test_only_each_third_message_is_answered_with_a_multiplier_of_three() -> None:
     cabinet = Cabinet()
     answers = [cabinet.ask(replace(MONITORING, multiplier=3)) for _ in range(6)]
     assert [answer is None for answer in answers] == [True, True, False, True, True, False]
