@@ -108,7 +108,7 @@ def _within_driver_limits(config: Config) -> Config:
 
 
 def _line_number(text: str, location: Sequence[int | str]) -> int | None:
-    """Return the line of a key in a YAML, or of the deepest block around the key that the YAML has; None if it has none."""
+    """Return the line of a key in a YAML, or of the deepest block around it that the YAML has; None if it has none."""
     node, line = yaml.compose(text, Loader=_Loader), None
     for part in location:
         if isinstance(node, yaml.MappingNode):

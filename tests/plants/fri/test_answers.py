@@ -1,4 +1,4 @@
-"""Answers to cabinets whose clocks drift, through networks that jitter, repeat and lose, in virtual time."""
+"""Answers to cabinets whose clocks drift, through networks that delay and lose messages, in virtual time."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ from tests.plants.fri.virtual_cabinets import VirtualCabinets
 
 @pytest.fixture(scope="session")
 def config(config: Config) -> Config:
-    """Return the cell at the rate of the shipped cell of cabinets."""
+    """Return the cell at the rate of the shipped cell with cabinets."""
     return config.model_copy(update={"loop_rate_hz": 500.0})
 
 

@@ -27,7 +27,7 @@ def waiting_cabinets(
 ) -> Iterator[dict[str, Cabinet]]:
     """Run a cabinet for each arm in a thread.
 
-    Each sends every ``period`` [s], and starts its overlay whenever it may.
+    Each cabinet sends every ``period`` [s], and starts its overlay whenever it may.
     """
     made, done = {}, threading.Event()
     for arm in SIDES:
