@@ -32,7 +32,7 @@ def models_in(annotation: object) -> Iterator[type[BaseModel]]:
 
 
 def shown(model: type[BaseModel], data: dict[str, Any], place: str = "") -> Iterator[tuple[str, type[BaseModel], Any]]:
-    """Return every block of a file with its path of keys and its model. Of blocks by name, only the first is returned."""
+    """Return every block of a file with its keys and its model. Of blocks by name, only the first is returned."""
     yield place, model, data
     for key, field in model.model_fields.items():
         value, path = data.get(key), f"{place}.{key}".lstrip(".")
