@@ -32,7 +32,7 @@ def _beside_the_file(value: str, info: ValidationInfo) -> str:
     path = f"robots/{value}.urdf" if info.field_name == "model" and not Path(value).suffix else value
     try:
         return str(folder / path) if folder is not None and value and (folder / path).exists() else value
-    except (OSError, ValueError):  # No file can have this name. The reader of the file says so.
+    except (OSError, ValueError):  # No file can have this name. The code that reads the file says so.
         return value
 
 

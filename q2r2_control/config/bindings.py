@@ -43,7 +43,7 @@ LASTING = frozenset(
 
 
 class Gesture(StrEnum):
-    """The use of a control. ``DOWN`` is the beginning of a press, which only stops an arm that this control pauses."""
+    """How a control is used. ``DOWN`` is the beginning of a press. It only stops an arm that this control pauses."""
 
     DOWN = "down"
     TAP = "tap"

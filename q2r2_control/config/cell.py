@@ -53,7 +53,7 @@ _LoopRate = Annotated[
 
 
 class ObstacleConfig(StrictModel):
-    """A fixed body of the cell. Cylinders and capsules stand along z; a capsule's length is its segment's."""
+    """A fixed body of the cell. Cylinders and capsules stand along z; a capsule's length is that of its segment."""
 
     shape: Literal["box", "cylinder", "sphere", "capsule"]
     size: tuple[Extent, ...] = Field(

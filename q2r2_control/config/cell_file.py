@@ -68,8 +68,8 @@ def parse_config(
         return f"{path}: " if number is None else f"{path}, line {number}: "
 
     try:
-        # The check is strict, because `off` would otherwise count as 0.0. The data pass through JSON, so that sequences
-        # may become tuples, and names enums, in spite of the strict check.
+        # The check is strict, because `off` would otherwise count as 0.0. The data pass through JSON, so that lists
+        # may become tuples, and names may become enums, in spite of the strict check.
         content = json.dumps(data, default=str)
         config = Config.__pydantic_validator__.validate_json(content, strict=True, context={"folder": folder})
         return _within_driver_limits(config)
@@ -83,12 +83,12 @@ def parse_config(
 
 # A KUKA driver's joint limits are one degree inside the model's, and its soft limits 5 degrees inside these [rad].
 # Beyond the limits, lbr_fri_ros2_stack closes the connection, and a cabinet ends its session. The driver's safe_stop
-# does so one step at a joint's greatest speed before the limits. This step is 1.8 degrees at most if commands are due
-# every 10 ms, which the 5 degrees include.
+# closes it already if one more step at a joint's greatest speed would leave the limits. This step is 1.8 degrees at
+# most if commands are due every 10 ms. The 5 degrees include it.
 _DRIVER_MARGIN = 0.105
-# Commands come unevenly. One more command than usual in a period of the driver speeds up its filter of time constant T.
-# The share is the time between commands / T, which is an eighth for 5 ms and 40 ms. A command that was late by d adds
-# (d / T)^2 / 2. A joint beyond its velocity limit closes the connection as well.
+# Commands come unevenly. If a period of the driver gets one command more than usual, its filter with the time constant
+# T becomes faster by the share h / T, where h is the time between commands. This is an eighth for 5 ms and 40 ms. A
+# command that was late by d adds (d / T)^2 / 2. A joint beyond its velocity limit closes the connection as well.
 _DRIVER_SPEED = 0.85
 # If answers catch up with a cabinet's clock, the cabinet sees 1.05 times the reference's speeds (plants.fri.answers).
 _CABINET_SPEED = 0.95
@@ -108,7 +108,7 @@ def _within_driver_limits(config: Config) -> Config:
 
 
 def _line_number(text: str, location: Sequence[int | str]) -> int | None:
-    """Return the line of a key in a YAML, or of the deepest block around it that is written there; None if none is."""
+    """Return the line of a key in a YAML, or of the deepest block around it that the YAML has; None if it has none."""
     node, line = yaml.compose(text, Loader=_Loader), None
     for part in location:
         if isinstance(node, yaml.MappingNode):

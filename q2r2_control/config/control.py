@@ -28,8 +28,8 @@ class DistanceSettings(StrictModel):
 
     A finger is moved by a gripper's joints, and carried by a tool (the hand). An obstacle stands in the cell, and the
     floor counts as an obstacle. An object is the body that ``gripper.object`` describes, while it is held. ``arm_self``
-    is for all bodies of one arm among themselves and with the rest of its robot. They include the arm's own object. The
-    other classes without obstacles are for pairs of different arms.
+    is for all bodies of one arm among themselves and with the rest of its robot. The bodies of an arm include the
+    object that it holds. The other classes without obstacles are for pairs of different arms.
     """
 
     arm_arm: Distance | None = Field(None, description="links of two arms, bases included [m]")
@@ -60,7 +60,8 @@ class NamedPairDistance(StrictModel):
 class ContactPair(StrictModel):
     """Bodies that may touch in torque mode, by their names. In the other modes they keep their distance.
 
-    The reference may get inside by ``depth``, so that the impedance presses with at most its stiffness times that.
+    The reference may penetrate a body by ``depth``. The impedance then presses with at most its stiffness times this
+    depth.
     """
 
     pair: tuple[LinkPattern, LinkPattern] = Field(description="as in control.pairs")
@@ -72,7 +73,7 @@ _LONGEST_SOLVE = 0.005  # Default of solve_time_limit in real time [s].
 
 
 class ControllerSettings(StrictModel):
-    """Settings of :class:`CartesianController`; every range is checked when the object is made."""
+    """Settings of :class:`CartesianController`; every range is checked when an instance is created."""
 
     solver: str = Field(
         "daqp",
@@ -211,8 +212,8 @@ class ControllerSettings(StrictModel):
     def timed(self, realtime: bool) -> ControllerSettings:
         """Return the settings with a ``solve_time_limit`` in real time, and without one in simulated time.
 
-        A repeatable run must not depend on the speed of the computer, on which it depends whether a solution is late.
-        In real time, the arms must not wait for a solver that blocks.
+        Whether a solution is late depends on the speed of the computer, and a repeatable run must not depend on it. In
+        real time, the arms must not wait for a solver that blocks.
         """
         limit = (self.solve_time_limit or _LONGEST_SOLVE) if realtime else None
         return self.model_copy(update={"solve_time_limit": limit})
@@ -245,7 +246,7 @@ def check_priority(priority: str, arms: Collection[str]) -> None:
 
 
 class WallSettings(StrictModel):
-    """The wall between measured links; its depth is the distance that each pair keeps."""
+    """The force that pushes measured links apart if they are nearer than the distance that their pair keeps."""
 
     stiffness: float = Field(10000.0, gt=0, le=100000, description="force per depth below a pair's distance [N/m]")
     damping_ratio: float = Field(1.0, ge=0.2, le=2, description="damping ratio at the effective mass of each pair")

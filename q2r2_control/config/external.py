@@ -42,7 +42,7 @@ class ControllerKind(StrEnum):
 
 
 class GripperType(StrEnum):
-    """The drive of a gripper."""
+    """The ROS interface that moves a gripper."""
 
     GRIPPER_COMMAND = "GripperCommand"
     PARALLEL_GRIPPER_COMMAND = "ParallelGripperCommand"

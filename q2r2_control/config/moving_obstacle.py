@@ -12,7 +12,7 @@ from q2r2_control.errors import ConfigError, check_kind, shown
 
 
 class MovingObstacle(ObstacleConfig):
-    """The shape and pose of an obstacle in the world, and the greatest speed of any of its points from then on."""
+    """The shape and pose of an obstacle in the world, and the greatest speed of any of its points after this pose."""
 
     shape: Literal["box", "sphere", "capsule"]
     speed: float = Field(ge=0, le=10, description="largest speed of any of its points; 0: the obstacle stays [m/s]")

@@ -25,7 +25,7 @@ class Hold(StrEnum):
     SILENCE = "silence"  # No messages. The controller then holds the arm by itself, and stops for an old target.
 
 
-# For controllers without limits of their own.
+# Limits of targets for controllers that have no limits.
 _CAREFUL = GuardSettings()
 # The built-in controller keeps its own limits, which are narrower. These limits only prevent jumps of a target.
 _WIDE = GuardSettings(
@@ -85,7 +85,8 @@ _ALL = (
         hold=Hold.SILENCE,
         command_type="{ctrl}/switch_command_type",
     ),
-    # Both get zero velocity while the arm is paused. The tool may drift from the target, whose velocity alone is sent.
+    # The next two presets send the target's velocity and not its pose, so that the tool may drift from the target.
+    # While the arm is paused, they send zero velocity.
     Preset("twist", "it stops the arm by itself when no velocity comes", topic="{ctrl}/teleop_twist", message=TWIST),
     Preset(
         "moveit_servo_twist",

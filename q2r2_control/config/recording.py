@@ -136,7 +136,7 @@ def subtask_name(names: Sequence[str], number: int) -> str:
 
 
 def subtask_names(names: Sequence[str], presses: int) -> tuple[str, ...]:
-    """Return the names of the subtasks that an episode has begun, or nothing if nobody told of subtasks.
+    """Return the names of the subtasks that an episode has begun, or nothing if the episode has no subtasks.
 
     ``names`` are those of ``recording.subtasks``, and ``presses`` is how often the operator began another subtask.
     """
@@ -154,7 +154,7 @@ REALSENSE = "realsense:"  # The beginning of the device of a RealSense camera, b
 
 
 class CameraConfig(StrictModel):
-    """A camera of the simulated cell, one whose pictures come on a ROS topic, or a device that this computer opens.
+    """A camera of the simulated cell, a real camera on a ROS topic, or a device that this computer opens.
 
     The simulated camera is fixed in the world or on a link. In its own frame, x is the direction of view, and z points
     up in the picture.

@@ -15,7 +15,7 @@ from q2r2_control.errors import ConfigError, shown
 Model = TypeVar("Model", bound=BaseModel)
 
 
-# What is allowed instead of a value, by pydantic's type of the fault. The names in braces are its numbers.
+# What is allowed instead of a value, by pydantic's type of the fault. Braces enclose values that pydantic adds to it.
 _ALLOWED = {
     "list_type": "a list such as [a, b]",
     "tuple_type": "a list such as [a, b]",
@@ -95,7 +95,8 @@ def config_error(
 ) -> ConfigError:
     """Return an error with all faults in a ``model``. Its message has the first fault and the number of others.
 
-    Each line begins with ``place`` of its key, whose parts are given from the outermost one.
+    Each line begins with what ``place`` returns for the fault's key. ``place`` takes the parts of the key, the
+    outermost part first.
     """
     # If a key is misspelt, the right key is missing too. The misspelt key comes first, because it explains the fault.
     found = sorted(error.errors(), key=lambda fault: fault["type"] != "extra_forbidden")

@@ -44,7 +44,7 @@ class Stance(StrEnum):
     MIRROR_REFLECTED = "mirror_reflected"  # The hands are swapped, and the motion is reflected left to right.
 
     def hand_of(self, arm: str) -> str:
-        """Return the hand that leads an arm."""
+        """Return the hand that moves an arm."""
         return arm if self is Stance.SIDE_BY_SIDE else SIDES[1 - SIDES.index(arm)]
 
 
@@ -133,7 +133,7 @@ class WorkspaceSettings(StrictModel):
 
 
 class TeleopSettings(StrictModel):
-    """Settings of the teleop layer; every range is checked when the object is made."""
+    """Settings of the teleop layer; every range is checked when an instance is created."""
 
     stance: Stance = Field(Stance.SIDE_BY_SIDE, description="side_by_side, mirror or mirror_reflected")
     position_scale: float = Field(1.0, gt=0, le=10, description="tool metres per hand metre")

@@ -14,7 +14,7 @@ except ImportError:  # PyYAML was built without libyaml.
 
 
 def read_yaml(text: str) -> Any:
-    """Return the data of a text, as ``yaml.safe_load`` does; raises :class:`yaml.YAMLError` for another text."""
+    """Return the data of a text, as ``yaml.safe_load`` does; raises :class:`yaml.YAMLError` if it is not YAML."""
     return yaml.load(text, Loader=SafeLoader)
 
 

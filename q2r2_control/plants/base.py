@@ -17,7 +17,7 @@ from q2r2_control.plugins import PLANTS, load_class
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import ArmTiming, Array, Command, CommandMode, RobotState, is_number
 
-# Longest time of one call [s]. A loop that is farther behind must not catch up at once.
+# Longest time of one call of ``advance`` [s]. A loop that is farther behind must not catch up at once.
 MAX_ADVANCE = 1.0
 
 
@@ -40,7 +40,7 @@ class Plant(Protocol):
     def apply(self, command: Command) -> None:
         """Take a command. Posture and velocity are due at the end of the next ``advance``; a torque acts at once.
 
-        If no newer command comes, later advances hold its posture at rest, or its torque.
+        If no newer command comes, later calls of ``advance`` hold its posture at rest, or its torque.
 
         Raises:
             PlantError: If the plant lacks the mode, or a number is not finite. The previous command then stays.
@@ -78,10 +78,10 @@ class PicturedPlant(Protocol):
     """The additional method of a plant that draws what the simulated cameras of its cell see."""
 
     def picture_of(self, camera: str) -> Callable[[], npt.NDArray[np.uint8]]:
-        """Return a function that draws what a camera saw at the last ``state``, at any time and in any thread.
+        """Return a function that draws what a camera saw when ``state`` was last called.
 
-        It returns a picture (height, width, 3), r g b, or raises :class:`PlantError`. ``camera`` is one of the cell's
-        ``simulated_cameras``.
+        The function may be called at any time and in any thread. It returns a picture (height, width, 3), r g b, or
+        raises :class:`PlantError`. ``camera`` is one of the cell's ``simulated_cameras``.
         """
 
 
@@ -101,11 +101,12 @@ class SessionPlant(Protocol):
     def due(self, now: float) -> tuple[float, float]:
         """Return two durations for the tick at ``now`` [s]: of the certified stop, and of the motion after it [s].
 
-        The plant has begun to follow the certified stop if a command was late. The next command is for the end of both.
+        If a command was late, the plant follows the certified stop already, for the first duration. The next command is
+        for the end of both durations.
         """
 
     def withdraws(self) -> bool:
-        """Return whether the newest command came too late, so that the arms follow the stop of the one before it."""
+        """Return whether the newest command came too late. The arms then follow the stop of the command before it."""
 
     def delay(self) -> float:
         """Return the time from when a command is due until the arms are measured there [s]."""
@@ -114,10 +115,13 @@ class SessionPlant(Protocol):
         """Return the timing of each arm that follows the reference on its own; empty if all arms move as one."""
 
     def lead(self) -> float:
-        """Return the longest time from the posture that arms are sent to, to the end of the tick's command [s]."""
+        """Return the longest time by which commands are ahead of the arms [s].
+
+        It is the time of the end of a tick's command, minus the time of the posture that the arms are sent.
+        """
 
     def fault(self) -> Reason | None:
-        """Return why the arms cannot be commanded now, or could not since the last call; None if they can."""
+        """Return why the arms cannot be commanded, or could not at some time since the last call; otherwise None."""
 
     def sessions(self) -> dict[str, str]:
         """Return the state of each arm's session in words."""
@@ -127,8 +131,9 @@ class SessionPlant(Protocol):
 class WaitingPlant(Protocol):
     """The additional attributes of a plant whose reset waits for a person, for ``--wait``."""
 
-    longest_wait: float  # Time to wait for the robot. A reset then raises :class:`PlantError` [s].
-    longest_session_wait: float  # Time to wait for all sessions. A run then begins without them [s].
+    # Longest time that a reset waits for the robot [s]. After this time it raises :class:`PlantError`.
+    longest_wait: float
+    longest_session_wait: float  # Longest time that a reset waits for all sessions [s]. A run then begins without them.
 
 
 def make_plant(plant: Plant | str, robot: Robot, config: Config) -> Plant:
@@ -193,7 +198,11 @@ def _check_shape(what: str, values: Array, robot: Robot) -> None:
 
 
 def check_state(state: RobotState, robot: Robot) -> RobotState:
-    """Return the first ``state`` of a plant, with any numbers; raises :class:`PlantError` for another object."""
+    """Return the first ``state`` of a plant. Its numbers need not be finite.
+
+    Raises:
+        PlantError: If ``state`` is not a RobotState with arrays of the robot's shape.
+    """
     check_kind("state() of the plant", state, RobotState, "a RobotState", PlantError)
     check_kind("stamp of the plant's state", state.stamp, (float, int, np.number), "a time [s]", PlantError)
     _check_shape("q of the plant's state", state.q, robot)
@@ -210,7 +219,7 @@ def check_duration(dt: float) -> None:
 
 
 class GripperMotion:
-    """Simulated openings of grippers, which move to the commanded ones at the configured speed."""
+    """Simulated openings of grippers, which move to the commanded openings at the configured speed."""
 
     def __init__(self, config: Config) -> None:
         self._rate: dict[str, float] = {

@@ -2,10 +2,10 @@
 
 Hand-E, 2F-85 and 2F-140 have the same registers (chapter 4 of their instruction manuals).
 
-**Safety.** Until an opening is measured, the fingers count as their whole way. After that, they count as the openings
-that were measured and commanded a moment ago. An activation opens and closes the fingers fully. It is therefore done
-only before the first opening of a run. If the measured opening, or the command at that time, is older than
-``MODBUS_DELAY``, the opening is no longer known. Supervision then grants no other opening.
+**Safety.** Until an opening is measured, the bodies of the fingers cover all their positions. After that, they cover
+the openings that were measured and commanded a moment ago. An activation opens and closes the fingers fully. It is
+therefore done only before the first opening of a run. If the measured opening, or the command at that time, is older
+than ``MODBUS_DELAY``, the opening is no longer known. Supervision then grants no other opening.
 """
 
 from __future__ import annotations
@@ -39,7 +39,8 @@ _FAULTS = {  # Faults with other numbers end by an activation, or by reading the
     0x0F: "automatic release completed",
 }
 _logger = logging.getLogger(__name__)
-logging.getLogger("pymodbus").addHandler(logging.NullHandler())  # It would print each try of a lost connection.
+# Without a handler, each attempt to connect again would be printed.
+logging.getLogger("pymodbus").addHandler(logging.NullHandler())
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +79,7 @@ class ModbusGripper:
         self._where = f"{config.modbus}, unit {config.unit}"
         self.status: GripperStatus | None = None  # None if the gripper does not answer.
         self._wanted: float | None = None
-        # The measured opening, and the time at which the command of that moment was chosen [s].
+        # The measured opening, and the time at which the command that was in force then was chosen [s].
         self._measured: tuple[float, float] | None = None
         self._used = False  # Whether the gripper was ready in this run.
         self._sent, self._told = b"", ""

@@ -20,7 +20,7 @@ from q2r2_control.plants.mujoco_model import build_model, settle_mimics
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Command, CommandMode, RobotState
 
-# Rounding of the sum of ticks, in physics steps. A step that is due up to this error is due.
+# Largest rounding error of the sum of ticks, in physics steps. A step that is due within this error is taken.
 _STEP_ROUNDING = 1e-6
 
 # In every posture the inertia of a joint is at least its armature: M >= diag(armature). If K dt^2 / armature <= 0.16
@@ -31,7 +31,7 @@ _MAX_STIFFNESS_STEP, _MAX_DAMPING_STEP = 0.16, 1.0
 
 @dataclass(frozen=True, slots=True)
 class _Fingers:
-    """The places of one gripper's joints in MuJoCo's arrays, and their positions when fully open and closed."""
+    """The indices of one gripper's joints in MuJoCo's arrays, and the joints' positions when fully open and closed."""
 
     positions: list[int]
     actuators: list[int]
@@ -47,7 +47,7 @@ class _Fingers:
 
 
 class MujocoPlant:
-    """The simulated cell. The mode of each command chooses one of three ways to drive it.
+    """The simulated cell. The mode of each command chooses how the arms are driven.
 
     In position mode each joint has a servo, tau = K (q_ref - q) + D (v_ref - v) + M a_ref + bias. M and the bias
     (gravity and Coriolis) come from the simulator, and tau is clipped at the torque limits. The reference moves
@@ -99,7 +99,7 @@ class MujocoPlant:
         return cls(robot, config)
 
     def reset(self, q: Array | None = None) -> None:
-        """See :meth:`Plant.reset`. Loose objects go back to their places, and pushes end."""
+        """See :meth:`Plant.reset`. Loose objects go back to their first poses, and pushes end."""
         posture = self._robot.home if q is None else q
         check_joints("reset q", posture, self._robot)
         mujoco.mj_resetData(self.model, self.data)
@@ -127,7 +127,7 @@ class MujocoPlant:
             self._torque = command.tau.copy()
         else:
             if self._torque is not None:
-                # After torque mode there is no last command at which the line could start.
+                # After torque mode there is no last commanded posture from which the reference could start.
                 self._end = self._at_rest(command.q if self._velocity is None else self._qpos[self._q_index])
                 self._next = self._torque = None
             if self._velocity is None:
@@ -180,7 +180,7 @@ class MujocoPlant:
         return {side: fingers.opening(self._qpos) for side, fingers in self._fingers.items()}
 
     def push(self, arm: str, wrench: Array, duration: float) -> None:
-        """Push the tool of ``arm`` from now on, in the place of an earlier push.
+        """Push the tool of ``arm`` from now on. An earlier push ends.
 
         Args:
             arm: The arm.
@@ -204,7 +204,7 @@ class MujocoPlant:
             self._window = open_window(self.model, self.data)
 
     def viewer_say(self, words: str) -> None:
-        """Write ``words`` into the window, if there is one, in the place of earlier words."""
+        """Write ``words`` into the window, if there is one. They replace earlier words."""
         if self._window is not None:
             self._window.set_texts((mujoco.mjtFontScale.mjFONTSCALE_150, mujoco.mjtGridPos.mjGRID_TOPLEFT, words, ""))
 

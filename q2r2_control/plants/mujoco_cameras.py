@@ -1,4 +1,4 @@
-"""The cell's cameras in MuJoCo: their places in the model, pictures without a window, and MuJoCo's window."""
+"""The cell's cameras in MuJoCo: their poses in the model, pictures without a window, and MuJoCo's window."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from q2r2_control.types import Array
 
 # A camera of MuJoCo looks along -z, with y up in the picture. Ours looks along x, with z up.
 _FROM_OURS = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-_STRAIGHT = 1e-9  # Least sine of the angle between the line of sight and the vertical.
+_STRAIGHT = 1e-9  # With a smaller sine of the angle to the vertical, the camera looks straight up or down.
 _LONGEST_CLOSE = 5.0  # Time to wait until a window is closed [s].
 _OPACITY = 0.6  # Opacity of moving obstacles.
 # Without a graphics card, MuJoCo's 8 samples per pixel and shadow map of 8192 take five times as long. Its round shapes
@@ -79,7 +79,7 @@ class CellPictures:
         sizes = {name: (camera.height, camera.width) for name, camera in cameras.items()}
         try:
             renderers = {size: mujoco.Renderer(model, *size) for size in set(sizes.values())}
-        # Without the library, PyOpenGL fails with an error about the first name that it looks up.
+        # Without OpenGL's library, PyOpenGL fails with an error about the first name that it looks up.
         except (ImportError, AttributeError, RuntimeError, mujoco.FatalError) as error:
             reason = " ".join(str(error).split())
             raise PlantError(
@@ -111,7 +111,8 @@ class ThreadPictures:
     def take(self, camera: str, qpos: Array) -> npt.NDArray[np.uint8]:
         """Return the picture (height, width, 3), r g b, of the cell at ``qpos``; raises :class:`PlantError`."""
         if not hasattr(self._own, "cell"):
-            # A copy, because settings of the drawing change, which the window of the plant has too.
+            # The model is copied, because CellPictures changes settings of the drawing that the plant's window uses
+            # too.
             self._own.cell = CellPictures(copy.copy(self._model), self._cameras)
         cell: CellPictures = self._own.cell
         cell.place(qpos)

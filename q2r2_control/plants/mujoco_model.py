@@ -88,7 +88,10 @@ def build_model(robot: Robot, config: Config) -> mujoco.MjModel:
 
 
 def _moving_without_mass(spec: mujoco.MjSpec) -> list[str]:
-    """Return all moving bodies to which neither they nor bodies fixed to them give a mass. MuJoCo would name one."""
+    """Return all moving bodies to which neither they nor bodies fixed to them give a mass.
+
+    MuJoCo's own error names one only.
+    """
 
     def mass(body: mujoco.MjsBody) -> float:
         fixed = (mass(child) for child in body.bodies if not child.joints)
@@ -144,10 +147,10 @@ def _set_solver(spec: mujoco.MjSpec, config: MujocoConfig) -> None:
 
 
 def _correct_inertias(spec: mujoco.MjSpec) -> None:
-    """Raise eigenvalues of inertias that no real body can have. Some files have them, for antennas of a milligram.
+    """Raise eigenvalues of inertias that no real body can have.
 
-    MuJoCo refuses such a file as a whole. Only terms that no joint feels are added. MuJoCo still refuses inertias that
-    are wrong by more.
+    Some files have such inertias for antennas of a milligram, and MuJoCo refuses these files as a whole. The added
+    terms are too small for a joint to feel. MuJoCo still refuses inertias that are wrong by more.
     """
     for body in spec.bodies:
         if not body.explicitinertial or np.isnan(body.fullinertia).any():
@@ -160,7 +163,7 @@ def _correct_inertias(spec: mujoco.MjSpec) -> None:
 
 
 def _set_shapes(spec: mujoco.MjSpec, robot: Robot) -> None:
-    """Sort shapes into groups, keep envelopes out of contact, and restore capsules. The URDF has them as cylinders."""
+    """Sort shapes into groups, keep envelopes out of contact, and restore capsules, which the URDF has as cylinders."""
     declared = ET.fromstring(robot.urdf).iterfind("link/collision_checking/capsule")
     capsules = {capsule.get("name", "") for capsule in declared}
     for body in spec.bodies:
@@ -264,6 +267,7 @@ def _add_objects(spec: mujoco.MjSpec, config: MujocoConfig) -> None:
                 condim=4,
                 friction=(thing.friction, TORSION, ROLLING),
             )
-            # Parts that slide into each other are hard. With MuJoCo's usual contacts, light ones sink in millimetres.
+            # Parts that slide into each other are hard. With MuJoCo's usual contacts, light parts would sink in by
+            # millimetres.
             if thing.friction < _PAD_FRICTION[0]:
                 geom.solref = _PAD_STIFFNESS

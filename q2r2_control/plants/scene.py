@@ -14,7 +14,7 @@ VISUAL_GROUP, COLLISION_GROUP, ENVELOPE_GROUP = 2, 3, 4
 def furnish(spec: mujoco.MjSpec, floor: bool) -> None:
     """Add sky and lights, make a plane of the cell's ``floor`` if it has one, and set the view of a window.
 
-    A cell without a floor gets a drawing of one at z = 0 that touches nothing, since its arms may reach below.
+    A cell without a floor gets a drawing of a floor at z = 0. Nothing touches it, since the arms may reach below.
     """
     spec.add_texture(
         name="sky",
@@ -58,7 +58,7 @@ def _add_floor(spec: mujoco.MjSpec, body: mujoco.MjsBody | None) -> None:
     if body is None:
         plane.contype, plane.conaffinity = 0, 0
         return
-    for box in body.geoms[:-1]:  # These boxes replace a plane in the URDF, which has none.
+    for box in body.geoms[:-1]:  # These boxes stand for the plane in the URDF, which has no planes.
         spec.delete(box)
 
 
@@ -85,10 +85,10 @@ def _add_lights(spec: mujoco.MjSpec) -> None:
     )
 
 
-# Priorities of contacts, in which the larger one decides: first gripper pads, then obstacles.
+# Priorities of contacts. The shape with the larger priority decides: first gripper pads, then obstacles.
 PAD_PRIORITY, _OBSTACLE_PRIORITY = 1, 2
 
-# Torsion [m] and rolling [m] of a contact of about a square centimetre.
+# Torsional and rolling friction [m] of a contact of about one square centimetre.
 TORSION, ROLLING = 0.02, 0.001
 
 # Time constant of contacts in the normal direction [s], which is MuJoCo's default, and the damping ratio. With the
@@ -124,13 +124,13 @@ def let_fingers_slide(spec: mujoco.MjSpec, config: Config) -> None:
                 pair.solref, pair.solreffriction = _STIFFNESS, _SLIDING
 
 
-# Contacts of soft objects. The numbers are the share of MuJoCo's answer for a rigid body, the time in which foam takes
-# its shape again [s], and the number of points on which a box stands.
+# Contacts of soft objects. The numbers are MuJoCo's impedance (``solimp``), the share of the force by which it would
+# stop a rigid body; the time in which foam takes its shape again [s]; and the number of points on which a box stands.
 _SHARE, _RECOVERY, _CORNERS = 0.9, 0.02, 4
 
 
 def let_objects_yield(spec: mujoco.MjSpec, config: Config) -> None:
-    """Set contacts of soft objects with obstacles in MuJoCo's terms, per mass and corner (solref)."""
+    """Set the contacts of soft objects with obstacles. MuJoCo's ``solref`` takes a stiffness per mass and corner."""
     for name, thing in config.mujoco.objects.items():
         if thing.stiffness is None:
             continue
@@ -143,7 +143,7 @@ def let_objects_yield(spec: mujoco.MjSpec, config: Config) -> None:
 
 
 def _add_pair(spec: mujoco.MjSpec, one: mujoco.MjsGeom, other: mujoco.MjsGeom, friction: float) -> mujoco.MjsPair:
-    for shape in (one, other):  # A pair needs names.
+    for shape in (one, other):  # A pair names its shapes.
         number = next(i for i, geom in enumerate(shape.parent.geoms) if geom == shape)
         shape.name = shape.name or f"{shape.parent.name}_shape_{number}"
     pair = spec.add_pair(geomname1=one.name, geomname2=other.name)

@@ -13,15 +13,15 @@ from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Command, CommandMode, RobotState
 
-# Bounds of the time for which a joint goes on at its velocity when the next command is late [s]. The time is three
-# intervals between commands, because a busy machine delivers them unevenly.
+# If the next command is late, a joint goes on at its velocity for this number of intervals between commands, because a
+# busy machine delivers them unevenly; and the bounds of this time [s].
 _COAST_INTERVALS, _SHORTEST_COAST, _LONGEST_COAST = 3.0, 0.01, 0.1
 # Share of the newest interval in its running mean.
 _INTERVAL_SHARE = 0.1
 
 
 class JointFollower:
-    """Computes the wanted place of each joint at any time, from the newest command that names it.
+    """Computes the wanted position of each joint at any time, from the newest command that names it.
 
     A command has a posture and a velocity at a time. Until the next command, the joint moves on at that velocity. If no
     command comes for too long, the joint brakes at its ``acceleration_limit`` (nv,) [rad/s^2], so that no velocity
@@ -42,7 +42,8 @@ class JointFollower:
     def command(self, joints: Array, q: Array, v: Array | None, due: float) -> None:
         """Take posture ``q`` and velocity ``v`` of the joints with the indices ``joints`` at time ``due`` [s].
 
-        Without ``v``, the velocity is the way from the last command to this one, divided by the mean time between two.
+        Without ``v``, the velocity is the change of position since the last command, divided by the mean time between
+        two commands.
         """
         interval = due - self._due[joints]
         known = (interval > 0.0) & (interval <= _LONGEST_COAST)
@@ -69,12 +70,12 @@ class JointFollower:
         )
         bounded = np.minimum(np.maximum(way, -reach), reach)
         self.q = self.q + bounded
-        # A joint far from its wanted place catches up at its limit. Its velocity is then that of this motion.
+        # A joint far from its wanted position catches up at its limit. Its velocity is then that of this motion.
         on_time = np.abs(way) <= reach
         self.v = np.where(fresh, np.where(on_time, self._command_v, bounded / dt), slower)
 
 
-# A loop that is farther behind drops the time, instead of catching up with a jump [s].
+# Longest time that a late loop catches up [s]. The rest is dropped, because it would be a jump.
 _LONGEST_CATCH_UP = 0.05
 # Time for which one torque acts [s]. A robot stops if its sender misses a few periods. The simulation waits instead.
 _LONGEST_TORQUE = 0.012
@@ -147,11 +148,11 @@ class SimulatedCell:
         return None
 
     def command_velocities(self, v: Array, now: float) -> str | None:
-        """Move all joints on at velocities ``v`` (nv,) [rad/s] that came at ``now`` [s], from their wanted places."""
+        """Move all joints on from their wanted positions at ``v`` (nv,) [rad/s], which came at ``now`` [s]."""
         if len(v) != len(self._columns):
             return f"{len(v)} velocities for {len(self._columns)} joints"
         q = self._follower.q if self._tau is None else self.plant.state().q
-        if self._time is not None:  # The wanted place moves on to ``now``, because the follower is at the last step.
+        if self._time is not None:  # The wanted position moves on to ``now``, because the follower is at the last step.
             q = q + v * min(max(now - self._time, 0.0), _LONGEST_CATCH_UP)
         return self.command_positions(self.robot.joint_names, q, v, now)
 
@@ -226,7 +227,7 @@ class SimulatedCell:
         return None
 
     def _find(self, names: tuple[str, ...]) -> tuple[list[int], Array] | str:
-        """Return the places of our joints in ``names`` and their indices in our arrays, or the fault of these names."""
+        """Return the indices of our joints in ``names``, and in our arrays; or the fault of these names."""
         if len(set(names)) != len(names):
             return "a joint is named twice"
         if not (ours := [place for place, name in enumerate(names) if name in self._columns]):

@@ -28,7 +28,7 @@ _TOOL_FRAMES = [
     re.compile(pattern, re.IGNORECASE)
     for pattern in (r"tcp", r"tool", r"(^|_)eef?(_|$)|end_?effector|endpoint", r"grasp|gripper_?frame", r"flange")
 ]
-_SAME_PLACE = 1e-3  # [m]
+_SAME_PLACE = 1e-3  # Largest distance between links that count as being at the same place [m].
 _LEAST_JOINTS = 4  # Least number of joints of an arm. Chains of wheels and heads have fewer.
 
 
@@ -58,7 +58,7 @@ def arm_ends(tree: LinkTree) -> list[str]:
 
 
 def _onwards(tree: LinkTree, link: str, gripper_joints: Collection[str]) -> list[ET.Element]:
-    """Return the joints that continue the chain from the links fixed to ``link``; none if a hand begins there."""
+    """Return the joints that continue the chain from the links fixed to ``link``; [] if a hand begins there."""
     body, depth = tree.fixed_to(link), len(tree.chain(link))
     onwards = [
         joint

@@ -68,7 +68,7 @@ class Mounted(NamedTuple):
 
     model: Model
     joint: ET.Element  # The joint to the part that carries it.
-    is_flat: bool  # True if it sits flat on the end of that part, so that a file may exclude pairs of both.
+    is_flat: bool  # True if it sits flat on the end of that part. An SRDF may then exclude pairs between both.
 
 
 class ArmAssembly:
@@ -129,7 +129,10 @@ class ArmAssembly:
         return tuple(map(self.name_in_cell, self.config.gripper.joints))
 
     def tool_links(self) -> tuple[str, ...]:
-        """Return the names in the cell of the links of the tool, or of the hand that carries the gripper's joints."""
+        """Return the links of the tool, or else of the hand that carries the gripper's joints.
+
+        The links have their names in the cell.
+        """
         has_tool = self.config.tool.model is not None
         links = self.mounted[-1].model.links if has_tool else hand_links(self.tree, self.config.gripper.joints)
         return tuple(sorted(map(self.name_in_cell, links)))
@@ -150,7 +153,7 @@ class ArmAssembly:
         return [renamed(part, self.name_in_cell) for item in self.mounted for part in [item.joint, *item.model.parts]]
 
     def mounted_exclusions(self) -> list[ET.Element]:
-        """Return the excluded pairs of flange and tool, each with its own links and with the part below it."""
+        """Return the excluded pairs of flange and tool: pairs inside each of them, and pairs with its carrier."""
         parts, carriers = [], [self.model.description]
         for mounted in self.mounted:
             part = mounted.model.description

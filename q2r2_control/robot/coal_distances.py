@@ -15,7 +15,7 @@ class CoalDistances:
         self.model, self.geometry = model, geometry
         self.data: pin.Data = model.createData()
         self.geometry_data: pin.GeometryData = geometry.createData()
-        # These objects stay the same, and to look each of them up again would take longer than to measure.
+        # Pinocchio keeps these results in place. To look each of them up again would take longer than to measure.
         self._results = list(self.geometry_data.distanceResults)
 
     def at(self, q: Array) -> Array:

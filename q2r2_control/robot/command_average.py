@@ -8,15 +8,15 @@ the references of a window W [s] until now.
 accelerations of the reference, divided by n. So its jerk is at most 2 A / (n h), and n h >= W = 2 A / j keeps the limit
 j.
 
-**Other limits.** Positions, velocities and accelerations of the mean are means of the reference's. What holds for a
-joint's interval holds for its mean.
+**Other limits.** Positions, velocities and accelerations of the mean are means of those of the reference. If the
+reference keeps an interval of a joint, so does the mean.
 
-**Distances.** A mean of postures is not a posture of the way, but it is near one. Let the reference be at ``q(c + s)``
+**Distances.** A mean of postures is not a posture of the path, but it is near one. Let the reference be at ``q(c + s)``
 at the times of the window around its centre ``c``. The mean of ``q(c + s) - q(c) - s v(c)`` is at most A mean(s^2) / 2,
-and the mean of ``s v(c)`` is 0. With n >= 2 references the period is below W, and this is at most A W^2 / 8. Twice as
-much is allowed for, so that ticks may be irregular (``drives/command_average.py``). The reference keeps its distances
-at ``c``, also between two ticks. A pair's distance changes by no more than the joints' ways times the distances of its
-bodies from their axes. The reference keeps that much more.
+and the mean of ``s v(c)`` is 0. With n >= 2 references the period is below W, and this bound is at most A W^2 / 8.
+Twice as much is allowed for, so that ticks may be irregular (``drives/command_average.py``). The reference keeps its
+distances at ``c``, also between two ticks. A pair's distance changes by no more than the sum, over the joints, of the
+joint's displacement times the distance of the pair's bodies from its axis. The reference keeps this much more distance.
 """
 
 from __future__ import annotations
@@ -30,7 +30,8 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.robot.turning_fingers import TurningBody
 from q2r2_control.types import Array
 
-LONGEST_WINDOW = 0.05  # Commands are behind the reference by half a window, and a person feels more [s].
+# Longest window [s]. Commands are behind the reference by half a window, and a person feels a longer delay.
+LONGEST_WINDOW = 0.05
 
 
 def average_window(robot: Robot, settings: ControllerSettings) -> float:
@@ -66,18 +67,19 @@ def average_allowance(robot: Robot, settings: ControllerSettings, geometry: pin.
     window, pairs = average_window(robot, settings), geometry.collisionPairs
     if window == 0.0:
         return np.zeros(len(pairs))
-    off = 0.25 * window**2 * robot.capped_acceleration(settings.acceleration_limit)  # [rad], or [m] of a slide.
+    # Largest distance of the mean from the path, for each joint [rad or m].
+    off = 0.25 * window**2 * robot.capped_acceleration(settings.acceleration_limit)
     shift = np.array([_shift(robot, item, off) for item in geometry.geometryObjects])
     return np.array([shift[pair.first] + shift[pair.second] for pair in pairs])
 
 
 def _shift(robot: Robot, item: pin.GeometryObject, off: Array) -> float:
-    """Return how far any point of a body moves at most if each joint moves by ``off`` (nv,) [m]."""
+    """Return the largest distance that a point of a body moves [m], if each joint moves by at most ``off`` (nv,)."""
     model, shape = robot.model, item.geometry
     finger = next((it for it in robot.finger_bodies if isinstance(it, TurningBody) and it.name == item.name), None)
     shape.computeLocalAABB()
     reach = float(np.linalg.norm(item.placement.translation) + np.linalg.norm(shape.aabb_center) + shape.aabb_radius)
-    if finger is not None:  # Its capsule is another one for each opening.
+    if finger is not None:  # Its capsule changes with the opening of the gripper.
         reach = max(reach, finger.extent + finger.radius)
     moved = 0.0
     for joint in reversed(list(model.supports[item.parentJoint])[1:]):

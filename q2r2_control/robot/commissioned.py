@@ -33,7 +33,7 @@ def fingerprint(config: Config) -> str:
 
 
 def has_real_cabinets(config: Config) -> bool:
-    """Return whether a cabinet is not on this computer. Simulated cabinets run on this computer."""
+    """Return whether at least one cabinet is not on this computer. Simulated cabinets run on this computer."""
     return not all(ip_address(cabinet.address).is_loopback for cabinet in config.fri.values())
 
 

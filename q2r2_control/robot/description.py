@@ -46,7 +46,7 @@ _SCALARS = {
 
 @dataclass(frozen=True, slots=True)
 class Description:
-    """One robot model: its URDF tree with absolute paths of meshes, its SRDF tree if it has one, and its origin."""
+    """One robot model: its URDF tree with absolute paths of meshes, its SRDF tree if it has one, and its file."""
 
     urdf: ET.Element
     srdf: ET.Element | None
@@ -118,8 +118,9 @@ def parse_urdf(
 ) -> ET.Element:
     """Parse a URDF, check that it is one tree with unique names and finite numbers, and make mesh paths absolute.
 
-    Continuous joints become revolute joints with :data:`CONTINUOUS_RANGE` each way, because the controller's guarantees
-    need a bound. The limits of a joint that others mimic are narrowed to what these may do.
+    Continuous joints become revolute joints with :data:`CONTINUOUS_RANGE` in each direction, because the controller's
+    guarantees need a bound. If other joints mimic a joint, its limits are narrowed so that these joints keep their own
+    limits.
 
     Args:
         text: The URDF.
@@ -133,7 +134,7 @@ def parse_urdf(
     root = parse_srdf(text, where)  # URDF and SRDF begin in the same way.
     _check_numbers(root, where)
     unify(root, where)
-    # A shape that a reader ignores would be a body that nothing keeps apart from others.
+    # If the parser ignored a shape, the distance from this body to others would not be kept.
     for link in root.findall("link"):
         for collision in link.findall("collision"):
             shapes = [shape.tag for shape in collision.findall("geometry/*")]
@@ -223,7 +224,7 @@ def joint_end(joint: ET.Element, end: str) -> str:
 
 
 def joint_limits(joint: ET.Element) -> tuple[float, float]:
-    """Return the position limits of a joint, as they are written."""
+    """Return the position limits of a joint, as the URDF has them."""
     limit = joint.find("limit")
     return (0.0, 0.0) if limit is None else (float(limit.get("lower", "0")), float(limit.get("upper", "0")))
 

@@ -33,7 +33,7 @@ Capsule = tuple[float, Array, Array]  # The radius and both ends of the segment 
 
 # One micrometre is added to every enclosing radius, because rounding may make it smaller.
 _ROUNDING = 1e-6
-_SLABS = 12  # Number of slabs of equal height that the capsules of a mesh share.
+_SLABS = 12  # Number of slabs of equal height into which a mesh is cut. Each capsule encloses neighbouring slabs.
 
 
 def enclose_shapes(geometry: pin.GeometryModel, capsules: Mapping[str, int] | None = None) -> None:
@@ -100,9 +100,9 @@ def capsules_around(shape: coal.CollisionGeometry, name: str, count: int) -> lis
 def enclosing_capsule(points: Array) -> Capsule:
     """Return a small capsule around ``points`` (n, 3): the radius and both ends of the segment (3,).
 
-    It starts from the principal axes, and minimises the volume over the axis (two angles), its place (two offsets), and
-    the radius. Let a point have the height t and the distance rho from the axis. It is inside a capsule of radius r if
-    the segment has a height within sqrt(r^2 - rho^2) of t.
+    It starts from the principal axes, and minimises the volume over the direction of the axis (two angles), its
+    position (two offsets), and the radius. Let a point have the height t and the distance rho from the axis. It is
+    inside a capsule of radius r if the segment has a height within sqrt(r^2 - rho^2) of t.
     """
     return _cached_capsule(np.array(points, dtype=float, order="C").tobytes())
 
@@ -126,7 +126,10 @@ def _cached_capsule(found: bytes) -> Capsule:
 
 @lru_cache(maxsize=64)
 def _cached_capsules(points: bytes, corners: bytes, count: int) -> tuple[Capsule, ...]:
-    """Return at most ``count`` capsules of neighbouring slabs, along the principal axis with the least volume."""
+    """Return at most ``count`` capsules, each around neighbouring slabs of a mesh.
+
+    The slabs lie along the principal axis for which the capsules have the least volume.
+    """
     vertices = np.frombuffer(points).reshape(-1, 3)
     triangles = np.frombuffer(corners, dtype=np.int64).reshape(-1, 3)
     edges = np.unique(np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
@@ -170,7 +173,7 @@ def _corners(points: Array) -> Array:
 
 
 def _best_view(points: Array, axes: Array, scale: float = 1.0) -> tuple[Array, Array]:
-    """Return the order of ``axes`` (3, 3) whose last one gives the smallest first capsule, and the points in it."""
+    """Return the order of ``axes`` (3, 3) whose last axis gives the smallest first capsule, and the points in it."""
     frames = [axes[[index - 2, index - 1, index]] for index in range(3)]
     views = [points @ frame.T / scale for frame in frames]
     best = int(np.argmin([_volume(*_fit(view, _start(view))) for view in views]))
@@ -216,7 +219,7 @@ def _fit(local: Array, x: Array) -> tuple[float, Array]:
     radius = float(across.max()) * (1 + abs(x[4]))
     reach = np.sqrt(np.maximum(radius**2 - across**2, 0.0))
     top, bottom = float((height - reach).max()), float((height + reach).min())
-    if top < bottom:  # One sphere encloses every point, at any height between the two.
+    if top < bottom:  # A sphere at any height between these two encloses every point.
         top = bottom = (top + bottom) / 2
     return radius, place + np.outer([bottom, top], direction)
 
@@ -226,7 +229,10 @@ def _volume(radius: float, ends: Array) -> float:
 
 
 def _around_cylinder(radius: float, half_length: float, box_allowed: bool) -> coal.CollisionGeometry:
-    """Return the smallest coaxial capsule, or the box if that is allowed and smaller, as for a round table top."""
+    """Return the smallest capsule on the cylinder's axis, or a box around the cylinder if that is allowed and smaller.
+
+    The box is smaller for flat cylinders, such as a round table top.
+    """
 
     def half_segment(capsule_radius: float) -> float:
         return max(half_length - float(np.sqrt(max(capsule_radius**2 - radius**2, 0.0))), 0.0)
@@ -242,7 +248,7 @@ def _around_cylinder(radius: float, half_length: float, box_allowed: bool) -> co
 
 
 def capsule_between(radius: float, start: Array, end: Array) -> tuple[coal.CollisionGeometry, pin.SE3]:
-    """Return Coal's capsule from ``start`` to ``end``, and its placement. It lies along z about its middle."""
+    """Return Coal's capsule from ``start`` to ``end``, and the pose of its middle, whose z is along the capsule."""
     length = float(np.linalg.norm(end - start))
     along = (end - start) / length if length > 0 else np.array([0.0, 0.0, 1.0])
     rotation = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), along).matrix()

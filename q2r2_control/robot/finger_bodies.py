@@ -1,8 +1,8 @@
 """Compute the bodies of fingers. Each body is the volume that a finger sweeps over the travel of its joints.
 
-Distances depend on the arm's joints only, and so the body of a finger covers its whole way. While the opening of the
-gripper is known, a smaller body counts. It is a part of the segment if the finger slides, and a capsule of
-turning_fingers.py if it turns.
+The kernels compute distances from the arm's joints only, and so the body of a finger covers all positions of the
+finger. While the opening of the gripper is known, a smaller body replaces it: a part of the capsule's segment if the
+finger slides, or a capsule of turning_fingers.py if the finger turns.
 """
 
 from __future__ import annotations
@@ -27,16 +27,17 @@ from q2r2_control.types import ALL_OF_THE_WAY, Array, Interval
 
 @dataclass(frozen=True, slots=True)
 class FingerBody:
-    """A body that covers the whole way of one arm's fingers along a line."""
+    """A body that covers all positions of one arm's fingers that slide along one line."""
 
     arm: str
     name: str  # Name of the geometry object.
     length: float  # Length of its segment [m].
-    # Places along the segment at home [m]. Each has the joints that move it, with the part of their way along the line.
+    # The ends of the fingers' shapes: their positions along the segment at home [m]. Each end has the joints that move
+    # it, with the share of the joint's travel that is along the line.
     ends: tuple[tuple[float, tuple[tuple[float, FingerJoint], ...]], ...]
 
     def part(self, interval: Interval) -> tuple[float, float]:
-        """Return the part of the segment, from 0 to 1, in which the fingers are at openings in ``interval``."""
+        """Return the part of the segment in which fingers are at openings in ``interval``, as shares of its length."""
         if interval == ALL_OF_THE_WAY:
             return 0.0, 1.0
         lowest, highest = [], []
@@ -48,7 +49,10 @@ class FingerBody:
 
 
 def part_of_segment(start: Array, end: Array, part: tuple[float, float]) -> tuple[Array, Array]:
-    """Return both ends (3,) of a part of the segment from ``start`` to ``end`` (3,). The whole segment is exact."""
+    """Return both ends (3,) of a part of the segment from ``start`` to ``end`` (3,).
+
+    For (0, 1) these are exactly ``start`` and ``end``.
+    """
     along = end - start
     return start + part[0] * along, end - (1.0 - part[1]) * along
 
@@ -56,7 +60,10 @@ def part_of_segment(start: Array, end: Array, part: tuple[float, float]) -> tupl
 def collision_model_at(
     geometry: pin.GeometryModel, fingers: Iterable[FingerBody | TurningBody], openings: Mapping[str, Interval]
 ) -> pin.GeometryModel:
-    """Return a copy of ``Robot.collision_model`` with fingers at ``openings`` by arm, and others on their whole way."""
+    """Return a copy of ``Robot.collision_model`` whose bodies of fingers fit the ``openings``, by arm.
+
+    Fingers of other arms keep the body that covers all their positions.
+    """
     made, bodies = geometry.copy(), list(fingers)
     for arm, interval in openings.items():
         if interval == ALL_OF_THE_WAY:
@@ -91,12 +98,12 @@ def sweep_fingers(
     """Replace in place the capsules and spheres of fingers, locked at ``home``, by what they sweep.
 
     If two fingers of one gripper slide on one line and are equally thick, their capsules become one. It keeps the name
-    of the first one, and includes the space between the fingers. A finger that slides across its body always counts as
-    its whole way. A finger that is moved by a joint with more than one axis stays as it is.
+    of the first capsule, and includes the space between the fingers. If a finger slides across the line of its body,
+    this body always covers all positions. A finger that is moved by a joint with more than one axis keeps its shape.
 
     Returns:
-        The bodies that become smaller while the gripper's opening is known. These are bodies along whose line the
-        fingers slide, and bodies of fingers that turn.
+        The bodies that become smaller while the gripper's opening is known: those of fingers that slide along the line
+        of their body, and those of fingers that turn.
     """
     bodies: list[FingerBody | TurningBody] = []
     for arm, joints in parts.finger_joints.items():
@@ -146,7 +153,7 @@ def _finger_joint(
     """Return a joint of a finger that is locked at ``home`` in ``model``.
 
     ``stroke`` [m or rad] moves the gripper's joints from closed to open. Without a stroke, a joint without a <mimic>
-    may be anywhere in its limits. One of the ``followers`` follows its driver, also at the end of the driver's travel.
+    may be anywhere in its limits. A joint in ``followers`` follows its driver, also to the driver's limits.
     """
     name = joint.get("name", "")
     followed = followers.get(name, Follower(name, 1.0, 0.0))
@@ -201,9 +208,10 @@ def _line_of(points: Array) -> Array | None:
 
 
 def _merge(geometry: pin.GeometryModel, swept: dict[str, list[_Finger] | None]) -> dict[str, list[_Finger] | None]:
-    """Join bodies on one line, and return the fingers of the remaining bodies.
+    """Join bodies whose axes lie on one line and whose radii are equal.
 
-    The value is None for bodies with a finger that moves across the line.
+    Returns:
+        By body, the fingers that it contains; None if one of them moves across the line.
     """
     kept: dict[str, list[_Finger] | None] = {}
     for name, fingers in swept.items():

@@ -22,7 +22,7 @@ from q2r2_control.robot.urdf_parts import fixed_joint
 FLOOR = "floor"  # The name of the floor's link.
 
 _SIZE = (100.0, 100.0, 10.0)  # [m]
-_ON = 1e-3  # A box stands on the floor if its underside is not higher than this [m].
+_ON = 1e-3  # A box stands on the floor if its underside is not higher above the floor than this [m].
 _UPRIGHT = 1e-9  # Greatest sine of the angle to the vertical at which an axis counts as vertical [-].
 
 
@@ -48,8 +48,8 @@ def sink_boxes_into_floor(geometry: pin.GeometryModel) -> None:
     """Extend fixed upright boxes that stand on the floor deep into it, so that nothing is pushed out downwards.
 
     A body inside a box is pushed out through the nearest face. It cannot leave through the underside of a box on the
-    floor. A hand deep in the box and its wrist above would be pushed apart, and stay there for ever. Above the floor
-    the box does not change.
+    floor. If a hand is deep in such a box and its wrist is above, they would be pushed in opposite directions, and stay
+    there for ever. The part of the box above the floor does not change.
     """
     floor = next((item for item in geometry.geometryObjects if _is_floor(item)), None)
     if floor is None:
@@ -68,10 +68,11 @@ def sink_boxes_into_floor(geometry: pin.GeometryModel) -> None:
 
 
 def remove_unreachable_floor_pairs(model: pin.Model, geometry: pin.GeometryModel) -> None:
-    """Remove pairs of the floor with bodies that provably cannot come near to it.
+    """Remove each pair of the floor and a body that provably cannot come near to it.
 
-    These are bodies that turn about vertical axes only, as the first link of an arm does, and keep their height. They
-    are also bodies that are too close to the first joint that can tip them to come within :data:`CLEARANCE`.
+    There are two kinds of such bodies. Some turn about vertical axes only, as the first link of an arm does, and keep
+    their height. Others are carried by a joint that can tip them, but do not reach from it to within :data:`CLEARANCE`
+    of the floor.
     """
     data = model.createData()
     pin.computeJointJacobians(model, data, pin.neutral(model))
@@ -101,9 +102,9 @@ def _top(floor: pin.GeometryObject) -> float:
 def _lowest(model: pin.Model, data: pin.Data, item: pin.GeometryObject) -> float | None:
     """Return the least height of any point of a capsule or sphere [m]; None if no joint changes its height.
 
-    Joints that turn about vertical axes or slide along level ones do not change heights. The origin of the first other
+    Joints that turn about vertical axes or slide along level axes do not change heights. The origin of the first other
     joint therefore keeps its height, and the bodies that this joint carries lie in a ball around it. ``data`` has the
-    frames and Jacobians at zero.
+    frames and Jacobians at the neutral posture.
     """
     height, world_axes = None, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
     reach = float(np.linalg.norm(item.placement.translation)) + item.geometry.radius

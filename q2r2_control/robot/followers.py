@@ -67,7 +67,7 @@ def with_followers(positions: Mapping[str, float], followers: Mapping[str, Follo
 def narrow_limits(joints: Collection[ET.Element], where: str = "") -> None:
     """Narrow the limits of drivers in place, so that all followers stay within their own limits.
 
-    A follower has no effect if it has no limits, if it turns on for ever, or if it does not move. A follower whose
+    A follower has no effect if it has no limits, if it is continuous, or if it does not move. A follower whose
     limits have the wrong sign, as in models of mirrored fingers, gets the range in which it follows.
 
     Raises:
@@ -85,7 +85,7 @@ def narrow_limits(joints: Collection[ET.Element], where: str = "") -> None:
             continue
         first, last = sorted((end - follower.offset) / follower.multiplier for end in (lower, upper))
         low, high = max(least, first), min(most, last)
-        mirrored = not low < high  # The follower moves the other way.
+        mirrored = not low < high  # The follower's limits have the wrong sign.
         if mirrored:
             first, last = sorted((-end - follower.offset) / follower.multiplier for end in (lower, upper))
             low, high = max(least, first), min(most, last)

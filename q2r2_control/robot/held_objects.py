@@ -1,8 +1,8 @@
 """Held objects: bodies that are fixed to the tools, and the monitored pairs with them.
 
-They are in a copy of ``Robot.collision_model``, after its own bodies and pairs. An object has pairs with the same
-bodies as its link. There are no pairs with its own hand. There are also none with the fingers of other hands, because
-these must be able to take the object over.
+The objects are in a copy of ``Robot.collision_model``, after its own bodies and pairs. An object has pairs with the
+same bodies as the link that carries it, and with all obstacles. It has no pairs with the hand that holds it, and none
+with the fingers of other hands, because these must be able to take the object over.
 
 **The distance of two boxes** has no short closed form. One of the two closest points of two convex polyhedra can be
 taken on an edge. If both points lie inside of faces, these faces are parallel. Both points can then be moved along
@@ -38,7 +38,7 @@ class HeldObject:
     config: HeldObjectConfig
 
     def inertia(self, share: float = 1.0) -> pin.Inertia:
-        """Return the inertia of a uniform box or ball with a share of its mass, in the joint's frame."""
+        """Return the inertia of a uniform box or ball with a ``share`` of the object's mass, in the joint's frame."""
         mass, box = share * self.config.mass, self.config.box
         own = pin.Inertia.FromSphere(mass, self.config.radius) if box is None else pin.Inertia.FromBox(mass, *box)
         return own.se3Action(self.placement)
@@ -50,7 +50,8 @@ class HeldObjects:
 
     geometry: pin.GeometryModel  # ``Robot.collision_model``, followed by the bodies and pairs of objects.
     by_arm: dict[str, HeldObject]
-    holders: tuple[frozenset[str], ...]  # For each pair of objects, the arms that have to hold for it to count.
+    # For each of the objects' pairs, the arms that have to hold their objects. Otherwise the pair does not count.
+    holders: tuple[frozenset[str], ...]
 
     def pair_names(self) -> tuple[tuple[str, str], ...]:
         """Return the names of both bodies of each of the objects' pairs."""
@@ -100,7 +101,7 @@ class _Pairs:
         self._solids[held.link] = self._add(f"{held.link}_solid", held.joint, shape, held.placement)
 
     def watch(self, holders: Iterable[str], first: str, second: str) -> None:
-        """Watch the pairs of two solids. They count while all grippers in ``holders`` hold their object."""
+        """Add the pairs between two solids. These pairs count while all arms in ``holders`` hold their objects."""
         pairs = [(self._solids[first], self._solids[second])]
         if self._is_box(first) and self._is_box(second):
             pairs = [(edge, self._solids[second]) for edge in self._edges_of(first)]
@@ -129,7 +130,7 @@ class _Pairs:
 
 
 def _watched(geometry: pin.GeometryModel, roles: Mapping[str, Role], held: HeldObject) -> list[str]:
-    """Return the bodies with which the object's link has pairs, without hands that hold or may take the object."""
+    """Return the bodies with which the object has pairs: no hand that holds it, and no fingers that may take it."""
     items = geometry.geometryObjects
     # All obstacles count, also those that the hand itself cannot reach, because an object reaches farther.
     found = dict.fromkeys(item.name for item in items if roles[link_of(item.name)].part is LinkClass.OBSTACLE)

@@ -1,8 +1,9 @@
 """Find a home posture for a cell that names none, by sampling and a local search.
 
 A good home has joints near the middle of their ranges. The tool is before and below the shoulder, points forwards and
-down, and can move in all directions. The joints have torque to spare, and the bodies have room, most of all below the
-tool, because work goes down from home. A part of the torque and of the room is required. Without it the cost jumps.
+down, and can move in all directions. Gravity needs clearly less than the torque limits. The bodies are clearly farther
+apart than the distances that they keep, most of all below the tool, because work goes down from home. A small part of
+these two reserves is required: without it, the cost of a posture jumps.
 """
 
 from __future__ import annotations
@@ -21,16 +22,18 @@ from q2r2_control.types import Array
 if TYPE_CHECKING:
     from q2r2_control.robot.robot import Arm, Robot
 
+# Number of random postures, of the best ones that are examined further, and of steps of the local search.
 _SAMPLES, _BEST, _STEPS = 2000, 24, 150
-_INSIDE = 0.85  # Share of half its range that each joint may use.
-_HALF = np.pi / 2  # Half range of a joint that turns farther than this [rad].
-_WORK = np.array([0.62, 0.0, 0.05])  # Place of the tool from the shoulder, in reaches of the arm.
-_AHEAD = np.array([0.8, 0.0, -0.6])  # Direction in which the tool points.
-_LEAST_GAIN = 0.15  # Least gain of the weakest direction of motion, in reaches of the arm.
+_INSIDE = 0.85  # Share of its half range that each joint may use on both sides of the middle.
+_HALF = np.pi / 2  # Greatest half range that is assumed for a joint [rad].
+_WORK = np.array([0.62, 0.0, 0.05])  # Wanted position of the tool relative to the shoulder, in reaches of the arm.
+_AHEAD = np.array([0.8, 0.0, -0.6])  # Wanted direction in which the tool points.
+# Least wanted singular value of the tool's Jacobian, whose lengths are divided by the reach of the arm.
+_LEAST_GAIN = 0.15
 _BORNE = 0.7  # Share of the torque limits that gravity may need.
-_ROOM = 0.04  # Wanted room in addition to the distance that a pair keeps [m].
-_BELOW = 0.16  # Wanted room between the tool and the floor. Scripted hands go down by less [m].
-_NEEDED = 0.005  # Required room [m].
+_ROOM = 0.04  # Wanted distance of a pair in addition to the distance that it keeps [m].
+_BELOW = 0.16  # Wanted additional distance between the tool and the floor [m]. Scripted hands move down by less.
+_NEEDED = 0.005  # Required additional distance [m].
 _MIRROR = np.array([1.0, -1.0, 1.0])
 _ALONG_X, _ALONG_Z = np.diag([0.01, 0.0, 0.01])[[0, 2]]  # Points on two axes of the tool's frame [m].
 _FAULTY = 100.0  # Cost of each requirement that a posture does not meet.
@@ -39,7 +42,9 @@ _FAULTY = 100.0  # Cost of each requirement that a posture does not meet.
 def find_home(
     robot: Robot, arm: str, q: Array, kept: Array, placed: Collection[str], like: Array | None = None
 ) -> Array:
-    """Return the best home positions that were found for the joints of ``arm`` (n,) [rad]. They may have faults.
+    """Return the best home positions that were found for the joints of ``arm`` (n,) [rad].
+
+    They may still miss a requirement.
 
     Args:
         robot: The robot.
@@ -47,7 +52,7 @@ def find_home(
         q: The positions of all other joints (nv,) [rad].
         kept: The distance that each pair keeps (pairs,) [m].
         placed: Arms whose home is known. Pairs with other arms do not count.
-        like: Positions of an equal arm (n,), which are taken if they are allowed.
+        like: Positions of an equal arm (n,) [rad]. They are returned if they meet all requirements.
     """
     search = _HomeSearch(robot, arm, q, kept, placed)
     if like is not None and search.cost(like) < _FAULTY:
@@ -58,8 +63,8 @@ def find_home(
 def mirrored_home(robot: Robot, arm: str, placed: str, q: Array) -> Array | None:
     """Return positions of ``arm`` (n,) [rad] that mirror the arm ``placed`` at ``q`` (nv,) in the plane y = 0.
 
-    Joints of mirrored arms differ in their signs only. The signs that mirror the places of the joints best are taken.
-    Returns None if the arms have different numbers of joints.
+    Joints of mirrored arms differ in their signs only. Those signs are taken that mirror the positions of the joints
+    best. Returns None if the arms have different numbers of joints.
     """
     own, other = robot.arms[arm], robot.arms[placed]
     if len(own.joints) != len(other.joints):
@@ -67,7 +72,7 @@ def mirrored_home(robot: Robot, arm: str, placed: str, q: Array) -> Array | None
     data = robot.model.createData()
 
     def points(posture: Array, of: Arm) -> Array:
-        """Return the places of joints and tool, and of points on the tool's axes (n, 3) [m]."""
+        """Return the positions of joints and tool, and of points on the tool's axes (n, 3) [m]."""
         pin.forwardKinematics(robot.model, data, posture)
         tool = pin.updateFramePlacement(robot.model, data, of.frame_id)
         places = [data.oMi[int(joint) + 1].translation.copy() for joint in of.joints]
@@ -126,7 +131,7 @@ class _HomeSearch:
         return self._q
 
     def _lever(self, x: Array) -> Array:
-        """Return the tool's place from the shoulder (3,) [m], with the model's data at ``x``."""
+        """Return the tool's position relative to the shoulder (3,) [m], and leave the model's data at ``x``."""
         model, data = self._robot.model, self._data
         pin.computeJointJacobians(model, data, self._at(x))
         pin.updateFramePlacements(model, data)
@@ -151,7 +156,7 @@ class _HomeSearch:
         )
 
     def cost(self, x: Array) -> float:
-        """Return the cost of the posture ``x``, including a cost for pairs of bodies with too little room."""
+        """Return the cost of the posture ``x``, including a cost for pairs of bodies that are too close."""
         cost, kept = self._cost_of_posture(x), self._robot.distance_values(self._at(x)) - self._kept
         for pairs, room in self._rooms:
             cost += _beyond(room - float(kept[pairs].min(initial=room)), room - _NEEDED)
@@ -159,5 +164,5 @@ class _HomeSearch:
 
 
 def _beyond(excess: float, most: float) -> float:
-    """Return 0 if ``excess`` is not above 0, and a cost that jumps at ``most``."""
+    """Return the cost of an ``excess``: 0 if it is not positive, and a value that jumps at ``most``."""
     return max(excess, 0.0) / most + (_FAULTY * (1.0 + excess) if excess > most else 0.0)

@@ -23,16 +23,17 @@ _OUTERMOST_FIRST = list(LinkClass)
 class KeptDistances:
     """The distances of all pairs, in the order of ``Robot.distances``."""
 
-    values: Array  # Kept distances (p,) [m]. A pair that may touch has minus the depth that the reference may have.
+    values: Array  # Kept distances (p,) [m]. For a pair that may touch: minus the depth to which the reference may go.
     keys: tuple[str, ...]  # Keys in the block ``control``, such as min_distance, distances.arm_arm or pairs[0].
-    contact_speed: Array  # Closing speeds near contact of pairs that may touch (p,) [m/s]; infinite for others.
+    # Greatest closing speeds near contact of pairs that may touch (p,) [m/s]; infinite for others.
+    contact_speed: Array
 
 
 def kept_distances(robot: Robot, settings: ControllerSettings) -> KeptDistances:
     """Return the distance that every monitored pair of ``robot`` has to keep.
 
-    With a limit of jerk it is larger by :func:`average_allowance`, because the commands are not exactly on the
-    reference's way.
+    With a limit of jerk, these distances are larger by :func:`average_allowance`, because the commands are not exactly
+    on the reference's path.
 
     Raises:
         ConfigError: If no monitored pair has a name in ``settings.pairs`` or ``settings.contact_allowed``, or if
@@ -89,7 +90,7 @@ def _of_all_pairs(robot: Robot, settings: ControllerSettings) -> tuple[KeptDista
     speed = np.full(len(names), np.inf)
     count = len(robot.collision_model.collisionPairs)
     last = count + len(robot.objects.holders)
-    for i, contact in enumerate(settings.contact_allowed):  # The classes of objects allow contact anyway.
+    for i, contact in enumerate(settings.contact_allowed):  # Distances of held objects may be negative anyway.
         for p in _found(f"contact_allowed[{i}]", contact.pair, names[:count]):
             values[p], keys[p], speed[p] = -contact.depth, f"contact_allowed[{i}]", contact.speed
     values += average_allowance(robot, settings, geometry)
@@ -117,7 +118,7 @@ def _found(key: str, patterns: tuple[str, str], names: tuple[tuple[str, str], ..
 
 
 def _is(pattern: str, geometry: str) -> bool:
-    """Return whether a pattern is the link of a body, or its own name as in reports."""
+    """Return whether ``pattern`` matches the link of the body ``geometry``, or the body's name in reports."""
     return fnmatchcase(link_of(geometry), pattern) or fnmatchcase(geometry, pattern)
 
 

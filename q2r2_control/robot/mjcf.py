@@ -23,8 +23,8 @@ _MESHES = (".stl", ".obj")  # Formats of meshes that other programs than MuJoCo 
 _TOOL_SITE = re.compile(r"attachment|tcp|tool|end_?eff|(^|_)eef?(_|$)|grasp|pinch|flange", re.IGNORECASE)
 _Joint, _Geom = mujoco.mjtJoint, mujoco.mjtGeom
 _ON_JOINTS = int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)
-# Mass and principal inertia of links between two joints of one body. Without them no simulation takes these links [kg],
-# [kg m^2].
+# Mass [kg] and principal inertia [kg m^2] of the links between two joints of one body. Simulations refuse links without
+# a mass.
 _NEXT_TO_NONE = 1e-6, np.full(3, 1e-9)
 
 
@@ -68,7 +68,7 @@ class _Writer:
         self._names = {model.body(body).name for body in range(model.nbody)}
         self._names |= {model.joint(j).name for j in range(model.njnt)}
         self._links: dict[int, str] = {}  # Names of links by the number of their body.
-        self._within: dict[int, pin.SE3] = {}  # The frame of a body's link in the body's frame.
+        self._within: dict[int, pin.SE3] = {}  # By body, the pose of its link's frame in the frame of the body.
 
     def robot(self) -> ET.Element:
         model = self._model
@@ -138,7 +138,7 @@ class _Writer:
         return joint
 
     def _add_moving_joint(self, j: int, parent: str, child: str, at: pin.SE3) -> None:
-        """Add the joint with the index ``j``. ``at`` is its pose where the file places its body."""
+        """Add the joint with the index ``j``. ``at`` is its pose in ``parent`` at the body's position in the file."""
         model = self._model
         axis, there = model.jnt_axis[j], float(model.qpos0[model.jnt_qposadr[j]])
         turns, limited = model.jnt_type[j] == _Joint.mjJNT_HINGE, bool(model.jnt_limited[j])
@@ -197,7 +197,7 @@ class _Writer:
         touching = [g for g in geoms if model.geom_contype[g] or model.geom_conaffinity[g] or g in paired]
         for g in geoms:
             at = within.inverse() * _pose(model.geom_pos[g], model.geom_quat[g])
-            # Nobody would watch a body without a shape that may touch something. Then all drawn shapes count.
+            # A body without a shape that may touch something would not be watched. All its drawn shapes then count.
             if g in touching or not touching:
                 self._add_shape(link, "collision", g, at)
             if g not in touching:

@@ -132,7 +132,7 @@ def _span(
     followers: Mapping[str, Follower],
     end: float,
 ) -> float:
-    """Return the mean distance of the fingers from the axis of the arm's last joint [m]."""
+    """Return the mean distance of the fingers from the axis of the arm's last joint [m], with ``driven`` at ``end``."""
     q, data = pin.neutral(model), model.createData()
     places = with_followers(dict.fromkeys(driven, end), followers)
     for name in beyond:
@@ -156,8 +156,8 @@ class CapsuleFit:
     link: str
     radius: float  # [m]
     length: float  # Length of its segment [m].
-    beyond: float  # Distance by which it reaches at least beyond the mesh's convex hull [m].
-    wasted: float  # Share of its volume by which it exceeds the hull's volume.
+    beyond: float  # Lower bound on the greatest distance of its surface from the mesh's convex hull [m].
+    wasted: float  # Share of its volume that is outside the hull.
     capsules: int  # Number of capsules that enclose the mesh in clearly less volume; 1 if more capsules do not.
     then_wasted: float  # The wasted share with this number of capsules.
 

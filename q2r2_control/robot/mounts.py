@@ -1,4 +1,4 @@
-"""Find the place of one arm's base from points that the tips of both arms have touched."""
+"""Find the pose of one arm's base from points that the tips of both arms have touched."""
 
 from __future__ import annotations
 

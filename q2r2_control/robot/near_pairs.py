@@ -1,4 +1,4 @@
-"""Examine pairs that are too near at home: whether they ever part, and what a user can change about them."""
+"""Examine pairs that are too near at home: whether other postures bring them apart, and what a user can change."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class _Ways(NamedTuple):
     """Possible remedies for a pair that belongs to one robot."""
 
     links: Pair
-    parts: bool  # True if the pair keeps its distance in some posture.
+    can_be_apart: bool  # True if the pair has its required distance in at least one posture.
     nearer: float | None  # A smaller distance that control.pairs could name instead [m]; None if there is none.
 
 
@@ -90,7 +90,7 @@ def remedy(robot: Robot, pair: NearPair) -> str:
     if ways is None:
         return "to change: another home"
     by_name = "" if ways.nearer is None else f"control: {{pairs: [{_pair_entry(ways.links, ways.nearer)}]}}"
-    if ways.parts:
+    if ways.can_be_apart:
         return f"to change: {', or '.join(filter(None, ('another home', by_name)))}"
     in_file = f"a file for srdf, such as q2r2 check --pairs writes, with the line {_srdf_line(ways.links)}"
     return f"they hardly part anywhere; to change: {', or '.join(filter(None, (by_name, in_file)))}"
@@ -106,7 +106,7 @@ def lines_to_paste(robot: Robot, config: Config, near: Iterable[NearPair]) -> li
     for ways in (_ways_out(robot, pair) for pair in near):
         if ways is not None and ways.nearer is not None:
             nearer[ways.links] = min(ways.nearer, nearer.get(ways.links, math.inf))
-        elif ways is not None and not ways.parts:
+        elif ways is not None and not ways.can_be_apart:
             disabled[ways.links] = f"  {_srdf_line(ways.links)}"
     entries = [f"    - {_pair_entry(links, least)}" for links, least in nearer.items() if links not in disabled]
     lines = []

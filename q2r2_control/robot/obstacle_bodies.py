@@ -1,6 +1,7 @@
-"""Make the bodies of moving obstacles: one body for each name, with pairs with every body that moves.
+"""Make the bodies of moving obstacles. Each obstacle has one body, and this body has a pair with every moving body.
 
-They come last in the collision geometry with which a controller is made. Shape and pose are written at run time.
+The bodies of obstacles come last in the collision geometry with which a controller is made. Their shapes and poses are
+written at run time.
 """
 
 from __future__ import annotations
@@ -34,8 +35,8 @@ def body_of(name: str, obstacle: MovingObstacle) -> pin.GeometryObject:
 def with_obstacle_bodies(robot: Robot, names: Iterable[str], held: bool = True) -> pin.GeometryModel:
     """Return a copy of ``Robot.objects.geometry``, followed by a sphere with its pairs for each of ``names``.
 
-    If ``held`` is False, they follow the collision model without held objects. A held object counts as the capsule
-    around it, because two boxes would need pairs of all their edges.
+    If ``held`` is False, these bodies follow the collision model without held objects. A held object counts as the
+    capsule around it, because two boxes would need pairs of all their edges.
     """
     known = robot.objects.geometry if held else robot.collision_model
     if not names:

@@ -94,7 +94,7 @@ def expand_xacro(file: Path, arguments: Mapping[str, object], packages: Mapping[
 
 
 class _Arguments(dict[str, str]):
-    """Arguments by name, which note for which names the file asks. xacro ignores all other arguments."""
+    """Arguments by name. They record the names for which the file asks, because xacro ignores all other arguments."""
 
     def __init__(self, given: Mapping[str, str]) -> None:
         super().__init__(given)

@@ -40,7 +40,7 @@ class KnownParts:
     strokes: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     # Greatest number of capsules for each mesh, by link. The default is one.
     capsules: Mapping[str, int] = field(default_factory=dict)
-    # The joint of an arm that a link beside the arm follows, by link.
+    # For each link beside an arm that follows the arm, such as a bar of a parallelogram: the joint that it follows.
     following: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
@@ -95,9 +95,9 @@ def links_moved_by(tree: LinkTree, joints: Iterable[str]) -> set[str]:
 
 
 def links_that_follow(tree: LinkTree, joints: Collection[str]) -> dict[str, str]:
-    """Return the links of parts beside an arm that follow it, such as the bars of a parallelogram.
+    """Return the links beside an arm that follow it, such as the bars of a parallelogram.
 
-    The value is the one of ``joints`` that the link follows.
+    The value is the joint that the link follows, which is one of ``joints``.
     """
     followers = followers_of(tree.joint_to.values(), driven=joints)
     beside = {name: one.driver for name, one in followers.items() if one.driver in joints}
@@ -117,8 +117,8 @@ def hand_links(tree: LinkTree, finger_joints: Iterable[str]) -> set[str]:
 # Links that always stay farther apart than this distance need no watching. It is more than twice the distance that is
 # usually kept [m].
 CLEARANCE = 0.05
-# Links and shapes whose names end in this way stand for a whole tool at every opening. Their distances are watched, and
-# they take part in no contact.
+# Links and shapes whose names end in this way stand for a whole tool at every opening. Their distances are watched, but
+# they have no contacts in the simulation.
 ENVELOPE = "_envelope"
 
 
@@ -128,7 +128,7 @@ def link_of(geometry_name: str) -> str:
 
 
 def pairs_with_others(pairs: Iterable[tuple[str, str]], roles: Mapping[str, Role], arm: str) -> np.ndarray:
-    """Return the numbers (p,) of those ``pairs`` of geometry names of which exactly one body belongs to ``arm``."""
+    """Return the indices (p,) of those ``pairs`` of geometry names of which exactly one body belongs to ``arm``."""
     own = [[arm in roles[link_of(name)].arms for name in names].count(True) for names in pairs]
     return np.flatnonzero(np.array(own, dtype=np.int64) == 1)
 

@@ -25,10 +25,10 @@ def joint_origin(joint: ET.Element) -> pin.SE3:
 
 
 def lock_joints(robot: ET.Element, movable: Collection[str], positions: Mapping[str, float]) -> None:
-    """Fix in place every joint of the URDF ``robot`` except the ``movable`` ones. So every reader locks them alike.
+    """Fix in place every joint of the URDF ``robot`` except the ``movable`` ones.
 
-    A joint with one axis is fixed at its value in ``positions`` [rad or m], or at 0 if it has none. A planar or
-    floating joint is fixed at its origin.
+    All programs that read this URDF then have the same fixed joints. A joint with one axis is fixed at its value in
+    ``positions`` [rad or m], or at 0 if it has none. A planar or floating joint is fixed at its origin.
     """
     for joint in robot.findall("joint"):
         name, kind = joint.get("name", ""), joint.get("type")
@@ -66,8 +66,8 @@ def _vector(element: ET.Element | None, attribute: str) -> list[float]:
     return [] if element is None else [float(part) for part in element.get(attribute, "").split()]
 
 
-# Inertia that the rotor of a geared drive adds if the URDF does not say [kg m^2]. Without a rotor's inertia, a control
-# loop is too slow for light wrist joints.
+# Inertia that the rotor of a geared drive adds to a joint, if the URDF names no rotor [kg m^2]. Without this inertia,
+# wrist joints would be so light that a control loop is too slow for them.
 _USUAL_ARMATURE = 0.1
 
 

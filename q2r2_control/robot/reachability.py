@@ -33,7 +33,7 @@ _BATCH, _FEW = 250, 4  # Number of postures in a batch, and of batches before pa
 
 @dataclass(frozen=True, slots=True)
 class PairReach:
-    """The least distance to which two links can come."""
+    """The least distance of two links that a search has found."""
 
     link_a: str
     link_b: str
@@ -43,7 +43,7 @@ class PairReach:
 def nearest_approaches(
     robot: Robot, samples: int, seed: int, clearance: float, progress: Progress | None = None
 ) -> list[PairReach]:
-    """Return the least distance that was found of every monitored pair of links, the nearest first.
+    """Return the least distance that was found for every monitored pair of links, the nearest first.
 
     Args:
         robot: The robot.
@@ -87,7 +87,7 @@ class _Search:
         self._bounds = Bounds(robot.position_lower, robot.position_upper)
         self.names = pair_names(self._geometry)
         self.nearest = np.full(len(self.names), np.inf)  # The least distance of each pair so far (pairs,) [m].
-        self._left = np.arange(len(self.names))
+        self._left = np.arange(len(self.names))  # The indices of the pairs that are still examined.
         # The postures of each pair from which the search goes downhill, and their distances, the nearest first.
         self._starts = np.zeros((len(self.names), _STARTS, self._model.nv))
         self._at = np.full((len(self.names), _STARTS), np.inf)
@@ -107,7 +107,7 @@ class _Search:
         self._drop_the_near()
 
     def go_downhill(self, starts: int, progress: Progress | None = None) -> None:
-        """Follow the number ``starts`` of the nearest postures of each pair downhill inside the limits."""
+        """Descend from the ``starts`` nearest postures of each pair to smaller distances, inside the limits."""
         for k, p in enumerate(self._left):
             for q in self._starts[p][np.isfinite(self._at[p])][:starts]:
                 if self.nearest[p] > self._clearance:
@@ -117,7 +117,10 @@ class _Search:
         self._drop_the_near()
 
     def _downhill(self, k: int, q: Array) -> float:
-        """Return the least distance of the pair with the number ``k`` among the remaining ones, downhill from ``q``."""
+        """Return the local minimum of a pair's distance that a descent from the posture ``q`` finds [m].
+
+        ``k`` is the pair's index in ``_left``.
+        """
         data, geometry_data = self._distances.data, self._distances.geometry_data
 
         def distance(posture: Array) -> tuple[float, Array]:
@@ -151,7 +154,10 @@ def srdf_of(robot: Robot, approaches: Sequence[PairReach], clearance: float, sam
 
 
 def srdf_text(name: str, comment: str, pairs: Iterable[tuple[str, str, str]], links: Iterable[str] = ()) -> str:
-    """Return an SRDF that disables ``links``, and ``pairs`` of links with a reason, which is a word of MoveIt."""
+    """Return an SRDF that disables ``links``, and ``pairs`` of links.
+
+    Each pair has a reason, which is a word that MoveIt uses, such as "Never".
+    """
     root = ET.Element("robot", name=name)
     root.append(ET.Comment("\n    " + "\n    ".join(textwrap.wrap(comment, 112)) + "\n  "))
     for link in links:

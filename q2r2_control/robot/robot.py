@@ -80,7 +80,7 @@ class Robot:
 
     ``collision_model`` holds exactly the monitored pairs. Each arm has pairs with the other arm and its base, with its
     own links that it can meet, and with obstacles. Every monitored shape is a capsule, a sphere, or a box fixed in the
-    world. The body of a finger is the volume that it sweeps. ``finger_bodies`` tells which part counts at an opening.
+    world. The body of a finger is the volume that it sweeps. ``finger_bodies`` tells its part at a known opening.
     ``objects`` are the objects that grippers hold, in addition to the collision model. ``ignored_pairs`` are pairs of
     one arm's shapes that overlap by construction.
 
@@ -91,20 +91,23 @@ class Robot:
             q, robot.arms["left"].frame_id, pinocchio.LOCAL_WORLD_ALIGNED)``, (6, nv), first linear, then angular.
         joint_names: Names in the order of every array of joints.
         arms: Arms by name. ``tool_frame`` is the name of the tool's link, and ``frame_id`` is its number in ``model``.
-            ``joints`` are the places of the arm's joints in arrays of joints, from base to tool.
+            ``joints`` are the indices of the arm's joints in arrays of joints, from base to tool.
         home: Joint positions at which the cell starts (nv,) [rad].
         position_lower: The model's lower position limits (nv,) [rad].
         position_upper: The model's upper position limits (nv,) [rad].
-        endless: True for each joint that turns on for ever (nv,).
+        endless: True for each continuous joint, which turns without end (nv,).
         velocity_limit: The model's velocity limits (nv,) [rad/s].
         torque_limit: The model's torque limits (nv,) [Nm].
-        following_links: The joint of an arm that a link beside the arm follows, by link. Such a link is watched only at
-            its place at home.
+        following_links: For each link beside an arm that follows the arm, the joint of the arm that it follows. Such a
+            link is watched only at its pose at home.
         unchecked_links: Names of links without a collision shape, which by the user's choice are not watched.
     """
 
     def __new__(cls, urdf: ET.Element | None = None, *_: object, **__: object) -> Self:
-        """Refuse what is no parsed URDF before Python counts the arguments. A copy is made without any argument."""
+        """Refuse a first argument that is no parsed URDF, before Python counts the arguments.
+
+        The error then names the right constructors. Python makes a copy of a robot without any argument.
+        """
         if not isinstance(urdf, ET.Element | None):
             raise RobotError(
                 f"Robot({shown(urdf)}, ...): allowed: Robot.from_config(config), Robot.from_urdf(file, ...)"
@@ -148,7 +151,7 @@ class Robot:
         self.torque_limit: Array = self.model.effortLimit.copy()
         joints = {joint.get("name", ""): joint for joint in urdf.findall("joint")}
         self.acceleration_limit: Array = np.array([acceleration_limit(joints[name]) for name in self.joint_names])
-        # The links of an arm are those from the root to the tool, and those of branches beside this way, like fingers.
+        # The links of an arm are those from the root to the tool, and those of branches beside this path, like fingers.
         bodies = [frame for frame in self.model.frames if frame.type == pin.FrameType.BODY]
         own_links = {
             name: {*tree.path(arm.tool_frame), *(body.name for body in bodies if body.parentJoint - 1 in arm.joints)}
@@ -205,7 +208,7 @@ class Robot:
         """Return a robot from any URDF.
 
         Joints that an arm carries beyond its own joints move its fingers, and the links that carry these joints are
-        its tool. No link counts as an obstacle. A warning names pairs that would hold the arm up at home, and pairs
+        its tool. No link counts as an obstacle. A warning names pairs that would block the arm at home, and pairs
         that overlap only there.
 
         Args:
@@ -334,7 +337,7 @@ class Robot:
             self.roles[held.link] = Role(LinkClass.OBJECT, frozenset({arm}))
 
     def _check_operators_frames(self, config: Config) -> None:
-        """Check that in mode filtered the operator moves the cell's tool. A target has to begin at this frame."""
+        """Check that in mode filtered the operator's frame is at the cell's tool. Targets have to begin there."""
         if config.external is None or not config.external.filtered:
             return
         for arm in self.arms:

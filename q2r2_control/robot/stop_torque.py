@@ -1,7 +1,7 @@
 """Compare the torques that a commanded stop requires with the torque limits of the joints.
 
-The controller promises stops in which every joint j decelerates at its limit a_j, whatever the torque. Joints with a
-low speed may decelerate with any signs. Joint i therefore requires at most the torque
+The controller promises stops in which every joint j decelerates at its limit a_j, whatever torque this requires. At low
+speeds, the decelerations of the joints may have any signs. Joint i therefore requires at most the torque
 
     |g_i(q)| + sum_j |M_ij(q)| a_j
 
@@ -50,7 +50,9 @@ class StopTorque:
     seed: int  # Seed of the random postures.
     stop: WorstTorque  # The worst torque of gravity and a full stop.
     gravity: WorstTorque  # The worst torque of gravity alone.
-    bearable: float  # Share of all decelerations with which no joint exceeds its torque limit in any of the postures.
+    # Largest factor for all decelerations with which no joint exceeds its torque limit in any of the postures. It is 0
+    # if gravity alone exceeds a limit.
+    bearable: float
 
 
 def joints_that_cannot_hold(robot: Robot, q: Array) -> dict[str, tuple[float, float]]:

@@ -20,11 +20,11 @@ is convex. If it encloses each sample with the shape's radius and that remainder
 segment, this radius is the distance of the farthest sample from the segment, plus the shape's radius and the remainder.
 []
 
-The choice of the segment decides only on the size. Some candidates lie along the shape and some along its way. The one
-with the least mean width is taken. Capsules of nested intervals are not nested: the capsule of the narrower interval
-may stick out of the capsule of the wider one. A narrower interval has to be proven as if a body grew
-(:func:`sticks_out`). The capsule of the wider interval stays valid as long as the opening is in that interval. A
-narrower interval may therefore always be refused.
+The choice of the segment affects only the size of the capsule. Some candidates lie along the shape and some along the
+path of its middle. The candidate with the least mean width is taken. Capsules of nested intervals are not nested: the
+capsule of the narrower interval may stick out of the capsule of the wider one. A change to a narrower interval has to
+be proven safe as if a body grew (:func:`sticks_out`). The capsule of the wider interval stays valid as long as the
+opening is in that interval. A narrower interval may therefore always be refused.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ _REMAINDER = 5e-5  # The wanted error of the interpolation. The steps are made s
 # Greatest number of samples of all driven joints of a chain together. If more were needed, the error is greater.
 _MOST_SAMPLES = 512
 _ROUNDING = 1e-9  # Addition to radii for the rounding of numbers [m].
-# Shares of the least radius (without the shape's) by which both ends of a segment are pulled in. The capsule becomes
-# thicker and its ends flatter.
+# Both ends of a segment are pulled in by these multiples of the radius that its capsule needs without the shape's own
+# radius. The capsule becomes thicker and its ends flatter.
 _PULLED_IN = np.array([0.0, 0.58, 1.2])
 
 
@@ -69,7 +69,7 @@ class FingerJoint:
     def travel(self, interval: Interval) -> tuple[float, float]:
         """Return the positions at both ends of ``interval``.
 
-        For an end at 0 or 1 it is the end of the joint's travel, which may lie beyond the gripper's stroke.
+        The position for 0 or 1 is the end of the joint's travel, which may lie beyond the gripper's stroke.
         """
         first = self.before if interval[0] <= 0.0 else self.closed + interval[0] * (self.open - self.closed)
         last = self.beyond if interval[1] >= 1.0 else self.closed + interval[1] * (self.open - self.closed)
@@ -118,7 +118,7 @@ class TurningBody:
 
     @cached_property
     def way(self) -> float:
-        """The greatest distance between the closed and the open place of an end of the segment [m]."""
+        """The greatest distance between the closed and the open position of an end of the segment [m]."""
         closed, opened = map(TurningSweeps((self,)).ends_at, (0.0, 1.0))
         return float(np.linalg.norm(opened[0] - closed[0], axis=1).max())
 
@@ -129,7 +129,7 @@ class TurningBody:
 
 
 class TurningSweeps:
-    """Computes the capsules of several bodies together in arrays. A gripper needs all of its own in mid-motion."""
+    """Computes the capsules of several bodies together in arrays. A moving gripper needs all of its capsules."""
 
     def __init__(self, bodies: Sequence[TurningBody]) -> None:
         count, depth = len(bodies), max(len(body.joints) for body in bodies)
@@ -165,7 +165,7 @@ class TurningSweeps:
         first, second = points[:, :half], points[:, half:]
         middles = 0.5 * (first + second)
         way, middle = 0.5 * (middles[:, -1] - middles[:, 0]), middles.mean(axis=1)
-        # The candidates (b, 2, 3): the first segment lies along the shape, the second one along its way.
+        # The candidates (b, 2, 3): the first segment lies along the shape, the second one along the path of its middle.
         starts = np.stack([first.mean(axis=1), middle - way], axis=1)
         ends = np.stack([second.mean(axis=1), middle + way], axis=1)
         pull = _PULLED_IN * _farthest(points, starts, ends)[..., None]

@@ -32,7 +32,7 @@ class MovingLink:
     mass: float | None  # [kg]; None if the model has no mass.
     drawn: bool  # Whether it has a <visual>.
     shaped: bool  # Whether it has a <collision>.
-    # The joint of an arm that a joint beside the arm mimics, if it moves this link. It is watched only at home.
+    # If a joint beside the arm moves this link: the joint of the arm that it mimics. The link is watched only at home.
     follows: str | None
     arms: tuple[str, ...]  # The arms that move it.
 
@@ -43,11 +43,14 @@ class MovingLink:
 
     @property
     def is_unchecked(self) -> bool:
-        """Whether the link is a body that is not watched at its real place."""
+        """Whether the link is a body that is not watched at its real pose."""
         return self.is_body and (not self.shaped or self.follows is not None)
 
     def fault(self, in_cell: bool) -> str:
-        """Return one line about what is missing and how to mend it; with ``in_cell`` in the YAML of a cell."""
+        """Return one line about what is missing and how to mend it.
+
+        With ``in_cell`` the line names keys of the cell's YAML, and without it arguments of :meth:`Robot.from_urdf`.
+        """
         named = _named([self.name], in_cell)
         if self.follows is not None:
             moves = f"follows {self.follows} as its joint mimics it, and would be watched where it is at home"
@@ -78,7 +81,7 @@ def moving_links(robot: Robot) -> list[MovingLink]:
 
 
 def unchecked_faults(robot: Robot, in_cell: bool = True) -> list[str]:
-    """Return one line for each link or arm that nothing is kept apart from, unless ``unchecked_links`` names it.
+    """Return one line for each link or arm that keeps no distance to others, unless ``unchecked_links`` names it.
 
     With ``in_cell`` the lines name keys of the cell's YAML as remedies, and without it arguments of
     :meth:`Robot.from_urdf`.

@@ -1,7 +1,7 @@
-"""Handle parts of a URDF that different readers understand in different ways.
+"""Handle parts of a URDF that different programs understand in different ways.
 
-Each part is brought to one form, refused, or reported. Readers of URDF silently skip elements that they do not know. A
-hand, a mass or half of a joint's range could be missing.
+Each part is brought to one form, refused, or reported. Readers of URDF silently skip elements that they do not know. In
+their models, a hand, a mass or half of a joint's range could be missing.
 """
 
 from __future__ import annotations
@@ -17,8 +17,10 @@ import pinocchio as pin
 
 from q2r2_control.errors import RobotError
 
-LARGEST_ANGLE = 6.0 * math.pi  # Greatest angle that a joint that counts its turns usually has [rad].
-LARGEST_SPEED = 40.0  # Greatest speed that the joint of an arm usually has [rad/s].
+# Greatest usual limits of the angle of a joint that counts its turns [rad], and of the speed of an arm's joint [rad/s].
+# Larger limits are probably in degrees.
+LARGEST_ANGLE = 6.0 * math.pi
+LARGEST_SPEED = 40.0
 _UNIT = re.compile(r"<unit\b[^>]*\bmeter\s*=\s*[\"']([0-9.eE+-]+)[\"']")
 _HEADER = 20_000  # Number of characters at the beginning of a COLLADA file in which its unit is searched.
 _UNIT_LENGTH = 1e-3  # Greatest difference of a quaternion's length from 1.

@@ -44,7 +44,7 @@ def renamed_exclusions(parts: Sequence[ET.Element], name_of: Callable[[str], str
 
 
 def shape_from_drawings(links: Sequence[ET.Element], names: Collection[str]) -> None:
-    """Give each link in ``names`` without a collision shape the shapes of its drawing."""
+    """Give each link in ``names`` that has no collision shape the shapes of its <visual> elements."""
     for link in links:
         if link.get("name") in names and link.find("collision") is None:
             for drawing in link.findall("visual"):

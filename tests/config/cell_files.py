@@ -19,7 +19,7 @@ CELL = SHIPPED / "dual_iiwa7.yaml"
 
 
 def shipped() -> dict[str, Any]:
-    """Return the text of the shipped cell of two iiwa 7."""
+    """Return the data of the shipped cell of two iiwa 7."""
     data: dict[str, Any] = read_yaml(CELL.read_text(encoding="utf-8"))
     return data
 
@@ -32,7 +32,7 @@ def loaded(tmp_path: Path, text: str | bytes) -> Config:
 
 
 def fault(tmp_path: Path, text: str | bytes) -> str:
-    """Return the text of the one line after the file's name and the number of the line."""
+    """Return the message about a faulty cell without the file's name and the line's number."""
     with pytest.raises(ConfigError) as caught:
         loaded(tmp_path, text)
     message = str(caught.value)

@@ -1,4 +1,4 @@
-"""The YAML of a cell: every fault gives one line that names its place and what is allowed."""
+"""The YAML of a cell: every fault gives one line that names the key and what is allowed."""
 
 from __future__ import annotations
 
@@ -199,7 +199,7 @@ def test_each_fault_in_a_file_is_named_with_its_line(tmp_path: Path) -> None:
         (15, "obstacles.table.pose"),
         (16, "colour"),
         (7, "arms.left.home.1"),
-        (14, "obstacles.table.shape"),  # It is missing. The line is that of the table.
+        (14, "obstacles.table.shape"),  # The key is missing. The line is that of its block.
         (14, "obstacles.table.size"),
     ]
     with pytest.raises(ConfigError) as of_no_file:

@@ -76,7 +76,7 @@ def test_the_blocks_of_the_page_about_kuka_are_valid_in_a_cell() -> None:
 
 
 @pytest.mark.parametrize(("name", "frame", "base"), [("iiwa7", "link_ee", 1.266), ("iiwa14", "link_7", 1.261)])
-def test_the_tool_that_the_page_puts_on_tf_is_the_shipped_cells(name: str, frame: str, base: float) -> None:
+def test_the_page_puts_the_tool_frame_of_the_shipped_cell_on_tf(name: str, frame: str, base: float) -> None:
     """The height ``base`` is that of the frame above the base of the stretched arm in the driver's own model [m]."""
     text = find_resource(f"config/dual_{name}.yaml").read_text(encoding="utf-8")
     robot = Robot.from_config(parse_config(text, "cell.yaml"))

@@ -48,6 +48,6 @@ def test_the_mount_is_replaced_and_everything_else_stays(text: str) -> None:
         pytest.param("[]", id="no cell"),
     ],
 )
-def test_a_mount_that_is_not_its_own_block_is_left_to_the_user(text: str) -> None:
+def test_a_mount_without_a_block_of_its_own_is_refused(text: str) -> None:
     with pytest.raises(ConfigError, match=r"arms\.right\.mount: no block of its own"):
         with_mount(text, "right", POSITION, RPY)

@@ -1,4 +1,4 @@
-"""The places where the files that a cell names are searched."""
+"""The folders in which the files that a cell names are searched."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ def models_in(annotation: object) -> Iterator[type[BaseModel]]:
 
 
 def shown(model: type[BaseModel], data: dict[str, Any], place: str = "") -> Iterator[tuple[str, type[BaseModel], Any]]:
-    """Return every block of a file with its place and its model. Of blocks by name, only the first is returned."""
+    """Return every block of a file with its keys and its model. Of blocks by name, only the first is returned."""
     yield place, model, data
     for key, field in model.model_fields.items():
         value, path = data.get(key), f"{place}.{key}".lstrip(".")
@@ -45,9 +45,9 @@ def shown(model: type[BaseModel], data: dict[str, Any], place: str = "") -> Iter
 
 
 class TestTheShippedCellShowsAllThereIsToTune:
-    # The value is not the default, and a comment in the file says so.
+    # Keys whose value is not the default, which a comment in the file says.
     CHOSEN = ("control.solve_time_limit", "control.distances", "mujoco.objects")
-    # A placement, such as an arm's mount, shows its keys.
+    # Blocks whose keys another block of the same kind shows, such as an arm's mount.
     SHOWN_ELSEWHERE = ("arms.left.tool.mount", "obstacles.table.rpy", "robot.mount.rpy", "external")
 
     @pytest.mark.parametrize("text", [external_text(), robot_text()], ids=["arms of their own", "one robot"])
@@ -68,7 +68,7 @@ class TestTheShippedCellShowsAllThereIsToTune:
     @pytest.mark.parametrize(
         "place", ["headset", "control", "impedance", "admittance", "supervision", "teleop", "mujoco", "judge"]
     )
-    def test_what_is_written_is_the_default(self, place: str) -> None:
+    def test_the_written_values_are_the_defaults(self, place: str) -> None:
         written = getattr(load_config(CELL), place)
         default = type(written)()
         for key in type(written).model_fields:

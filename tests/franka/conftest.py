@@ -1,4 +1,4 @@
-"""The plug-in is imported from its folder, so that what needs no robot is tested where it is not installed."""
+"""Import the plug-in from its folder. The parts that need no robot are then tested even if it is not installed."""
 
 from __future__ import annotations
 

@@ -3,7 +3,8 @@
     python simulated_arm.py 127.0.0.11 build/fr3.xml 0 0 0 -1.57 0 1.57 0.785
 
 The numbers are the posture in which it starts [rad]. A line on standard input changes what the robot does: ``reflex``,
-``user stop`` or ``user stop ends``. It ends at the end of standard input. Its standard output says what it does.
+``user stop`` or ``user stop ends``. The process ends at the end of standard input. Its standard output says what the
+robot does.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ ARMATURE = (0.195, 0.195, 0.195, 0.195, 0.074, 0.074, 0.074)
 FRICTION = (1.137, 1.137, 1.137, 1.137, 0.763, 0.44, 0.248)
 OBJECT_WIDTH = 0.04  # Width of the object between the fingers of the hand [m].
 IDLE, USER_STOPPED = 1, 5  # Modes of the robot.
-REFLEX = 3  # The number of a measured joint velocity above its limit, one of the errors that end in a reflex.
+REFLEX = 3  # The number of an error that ends in a reflex: a measured joint velocity is above its limit.
 
 
 def write_model(urdf: Path, path: Path) -> None:

@@ -65,7 +65,7 @@ class SimulatedArm:
         assert found, f"no {words!r} in {self.lines[since:]}"
 
     def ask(self, what: str) -> None:
-        """Ask the robot for a ``reflex``, a ``user stop``, or the end of it."""
+        """Ask the robot for a ``reflex``, a ``user stop``, or the end of this stop."""
         before = len(self.lines)
         assert self._process.stdin is not None
         self._process.stdin.write(f"{what}\n")

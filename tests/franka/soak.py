@@ -50,7 +50,7 @@ class Report:
 
 
 class Operator(ScriptedInput):
-    """Hands that move in circles. Their operator presses again after a pause, and ends each session in some way."""
+    """Hands that move in circles. Their operator presses again after a pause, and ends each session as ``ends`` say."""
 
     def __init__(
         self, arms: Mapping[str, SimulatedArm], sessions: int, ends: tuple[str, ...], seed: int, trajectory: str

@@ -1,4 +1,4 @@
-"""Two simulated FR3 behind the real client library. franka-sim is not ours, and neither is its judgement."""
+"""Two simulated FR3 behind the real client library. franka-sim judges the commands, and others wrote it."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def test_sessions_that_end_in_every_way_have_no_reflex_and_no_violation(mode: Co
 
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", [CommandMode.POSITION, CommandMode.TORQUE])
-def test_hands_that_hand_over_and_stack_are_followed_without_a_reflex(mode: CommandMode) -> None:
+def test_arms_follow_the_handover_and_stacking_trajectory_without_a_reflex(mode: CommandMode) -> None:
     found = run_slowly("--trajectory", "handover+stack", "--mode", mode, slowness=SLOWNESS)
     assert found["failure"] == ""
     assert found["reflexes"] == []

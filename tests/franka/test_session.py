@@ -35,7 +35,11 @@ class Arm:
         return self.session.answer(self.now, ahead)
 
     def command(self, end: float, speed: float, way: float, start: float, **torques: object) -> bool:
-        """Take the command of a tick, of which the first joint moves by ``way`` [rad] in all."""
+        """Give the session the command of a tick, at whose end the first joint is ``way`` [rad] away from ``Q``.
+
+        Returns:
+            True if the session takes the command.
+        """
         first = np.eye(JOINTS)[0]
         q, v = np.array(Q) + way * first, speed * first
         command = ArmCommand(self.now, start, end, tuple(q), tuple(v), (ACCELERATION,) * JOINTS)
@@ -44,7 +48,11 @@ class Arm:
         return follow({"left": self.session}, {"left": command})
 
     def accelerate(self, until: float) -> tuple[float, float]:
-        """Follow a reference that accelerates from rest; returns its last time [s] and the first joint's way [rad]."""
+        """Follow a reference that accelerates from rest.
+
+        Returns:
+            The reference's last time [s], and the first joint's displacement [rad].
+        """
         start = end = self.now + 2 * TICK
         speed = way = 0.0
         while speed < until:
@@ -68,7 +76,7 @@ def test_arm_comes_to_rest_on_its_certified_stop_if_no_command_comes() -> None:
     assert arm.session.is_still(arm.now)
 
 
-def test_command_that_an_answer_has_passed_is_refused() -> None:
+def test_command_that_begins_before_the_time_of_the_last_answer_is_refused() -> None:
     arm = Arm()
     end, way = arm.accelerate(SPEED)
     for _ in range(20):

@@ -42,7 +42,7 @@ def test_positions_keep_the_limits_of_jerk_where_the_acceleration_jumps_by_twice
 
 
 @pytest.mark.parametrize("lost", [1, 2, 5, 15])
-def test_robot_that_lost_commands_is_led_back_within_the_limits(lost: int) -> None:
+def test_robot_that_got_no_commands_comes_back_to_the_path_within_the_limits(lost: int) -> None:
     random = np.random.default_rng(lost)
     sent, entries, passed = PositionStream(MIDDLE), list[Entry](), list[Array]()
     for i, q in enumerate(restless_path(2.0, random)):
@@ -55,7 +55,7 @@ def test_robot_that_lost_commands_is_led_back_within_the_limits(lost: int) -> No
     assert result.lost == lost * 15
 
 
-def test_command_is_the_mean_again_some_time_after_lost_commands() -> None:
+def test_command_equals_the_mean_of_positions_again_some_time_after_lost_commands() -> None:
     path = list(restless_path(2.0, np.random.default_rng(2), 400))
     all_heard, some_lost = PositionStream(MIDDLE), PositionStream(MIDDLE)
     expected = [all_heard.next([q]) for q in path]
@@ -96,5 +96,5 @@ def test_recorded_commands_are_read_as_they_were_written(tmp_path: Path) -> None
         np.testing.assert_array_equal(read.values, written.values)
 
 
-def test_means_are_enough_for_the_limit_of_jerk() -> None:
+def test_number_of_averaged_positions_is_enough_for_the_limit_of_jerk() -> None:
     assert 2.0 * limits.ACCELERATION / (stream.MEANS * PERIOD) <= limits.JERK

@@ -1,4 +1,4 @@
-"""A cell with one block on a post between the left fingers, and motions that drive it."""
+"""A cell with one block on a post between the left fingers, and commands that move its arms."""
 
 from __future__ import annotations
 

@@ -82,7 +82,10 @@ def test_a_push_moves_the_tool_by_force_over_stiffness(bare: MujocoPlant, robot:
 
 
 def modes(robot: Robot, settings: ImpedanceSettings) -> tuple[Array, Array]:
-    """Return frequencies (6,) [rad/s] and shapes V (6, 6) of the left tool on its spring, with V' Lambda V = 1."""
+    """Return the frequencies (6,) [rad/s] and shapes V (6, 6) of the modes of the left tool on its spring.
+
+    V' Lambda V = 1 holds, where Lambda is the tool's inertia.
+    """
     J, M = left_arm(robot, robot.home)
     inertia = np.linalg.inv(J @ np.linalg.solve(M, J.T))
     stiffness = np.diag([settings.translational_stiffness] * 3 + [settings.rotational_stiffness] * 3)
@@ -94,7 +97,7 @@ def fitted_ratio(z: Array) -> float:
     """Return the damping ratio of z'' + 2 xi w z' + w^2 z = 0 that fits a release from rest best, for any xi.
 
     Integrated twice, z - z_0 = -2 xi w S(z - z_0) - w^2 SS z, which is linear in 2 xi w and w^2 and takes no derivative
-    of a measurement. Nothing is assumed about xi, other than by a logarithmic decrement, which needs oscillation.
+    of a measurement. This assumes nothing about xi. A logarithmic decrement, in contrast, needs an oscillation.
     """
     first = cumulative_trapezoid(z - z[0], dx=DT, initial=0)
     second = cumulative_trapezoid(cumulative_trapezoid(z, dx=DT, initial=0), dx=DT, initial=0)
@@ -111,7 +114,7 @@ def test_every_mode_that_is_released_returns_with_its_damping_ratio(
     frequencies, V = modes(robot, settings)
     stiffness = np.repeat([settings.translational_stiffness, settings.rotational_stiffness], 3)
     for frequency, shape in zip(frequencies, V.T, strict=True):
-        # Each mode is tested alone, because a fast mode would be hidden by the rest of a slow one.
+        # Each mode is tested alone, because the remaining motion of a slow mode would hide a fast mode.
         wrench = stiffness * shape
         wrench *= min(15.0 / np.linalg.norm(wrench[:3]), 4.0 / np.linalg.norm(wrench[3:]))
         loop = TorqueLoop(bare, robot, settings, robot.home)
@@ -201,7 +204,7 @@ def test_an_arm_after_a_blow_keeps_every_bound_and_comes_back(bare: MujocoPlant,
     assert np.linalg.norm(loop.displacement()[:3]) < 2e-3
 
 
-def test_what_a_gripper_holds_hangs_on_no_spring_and_makes_no_torque_jump(bare_config: Config) -> None:
+def test_a_known_held_mass_causes_no_sag_and_no_torque_jump(bare_config: Config) -> None:
     """A mass of 2 kg at the tool's point causes a sag of 9.8 mm at 2000 N/m, as long as the controller does not know
     it.
     """

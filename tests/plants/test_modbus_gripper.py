@@ -1,4 +1,4 @@
-"""A gripper on Modbus against a simulated one, which moves by a step whenever it is read."""
+"""A gripper on Modbus, tested with a simulated gripper that moves by one step whenever it is read."""
 
 from __future__ import annotations
 
@@ -249,7 +249,7 @@ def test_a_gripper_on_a_serial_device_speaks_modbus_rtu() -> None:
         assert simulated.activations == 1
 
 
-def test_without_its_package_the_error_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_pymodbus_is_an_error_that_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pymodbus.client", None)
     with pytest.raises(ConfigError, match=rf"fri\.left\.gripper\.modbus: .* {re.escape(install_line('modbus'))}"):
         ModbusGripper("left", ModbusGripperConfig(modbus="192.168.1.11"))

@@ -97,7 +97,7 @@ class TestTorqueMode:
 
 
 class TestPush:
-    def test_external_torque_is_the_push_seen_from_the_joints(self, plant: MujocoPlant, robot: Robot) -> None:
+    def test_external_torque_equals_the_joint_torques_of_the_push(self, plant: MujocoPlant, robot: Robot) -> None:
         wrench = np.array([10.0, -20.0, 30.0, 1.0, 2.0, -3.0])
         plant.push("left", wrench, 0.5)
         plant.advance(0.4)

@@ -55,7 +55,7 @@ def test_a_window_without_a_display_is_refused(plant: MujocoPlant, monkeypatch: 
     assert plant.viewer_sync() is False
 
 
-def test_the_window_draws_moving_obstacles_at_their_places_while_they_exist(plant: MujocoPlant) -> None:
+def test_the_window_draws_moving_obstacles_at_their_poses_while_they_exist(plant: MujocoPlant) -> None:
     scene = mujoco.MjvScene(plant.model, maxgeom=8)
     shapes = [("sphere", (0.1,)), ("capsule", (0.1, 0.4)), ("box", (0.1, 0.2, 0.4))]
     turned = {"position": (0.6, 0.4, 0.3), "rpy": (0.0, np.pi / 2, 0.0), "speed": 0.2}

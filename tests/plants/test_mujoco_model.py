@@ -140,7 +140,7 @@ def test_an_object_named_like_a_part_of_the_robot_is_refused(robot: Robot, confi
         build_model(robot, clashing)
 
 
-# The mesh has a wedge in a node that turns it about z by a quarter, which a reader could ignore.
+# The mesh is a wedge in a node that turns it by 90 degrees about z. A parser could ignore this rotation.
 DAE = """<?xml version="1.0"?>
 <COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
   <asset><unit name="meter" meter="1"/><up_axis>Z_UP</up_axis></asset>

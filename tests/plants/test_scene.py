@@ -1,4 +1,4 @@
-"""Contacts of obstacles in MuJoCo: the named pairs, and the depth of a sliding finger."""
+"""Contacts of obstacles in MuJoCo: the contact pairs of the model, and the depth of a sliding finger."""
 
 from __future__ import annotations
 
@@ -49,7 +49,10 @@ def test_a_soft_object_yields_by_its_stiffness_where_it_stands(robot: Robot, con
 
 
 def depths(config: Config, speed: float, named: bool) -> Array:
-    """Return the depth in the table [m] at each millisecond of a pad that :data:`LOAD` presses and that slides."""
+    """Return the depth in the table at each millisecond [m] of a pad that slides under the load :data:`LOAD`.
+
+    With ``named``, the model has contact pairs of pads and obstacles.
+    """
     spec = mujoco.MjSpec()
     spec.option.cone, spec.option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, 100.0
     spec.option.gravity = (0.0, 0.0, -LOAD / MASS)

@@ -19,7 +19,7 @@ def cell(robot: Robot, config: Config) -> SimulatedCell:
 
 
 def push(cell: SimulatedCell, now: float) -> None:
-    """Return a torque that bears the arms and turns one joint."""
+    """Command torques that bear the arms and turn one joint."""
     robot = cell.robot
     tau = pin.computeGeneralizedGravity(robot.model, robot.model.createData(), cell.plant.state().q)
     tau[5] += 5.0
@@ -40,14 +40,14 @@ def test_a_torque_that_is_not_renewed_acts_for_some_milliseconds(cell: Simulated
     assert cell.dropped == pytest.approx(late - 0.012, abs=0.005)
 
 
-def test_if_the_simulation_is_called_late_an_old_torque_does_not_act_for_all_that_time(cell: SimulatedCell) -> None:
+def test_an_old_torque_does_not_act_for_the_whole_time_of_a_late_call(cell: SimulatedCell) -> None:
     cell.advance(0.0)
     push(cell, 0.0)
     cell.advance(0.05)
     assert cell.plant.data.time <= 0.012 + 1e-9
 
 
-def test_without_torques_for_a_while_the_arms_stand_on_their_servos(cell: SimulatedCell) -> None:
+def test_servos_hold_the_arms_if_no_torques_come_for_a_while(cell: SimulatedCell) -> None:
     cell.advance(0.0)
     push(cell, 0.0)
     for now in np.arange(0.004, 1.0, 0.004):

@@ -1,4 +1,4 @@
-"""Cells for several tests. Loading one takes a tenth of a second, so that each is loaded once."""
+"""Cells for several tests. Loading a cell takes a tenth of a second, and so each cell is loaded only once."""
 
 from __future__ import annotations
 

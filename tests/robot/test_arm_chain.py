@@ -13,7 +13,7 @@ from q2r2_control.robot.description import LinkTree, load_description
 
 
 def tree(*joints: str) -> LinkTree:
-    """Return a model of joints, each given as parent, child, kind (default: fixed) and name (default: its child's)."""
+    """Return a model of joints, each given as parent, child, kind (default: fixed) and name (default: to_CHILD)."""
     robot = ET.Element("robot")
     links: dict[str, None] = {}
     for text in joints:
@@ -22,7 +22,7 @@ def tree(*joints: str) -> LinkTree:
         joint = ET.SubElement(robot, "joint", name=name, type=kind)
         ET.SubElement(joint, "parent", link=parent)
         ET.SubElement(joint, "child", link=child)
-        ET.SubElement(joint, "origin", xyz=f"{len(links)} 0 0")  # Every link has its own place.
+        ET.SubElement(joint, "origin", xyz=f"{len(links)} 0 0")  # Every link has its own position.
         links |= {parent: None, child: None}
     for link in links:
         ET.SubElement(robot, "link", name=link)

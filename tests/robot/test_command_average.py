@@ -1,4 +1,7 @@
-"""The window of averaged commands fits the limit of jerk, and pairs keep as much more distance as a mean may be off."""
+"""The window of averaged commands fits the limit of jerk.
+
+Pairs keep more distance, by as much as the mean can be off the path.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +42,7 @@ def test_the_joint_with_the_least_limit_decides_the_window(robot: Robot) -> None
         (300.0, r"control\.jerk_limit = 300: allowed for left_A. with its acceleration limit: 400 rad/s\^3 or more"),
     ],
 )
-def test_a_limit_that_does_not_fit_the_robot_is_refused_by_name(robot: Robot, jerk: object, why: str) -> None:
+def test_a_jerk_limit_that_does_not_fit_the_robot_is_refused_by_name(robot: Robot, jerk: object, why: str) -> None:
     with pytest.raises(ConfigError, match=why):
         kept_distances(robot, ControllerSettings(jerk_limit=jerk))
 
@@ -57,7 +60,7 @@ def test_no_pair_comes_closer_by_more_than_the_allowance_when_every_joint_is_off
     assert float((largest / np.maximum(allowance, 1e-12)).max()) > 0.2, "the allowance is far too large"
 
 
-def test_every_pair_keeps_its_allowance_more(robot: Robot) -> None:
+def test_every_pair_keeps_more_distance_by_its_allowance(robot: Robot) -> None:
     plain, limited = ControllerSettings(), ControllerSettings(jerk_limit=5000.0)
     more = kept_distances(robot, limited).values - kept_distances(robot, plain).values
     assert more == pytest.approx(average_allowance(robot, limited, robot.collision_model), abs=1e-12)

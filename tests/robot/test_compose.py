@@ -106,7 +106,7 @@ def test_a_bad_arm_ends_in_one_line_that_names_key_value_and_what_is_allowed(arm
 @pytest.mark.parametrize(
     "name", ["world", "universe", "left_post", "right_", "", "two words", 'a"><link name="b', "ä", "1st", "a\n"]
 )
-def test_obstacle_names_that_clash_or_break_out_are_refused(name: str) -> None:
+def test_obstacle_names_that_clash_or_would_change_the_xml_are_refused(name: str) -> None:
     data = one_arm().model_dump() | {"obstacles": {name: {"shape": "sphere", "size": [0.1]}}}
     with pytest.raises(ConfigError, match=r"obstacles\..*allowed: letters") as error:
         compose(Config.model_validate(data))
@@ -132,7 +132,7 @@ def test_an_obstacle_may_be_called_floor_only_if_the_cell_has_no_floor() -> None
     assert compose(Config.model_validate(data | {"floor": None})).obstacles == ("floor",)
 
 
-def test_a_cell_name_cannot_break_out_of_the_text() -> None:
+def test_a_cell_name_cannot_change_the_xml() -> None:
     quoted = one_arm().model_copy(update={"name": 'a"><link name="b'})
     assert ET.fromstring(compose(quoted).urdf).get("name") == 'a"><link name="b'
     with pytest.raises(ConfigError, match="printable"):

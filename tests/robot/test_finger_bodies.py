@@ -46,14 +46,14 @@ def bodies(robot: Robot, link: str) -> list[pin.GeometryObject]:
 
 
 def beyond(point: Array, item: pin.GeometryObject) -> float:
-    """Return how far a point of the arm's last joint's frame is outside a capsule [m]."""
+    """Return how far ``point``, in the frame of the arm's last joint, is outside a capsule [m]."""
     local = item.placement.actInv(point)
     half = getattr(item.geometry, "halfLength", 0.0)
     return float(np.linalg.norm(local - [0.0, 0.0, np.clip(local[2], -half, half)]) - item.geometry.radius)
 
 
 def finger_at(position: float) -> pin.SE3:
-    """Return the finger's link in the frame of the arm's joint."""
+    """Return the pose of the finger's link in the frame of the arm's joint, with the finger at ``position`` [m]."""
     tool = pin.SE3(pin.rpy.rpyToMatrix(0.3, -0.4, 0.5), np.array([0.2, 0.0, 0.0]))
     slide = pin.SE3(pin.rpy.rpyToMatrix(0.0, 0.0, 1.0), np.array([0.0, 0.03, 0.0]))
     moved: pin.SE3 = tool * slide * pin.SE3(np.eye(3), np.array([0.0, position, 0.0]))
@@ -77,7 +77,7 @@ def test_the_body_contains_the_finger_at_every_opening(shape: str) -> None:
         assert 2 * body.geometry.halfLength == pytest.approx(0.05 if shape == "sphere" else 0.07)
 
 
-def test_a_turning_finger_covers_its_whole_sweep_and_a_fixed_one_stays_unchanged() -> None:
+def test_the_body_of_a_turning_finger_covers_its_sweep_and_that_on_a_planar_joint_is_not_changed() -> None:
     (ball,) = bodies(robot_with("sphere", kind="planar"), "finger")
     assert isinstance(ball.geometry, coal.Sphere)
     (body,) = bodies(robot_with("cylinder across", kind="revolute"), "finger")

@@ -1,4 +1,4 @@
-"""A finger's body at a known opening contains the finger tightly, and only shrinks with more knowledge."""
+"""A finger's body at a known opening contains the finger tightly, and is never larger for fewer openings."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def finger_at(robot: Robot, joint: str, position: float, points: Array) -> Array
 
 def test_the_body_of_the_hand_e_contains_both_fingers_at_each_opening_of_the_interval() -> None:
     robot = Robot.from_config(HAND_E)
-    # These are both ends of the capsules that robots/hand_e.urdf draws around a tip, in the link of their finger.
+    # Both ends of a capsule around a fingertip in robots/hand_e.urdf, by finger, in the frame of the finger's link.
     drawn = {1: np.array([[0.00825, 0.0, 0.03725], [0.00825, 0.012, 0.03725]])}
     drawn[2] = drawn[1] * [1.0, -1.0, 1.0]
     name = "left_hand_e_finger_1_envelope_3"
@@ -80,7 +80,7 @@ def test_the_body_of_the_hand_e_contains_both_fingers_at_each_opening_of_the_int
 
 
 @pytest.mark.parametrize("positions", [(0.03, 0.0), (0.0, 0.03)], ids=["opens outwards", "opens inwards"])
-def test_fingers_on_two_lines_have_separate_ways(positions: tuple[float, float], tmp_path: object) -> None:
+def test_fingers_on_two_lines_have_separate_bodies(positions: tuple[float, float], tmp_path: object) -> None:
     robot = cell(hand(), ("slide", "other"), str(tmp_path), positions)
     assert {body.name for body in robot.finger_bodies if body.arm == "left"} == {"left_one_0", "left_two_0"}
     opened, closed = positions
@@ -94,7 +94,7 @@ def test_fingers_on_two_lines_have_separate_ways(positions: tuple[float, float],
             assert np.linalg.norm(ends[1] - ends[0]) == pytest.approx(0.03 * np.ptp(interval) + beyond, abs=1e-9)
 
 
-def test_a_finger_that_mimics_another_one_is_where_that_one_puts_it(tmp_path: object) -> None:
+def test_a_finger_that_mimics_another_finger_is_where_the_mimic_puts_it(tmp_path: object) -> None:
     mimic = '<mimic joint="slide" multiplier="-0.5" offset="0.001"/>'
     robot = cell(hand(mimic, axis="0 1 0"), ("slide",), str(tmp_path), (0.03, 0.0))
     ends = ends_at(robot, "left_two_0", (0.2, 0.6))
@@ -115,7 +115,7 @@ def test_the_body_of_more_openings_contains_that_of_fewer() -> None:
         assert body.part(ALL_OF_THE_WAY) == (0.0, 1.0)
 
 
-def test_without_known_closed_and_open_positions_fingers_cover_their_whole_way() -> None:
+def test_without_known_closed_and_open_positions_bodies_cover_all_positions_of_fingers() -> None:
     made = Robot.from_config(HAND_E)
     plain = Robot.from_urdf(made.urdf, {arm.name: arm.tool_frame for arm in made.arms.values()})
     assert plain.finger_bodies == ()

@@ -1,4 +1,4 @@
-"""Flanges between an arm and its tool: the place of the tool, the monitored pairs, and refused flanges."""
+"""Flanges between an arm and its tool: the pose of the tool, the monitored pairs, and refused flanges."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_the_body_of_each_flange_is_monitored_against_everything_that_its_arm_ca
     assert not {pair for pair in new if pair & {"right_media_flange"} and pair & {"right_link_5", "right_link_2"}}
 
 
-def test_the_sphere_of_the_touch_flange_encloses_its_drawing_and_what_link_7_does_not() -> None:
+def test_the_sphere_of_the_touch_flange_encloses_its_outline_which_link_7_does_not() -> None:
     """The outline is that of the published mesh, from the end of the plain flanges: radius at height z [m]."""
     outline = {-0.045: 0.055, -0.026: 0.0582, 0.0: 0.0553, 0.026: 0.0329}
     urdf = load_description("media_flange_touch_pneumatic").urdf
@@ -87,8 +87,11 @@ def test_known_pairs_of_tool_and_arm_are_not_used_with_an_unknown_flange_between
     assert "media_flange" not in compose(elsewhere).srdf
 
 
-def test_a_flange_of_one_s_own_is_a_urdf_whose_last_link_or_frame_carries_the_tool(tmp_path: Path) -> None:
-    """The flange is a coupler with a sensor beside it: two ends, of which the file names one."""
+def test_a_users_flange_is_a_urdf_whose_last_link_or_frame_carries_the_tool(tmp_path: Path) -> None:
+    """The flange is a coupler with a sensor beside it.
+
+    It has two ends, and the cell names the one that carries the tool.
+    """
     joint = '<joint name="{0}_joint" type="fixed"><parent link="disc"/><child link="{0}"/><origin xyz="{1}"/></joint>'
     links = '<link name="disc"/><link name="end"/><link name="side"/>'
     text = f'<robot name="disc">{links}{joint.format("end", "0 0 0.04")}{joint.format("side", "0.05 0 0.01")}</robot>'

@@ -100,7 +100,7 @@ def test_an_impossible_mimic_is_refused_by_name(joints: tuple[str, ...], complai
         pytest.param(joint("b", "a -1 0", "0 0.8"), (0.0, 0.8), id="whose range has the wrong sign"),
     ],
 )
-def test_a_driver_moves_no_farther_than_its_follower(follower: str, limits: tuple[float, float]) -> None:
+def test_a_driver_moves_only_as_far_as_its_followers_limits_allow(follower: str, limits: tuple[float, float]) -> None:
     root = parse_urdf(model(joint("a"), follower), "arm.urdf")
     found = {one.get("name"): joint_limits(one) for one in root.findall("joint")}
     assert found["a"] == pytest.approx(limits)

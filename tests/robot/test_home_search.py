@@ -8,7 +8,7 @@ from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.robot import Robot
 
 
-def test_a_low_base_has_a_home_with_room_below_the_tool() -> None:
+def test_an_arm_on_a_low_base_has_a_home_that_is_high_enough_for_scripted_hands() -> None:
     arm = {"model": "example-robot-data:ur5", "tip": "tool0", "home": [0.0, -1.0, 1.3, 0.4, 1.2, 0.0]}
     low = {"mount": {"position": [0.0, 0.0, 0.02]}}
     config = Config.model_validate({"name": "low", "arms": {"left": arm | low}})

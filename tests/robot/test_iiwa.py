@@ -1,4 +1,4 @@
-"""robots/iiwa7 and robots/iiwa14: numbers against their sources, exclusions against sampling."""
+"""robots/iiwa7 and robots/iiwa14 agree with their sources: lengths, masses, limits, rotors and capsules."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def test_a7_turns_the_flange_about_its_own_axis(robot: Robot) -> None:
     np.testing.assert_allclose(pose.rotation, pin.utils.rotate("z", math.pi / 6), atol=1e-9)
 
 
-def test_masses_are_those_of_the_table(name: str) -> None:
+def test_masses_are_those_of_the_source(name: str) -> None:
     urdf = load_description(name).urdf
     written = [float(mass.get("value", "nan")) for mass in urdf.findall("link/inertial/mass")]
     assert written == list(SHEETS[name].masses)

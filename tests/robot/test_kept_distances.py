@@ -1,4 +1,4 @@
-"""The distance that each pair keeps: by the class of its bodies, by their names, or else the common one."""
+"""The distance that each pair keeps: by the class of its bodies, by their names, or else min_distance."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ from q2r2_control.robot.load import MODEL, PENDANT, LoadReport, identify_load
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
-# Mass [kg], and place in the frame of the tool's base, which is the flange [m].
+# Added mass [kg], and its position in the frame of the tool's base, which is the flange [m].
 ADDED, AT = 0.7, np.array([0.02, -0.03, 0.1])
 
 

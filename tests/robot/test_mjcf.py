@@ -51,7 +51,7 @@ JOINTS = ("turn", "lift", "out", "spin", "a", "b")
 
 @pytest.fixture
 def arm(tmp_path: Path) -> Path:
-    """Return the file with its mesh, which is not centred where it is drawn."""
+    """Return the MJCF file. The origin of its mesh is not the centre of the mesh."""
     (tmp_path / "parts").mkdir()
     corners = "v 0.1 0 0\nv 0.3 0 0\nv 0.1 0.1 0\nv 0.1 0 0.05\n"
     (tmp_path / "parts" / "wedge.obj").write_text(corners + "f 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n")
@@ -149,7 +149,7 @@ def test_arms_at_an_angle_to_the_world_and_two_arms_in_one_file_get_a_root(arm: 
         assert data.oMf[model.getFrameId(name)].translation == pytest.approx(theirs)
 
 
-def test_additional_names_of_the_urdf_give_way_to_the_files(arm: Path) -> None:
+def test_names_that_the_urdf_adds_differ_from_all_names_of_the_file(arm: Path) -> None:
     text = ARM.replace('name="slide"', 'name="shoulder_before_turn"').replace('name="spinner"', 'name="mjcf_world"')
     arm.write_text(text.replace('name="base"', 'name="base"><joint name="j"/><geom size="1"/></body><body name="b"'))
     assert LinkTree(read(arm)[0], "arm").root == "mjcf_world_"

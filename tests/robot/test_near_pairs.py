@@ -34,7 +34,7 @@ def made(
     return robot, [record.getMessage() for record in caplog.records]
 
 
-def test_own_links_that_hold_an_arm_up_are_named_with_lines_that_release_it(
+def test_own_links_that_block_an_arm_are_named_with_lines_that_release_it(
     ur5: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     robot, (said,) = made(ur5, caplog)
@@ -70,7 +70,7 @@ def test_the_warning_is_python_code_that_removes_the_warning(ur5: Path, caplog: 
         ("tiago_dual", {"left": "hand_left_grasping_frame", "right": "hand_right_grasping_frame"}),
     ],
 )
-def test_too_near_home_and_hardly_parting_links_are_both_named_and_only_both_cures_release_the_arms(
+def test_both_cures_are_named_and_needed_if_pairs_are_too_near_at_home_and_other_links_hardly_part(
     model: str, tools: dict[str, str], caplog: pytest.LogCaptureFixture
 ) -> None:
     file = load_description(f"example-robot-data:{model}").file
@@ -94,7 +94,7 @@ def test_an_srdf_that_names_the_pair_prevents_the_warning(ur5: Path, caplog: pyt
     assert made(ur5, caplog, srdf=f'<robot name="ur5">{both}</robot>')[1] == []
 
 
-def test_a_pair_that_can_part_needs_another_home(ur5: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_pair_that_other_postures_bring_apart_needs_another_home(ur5: Path, caplog: pytest.LogCaptureFixture) -> None:
     bent = {"elbow_joint": 2.9, "shoulder_lift_joint": -1.2}
     robot, (said,) = made(ur5, caplog, home=bent)
     assert robot.home[1:3].tolist() == [-1.2, 2.9]

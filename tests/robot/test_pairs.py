@@ -67,7 +67,7 @@ def test_the_floor_is_watched_against_the_links_that_can_come_near_it(dual_iiwa:
     [((0.0, 0.0, 0.7), 0.0), ((0.0, 0.5, 0.0), -0.3), ((0.0, 0.5, 0.0), 0.1), ((3.1416, 0.0, 0.0), -0.3)],
     ids=["upright", "tilted", "tilted, a floor that is high", "hung"],
 )
-def test_links_that_are_not_monitored_against_the_floor_stay_away(rpy: tuple[float, ...], height: float) -> None:
+def test_links_without_a_monitored_pair_with_the_floor_stay_away_from_it(rpy: tuple[float, ...], height: float) -> None:
     mount = {"position": (0.0, 0.0, 0.0), "rpy": rpy}
     robot = Robot.from_config(one_arm(mount=mount).model_copy(update={"floor": height}))
     geometry = robot.collision_model.copy()
@@ -104,7 +104,7 @@ def _disabled(text: str) -> set[tuple[str, ...]]:
 
 @pytest.mark.parametrize("arm", ["iiwa7", "iiwa14"])
 @pytest.mark.parametrize("flange", [None, pytest.param(TOUCH, marks=pytest.mark.slow)])
-def test_every_shipped_file_lists_what_the_program_finds(arm: str, flange: str | None) -> None:
+def test_every_shipped_srdf_lists_the_pairs_that_the_program_finds(arm: str, flange: str | None) -> None:
     gripper = load_config(f"config/dual_{arm}.yaml").arms["left"].gripper.model_dump()  # The fingers are one body.
     made = model_srdfs(one_arm(model=arm, flange={"model": flange}, tool=HAND, gripper=gripper), SAMPLES)
     on = f"{TOUCH}_on_{arm}" if flange else arm

@@ -46,7 +46,9 @@ def test_fingers_are_locked_open(dual_iiwa7: Robot) -> None:
 
 
 @pytest.mark.parametrize(("side", "sign"), [("left", 1), ("right", -1)])
-def test_at_home_the_tools_point_straight_down_mirrored_and_clear(dual_iiwa: Robot, side: str, sign: int) -> None:
+def test_at_home_the_tools_point_down_mirrored_and_far_from_other_bodies(
+    dual_iiwa: Robot, side: str, sign: int
+) -> None:
     pose = dual_iiwa.tool_pose(dual_iiwa.home, side)
     np.testing.assert_allclose(pose.translation, [0.5, 0.25 * sign, 0.38], atol=2e-4)
     np.testing.assert_allclose(pose.rotation, np.diag([-1.0, 1.0, -1.0]), atol=2e-4)
@@ -62,7 +64,7 @@ def test_distances_name_the_pairs_in_their_order_and_turn_negative_in_penetratio
     assert "table_0" in (worst.name_a, worst.name_b)
 
 
-def test_the_urdf_it_carries_loads_to_the_same_robot(dual_iiwa7: Robot, dual_iiwa7_cell: ComposedCell) -> None:
+def test_the_urdf_of_a_robot_loads_to_an_equal_robot(dual_iiwa7: Robot, dual_iiwa7_cell: ComposedCell) -> None:
     again = Robot.from_urdf(dual_iiwa7.urdf, TOOLS, srdf=dual_iiwa7_cell.srdf)
     assert again.name == "dual_iiwa7"
     assert again.joint_names == dual_iiwa7.joint_names
@@ -74,7 +76,7 @@ def test_the_urdf_it_carries_loads_to_the_same_robot(dual_iiwa7: Robot, dual_iiw
     )
 
 
-def test_a_file_in_the_place_of_a_urdf_tree_is_refused_with_the_ways_to_make_a_robot(dual_iiwa7: Robot) -> None:
+def test_a_file_instead_of_a_urdf_tree_is_refused_with_the_right_constructors(dual_iiwa7: Robot) -> None:
     with pytest.raises(RobotError, match=re.escape("Robot('arm.urdf', ...): allowed: Robot.from_config(config), Rob")):
         Robot("arm.urdf")  # type: ignore[call-arg, arg-type]
     assert copy(dual_iiwa7).joint_names == dual_iiwa7.joint_names
@@ -109,7 +111,7 @@ def test_without_an_srdf_an_arm_inside_the_other_one_or_an_obstacle_at_home_is_s
     assert {frozenset(("l3_0", "a_l3_0")), frozenset(("l3_0", "post_0")), frozenset(("l1_0", "post_0"))} <= watched
 
 
-def test_with_an_srdf_only_what_overlaps_everywhere_is_left_out() -> None:
+def test_with_an_srdf_only_pairs_that_overlap_everywhere_are_not_monitored() -> None:
     """Links 1 and 3 are at most 0.6 m apart, and less at home, where the chain is bent."""
     bent = _urdf(3).replace('xyz="0 0 0.3"', 'xyz="0 0 0.3" rpy="0 1 0"')
     touching_at_home, touching_always = bent.replace("0.1", "0.28"), bent.replace("0.1", "0.301")
@@ -163,7 +165,7 @@ def test_a_robot_whose_only_link_without_shapes_is_named_monitors_no_pair() -> N
 
 
 @pytest.mark.slow
-def test_a_link_and_a_fixed_joint_may_have_one_name() -> None:
+def test_a_link_and_a_fixed_joint_may_have_the_same_name() -> None:
     file = load_description("example-robot-data:z1").file
     robot = Robot.from_urdf(file, {"left": "gripperMover"}, unchecked_links=["link01", "link05"])
     assert robot.joint_names == (*(f"joint{number}" for number in range(1, 7)), "jointGripper")

@@ -60,8 +60,9 @@ TIAGO: dict[str, Any] = {
 
 
 def _tiago_pairs() -> str:
-    """The maker does not list these pairs: the forearm's capsule reaches into the palm's, the torso's into the
-    shoulder's.
+    """Return an SRDF with pairs that the maker does not list.
+
+    The forearm's capsule reaches into the palm's capsule, and the torso's capsule into the shoulder's.
     """
     hand = ("safety_box", "palm_link", "index_link", "mrl_link", "thumb_link")
     pairs = [(f"arm_{side}_5_link", f"hand_{side}_{part}") for side in ("left", "right") for part in hand]
@@ -104,7 +105,7 @@ def test_the_arms_are_monitored_against_each_other_and_the_torso_that_carries_th
         assert frozenset(pair) in watched, pair
 
 
-def test_a_robot_without_an_srdf_monitors_every_pair_that_can_be_parted() -> None:
+def test_a_robot_without_an_srdf_monitors_every_pair_that_some_posture_brings_apart() -> None:
     tiago = Robot.from_config(Config.model_validate(TIAGO | {"srdf": None}))
     watched = {frozenset(map(link_of, names)) for names in pair_names(tiago.collision_model)}
     for pair in (("arm_left_5_link", "arm_right_5_link"), ("arm_left_4_link", "torso_lift_link"),

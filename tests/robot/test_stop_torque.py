@@ -37,7 +37,7 @@ def test_the_torque_is_the_largest_over_all_signs_of_the_decelerations(robot: Ro
     assert (stop.gravity.ratio, stop.gravity.posture) == (pytest.approx(at_rest.max()), stop.stop.posture)
 
 
-def test_the_share_and_the_bearable_deceleration_agree(robot: Robot) -> None:
+def test_share_over_is_zero_exactly_for_bearable_decelerations(robot: Robot) -> None:
     (stop,) = stop_torques(robot, FAST, postures=1000)
     assert 0.05 < stop.stop.share_over < 0.15
     assert 0.0 < stop.bearable < 1.0
@@ -55,7 +55,7 @@ def test_too_much_gravity_for_a_joint_is_distinguished_from_a_stop(robot: Robot)
     assert stop_torques(robot, FAST, postures=1000)[0].gravity.share_over == 0.0
 
 
-def test_no_full_stop_at_the_limits_of_the_shipped_cells_asks_for_more_than_a_joint_has(dual_iiwa: Robot) -> None:
-    """The same holds for their models' own limits, which a higher control.acceleration_limit lets hold."""
+def test_no_full_stop_at_the_limits_of_the_shipped_cells_needs_more_torque_than_a_joint_has(dual_iiwa: Robot) -> None:
+    """The same holds for the models' own limits, which count if control.acceleration_limit is higher."""
     for acceleration in (dual_iiwa.capped_acceleration(10.0), dual_iiwa.acceleration_limit):
         assert max(stop.stop.ratio for stop in stop_torques(dual_iiwa, acceleration, postures=1000)) < 0.9

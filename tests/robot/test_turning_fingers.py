@@ -70,7 +70,7 @@ def test_at_one_opening_a_body_equals_its_shape_and_a_narrow_interval_adds_littl
             ends, drawn = real.ends("left", name, opening)
             np.testing.assert_allclose(np.sort([start, end], axis=0), np.sort(ends, axis=0), atol=1e-9)
             assert radius == pytest.approx(drawn, abs=1e-8)
-        # A finger with a way of 44 mm moves 2.2 mm in a twentieth of it.
+        # A finger that moves by 44 mm over the whole stroke moves by 2.2 mm in a twentieth of it.
         assert body.capsule((0.5, 0.55))[2] - drawn < 0.0013
 
 
@@ -106,7 +106,7 @@ def test_no_interval_reaches_farther_from_a_joint_than_the_bounds_of_the_kernels
             assert max(np.linalg.norm(start), np.linalg.norm(end)) <= min(reach) + 1e-12
 
 
-# This is any chain with rotations and slides of one or several drivers.
+# Strategies for any chain of turning and sliding joints with one or two drivers.
 _NUMBERS = st.floats(-0.1, 0.1)
 _VECTORS = st.tuples(_NUMBERS, _NUMBERS, _NUMBERS)
 _AXES = st.sampled_from([(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.6, 0.8), (-0.48, 0.6, 0.64)])
@@ -117,16 +117,17 @@ def joints(draw: st.DrawFn) -> FingerJoint:
     slides = draw(st.booleans())
     size = 0.05 if slides else 1.6
     closed, opened, home = (size * draw(st.floats(-1.0, 1.0)) for _ in range(3))
-    beyond = 0.1 * (opened - closed)  # The part of the stroke is the same for all joints of one driver.
+    # The travel beyond the stroke is the same share of the stroke for all joints of one driver.
+    beyond = 0.1 * (opened - closed)
     axis, point = np.array(draw(_AXES)), np.array(draw(_VECTORS))
     driver = draw(st.sampled_from("ab"))
     return FingerJoint(slides, axis, point, home, closed, opened, closed - beyond, opened + beyond, driver)
 
 
 def moved(chain: Sequence[FingerJoint], ends: Array, at: dict[str, float], travel: bool = False) -> Array:
-    """Return the ends (2, 3) of a shape with each driver at an opening in 0 ..
+    """Return the ends (2, 3) of a shape [m].
 
-    1, or at such a part of the whole travel.
+    ``at`` has the opening of each driver, from 0 to 1, or with ``travel`` the share of the driver's whole travel.
     """
     for joint in reversed(chain):
         first, last = (joint.before, joint.beyond) if travel else (joint.closed, joint.open)
@@ -155,8 +156,8 @@ def test_any_chain_of_fingers_is_inside_its_body(
         assert max(np.linalg.norm(capsule[0]), np.linalg.norm(capsule[1])) <= body.extent + 1e-12
 
 
-def test_between_samples_as_far_as_the_remainder_allows_is_held_too() -> None:
-    """The driver turns by two turns, with as few samples as possible, because three drivers share them."""
+def test_positions_between_few_samples_are_inside_the_body_too() -> None:
+    """Each driver turns by 6 rad, with as few samples as possible, because three drivers share them."""
     chain = [
         FingerJoint(False, np.array([0.0, 0.0, 1.0]), np.zeros(3), 0.0, -turn, turn, -turn, turn, driver)
         for driver, turn in (("a", 3.0), ("b", 3.0), ("c", 3.0))

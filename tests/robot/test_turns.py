@@ -1,4 +1,4 @@
-"""Endless joints whose angle is reported within one turn: their positions go on, and other joints are not changed."""
+"""Continuous joints whose angle is reported within one turn: their positions go on. Other joints do not change."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_reports_that_count_turns_themselves_are_not_changed(robot: Any) -> None
         assert counter.counted(q, now) is q
 
 
-def test_a_joint_with_limits_is_never_turned(robot: Any) -> None:
+def test_the_position_of_a_joint_with_limits_is_never_changed(robot: Any) -> None:
     counter = TurnCounter(robot)
     counter.counted(np.array([0.0, 3.1, 0.0]), 0.0)
     assert counter.counted(np.array([0.0, -3.1, 0.0]), PERIOD)[1] == -3.1

@@ -1,4 +1,4 @@
-"""Links of an arm that keep no distance: they are refused by name, unless the cell names them too."""
+"""Links of an arm that keep no distance: they are refused by name, unless ``unchecked_links`` names them."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ def weighs(mass: float) -> str:
 
 
 def chain(*contents: str) -> str:
-    """Return links l1, l2, ...
+    """Return a chain of links l1, l2 and so on, with these contents, on a base l0.
 
-    0.3 m apart that turn on each other, on a base l0. The last one is fixed to the one before.
+    The links are 0.3 m apart, and turn on each other. The last link is fixed to the link before it.
     """
     joints = "".join(
         f'<joint name="j{n}" type="{"fixed" if n == len(contents) else "revolute"}"><parent link="l{n - 1}"/>'
@@ -44,7 +44,7 @@ def chain(*contents: str) -> str:
 
 
 def arm(third: str = BALL, last: str = BALL) -> str:
-    """Return four moving balls. The third and the last may have other properties."""
+    """Return a chain of five links, by default balls. The third and the last link may have other contents."""
     return chain(BALL, BALL, third, BALL, last)
 
 
@@ -73,7 +73,7 @@ def test_a_frame_needs_no_shape(frame: str) -> None:
     assert Robot.from_urdf(arm(last=frame), {"left": "l5"}).unchecked_links == ()
 
 
-def test_all_missing_links_are_named_at_once() -> None:
+def test_all_links_without_a_shape_are_named_at_once() -> None:
     with pytest.raises(RobotError, match=r"l3: weighs 1 kg.*; l5: weighs 2 kg"):
         Robot.from_urdf(arm(weighs(1.0), weighs(2.0)), {"left": "l5"})
 
@@ -140,7 +140,7 @@ def test_a_cell_names_links_or_encloses_their_drawings() -> None:
     assert "left_link01" not in watched
 
 
-def test_commands_that_move_arms_refuse_them_with_the_line_of_check() -> None:
+def test_programs_that_move_arms_refuse_unchecked_links_with_the_lines_of_check() -> None:
     lines = "; ".join(unchecked_faults(Robot.from_config(z1())))
     with pytest.raises(RobotError, match=re.escape(f"{z1().name}: {lines}")):
         Pipeline.from_config(z1(), input="scripted", plant="kinematic")

@@ -1,4 +1,4 @@
-"""Acceleration limits of joints: their places in a URDF, their replacement by the cell's YAML, and refusals."""
+"""Acceleration limits of joints: their attributes in a URDF, their replacement by the cell's YAML, and refusals."""
 
 from __future__ import annotations
 

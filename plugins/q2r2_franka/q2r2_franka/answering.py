@@ -1,7 +1,8 @@
 """Answer the robots in a process of its own, so that no tick of the loop makes a robot wait.
 
-The loop sends commands to this process, and gets back whether they came in time. After each state of a robot it gets
-the state of the session. If the loop ends in any way, the process goes on until the arms rest on their certified stop.
+The loop sends commands to this process, and gets back whether they came in time. After each state of a robot the loop
+gets the state of the session. If the loop ends in any way, the process goes on until the arms rest on their certified
+stop.
 """
 
 from __future__ import annotations
@@ -34,14 +35,15 @@ from q2r2_franka.session import ArmSession, ahead_of_others, follow
 from q2r2_franka.settings import FrankaSettings
 from q2r2_franka.state import Mode, SessionState
 
-_RESERVED = 0.0006, 0.001  # Processor time that is reserved for answers in each interval [s].
-_POLL = 0.01  # Longest time between two looks at all sessions [s].
-_LONGEST_WORD = 5.0  # Time to wait for the reply to commands. A robot may be connected or recovered meanwhile [s].
+_RESERVED = 0.0006, 0.001  # Processor time that is reserved for answers, and the interval in which it is reserved [s].
+_POLL = 0.01  # Longest time between two checks of all sessions [s].
+# Longest time that the loop waits for the reply to its commands [s]. A robot may be connected or recovered meanwhile.
+_LONGEST_WORD = 5.0
 _AGAIN = 0.5  # Time from the end of a motion, or from a failed attempt, until the next attempt [s].
 
 
 class RobotAnswers(AnsweringProcess):
-    """The loop's end of the connection to the process."""
+    """The loop's end of the connection to the process that answers the robots."""
 
     def __init__(self, settings: FrankaSettings, mode: CommandMode, torque_limits: Mapping[str, Array]) -> None:
         """Start the process. It connects to the robots afterwards.
@@ -100,7 +102,8 @@ class _Answering:
             arm: ArmSession(arm, its.address, mode, torque_limits[arm]) for arm, its in settings.arms.items()
         }
         self._next_attempt = 0.0
-        self._refused: set[str] = set()  # Arms whose robots refused a motion, such as for an error of an earlier one.
+        # Arms whose robots refused a motion, such as because of an error of an earlier motion.
+        self._refused: set[str] = set()
         self._loop_ended = False
 
     def run(self) -> None:
@@ -119,7 +122,7 @@ class _Answering:
                 return
 
     def _take_commands(self) -> bool:
-        """Take all commands before an answer; returns whether the loop is still there."""
+        """Take all commands that have come; returns True if the loop has not ended."""
         try:
             while said := self._commands.recv(RobotAnswers.LARGEST):
                 self._commands.send(
@@ -148,7 +151,7 @@ class _Answering:
         self._tell(arm)
 
     def _write(self, arm: str, values: Array, begins: bool = False) -> None:
-        """Add a command, or what a robot holds at the beginning of a motion, to the record."""
+        """Add a command to the record, or the values that a robot holds at the beginning of a motion."""
         newest = self._sessions[arm].state.newest
         if self._record is not None and newest is not None:
             is_torque = self._mode is CommandMode.TORQUE
@@ -156,7 +159,7 @@ class _Answering:
             write_entry(self._record, entry)
 
     def _tell(self, arm: str) -> None:
-        with suppress(OSError):  # A loop that stands still gets a later state.
+        with suppress(OSError):  # If the loop stands still, there is no space for this state. It gets a later one.
             self._states.send(bytes([self._arms.index(arm)]) + pickle.dumps(self._sessions[arm].state))
 
     def _lost(self, arm: str, error: Exception) -> None:
@@ -169,7 +172,7 @@ class _Answering:
         self._brake_all()
 
     def _lose(self, arm: str) -> None:
-        """Forget a lost connection. The last state stays, because the loop needs one at every tick."""
+        """Forget a lost connection. The last state stays, because the loop needs a state at every tick."""
         self._links[arm].lose()
         if (newest := self._sessions[arm].state.newest) is not None:
             newest.mode = Mode.ABSENT
@@ -181,7 +184,11 @@ class _Answering:
             session.brake(now)
 
     def _tend(self, now: float) -> bool:
-        """Bring sessions forward; returns whether everything has ended."""
+        """End silent sessions and the motions of arms that rest, and begin motions again.
+
+        Returns:
+            True if the loop has ended and all arms rest.
+        """
         for arm, session in self._sessions.items():
             if session.state.controlled and session.state.is_silent(now):
                 session.end("no state for a while")

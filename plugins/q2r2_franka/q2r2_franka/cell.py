@@ -2,9 +2,10 @@
 
 **The loop's time and the robots' time.** The time of the reference passes with the states of the robots, so that each
 robot gets a command for the next millisecond with every state, whatever the clocks are. Each tick of the loop moves the
-reference so far ahead that no usual tick is overtaken. If the loop is so late that a robot would pass the end of the
-reference, the robots get the certified stop. :meth:`FrankaCell.due` then lets the reference follow the same stop first.
-If a robot passes the end in the middle of a tick, the sessions refuse the command of this tick, and it is withdrawn.
+reference so far ahead that no robot passes its end before the next tick has come, unless this tick is later than usual.
+If the loop is so late that a robot would pass the end of the reference, the robots get the certified stop.
+:meth:`FrankaCell.due` then lets the reference follow the same stop first. If a robot passes the end in the middle of a
+tick, the sessions refuse the command of this tick, and it is withdrawn.
 """
 
 from __future__ import annotations
@@ -22,14 +23,14 @@ from q2r2_franka.reasons import FrankaReason
 from q2r2_franka.state import ArmCommand, SessionState
 from q2r2_franka.stream import SMOOTHING_DELAY
 
-# Time from the decision about the reference's end until the sessions have it: usually, and after commands that came too
-# late [s]. The reference then goes farther ahead by the difference.
+# Time that is allowed from the start of a tick until the sessions have its commands [s]: usually, and at most after
+# commands that came too late. The reference then goes farther ahead by the difference.
 _MARGIN, _LONGEST_MARGIN = 0.002, 0.016
 # Shortest step of the reference, as a share of a period. The steps are shorter than a period if the robots' time passes
 # more slowly than the loop's.
 _SHORTEST = 0.1
-_FORGETTING = 0.01  # Share of the longest recent tick and margin that each tick forgets.
-_NO_COMMANDS = 0.1  # Time without a command in time, after which this is reported [s].
+_FORGETTING = 0.01  # Share by which the longest recent tick and the margin become shorter in each tick.
+_NO_COMMANDS = 0.1  # If all commands come too late for longer than this, it is reported as a fault [s].
 _BRAKING_TIME = 0.03  # Time constant with which an arm loses its speed if no torques come [s].
 _PASSING = 0.0015  # Approximate time that a measurement takes through network and processes [s].
 
@@ -98,7 +99,10 @@ class FrankaCell:
         return sent
 
     def fault(self) -> Reason | None:
-        """Return why the arms cannot be commanded at the newest tick, or could not since the last call; else None."""
+        """Return why the arms cannot be commanded at the newest tick.
+
+        The result is also a reason if they could not be commanded at some time since the last call; otherwise None.
+        """
         told, self._told = self._told, self._ends()
         for arm, state in self.states.items():
             fault = state.fault(self._now)
@@ -122,7 +126,7 @@ class FrankaCell:
             self._end, self._margin = self._start, min(2.0 * self._margin, _LONGEST_MARGIN)
 
     def withdraws(self) -> bool:
-        """Return whether the newest command came too late for an arm, so that the arms follow the stop before it."""
+        """Return whether the newest command came too late. The arms then follow the stop of the command before it."""
         return self._withdraws
 
     def delay(self) -> float:
@@ -136,7 +140,7 @@ class FrankaCell:
         return self._longest_tick + self._margin + PERIOD
 
     def timings(self) -> dict[str, ArmTiming]:
-        """Return the timing of all arms that were heard."""
+        """Return the timing of all arms whose robots were heard."""
         return {arm: state.timing(self._now) for arm, state in self.states.items() if state.newest is not None}
 
     @property

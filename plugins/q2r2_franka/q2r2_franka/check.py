@@ -1,7 +1,7 @@
 """Check recorded commands against the published limits: ``python -m q2r2_franka.check FILE``.
 
-The commands are differenced 1 ms apart, as the robot sees them. For a period without a command, the robot goes on with
-the last acceleration, and so does the check.
+Velocities, accelerations and jerks are differences of commands that are 1 ms apart, as the robot computes them. In a
+period without a command, the robot goes on with the last acceleration, and so does the check.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Checked:
 
 
 def check_commands(entries: Iterable[Entry]) -> dict[str, Checked]:
-    """Return the result for each arm of which there are commands."""
+    """Return the result for each arm that has commands."""
     checked: dict[str, Checked] = {}
     histories: dict[str, list[Array]] = {}
     for entry in entries:

@@ -1,7 +1,7 @@
 """A Franka Hand in a process of its own, because a call of its library waits until the fingers have arrived.
 
 The hand takes whole motions, not a stream: ``move`` to a width, and ``grasp`` with a force. A command is an opening,
-from 0 to 1. The fingers move to the newest one when the motion before it has ended, so that they follow a trigger in
+from 0 to 1. When a motion has ended, the fingers move to the newest commanded opening, so that they follow a trigger in
 steps. A command to close is a grasp, which holds with its force whatever is between the fingers.
 """
 
@@ -18,10 +18,10 @@ from q2r2_control.process import leave_signals_to_the_run, start_python
 from q2r2_franka.settings import HandSettings
 
 _LARGEST = 1 << 10  # Largest datagram between the processes [bytes].
-_CLOSED = 0.02  # A smaller opening is a grasp.
+_CLOSED = 0.02  # A command of a smaller opening is a grasp.
 _SAME = 0.02  # A smaller change of the opening moves nothing.
 _MEASURES = 0.1  # Time between two measurements while nothing moves [s].
-_KNOWN = 5.0  # A measurement counts as known for this time. A motion gives none meanwhile [s].
+_KNOWN = 5.0  # A measured opening counts as known for this time [s]. During a motion there are no measurements.
 _AGAIN = 1.0  # Time between two attempts to connect [s].
 _PATIENCE = 2.0  # Time to wait until the process ends [s].
 
@@ -102,7 +102,7 @@ def _move(loop: socket.socket, gripper: Any, settings: HandSettings) -> bool:
 
 
 def _newest(loop: socket.socket, before: float, wait: float) -> tuple[float, bool]:
-    """Return the newest commanded opening within ``wait`` [s], and whether the loop is still there."""
+    """Return the newest commanded opening within ``wait`` [s], and True if the loop has not ended."""
     loop.settimeout(wait)
     try:
         while said := loop.recv(_LARGEST):

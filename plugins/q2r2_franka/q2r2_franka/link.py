@@ -1,8 +1,9 @@
-"""The connection to one robot by pylibfranka, whose calls this module alone makes.
+"""The connection to one robot by pylibfranka. Only this module and hand.py call this library.
 
 pylibfranka keeps Python's global lock while it waits for a state. Two threads with an arm each would make each other
-late. The process therefore waits for the sockets of all robots at once by ``select``, and reads a state only when it is
-there. pylibfranka does not name its socket, so that it is found among the files that a connection opens.
+late. The process therefore waits for the sockets of all robots at once by ``select``, and reads a state only when it
+has come. pylibfranka does not tell which socket it uses. The socket is therefore found among the files that a
+connection opens.
 """
 
 from __future__ import annotations
@@ -21,9 +22,10 @@ from q2r2_franka.state import Measured, Mode
 
 ERRORS = (RuntimeError, pylibfranka.FrankaException)
 _FILES = "/proc/self/fd"
-# A robot's own controller of positions may filter the commands in Desk's settings. Its stiffness stays as it is.
+# The robot's own controller of joint positions. Desk's settings may let it filter the commands. Its stiffness stays.
 _CONTROLLER = pylibfranka.ControllerMode.JointImpedance
-_kept: list[Any] = []  # A motion whose connection is lost may not be destroyed, because that ends the process.
+# Objects of lost connections. They may not be destroyed, because that would end the process.
+_kept: list[Any] = []
 
 
 class ArmLink:
@@ -44,7 +46,7 @@ class ArmLink:
         return self._robot is not None
 
     def open(self) -> None:
-        """Connect, and set what the cell says of collisions and the load."""
+        """Connect, and set the robot's collision thresholds and load to those of the cell."""
         before = _datagram_sockets()
         try:
             robot = pylibfranka.Robot(self._settings.address, self._real_time)
@@ -68,7 +70,7 @@ class ArmLink:
         self.file = -1
 
     def read(self) -> Measured:
-        """Return the newest state. It waits if there is none."""
+        """Return the newest state. If there is none, wait for the next state."""
         state = self._robot.read_once() if self._motion is None else self._motion.readOnce()[0]
         now = state.time.to_sec()
         cycles, self._last = max(round((now - self._last) / PERIOD), 1), now

@@ -17,25 +17,25 @@ from q2r2_franka.settings import franka_settings
 from q2r2_franka.state import SessionState
 from q2r2_franka.stream import MEANS
 
-_LOOKS = 0.01  # Time between two looks at the robots during a wait [s].
+_LOOKS = 0.01  # Time between two checks of the robots during a wait [s].
 
 
 class FrankaPlant:
-    """A plant whose arms start where they stand, also after each motion that a robot has ended."""
+    """A plant whose arms start where they stand, even after a robot has ended a motion."""
 
     modes: tuple[CommandMode, ...] = (CommandMode.TORQUE, CommandMode.POSITION)
     realtime_only = True
     averages = True  # Each position is the mean of MEANS positions of the path, and so control.jerk_limit is kept here.
-    # Times that a reset waits for a state of each robot, and for all motions [s]. Without all motions a run begins
-    # nevertheless.
+    # Longest times that a reset waits for a state of each robot, and for all motions to begin [s]. If some motions do
+    # not begin, the run begins nevertheless.
     longest_wait = longest_session_wait = 10.0
 
     def __init__(self, robot: Robot, config: Config) -> None:
         """Make the plant.
 
         Raises:
-            ConfigError: If an arm lacks a robot or does not have seven joints, if a late tick would be split, or if the
-                limit of jerk is too low.
+            ConfigError: If an arm lacks a robot or does not have seven joints, if a late tick would be split into
+                steps, or if the limit of jerk is too low.
         """
         self._settings = franka_settings(config)
         for arm, its in robot.arms.items():

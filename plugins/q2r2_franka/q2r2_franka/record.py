@@ -20,7 +20,7 @@ class Entry(NamedTuple):
     arm: int  # 0 for left, 1 for right.
     begins: bool  # True at the beginning of a motion. The values are then those that the robot holds by itself.
     is_torque: bool
-    cycles: int  # Number of periods since the command before. The robot got no command for all but the last.
+    cycles: int  # Number of periods since the command before. The robot got no command in all but the last of them.
     time: float  # Time by the monotonic clock [s].
     values: Array  # Positions [rad] or torques [Nm] (7,).
 

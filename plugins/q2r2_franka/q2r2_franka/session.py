@@ -15,19 +15,24 @@ from q2r2_franka.stream import PositionStream, TorqueStream
 
 _AT_REST = 1e-9  # Greatest distance from the end of the path at which the arm counts as resting [rad].
 _STILL = 0.02  # Greatest velocity of an arm with torques that counts as resting [rad/s].
-# Greatest distance of a reference at its beginning from where the arm is held, or with torques is measured [rad].
+# Greatest distance between a reference at its beginning and the arm [rad]: the position in which the arm is held, or,
+# with torques, its measured position.
 _SAME, _NEAR = 1e-6, 0.02
 _FROM_REST = 20.0  # A bound above the acceleration of a joint in the first tick [rad/s^2].
 _TORQUE_LASTS = 0.02  # A torque that is not updated for longer is replaced by one that brakes [s].
 _BRAKES = 1.0  # Longest time that an arm with torques is braked. Then its robot holds it [s].
-# An arm whose time is ahead of the other's waits: its time passes more slowly by this share at most, and the share
-# changes by this much in a second. The robot sees at most the acceleration a + _WAITING_RAMP v.
+# An arm whose time is ahead of the other arm's waits: its time passes more slowly by the share _WAITING at most, and
+# the share changes by _WAITING_RAMP in a second. The robot sees at most the acceleration a + _WAITING_RAMP v. The
+# wanted share is _WAITING_GAIN [1/s] times the time by which the arm is ahead.
 _WAITING, _WAITING_RAMP, _WAITING_GAIN = 0.1, 0.4, 10.0
 _MOST_CYCLES = 100  # After more lost periods than this, the robot has ended the motion anyway.
 
 
 class ArmSession:
-    """The session of one arm. While it follows, its commands are on the reference's path; else the arm is held."""
+    """The session of one arm.
+
+    While the arm follows the reference, its commands lie on ``path``. Otherwise they hold the arm.
+    """
 
     def __init__(self, arm: str, address: str, wanted: CommandMode, torque_limit: Array) -> None:
         """Make the session of one arm; ``torque_limit`` is the greatest torque of its joints (7,) [Nm]."""
@@ -49,13 +54,13 @@ class ArmSession:
         state.rest = tuple(map(float, q))
 
     def end(self, problem: str) -> None:
-        """Take note that commands move the arm no more, because of ``problem``."""
+        """Take note that commands no longer move the arm, because of ``problem``."""
         self.state.ended += self.state.following
         self.state.controlled = self.state.following = False
         self.state.problem = problem
 
     def brake(self, now: float) -> None:
-        """Let the arm follow its certified stop, or with torques a damping, from ``now`` [s] on."""
+        """From ``now`` [s] on, let the arm follow its certified stop, or let a damping brake it in torque mode."""
         if self.state.following:
             self.state.following, self._ceased = False, now
             self.path.brake(self.state.answered)
@@ -76,11 +81,14 @@ class ArmSession:
         return bool(np.abs(self.path.at(t) - self.path.rest).max() <= _AT_REST)
 
     def has_passed(self, command: ArmCommand) -> bool:
-        """Return whether a command has already followed the earlier stop at a time for which ``command`` is."""
+        """Return whether a command was already sent for a time after the start of ``command``.
+
+        It lay on the earlier stop, so that ``command`` has come too late.
+        """
         return self.state.following and self.state.answered > command.start
 
     def follow(self, command: ArmCommand) -> None:
-        """Take the command of a tick, which the session has not passed."""
+        """Take the command of a tick, for which :meth:`has_passed` is False."""
         state = self.state
         if not state.following and state.controlled and self._begins(command):
             state.following = state.fault(command.now) is None
@@ -94,7 +102,7 @@ class ArmSession:
             self._damping, self._tau_came = np.array(command.damping), command.now
 
     def _begins(self, command: ArmCommand) -> bool:
-        """Return whether the reference was at rest a tick ago, at the place of the arm."""
+        """Return whether the reference was at rest one tick ago, at the position of the arm."""
         state, step = self.state, command.end - command.start
         has_torques = state.wanted is CommandMode.TORQUE and state.newest is not None
         if not has_torques and not self._rests(state.answered):
@@ -136,7 +144,10 @@ class ArmSession:
 
 
 def follow(sessions: Mapping[str, ArmSession], commands: Mapping[str, ArmCommand]) -> bool:
-    """Let every arm take its command. If one of them came too late, no arm takes its own, and False is returned."""
+    """Let every arm take its command, and return True.
+
+    If one of the commands came too late, no arm takes its command, and the function returns False.
+    """
     if any(sessions[arm].has_passed(command) for arm, command in commands.items()):
         return False
     for arm, command in commands.items():
@@ -147,14 +158,14 @@ def follow(sessions: Mapping[str, ArmSession], commands: Mapping[str, ArmCommand
 def ahead_of_others(sessions: Mapping[str, ArmSession], arm: str, now: float) -> float:
     """Return the time by which an arm is ahead of the slowest other arm that follows [s]; at least 0.
 
-    It also writes into each state how far that arm is behind.
+    It also writes into the arm's state how far the arm is behind the fastest other arm [s].
     """
     state = sessions[arm].state
     others = [session.state for name, session in sessions.items() if name != arm and session.state.following]
     if not state.following or not others:
         state.behind = 0.0
         return 0.0
-    # Between its states, an arm's time is thought to go on for one period at most.
+    # Between two states, the time of an arm is assumed to go on, for one period at most.
     times = [other.answered + min(max(now - other.arrival, 0.0), PERIOD) for other in others]
     own = state.answered + min(now - state.arrival, PERIOD)
     state.behind = max(max(times) - own, 0.0)

@@ -13,9 +13,10 @@ from q2r2_franka.reasons import FrankaReason
 
 Joints = tuple[float, ...]
 NONE: Joints = (0.0,) * JOINTS
-_SILENT = 0.1  # A robot without a state for longer than this has gone [s].
-# Bounds of the usual time between two states, which is the longest recent one. A state forgets this share of it. The
-# controller keeps the arms apart for the time in which one of them may be ahead [s].
+_SILENT = 0.1  # A robot that sends no state for longer than this counts as silent [s].
+# The usual time between two states is the longest recent one. _LONGEST_USUAL bounds it [s], and each state shortens it
+# by the share _FORGETTING. One arm may be ahead of the other for this time, and so the controller keeps them farther
+# apart.
 _LONGEST_USUAL, _FORGETTING = 0.02, 0.002
 
 
@@ -43,7 +44,7 @@ class Measured:
     v: Joints  # Measured velocities [rad/s].
     tau: Joints  # Measured torques [Nm].
     external: Joints  # Estimated external torques [Nm].
-    held: Joints  # Where the robot's own controller holds the arm [rad].
+    held: Joints  # Positions at which the robot's own controller holds the arm [rad].
 
 
 @dataclass(slots=True)
@@ -60,7 +61,7 @@ class SessionState:
     following: bool = False  # True while the arm follows the reference.
     ended: int = 0  # Number of times that the arm ceased to follow because the robot ended the motion.
     rest: Joints = NONE  # Positions at the end of the arm's path [rad].
-    # The time of the reference for which the newest command is [s]. It passes with the states of the robot.
+    # The time of the reference for which the newest command is [s]. This time passes with the states of the robot.
     answered: float = -math.inf
     behind: float = 0.0  # Time by which ``answered`` is behind that of the other arm [s].
     took: float | None = None  # Time from the newest state until its command was sent; None without a command [s].
@@ -82,7 +83,7 @@ class SessionState:
         return ArmTiming(behind, now - self.arrival, self.usual)
 
     def latest(self, t: float) -> float:
-        """Return the latest time of the reference for which there may be a command until ``t`` [s]."""
+        """Return an upper bound on the times of the reference for which commands are sent until ``t`` [s]."""
         return self.answered + max(t - self.arrival, 0.0) + PERIOD
 
     @property

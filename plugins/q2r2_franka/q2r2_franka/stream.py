@@ -35,7 +35,8 @@ class PositionStream:
         self._path = deque([q] * MEANS, maxlen=MEANS)
         self._means = deque([q] * 3, maxlen=3)  # The last three means, and the last three positions at the robot.
         self._sent = deque([q] * 3, maxlen=3)
-        self._difference = np.zeros((6, JOINTS))  # Coefficients of the polynomial over the time since it began.
+        # Coefficients of the difference, a polynomial over the time since it began.
+        self._difference = np.zeros((6, JOINTS))
         self._since = _RETURN
 
     def next(self, path: Sequence[Array]) -> Array:
@@ -48,7 +49,7 @@ class PositionStream:
         for q in path[:-1]:
             self._advance(q)
             newest, before, oldest = self._sent[-1], self._sent[-2], self._sent[-3]
-            self._sent.append(3.0 * newest - 3.0 * before + oldest)  # With the last acceleration.
+            self._sent.append(3.0 * newest - 3.0 * before + oldest)  # The robot goes on with the last acceleration.
         if len(path) > 1:
             self._begin_return()
         mean = self._advance(path[-1])

@@ -1,8 +1,8 @@
 """Answer the cabinets in a process of its own, so that no tick of the loop makes a cabinet wait.
 
-The loop sends commands to this process, and gets back whether they came in time. After each message of a cabinet it
-gets the state of the session. If the loop ends in any way, the process goes on until the arms have come to rest on
-their certified stop.
+The loop sends commands to this process, and gets back whether they came in time. After each message of a cabinet the
+loop gets the state of the session. If the loop ends in any way, the process goes on until the arms have come to rest
+on their certified stop.
 """
 
 from __future__ import annotations
@@ -24,10 +24,13 @@ from q2r2_control.process.answering_process import AnsweringProcess
 from q2r2_control.process.helper_process import leave_signals_to_the_run, reason_of
 from q2r2_control.process.scheduling import few_garbage_collections, real_time, reserve
 
-_RESERVED = 0.0015, 0.002  # Processor time that is reserved for answers in each interval [s]. An answer takes 0.2 ms.
-_POLL = 0.05  # After the loop has ended, time between two looks whether the arms stand still [s].
-_LONGEST_WORD = 1.0  # Time to wait for the reply to commands. Arms brake meanwhile [s].
-# Linux stamps arriving datagrams by its real-time clock (SO_TIMESTAMPNS). A longer wait is a jump of that clock [s].
+# Processor time that is reserved for answers, and the interval in which it is reserved [s]. An answer takes 0.2 ms.
+_RESERVED = 0.0015, 0.002
+_POLL = 0.05  # Time between two checks whether the arms stand still, after the loop has ended [s].
+_LONGEST_WORD = 1.0  # Longest time that the loop waits for the reply to its commands [s]. Arms brake meanwhile.
+# The socket option SO_TIMESTAMPNS, by which Linux stamps each arriving datagram with its real-time clock; the layout of
+# such a stamp; the size of the buffer for it [bytes]; and the longest time that a datagram can have waited [s]. If the
+# stamp tells a longer wait, that clock has jumped.
 _TIMESTAMP, _TIMESPEC, _EXTRA, _LONGEST_WAIT = 35, struct.Struct("@qq"), 64, 0.1
 
 
@@ -42,10 +45,12 @@ class Line:
 
 
 class CabinetAnswers(AnsweringProcess):
-    """The loop's end of the connection to the process."""
+    """The loop's end of the connection to the process that answers the cabinets."""
 
     def __init__(self, lines: Sequence[Line]) -> None:
-        """Start the process, with a line to each cabinet. The caller may close its own sockets then.
+        """Start the process, with a line to each cabinet.
+
+        The process gets a copy of each socket, so that the caller may then close its own.
 
         Raises:
             PlantError: If the process cannot begin.
@@ -54,7 +59,9 @@ class CabinetAnswers(AnsweringProcess):
         super().__init__(__name__, "the cabinets", (list(lines),), _LONGEST_WORD, files)
 
     def receive(self) -> tuple[list[SessionState], list[tuple[float, float]]]:
-        """Return each arm's newest state since the last call, and for each message its arrival and answer time [s].
+        """Return each arm's newest state since the last call, and two times for each message that was answered.
+
+        These times are the arrival of the message, and the time from its arrival until its answer was sent [s].
 
         Raises:
             PlantError: If the process has ended.
@@ -109,7 +116,7 @@ class _Answering:
                     self._answer(*self._lines[file])
 
     def _take_commands(self) -> bool:
-        """Take all commands before an answer; returns whether the loop is still there."""
+        """Take all commands that have come; returns True if the loop has not ended."""
         try:
             while said := self._commands.recv(CabinetAnswers.LARGEST):
                 self._commands.send(
@@ -137,19 +144,26 @@ class _Answering:
                 state.took = time.monotonic() - came
         except OSError:  # The cabinet has gone. Its silence will be noticed.
             return
-        with suppress(OSError):  # A loop that stands still gets a later state.
+        with suppress(OSError):  # If the loop stands still, there is no space for this state. It gets a later one.
             self._states.send(pickle.dumps((vars(state) | {"newest": None}, line.newest)))
 
 
 def address_for(cabinet: str) -> str:
-    """Return the address to which a ``cabinet`` on this computer sends; "" for a cabinet elsewhere, on any network."""
+    """Return the address of this computer on which the messages of ``cabinet`` are received.
+
+    It is the loopback address if the cabinet is on this computer, otherwise "", which means all networks.
+    """
     if not ip_address(cabinet).is_loopback:
         return ""
     return "::1" if ":" in cabinet else "127.0.0.1"
 
 
 def open_socket(address: str, port: int) -> socket.socket:
-    """Open a socket for one cabinet, on loopback if it is on this computer, else on all networks; may raise OSError."""
+    """Open a socket for one cabinet: on loopback if the cabinet is on this computer, otherwise on all networks.
+
+    Raises:
+        OSError: If the port cannot be bound.
+    """
     opened = socket.socket(socket.AF_INET6 if ":" in address else socket.AF_INET, socket.SOCK_DGRAM)
     try:
         opened.bind((address_for(address), port))
@@ -162,7 +176,7 @@ def open_socket(address: str, port: int) -> socket.socket:
 
 
 def _waited(extra: list[tuple[int, int, bytes]]) -> float:
-    """Return the time since the kernel received a datagram [s]; 0 if the kernel does not say."""
+    """Return the time since the kernel received a datagram [s]; 0 if the datagram has no stamp of the kernel."""
     for _, kind, data in extra:
         if kind == _TIMESTAMP:
             seconds, nanoseconds = _TIMESPEC.unpack(data)

@@ -1,13 +1,13 @@
 """Compute where an arm has to be when its cabinet asks: the reference between ticks, and the time of an answer.
 
 **Two clocks.** A cabinet asks by its own clock, which drifts against ours, through a network that delays and loses
-messages. The difference of two answers over its period is a velocity to it. If an answer were for the time at which its
-question arrived, the jitter of the network would reach the arm. The times of answers are therefore even: each answer is
-for one period after the newest answer that the cabinet has heard.
+messages. For the cabinet, the difference of two answers divided by its period is a velocity. If an answer were for the
+time at which its question arrived, the jitter of the network would reach the arm. The times of answers are therefore
+evenly spaced: each one is one period after the time of the newest answer that the cabinet has heard.
 
-**Catching up.** Lost messages and drift let the even time fall behind. It catches up at a rate of 1 + ``CATCH_UP`` at
+**Catching up.** Lost messages and drift let this even time fall behind. It catches up at a rate of 1 + ``CATCH_UP`` at
 most, and the rate changes by ``CATCH_UP_RAMP`` per second. If the reference has the velocity v and the acceleration a,
-the cabinet sees at most (1 + CATCH_UP) v and (1 + CATCH_UP)^2 a + CATCH_UP_RAMP v.
+the cabinet sees at most the velocity (1 + CATCH_UP) v and the acceleration (1 + CATCH_UP)^2 a + CATCH_UP_RAMP v.
 
 **Never beyond the certificate.** If the newest reference ends before the time of an answer, because our loop is late,
 its certified stop follows. The loop then lets its own reference follow the same stop for the same time.
@@ -27,15 +27,16 @@ from q2r2_control.types import Array
 
 CATCH_UP = 0.05  # Greatest additional rate of the even time.
 CATCH_UP_RAMP = 0.4  # Greatest change of this rate per second [1/s].
-_SETTLED = 500  # Number of messages within which the estimate follows a clock that is slower than it was assumed.
-_PIECES = 1024  # Number of pieces of the reference that are kept.
-# Number of answers whose time is remembered. At the shortest period of 1 ms this is four times as long as a cabinet
-# that hears none of them is followed.
+# Number of messages within which ``MessageClock`` follows a cabinet's clock that is slower than it was assumed.
+_SETTLED = 500
+_PIECES = 1024  # Number of pieces of the path that are kept. A piece is the motion of one tick, or a stop.
+# Number of answers whose time is remembered. At the shortest period of 1 ms this is four times the lag at which an arm
+# is no longer commanded because its cabinet hears no answers.
 _REMEMBERED = 1024
 
 
 class _Move(NamedTuple):
-    """The motion from the posture and velocity of one tick to those of the next one."""
+    """The motion from the posture and velocity of one tick to those of the next tick."""
 
     start: float  # [s]
     end: float  # [s]
@@ -44,7 +45,10 @@ class _Move(NamedTuple):
     deceleration: Array  # Deceleration of the certified stop from the end [rad/s^2].
 
     def at(self, t: float) -> tuple[Array, Array]:
-        """Return posture and velocity by the cubic through both ends, a parabola if the acceleration is constant."""
+        """Return posture and velocity at ``t`` [s], on the cubic through both ends.
+
+        It is a parabola if the acceleration is constant.
+        """
         h = self.end - self.start
         return cubic(min(max((t - self.start) / h, 0.0), 1.0), h, self.q, self.v)
 
@@ -71,7 +75,7 @@ _start = attrgetter("start")
 
 
 class ReferencePath:
-    """The reference of the last ticks, and the certified stop from the newest one."""
+    """The reference of the last ticks, and the certified stop that follows the newest tick."""
 
     def __init__(self, t: float, q: Array) -> None:
         """Make the path of an arm that rests at ``q`` (n,) [rad] from ``t`` [s] on."""
@@ -80,7 +84,7 @@ class ReferencePath:
 
     @property
     def end(self) -> float:
-        """The time from which on there is only the stop [s]."""
+        """The end of the reference, after which the path contains only the stop [s]."""
         return self._stop.start
 
     @property
@@ -89,9 +93,16 @@ class ReferencePath:
         return self._stop.at(math.inf)[0]
 
     def extend(self, t: float, q: Array, v: Array, deceleration: Array, start: float = -math.inf) -> None:
-        """Add a piece that ends at ``q``, ``v`` at the time ``t`` [s], with a certified stop at ``deceleration``.
+        """Add the motion of one tick, and the certified stop that follows it.
 
-        The reference leaves the earlier stop at ``start`` [s], or at once.
+        Until ``start``, the path follows the earlier stop. The motion then leads to ``q`` and ``v``.
+
+        Args:
+            t: Time at which the motion ends [s].
+            q: Posture at its end (n,) [rad].
+            v: Velocity at its end (n,) [rad/s].
+            deceleration: Deceleration of the stop from its end (n,) [rad/s^2].
+            start: Time at which the motion leaves the earlier stop [s]; by default the beginning of that stop.
         """
         stop, start = self._stop, max(start, self._stop.start)
         there, speed = stop.at(start)
@@ -100,10 +111,10 @@ class ReferencePath:
         self._stop = _Stop(t, q, v, deceleration)
 
     def brake(self, t: float) -> None:
-        """Let only the certified stop follow the piece at ``t`` [s].
+        """Remove all motions after the piece that contains ``t`` [s], so that only the piece's certified stop follows.
 
-        The stop is the one from the end of the piece. From its middle, a joint that nearly stands at the end would
-        hardly brake.
+        The stop begins at the end of the piece. If it began at ``t``, a joint that nearly stands at the end would
+        hardly brake, because its deceleration is small.
         """
         piece = self._piece(t)
         if piece is not self._stop:
@@ -122,7 +133,7 @@ class ReferencePath:
 
 class _Answer(NamedTuple):
     time: float  # The time for which the answer is [s].
-    rate: float  # How fast this time has passed since the answer before [s/s].
+    rate: float  # The difference to the time of the answer before, divided by the period [s/s].
 
 
 class MessageClock:
@@ -137,7 +148,10 @@ class MessageClock:
         self._taken, self.expected = 1, arrival  # Number of messages so far, and the expected time of the newest one.
 
     def update(self, arrival: float, passed: float) -> None:
-        """Take a newer message, ``passed`` [s] after the one before by the cabinet's clock."""
+        """Update the estimate with a newer message, which came at ``arrival`` [s].
+
+        ``passed`` is the time since the message before by the cabinet's clock [s].
+        """
         self._taken += 1
         expected = self.expected + passed
         late = arrival - expected
@@ -145,32 +159,33 @@ class MessageClock:
 
 
 class AnswerTimes:
-    """Computes the even times of the answers to one cabinet, in seconds of our clock."""
+    """Computes the evenly spaced times for which one cabinet gets answers, in seconds of our clock."""
 
     def __init__(self, period: float, delay: float) -> None:
         """Make the times of one cabinet.
 
         Args:
             period: Time between two answers [s].
-            delay: Time by which the time of an answer is before the expected time of its question [s].
+            delay: An answer is for a time that is earlier than the expected time of its question by this much [s].
         """
         self._period, self._delay = period, delay
-        self._question = -1  # The newest question.
+        self._question = -1  # The counter of the newest question.
         self._answers: dict[int, _Answer] = {}  # The last answers by their counter.
         self._newest: _Answer | None = None  # The answer for the latest time.
-        # The first counter, and the answer from which the cabinet goes on until then.
+        # The counter of the first answer since the restart, and a virtual answer one period before it. Until the
+        # cabinet has heard the first answer, times continue from the virtual one.
         self._begin: tuple[int, _Answer] | None = None
 
     def restart(self) -> None:
-        """Let the next answer be for any time, because the arm stands still."""
+        """Forget all answers, so that the next answer may be for any time. The arm has to stand still."""
         self._answers, self._newest, self._begin = {}, None, None
 
     def _heard(self, counter: int) -> _Answer:
-        """Return the answer from which the cabinet goes on, or the oldest one that is known."""
+        """Return the answer with ``counter``, or the oldest answer that is remembered."""
         return self._answers.get(counter) or self._answers[min(self._answers)]
 
     def at(self, question: int, expected: float, counter: int, heard: int) -> float:
-        """Return the time of an answer.
+        """Return the time for which an answer is [s].
 
         Args:
             question: The counter of the question.
@@ -187,11 +202,12 @@ class AnswerTimes:
         if self._begin is None:
             self._begin = counter, _Answer(wanted - self._period, 1.0)
         first, standing = self._begin
-        # The time goes on from the answer that the cabinet has heard, because it has not followed any later one.
+        # The time goes on from the answer that the cabinet has heard, because the cabinet has not followed any later
+        # answer.
         before = standing if heard < first or newest is None else self._heard(heard)
         lag = (wanted - before.time) / self._period - 1.0  # The lag as a number of answers.
         ramp = CATCH_UP_RAMP * self._period
-        # The greatest additional rate from which CATCH_UP_RAMP comes back to 0 at the moment when the lag does.
+        # The greatest additional rate from which a change by CATCH_UP_RAMP reaches 0 together with the lag.
         excess = math.copysign(math.sqrt(2.0 * ramp * abs(lag) + 0.25 * ramp * ramp) - 0.5 * ramp, lag)
         excess = min(max(excess, -CATCH_UP), CATCH_UP)
         rate = min(max(1.0 + excess, before.rate - ramp), before.rate + ramp)

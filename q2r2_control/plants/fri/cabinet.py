@@ -1,6 +1,6 @@
 """A simulated Sunrise cabinet: its session, its guards and its arm. The caller passes the time in.
 
-It is a test of a client, and not a model of KUKA's controller. The states and their conditions follow the public client
+It tests a client, and is not a model of KUKA's controller. The states and their conditions follow the public client
 kits. Where the kits say nothing, such as how many answers a client may miss, the simulation is rather too strict.
 """
 
@@ -28,9 +28,9 @@ from q2r2_control.plants.fri.wire import (
     read_command,
 )
 
-_WINDOW = 50  # Number of answers by which the quality is judged.
-# Least share of answers in time. KUKA publishes no such numbers. With 0.9, a loss of 1 % in each direction ends a
-# session within minutes, by six random misses in 50.
+_WINDOW = 50  # Number of the newest answers by which the quality of the connection is judged.
+# Least share of answers in time for each quality. KUKA publishes no such numbers. If GOOD needed 0.9, a loss of 1 % in
+# each direction would end a session within minutes, because 6 of 50 answers are missed by chance.
 _FAIR, _GOOD, _EXCELLENT = 0.5, 0.8, 0.98
 _MISSES = 10  # Number of successive answers that may be late while the client commands.
 _NEAR = 1e-3  # Largest distance of the first command from the cabinet's own position [rad].
@@ -77,7 +77,7 @@ class CabinetArm(Protocol):
         """Let ``dt`` [s] pass. The drives move to ``q`` [rad], and ``tau`` [Nm] is added to their impedance."""
 
     def tool_way(self, start: Joints, end: Joints) -> float:
-        """Return the distance of the tool between two postures [m]."""
+        """Return the distance between the tool's positions in two postures [m]."""
 
 
 @dataclass(slots=True)
@@ -92,7 +92,7 @@ class StillArm:
         self.q = q
 
     def tool_way(self, start: Joints, end: Joints) -> float:
-        """Return the distance of a tool that is a metre from each axis."""
+        """Return the distance by which a tool moves that is one metre from each axis [m]."""
         return _apart(start, end)
 
 
@@ -107,7 +107,7 @@ class CabinetSettings:
     torque: Joints  # Torque limits of the overlay [Nm].
     version: int = 2
     period: float = 0.005  # Time between two messages [s].
-    multiplier: int = 1  # Number of messages for which one answer is due.
+    multiplier: int = 1  # The cabinet expects one answer after this number of messages.
     command: CommandKind = CommandKind.POSITION
 
     def __post_init__(self) -> None:
@@ -135,8 +135,8 @@ class Cabinet:
         self.settings, self.arm = settings, arm
         self.session, self.safety, self.operation = Session.MONITORING_WAIT, Safety.NORMAL, Operation.AUTOMATIC
         self.load_fits = True  # True if the load data fit the tool. Otherwise, no client may command.
-        self.inputs: dict[str, IoValue] = {}  # Values for the client.
-        self.outputs = dict(outputs or {})  # Values from the client, in any state of the session.
+        self.inputs: dict[str, IoValue] = {}  # Values of inputs, which the client reads.
+        self.outputs = dict(outputs or {})  # Values of outputs, which the client may write in any state of the session.
         self.trips: list[Trip] = []  # Trips of all sessions, in order.
         self._sent = 0  # Number of messages so far.
         self._heard: int | None = None  # Counter of the client's newest message.
@@ -234,13 +234,13 @@ class Cabinet:
 
     @property
     def _commanded_tau(self) -> Joints:
-        """The torques of the arm's motors: the torques that they bear, and the client's overlay [Nm]."""
+        """The torques that the motors are commanded: the measured torques plus the client's overlay [Nm]."""
         overlay = self._tau or (0.0,) * JOINTS
         return tuple(borne + added for borne, added in zip(self.arm.tau, overlay, strict=True))
 
     @property
     def _bears_the_load(self) -> bool:
-        """True if the load data explain the torques of an arm before an overlay of torques."""
+        """True if the load data fit and, before torques are overlaid, the external torques are small."""
         torques = self.settings.command is CommandKind.TORQUE
         return self.load_fits and not (torques and max(map(abs, self.arm.external_tau)) > _LARGEST_LOAD_ERROR)
 
@@ -263,7 +263,7 @@ class Cabinet:
             elif not self._bears_the_load or answer is None or answer.q is None:
                 return
             elif self.settings.command is CommandKind.TORQUE and answer.tau is None:
-                return  # Torques have to come before they count.
+                return  # The client has to send torques before the cabinet follows them.
             elif _apart(answer.q, self._held) <= _NEAR:
                 self.session = Session.COMMANDING_ACTIVE
                 self._follow(answer)
@@ -284,7 +284,10 @@ class Cabinet:
         self.commanded, self._tau = answer.q, answer.tau
 
     def _guard(self, answer: FriCommand) -> Trip | None:
-        """Return the reason why an answer cannot be followed. A missed answer before it gives no more time."""
+        """Return the reason why an answer cannot be followed; None if it can.
+
+        The allowed change is that of one period, even if the answers before were missed.
+        """
         limits, period = self.settings, self.settings.answer_period
         if answer.q is None:
             return Trip.NO_POSITION

@@ -33,9 +33,11 @@ from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Command, CommandMode
 
-_LONGEST_STALL = 1.0  # Longest stall of this process that is compensated. A longer one counts as the cabinet's [s].
-_LONGEST_CATCH_UP = 0.05  # Longest delay that is caught up; the rest is dropped [s].
-_LOOK_AGAIN = 2e-4  # Time between two checks for the answer that a late message waits for [s].
+# If this process stalls for up to this time, it sends all messages late [s]. The rest of a longer stall counts as a
+# silence of the cabinets.
+_LONGEST_STALL = 1.0
+_LONGEST_CATCH_UP = 0.05  # Longest time that the simulation catches up at once [s]. More is dropped.
+_LOOK_AGAIN = 2e-4  # Time between two checks for an answer, while the next message waits for it [s].
 _ROUNDING = 1e-6
 _SAG = 1e-3  # The simulated arm may be this far beyond its limits [rad].
 _DAMPING_RATIO = 0.7  # Damping ratio of the application's joint impedance. It is the cabinet's default.
@@ -78,7 +80,7 @@ class SimulatedArm:
         return (0.0,) * JOINTS if external is None else joints_of(external[self._joints])
 
     def advance(self, dt: float, q: Joints, tau: Joints | None) -> None:
-        """Begin a motion to ``q`` that takes ``dt`` [s]. The cell's own time goes on by itself."""
+        """Begin a motion to ``q`` that takes ``dt`` [s]. Only :meth:`SimulatedArms.advance` lets time pass."""
         self._from, self._to, self._began, self._lasts = self._to, q, self._cell.now, dt
         self.overlay = tau
 
@@ -93,7 +95,7 @@ class SimulatedArm:
     def wanted(self, t: float) -> tuple[Array, Array]:
         """Return the wanted position of the drives at ``t`` [s], and their velocity."""
         share, way = (t - self._began) / self._lasts, np.subtract(self._to, self._from)
-        if share > 1.0 + _ROUNDING:  # At the end itself, when every message comes, the drives still move.
+        if share > 1.0 + _ROUNDING:  # A message in time finds a share of 1, at which the drives still move.
             return np.array(self._to), np.zeros(JOINTS)
         return np.add(self._from, max(share, 0.0) * way), way / self._lasts
 
@@ -233,9 +235,9 @@ class CabinetServer:
         heapq.heappush(self._queue, (t, self._serial, act))
 
     def _after(self, late: float, t: float, act: Callable[[], None]) -> None:
-        """Call ``act`` at once, or ``late`` after ``t`` [s].
+        """Call ``act`` at once if ``late`` is 0, otherwise ``late`` [s] after ``t`` [s].
 
-        An answer that has come must not wait behind a late message.
+        An answer without delay is taken at once, because in the queue it would wait behind a late message.
         """
         if late > 0.0:
             self._at(t + late, act)
@@ -278,7 +280,7 @@ class CabinetServer:
         return datagram[: self._random.integers(len(datagram))] if is_cut else datagram
 
     def _ways(self, duplicate: float) -> Iterable[float]:
-        """Return the delay of each copy of a datagram [s]; no delay if the datagram is lost."""
+        """Return the delay of each copy of a datagram [s]. The result is empty if the datagram is lost."""
         if self._network == _PERFECT:
             return [0.0]
         copies = 0 if self._random.random() < self._network.loss else 1 + (self._random.random() < duplicate)

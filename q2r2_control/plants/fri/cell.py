@@ -25,17 +25,17 @@ from q2r2_control.plants.fri.wire import JOINTS, CommandKind, Monitoring, joints
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import ArmTiming, Command, CommandMode, RobotState
 
-# Time from the decision about the reference's end until the sessions have it: usually, and after commands that came too
-# late [s]. The reference then goes farther ahead by the difference.
+# Time that is allowed from the start of a tick until the sessions have its commands [s]: usually, and at most after
+# commands that came too late. The reference then goes farther ahead by the difference.
 _MARGIN, _LONGEST_MARGIN = 0.002, 0.016
 # Shortest step of the reference, as a share of a period.
 _SHORTEST = 0.5
-_FORGETTING = 0.01  # Share of the longest recent tick and margin that each tick forgets.
+_FORGETTING = 0.01  # Share by which the longest recent tick and the margin become shorter in each tick.
 _PASSING = 0.0015  # Approximate time that a measurement takes through cabinet, network and processes [s].
-_NO_COMMANDS = 0.1  # Time without a command in time, after which this is reported [s].
+_NO_COMMANDS = 0.1  # If all commands come too late for longer than this, it is reported as a fault [s].
 # Time constant with which an arm loses its speed if no overlay comes: several periods of a cabinet [s].
 _BRAKING_TIME = 0.03
-_MISSING = 10  # Number of lost messages of a cabinet in a run from which they are reported.
+_MISSING = 10  # Number of lost or unreadable messages of a cabinet in a run at which they are reported.
 _logger = logging.getLogger(__name__)
 
 
@@ -100,13 +100,13 @@ class FriCell:
         late, self._now, before = now - self._now if following else 0.0, now, self._end
         longest = max(late, (1.0 - _FORGETTING) * self._longest_tick)
         self._longest_tick = max(self._period, min(longest, self._longest))
-        # A session may have begun that is not known yet. The path therefore gets a step for each period.
+        # While no arm follows, a session may have begun that is not known yet. Each tick therefore adds a step.
         ahead = self._ahead if following else self._period
         if not following or latest <= before:
             braked, self._start = 0.0, before if following else now
         else:
             braked, self._start = latest - before, latest
-        # A step with one acceleration is a parabola, as the path expects. The rest of a late tick comes in the next.
+        # A step with one acceleration is a parabola, as the path expects. The next tick adds the rest of a late tick.
         step = min(max(now + ahead - self._start, _SHORTEST * self._period), self._longest)
         self._end = self._start + step
         return braked, step
@@ -135,7 +135,10 @@ class FriCell:
         return sent
 
     def fault(self) -> Reason | None:
-        """Return why the arms cannot be commanded at the newest tick, or could not since the last call; else None."""
+        """Return why the arms cannot be commanded at the newest tick.
+
+        The result is also a reason if they could not be commanded at some time since the last call; otherwise None.
+        """
         told, self._told = self._told, self._ends()
         for arm, state in self.states.items():
             dropped = self._told[arm] > told[arm]
@@ -165,14 +168,14 @@ class FriCell:
         return self._longest_tick + self._margin - _MARGIN
 
     def withdraws(self) -> bool:
-        """Return whether the newest command came too late for an answer, so that the arms follow the stop before it."""
+        """Return whether the newest command came too late. The arms then follow the stop of the command before it."""
         return self._withdraws
 
     def delay(self) -> float:
         """Return the time from the end of a command until a tick finds the arm there [s].
 
-        A cabinet begins to go there with its next message, and takes a period for it. The newest message is half a
-        period old on average. Torques act at once.
+        A cabinet begins to move the arm there with its next message, and takes one period for this motion. The newest
+        message is half a period old on average. Torques act at once.
         """
         states = self.states.values()
         is_torque = any(state.wanted is CommandKind.TORQUE for state in states)
@@ -180,7 +183,10 @@ class FriCell:
         return 0.0 if is_torque else farther + DELAY + _PASSING + 2.5 * max(state.period for state in states)
 
     def timings(self) -> dict[str, ArmTiming]:
-        """Return the timing of all arms that were heard. Torques have no lag, so that only silence counts for them."""
+        """Return the timing of all arms whose cabinets were heard.
+
+        Answers with torques have no lag, so that only silence counts for them.
+        """
         return {arm: state.timing(self._now) for arm, state in self.states.items() if state.newest is not None}
 
     def lead(self) -> float:

@@ -23,17 +23,18 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import ArmTiming, Array, Command, CommandMode, RobotState
 from q2r2_control.wording import sentence
 
-_KEPT = 100_000  # Number of answers that are kept. During a run the garbage collector looks at all of them.
+# Number of answers whose times are kept. It is bounded, because the garbage collector visits all of them during a run.
+_KEPT = 100_000
 _KINDS = {CommandMode.POSITION: CommandKind.POSITION, CommandMode.TORQUE: CommandKind.TORQUE}
 
 
 class FriPlant:
-    """A plant whose arms start where they stand, also after each session that a cabinet has ended."""
+    """A plant whose arms start where they stand, even after a cabinet has ended a session."""
 
     modes: tuple[CommandMode, ...] = (CommandMode.POSITION, CommandMode.TORQUE)
     realtime_only = True
-    # Times that a reset waits for the first message of each cabinet, and for all sessions [s]. Without all sessions a
-    # run begins nevertheless.
+    # Longest times that a reset waits for the first message of each cabinet, and for all sessions to begin [s]. If some
+    # sessions do not begin, the run begins nevertheless.
     longest_wait = longest_session_wait = 5.0
 
     def __init__(self, robot: Robot, config: Config) -> None:
@@ -41,7 +42,8 @@ class FriPlant:
 
         Raises:
             ConfigError: If an arm lacks a cabinet or does not have seven joints, if the package of a gripper is
-                missing, or if a late tick would be split into steps. Between two ticks the cabinets get one parabola.
+                missing, or if ``control.max_substep`` would split a late tick into steps. Between two ticks the
+                cabinets get one parabola.
         """
         for arm, its in robot.arms.items():
             if arm not in set(config.fri):
@@ -89,7 +91,7 @@ class FriPlant:
             self._answering = CabinetAnswers(lines)
         finally:
             for line in lines:
-                socket.close(line.file)  # The process has a copy of it.
+                socket.close(line.file)  # The process has a copy of the socket.
         self.grippers = self._modbus_grippers()
         for gripper in self.grippers.values():
             gripper.start()

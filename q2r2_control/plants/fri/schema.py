@@ -1,6 +1,6 @@
 """Messages of KUKA's Fast Robot Interface, FRI 1 and 2, as classes of the package ``protobuf``.
 
-The tables were written for interoperation from the field numbers of the public client kits 1.15 and 2.7. Enumerations
+``_MESSAGES`` was written for interoperation from the field numbers of the public client kits 1.15 and 2.7. Enumerations
 are plain integers here, so that a value of a newer version does not make a message unreadable.
 """
 

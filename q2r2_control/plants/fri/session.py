@@ -23,8 +23,8 @@ from q2r2_control.plants.fri.wire import (
 )
 from q2r2_control.types import Array
 
-# An answer is for a time that is this much before the arrival of its question [s]. Also on a busy computer the loop has
-# ticked by then.
+# An answer is for a time that is this much earlier than the arrival of its question [s]. Even on a busy computer, the
+# loop has computed the reference for this time by then.
 DELAY = 0.004
 _AT_REST = 1e-9  # Greatest distance from the end of the path at which the arm counts as resting [rad].
 _RESTARTED = 1000  # A counter that goes back by more shows that the session has begun again.
@@ -33,14 +33,19 @@ _MOST_AHEAD = 20  # Number of messages that may come at once after a gap.
 # Times after which a torque that is not updated is replaced [s]. A torque that nobody updates would push for ever. It
 # is replaced by a torque that brakes, and later by no answer, so that the cabinet ends the session.
 _TORQUE_LASTS, _TORQUE_GONE = 0.02, 0.1
-_BRAKING_RATE = 5000.0  # Least permitted rate of torques, because slower damping would come too late [Nm/s].
-# Greatest distance of a reference at its beginning from where the arm is held, or with torques is measured [rad].
+# A lower limit of the torques' rate is raised to this value [Nm/s]. With the lower limit, damping would come too late.
+_BRAKING_RATE = 5000.0
+# Greatest distance between a reference at its beginning and the arm [rad]: the position in which the arm is held, or,
+# with torques, its measured position.
 _SAME, _NEAR = 1e-6, 0.02
 _FROM_REST = 20.0  # A bound above the acceleration of a joint in the first tick [rad/s^2].
 
 
 class ArmSession:
-    """The session of one arm. While it follows, its answers are on the reference's ``path``; else the arm is held."""
+    """The session of one arm.
+
+    While the arm follows the reference, its answers lie on ``path``. Otherwise they hold the arm.
+    """
 
     def __init__(
         self,
@@ -60,17 +65,18 @@ class ArmSession:
             wanted: The kind of commands, positions or torques.
             version: The version of FRI; None for either.
             torque_limit: Greatest torque of an overlay (n,) [Nm].
-            velocity_limit: Greatest plausible measured velocity (n,) [rad/s]. A measured position that jumps once then
-                lets the damping push the joint back by the way of one period at this velocity at most.
-            torque_rate_limit: Greatest change of a torque between two answers [Nm/s]. The damping keeps it as well, or
-                5000 Nm/s if the limit is lower.
+            velocity_limit: Greatest plausible measured velocity (n,) [rad/s]. Faster measurements are clipped. If a
+                measured position jumps once, the damping then pushes the joint back by at most the distance that it
+                moves in one period at this velocity.
+            torque_rate_limit: Greatest rate of a torque between two answers [Nm/s]. A limit below 5000 Nm/s is raised
+                to 5000 Nm/s, so that the damping comes in time.
         """
         self.state, self._version = SessionState(arm, source, wanted), version
         self.path = ReferencePath(0.0, np.zeros(JOINTS))
-        # The torque overlay [Nm], or None for the damping; and the time at which it was decided on [s].
+        # The torque overlay [Nm], or None if the damping brakes; and the time of the tick that computed it [s].
         self._tau: Array | None = None
         self._tau_came = -math.inf
-        self._damping = np.zeros(JOINTS)  # Brakes the arm if no overlay comes [Nm s/rad].
+        self._damping = np.zeros(JOINTS)  # The damping that brakes the arm if no overlay comes [Nm s/rad].
         none = np.full(JOINTS, math.inf)
         self._torque_limit = none if torque_limit is None else torque_limit
         self._torque_rate_limit = max(torque_rate_limit, _BRAKING_RATE)
@@ -80,7 +86,7 @@ class ArmSession:
         self._answers = 0
         self._times: AnswerTimes | None = None
         self._clock = MessageClock(-math.inf)
-        self.waits = 0.0  # Time by which the answers wait for the other arms [s].
+        self.waits = 0.0  # The answers are for times that are earlier by this much, because other arms are behind [s].
         self._begun = False  # Whether the cabinet's own position is known, at which the path begins.
 
     def is_still(self, now: float) -> bool:
@@ -96,11 +102,14 @@ class ArmSession:
         return bool(np.abs(self.path.at(t) - self.path.rest).max() <= _AT_REST)
 
     def has_passed(self, command: ArmCommand) -> bool:
-        """Return whether an answer has already followed the earlier stop at a time for which ``command`` is."""
+        """Return whether an answer was already sent for a time after the start of ``command``.
+
+        That answer lay on the earlier stop, so that the command has come too late.
+        """
         return self.state.following and self.state.answered > command.start
 
     def follow(self, command: ArmCommand) -> None:
-        """Take the command of a tick, which no answer has passed."""
+        """Take the command of a tick, for which :meth:`has_passed` is False."""
         state = self.state
         if state.is_silent(command.now):
             self._brake()
@@ -117,7 +126,7 @@ class ArmSession:
             self._damping, self._tau_came = np.array(command.damping), command.now
 
     def _begins(self, command: ArmCommand) -> bool:
-        """Return whether the reference was at rest a tick ago, at the place of the arm."""
+        """Return whether the reference was at rest one tick ago, at the position of the arm."""
         state, step = self.state, command.end - command.start
         torques = state.wanted is CommandKind.TORQUE and state.newest
         if not torques and not self._rests(state.answered):
@@ -162,7 +171,7 @@ class ArmSession:
         if before is None or state.is_silent(now):
             passed = 0
             if before is not None and self._lasts(message, before):
-                self._brake()  # A new beginning here would stop the arm at once.
+                self._brake()  # If the session began anew here, the arm would stop abruptly.
             else:
                 self._begin_anew()
         else:
@@ -198,7 +207,7 @@ class ArmSession:
         return self._begun and same and _ahead(message, before) > 0
 
     def _brake(self) -> None:
-        """Let the arm brake from the newest answer, because its cabinet is silent."""
+        """Let the arm brake from the newest answer, because its cabinet was silent."""
         if self.state.following:
             self._cease()
             if self.state.wanted is CommandKind.POSITION:
@@ -227,8 +236,8 @@ class ArmSession:
         if self._times is None:
             self._times = AnswerTimes(message.period * message.multiplier, DELAY)
         if message.session is Session.COMMANDING_WAIT or not self._begun:
-            # The first command has to equal the cabinet's own position, where the reference begins. In a session that
-            # another client has begun, the arm is not there any more.
+            # The first command has to equal the cabinet's own position, at which the reference begins. If another
+            # client has begun the session, the arm has left that position, and its commanded position counts.
             own = message.ipo_q if message.session is Session.COMMANDING_WAIT else message.commanded_q
             self._cease()
             self._begun = True
@@ -253,9 +262,9 @@ class ArmSession:
         return {name: value for name, value in fitting.items() if value is not None}
 
     def _torque(self, message: Monitoring, now: float) -> FriCommand | None:
-        """Return the newest torque overlay, or one that brakes.
+        """Return an answer with the newest torque overlay, or with an overlay that brakes; None if no answer is due.
 
-        It has the cabinet's own position, as in KUKA's examples.
+        The answer repeats the cabinet's own position, as in KUKA's examples.
         """
         age = now - self._tau_came
         if self.state.is_too_slow or (message.session is Session.COMMANDING_ACTIVE and age > _TORQUE_GONE):
@@ -271,9 +280,9 @@ class ArmSession:
 
 
 def follow(sessions: Mapping[str, ArmSession], commands: Mapping[str, ArmCommand]) -> bool:
-    """Let every arm take its command. If one of them came too late, no arm takes its own, and False is returned.
+    """Let every arm take its command, and return True.
 
-    All arms then brake.
+    If one of the commands came too late, no arm takes its command, all arms brake, and the function returns False.
     """
     if any(sessions[arm].has_passed(command) for arm, command in commands.items()):
         return False
@@ -285,7 +294,7 @@ def follow(sessions: Mapping[str, ArmSession], commands: Mapping[str, ArmCommand
 def answer(sessions: Mapping[str, ArmSession], arm: str, datagram: bytes, now: float) -> bytes | None:
     """Answer a message of one arm as :meth:`ArmSession.answer` does, and let the arm wait for arms that are behind.
 
-    It waits for half of the time that they are behind. They catch up meanwhile, until no arm is behind.
+    The arm waits for half of the largest lag of the other arms. These arms catch up meanwhile, until no arm is behind.
     """
     lags = [other.state.timing(now).lag for name, other in sessions.items() if name != arm and other.state.following]
     sessions[arm].waits = 0.5 * max(0.0, *lags, 0.0)

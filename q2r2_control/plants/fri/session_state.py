@@ -11,9 +11,10 @@ from q2r2_control.plants.fri.reasons import FriReason
 from q2r2_control.plants.fri.wire import JOINTS, CommandKind, IoValue, Joints, Monitoring, Safety, Session, in_words
 from q2r2_control.types import ArmTiming
 
-TORQUE_PERIOD = 0.005  # Longest time between two answers. With 0.01 an arm at the default stiffness is unstable [s].
-_SILENT = 0.1  # A cabinet without a message for longer than this has gone [s].
-_LONGEST_LAG = 0.25  # Lag from which a cabinet that asks too seldom is not answered any more [s].
+# Longest time between two answers with torques [s]. With 0.01 s, an arm at the default stiffness is unstable.
+TORQUE_PERIOD = 0.005
+_SILENT = 0.1  # A cabinet that sends no message for longer than this counts as silent [s].
+_LONGEST_LAG = 0.25  # An arm with a larger lag is not commanded, because its cabinet asks too seldom [s].
 _EARLY = 5e-4  # Time by which a message may come before it is expected [s].
 
 
@@ -36,8 +37,9 @@ class SessionState:
     ended: int = 0  # Number of times that the arm ceased to follow because its cabinet ended the session.
     answered: float = -math.inf  # The latest time for which there was an answer.
     expected: float = -math.inf  # The time at which the message of that answer would have come without delay.
-    lag: float = 0.0  # Time by which the times of answers are behind.
-    behind: float = 0.0  # The lag by the cabinet's clock, which does not depend on the arrival of its messages.
+    lag: float = 0.0  # By how much the time of the newest answer is too early, judged by the arrival of its question.
+    # The same, judged by the expected time of the question, so that delays of the network do not count.
+    behind: float = 0.0
     took: float | None = None  # Time from the newest message until its answer was sent; None if it got no answer.
     lost: int = 0  # Number of lost messages of the cabinet.
     unreadable: int = 0  # Number of unreadable messages.
@@ -69,14 +71,14 @@ class SessionState:
         return ArmTiming(self.behind, now - self.arrival, self.period)
 
     def latest(self, t: float) -> float:
-        """Return the latest time for which there may be an answer until ``t`` [s]."""
+        """Return an upper bound on the times for which answers are sent until ``t`` [s]."""
         if self.period == 0.0 or self.answered == -math.inf:
             return -math.inf
         messages = max(math.floor((t + _EARLY - self.expected) / self.period), 0)
         return self.answered + (1.0 + CATCH_UP) * messages * self.period
 
     def fault(self, now: float) -> Reason | None:
-        """Return why the arm cannot be commanded at ``now`` [s], or None."""
+        """Return why the arm cannot be commanded at ``now`` [s], or None if it can."""
         newest = self.newest
         if newest is None or self.is_silent(now):
             if self.problem is not None:

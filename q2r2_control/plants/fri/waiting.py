@@ -28,7 +28,10 @@ _logger = logging.getLogger(__name__)
 
 
 class CabinetWait:
-    """Waits, and logs a line after some seconds and then every ten seconds. The time begins when it is made."""
+    """Waits for cabinets, and logs what is missing after three seconds and then every ten seconds.
+
+    The time begins when an instance is created.
+    """
 
     def __init__(
         self, stopped: Callable[[], bool] = lambda: False, clock: Callable[[], float] = time.monotonic
@@ -47,11 +50,11 @@ class CabinetWait:
         return self._stopped()
 
     def until(self, done: Callable[[], bool], states: Callable[[], Iterable[SessionState]], longest: float) -> bool:
-        """Wait until ``done``, at most until ``longest`` [s] after the begin of all waiting.
+        """Wait until ``done()`` is True, at most until ``longest`` [s] after this instance was created.
 
         Args:
             done: Checks the cabinets, and returns True if there is nothing left to wait for.
-            states: Returns the sessions of all arms, for the lines.
+            states: Returns the states of all arms' sessions, which are logged.
             longest: The longest wait; infinite if there is no bound [s].
 
         Returns:

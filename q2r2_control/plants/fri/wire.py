@@ -1,7 +1,8 @@
 """Messages of KUKA's Fast Robot Interface, converted from and to datagrams.
 
 A cabinet sends a :class:`Monitoring` datagram in every period, and its client answers with a :class:`FriCommand`. FRI 1
-sends the protobuf message itself. FRI 2 puts its length before it and a CRC-32 behind it, both uint32, little endian.
+sends the protobuf message itself. FRI 2 puts the message's length before it and a CRC-32 behind it, both as uint32,
+little endian.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from q2r2_control.plants.fri.schema import CommandMessage, MonitoringMessage
 JOINTS = 7
 LONGEST = 1500  # Longest datagram [bytes].
 _MONITORING, _COMMAND = 0x245142, 0x34001  # Identifiers of the two messages.
-_FIRST_FIELD = 0x0A  # First byte of a message whose field 1 is a message.
+_FIRST_FIELD = 0x0A  # First byte of a protobuf message whose field 1 is itself a message.
 _LENGTH = struct.Struct("<I")
 
 Joints = tuple[float, ...]  # The positions, velocities or torques of seven joints.
@@ -109,11 +110,11 @@ class Monitoring:
     session: Session
     quality: Quality
     period: float  # Time between two messages of the cabinet [s].
-    multiplier: int  # Number of messages for which one answer is due.
+    multiplier: int  # The cabinet expects one answer after this number of messages.
     q: Joints  # Measured positions.
     stamp: float = 0.0  # Time of the cabinet's clock [s].
     tau: Joints | None = None  # Measured torques.
-    external_tau: Joints | None = None  # Torques by contacts, which the cabinet estimates.
+    external_tau: Joints | None = None  # Torques that contacts cause, as the cabinet estimates them.
     commanded_q: Joints | None = None  # Commanded positions, only in FRI 1.
     ipo_q: Joints | None = None  # Position of the cabinet's own motion, which a client's command overlays.
     command: CommandKind = CommandKind.NONE
@@ -122,7 +123,8 @@ class Monitoring:
     drives: Drives = Drives.ACTIVE
     io: dict[str, IoValue] = field(default_factory=dict)  # Inputs and outputs that the application registered.
     outputs: frozenset[str] = frozenset()  # Names in ``io`` that a client may write.
-    # Torques of the cabinet's controller with the client's overlay. They are written, but never read.
+    # Torques of the cabinet's controller plus the client's overlay. A simulated cabinet writes them; no client reads
+    # them.
     commanded_tau: Joints | None = None
 
     def output(self, name: str, value: IoValue) -> IoValue | None:
@@ -148,7 +150,7 @@ class FriCommand:
 
 
 def read_monitoring(datagram: bytes) -> Monitoring:
-    """Return a cabinet's message; raises :class:`ProtocolError` if the bytes are not one."""
+    """Return a cabinet's message; raises :class:`ProtocolError` if the bytes are no such message."""
     version, message = _parsed(datagram, MonitoringMessage, _MONITORING)
     data, connection, ipo, robot = message.data, message.connection, message.ipo, message.robot
     if (q := _joints(data, "q")) is None:
@@ -220,7 +222,11 @@ def write_command(command: FriCommand, version: int) -> bytes:
 
 
 def version_of(datagram: bytes) -> int:
-    """Return FRI 1 or 2. The length at the begin of FRI 2 is below 1500, so that its second byte differs from FRI 1."""
+    """Return the version of FRI, 1 or 2.
+
+    A datagram of FRI 2 begins with a length of at most 1500, so that its second byte is 5 at most. In FRI 1 this byte
+    is larger.
+    """
     return 1 if len(datagram) > 1 and datagram[0] == _FIRST_FIELD and datagram[1] > 5 else 2
 
 
@@ -274,7 +280,7 @@ def _set_joints(message: Any, name: str, values: Joints | None) -> None:
         getattr(message, name).value.extend(values)
 
 
-# A call of an enum takes ten times as long as this table, and there are six look-ups for each message.
+# A call of an enum takes ten times as long as a look-up in this dictionary, and each message needs six look-ups.
 _ENUMS: tuple[type[IntEnum], ...] = (Session, Quality, CommandKind, Safety, Operation, Drives)
 _MEMBERS = {kind: {one.value: one for one in kind} for kind in _ENUMS}
 
@@ -287,7 +293,7 @@ def _member(kind: type[IntEnum], value: int) -> Any:
 
 
 def _io_of(values: Any) -> dict[str, IoValue]:
-    """Return values by name: booleans, numbers of bits, and analog values."""
+    """Return values by name: a bool, an int of several bits, or a float for an analog value."""
     kinds: tuple[Any, ...] = (lambda io: bool(io.digital), lambda io: io.digital, lambda io: io.analog)
     return {_name_of(io.name): kinds[io.type](io) for io in values if 0 <= io.type < len(kinds)}
 

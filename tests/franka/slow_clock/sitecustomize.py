@@ -1,7 +1,7 @@
-"""Let the clock of every Python process run more slowly whose path has this folder: ``SLOWNESS`` seconds for a second.
+"""Slow down the clocks of every Python process whose path has this folder: one second takes ``SLOWNESS`` real seconds.
 
-A busy computer then has this many times as long for each tick of a loop and for each answer, and everything else is as
-with real clocks.
+A busy computer then has this many times as long for each tick of a loop and for each answer. Everything else is as with
+real clocks.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Two arms that move alike, near each other, when one of them lags or stops: how near the measured arms come.
+"""Measure how near two arms come that move alike side by side, if one of them lags or stops.
 
 ``python -m tests.plants.fri.skewed_arms`` prints a table.
 """
@@ -34,12 +34,12 @@ _HEIGHT = 0.45  # Height of the tools [m].
 class Outcome:
     """The result of a run. Distances are the least ones between bodies of different arms [m]."""
 
-    speed: float  # Largest speed of both tools before the case [m/s].
+    speed: float  # Largest speed of both tools before the incident [m/s].
     reference: float
     measured: float
-    rest: float  # Time from the case until both measured arms rested [s].
+    rest: float  # Time from the incident until both measured arms rested [s].
     margin: float  # Margin of the measured arms: distance minus the kept distance.
-    error: float  # Error of the measured tools before the case [m RMS].
+    error: float  # Error of the measured tools before the incident [m RMS].
     events: list[str]
 
 
@@ -132,7 +132,7 @@ class Case:
             self.plant.unplugged.add(self._arm)
 
     def _measure(self, t: float) -> None:
-        """Measure the arms as their cabinets know them."""
+        """Measure the distances of the arms at the positions that their cabinets measure."""
         if t < self._happens - 0.1:
             return
         q = np.zeros(self.robot.model.nv)

@@ -25,7 +25,8 @@ from tests.pipeline.loops import FreezingLoop
 from tests.plants.fri.virtual_cabinets import VirtualCabinets
 
 ACCELERATION = 4.0  # Acceleration of the reference [rad/s^2].
-# Time after the braking time of the reference [s], and speed of resting joints [rad/s].
+# Time that is allowed in addition to the braking time of the reference [s], and greatest speed of resting joints
+# [rad/s].
 _ALLOWANCE, _STILL = 0.05, 1e-3
 
 
@@ -43,7 +44,7 @@ _RESTS = {CommandMode.POSITION: Rest(0.0, _STILL, 0.0, _STILL), CommandMode.TORQ
 _ENDS = ("pendant", "back at once", "safety stop", "loop freezes", "computer freezes", "cabinet freezes", "garbage")
 _ASKED = {Trip.STOPPED, Trip.SAFETY}
 _SILENT = 0.1  # Time after which a silent cabinet is noticed [s].
-_MUTATED = 250  # Number of datagrams with wrong bytes before a session ends by them.
+_MUTATED = 250  # Number of datagrams with wrong bytes that are sent before the session ends.
 
 
 class PressingHands(ScriptedInput):
@@ -71,9 +72,9 @@ def make_loop(
     mode: CommandMode = CommandMode.POSITION,
     **network: Any,
 ) -> FreezingLoop:
-    """Return a loop whose reference leaves the cabinets' limits room for catching up. The arms ``start`` at home.
+    """Return a loop whose reference is slower than the cabinets allow, so that answers can catch up.
 
-    For torques they are simulated.
+    The arms begin at ``start`` (nv,) [rad], by default at home. In torque mode they are simulated.
     """
     changes = {"velocity_scale": 1.0 / (1.0 + CATCH_UP), "acceleration_limit": ACCELERATION, "max_substep": 0.01}
     config = config.model_copy(update={"control": config.control.model_copy(update=changes)})
@@ -101,7 +102,7 @@ def make_loop(
 
 @dataclass
 class Soak:
-    """A soak that starts both overlays, lets the arms move for a while, and ends the session in some way."""
+    """A soak that starts both overlays, lets the arms move for a while, and ends the session in one of many ways."""
 
     pipeline: FreezingLoop
     sessions: int
@@ -123,7 +124,8 @@ class Soak:
         self._lasts = 0.3
         self._rest = _RESTS[self.pipeline.drive.mode]
         self._braked_by, self._slow_by, self._start_at = math.inf, math.inf, 0.0
-        # Speeds of the last 50 ms [s]. An arm is late, and brakes from that speed if its cabinet is silent.
+        # Braking times of the reference in the last 50 ms [s]. A measured arm is late: if its cabinet is silent, the
+        # arm brakes from one of these earlier references.
         self._braking: deque[float] = deque(maxlen=25)
         self._seen, self._end = dict.fromkeys(SIDES, 0), "start"
         self.pipeline.listeners.append(self.look)
@@ -144,7 +146,7 @@ class Soak:
         self._braking.append(float((np.abs(tick.reference.v) / self.pipeline.controller.stop_deceleration).max()))
         self.moved = max(self.moved, speed)
         held = not any(tick.engaged.values())
-        # Springs, or an arm that stopped sooner, may leave joints beyond a limit. The reference returns and then rests.
+        # Springs, or an arm that stopped sooner, may leave joints beyond a limit. The reference then returns and rests.
         returns = tick.reference.report.status is StepStatus.RECOVERING
         self._returns = held and (returns or (self._returns and speed > _STILL))
         still = self.pipeline.controller.settings.recovery_velocity if self._returns else _STILL
@@ -180,7 +182,7 @@ class Soak:
             self._start_at = now + float(self.random.uniform(0.05, 0.3))
 
     def _fastest(self, arm: str) -> float:
-        """Return the speed of the fastest joint [rad/s] in the newest period of a cabinet that is commanded."""
+        """Return the speed of the arm's fastest joint in the newest period [rad/s]; 0 if nobody commands it."""
         way = np.diff(self.plant.heard[arm][-2:], axis=0)
         return float(np.abs(way[np.isfinite(way)]).max(initial=0.0)) / self.plant.cabinets[arm].settings.period
 

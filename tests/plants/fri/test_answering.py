@@ -26,7 +26,7 @@ MONITORING = Monitoring(2, 1, 0, Session.MONITORING_READY, Quality.EXCELLENT, 0.
 
 
 class LongMotion(ArmSession):
-    """A motion that is over after ``answers`` answers."""
+    """A session whose arm stands still after ``answers`` messages."""
 
     def __init__(self, answers: int) -> None:
         super().__init__("left", "cabinet")
@@ -41,7 +41,7 @@ class LongMotion(ArmSession):
 
 
 class BrokenOnTheWay(ArmSession):
-    """A motion that the process cannot read."""
+    """A session that the process cannot unpickle."""
 
     def __setstate__(self, state: object) -> None:
         raise ValueError("it came broken")
@@ -87,7 +87,7 @@ def between() -> Iterator[Between]:
         yield made
 
 
-def test_the_process_has_begun_as_soon_as_the_loop_has_it(between: Between) -> None:
+def test_the_process_answers_as_soon_as_its_creation_returns(between: Between) -> None:
     assert between.ask().reflected == 1, "messages that came before it had begun would be dropped"
 
 
@@ -96,7 +96,7 @@ def test_a_process_that_cannot_begin_gives_the_reason() -> None:
         CabinetAnswers([Line(BrokenOnTheWay("left", "cabinet"), "127.0.0.1", ours.fileno())])
 
 
-def test_the_loop_gets_the_state_after_each_message_and_answers_use_only_earlier_commands(
+def test_the_loop_gets_the_state_after_each_message_and_an_answer_uses_the_last_command(
     between: Between,
 ) -> None:
     between.ask()

@@ -1,4 +1,4 @@
-"""Answers to cabinets whose clocks drift, through networks that jitter, repeat and lose, in virtual time."""
+"""Answers to cabinets whose clocks drift, through networks that delay and lose messages, in virtual time."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ import pytest
 from q2r2_control.plants.fri.answers import CATCH_UP, CATCH_UP_RAMP, AnswerTimes, MessageClock, ReferencePath
 from q2r2_control.types import Array
 
-SPEED, ACCELERATION = 1.5, 9.0  # Largest speed and acceleration of the reference.
+SPEED, ACCELERATION = 1.5, 9.0  # Largest speed [rad/s] and acceleration [rad/s^2] of the reference.
 DELAY, TICK = 0.008, 0.001
 
 
 def swing(t: float) -> tuple[Array, Array]:
-    """Return a swinging joint that reaches the largest speed and acceleration."""
+    """Return the position [rad] and velocity [rad/s] of a swing that reaches the largest speed and acceleration."""
     w = ACCELERATION / SPEED
     return np.array([SPEED / w * (1.0 - np.cos(w * t))]), np.array([SPEED * np.sin(w * t)])
 
@@ -55,7 +55,7 @@ CASES = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", list(CASES))
-def test_the_cabinet_sees_no_larger_speed_and_acceleration_than_stated(case: str) -> None:
+def test_the_cabinet_sees_no_larger_speed_and_acceleration_than_documented(case: str) -> None:
     period = CASES[case][0]
     q = answered(*CASES[case], seed=3)
     v = np.diff(q) / period
@@ -80,7 +80,7 @@ def test_the_arm_is_not_late_by_more_than_the_delay_and_a_few_periods() -> None:
     assert max(late[500:]) <= DELAY + 4 * period
 
 
-def test_a_repeated_question_moves_nothing() -> None:
+def test_a_repeated_question_gets_an_answer_for_the_same_time() -> None:
     times = AnswerTimes(0.005, DELAY)
     for question in range(100):
         first = times.at(question, 0.005 * question, 2 * question, 2 * question - 1)
@@ -88,7 +88,7 @@ def test_a_repeated_question_moves_nothing() -> None:
         assert abs(again - first) <= 1e-4
 
 
-def test_a_loop_that_stands_still_leads_into_the_certified_stop_and_to_rest() -> None:
+def test_the_path_ends_with_the_certified_stop_if_the_loop_stands_still() -> None:
     path = ReferencePath(0.0, np.zeros(2))
     path.extend(0.001, np.array([0.0005, -0.001]), np.array([1.0, -2.0]), np.array([10.0, 10.0]))
     t = 0.001 + np.linspace(0.0, 0.3, 301)
@@ -98,7 +98,7 @@ def test_a_loop_that_stands_still_leads_into_the_certified_stop_and_to_rest() ->
     assert np.abs(a).max() <= 10.0 + 1e-6
 
 
-def test_a_path_that_brakes_during_a_move_rests_as_certified_from_the_end_of_the_move() -> None:
+def test_a_path_that_brakes_during_a_motion_stops_as_certified_from_the_end_of_that_motion() -> None:
     path, certified = ReferencePath(0.0, np.zeros(2)), ReferencePath(0.0, np.zeros(2))
     for each in (path, certified):
         each.extend(0.01, np.array([0.0, 0.0]), np.array([1.0, 0.02]), np.array([5.0, 0.1]))

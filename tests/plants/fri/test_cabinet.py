@@ -183,7 +183,7 @@ def test_invalid_answers_and_other_versions_end_the_session_and_a_late_answer_do
     assert cabinet.trips == [Trip.LATE]
 
 
-def test_missing_answers_are_counted_if_the_client_goes_on_and_not_after_its_end() -> None:
+def test_missed_answers_are_counted_only_if_the_client_answers_again() -> None:
     cabinet, client = commanding()
     run(cabinet, 100, lambda message: client.answer(message) if message.counter % 20 else None)
     assert cabinet.missed == 6  # The last message of commanding() is one of them.
@@ -191,7 +191,7 @@ def test_missing_answers_are_counted_if_the_client_goes_on_and_not_after_its_end
     assert (cabinet.missed, cabinet.trips) == (6, [Trip.LATE])
 
 
-def test_the_cabinets_own_position_is_the_posture_that_it_holds_wherever_a_client_has_led_the_arm() -> None:
+def test_the_cabinets_own_position_stays_where_the_session_began_until_the_next_session() -> None:
     cabinet, client = commanding(replace(SETTINGS, acceleration=(1e3,) * 7))
     ways = iter(range(1, 101))
     message = run(cabinet, 100, lambda message: client.answer(message, moved(1e-3 * next(ways))))

@@ -1,4 +1,4 @@
-"""The cell behind the simulated cabinets moves as they are commanded."""
+"""The simulated cell moves as its simulated cabinets are commanded."""
 
 from __future__ import annotations
 
@@ -55,14 +55,14 @@ def test_torque_commands_are_added_to_the_joint_impedance(config: Config, robot:
         assert turned[0] > 0.5
 
 
-def test_the_guards_leave_the_reference_room_for_catching_up(robot: Robot) -> None:
+def test_the_cabinets_limits_allow_the_reference_to_catch_up(robot: Robot) -> None:
     settings = settings_of(robot, "left", CommandKind.POSITION, 2, PERIOD)
     joints = robot.arms["left"].joints
     assert (np.array(settings.acceleration) > 1.1 * robot.acceleration_limit[joints]).all()
     assert settings.velocity == tuple(robot.velocity_limit[joints])
 
 
-def test_an_arm_moves_on_at_the_end_of_its_way_when_the_next_command_comes(config: Config, robot: Robot) -> None:
+def test_the_drives_keep_their_velocity_until_the_next_command_is_due(config: Config, robot: Robot) -> None:
     cell = SimulatedArms(robot, config)
     cell.arms["left"].advance(PERIOD, tuple(np.array(cell.arms["left"].q) + 0.01), None)
     for t, speed in ((0.5 * PERIOD, 0.01 / PERIOD), (PERIOD, 0.01 / PERIOD), (1.5 * PERIOD, 0.0)):

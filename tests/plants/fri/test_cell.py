@@ -32,7 +32,7 @@ from tests.plants.fri.virtual_cabinets import VirtualCabinets
 
 @pytest.fixture(scope="session")
 def config(config: Config) -> Config:
-    """Return the cell at the rate of the shipped cell of cabinets."""
+    """Return the cell at the rate of the shipped cell with cabinets."""
     return config.model_copy(update={"loop_rate_hz": 500.0})
 
 
@@ -117,7 +117,7 @@ def test_a_cabinet_without_the_grippers_output_is_named_once_and_gets_no_write(
         pytest.param({"drift": -200e-6, "jitter": 0.0005, "loss": 0.005}, id="loss"),
     ],
 )
-def test_a_bad_network_trips_no_guard(config: Config, network: dict[str, Any]) -> None:
+def test_a_network_with_drift_jitter_and_loss_ends_no_session(config: Config, network: dict[str, Any]) -> None:
     pipeline = make_loop(config, (0.005, 0.002), **network)
     plant = started(pipeline)
     summary = pipeline.run(2.5, realtime=False)
@@ -141,10 +141,10 @@ def test_a_late_loop_brakes_on_the_stop_that_the_cabinets_get(config: Config) ->
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("latest", "thinks", "bound"), [(0.007, False, 1.3), (0.01, True, 2.0)])
-def test_a_loop_whose_ticks_are_all_late_follows_as_one_in_time(
+def test_a_loop_with_only_late_ticks_follows_nearly_as_well_as_a_punctual_loop(
     config: Config, latest: float, thinks: bool, bound: float
 ) -> None:
-    """Each tick lasts 2 ms. With ``thinks``, its command is as late as the tick."""
+    """Ticks are up to ``latest`` [s] late. With ``thinks``, their commands are late as well."""
 
     def run(most: float) -> float:
         pipeline = make_loop(config, (0.002, 0.002), jitter=0.0004)
@@ -250,7 +250,7 @@ def test_arms_rest_on_their_certified_stop_while_a_solver_blocks_and_go_on_after
 
 
 @pytest.mark.slow
-def test_a_loop_that_is_always_too_late_gets_a_message(config: Config) -> None:
+def test_a_loop_that_is_always_too_late_is_reported(config: Config) -> None:
     pipeline = make_loop(config)
     plant = started(pipeline)
 
@@ -313,7 +313,7 @@ def test_arms_with_an_untrusted_state_are_braked_at_every_tick(config: Config, r
     assert len(brakings) > 4
     for speeds in brakings[:-1]:
         assert max(speeds) < speeds[0] + 0.2, "a jump of what is measured is hardly a push"
-        # These come after the periods of both cabinets, and after the filter of the jump.
+        # These speeds are measured after the periods of both cabinets, and after the filter of the jump.
         later = np.array(speeds[20:])
         assert (np.diff(later) < 0.01 * later[:-1] + 1.0 / config.nominal_rate_hz).all(), "no arm gets faster"
         assert later[-1] < 0.02, "and both rest before they are believed again"
@@ -344,7 +344,7 @@ def test_sessions_end_in_every_way_without_a_jump_and_begin_again(config: Config
     assert soak.faults == []
 
 
-def test_the_first_command_of_a_session_is_where_the_cabinet_holds_its_arm(config: Config) -> None:
+def test_the_first_command_of_a_session_is_the_posture_in_which_the_cabinet_holds_its_arm(config: Config) -> None:
     pipeline = make_loop(config)
     plant = started(pipeline)
     assert pipeline.run(0.6, realtime=False).at_rest
@@ -353,7 +353,7 @@ def test_the_first_command_of_a_session_is_where_the_cabinet_holds_its_arm(confi
         np.testing.assert_allclose(plant.heard[arm][0], home, atol=1e-6)
 
 
-def test_an_arm_beyond_its_margin_is_led_back(config: Config, robot: Robot) -> None:
+def test_an_arm_beyond_its_position_margin_moves_back_inside(config: Config, robot: Robot) -> None:
     margin, start = config.control.position_margin, robot.home.copy()
     joint = int(robot.arms["left"].joints[6])
     start[joint] = robot.position_upper[joint] - 0.3 * margin

@@ -101,7 +101,7 @@ def test_an_arm_without_a_cabinet_is_named(robot: Robot, config: Config) -> None
         FriPlant.from_config(robot, config)
 
 
-def test_a_late_tick_of_several_accelerations_is_refused(robot: Robot, fri_config: Config) -> None:
+def test_a_max_substep_that_would_split_a_late_tick_is_refused(robot: Robot, fri_config: Config) -> None:
     config = fri_config.model_copy(update={"loop_rate_hz": 500.0})
     with pytest.raises(ConfigError, match=r"control\.max_substep = 0\.002: allowed with cabinets: two ticks"):
         FriPlant.from_config(robot, config)

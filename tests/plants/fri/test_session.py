@@ -16,7 +16,7 @@ from q2r2_control.plants.fri.wire import CommandKind, FriCommand, Joints, Monito
 from q2r2_control.wording import sentence
 from tests.plants.fri.asking_cabinet import ACTIVE, IPO, MONITORING, WAITING, Cabinet, Q
 
-FAR = (0.3, 0.5, 0.0, -1.2, 0.0, 1.0, 0.0)  # A client has led the arm to this posture.
+FAR = (0.3, 0.5, 0.0, -1.2, 0.0, 1.0, 0.0)  # A client has moved the arm to this posture.
 
 
 def test_an_idle_cabinet_gets_no_answer_and_a_monitoring_one_gets_no_position() -> None:
@@ -40,7 +40,7 @@ def test_fri_1_gets_the_commanded_position_mirrored() -> None:
         pytest.param(replace(ACTIVE, version=1, commanded_q=FAR), FAR, id="already active, FRI 1"),
     ],
 )
-def test_the_first_command_is_the_posture_that_the_cabinet_holds_or_that_another_client_has_left(
+def test_the_first_command_is_the_posture_that_the_cabinet_holds_or_to_which_another_client_moved_it(
     message: Monitoring, q: Joints
 ) -> None:
     cabinet = Cabinet()
@@ -63,7 +63,7 @@ def test_only_outputs_that_the_cabinet_has_are_written_in_its_own_type(message: 
     assert isinstance(answer.io["open"], bool)
 
 
-def test_every_multiplier_th_message_is_answered() -> None:
+def test_only_each_third_message_is_answered_with_a_multiplier_of_three() -> None:
     cabinet = Cabinet()
     answers = [cabinet.ask(replace(MONITORING, multiplier=3)) for _ in range(6)]
     assert [answer is None for answer in answers] == [True, True, False, True, True, False]
@@ -75,7 +75,7 @@ def torque_cabinet(limit: float = 100.0, rate: float = math.inf) -> Cabinet:
 
 
 def begin_torques(cabinet: Cabinet) -> Monitoring:
-    """Begin a session of torques in commanding wait with a command, and return the message of an active one."""
+    """Begin a session with torques and one command. Return the message of the active session."""
     active = replace(ACTIVE, command=CommandKind.TORQUE)
     cabinet.ask(replace(WAITING, command=CommandKind.TORQUE))
     cabinet.ask(active)
@@ -85,14 +85,14 @@ def begin_torques(cabinet: Cabinet) -> Monitoring:
     return active
 
 
-def test_torques_go_with_the_cabinets_own_position() -> None:
+def test_an_answer_with_torques_repeats_the_cabinets_own_position() -> None:
     cabinet = torque_cabinet()
     answer = cabinet.ask(begin_torques(cabinet))
     assert answer is not None
     assert (answer.q, answer.tau) == (IPO, (1.0,) * 7)
 
 
-def test_a_torque_that_is_not_replaced_becomes_a_braking_one_and_ends_with_the_answers() -> None:
+def test_a_torque_that_is_not_updated_becomes_a_braking_torque_and_later_no_answer() -> None:
     cabinet = torque_cabinet()
     active = begin_torques(cabinet)
     q = iter(np.linspace(Q, np.add(Q, 0.025), 26)[1:])  # The joints move at 0.2 rad/s.
@@ -101,7 +101,7 @@ def test_a_torque_that_is_not_replaced_becomes_a_braking_one_and_ends_with_the_a
     assert torques == [1.0] * 4 + [-4.0] * 16 + [None] * 5
 
 
-def test_a_braking_torque_keeps_the_rate_limit_as_long_as_it_still_brakes() -> None:
+def test_a_braking_torque_keeps_the_rate_limit_or_5000_nm_s_if_the_limit_is_lower() -> None:
     for rate, change in ((6000.0, 30.0), (100.0, 25.0)):
         cabinet = torque_cabinet(rate=rate)
         active, still, ones = begin_torques(cabinet), (0.0,) * 7, (1.0,) * 7
@@ -186,7 +186,7 @@ def test_late_commands_are_refused_for_both_arms_which_stop_as_certified() -> No
     stop = np.array([answer.q for answer in answers if answer and answer.q])
     assert np.diff(stop, axis=0).min() >= 0.0, "it goes on, slower and slower"
     np.testing.assert_allclose(stop[-1], state.rest, atol=1e-9)
-    # From there on, a reference is followed again.
+    # A reference that begins there is followed again.
     now = cabinet.now
     assert follow({"left": cabinet.session}, {"left": ArmCommand(now, now, now + 0.002, state.rest, still, ones)})
     assert cabinet.session.path.end == now + 0.002

@@ -42,7 +42,7 @@ def test_an_arm_whose_cabinet_was_silent_during_motion_brakes_as_certified_and_f
     assert follows()
     if loop == "stands still":
         cabinet.silence = silence
-    while cabinet.silence < silence:  # The arm goes on at that speed, and no message about it comes.
+    while cabinet.silence < silence:  # The reference goes on at this speed, while no message comes.
         cabinet.silence += 0.005
         command(0.005 + 0.1 * cabinet.silence, 0.1)
     ask()

@@ -42,7 +42,7 @@ def test_a_wait_lasts_until_cabinets_are_ready_or_its_time_is_over_or_it_is_stop
     assert waited(math.inf, stopped_after=5.0) == (False, 5.0)
 
 
-def test_a_wait_names_its_cabinets_and_every_ten_seconds_its_duration(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_wait_logs_its_cabinets_and_its_duration_every_ten_seconds(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO")
     waited(34.0)
     lines = [entry.getMessage() for entry in caplog.records]
@@ -50,7 +50,7 @@ def test_a_wait_names_its_cabinets_and_every_ten_seconds_its_duration(caplog: py
     assert "left: no FRI message from cabinet 192.0.2.1 on port 30200 of this computer; start its FRI" in lines[0]
 
 
-def test_cabinets_that_are_ready_soon_need_no_line(caplog: pytest.LogCaptureFixture) -> None:
+def test_nothing_is_logged_if_the_cabinets_are_ready_soon(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO")
     waited(math.inf, ready_after=2.0)
     assert caplog.records == []

@@ -106,7 +106,7 @@ def test_a_cabinet_names_the_control_mode_that_it_allows_for_commands(
     assert (message.robot.control, message.ipo.overlay, message.ipo.tracking) == (control, overlay, 1.0)
 
 
-def test_the_frame_of_fri_2_is_a_length_and_the_crc_of_zlib() -> None:
+def test_fri_2_puts_a_length_before_the_message_and_the_crc_of_zlib_behind_it() -> None:
     command = FriCommand(0, 1, q=Q)
     body = write_command(command, 1)
     assert write_command(command, 2) == struct.pack("<I", len(body)) + body + struct.pack("<I", zlib.crc32(body))
@@ -135,7 +135,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("case", list(REFUSED))
-def test_other_bytes_are_refused_with_what_is_allowed(case: str) -> None:
+def test_invalid_bytes_are_refused_with_a_message_of_what_is_allowed(case: str) -> None:
     datagram, told = REFUSED[case]
     with pytest.raises(ProtocolError, match=told):
         read_monitoring(datagram)
@@ -157,7 +157,7 @@ def test_changed_bytes_are_read_or_refused_and_never_raise_anything_else(
         for place, value in edits:
             datagram[place % len(datagram)] = value
         body = bytes(datagram[: max(end, 1)])
-        if version == 2:  # The bytes are those after the checksum.
+        if version == 2:  # The changed bytes get a valid length and checksum.
             body = struct.pack("<I", len(body)) + body + struct.pack("<I", zlib.crc32(body))
         with contextlib.suppress(ProtocolError):
             read_monitoring(body)

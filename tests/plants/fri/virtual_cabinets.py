@@ -46,8 +46,8 @@ class VirtualCabinets:
     ) -> None:
         """Make cabinets for a loop with this ``period`` and ``longest`` step [s].
 
-        The clocks of the cabinets ``drift`` apart, and messages are up to ``jitter`` [s] late.
-        Without ``arms`` they are where they are commanded to be, and torques do not move them.
+        The clocks of the cabinets ``drift`` apart by this share, and messages are up to ``jitter`` [s] late. Without
+        ``arms``, each arm is always at its commanded position, and torques do not move it.
         """
         self._robot, self._period, self._longest, self._random = robot, period, longest, np.random.default_rng(seed)
         self._jitter, self._loss = jitter, loss
@@ -82,9 +82,8 @@ class VirtualCabinets:
         self.cell = FriCell(self._robot, states, self._period, self._longest, self._grippers)
         self.now, self._serial = _BEGIN, 0  # The loop begins at 0.
         self._events: list[tuple[float, int, Callable[..., None], tuple[object, ...]]] = []
-        self.heard: dict[str, list[Array]] = {
-            arm: [] for arm in self.cabinets
-        }  # Positions that a cabinet follows. With torques, they are the measured ones.
+        # Positions that a cabinet follows, by arm. With torques, they are the measured positions.
+        self.heard: dict[str, list[Array]] = {arm: [] for arm in self.cabinets}
         for arm in self.cabinets:
             self._at(self.now, self._send, arm)
         self.due(0.0)

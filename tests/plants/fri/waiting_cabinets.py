@@ -18,7 +18,7 @@ from q2r2_control.types import SIDES
 
 _PRIORITY = 41  # The priority is above that of the loop, because a real cabinet does not wait for the computer.
 _LOOKS = 0.02  # Time between two messages to an absent client, and between two checks for the end [s].
-_GONE = 1.0  # Time without an answer after which the client has ended before it read the message [s].
+_GONE = 1.0  # If no answer comes for this time, the client has probably ended before it read the message [s].
 
 
 @contextmanager
@@ -27,7 +27,7 @@ def waiting_cabinets(
 ) -> Iterator[dict[str, Cabinet]]:
     """Run a cabinet for each arm in a thread.
 
-    Each sends every ``period`` [s], and starts its overlay whenever it may.
+    Each cabinet sends every ``period`` [s], and starts its overlay whenever it may.
     """
     made, done = {}, threading.Event()
     for arm in SIDES:
