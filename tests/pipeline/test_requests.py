@@ -124,7 +124,7 @@ def test_a_late_first_tick_makes_a_reported_hand_older() -> None:
     loop.controller.move_obstacle("hand", hand)
     loop.freeze(0.3)
     loop.tick()
-    assert loop.controller.obstacle_reports["hand"].age == pytest.approx(0.8, abs=0.01)
+    assert 0.8 <= loop.controller.obstacle_reports["hand"].age < 0.9
 
 
 @pytest.mark.slow
