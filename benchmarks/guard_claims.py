@@ -115,6 +115,24 @@ AGES = (
     ),
     Mutation("reports age while the arms brake", CONTROLLER, "self._obstacles.pass_time(dt)", "pass"),
     Mutation(
+        "reports age by the clock where ticks are late",
+        "q2r2_control/loop/control_loop.py",
+        "self.controller.pass_time(behind)",
+        "pass",
+    ),
+    Mutation(
+        "a report ages until a tick takes it",
+        "q2r2_control/pipeline/requests.py",
+        'given["age"] += waited',
+        "pass",
+    ),
+    Mutation(
+        "arms rest where an obstacle may be that is not reported any more",
+        "q2r2_control/control/safety/protective_distance.py",
+        "max((stop_time + age) / _SHARE - age, 0.0)",
+        "_LEAST_STOP",
+    ),
+    Mutation(
         "a state that a plant repeats gets older",
         CLOCK,
         "replace(state, stamp=now - self._unanswered)",

@@ -35,7 +35,12 @@ TESTS = {  # Tests that run for a row, by the folder of its line.
     "q2r2_control/drives/": ("tests/drives/test_command_average.py",),
     "q2r2_control/plants/": ("tests/drives/test_command_average.py",),
     "q2r2_control/robot/": ("tests/robot/test_command_average.py",),
-    "q2r2_control/pipeline/": ("tests/pipeline/test_loop_clock.py", "tests/test_stalls.py"),
+    "q2r2_control/loop/": ("tests/loop",),
+    "q2r2_control/pipeline/": (
+        "tests/pipeline/test_loop_clock.py",
+        "tests/pipeline/test_requests.py",
+        "tests/test_stalls.py",
+    ),
 }
 _TIMEOUT_S = 1800.0  # Timeout for a soak or the tests [s].
 

@@ -25,7 +25,7 @@ class MovingObstacle(ObstacleConfig):
     speed_now: float | None = Field(
         None, ge=0, description="present speed of its fastest point [m/s]; null: the largest speed"
     )
-    age: float = Field(0.0, ge=0, le=10, description="age of the pose when it is passed on [s]")
+    age: float = Field(0.0, ge=0, description="age of the pose when it is passed on [s]")
 
     @property
     def slower(self) -> float:

@@ -192,7 +192,7 @@ class ControlLoop:
         Returns:
             The reference and the command for the plant.
         """
-        self._age_obstacles(now)
+        self.age_obstacles(now)
         supervisor, refusals = self.supervisor, {}
         for arm, pose in targets.items():
             if pose is None:
@@ -227,11 +227,12 @@ class ControlLoop:
             command.deceleration = self.controller.stop_deceleration
         return LoopStep(reference, command, commanded, trusted, self.drive.report, refusals)
 
-    def _age_obstacles(self, now: float) -> None:
-        """Let reports of moving obstacles age by the clock.
+    def age_obstacles(self, now: float) -> None:
+        """Let reports of moving obstacles age by the clock, up to ``now`` [s].
 
-        A step ages them by the time by which it advances the reference. This is less than the time of the clock while
-        the loop stalls, and nothing while the arms are not commanded. The rest is added here.
+        They age from the first call on. A step ages them by the time by which it advances the reference. This is less
+        than the time of the clock while the loop stalls, and nothing while the arms are not commanded. The rest is
+        added here, by every step and by a caller who is about to pass on a report of a known age.
         """
         if self._first is None:
             self._first = now

@@ -92,6 +92,10 @@ class LoopClock:
         """Return the present time [s]; in simulated time the time of the tick."""
         return time.monotonic() if self._realtime else self.now
 
+    def since(self, moment: float) -> float:
+        """Return the time from a ``moment`` of time.monotonic() to this tick [s]; 0 in simulated time."""
+        return max(self.now - moment, 0.0) if self._realtime else 0.0
+
     def real_time_factor(self) -> float | None:
         """Return the simulated time per second of the computer's clock [s/s]; None in real time."""
         return None if self._realtime else (self.now - self.start) / max(self.wall_time(), 1e-9)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from itertools import cycle
 
@@ -21,7 +21,7 @@ from q2r2_control.events import CommonReason, Event, Reason, ReasonKind
 from q2r2_control.inputs.base import Input, PolicySource, check_samples
 from q2r2_control.loop.control_loop import ArmConditions
 from q2r2_control.pipeline.newest_pictures import NewestPictures
-from q2r2_control.pipeline.requests import change_of, changed
+from q2r2_control.pipeline.requests import ObstacleRequest, Request, change_of, changed
 from q2r2_control.summary.tick import Tick
 from q2r2_control.supervision.gripper_limiter import Grip
 from q2r2_control.supervision.supervisor import Phase, Supervisor
@@ -45,11 +45,13 @@ class OperatorSide:
         source: Input,
         supervisor: Supervisor,
         controller: CartesianController,
-        requests: deque[Reason | TeleopSettings],
+        requests: deque[Request],
         pictures: NewestPictures,
+        since: Callable[[float], float],
         impedance: ImpedanceController | None = None,
     ) -> None:
-        self._pictures = pictures
+        """``since`` is :meth:`LoopClock.since`."""
+        self._pictures, self._since = pictures, since
         self._teleop, self._input, self._supervisor = teleop, source, supervisor
         self._policy = source if isinstance(source, PolicySource) else None
         self.chunks: list[ActionChunk] = []  # Chunks of a policy since the last poll.
@@ -131,6 +133,8 @@ class OperatorSide:
             request = self._requests.popleft()
             if isinstance(request, TeleopSettings):
                 request = change_of(self._teleop.settings, request)
+            elif isinstance(request, ObstacleRequest):
+                request = request.reason(self._since(request.reported))
             self._teleop.record_event(now, request)
             self._do(request, now)
 

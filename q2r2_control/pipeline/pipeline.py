@@ -121,7 +121,7 @@ class Pipeline(RequestedRun):
         self.cameras: CameraStreams | None = None  # The open real cameras, whose pictures a policy gets.
         # This is a plain flag, because a signal handler cannot take the lock of a threading.Event safely.
         self._stopping = False
-        self._rested_since: float | None = None  # The end of the last run [s].
+        self._ticked = time.monotonic()  # The end of the last tick, or the time before the first one [s].
         self._rate_was_fitted = False  # Whether :meth:`fit_rate` chose the rate of the loop.
         self._pace: WallPace | None = None  # If given, simulated time must not be faster than the clock.
         self._set_up()
@@ -296,7 +296,10 @@ class Pipeline(RequestedRun):
         """Forget the last run, so that nothing of it moves an arm. Every run starts paused, with open grippers."""
         settings = permitted(self.config.control.timed(realtime), self.drive)
         if settings != self.controller.settings:
+            reports = self.controller.obstacle_reports
             self.controller = CartesianController(self.robot, settings, **self._own)
+            for name, (obstacle, age) in reports.items():
+                self.controller.move_obstacle(name, obstacle.model_copy(update={"age": age}))
         self._set_up()
 
     def _set_up(self) -> None:
@@ -324,8 +327,8 @@ class Pipeline(RequestedRun):
         self._clock = self.make_clock(realtime)
         self._turns = TurnCounter(self.robot)
         self._turns.counted(self._state.q, self._clock.now)
-        if realtime and self._rested_since is not None:
-            self.controller.pass_time(self._clock.now - self._rested_since)
+        self.controller.pass_time(self._clock.since(self._ticked))
+        self.loop.age_obstacles(self._clock.now + self._clock.period)  # A first tick that is later makes them older.
         self._start = RunStart(self._clock.now, self._state)
         self._plant_clock = PlantClock(self._state)
         self._lead = TargetLead()
@@ -341,7 +344,14 @@ class Pipeline(RequestedRun):
         streams = {} if self.cameras is None else self.cameras.streams
         pictures = NewestPictures(self.config, self.plant, streams, realtime)
         self._operator = OperatorSide(
-            self.teleop, self.input, self.supervisor, self.controller, self.requests, pictures, self.impedance
+            self.teleop,
+            self.input,
+            self.supervisor,
+            self.controller,
+            self.requests,
+            pictures,
+            self._clock.since,
+            self.impedance,
         )
         self.teleop.marks.recorded = self._recorder.keeps_episodes
         self.teleop.marks.subtasks = self.config.recording.subtasks
@@ -378,7 +388,6 @@ class Pipeline(RequestedRun):
             # The last state that came is used, because a plant that has lost its sensors still takes commands.
             if (command := self.drive.last_command(self._state, self._grippers)) is not None:
                 self.plant.apply(command)
-            self._rested_since = time.monotonic()
 
     def tick(self) -> Tick:
         """Pass the data through all stations once: sample -> target -> reference -> command -> state."""
@@ -400,6 +409,7 @@ class Pipeline(RequestedRun):
         self.loop.observe(seen, now, passed, lost)
         self._watch_skew(now)
         openings, tools = self.plant.gripper_openings(), self._measured_tools(state)
+        self.loop.age_obstacles(now)  # The age of a report that comes now is known.
         if self._following:
             self._targets = self._operator.targets(samples, tools, now)
         step = self._control(state, openings, now, gap, dt, braked)
@@ -448,6 +458,7 @@ class Pipeline(RequestedRun):
         if self._following:
             self._operator.feed_back(tick)
         self._recorder.add(tick)
+        self._ticked = time.monotonic()
         return tick
 
     def _watch_skew(self, now: float) -> None:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import time
 from collections import deque
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 from q2r2_control.cameras.reasons import CameraReason
 from q2r2_control.compliance.impedance import ImpedanceController, check_springs
@@ -20,15 +21,33 @@ from q2r2_control.inputs.base import Input
 from q2r2_control.teleop.reasons import TeleopReason
 
 
+class ObstacleRequest(NamedTuple):
+    """A report of a moving obstacle, which ages until a tick takes it."""
+
+    name: str
+    obstacle: MovingObstacle | None
+    reported: float  # The time of the report, of time.monotonic() [s].
+
+    def reason(self, waited: float) -> Reason:
+        """Return the request as it is recorded, ``waited`` [s] after the report."""
+        given = None if self.obstacle is None else self.obstacle.model_dump(mode="json")
+        if given is not None:
+            given["age"] += waited
+        return Reason.of(TeleopReason.OBSTACLE_REPORTED, name=self.name, obstacle=given)
+
+
+Request = Reason | TeleopSettings | ObstacleRequest
+
+
 class RequestedRun:
-    """The requests to a run. Each waits as the reason that is recorded, or as the settings from which it is made."""
+    """The requests to a run. Each waits as the reason that is recorded, or as that from which this reason is made."""
 
     config: Config
     input: Input
     drive: Drive
 
     def __init__(self) -> None:
-        self.requests: deque[Reason | TeleopSettings] = deque()
+        self.requests: deque[Request] = deque()
 
     @property
     def impedance(self) -> ImpedanceController | None:
@@ -89,12 +108,12 @@ class RequestedRun:
     def move_obstacle(self, name: str, obstacle: MovingObstacle | None) -> None:
         """Report where a moving obstacle is now, or that it is gone; from any thread.
 
-        :meth:`CartesianController.move_obstacle` says what follows, and an event names a pair that is in the way.
-        Raises :class:`ConfigError` for a name that ``control.moving_obstacles`` lacks.
+        :meth:`CartesianController.move_obstacle` says what follows, and an event names a pair that is in the way. In
+        real time the report ages from now on, also before the run begins. Raises :class:`ConfigError` for a name that
+        ``control.moving_obstacles`` lacks.
         """
         check_obstacle(name, obstacle, self.config.control.moving_obstacles)
-        given = None if obstacle is None else obstacle.model_dump(mode="json")
-        self.requests.append(Reason.of(TeleopReason.OBSTACLE_REPORTED, name=name, obstacle=given))
+        self.requests.append(ObstacleRequest(name, obstacle, time.monotonic()))
 
     def record_outcome(self, reason: Reason) -> None:
         """Report the outcome of the recording, or of an episode in it, to the operator; from any thread."""

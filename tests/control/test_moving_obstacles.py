@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -103,6 +104,22 @@ def test_the_end_of_reports_brings_arms_to_rest_and_the_report_names_the_pair(co
     assert "hand_0" in references[-1].report.tightest_pair
     controller.move_obstacle("hand", hand(far))
     assert max(np.abs(controller.step(circle(0.002 * tick, start), 0.002).v).max() for tick in range(500)) > 0.05
+
+
+def test_no_arm_moves_any_more_where_a_hand_may_be_that_is_not_reported_again(controller: CartesianController) -> None:
+    """The target leads away from the reported place, where an arm may go as long as reports come."""
+    start, speed = controller.tool_pose("left"), 0.3
+    reported, goal = start.translation + np.array([0.0, 0.4, 0.0]), start.translation - np.array([0.0, 0.3, 0.0])
+    coal_distances, back, moved = Coal(controller), np.array([0.0, 1.0, 0.0]), 0.0
+    controller.move_obstacle("hand", hand(reported, speed))
+    for tick in range(1, 1501):
+        time = 0.002 * tick
+        away = {"left": pin.SE3(start.rotation, goal + 0.1 * math.sin(3.0 * time) * back)}
+        reference = controller.step(away, 0.002)
+        if np.abs(reference.v).max() > 1e-9:
+            moved = time
+            assert coal_distances.distances(reference.q, reported - speed * time * back).min() > 0.0
+    assert 0.5 < moved < 1.3
 
 
 def test_an_obstacle_in_front_of_a_moving_arm_is_named_and_the_arm_brakes_along_its_stop(

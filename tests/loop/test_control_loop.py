@@ -143,6 +143,16 @@ def test_the_age_of_a_hands_report_grows_with_the_clock_when_the_loop_stalls() -
         assert arms.now - first - 1e-9 <= arms.age <= arms.now - first + DT + 1e-5
 
 
+def test_the_time_before_a_late_first_tick_makes_a_hands_report_older() -> None:
+    arms = ReportedHand(owns_plant=True)
+    arms.loop.activate(arms.state, arms.now)
+    first = arms.now + DT
+    arms.loop.age_obstacles(first)
+    arms.now += 0.3
+    arms.tick()
+    assert arms.now - first - 1e-9 <= arms.age <= arms.now - first + DT + 1e-5
+
+
 def test_the_age_of_a_hands_report_grows_while_arms_of_another_program_are_not_commanded() -> None:
     arms = ReportedHand(owns_plant=False)
     first = arms.now + DT

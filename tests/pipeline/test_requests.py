@@ -12,10 +12,11 @@ from q2r2_control.config.moving_obstacle import MovingObstacle
 from q2r2_control.config.teleop import TeleopSettings
 from q2r2_control.drives.base import TorqueDrive
 from q2r2_control.errors import ConfigError
+from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.robot.obstacle_bodies import distances_with
 from q2r2_control.summary.tick import Tick
 from q2r2_control.teleop.reasons import TeleopReason
-from tests.pipeline.loops import pipeline, when_moving
+from tests.pipeline.loops import FreezingLoop, pipeline, when_moving
 from tests.support.processes import cell, changes
 
 
@@ -90,6 +91,40 @@ def test_the_age_of_a_hands_report_grows_between_two_runs_of_one_pipeline() -> N
     time.sleep(0.2)
     loop.run(0.02)
     assert loop.controller.obstacle_reports["hand"].age >= 0.2
+
+
+def run_with_a_hand() -> tuple[Pipeline, MovingObstacle]:
+    """Return a pipeline that knows a moving obstacle by name, and a report of it far from the arms."""
+    loop = pipeline(control=cell().control.model_copy(update={"moving_obstacles": ("hand",)}))
+    return loop, MovingObstacle(shape="sphere", size=(0.1,), position=(9.0, 9.0, 9.0), speed=0.1, age=0.5)
+
+
+def test_a_report_of_a_hand_ages_before_the_run_begins() -> None:
+    loop, hand = run_with_a_hand()
+    loop.move_obstacle("hand", hand)
+    time.sleep(0.2)
+    loop.run(0.02)
+    assert loop.controller.obstacle_reports["hand"].age >= 0.7
+
+
+def test_a_reported_hand_is_known_and_ages_after_a_run_in_simulated_time() -> None:
+    loop, hand = run_with_a_hand()
+    loop.move_obstacle("hand", hand)
+    loop.run(0.02, realtime=False)
+    assert loop.controller.obstacle_reports["hand"].age == pytest.approx(0.5, abs=0.1)
+    time.sleep(0.2)
+    loop.run(0.02)
+    assert loop.controller.obstacle_reports["hand"].age >= 0.7
+
+
+def test_a_late_first_tick_makes_a_reported_hand_older() -> None:
+    made, hand = run_with_a_hand()
+    loop = FreezingLoop(made.config, made.robot, made.input, made.plant)
+    loop.begin()
+    loop.controller.move_obstacle("hand", hand)
+    loop.freeze(0.3)
+    loop.tick()
+    assert 0.8 <= loop.controller.obstacle_reports["hand"].age < 0.9
 
 
 @pytest.mark.slow

@@ -17,6 +17,9 @@ T. Until its end the obstacle is within reach(A + h + T) of the pose. []
 
 T_0 falls as an obstacle comes nearer, but no faster than the joints can brake, so that the velocity box is never empty.
 The joints slow down early, and then need less distance. Half of the room to the obstacle is left for the arms' own way.
+
+Arms that an obstacle has come too near to may leave its reported place. If the report is old, this may lead to where
+the obstacle is now. T_0 then falls to 0 with the room, and the arms rest until the next report.
 """
 
 from __future__ import annotations
@@ -34,6 +37,7 @@ from q2r2_control.types import Array
 
 REPORT_AGE = 0.1  # R. If reports come more often, the kept distance does not jump with each of them [s].
 _LEAST_STOP = 0.05  # T_0 of arms close to an obstacle [s].
+_LOST = 0.5  # Age from which a report does not tell any more which motion leads away from the obstacle [s].
 _SHARE = 0.5  # Share of the room to an obstacle that its reach may take.
 # A row asks a pair that is too close to open by this at most [m]. The arms are then not pushed, and can still leave.
 _OPENING = 1e-4
@@ -68,18 +72,23 @@ def keep_clear(
     """Write the distances that pairs with obstacles keep, and the velocity limits, for a step of ``h`` [s]."""
     model, data, obstacles = pointee(model_pointer).safety, pointee(data_pointer).safety, pointee(obstacles_pointer)
     a, v = model.limits.acceleration, data.state.v
-    longest, moving, wanted = 0.0, 0.0, np.inf
+    longest, moving, wanted, least_stop = 0.0, 0.0, np.inf, _LEAST_STOP
     for j in range(v.shape[0]):
         longest = max(longest, obstacles.velocity[j] / a[j])
         moving = max(moving, abs(v[j]) / a[j])
     for o in range(obstacles.age.shape[0]):
         obstacles.age[o] += h
+        age = obstacles.age[o]
         for p in range(obstacles.first[o], obstacles.first[o + 1]):
-            if _stop_time(data, obstacles, o, p) < min(wanted, longest):
+            lost = _SHARE * (least_stop + age) - age if age > _LOST else -np.inf
+            if _stop_time(data, obstacles, o, p) < min(max(wanted, lost), longest):
                 _measure(model, data, obstacles, p)  # A lower bound of the distance does not suffice here.
-                wanted = min(wanted, _stop_time(data, obstacles, o, p))
+                stop_time = _stop_time(data, obstacles, o, p)
+                wanted = min(wanted, stop_time)
+                if age > _LOST:  # The time until the obstacle may have used up the whole room.
+                    least_stop = min(least_stop, max((stop_time + age) / _SHARE - age, 0.0))
     known = obstacles.stop_time[0]
-    time = min(max(wanted, _LEAST_STOP, known - h), known + h, longest)
+    time = min(max(wanted, least_stop, known - h), known + h, longest)
     obstacles.stop_time[0] = time
     for j in range(v.shape[0]):
         model.limits.velocity[j] = min(obstacles.velocity[j], a[j] * time)

@@ -16,7 +16,6 @@ from q2r2_control.ros.base_node import BaseNode
 from q2r2_control.ros.bridge.messages import pose_of, seconds
 
 TOPIC = "~/obstacles"
-_OLDEST = 10.0  # Greatest age of a marker; older ones count as this old [s].
 
 
 class ObstacleIntake:
@@ -69,6 +68,6 @@ def obstacle_of(message: Marker, now: float) -> MovingObstacle | None:
         raise RobotError(f"text = {message.text!r:.60}: allowed: bounds such as 'speed: 0.25' [m/s]")
     shape, size = shapes[message.type]
     stamp = seconds(message.header.stamp)
-    age = min(max(now - stamp, 0.0), _OLDEST) if stamp > 0.0 else 0.0
+    age = max(now - stamp, 0.0) if stamp > 0.0 else 0.0
     place = {"position": tuple(pose.translation.tolist()), "rpy": tuple(pin.rpy.matrixToRpy(pose.rotation).tolist())}
     return MovingObstacle(**{"shape": shape, "size": size, "age": age, **bounds, **place})
