@@ -9,11 +9,11 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True, slots=True)
 class DeviceWords:
-    """Words of one device. A control without a noun has its name in the cell's bindings."""
+    """Words of one device. A control without a noun is called by its name in the cell's bindings."""
 
     nouns: Mapping[str, str] = field(default_factory=dict, hash=False)  # Nouns by control.
     verbs: Mapping[str, str] = field(default_factory=dict, hash=False)  # By control, if not "press" and "hold".
-    absent: str = "nothing: no input is connected"  # Said while no device is there. Empty if its controls connect it.
+    absent: str = "nothing: no input is connected"  # Text without a device; empty if its controls connect it.
     nobody: str = ""  # Why no person presses anything; empty if a person does.
 
     def noun(self, control: str) -> str:
@@ -29,7 +29,7 @@ class DeviceWords:
         return f"{self.verbs.get(control, 'hold')} {self.noun(control)}"
 
 
-NO_WORDS = DeviceWords()  # Every control has its name.
+NO_WORDS = DeviceWords()  # Every control is called by its name.
 QUEST_WORDS = DeviceWords(
     nouns={
         "lower": "A or X",

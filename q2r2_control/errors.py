@@ -29,8 +29,8 @@ class ConfigError(Q2R2Error):
 class AllFaults:
     """Collects the errors of several parts, so that a user reads all of them at once.
 
-    Errors in ``with faults.of_part():`` end that part only. The end of ``with AllFaults() as faults:`` raises a single
-    error as it is, and several as one :class:`ConfigError`.
+    An error in ``with faults.of_part():`` ends that part only. The end of ``with AllFaults() as faults:`` raises a
+    single error as it is, and several errors as one :class:`ConfigError`.
     """
 
     def __init__(self) -> None:

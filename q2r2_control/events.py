@@ -14,8 +14,9 @@ from q2r2_control.plugins import REASONS, load_class, names_of
 class ReasonKind(StrEnum):
     """A kind of reason: for a change of an arm's state, for a refusal, for a result, or for a fault.
 
-    Each room that gives reasons has an enum of its own kinds, a subclass of this one, such as :class:`TeleopReason`.
-    It is an entry point of the group ``q2r2_control.reasons``, so that recordings and messages with it can be read.
+    Each subpackage that gives reasons has an enum of its own kinds, a subclass of this class, such as
+    :class:`TeleopReason`. The enum is an entry point of the group ``q2r2_control.reasons``, so that recordings and
+    messages with its kinds can be read.
 
     The values never change, so that old recordings stay readable. Each kind has the ``template`` of its sentence. The
     fields of the template are the details of the reason, and ``cause`` is the sentence of its cause.
@@ -30,7 +31,7 @@ class ReasonKind(StrEnum):
 
 
 class CommonReason(ReasonKind):
-    """Kinds that several rooms give."""
+    """Kinds of reasons that several subpackages give."""
 
     # The way home.
     HOMING = "homing", "way home"
@@ -53,7 +54,7 @@ def _kinds() -> dict[str, ReasonKind]:
 
 
 def kind_named(value: str) -> ReasonKind:
-    """Return the kind with this value, of any room. Raises :class:`ValueError` if there is none."""
+    """Return the kind with this value, from any subpackage. Raises :class:`ValueError` if no kind has the value."""
     if value not in _kinds():
         raise ValueError(f"no room has the kind of reason {value!r:.60}")
     return _kinds()[value]
@@ -65,7 +66,7 @@ class Reason:
 
     kind: ReasonKind
     detail: Mapping[str, Any] = field(default_factory=dict)
-    cause: Reason | None = None  # The reason from which this one follows.
+    cause: Reason | None = None  # The reason from which this reason follows.
 
     @classmethod
     def of(cls, kind: ReasonKind, cause: Reason | None = None, **detail: Any) -> Reason:
@@ -74,7 +75,7 @@ class Reason:
 
     @classmethod
     def in_words(cls, text: str) -> Reason:
-        """Make a reason of a sentence by which no code decides."""
+        """Make a reason from a sentence. No code decides by this reason."""
         return cls(CommonReason.OTHER, {"text": text})
 
     @property
@@ -103,9 +104,9 @@ class Reason:
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """A change of an arm's state; or news for its operator, if both states are the same."""
+    """A change of an arm's state. If both states are the same, the event is only news for the operator."""
 
-    t: float  # [s]
+    t: float  # Time of the event [s].
     arm: str
     source: str  # The state before.
     destination: str  # The state after.

@@ -27,8 +27,8 @@ REASONS = "q2r2_control.reasons"
 def points_of(group: str) -> Mapping[str, EntryPoint]:
     """Return the entry points that installed packages declare, by name in alphabetical order.
 
-    To read the files of some hundred packages takes longer than to load a cell. They are read again when a folder of
-    the path has changed, as it does when a package is installed.
+    The result is kept, because reading the files of some hundred packages takes longer than loading a cell. The files
+    are read again when a folder of the path has changed, as it does when a package is installed.
     """
     folders = tuple((folder, _changed_at(folder)) for folder in sys.path)
     return _points(group, folders)

@@ -24,7 +24,7 @@ def floats_of(pose: pin.SE3) -> Pose:
 
 
 def se3_of(pose: Pose) -> pin.SE3:
-    """Return the pose of these floats."""
+    """Return the pose that these floats describe."""
     position, rotation = pose
     return pin.XYZQUATToSE3(position + rotation)
 
@@ -70,7 +70,7 @@ def turn_between(start: Quaternion, end: Quaternion) -> Vector:
 
 
 def turned_by(q: Quaternion, vector: Vector) -> Quaternion:
-    """Return the rotation that applies ``q`` first and a rotation vector second."""
+    """Return the rotation that applies ``q`` first and the rotation of ``vector`` second."""
     return product(rotation_of(vector), q)
 
 

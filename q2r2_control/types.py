@@ -163,11 +163,12 @@ class Command:
     mode: CommandMode
     q: Array  # (nv,) [rad]. In velocity and torque mode this is the reference, for plants that show it.
     v: Array  # (nv,) [rad/s]
-    tau: Array  # (nv,) The torque of torque mode [Nm].
+    tau: Array  # (nv,) The commanded torque in torque mode [Nm].
     grippers: dict[str, float]  # Openings by arm, from 0 for closed to 1 for fully open.
     # (nv,) Deceleration of the certified stop from q and v [rad/s^2]; None if no stop is known.
     deceleration: Array | None = None
-    # True if tau only bears the arms, at a posture that is not sure. A plant with its own sensors then brakes the arms.
+    # True if tau only compensates gravity, for a posture that may be wrong. A plant with its own sensors then brakes
+    # the arms.
     gravity_only: bool = False
 
 
@@ -180,7 +181,7 @@ class ObservedPicture(Protocol):
 
     @property
     def pixels(self) -> npt.NDArray[np.uint8]:
-        """The picture (height, width, 3), r g b. It is decoded or drawn when it is read for the first time."""
+        """The picture (height, width, 3), r g b. It is decoded or rendered when it is read for the first time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,7 +192,7 @@ class Observation:
     state: RobotState
     openings: Mapping[str, float]  # Measured openings by arm, from 0 for closed to 1; only arms that measure them.
     tools: Mapping[str, pin.SE3]  # Measured poses of the tools, in the world frame.
-    # The newest picture of each camera of the cell. Reading that of a camera which gives none raises CameraError.
+    # The newest picture of each camera of the cell. If a camera gives no picture, reading it raises CameraError.
     pictures: Mapping[str, ObservedPicture] = field(default_factory=dict)
 
 
@@ -206,7 +207,7 @@ class ActionChunk:
         default_factory=dict
     )  # By arm (n, 6): motions, in the frame of the target before.
     grippers: Mapping[str, Array] = field(default_factory=dict)  # By arm (n,): openings.
-    postures: Array | None = None  # (n, nv) Positions of all joints, for those that the tools leave free [rad].
+    postures: Array | None = None  # (n, nv) Positions of all joints, used where the tool poses leave them free [rad].
     fault: Reason | None = None
 
     def as_json(self) -> dict[str, Any]:
@@ -238,7 +239,7 @@ class ActionChunk:
 
 
 def _packed(values: Array) -> str:
-    """Return the float64 values of an array as base64, since decimals of a long chunk would take a millisecond."""
+    """Return the float64 values of an array as base64. Decimal numbers of a long chunk would take a millisecond."""
     return b64encode(values.tobytes()).decode("ascii")
 
 
@@ -250,7 +251,7 @@ class StepStatus(StrEnum):
     """The outcome of one control tick."""
 
     OK = "ok"
-    TARGET_REJECTED = "target_rejected"  # A target was not usable, and its arm holds the last one.
+    TARGET_REJECTED = "target_rejected"  # A target was not usable, and its arm keeps the last target.
     DT_REJECTED = "dt_rejected"  # dt was not in (0, 0.1] s.
     RECOVERING = "recovering"  # A joint is outside a limit, or a pair is too close, and the arms are on the way back.
     FALLBACK = "fallback"  # The certified stop was executed instead of the solution of the QP, at least in part.
@@ -279,7 +280,7 @@ class StepReport:
     """The outcome of one control tick. Distances are in metres, and joints are given by name."""
 
     status: StepStatus
-    rejected: tuple[str, ...]  # Arms whose target was not usable, and which hold the last one.
+    rejected: tuple[str, ...]  # Arms whose target was not usable, and which keep the last target.
     binding: tuple[ActiveLimit, ...]  # The limits that were active in the solution.
     closest_pair: tuple[str, str]  # Names of the geometries.
     closest_distance: float  # [m]
@@ -288,7 +289,7 @@ class StepReport:
     slack: float  # Largest violation of a row of unit norm [rad/s].
     solve_time: float  # Time of the solver [s]; 0 if the solver was not needed.
     tightest_pair: tuple[str, str] = ("", "")  # Names of the geometries of the pair with the least margin.
-    margin: float = math.inf  # Distance of that pair less the distance that it keeps [m].
+    margin: float = math.inf  # Distance of that pair minus the distance that it has to keep [m].
     unsolved: int = 0  # Bit i is set if the QP of substep i had no solution in time, so that the stop was executed.
     faults: tuple[str, ...] = ()  # Why targets, or answers of the user's tasks, constraints and solver, were not used.
 
@@ -315,7 +316,7 @@ class ArmTarget:
     gripper: float  # Opening, from 0 for closed to 1 for fully open.
     slip: float = 0.0  # By how much the leash and the workspace have held the target back since engaging [m].
     slip_angle: float = 0.0  # The same for the rotation [rad].
-    offset: Array | None = None  # (3,) Measured tool less commanded tool at engaging [m]; None if not known.
+    offset: Array | None = None  # (3,) Measured minus commanded tool position when engaged [m]; None if not known.
     filtered_hand: Pose | None = None  # The filtered pose of the hand from which the target was computed.
     posture: Array | None = None  # (nv,) Joint positions that a policy wants where the tool leaves them free [rad].
 
@@ -341,7 +342,7 @@ class ArmTarget:
 class ArmTiming:
     """The timing of one arm relative to the reference that it follows. All times are in seconds."""
 
-    behind: float | None  # Lag by the newest message of the arm; None if nobody reports it, so that it is measured.
+    behind: float | None  # Lag that the arm's newest message reports; None if it is not reported but measured.
     silent: float  # Time since that message.
     period: float  # Usual time between two messages.
     noise: float = 0.0  # Noise of ``behind``.

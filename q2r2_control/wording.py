@@ -1,4 +1,4 @@
-"""Make sentences of events and reasons for people. No code decides by these sentences."""
+"""Make sentences for people from events and reasons. No code decides by these sentences."""
 
 from __future__ import annotations
 

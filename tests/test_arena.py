@@ -12,11 +12,11 @@ import pytest
 from arena_hands import TARGET_SPEED, Ask, Judge, ScriptedHands, looking_down
 from arena_robot import ArmModel, corners_of, geoms_of, robot_of, tool_pose
 
-LIMIT = 2.0  # [rad/s]
+LIMIT = 2.0  # Velocity limit of each joint [rad/s].
 
 
 def an_arm(name: str, x: float) -> str:
-    """Return a model of two hinges, and a hand with a sliding finger."""
+    """Return the XML of an arm with two hinges, whose hand has a sliding finger."""
     return f"""
     <body name="{name}_base" pos="{x} 0.1 0.2" euler="0 0 0.3"><geom type="cylinder" size="0.05 0.05"/>
       <body name="{name}_upper" pos="0 0 0.1"><joint name="{name}_1" axis="0 0 1" range="-1 2"/>
@@ -52,7 +52,7 @@ def placed(model: mujoco.MjModel, **positions: float) -> mujoco.MjData:
     return data
 
 
-def test_our_robot_of_a_model_moves_like_it_and_encloses_all_that_a_finger_sweeps(
+def test_a_robot_made_from_a_mujoco_model_has_its_tool_poses_and_encloses_all_that_a_finger_sweeps(
     model: mujoco.MjModel, arms: dict[str, ArmModel]
 ) -> None:
     closing = [placed(model, left_slide=way, right_slide=way).qpos.copy() for way in (0.1, 0.04, 0.0)]
@@ -122,7 +122,7 @@ def test_hands_move_straight_and_wait_for_their_tools_before_they_go_on() -> Non
     assert hands.done
 
 
-def test_a_hand_that_looks_down_closes_where_it_is_told_and_leans_about_that_point() -> None:
+def test_a_hand_that_looks_down_has_its_x_axis_in_the_given_direction_and_may_lean() -> None:
     rotation = looking_down(np.array([0.0, 2.0]))
     assert rotation[:, 0] == pytest.approx([0.0, 1.0, 0.0])
     assert rotation[:, 2] == pytest.approx([0.0, 0.0, -1.0])

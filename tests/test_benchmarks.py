@@ -78,7 +78,7 @@ def test_qps_of_motions_are_a_test_set_that_qpbenchmark_loads_and_daqp_solves(
     assert len(set(names)) == 40
 
 
-def test_every_line_of_the_table_occurs_once_in_its_file() -> None:
+def test_every_line_that_a_mutation_changes_occurs_once_in_its_file() -> None:
     for mutation in load_script("benchmarks/safety_mutations.py").MUTATIONS:
         text = (ROOT / mutation.path).read_text(encoding="utf-8")
         assert text.count(mutation.old) == 1, mutation.claim

@@ -1,7 +1,8 @@
-"""Whatever opens to the outside can be taken away: arms still move by everything that is left.
+"""Optional subpackages can be removed: arms still move with everything that is left.
 
-A door is a folder for one kind of devices, formats or programs: ROS, cabinets, pages, exports, tests for others. A
-finder that raises for a folder's modules takes the door away, as if the files were not there.
+An optional subpackage, here called a door, is a folder for one kind of devices, formats or programs: ROS, cabinets,
+pages, exports, tests for others. An import finder that raises for all modules of a folder acts as if the files were not
+there.
 """
 
 from __future__ import annotations
@@ -38,19 +39,19 @@ runpy.run_module("q2r2_control", run_name="__main__", alter_sys=True)
 
 
 def q2r2(*arguments: str, without: tuple[str, ...] = DOORS) -> subprocess.CompletedProcess[str]:
-    """Run a command in a process that cannot import the doors."""
+    """Run a command in a process that cannot import the subpackages ``without``."""
     return subprocess.run(
         [sys.executable, "-c", WITHOUT, ",".join(without), *arguments], capture_output=True, text=True, check=False
     )
 
 
-def test_the_help_lists_all_commands_without_any_door() -> None:
+def test_the_help_lists_all_commands_without_any_optional_subpackage() -> None:
     result = q2r2("--help")
     assert result.returncode == 0, result.stderr
     assert "demo" in result.stdout
 
 
-def test_arms_run_without_any_door() -> None:
+def test_arms_run_without_any_optional_subpackage() -> None:
     cell = "config/dual_iiwa7.yaml"
     result = q2r2("run", cell, "--plant", "kinematic", "--fast", "--headless", "--duration", "1.5")
     assert result.returncode == 0, result.stderr
@@ -59,7 +60,7 @@ def test_arms_run_without_any_door() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("door", DOORS)
-def test_the_demo_succeeds_without_a_door(door: str) -> None:
+def test_the_demo_succeeds_without_an_optional_subpackage(door: str) -> None:
     result = q2r2("demo", "grasp", "--fast", "--headless", without=(door,))
     assert result.returncode == 0, result.stderr
 
@@ -74,7 +75,9 @@ def test_the_demo_succeeds_without_a_door(door: str) -> None:
         (("export", "csv", "run.mcap"), "q2r2_control.export"),
     ],
 )
-def test_a_command_that_needs_a_missing_door_names_it_in_one_line(arguments: tuple[str, ...], missing: str) -> None:
+def test_a_command_that_needs_a_missing_subpackage_names_it_in_one_line(
+    arguments: tuple[str, ...], missing: str
+) -> None:
     result = q2r2(*arguments)
     assert result.returncode == 2, result.stderr
     assert missing in result.stderr

@@ -34,7 +34,7 @@ from q2r2_control.plants.base import Plant, make_plant
 from q2r2_control.types import QUEST_CONTROLS
 
 CONFIG = load_config("config/dual_iiwa7.yaml")
-WRONG: Any = None  # A type checker would not allow these kinds.
+WRONG: Any = None  # A type checker would not allow values of these types.
 FIVE: Any = 5
 NO_SETTINGS: Any = {}
 A_CELL: Any = CONFIG
@@ -144,7 +144,9 @@ def test_an_arm_that_does_not_exist_is_named_with_those_that_do(
         assert f"no arm {arm!r}; {ARMS}" in said
 
 
-def test_wrong_parts_are_refused_where_they_come_in(robot: Robot, controller: CartesianController) -> None:
+def test_arguments_of_a_wrong_type_are_refused_by_the_function_that_gets_them(
+    robot: Robot, controller: CartesianController
+) -> None:
     for kind, call, said in (
         (RobotError, lambda: Robot.from_urdf(WRONG, {"left": "x"}), "None: neither URDF text nor the path of a file"),
         (RobotError, lambda: Robot.from_urdf(robot.urdf, {"left": "left_tool_frame"}, FIVE), "5: neither SRDF"),
@@ -176,7 +178,7 @@ def test_a_pipeline_refuses_a_wrong_duration_and_wrong_settings(pipeline: Pipeli
 
 
 @pytest.mark.parametrize("dt", [math.nan, math.inf, -1.0, 0.0, None, "a"])
-def test_an_invalid_time_brakes_nothing(controller: CartesianController, dt: Any) -> None:
+def test_brake_with_an_invalid_time_changes_nothing(controller: CartesianController, dt: Any) -> None:
     controller.reset(controller.robot.home)
     controller.brake(dt)
     np.testing.assert_allclose(controller.step({}, 0.001).q, controller.robot.home, atol=1e-9)
@@ -229,7 +231,7 @@ class Device:
 
 
 class Program:
-    """One right argument of each kind."""
+    """The objects of a user's program: one valid argument of each kind."""
 
     def __init__(self, robot: Robot, controller: CartesianController) -> None:
         self.robot, self.controller, self.policy = robot, controller, PolicyInput()
@@ -250,7 +252,7 @@ Call = Callable[[Program, Any], object]
 
 
 def each(what: str, names: Iterable[str], call: Callable[[Program, str, Any], object]) -> dict[str, Call]:
-    """Return calls, each with one of these keywords."""
+    """Return one call for each keyword in ``names``, under the key ``what`` and the keyword."""
 
     def of(name: str) -> Call:
         return lambda own, x: call(own, name, x)

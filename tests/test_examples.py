@@ -26,7 +26,7 @@ START_PROCESS: Callable[..., Done] = subprocess.run
 
 
 def run_command(command: list[str], *arguments: Any, **options: Any) -> Done:
-    """Run the package's command that an example starts in this process. Any other program is started."""
+    """Replace ``subprocess.run`` for an example. The package's command runs in this process, others are started."""
     if command[:3] != [sys.executable, "-m", "q2r2_control"]:
         return START_PROCESS(command, *arguments, **options)
     result = CliRunner().invoke(app, command[3:])

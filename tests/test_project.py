@@ -1,6 +1,7 @@
 """Imports follow the rules and dependencies of the project, and the documentation is current.
 
-Beyond the rules of ``lint-imports``: modules import each other in no circle, and light ones stay light.
+These tests go beyond the rules of ``lint-imports``: no modules import each other in a circle, and importing a light
+module imports nothing heavy.
 """
 
 from __future__ import annotations

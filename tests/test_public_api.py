@@ -28,12 +28,12 @@ EACH_PACKAGE = pytest.mark.parametrize("package", PACKAGES)
 
 
 def names_on_the_page(package: str) -> list[str]:
-    """The names of a package that the page of the API documents."""
+    """Return the names of a package that the page of the API documents."""
     return sorted(entry.rpartition(".")[2] for entry in ENTRIES if entry.rpartition(".")[0] == package)
 
 
 def inner_imports(code: str, where: str) -> Iterator[str]:
-    """A line for each import from this package that is not one of a public name."""
+    """Yield a line for each name that ``code`` imports from this package although the name is not public."""
     for node in ast.walk(ast.parse(code)):
         if isinstance(node, ast.Import):
             imported = [("", alias.name) for alias in node.names]
@@ -93,7 +93,7 @@ def test_the_code_on_a_page_imports_public_names_only(page: Path) -> None:
         ),
     ],
 )
-def test_an_inner_import_is_told_with_file_line_and_what_is_allowed(code: str, told: list[str]) -> None:
+def test_an_inner_import_is_reported_with_file_line_and_what_is_allowed(code: str, told: list[str]) -> None:
     assert list(inner_imports(code, "a.py")) == told
 
 

@@ -26,12 +26,12 @@ RATE = 250.0  # [Hz]
 
 
 def swing(t: float) -> Array:
-    """Return a hand that swings as fast as the arms can just follow."""
+    """Return the displacement at ``t`` [s] of a hand that swings so fast that the arms can just follow."""
     return np.array([0.0, 0.12 * np.sin(6.0 * max(t - 0.5, 0.0)), 0.0, 0.0, 0.0, 0.0])
 
 
 def reach(t: float) -> Array:
-    """Return a hand that moves far and slowly."""
+    """Return the displacement at ``t`` [s] of a hand that moves far and slowly."""
     return np.array([0.0, 0.0, 0.2 * (1.0 - np.cos(1.5 * max(t - 0.5, 0.0))), 0.0, 0.0, 0.0])
 
 
@@ -78,7 +78,7 @@ def test_after_a_stall_no_joint_moves_farther_than_in_a_period(stall: float, mon
     assert largest_step(plant, loop.robot.velocity_limit) <= 1.0 + 1e-9
     paused = [event for event in summary.events if event.destination == "lost"]
     assert bool(paused) == (stall > loop.config.teleop.gate.timeout), "a long stall pauses, a short one does not"
-    expected = ("loop_stalled", "pose_silent", "pose_gap", "inputs_silent")  # None of these events comes in a stall.
+    expected = ("loop_stalled", "pose_silent", "pose_gap", "inputs_silent")  # Only these reasons may pause an arm.
     assert all(event.reason.root.kind in expected for event in paused)
 
 
@@ -91,7 +91,7 @@ def test_a_stall_before_the_first_tick_does_not_count_as_a_fault_of_the_plant(mo
 
 
 @pytest.mark.parametrize("mode", ["position", "velocity", "torque"])
-def test_a_plant_that_catches_up_after_a_stall_is_not_a_plant_that_jumps(
+def test_a_plant_that_catches_up_after_a_stall_is_not_reported_as_jumping(
     mode: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(loop_clock, "time", StallingClock(0.09))
@@ -100,7 +100,7 @@ def test_a_plant_that_catches_up_after_a_stall_is_not_a_plant_that_jumps(
     summary = loop.run(3.0)
     assert summary.missed_ticks >= 5
     assert max(map(speed, watch.ticks)) > 0.5
-    # Velocities act during a stall, torques only for 5 ms. The arms are led back to the reference afterwards.
+    # Commanded velocities act during a whole stall, torques only for 5 ms. Afterwards the arms return to the reference.
     deviation = [np.abs(after.state.q - tick.reference.q).max() for tick, after in pairwise(watch.ticks)]
     assert max(deviation) < {"position": 0.15, "velocity": 0.3, "torque": 0.05}[mode]
     assert summary.at_rest
@@ -151,19 +151,19 @@ def test_a_plant_that_gives_no_more_states_gets_a_last_command_that_holds_the_ar
 
 
 def blocked(plant: RecordingPlant) -> Callable[[RobotState], RobotState]:
-    """From now on, the arms stay where they are, and report that."""
+    """Return a disturbance: from now on, the arms stay where they are, and their states say so."""
     q = plant.state().q
     return lambda state: replace(state, q=q, v=np.zeros_like(q))
 
 
 def frozen(plant: RecordingPlant) -> Callable[[RobotState], RobotState]:
-    """From now on, repeat the last measurement."""
+    """Return a disturbance: from now on, the last state is repeated."""
     last = plant.state()
     return lambda state: last
 
 
 def shifted(by: float) -> Callable[[RecordingPlant], Callable[[RobotState], RobotState]]:
-    """From now on, one joint of the fourteen is measured elsewhere."""
+    """Return a function that makes a disturbance: from now on, one joint is measured ``by`` [rad] away."""
     way = np.zeros(14)
     way[3] = by
     return lambda plant: lambda state: replace(state, q=state.q + way)

@@ -41,7 +41,7 @@ class LoopStep:
     refusals: dict[str, Reason] = field(default_factory=dict)  # For each arm that refuses its target, the reason.
 
 
-_REMEMBERED_LAG = 0.999  # Factor per tick by which the longest recent lag is forgotten.
+_REMEMBERED_LAG = 0.999  # In each tick the longest recent lag is multiplied by this factor, so that it is forgotten.
 _SAME_TIME = 1e-6  # A smaller difference is rounding [s].
 
 
@@ -90,7 +90,7 @@ class ControlLoop:
         self.pacer = TickPacer(period, velocity_limit, self.acceleration_limit, drive.coasts)
         self._delay = max(gripper_delay, REMEMBERED)
         self._grasps = GraspWatch(controller, STALL + gripper_delay)
-        self._limiter: GripperLimiter | None = None  # Exists while the reference is where the arms are.
+        self._limiter: GripperLimiter | None = None  # None while the reference may differ from the arms' posture.
         self._kept: Array = controller.kept_distances  # The kept distances that the drive knows [m].
         self._still: Mapping[str, MovingObstacle] = {}  # The obstacles at rest that the drive knows.
         self.holding: dict[str, bool] = {}  # For each arm that has an object, whether its gripper holds it.
@@ -116,22 +116,23 @@ class ControlLoop:
         return self.pacer.step(gap, self._velocity)
 
     def observe(self, state: RobotState | Reason, now: float, passed: float = 0.0, lost: Reason | None = None) -> None:
-        """Pass a measured state to supervision, or the reason why there is none; see :meth:`JointWatch.observe`.
+        """Pass a measured state to supervision, or the reason why there is no state; see :meth:`JointWatch.observe`.
 
-        ``lost`` is the reason why the arms cannot be commanded although they are measured. An arm that can still be
-        commanded then brakes by this state until it rests.
+        ``lost`` is the reason why the arms cannot be commanded although they are measured. If one of them can still be
+        commanded, it then brakes from this state until it rests.
         """
         self.supervisor.update_state(state, now, passed, lost)
 
     def watch_skew(self, timings: Mapping[str, ArmTiming], lead: float, now: float) -> None:
-        """Let supervision compare the lags of arms that follow the reference each on its own.
+        """Let supervision compare the lags of arms, each of which follows the reference with its own lag.
 
         It is called before a step and before an activation. The controller keeps the arms apart for the greatest
         difference between their lags.
 
         Args:
             timings: The timing of each arm's messages.
-            lead: Time from the posture that the arms are sent to until the end of the reference's newest step [s].
+            lead: Longest time along the reference from the posture to which an arm has been sent to the end of the
+                newest step [s].
             now: The time [s].
         """
         self._untold = untold = {arm: now - its.silent for arm, its in timings.items() if its.behind is None}
@@ -139,7 +140,7 @@ class ControlLoop:
             behind = self._lags.behind(state.q, untold)
             timings = {arm: replace(its, behind=behind.get(arm, its.behind)) for arm, its in timings.items()}
             self._usual_lag = max(_REMEMBERED_LAG * self._usual_lag, *behind.values())
-            lead += self._usual_lag  # A driver that reports no lag is sent on from where its arm is.
+            lead += self._usual_lag  # An arm whose driver reports no lag may be this far behind what it was sent.
         self.controller.allow_skew(min(skew_window(timings, lead), LONGEST_WINDOW))
         self.supervisor.skew.observe(timings, now)
 
@@ -180,14 +181,15 @@ class ControlLoop:
 
         Args:
             state: The newest measured state, which :meth:`observe` has seen; None if there is none.
-            targets: Targets of the tools in the world frame; None lets the arm hold. An arm whose targets come as
-                messages is not among them.
+            targets: Targets of the tools in the world frame, by arm; None lets the arm hold. An arm whose targets come
+                as messages is missing here.
             now: The time [s].
             dt: Time by which the reference advances [s].
             grippers: The wanted openings, from 0 for closed to 1 for fully open.
             openings: The measured openings.
             braked: Time for which the plant has followed the certified stop by itself before this tick [s].
-            posture: Where the joints go that the targets leave free (nv,) [rad]; None for the home posture.
+            posture: The posture that the joints approach as far as the targets leave them free (nv,) [rad]; None for
+                the home posture.
 
         Returns:
             The reference and the command for the plant.
@@ -269,7 +271,10 @@ class ControlLoop:
         self.drive.set_holding(self.holding)
 
     def _begin(self, state: RobotState, openings: Mapping[str, float], now: float) -> None:
-        """Let grippers and drive begin at ``state``, where the controller was reset, with the objects held before."""
+        """Let grippers and drive begin at ``state``, where the controller was reset.
+
+        Grippers still count as holding the objects that they held before.
+        """
         self._grasps.tell_again()
         self._limiter = GripperLimiter(self.controller, self._delay)
         self._tell_holding()
@@ -318,7 +323,7 @@ class ArmConditions:
         return {arm: self.look_at(arm, state, now) for arm in self._joints}
 
     def look_at(self, arm: str, state: RobotState, now: float) -> ArmCondition:
-        """Return the conditions of one arm at ``now``. Its distances take too long for every tick."""
+        """Return the conditions of one arm at ``now``. To measure its distances in every tick would take too long."""
         self._limited = {name: t for name, t in self._limited.items() if now - t <= _LIMIT_LASTS}
         limited = frozenset(self._joints[arm] & self._limited.keys())
         return ArmCondition(self._controller.spare_distance(arm), limited, self._contact_force(arm, state))

@@ -13,16 +13,17 @@ from q2r2_control.quaternions import floats_of, se3_of
 from q2r2_control.teleop.filters import Interpolator
 from q2r2_control.types import is_number
 
-_DELAY_PERIODS = 1.25  # With this delay, a sample that is late by a quarter of a period is in time.
-_SLOWEST, _FASTEST = 1.0, 500.0  # [Hz]
+_DELAY_PERIODS = 1.25  # With this delay, a sample may come late by a quarter of a period.
+_SLOWEST, _FASTEST = 1.0, 500.0  # Lowest and highest rate of samples [Hz].
 
 
 class SampledTargets:
     """Tool targets at every step, on straight lines from each sample to the next.
 
-    The controller itself bridges targets that are held for some steps, by the time for which the last one was held.
-    This class knows the rate of the samples instead, so it is smoother where they come unevenly, or less than nine
-    times a second. Each sample is reached :attr:`delay` after it was set, and steps in between get poses in between::
+    The controller itself interpolates targets that its caller holds for some steps. It assumes that a target is held as
+    long as the target before. This class gets the rate of the samples instead. The motion is therefore smoother if
+    samples come unevenly, or less than nine times a second. A sample is reached :attr:`delay` after it was set. Steps
+    in between get poses on the line between two samples::
 
         targets = SampledTargets(controller, rate_hz=90)
         while True:
@@ -30,18 +31,18 @@ class SampledTargets:
                 targets.set(arm, pose, now)
             reference = controller.step(targets.at(now), dt)
 
-    Nothing is extrapolated: where no sample comes any more, the tool comes to rest at the newest.
+    Nothing is extrapolated: if no more samples come, the tool comes to rest at the newest sample.
     """
 
     def __init__(self, controller: CartesianController, rate_hz: float) -> None:
         """Make targets for a controller.
 
         Args:
-            controller: The controller, at whose tools the targets begin.
+            controller: The controller, at whose tool poses the targets begin.
             rate_hz: Usual rate of the samples, 1 to 500 [Hz].
 
         Raises:
-            RobotError: For another rate, and for an object that is not a controller.
+            RobotError: If the rate is not allowed, or if ``controller`` is not a controller.
         """
         check_kind("controller", controller, CartesianController, "a CartesianController", RobotError)
         if not is_number(rate_hz) or not _SLOWEST <= rate_hz <= _FASTEST:
@@ -53,18 +54,19 @@ class SampledTargets:
     def set(self, arm: str, pose: pin.SE3, now: float) -> bool:
         """Take a sample.
 
-        The first one of an arm, also after :meth:`release`, begins a line at its tool.
+        The first sample of an arm, and the first one after :meth:`release`, begins a line at the arm's tool pose.
 
         Args:
             arm: The arm that the sample is for.
-            pose: Pose of the tool in the world.
-            now: Time of its arrival, on the clock of :meth:`at` [s].
+            pose: The tool pose in the world frame.
+            now: The time at which the sample arrived, by the same clock as in :meth:`at` [s].
 
         Returns:
-            False if the pose is not finite or no rotation; the arm then goes on to its last one.
+            True if the sample is used. False if the pose is not finite or its matrix is not a rotation; the arm then
+            goes on to its last sample.
 
         Raises:
-            RobotError: For an arm that does not exist, an object that is not a pose, and a time that is not finite.
+            RobotError: If the arm does not exist, ``pose`` is not a pinocchio.SE3, or the time is not finite.
         """
         check_kind("pose", pose, pin.SE3, "a pinocchio.SE3", RobotError)
         name, now = self._controller.robot.arm(arm).name, _time(now)
@@ -78,17 +80,17 @@ class SampledTargets:
         return True
 
     def release(self, arm: str) -> None:
-        """Let an arm hold. Raises :class:`RobotError` for an arm that does not exist."""
+        """Let an arm hold. Raises :class:`RobotError` if the arm does not exist."""
         self._lines.pop(self._controller.robot.arm(arm).name, None)
 
     def at(self, now: float) -> dict[str, pin.SE3]:
-        """Targets of the arms that have samples, for :meth:`CartesianController.step`.
+        """Return the targets of the arms that have samples, for :meth:`CartesianController.step`.
 
         Args:
             now: Time of the step, which does not go back [s].
 
         Raises:
-            RobotError: For a time that is not finite.
+            RobotError: If the time is not finite.
         """
         now = _time(now)
         return {arm: se3_of(line.at(now)[:2]) for arm, line in self._lines.items()}

@@ -1,4 +1,4 @@
-"""Measurements of a commissioning with slowly led arms: joints, loads, stops. Each has a stated bound."""
+"""Measure joints, loads and stops in a commissioning, while the arms move slowly. Each result has a stated bound."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from q2r2_control.robot.load import LEAST_POSTURES, MODEL, PENDANT, LoadReport, 
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
-_STEP = np.radians(1.17)  # Commanded step of a joint, 0.17 degrees of which may be missing.
-# Largest distance of a measured joint from the commanded one, at rest and on the way [deg].
+_STEP = np.radians(1.17)  # Commanded step of a joint [rad]. If 0.17 degrees of it are missing, a degree remains.
+# Largest difference between a measured joint and the commanded joint, at rest and during the motion [deg].
 _REACHED, _BEHIND = 0.2, 0.8
-# Displacements of A2 .. A7 from the first posture; turning A1 changes no torque [rad].
+# Largest displacements of A1 .. A7 from the first posture [rad]. A1 stays, because turning it changes no torque.
 _SPREAD = np.array([0.0, 0.1, 0.2, 0.25, 0.4, 0.5, 0.5])
 _TRIES = 40
 LED = 2.0  # Time of the upward motion before the hand lets go [s].
 _LATENCY = 0.15  # Longest time from when a hand lets go until the arm brakes: the time-out of a silent hand [s].
 LEAST_SPEED = 0.01  # Least speed of the tool from which a stop is measured [m/s].
-_STANDS = 1e-3  # Joints nearer than this to their place of rest count as resting [rad].
+_STANDS = 1e-3  # Joints nearer than this to their final positions count as resting [rad].
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +37,7 @@ class JointMotion:
     others_deg: float  # Largest motion of another joint.
 
     def check(self) -> JointMotion:
-        """Return this report. Raises :class:`PlantError` for a joint that did not follow, or did not move alone."""
+        """Return this report. Raises :class:`PlantError` if the joint did not follow, or did not move alone."""
         off = abs(self.measured_deg - self.commanded_deg)
         if off > _REACHED or self.behind_deg > _BEHIND or self.others_deg > _REACHED:
             raise PlantError(
@@ -49,7 +49,10 @@ class JointMotion:
 
 
 def measure_joint(run: SlowRun, joint: int) -> JointMotion:
-    """Lead ``joint``, an index of ``Robot.joint_names``, a degree towards its middle and back, and check the motion."""
+    """Move a joint by a degree towards the middle of its range and back, and check the motion.
+
+    ``joint`` is an index of ``Robot.joint_names``.
+    """
     robot, start = run.robot, run.reference
     goal = start.copy()
     middle = 0.5 * (robot.position_lower + robot.position_upper)[joint]
@@ -72,17 +75,18 @@ def measure_joint(run: SlowRun, joint: int) -> JointMotion:
 
 
 class LoadSurvey:
-    """Leads all arms through postures near their posture of rest, and finds the load of each."""
+    """Moves all arms through postures near their first posture, and finds the load that each arm carries."""
 
     def __init__(self, run: SlowRun) -> None:
         self._run, self._start = run, run.reference
         self._goals = _postures(run.robot, self._start)
-        self._rests: list[Array] = []  # For each, (3, nv): posture [rad], torque and external torque [Nm].
+        self._rests: list[Array] = []  # For each rest (3, nv): posture [rad], torque and external torque [Nm].
 
     def measure(self) -> list[LoadReport] | None:
-        """Return the load of each arm, compared with model and pendant; None if the cabinets measure no torques.
+        """Return each arm's load, compared with the loads in the model and on the pendant.
 
-        Where it raises :class:`PlantError`, the next call goes on with the next posture.
+        Return None if the cabinets measure no torques. After a :class:`PlantError`, the next call goes on with the next
+        posture.
         """
         while len(self._rests) < LEAST_POSTURES:
             if (goal := next(self._goals, None)) is None:
@@ -106,7 +110,7 @@ class LoadSurvey:
 
 
 def _postures(robot: Robot, start: Array) -> Iterator[Array]:
-    """Yield goals (nv,) near ``start``, which are the same each time."""
+    """Yield random postures (nv,) [rad] near ``start``, which are the same in each run."""
     random = np.random.default_rng(0)
     for _ in range(_TRIES):
         goal = start.copy()
@@ -128,7 +132,7 @@ class StopReport:
     allowed_s: float
 
     def check(self) -> StopReport:
-        """Return this report. Raises :class:`PlantError` for a stop that was too long or too late."""
+        """Return this report. Raises :class:`PlantError` if the stop was too long or too late."""
         if self.tool_speed_mm_s < 1e3 * LEAST_SPEED:
             raise PlantError(f"the {self.arm} arm did not go up; begin where its tool has 100 mm of room above it")
         if self.stopped_mm > self.allowed_mm or self.stopped_s > self.allowed_s:
@@ -141,12 +145,12 @@ class StopReport:
 
 
 def measure_stop(run: SlowRun, arm: str) -> StopReport:
-    """Let a hand lead ``arm`` upwards and let go, like an operator's hand, and check the stop."""
+    """Let a hand of the program move ``arm`` upwards and let go, like an operator's hand, and check the stop."""
     return let_go_report(run.robot, arm, run.let_go([arm], LED)).check()
 
 
 def let_go_report(robot: Robot, arm: str, moments: list[Moment]) -> StopReport:
-    """Return the report on ``moments`` in which a hand led ``arm`` until the arm came to rest."""
+    """Return the report on a stop. In ``moments``, a hand moves ``arm`` and lets go, and the arm comes to rest."""
     led = [index for index, moment in enumerate(moments) if moment.engaged[arm]]
     if not led:
         raise PlantError(f"the {arm} arm did not follow the hand")
@@ -160,9 +164,16 @@ def let_go_report(robot: Robot, arm: str, moments: list[Moment]) -> StopReport:
 def stop_report(
     robot: Robot, arm: str, cause: str, last: Moment, released: Array, rest: Array, took: float
 ) -> StopReport:
-    """Return the report on an ``arm`` that was led until the moment ``last``, and then ``took`` this time [s] to rest.
+    """Return the report on the stop of an arm.
 
-    ``released`` and ``rest`` (nv,): measured joints as it began to stop, and afterwards [rad].
+    Args:
+        robot: The robot.
+        arm: The arm.
+        cause: Why the arm stopped, in words.
+        last: The last moment in which the arm followed its hand.
+        released: Measured joints when the arm began to stop (nv,) [rad].
+        rest: Measured joints after the stop (nv,) [rad].
+        took: Duration of the stop [s].
     """
     v = np.where(np.isin(np.arange(len(rest)), robot.arms[arm].joints), last.v, 0.0)
     deceleration = np.full_like(v, np.inf) if last.deceleration is None else np.maximum(last.deceleration, 1e-6)

@@ -1,7 +1,7 @@
-"""A run that is killed while hands lead its arms: they have to stop by what outlives it.
+"""A run that is killed while hands move its arms. A process that outlives the run has to stop the arms.
 
-Where a loop dies, the process that answers the cabinets brings the arms to rest on the certified stop, and then ends
-and releases its ports. A commissioning sees to that with a loop in a process of its own.
+If a loop dies, the process that answers the cabinets brings the arms to rest on the certified stop, and then ends and
+releases its ports. A commissioning checks this with a loop that runs in a process of its own.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from q2r2_control.process.helper_process import HelperProcess
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
-_LOOKS = 0.005  # [s]
+_LOOKS = 0.005  # Time between two checks [s].
 _PATIENCE = 5.0  # Longest time until the ports are released [s].
 _FREEING = 0.5  # Time in which the system frees the memory of a killed program, before its end can be seen [s].
 
 
 def main(requests: Iterator[Config], answer: Callable[[Any], None]) -> None:
-    """Lead all arms of each cell upwards, and answer every moment. This runs in the process that is killed."""
+    """Move all arms of each cell upwards, and pass every moment to ``answer``. This runs in the killed process."""
     for config in requests:
         with SlowRun(config, FriPlant, listener=answer) as run:
             run.let_go(list(run.robot.arms), 1.5 * LED)
@@ -37,7 +37,7 @@ def measure_kill(config: Config, posture: Callable[[], Array], led: float = LED)
     """Kill a run after its tools have moved up for ``led`` [s], and return the unchecked report of each arm's stop.
 
     ``posture`` is called when nothing commands the arms any more, and returns where they rest (nv,) [rad]. Raises
-    :class:`PlantError` where the arms do not go up.
+    :class:`PlantError` if the arms do not go up.
     """
     robot = Robot.from_config(config)
     plant = FriPlant(robot, config)

@@ -8,8 +8,9 @@ from dataclasses import replace
 from q2r2_control.summary.run_summary import Histogram
 from q2r2_control.types import RobotState
 
-_SHORTEST_DT = 1e-6  # [s]
-# Shorter sleeps cost more than they are worth, since a picture of the arms lasts eight times as long [s].
+_SHORTEST_DT = 1e-6  # Least duration of a tick that is returned [s].
+# A shorter sleep is left out. It would cost more than it is worth: a picture of the arms is shown eight times as long
+# [s].
 _SHORTEST_SLEEP = 0.004
 # If simulated time is farther behind than this, it does not catch up, and the motion goes on in slow motion [s].
 _LONGEST_LAG = 0.1
@@ -18,7 +19,7 @@ _MANY_LATE = 0.1  # Share of late ticks in a window from which the loop falls be
 
 
 class WallPace:
-    """Lets simulated time pass no faster than the computer's clock, and more slowly where the computer is too slow."""
+    """Lets simulated time pass no faster than the computer's clock, and more slowly if the computer is too slow."""
 
     def __init__(self) -> None:
         self._ahead_since: float | None = None  # Time of the computer's clock at simulated time zero [s].
@@ -38,8 +39,8 @@ class WallPace:
 class LoopClock:
     """Ticks on a grid of ``period`` [s], in real time or in simulated time. Simulated time is never late.
 
-    Simulated time passes as fast as the ticks are computed, or with a ``pace`` no faster than it allows. A tick does
-    not know the difference, so that both give the same results to the bit.
+    Simulated time passes as fast as the ticks are computed, or no faster than ``pace`` allows. The ticks are the same
+    in both cases, so that their results are equal to the bit.
     """
 
     def __init__(self, period: float, realtime: bool, pace: WallPace | None = None) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from q2r2_control.config.cell import HIGHEST_FITTING_RATE_HZ
 
-# The highest one that leaves room is taken. At the lowest, torques of the impedance are shown to be stable, too.
+# The highest rate that leaves enough time free is chosen. The torques of the impedance are stable at the lowest, too.
 FITTING_RATES_HZ = (HIGHEST_FITTING_RATE_HZ, 500.0, 250.0)
 _ROOM = 0.4  # Share of the period that 99 of 100 ticks must leave free for other programs.
 _WARM_UP, _LOOKED_AT = 50, 250  # Numbers of ticks that are ignored at first, and that are timed then.

@@ -1,7 +1,7 @@
 """The newest picture of each camera at a tick, for a policy.
 
-The loop only hands over what a picture is made of: a JPEG that a camera's process sent, or the places of the simulated
-bodies. A policy that reads the pixels decodes or draws them, in its own thread.
+The loop only hands over what a picture is made from: a JPEG that a camera's process sent, or the poses of the simulated
+bodies. When a policy reads the pixels, they are decoded or rendered in the policy's own thread.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from q2r2_control.plants.base import PicturedPlant, Plant
 from q2r2_control.types import ObservedPicture
 
 Pixels = npt.NDArray[np.uint8]  # (height, width, 3) r g b.
-_ROUNDING = 1e-6  # Share of a period by which the rounding of times may make a picture seem to be not yet due.
+_ROUNDING = 1e-6  # A picture counts as due this share of a period early, because times are rounded.
 
 
 class ReadPicture:
@@ -52,7 +52,7 @@ class DrawnPicture:
 
 
 class PicturesByCamera(dict[str, ObservedPicture]):
-    """Pictures by the name of their camera. A camera without one raises :class:`CameraError`, which says why."""
+    """Pictures by the name of their camera. A camera without a picture raises :class:`CameraError`, which says why."""
 
     def __init__(self, pictures: Mapping[str, ObservedPicture], reasons: Mapping[str, str]) -> None:
         super().__init__(pictures)
@@ -97,7 +97,7 @@ class NewestPictures:
         return PicturesByCamera(found, reasons)
 
     def _why_lost(self, stream: CameraStream, computer: float) -> str | None:
-        """Note the newest picture; return why there is none that a policy should act on, or None if there is one."""
+        """Keep the newest picture. Return why it is missing or too old for a policy, or None if it may be used."""
         if (shot := stream.newest) is None:
             return f"no picture yet{_because(stream)}"
         known = self._devices.get(stream.name)

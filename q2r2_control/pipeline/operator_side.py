@@ -32,12 +32,16 @@ from q2r2_control.teleop.teleop import Teleop
 from q2r2_control.types import ActionChunk, ArmTarget, HandSample, Observation
 from q2r2_control.wording import event_line, sentence
 
-_PERIOD = 0.02  # Period in which more of an arm than its events is examined [s].
+_PERIOD = 0.02  # Each arm's conditions, slip and gripper are examined once in this time, its events at each tick [s].
 _logger = logging.getLogger(__name__)
 
 
 class OperatorSide:
-    """Once a tick: :meth:`poll`, :meth:`targets`, and at its end :meth:`take_events` and :meth:`feed_back`."""
+    """The operator's side of a run.
+
+    In each tick the loop calls :meth:`poll` and :meth:`targets`, and at its end :meth:`take_events` and
+    :meth:`feed_back`.
+    """
 
     def __init__(
         self,
@@ -68,7 +72,7 @@ class OperatorSide:
         self._turns, self._wait, self._due = cycle(arms), _PERIOD / len(arms), -np.inf
 
     def poll(self, now: float) -> list[HandSample]:
-        """Take samples of the hands. A lost connection stops the arms that hands drive."""
+        """Take samples of the hands. A lost connection stops the arms that follow hands."""
         samples = check_samples(self._input.poll(now))
         self.chunks = [] if self._policy is None else self._policy.chunks()
         was_connected, self.connected = self.connected, self._input.connected
@@ -129,7 +133,7 @@ class OperatorSide:
             pulses.grasps(self._grips[arm].look(commanded, opening, tick.now))
 
     def _fulfil(self, now: float) -> None:
-        for _ in range(len(self._requests)):  # Only present requests are done, even if others come fast.
+        for _ in range(len(self._requests)):  # Requests that come meanwhile wait for the next tick.
             request = self._requests.popleft()
             if isinstance(request, TeleopSettings):
                 request = change_of(self._teleop.settings, request)

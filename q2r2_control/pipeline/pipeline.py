@@ -77,14 +77,14 @@ class Pipeline(RequestedRun):
         input: The device whose hands move the arms, or a policy.
         plant: The real or simulated arms that get the commands.
         mode: Kind of the plant's commands: joint positions, velocities, or the torques of a Cartesian impedance.
-        solver: As of :class:`CartesianController`, like ``tasks`` and ``constraints``. A recording does not contain
-            these objects, so that a replay of the run goes without them.
+        solver: See :class:`CartesianController`, also for ``tasks`` and ``constraints``. A recording does not contain
+            these objects, so a replay of the run does not use them.
         tasks: Costs in addition to those of ``config.control.tasks``.
         constraints: Rows in addition to those of the controller.
 
     Raises:
-        ConfigError: If an argument is of another kind, if the plant lacks the mode, if the input lacks a control that
-            is bound, or if the controller refuses its part.
+        ConfigError: If an argument has another type, if the plant lacks the mode, if the input lacks a control that is
+            bound, or if the controller refuses its solver, tasks or constraints.
     """
 
     def __init__(
@@ -106,7 +106,7 @@ class Pipeline(RequestedRun):
         check_kind("plant", plant, Plant, "an object with all methods of Plant")
         config.teleop.bindings.check_device(input.controls)
         self.config, self.robot, self.input, self.plant = config, robot, input, plant
-        # A session has one mode: its arms cannot follow positions while torques are not safe.
+        # A session has one mode: if torques are not safe, its arms cannot change to position commands.
         has_servos = CommandMode.POSITION in plant.modes and not isinstance(plant, SessionPlant)
         self.drive = make_drive(check_mode(mode, plant), robot, config, has_servos)
         if config.control.jerk_limit is not None and not keeps_jerk_limit(plant, self.drive.mode):
@@ -179,7 +179,7 @@ class Pipeline(RequestedRun):
         self._stopping = True
 
     def run(self, duration: float | None = None, realtime: bool = True, *, paced: bool = False) -> RunSummary:
-        """Run until the duration is over, or until :meth:`stop`, Ctrl-C or SIGTERM. The arms come to rest first.
+        """Run until the duration is over, or until :meth:`stop`, Ctrl-C or SIGTERM. At the end, the arms come to rest.
 
         Args:
             duration: Length of the run [s]; None if only a stop ends it.
@@ -261,11 +261,11 @@ class Pipeline(RequestedRun):
         return LoopClock(1.0 / self.config.nominal_rate_hz, realtime, self._pace)
 
     def fit_rate(self) -> RateFit | None:
-        """Choose the rate of a loop in real time that leaves it to this computer, as ``loop_rate_hz: auto`` does.
+        """Choose the rate of a loop in real time, if the cell has ``loop_rate_hz: auto``.
 
         Ticks are taken in real time while the arms rest at the plant's start, first at the highest rate. The rate that
-        fits replaces ``auto`` in :attr:`config`. Returns None if the cell names a rate, which is taken as it is, or if
-        the plant has sessions, whose cabinets or controllers set the time.
+        fits this computer replaces ``auto`` in :attr:`config`. Returns None if the cell names a rate, which is then
+        used, or if the plant has sessions, whose cabinets or controllers set the time.
         """
         if self.config.loop_rate_hz != AUTO or isinstance(self.plant, SessionPlant):
             return None

@@ -40,7 +40,10 @@ Request = Reason | TeleopSettings | ObstacleRequest
 
 
 class RequestedRun:
-    """The requests to a run. Each waits as the reason that is recorded, or as that from which this reason is made."""
+    """The requests of a program to a run.
+
+    A waiting request is the reason that will be recorded, or the data from which this reason will be made.
+    """
 
     config: Config
     input: Input
@@ -55,9 +58,9 @@ class RequestedRun:
         return self.drive.impedance if isinstance(self.drive, TorqueDrive) else None
 
     def go_home(self) -> None:
-        """Bring both arms home, as an operator may
+        """Bring both arms home, as an operator may; from any thread.
 
-        from any thread. Any press ends it, and events report the result.
+        Any press ends the way home, and events report the result.
         """
         self.requests.append(Reason(TeleopReason.HOME_REQUESTED))
 
@@ -66,11 +69,11 @@ class RequestedRun:
         self.requests.append(Reason(TeleopReason.PAUSE_REQUESTED))
 
     def engage(self) -> None:
-        """Press for both hands the controls that engage their arms, with all conditions of a press; from any thread."""
+        """Engage both arms as presses of their hands would, under the same conditions; from any thread."""
         self.requests.append(Reason(TeleopReason.ENGAGE_REQUESTED))
 
     def give_back(self) -> None:
-        """Take the arms from the hands and give them to the policy, which goes on where they are; from any thread."""
+        """Give the arms back from the hands to the policy, which goes on where the arms are; from any thread."""
         self.requests.append(Reason(TeleopReason.POLICY_REQUESTED))
 
     def mark(self, action: Action) -> None:
@@ -83,10 +86,10 @@ class RequestedRun:
         self.requests.append(Reason.of(TeleopReason.RECORDING_REQUESTED, action=str(action)))
 
     def change_teleop(self, settings: TeleopSettings) -> None:
-        """Change settings of the operator for the rest of this run, without a jump; from any thread.
+        """Change settings of the teleoperation for the rest of this run, without a jump; from any thread.
 
-        :meth:`Teleop.change` says when they count, and an event whether they did. Raises :class:`ConfigError` for a
-        binding to a control that the input lacks.
+        :meth:`Teleop.change` says when a change takes effect, and an event tells whether it did. Raises
+        :class:`ConfigError` if a binding names a control that the input lacks.
         """
         check_kind("teleop", settings, TeleopSettings, "TeleopSettings, which a Config has as config.teleop")
         settings.bindings.check_device(self.input.controls)
@@ -95,9 +98,9 @@ class RequestedRun:
     def change_control(self, values: Mapping[str, float]) -> None:
         """Change settings of the controller by name for the rest of this run, without a jump; from any thread.
 
-        In torque mode those of ``LIVE_IMPEDANCE`` too. :meth:`CartesianController.change` and
-        :meth:`ImpedanceController.change` say how they come to count, and an event whether they did. Raises
-        :class:`ConfigError` for a name or a value that is never allowed.
+        In torque mode, settings in ``LIVE_IMPEDANCE`` may change too. :meth:`CartesianController.change` and
+        :meth:`ImpedanceController.change` say how a change takes effect, and an event tells whether it did. Raises
+        :class:`ConfigError` if a name or a value is never allowed.
         """
         check_kind("control", values, Mapping, "new values by name")
         springs = {} if self.impedance is None else {k: v for k, v in values.items() if k in LIVE_IMPEDANCE}
@@ -109,8 +112,8 @@ class RequestedRun:
         """Report where a moving obstacle is now, or that it is gone; from any thread.
 
         :meth:`CartesianController.move_obstacle` says what follows, and an event names a pair that is in the way. In
-        real time the report ages from now on, also before the run begins. Raises :class:`ConfigError` for a name that
-        ``control.moving_obstacles`` lacks.
+        real time, the report ages from now on, also before the run begins. Raises :class:`ConfigError` if
+        ``control.moving_obstacles`` lacks the name.
         """
         check_obstacle(name, obstacle, self.config.control.moving_obstacles)
         self.requests.append(ObstacleRequest(name, obstacle, time.monotonic()))
@@ -141,13 +144,13 @@ REPEATED = {
 
 
 def change_of(old: TeleopSettings, new: TeleopSettings) -> Reason:
-    """Return the request for other settings, with the values that differ from the ``old`` ones."""
+    """Return the request that changes ``old`` settings into ``new`` ones. It contains the values that differ."""
     changes = _difference(old.model_dump(mode="json"), new.model_dump(mode="json"))
     return Reason.of(TeleopReason.SETTINGS_REQUESTED, changes=changes)
 
 
 def changed(settings: TeleopSettings, changes: Mapping[str, Any]) -> TeleopSettings:
-    """Return the settings that such a request asks for. Raises :class:`ConfigError` for invalid changes."""
+    """Return ``settings`` with the ``changes`` of a request. Raises :class:`ConfigError` if a change is invalid."""
     return TeleopSettings.model_validate(_merged(settings.model_dump(mode="json"), changes))
 
 

@@ -16,8 +16,8 @@ from q2r2_control.supervision.tick_pacer import TickPacer
 class RunRecorder(RunStatistics):
     """Adds every tick to the statistics and passes it to the listeners.
 
-    A listener that raises ends the run, and is not called again. ``counts`` is False for a run whose summary nobody can
-    ask for: its ticks are not added.
+    A listener that raises ends the run, and is not called again. If ``counts`` is False, ticks are not added to the
+    statistics, because nobody can ask for the summary of that run.
     """
 
     def __init__(

@@ -1,7 +1,7 @@
-"""Arms that are led slowly, joint by joint or by a hand of the program, while a person at a terminal watches.
+"""Move arms slowly, to given postures or with a hand of the program, while a person at a terminal watches.
 
-The pipeline runs in a thread of its own, with every promise of an ordinary run, and holds the arms between the motions.
-Its controller knows 5 % of the joints' speeds as their limits, so that nothing can ask for more.
+The pipeline runs in a thread of its own, keeps every promise of an ordinary run, and holds the arms between the
+motions. The speed limits of its controller are 5 % of the joints' limits, so that nothing can move faster.
 """
 
 from __future__ import annotations
@@ -33,20 +33,20 @@ from q2r2_control.supervision.supervisor import Phase
 from q2r2_control.types import SIDES, Array, HandInputs
 from q2r2_control.wording import sentence
 
-SPEED = 0.05  # Share of the joints' speeds.
-HAND_SPEED = 0.03  # [m/s]
+SPEED = 0.05  # Share of the joints' speed limits.
+HAND_SPEED = 0.03  # Upward speed of the program's hands [m/s].
 _PATIENCE = 20.0  # Longest time until the cabinets command, and until arms come to rest [s].
 STILL, REST = 2e-3, 0.3  # Joints at rest move less than this [rad] in this time [s].
-_LOOKS = 0.05  # [s]
+_LOOKS = 0.05  # Time between two checks [s].
 _RATE = 75.0  # Rate of the hands [Hz].
 
 
 class _Hands(PlayedInput):
-    """Both hands, which rest until their buttons are held. Then their arms are engaged and move up."""
+    """Both hands. A hand rests until its button is held. Then its arm is engaged, and hand and arm move up."""
 
     def __init__(self) -> None:
         self.held: tuple[str, ...] = ()
-        self._height = dict.fromkeys(SIDES, 1.0)  # [m]
+        self._height = dict.fromkeys(SIDES, 1.0)  # Height of each hand [m].
         super().__init__(self._posed, self._pressed, {hand: EvenSampling(_RATE) for hand in SIDES})
 
     def _posed(self, hand: str, t: float) -> pin.SE3:
@@ -66,15 +66,15 @@ class Moment(NamedTuple):
     external: Array  # Torques that the cabinet's model does not explain [Nm]; NaN if the cabinet does not report them.
     reference: Array
     v: Array  # Velocities of the reference [rad/s].
-    deceleration: Array | None  # Deceleration of the certified stop from there [rad/s^2].
-    engaged: dict[str, bool]  # Arms that follow a hand.
+    deceleration: Array | None  # Deceleration of the certified stop from the reference [rad/s^2].
+    engaged: dict[str, bool]  # By arm, whether it follows a hand.
 
 
 class SlowRun:
-    """A context manager that leads the arms of ``plant``. Leaving it brings them to rest, and closes the plant.
+    """A context manager that moves the arms of ``plant``. Leaving it brings them to rest, and closes the plant.
 
-    Every method raises :class:`PlantError` where the arms do not do what they are asked to. It may be called again,
-    unless the run :attr:`is_over`.
+    Every method raises :class:`PlantError` if the arms do not do what they are asked to do. The method may be called
+    again, unless the run :attr:`is_over`.
     """
 
     def __init__(
@@ -129,13 +129,13 @@ class SlowRun:
 
     @property
     def is_over(self) -> bool:
-        """True if a fault has ended the run, so that no arm can be led any more."""
+        """True if a fault has ended the run. The arms can then no longer be moved by :meth:`lead_to`."""
         return not self._thread.is_alive()
 
     def lead_to(self, goal: Array) -> list[Moment] | None:
-        """Lead all joints straight to ``goal`` (nv,) [rad] and wait for rest. Return all ticks from rest to rest.
+        """Move all joints straight to ``goal`` (nv,) [rad], and wait until they rest.
 
-        None: the straight way there is not free, and nothing has moved.
+        Return the moments of all ticks from rest to rest; None if the straight way is not free, and nothing has moved.
         """
         homing = self._pipeline.supervisor.homing
         self._begin()
@@ -150,7 +150,7 @@ class SlowRun:
         return self._end()
 
     def let_go(self, arms: Sequence[str], duration: float) -> list[Moment]:
-        """Let hands lead ``arms`` upwards for ``duration`` [s] and let go. Return all ticks from rest to rest."""
+        """Let hands move ``arms`` upwards for ``duration`` [s] and let go. Return the moments from rest to rest."""
         self._begin()
         self._hands.held = tuple(self._pipeline.teleop.hand_of(arm) for arm in arms)
         try:

@@ -1,4 +1,4 @@
-"""Move targets ahead by the delay of a plant, so that the real arms are where the targets are."""
+"""Extrapolate targets by the delay of a plant, so that the real arms are where the targets are now."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ import pinocchio as pin
 
 from q2r2_control.types import Array
 
-_SMOOTHING = 0.01  # Time constant by which the velocity of a target is smoothed [s].
-_FASTEST = 3.0, 20.0  # A target that moves faster has made a step [m/s], [rad/s].
+_SMOOTHING = 0.01  # Time constant of the filter that smooths the velocity of a target [s].
+_FASTEST = 3.0, 20.0  # If a target seems to move faster than this, it has jumped [m/s], [rad/s].
 _REST = 1e-6  # A target that moves more slowly stands still [m/s], [rad/s].
 
 
 class TargetLead:
-    """Moves each target ahead by its own smoothed velocity.
+    """Extrapolates each target with its own smoothed velocity.
 
-    A target at constant velocity is moved ahead by exactly the delay. If it stops at once, it is overshot by its
-    velocity times the delay at most, for about ``_SMOOTHING``. A target at rest is not changed.
+    A target at constant velocity is extrapolated by exactly the delay. If the target stops abruptly, the result is
+    beyond it by at most its velocity times the delay, for about ``_SMOOTHING``. A target at rest is not changed.
     """
 
     def __init__(self) -> None:
@@ -50,7 +50,7 @@ class TargetLead:
 
 
 def _velocity(before: pin.SE3, pose: pin.SE3, dt: float) -> Array:
-    """Return the velocity from one target to the next (6,) [m/s], [rad/s]; zero if the target made a step."""
+    """Return the velocity from one target to the next (6,) [m/s], [rad/s]; zero if the target has jumped."""
     linear = (pose.translation - before.translation) / dt
     angular = pin.log3(before.rotation.T @ pose.rotation) / dt
     if math.hypot(*linear) > _FASTEST[0] or math.hypot(*angular) > _FASTEST[1]:

@@ -41,9 +41,11 @@ from q2r2_control.ros.launch.middleware import set_up_middleware
 from q2r2_control.ros.reasons import RosReason
 from q2r2_control.wording import sentence
 
-# Processor time after which Linux ends a real-time process that never sleeps [s]. It would leave nothing to others.
+# Linux signals a real-time process that has computed this long without a sleep [s]. Other processes could not run.
 _NEVER_IDLE = 0.5
-_LEAST_END = 2.0  # Least time that a process has to end after its nodes are closed [s]. Arms brake for 3 s at most.
+# After its nodes are closed, a process may take at least this long to end [s]. To close a node takes up to 3 s, because
+# its arms brake.
+_LEAST_END = 2.0
 _deadline = math.inf  # Time of the steady clock at which this process must have ended [s].
 # All QoS profiles keep the last messages. They are reliable and volatile unless they say otherwise.
 # The profile of a receiver of commands. Only the newest command counts, and it must arrive.
@@ -53,7 +55,7 @@ COMMAND_QOS = QoSProfile(depth=1)
 # the receiver may differ.
 SENT_COMMAND_QOS = QoSProfile(depth=1, lifespan=Duration(seconds=0.1))
 # The profile of streams of a headset, of joint states or of nodes' reports, in which a late message is worth less than
-# the next one. A reliable subscription delivers in order, and lets the next one wait up to 3 s for one that was lost.
+# the next one. A reliable subscription delivers in order: after a lost message, the next ones would wait up to 3 s.
 STREAM_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 # The profile of messages that are only recorded. All of them count, and nobody waits for them.
 RECORDED_QOS = QoSProfile(depth=200)
@@ -71,7 +73,7 @@ class BaseNode(Node):
 
     exit_code: int | None = None  # As soon as it is set, the executable ends with this exit code.
     ticks = False  # True if messages are taken only at the node's ticks, see TickExecutor.
-    priority = 0  # Real-time priority, if it is permitted; 0 for an ordinary one.
+    priority = 0  # Real-time priority, if the system permits it; 0 for the ordinary priority.
 
     def __init__(self, name: str, **kwargs: Any) -> None:
         self.tick_group = TickGroup()
@@ -89,7 +91,8 @@ class BaseNode(Node):
         self.create_timer(_DIAGNOSTICS_PERIOD, self.report_health, clock=STEADY)
 
     # rclpy checks the events of every endpoint each time that it waits, which costs processor time. These events warn
-    # of settings or types that do not match. The subscribers of a publisher warn as well, and best effort matches all.
+    # of settings or types that do not match. Publishers do without them, because their subscribers warn as well.
+    # Best-effort subscriptions do without them, because they match every publisher's settings.
     def create_publisher(self, *args: Any, **kwargs: Any) -> Any:
         kwargs.setdefault("event_callbacks", PublisherEventCallbacks(use_default_callbacks=False))
         return super().create_publisher(*args, **kwargs)
@@ -145,7 +148,10 @@ class BaseNode(Node):
         return str(self.resolve_topic_name(name, only_expand=True)) if name else name
 
     def name_in_set(self, name: str) -> str:
-        """Return the full name here of ``name``, such as ``/recorder``, in a set of nodes without a namespace."""
+        """Return the full name of a node or topic of the same set of nodes.
+
+        ``name``, such as ``/recorder``, is the full name that it would have without a namespace.
+        """
         return self.full_name(name.removeprefix("/"))
 
     @property
@@ -165,7 +171,7 @@ class BaseNode(Node):
         return OK, "running", {}
 
     def drop(self, topic: str, text: str) -> None:
-        """Warn once for each topic that messages of others cannot be read, with ``text`` as an example."""
+        """Warn once for each topic that a message of another node cannot be read; ``text`` describes the message."""
         if topic not in self._dropped:
             self._dropped.add(topic)
             self.get_logger().warning(sentence(Reason.of(RosReason.MESSAGE_UNREADABLE, topic=topic, text=text)))
@@ -188,7 +194,7 @@ class BaseNode(Node):
         """Close the node. It is called at the end, while the node can still publish."""
 
     def destroy_node(self) -> None:
-        """Destroy the node with its actions. rclpy would leave these, and they would keep the middleware alive."""
+        """Destroy the node with its actions. rclpy would not destroy the actions, and the middleware could not end."""
         for action in [one for one in self.waitables if isinstance(one, (ActionClient, ActionServer))]:
             action.destroy()
         super().destroy_node()
@@ -255,7 +261,7 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):
         return TransitionCallbackReturn.SUCCESS
 
     def _tried(self, what: str, act: Callable[[], str | None], meanwhile: str, done: str) -> TransitionCallbackReturn:
-        """Go to the state ``done`` by ``act``. If that returns a problem, the node goes back to the state before."""
+        """Call ``act`` to go to the state ``done``. If it returns a problem, the node keeps the state before."""
         before, self.lifecycle_state = self.lifecycle_state, meanwhile
         try:
             problem = act()
@@ -297,8 +303,8 @@ def run_node(*makes: Callable[[], BaseNode]) -> int:
         for node in nodes:
             executor.add_node(node)
         for timer in [timer for node in nodes for timer in node.timers if not timer.is_canceled()]:
-            timer.reset()  # Nodes of one rate then tick at one moment, and the process wakes up only once.
-        # Objects that exist now stay. A garbage collection of all of them would take longer than a tick.
+            timer.reset()  # Nodes with the same rate then tick together, and the process wakes up only once.
+        # Objects that exist now are excluded from garbage collection. To collect all of them takes longer than a tick.
         gc.collect()
         gc.freeze()
         _take_priority(nodes)
@@ -341,7 +347,7 @@ def _take_priority(nodes: Sequence[BaseNode]) -> None:
     if problem := schedule_thread_first(priority):
         log.info(f"real time: {problem}")
         return
-    import resource  # It exists on Linux, where alone a process can have a real-time priority.
+    import resource  # This module exists on Linux. Only there can a process have a real-time priority.
 
     def give_up(*_: object) -> None:
         schedule_thread_as_others()

@@ -19,7 +19,7 @@ from q2r2_control.ros.reasons import RosReason
 
 _DISCOVERY = 1.0  # Publishers that are discovered within this time are taken to be older than the node [s].
 _GRAPH_PERIOD = 0.04  # Time between two queries of the graph [s].
-_UNKNOWN = "a node not known yet"  # The graph knows an endpoint before it knows its node.
+_UNKNOWN = "a node not known yet"  # The graph lists an endpoint before the name of the endpoint's node.
 HEARD = 0.3  # A node that sent a command within this time is a commander [s].
 
 
@@ -41,7 +41,7 @@ class OnePublisher:
 
     def __init__(self, node: BaseNode, topics: Iterable[str]) -> None:
         self._node, self._topics = node, tuple(topics)
-        self._asked_at = -math.inf  # [s]
+        self._asked_at = -math.inf  # Time of the newest query of the graph [s].
         self._found: Reason | None = None
 
     def conflict(self) -> Reason | None:
@@ -60,10 +60,10 @@ class OnePublisher:
 class CommandWatch:
     """Watches for other publishers of the topics on which a node commands arms.
 
-    While the node commands, :meth:`intruder` finds a publisher that appears, and one that was there before and begins
-    to send. While it does not command, it may listen: :meth:`commander`. It listens by best effort, so that nobody
-    waits for its acknowledgements. The node's own commands come back as well. They are recognised by their bytes,
-    because rclpy does not say who sent a message.
+    While the node commands, :meth:`intruder` finds a new publisher, and an earlier publisher that begins to send. While
+    the node does not command, it may listen, and :meth:`commander` tells whether another node commands. It listens by
+    best effort, so that nobody waits for its acknowledgements. The node also receives its own commands. It recognises
+    them by their bytes, because rclpy does not say who sent a message.
     """
 
     def __init__(self, node: BaseNode, kind: type, publishers: Iterable[WatchedPublisher]) -> None:
@@ -73,7 +73,7 @@ class CommandWatch:
         self._subscriptions: list[Any] = []
         self._born = time.monotonic()
         self._asked_at = -math.inf  # Time of the last query of the graph [s].
-        self._known: int | None = None  # Number of other publishers when the node began to command, if it does.
+        self._known: int | None = None  # Number of other publishers at the last query; None while it does not command.
         self._found: Reason | None = None  # Another commander that was found since this node began to command.
 
     def begin(self) -> None:
@@ -95,7 +95,7 @@ class CommandWatch:
         self._subscriptions = []
 
     def commander(self, within: float = HEARD) -> Reason | None:
-        """Return a reason if another node sent a command ``within`` the last seconds, else None."""
+        """Return a reason if another node has sent a command in the last ``within`` seconds, else None."""
         now = time.monotonic()
         topics = (topic for topic, heard in self._heard.items() if now - heard <= within)
         return next(map(self._reason, topics), None)
@@ -127,7 +127,7 @@ class CommandWatch:
         return self._reason(reason.detail["topic"])
 
     def rest(self) -> None:
-        """Record that this node commands no more. Publishers that are there when it begins again were there before."""
+        """Record that this node has ceased to command. Publishers that exist when it begins again are not new ones."""
         self._known = None
 
     def _reason(self, topic: str) -> Reason:

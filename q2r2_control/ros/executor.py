@@ -4,8 +4,8 @@ Messages and ticks bypass rclpy's wait set. rclpy runs everything else, such as 
 arms moving, this needs 1.1 cores for 167 joint commands per second. With ``SingleThreadedExecutor`` it was 1.7 cores
 for 53. The ``EventsExecutor`` of rclpy 7.1 fails with a ``SystemError`` if a callback gets the times of a message.
 
-rclpy makes a wait set for each look, which takes a millisecond while other programs occupy the caches. A permanent wait
-set tells within 0.05 ms whether there is anything to run.
+rclpy makes a wait set each time that it looks for work. This takes a millisecond while other programs occupy the
+caches. A permanent wait set tells within 0.05 ms whether there is anything to run.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor, T
 from rclpy.impl.implementation_singleton import rclpy_implementation
 
 _SERVED = 0.05  # Period for services, slow timers and silent topics, which are neither ticks nor streams [s].
-_MOST_CALLS = 20  # Greatest number of these calls at once. A coroutine that waits is always ready.
+_MOST_CALLS = 20  # Greatest number of such callbacks in a row. A coroutine that waits is always ready to run.
 _MOST_MESSAGES = 100  # Greatest number of messages of one subscription between two ticks.
 _SIMULATED = 0.001  # Period for looking at a simulated clock [s].
 
@@ -44,10 +44,10 @@ class TickExecutor(SingleThreadedExecutor):
     def __init__(self, *, context: Context | None = None) -> None:
         super().__init__(context=context)
         self._changed = True  # Whether entities were made or destroyed.
-        self._subscriptions: list[Any] = []  # With the number of arguments of each callback.
+        self._subscriptions: list[Any] = []  # Subscriptions, each with the number of arguments of its callback.
         self._streams: list[Any] = []  # Subscriptions with a publisher. To look at others would be a waste of time.
         self._ticks: list[Any] = []  # The timers of ticks.
-        self._served_at = -math.inf  # [s]
+        self._served_at = -math.inf  # Time of the last look at services, slow timers and silent topics [s].
         self._simulated = False  # See _is_simulated.
         self._rest = _RestOfNodes([])
 

@@ -20,22 +20,22 @@ from q2r2_control.ros.base_node import SENT_COMMAND_QOS, STEADY, STREAM_QOS
 from q2r2_control.ros.reasons import RosReason
 from q2r2_control.teleop.reasons import HOLD_REQUESTS
 
-_MAX_AGE = 0.1  # Age of the graph's answer at which it is asked again [s].
+_MAX_AGE = 0.1  # If the graph's last answer is older than this, the graph is asked again [s].
 _PERIOD = 2.0  # Time between two queries of the graph, if no other code asks [s].
 _NO_WAIT = Duration(nanoseconds=0)
 # A subscriber may take 5 ms to acknowledge, which is longer than the period of a fast stream. Every _CHECK seconds
 # messages are therefore left out until the last one has been acknowledged, for at most _GAP seconds.
 _CHECK, _GAP = 0.05, 0.015
-_ASKED = 0.02  # Time after which it is asked again whether all was acknowledged [s].
-_LIFESPAN = SENT_COMMAND_QOS.lifespan.nanoseconds * 1e-9  # [s]
-_LATELY = 32  # Number of recent messages. A subscription of the same node keeps fewer.
+_ASKED = 0.02  # Time between two queries whether all messages were acknowledged [s].
+_LIFESPAN = SENT_COMMAND_QOS.lifespan.nanoseconds * 1e-9  # A command that is older than this is not published [s].
+_LATELY = 32  # Number of sent messages that are remembered. The queue of the node's own subscription is shorter.
 _STATE = "/state"
 _LOOK_PERIOD = 0.3  # Time between two queries of the graph for nodes that report [s].
 _DISCOVERY = 2.0  # Time within which every arm that is there has reported. Nodes report twice a second [s].
 _SILENT, _GONE = 2.0, 5.0  # Times without a report, after which a node is silent, and has gone [s].
 _ARM = {"engaged", "ready", "hand"}  # The keys by which the report of an arm's node is recognised.
-# By the number of an endpoint, which is unique. A node that the graph has lost, such as one that was frozen or
-# unreachable for longer than its lease, comes back with the same endpoints. Fast DDS never learns their node again.
+# Names of nodes by the unique number of an endpoint. The graph loses a node that was frozen or unreachable for longer
+# than its lease. The node comes back with the same endpoints, but Fast DDS does not learn its name again.
 _known: dict[bytes, str] = {}
 
 
@@ -57,13 +57,13 @@ class Publishers:
         node.create_timer(_PERIOD, partial(self._ask, *self._names), clock=STEADY)
 
     def of(self, topic: str) -> str:
-        """Return the full names of the nodes that publish on ``topic`` or did last; "" if there were none."""
+        """Return the full names of the nodes that publish on ``topic``, or that did so last; "" if there were none."""
         if time.monotonic() - self._asked_at[topic] > _MAX_AGE:
             self._ask(topic)
         return self._names[topic]
 
     def source(self, topic: str) -> str:
-        """Return the same for the middle of a sentence: " from /node", or "" if there were none."""
+        """Return the same names for the middle of a sentence, such as " from /node"; "" if there were none."""
         return f" from {names}" if (names := self.of(topic)) else ""
 
     def _ask(self, *topics: str) -> None:
@@ -77,9 +77,9 @@ class Publishers:
 def publish_in_time(publisher: Any, message: Any, decided: float) -> bool:
     """Publish a message, unless its lifespan is over; returns whether it was published.
 
-    The middleware counts the lifespan from the publishing. A process that was frozen before would send an old command,
-    which is a jump. Serialisation takes most of the time until the message is sent. :class:`DelayWatch` covers the
-    rest.
+    The middleware counts the lifespan from the moment of publishing. If the process was frozen before that moment, it
+    would send an old command, and the arm would jump. Serialisation takes most of the time until the message is sent.
+    :class:`DelayWatch` covers the rest.
 
     Args:
         publisher: The publisher.
@@ -99,8 +99,8 @@ class WatchedPublisher:
     The graph lists such a subscriber for seconds. Meanwhile the targets move on, and a new subscriber in its place
     would begin with a jump. If nothing of a stream was ever acknowledged, the stream is not judged, because the remains
     of an earlier subscriber do not acknowledge either. Best-effort subscribers never acknowledge, and do not count.
-    Middlewares without acknowledgements, on Zenoh, always affirm, and ``q2r2 ros doctor`` says so. All times are real
-    time, also with a simulated clock.
+    A middleware on Zenoh has no acknowledgements and always reports that all was acknowledged. ``q2r2 ros doctor``
+    warns of that. All times are real time, also with a simulated clock.
     """
 
     def __init__(self, node: Node, kind: type, topic: str, timeout: float) -> None:
@@ -113,11 +113,11 @@ class WatchedPublisher:
         self._streaming = False
         # Time when all messages were last acknowledged; None if they were not yet in this stream [s].
         self._acknowledged: float | None = None
-        self._gap_began = -math.inf  # [s]
+        self._gap_began = -math.inf  # Time since which messages are left out [s].
 
     @property
     def listeners(self) -> int:
-        """Return the number of subscribers of other nodes in the graph. Some of them may have ended."""
+        """Return how many subscriptions of other nodes the ROS graph lists. It may still list nodes that have ended."""
         return int(self._publisher.get_subscription_count()) - self.own_listeners
 
     def is_own(self, data: bytes) -> bool:
@@ -175,7 +175,7 @@ class NodeStates:
     ) -> None:
         """Observe only the nodes in ``namespace``."""
         self._node, self._on_state, self._prefix = node, on_state, f"{namespace.rstrip('/')}/"
-        self._heard: set[str] = set()  # The topics that are heard.
+        self._heard: set[str] = set()  # The topics that have a subscription.
         self.newest: dict[str, tuple[dict[str, Any], float]] = {}  # By node, the state and the time of receipt [s].
 
     def look(self) -> None:
@@ -197,11 +197,11 @@ class NodeStates:
 
 
 class HandListeners:
-    """The nodes that report on ``~/state`` that they follow one of some hands."""
+    """The nodes of arms that follow one of the given hands, as the nodes report on ``~/state``."""
 
     def __init__(self, node: Node, hands: Sequence[str]) -> None:
         self._states, self._hands = NodeStates(node, namespace=node.get_namespace()), hands
-        self._began = self._asked_at = 0.0  # [s]
+        self._began = self._asked_at = 0.0  # Times of the first and of the last query of the graph [s].
 
     def look(self) -> None:
         now = time.monotonic()
@@ -226,7 +226,7 @@ class HandListeners:
         return all(engaged) if engaged else None
 
     def asked_to_hold(self) -> bool:
-        """Return whether the last event of an arm is a request for a pause, a reset or the way home, or its result."""
+        """Return whether an arm's last event is a request to pause, reset or go home, or the result of a request."""
         return any(state.get("last_event_kind") in HOLD_REQUESTS for _, state, _ in self._arms())
 
     def _arms(self) -> list[tuple[str, dict[str, Any], float]]:

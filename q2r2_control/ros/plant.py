@@ -1,7 +1,7 @@
-"""``--plant ros``: a robot behind ROS 2, which sends joint states and gets setpoints of a loop in this process.
+"""``--plant ros``: a robot behind ROS 2, which sends joint states and gets setpoints from a loop in this process.
 
-The loop replaces ``cartesian_controller``, with the usual topics: ``joint_states``, ``joint_trajectory`` and the
-actions of the grippers. It begins only if nobody else commands the arms.
+The loop replaces ``cartesian_controller``, and uses the same topics: ``joint_states``, ``joint_trajectory`` and the
+actions of the grippers. The loop begins only if nobody else commands the arms.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ from q2r2_control.types import ArmTiming, Array, Command, CommandMode, RobotStat
 from q2r2_control.wording import sentence
 
 _WAIT = 5.0  # Time to wait for joint states and for a receiver of the commands [s].
-_QUIET = 1.0  # Other commanders must be silent for this long first, while they are discovered [s].
+_QUIET = 1.0  # Time for which the plant first listens for other commanders, which must be discovered [s].
 _CURE = "; start the robot, and see q2r2 ros doctor"
-_AWAY = 0.02  # A command farther from the measured joints would be a jump to a new receiver [rad].
+_AWAY = 0.02  # If a command is farther from the measured joints, a new receiver would let the arms jump [rad].
 
 
 class _PlantNode(BaseNode):
@@ -61,7 +61,7 @@ class RosPlant:
         self._fingers, self._kind = Fingers(robot, config), TrajectoryOutput(self._period, robot)
         self._openings = dict.fromkeys(self._fingers.arms, 1.0)  # No opening is measured before a run.
         self._context: Context | None = None
-        self._stopped: Callable[[], bool] = lambda: False  # Whether the wait for the robot is to end.
+        self._stopped: Callable[[], bool] = lambda: False  # Whether the wait for the robot should end.
 
     @classmethod
     def from_config(cls, robot: Robot, config: Config) -> RosPlant:
@@ -72,7 +72,7 @@ class RosPlant:
         self._stopped = stopped
 
     def reset(self, q: Array | None = None) -> None:
-        """Begin to hear the robot.
+        """Begin to listen to the robot, and wait for its joint states and for a receiver of the commands.
 
         Raises:
             PlantError: If the robot is not there, if another node commands it, or if ``q`` is given.
@@ -96,7 +96,7 @@ class RosPlant:
         self._bad: Reason | None = None  # What is wrong with the newest joint states.
         self._fault: Reason | None = None  # Why nothing is commanded.
         self._joints.subscribe(self._take_state, self._take_fingers)
-        # Times of the newest joint states, and of the first receiver after none [s]. The clock is the computer's.
+        # Times of the computer's clock: when the newest joint states came, and when a receiver appeared [s].
         self._seen = self._received_since = -math.inf
         self._last = -math.inf  # Time of the last tick [s].
         self._command: Command | None = None  # The newest command.
@@ -119,7 +119,7 @@ class RosPlant:
             return self._bad or Reason.of(SupervisionReason.NO_STATES_YET, source=_CURE)
         if not self._publisher.listeners:
             return Reason.of(RosReason.NO_SUBSCRIBER, topic=self._publisher.topic_name)
-        if self._seen <= self._received_since:  # The newest state is that of the robot before this one.
+        if self._seen <= self._received_since:  # The newest state is older than the robot that receives now.
             return Reason.of(SupervisionReason.NO_STATES_YET, source=_CURE)
         return self._bad
 

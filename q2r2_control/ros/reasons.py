@@ -8,9 +8,8 @@ from q2r2_control.events import ReasonKind
 class RosReason(ReasonKind):
     """What a node misses or refuses, and what it hears of other nodes."""
 
-    # A policy and its actions.
+    # Why arms may not be engaged or commanded, or have to pause.
     NODE_STALLED = "node_stalled", "this node stood still for {duration:.2f} s"
-    # Obstacles that ROS nodes find. Those of the first group have a cause.
     NO_TOOL_POSE = "no_tool_pose", "the tool's pose is not known: {cause}"
     CONTROLLER_REFUSES = "controller_refuses", "{cause}"
     CONTROLLER_STOPPED = "controller_stopped", "{controller} is stopped: {cause}; call {controller}/reset"
@@ -67,7 +66,7 @@ class RosReason(ReasonKind):
     MESSAGE_UNREADABLE = "message_unreadable", "{topic}: what cannot be read is dropped, such as {text}"
     BAD_JOINT_STATES = "bad_joint_states", "{text}"
     NO_EXTERNAL_TORQUES = "no_external_torques", "no external torques on {topic}"
-    # Cabinets of KUKA's.
+    # A stop, and why a target is not used.
     STOP_SERVICE = "stop_service", "the stop service was called"
     TARGET_LATE = "target_late", "{late:.2f} s late; its sender or this node stood still"
     TARGET_FRAME = "target_frame", "frame_id {frame!r}; allowed: {allowed!r}"

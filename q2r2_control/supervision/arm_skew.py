@@ -1,7 +1,7 @@
-"""Watch whether all arms are at the same time of their common reference, and brake all of them where one is not.
+"""Compare the lags with which the arms follow their common reference, and brake all arms if the lags differ too much.
 
-Each arm follows the reference with a lag of its own. The certificate (control/safety/arm_skew.py) keeps two arms apart
-as long as their lags differ by no more than its window. This watch keeps the difference within the window, for every
+Each arm follows the reference with its own lag [s]. The certificate (control/safety/arm_skew.py) keeps two arms apart
+as long as their lags differ by no more than its window. This watch keeps the difference within the window, in every
 loop. If one arm falls behind or stops sending, the reference follows its certified stop until the arms are together
 again. After 0.1 s of waiting the arms stop, and are activated again from rest.
 """
@@ -22,20 +22,21 @@ _MAX_WAIT_S = 0.1
 def allowed_skew(timings: Mapping[str, ArmTiming]) -> float:
     """Return the greatest permitted difference between the lags of two arms [s].
 
-    It has room for one lost message and one late message.
+    The arms' lags may differ by this much if one message is lost and another message is late.
     """
     return _TIMING_NOISE_S + max((2.0 * timing.period + timing.noise for timing in timings.values()), default=0.0)
 
 
 def skew_window(timings: Mapping[str, ArmTiming], lead: float) -> float:
-    """Return the greatest difference between the arms' lags until all of them brake [s]; 0 for a single arm.
+    """Return the greatest difference that the arms' lags can reach before all arms brake [s]; 0 for a single arm.
 
-    The controller gets it by :meth:`CartesianController.allow_skew`. It is the sum of three parts: the permitted
+    The value is passed to :meth:`CartesianController.allow_skew`. It is the sum of three times: the permitted
     difference; two periods, for a lost command and for the message that shows the loss; and ``lead``.
 
     Args:
         timings: The period and the noise of each arm's messages.
-        lead: Time from the posture that the arms are sent to until the end of the reference's newest step [s].
+        lead: Longest time along the reference from the posture to which an arm has been sent to the end of the newest
+            step [s].
     """
     if len(timings) < 2:
         return 0.0
@@ -59,7 +60,7 @@ class SkewWatch:
             self._last_together_s = now
 
     def _one_is_silent(self, timings: Mapping[str, ArmTiming]) -> bool:
-        """Return whether one arm has sent nothing for two periods longer than another arm.
+        """Return whether one arm has been silent for longer than another arm, by more than two of its periods.
 
         If all arms are silent for the same time, this loop was late, and no arm is to blame.
         """

@@ -1,12 +1,12 @@
 """Limit how far grippers open and close, and find out which of them hold an object.
 
 The certificate treats the fingers of an arm as the volume that they sweep between two openings. This interval of
-openings must contain the place of the gripper and the place to which it is sent. It covers the openings that were
-measured and commanded a moment ago, with a tolerance. A gripper is sent only to openings in the interval that the
+openings must contain the gripper's present opening and its commanded opening. Therefore it covers all openings that
+were measured or commanded recently, with a tolerance. A gripper is sent only to openings in the interval that the
 controller has accepted. This holds for closing as well, because fingers that turn reach farther forward as they close.
 
-If the wanted opening lies outside, the gripper goes there in steps. A step is halved if the certificate fails, and
-doubled if it holds. A smaller interval counts as soon as it is certified. Until then the wider one counts.
+If the wanted opening lies outside the interval, the gripper goes there in steps. A step is halved if the certificate
+fails, and doubled if it holds. A smaller interval counts as soon as it is certified. Until then the wider one counts.
 """
 
 from __future__ import annotations
@@ -17,12 +17,13 @@ from collections.abc import Mapping
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.types import Interval
 
-# Error of a measured opening and overshoot of a finger, as a distance of one finger [m]. The accepted interval always
-# has half of it as a margin, so that a noisy measurement does not ask for another interval at every tick.
+# Tolerance for the error of a measured opening and for the overshoot of a finger, as a distance that one finger moves
+# [m]. The accepted interval always keeps half of this tolerance as a margin. A noisy measurement therefore does not
+# need another interval at every tick.
 TOLERANCE = 0.001
 _FINEST = 0.0005  # Least step of a finger, and least change for which its bodies are computed again [m].
 REMEMBERED = 0.05  # An opening that was measured or commanded counts for at least this time [s].
-_PATIENCE = 0.005  # Time after which a gripper that was refused its finest step asks again [s].
+_PATIENCE = 0.005  # If even the finest step is refused, the gripper asks again after this time [s].
 _BELIEVABLE = (-0.2, 1.2)  # Plausible measured openings. A finger may go a little beyond its calibrated ends.
 
 
@@ -38,7 +39,8 @@ class GripperLimiter:
         self._controller = controller
         ways = {name: arm.finger_way for name, arm in controller.robot.arms.items()}
         self._grippers = {name: _Gripper(way, remembered) for name, way in ways.items() if way > 0.0}
-        self.held: dict[str, tuple[str, str]] = {}  # For each gripper that is held up, the pair of bodies that does so.
+        # For each gripper that may not move on, the names of the two bodies that would come too close.
+        self.held: dict[str, tuple[str, str]] = {}
         self.changed = False  # Whether the controller's openings changed in the last tick.
 
     def limit(self, wanted: Mapping[str, float], measured: Mapping[str, float], now: float) -> dict[str, float]:
@@ -46,7 +48,7 @@ class GripperLimiter:
 
         Args:
             wanted: The wanted openings by arm.
-            measured: The measured openings by arm. Without a plausible one, the last permitted opening stays.
+            measured: The measured openings by arm. Without a plausible measurement, the last permitted opening stays.
             now: The time [s].
         """
         self.changed = False
@@ -75,7 +77,8 @@ class GripperLimiter:
         if now < gripper.asks_at:
             return
         goal, accepted, refused = gripper.goal(), self._controller.openings[arm], None
-        # The goal is asked for alone, so that a gripper that was forced wider than can be certified may still close.
+        # The request adds only the goal to the accepted interval, and not the measured opening. A gripper that was
+        # forced wider than can be certified may therefore still close.
         free = _holds(accepted, gripper.around(goal))
         if not free:
             refused = self._controller.set_opening(arm, *_hull(accepted, gripper.around(goal)))
@@ -83,8 +86,8 @@ class GripperLimiter:
             refused = self._controller.set_opening(arm, *_hull(gripper.needed(), gripper.around(goal)))
         gripper.answered(goal, free, refused is None, now)
         self.changed |= self._controller.openings[arm] != accepted
-        # A smaller interval that cannot be certified yet holds no gripper up, if the accepted one has all that is
-        # needed.
+        # If the accepted interval contains all openings that are needed, the gripper does not count as held up,
+        # although a smaller interval cannot be certified yet.
         if refused is None or (free and _holds(accepted, gripper.needed(0.5))):
             self.held.pop(arm, None)
         else:
@@ -95,27 +98,31 @@ class _Gripper:
     """The recent openings of one gripper, and the next step that it may ask for."""
 
     def __init__(self, way: float, remembered: float) -> None:
-        """``way`` is the way of a finger from closed to open [m]; ``remembered`` as of :class:`GripperLimiter` [s]."""
+        """``way``: distance of a finger from closed to open [m]. ``remembered``: see :class:`GripperLimiter`."""
         self._remembered = remembered
         self._tolerance, self._finest = TOLERANCE / way, min(_FINEST / way, 1.0)
         self.granted: float | None = None  # The opening that is commanded.
         self.asks_at = -math.inf
         self._wanted = math.nan
-        self._step: float  # The farthest that the next opening may be from the commanded one. A new wish begins with 1.
-        self._seen: list[Interval] = []  # The openings in this time span, and in the one before.
+        # Largest difference between the next opening and the commanded one. It is 1 when a new opening is wanted.
+        self._step: float
+        self._seen: list[Interval] = []  # The openings in the present time span, and in the time span before.
         self._since = -math.inf
 
     def rests(self, wanted: float, measured: float, now: float) -> bool:
-        """Return whether this tick's openings are not new, as in most ticks."""
+        """Return whether a tick brings nothing new, as most ticks do.
+
+        The wanted opening is then commanded already, and the measured opening lies in the interval seen so far.
+        """
         if not wanted == self._wanted == self.granted or now - self._since >= self._remembered:
             return False
         least, greatest = self._seen[0]
         return least <= measured <= greatest
 
     def note(self, wanted: float, measured: float, now: float) -> bool:
-        """Take the openings of a tick; returns whether a time span has ended, so that a smaller interval may do."""
+        """Take the openings of a tick. Return whether a time span has ended; a smaller interval may then be enough."""
         if self.granted is None:
-            self.granted = wanted  # The certificate still counts the whole way of the fingers.
+            self.granted = wanted  # The certificate still assumes fingers anywhere between closed and open.
         if wanted != self._wanted:
             self._wanted, self._step, self.asks_at = wanted, 1.0, now
         spread = min(measured, self.granted), max(measured, self.granted)
@@ -127,12 +134,12 @@ class _Gripper:
         return rolled and len(self._seen) > 1
 
     def needed(self, share: float = 1.0) -> Interval:
-        """Return the openings at which the gripper may be, widened by a share of the tolerance."""
+        """Return the interval of openings at which the gripper may be, widened by a share of the tolerance."""
         least, greatest = self._seen[0] if len(self._seen) == 1 else _hull(*self._seen)
         return _hull(self.around(least, share), self.around(greatest, share))
 
     def around(self, opening: float, share: float = 1.0) -> Interval:
-        """Return an opening widened by a share of the tolerance, within the stroke."""
+        """Return an interval around an opening, with a share of the tolerance on each side, within 0 .. 1."""
         tolerance = share * self._tolerance
         return min(max(opening - tolerance, 0.0), 1.0), min(max(opening + tolerance, 0.0), 1.0)
 
@@ -174,10 +181,10 @@ def _hull(first: Interval, second: Interval) -> Interval:
     return min(first[0], second[0]), max(first[1], second[1])
 
 
-# A finger holds an object if it stays farther open than commanded by the first number, and has lost it below the second
-# [m or rad].
+# A finger holds an object if it stays farther open than commanded by more than the first number [m or rad]. If the
+# difference falls to the second number, the object has slipped out.
 _SQUEEZES, _SLIPPED = 0.002, 0.001
-_STILL, STALL = 0.0005, 0.2  # A finger that moves by less than this in that time stands still [m or rad], [s].
+_STILL, STALL = 0.0005, 0.2  # A finger stands still if it moves by at most _STILL [m or rad] in the time STALL [s].
 _CLOSED = 0.5  # A gripper without a measured opening counts as closed if it is commanded below this opening.
 
 
@@ -185,7 +192,7 @@ class GraspWatch:
     """Tells the controller which grippers hold their object, for grippers that have an object in the cell's YAML."""
 
     def __init__(self, controller: CartesianController, stall: float = STALL) -> None:
-        """``stall`` is the time after which a gripper that should close and stands still holds something [s]."""
+        """``stall``: a gripper that is asked to close and stands still for this time holds something [s]."""
         self._controller = controller
         arms = controller.robot.arms
         self._grips = {arm: Grip(arms[arm].stroke, stall) for arm in controller.robot.objects.by_arm}
@@ -220,7 +227,7 @@ class Grip:
     def __init__(self, stroke: float, stall: float = STALL) -> None:
         self._stroke, self._stall = stroke, stall
         self.holds = False
-        # The opening at which the finger stands still, and the time since when it does [s].
+        # The finger's opening when it last moved [m or rad], and that time [s].
         self._seen, self._since = math.nan, -math.inf
 
     def look(self, wanted: float, measured: float | None, now: float) -> bool:

@@ -1,4 +1,4 @@
-"""Move all arms home instead of following targets, and check before a run whether it may begin at home."""
+"""Move all arms to their home posture, or to another posture, instead of following targets."""
 
 from __future__ import annotations
 
@@ -18,55 +18,66 @@ from q2r2_control.supervision.target_stream import apart
 from q2r2_control.types import Array, Reference
 
 _SPEED = 0.3  # Speed of the fastest joint [rad/s].
-_SLOWED, _WAITED = 0.09, 0.12  # Lags of the arms at which the setpoint is slowed, and at which it waits [rad].
+# If an arm lags by more than the first angle, the setpoint moves more slowly. If it lags by the second one, the
+# setpoint waits [rad].
+_SLOWED, _WAITED = 0.09, 0.12
 _POINT_REACHED, _GOAL_REACHED = 0.1, 0.003  # Distances at which a way point, and the goal, count as reached [rad].
-_LONGEST_WAIT, _PROGRESS = 3.0, 1e-3  # Homing ends after this time with less progress than this [s], [rad].
-_AT_REST = 0.02  # [rad/s]
-_ROOM = 0.003  # Room on a planned way beyond the distance that a pair keeps [m].
-_STOP = 0.05  # Time in which joints of that speed stop, if their acceleration limit is 6 rad/s^2 or more [s].
-_SAMPLE = 0.05  # Distance between two postures at which a way is checked [rad].
+# Homing ends if the arms come no nearer than by _PROGRESS [rad] within _LONGEST_WAIT [s].
+_LONGEST_WAIT, _PROGRESS = 3.0, 1e-3
+_AT_REST = 0.02  # The arms are at rest if no joint is faster than this [rad/s].
+_ROOM = 0.003  # On a planned path, each pair is farther apart than its required distance by at least this [m].
+_STOP = 0.05  # Joints at _SPEED stop within this time if their acceleration limit is at least 6 rad/s^2 [s].
+_SAMPLE = 0.05  # A path is checked at postures that are this far from each other [rad].
 _SAMPLES_A_TICK = 2
 _RANDOM_WAYS = 300
 _SPREAD = 0.6  # Standard deviation of random way points [rad].
-_INSIDE = 0.02  # Distance of way points from joint limits [rad].
+_INSIDE = 0.02  # Least distance of random way points from joint limits [rad].
 
 
 class HomingStep(NamedTuple):
     """The setpoints of one tick on the way home."""
 
     joints: Array | None  # Joint setpoint of arms without a target (nv,) [rad]; None lets them stay where they rest.
-    targets: dict[str, pin.SE3 | None]  # Targets of the tools. An arm that is missing has no target.
+    targets: dict[str, pin.SE3 | None]  # Targets of the tools by arm. An arm that is missing has no target.
 
 
 class WayHome(Protocol):
-    """Moves all arms home, from the posture at which the object was made."""
+    """Moves all arms home, from the posture that they had when this instance was created."""
 
     @property
     def outcome(self) -> ReasonKind | None:
         """The result of the way home; None while it goes on."""
 
     def step(self, q: Array, v: Array, dt: float) -> HomingStep:
-        """Return the setpoints for the time ``dt`` [s] from now, with the reference at ``q``, ``v`` (nv,)."""
+        """Return the setpoints for the next ``dt`` [s].
+
+        Args:
+            q: Joint positions of the reference (nv,) [rad].
+            v: Joint velocities of the reference (nv,) [rad/s].
+            dt: Duration of the tick [s].
+        """
 
 
 class JointHoming:
-    """Moves all joints to a goal, from where they come to rest. It looks for a free way around obstacles."""
+    """Moves all joints to a goal. It waits until they rest, and then looks for a path without collisions."""
 
     def __init__(self, robot: Robot, look: Callable[[], PairsAhead], goal: Array, straight: bool = False) -> None:
-        """Make a way to ``goal`` (nv,) [rad].
+        """Prepare the motion to ``goal`` (nv,) [rad].
 
         Args:
             robot: The robot.
             look: See :meth:`CartesianController.pairs_ahead`.
             goal: The posture at the end (nv,) [rad].
-            straight: Whether only the straight way may be taken.
+            straight: True if only the straight path in joint space may be taken.
         """
         self._robot, self._look, self._goal, self._straight = robot, look, goal, straight
         self._search: Iterator[list[Array] | None] | None = None
-        self._points: list[Array] | None = None  # Way points that are still to be reached. The goal is the last one.
+        # Way points that are still to be reached. The goal is the last one. None until a path has been found.
+        self._points: list[Array] | None = None
         self._at = self._leg = self._goal  # The setpoint, and the beginning of the leg to the next way point.
         self._share = 0.0  # Share of the leg that the setpoint has covered.
-        self._least_left = np.inf  # Least distance from the next way point so far, of the farthest joint [rad].
+        # The smallest value so far of the distance between the next way point and the farthest joint [rad].
+        self._least_left = np.inf
         self._waited = 0.0  # Time without progress [s].
         self.outcome: ReasonKind | None = None  # How the way home ended.
 
@@ -76,7 +87,7 @@ class JointHoming:
             if float(np.abs(v).max()) > _AT_REST:
                 return HomingStep(None, {})
             self._distances, kept = self._look()
-            # A pair that has less room at the beginning of the way needs no more room than that.
+            # A pair that is closer than this at the start of the path may stay as close as it is there.
             self._needed = np.minimum(kept + _ROOM, self._distances(q) - 1e-4)
             self._at = self._leg = q.copy()
             self._search = self._ways(self._at)
@@ -110,11 +121,11 @@ class JointHoming:
             self.outcome = CommonReason.HOMING_HELD_UP
 
     def _ways(self, start: Array) -> Iterator[list[Array] | None]:
-        """Check one way after the other.
+        """Check one candidate path after the other.
 
         Yields:
-            None after each posture that was checked, so that the work can be spread over ticks; then the way points of
-            the first free way, or an empty list if no way is free.
+            None for each posture that is checked, so that the work can be spread over ticks. At the end, the way points
+            of the first free path, or an empty list if no path is free.
         """
         for between in self._candidates(start):
             points = [start, *between, self._goal]
@@ -128,7 +139,7 @@ class JointHoming:
         yield []
 
     def _candidates(self, start: Array) -> Iterator[tuple[Array, ...]]:
-        """Yield the way points between ``start`` and the goal of one way after the other."""
+        """Yield candidate paths, each as the tuple of its way points between ``start`` and the goal."""
         robot, goal = self._robot, self._goal
         yield ()
         if self._straight:
@@ -137,7 +148,7 @@ class JointHoming:
             first = start.copy()
             first[arm.joints] = goal[arm.joints]
             yield (first,)
-        random = np.random.default_rng(0)  # The same start always leads to the same way.
+        random = np.random.default_rng(0)  # The fixed seed gives the same path for the same start.
         for number in range(_RANDOM_WAYS):
             middle = goal if number % 2 else start + random.uniform(0.2, 0.8) * (goal - start)
             point = middle + random.normal(0.0, _SPREAD, len(goal))
@@ -145,23 +156,23 @@ class JointHoming:
 
 
 def _samples(points: list[Array]) -> Iterator[Array]:
-    """Yield postures along a way. The end of each leg comes first, since a bad way point makes the leg useless."""
+    """Yield postures along a path. The end of each leg comes first: if it is not free, the leg is useless."""
     for a, b in pairwise(points):
         count = max(int(np.abs(b - a).max() / _SAMPLE), 1)
         for share in (1.0, *(i / count for i in range(1, count))):
             yield a + share * (b - a)
 
 
-_LINEAR_SPEED, _ANGULAR_SPEED = 0.1, 0.3  # [m/s], [rad/s]
-_ARRIVED, _TURNED = 0.003, 0.01  # [m], [rad]
-_PATIENCE = 5.0  # Time for which the tools may take longer than their targets [s].
+_LINEAR_SPEED, _ANGULAR_SPEED = 0.1, 0.3  # Greatest speeds of the tools' targets [m/s], [rad/s].
+_ARRIVED, _TURNED = 0.003, 0.01  # A tool has arrived if its pose is this near to the home pose [m], [rad].
+_PATIENCE = 5.0  # The tools may arrive later than their targets by this time [s].
 
 
 class ToolHoming:
-    """Moves all tools home at once on straight lines. If the QP holds a tool up, the homing ends there."""
+    """Moves all tools home at the same time, on straight lines. If the QP holds a tool up, homing ends where it is."""
 
     def __init__(self, home: Mapping[str, pin.SE3], tool_pose: Callable[[str], pin.SE3]) -> None:
-        """Make a way to the poses ``home``. ``tool_pose`` returns the pose of an arm's tool in the reference."""
+        """Prepare the motion to the poses ``home``. ``tool_pose`` returns the tool pose of an arm in the reference."""
         self._home, self._tool_pose = dict(home), tool_pose
         self._start = {arm: tool_pose(arm) for arm in home}
         ways = [apart(start, home[arm]) for arm, start in self._start.items()]
@@ -193,7 +204,7 @@ class ToolHoming:
 class Homing:
     """Begins, continues and ends the way home.
 
-    With ``tools_only`` it gives targets to the tools, because another controller moves the joints.
+    With ``tools_only`` it gives targets to the tools and moves no joints itself, because another controller does that.
     """
 
     def __init__(self, robot: Robot, controller: CartesianController, tools_only: bool) -> None:
@@ -207,7 +218,7 @@ class Homing:
         return self._way is not None
 
     def begin(self, goal: Array | None = None) -> None:
-        """Begin the way home, or the straight way of all joints to another posture ``goal`` (nv,) [rad]."""
+        """Begin the way home. If ``goal`` (nv,) [rad] is given, move all joints straight to that posture instead."""
         self.outcome = None
         if goal is None and self._tools_only:
             self._way = ToolHoming(self._home, self._controller.tool_pose)
@@ -216,7 +227,7 @@ class Homing:
             self._way = JointHoming(self._robot, partial(self._controller.pairs_ahead, _STOP), to, straight)
 
     def targets(self, last: Reference | None, dt: float) -> dict[str, pin.SE3 | None]:
-        """Return the target of each tool for the time ``dt`` [s] from now; None for arms whose joints are moved.
+        """Return the target of each tool for the next ``dt`` [s]; None for an arm that goes home by joint setpoints.
 
         Args:
             last: The last reference.
@@ -229,7 +240,11 @@ class Homing:
         return dict.fromkeys(self._robot.arms) | step.targets
 
     def check(self, reference: Reference) -> Reason | None:
-        """End the way home if it has arrived or cannot go on at ``reference``; returns the outcome, or None."""
+        """End the way home if the arms have arrived or cannot go on. Return the outcome; None if it goes on.
+
+        Args:
+            reference: The newest reference. If the arms are held up, the outcome names its tightest pair.
+        """
         kind = None if self._way is None else self._way.outcome
         if kind is None:
             return None
@@ -245,7 +260,7 @@ class Homing:
         self._way = None
 
     def hold(self) -> Reason | None:
-        """End the way home, with ``outcome`` as the record. Returns None, because this is always possible."""
+        """Interrupt the way home, and record this in ``outcome``. Always returns None, because it cannot be refused."""
         if self.active:
             self.end()
             self.outcome = Reason(CommonReason.HOMING_INTERRUPTED)

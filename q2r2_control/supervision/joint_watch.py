@@ -21,8 +21,9 @@ from q2r2_control.supervision.reasons import SupervisionReason
 from q2r2_control.supervision.target_stream import StreamSettings, apart
 from q2r2_control.types import Array, Reference, RobotState
 
-# Tolerances of the test for jumps: for noise of the encoders, and for stamps that a busy machine delays.
-_JUMP_ALLOWANCE, _JUMP_TIME = 0.05, 0.02  # [rad], [s]
+# Tolerances of the test for jumps: an angle for the noise of the encoders [rad], and a time for stamps that a busy
+# machine delays [s].
+_JUMP_ALLOWANCE, _JUMP_TIME = 0.05, 0.02
 # A joint that moves by less than this during the settle time is at rest [rad].
 _REST = 0.01
 
@@ -36,7 +37,7 @@ class WatchSettings:
     unusable_time: float
     settle_time: float  # Time for which the states must be good and at rest before the arms are activated [s].
     deviation: float  # Greatest distance of a measured joint from the reference [rad].
-    deviation_time: float  # Time for which a joint may be farther away than that [s].
+    deviation_time: float  # Time for which a joint may be farther away than ``deviation`` [s].
 
 
 def watch_settings(settings: SupervisionSettings, yields: bool) -> WatchSettings:
@@ -56,7 +57,10 @@ def watch_settings(settings: SupervisionSettings, yields: bool) -> WatchSettings
 
 
 class JointWatch:
-    """Judges every measured state. Its stamp is the time of receipt of its oldest part [s]. Arrays are (nv,)."""
+    """Judges every measured state. A state's stamp is the time at which its oldest part was received [s].
+
+    Arrays are (nv,).
+    """
 
     def __init__(
         self,
@@ -75,7 +79,7 @@ class JointWatch:
         self._near_at: float | None = None
 
     def observe(self, state: RobotState | Reason, now: float, passed: float = 0.0) -> None:
-        """Judge a measured state, or record the reason why there is none.
+        """Judge a measured state, or record the reason why there is no state.
 
         Args:
             state: The state, or the reason why the plant has none.
@@ -95,8 +99,8 @@ class JointWatch:
         if last is None or self._still_since == math.inf:
             self._still_since, self._still_at = now, q
             return
-        # No joint is farther away than the Euclidean distance of all joints. A comparison with NaN is false, so that
-        # NaN counts as far.
+        # No joint has moved farther than the Euclidean distance between the two postures. A comparison with NaN is
+        # false, so NaN counts as far.
         far = not math.dist(q, last_q) < _JUMP_ALLOWANCE
         if far and (fault := self._jump(q, last_q, max(now - last.stamp, passed, 0.0))):
             self._fail(fault)
@@ -111,7 +115,7 @@ class JointWatch:
 
     @property
     def believed(self) -> bool:
-        """Whether the newest state is good enough for the arms to brake by it, even during a fault."""
+        """Whether the arms may brake from the newest measured state, even during a fault."""
         return self.fault is None or self._lost
 
     def settled(self, now: float) -> bool:
@@ -182,7 +186,7 @@ class JointWatch:
 
     def _fail(self, fault: Reason) -> None:
         self._still_since, self._lost = math.inf, False
-        # The first fault is the most helpful one. Before the first good state it is the newest one.
+        # The first fault tells most about the cause. Before the first good state, the newest fault does.
         if self.fault is None or self.state is None:
             self.fault = fault
 
@@ -193,7 +197,7 @@ def _all_within(q: list[float], other: list[float], limit: float) -> bool:
     return distance < limit or (math.isfinite(distance) and max(map(abs, map(sub, q, other))) <= limit)
 
 
-_SLOW = 0.01  # An arm whose joints are slower than this holds the pose that its tool has then [rad/s].
+_SLOW = 0.01  # If an arm has no target and its joints are slower than this, it holds its tool's present pose [rad/s].
 # How fast the elbows of the reference follow the measured elbows [1/s], [rad/s].
 _FOLLOW = {"posture_gain": 10.0, "posture_speed": 1.5}
 
@@ -202,14 +206,15 @@ _FOLLOW = {"posture_gain": 10.0, "posture_speed": 1.5}
 class ExternalSettings:
     """The limits for arms that another controller moves; they may be changed at run time."""
 
-    tolerance: float = 0.01  # By how much measured pairs may be closer than the reference keeps them [m].
+    tolerance: float = 0.01  # Two measured bodies may be closer than their required distance by this much [m].
 
 
 def settings_for_external_arms(config: Config) -> Config:
     """Return the cell's configuration for arms that another controller moves.
 
-    The elbows of the reference are free to follow the measured ones. The greatest deviation is the one for arms that
-    lag, since the lag is the other controller's. Arms that come too close are found by their measured distances.
+    The elbows of the reference are free to follow the measured elbows. A joint may deviate from the reference by
+    ``max_deviation_external``, because the other controller lags. Arms that come too close are found by their measured
+    distances.
     """
     control = config.control.model_copy(update=_FOLLOW)
     stiff = config.admittance.model_copy(update={"enabled": False})  # The other controller is the compliant one.
@@ -221,10 +226,10 @@ def settings_for_external_arms(config: Config) -> Config:
 class ExternalArms:
     """Targets and checks for arms that another controller moves along our reference.
 
-    The reference keeps the real arms apart only if they are where it is. The other controller follows the tools and
-    chooses the elbows itself. For that reason the elbows of the reference follow the measured ones, and an arm without
-    a target holds its tool's pose instead of its joint positions. The measured distances are checked as well; they may
-    be smaller than the reference's by a tolerance for the lag of an arm.
+    The reference keeps the real arms apart only if they are at its posture. The other controller follows the tool poses
+    and chooses the positions of the elbows itself. For that reason the elbows of the reference follow the measured
+    elbows, and an arm without a target holds its tool's pose instead of its joint positions. The measured distances are
+    checked as well. They may be smaller than the required distances by a tolerance, because the arms lag.
     """
 
     def __init__(
@@ -246,9 +251,9 @@ class ExternalArms:
         self._near_at.clear()
 
     def targets(self, wanted: dict[str, pin.SE3 | None], last: Reference | None) -> dict[str, pin.SE3 | None]:
-        """Return the ``wanted`` targets, with the tool's own pose for each arm that has no target.
+        """Return the ``wanted`` targets, by arm.
 
-        An arm gets its own pose as soon as it is at rest in the ``last`` reference.
+        If an arm has no target and rests in the ``last`` reference, its target is the tool's pose there.
         """
         for arm, pose in wanted.items():
             if pose is not None:
@@ -258,10 +263,16 @@ class ExternalArms:
         return {arm: self._held.get(arm, pose) for arm, pose in wanted.items()}
 
     def left_behind(self, state: RobotState, holding: Iterable[str], now: float) -> Reason | None:
-        """Return a reason if the tool of an arm without a target is away from its reference for too long, else None.
+        """Return a reason if an arm without a target has been too far from the reference for too long, else None.
 
-        The other controller does not move that arm to the reference. The operator could not engage it either, because
-        the operator's targets begin at the measured tool, and have to begin at the reference's tool.
+        The measured tool pose is compared with the reference's tool pose. Such an arm is not moved to the reference by
+        the other controller. The operator could not engage it either: an operator's targets begin at the measured tool,
+        and they would have to begin at the reference's tool.
+
+        Args:
+            state: The measured state.
+            holding: The arms without a target.
+            now: The time [s].
         """
         holding = set(holding)
         for arm in self._robot.arms:

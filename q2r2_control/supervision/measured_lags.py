@@ -11,16 +11,17 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
 _MAX_LAG_S = 0.4
-# Past postures of the reference whose distance from the measured arm differs by less than this fit equally well [rad].
+# Two past postures of the reference fit a measured arm equally well if their distances from it differ by at most this
+# [rad].
 _SAME_FIT = 0.005
 
 
 class MeasuredLags:
     """Remembers the reference, and finds the time at which the reference was where an arm is measured now.
 
-    Several times fit an arm that passes the same place twice, and an arm whose reference hardly moves. In that case
-    the times of the two arms that are nearest to each other are chosen. The arms then count as apart in time only if
-    the measured postures allow no other explanation.
+    If an arm passes the same posture twice, or if its reference hardly moves, several lags are possible. In that case
+    the possible lags of the arms that are nearest to each other are chosen. The lags then differ only if the measured
+    postures allow no other explanation.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -48,12 +49,12 @@ class MeasuredLags:
             return dict.fromkeys(measured, 0.0)
         times, places = np.array([t for t, _ in self._past]), np.array([place for _, place in self._past])
         found = {arm: self._possible(arm, t, times, places, q) for arm, t in measured.items()}
-        # The least lag that fits the arm that is farthest behind.
+        # The least possible lag of the arm that is farthest behind.
         reached = max(float(lags.min()) for lags in found.values())
         return {arm: float(lags[np.abs(lags - reached).argmin()]) for arm, lags in found.items()}
 
     def _possible(self, arm: str, measured: float, times: Array, places: Array, q: Array) -> Array:
-        """Return all lags [s] that explain where an arm was at the time ``measured`` [s]."""
+        """Return all lags [s] that explain the posture of an arm that was measured at the time ``measured`` [s]."""
         joints = self._joints[arm]
         off = np.sqrt(np.square(places[:, joints] - q[joints]).sum(axis=1))
         return np.maximum(measured - times[off <= off.min() + _SAME_FIT], 0.0)

@@ -12,13 +12,13 @@ from q2r2_control.robot.stop_torque import joints_that_cannot_hold
 from q2r2_control.robot.unchecked import unchecked_faults
 from q2r2_control.robot.urdf_forms import LARGEST_ANGLE, LARGEST_SPEED
 
-_NARROWEST = 1e-3  # Least range of a joint in which a home can be written down [rad or m].
+_NARROWEST = 1e-3  # The margins must leave a joint at least this range, so that a home position fits in [rad or m].
 
 
 def _in_degrees(robot: Robot) -> list[str]:
-    """Return one line if limits of joints are those of an arm in degrees."""
+    """Return one line if joint limits seem to be in degrees instead of radians; otherwise an empty list."""
     farthest = np.maximum(np.abs(robot.position_lower), np.abs(robot.position_upper))
-    # A joint whose position and speed are both beyond the usual limits is given in degrees.
+    # If the position limit and the speed limit of a joint are both too large, they are in degrees.
     turned = (farthest > LARGEST_ANGLE) & (farthest <= np.rad2deg(LARGEST_ANGLE))
     found = np.flatnonzero(turned & (robot.velocity_limit > LARGEST_SPEED)).tolist()
     if not found:
@@ -36,14 +36,16 @@ def preflight_faults(
 ) -> tuple[str, ...]:
     """Return one line for each reason why the robot should not start at home; empty if the cell may run.
 
-    Every link with a mass needs a shape, unless the cell names it. The home posture is checked against position limits
-    with their margin, torque limits under gravity, and the distance that every monitored pair keeps.
+    Every link with a mass needs a collision shape, unless the cell lists the link as unchecked. The home posture is
+    checked against position limits with their margin, torque limits under gravity, and the required distance of every
+    monitored pair.
 
     Args:
         robot: The robot.
         settings: The controller's settings.
-        controller: The controller, which needs a certified stop at home. It is left reset there. None if no controller
-            is about to move the arms; then the distances suffice, because arms at rest stop at once.
+        controller: The controller, which needs a certified stop at home. Afterwards the controller is reset to home.
+            None if no controller is going to move the arms. Then no certificate is needed, because arms at rest need no
+            time to stop.
     """
     lower, upper = robot.position_lower + settings.position_margin, robot.position_upper - settings.position_margin
     change = "to change: control.position_margin, or a fixed joint in the model"

@@ -6,9 +6,9 @@ from q2r2_control.events import CommonReason, ReasonKind
 
 
 class SupervisionReason(ReasonKind):
-    """What supervision finds, what stops the arms, and which targets it does not follow."""
+    """What supervision finds, why it stops the arms, and why it does not follow a target."""
 
-    # Obstacles that ROS nodes find. Those of the first group have a cause.
+    # A finding of supervision and of the ROS nodes.
     CONTROLLER_STANDS = (
         "controller_stands",
         "the {arm} arm's controller{takers} stands still: the arm is measured, and does not go the {way:.3f} {unit} "
@@ -43,7 +43,7 @@ class SupervisionReason(ReasonKind):
         "left_behind",
         "{arm}: the tool is {distance:.3f} m and {angle:.2f} rad from where it was led; begins anew where it is",
     )
-    # Cabinets of KUKA's.
+    # Why arms start over, what happens to them, and why a target is not followed.
     ARMS_APART = "arms_apart", "{arm}: {skew:.0f} ms behind the other arm; allowed: {allowed:.0f} ms"
     RUN_ENDED = "run_ended", "the run has ended"
     ACTIVATED = "activated", "active: the reference starts at the measured posture"
@@ -63,5 +63,5 @@ class SupervisionReason(ReasonKind):
     TARGETS_LINKED = "targets_linked", "{arm}: the arm holds because it is linked to {other}: {cause}"
 
 
-# Kinds that tell of no fault.
+# Kinds of reasons that report no fault.
 ROUTINE: frozenset[ReasonKind] = frozenset({SupervisionReason.ACTIVATED, CommonReason.HOMING_ARRIVED})

@@ -8,8 +8,9 @@ whose controller stands still does not move at all, which shows within a few sta
     path of m in W <= 0.1 |r(t) - r(t - W)|,  |r(t) - r(t - W)| >= least,  |r(t - W) - m(t)| >= ahead.
 
 Here r is the commanded and m the measured position: the joints of an arm, of which the greatest value counts, or its
-tool. W is the window. An arm that lags by L and turns round moves along W / (4 L) of the commanded way, which is more
-than 0.1 for a lag up to 0.12 s. Nothing is judged while the states have a gap, or just after this loop had one.
+tool. W is the window. An arm that lags by L and reverses still moves by the share W / (4 L) of the commanded distance,
+which is more than 0.1 for a lag up to 0.12 s. Nothing is judged while the states have a gap, or just after this loop
+had a gap.
 """
 
 from __future__ import annotations
@@ -27,9 +28,9 @@ from q2r2_control.supervision.reasons import SupervisionReason
 from q2r2_control.types import Array, RobotState
 
 WINDOW = 0.05  # W [s]
-_STANDS_BELOW = 0.1  # An arm stands still if it moves by less than this share of the commanded way.
-_FOLLOWS_ABOVE = 0.5  # An arm follows if it moves by more than this share of the commanded way.
-_LOOK_PERIOD = 0.0075  # Time between two looks; the loop may tick more often [s].
+_STANDS_BELOW = 0.1  # An arm stands still if it moves by less than this share of the commanded distance.
+_FOLLOWS_ABOVE = 0.5  # An arm follows if it moves by more than this share of the commanded distance.
+_LOOK_PERIOD = 0.0075  # Least time between two checks; the loop may tick more often [s].
 _STATE_GAP = 0.045  # After a longer gap between two states the window begins again [s].
 
 
@@ -37,14 +38,14 @@ _STATE_GAP = 0.045  # After a longer gap between two states the window begins ag
 class StandstillLimits:
     """How much commanded motion must be missing, in [rad] of joints or in [m] of a tool, and for how long."""
 
-    least: float  # Least commanded way within the window.
-    ahead: float  # Least distance from the measured arm to the command at the beginning of the window.
-    # Time for which the arm must stand still [s]. A controller that lags also stands still while its arm turns round.
+    least: float  # The command must move at least this far within the window.
+    ahead: float  # The command at the beginning of the window must be at least this far from the measured arm.
+    # Time for which the arm must stand still [s]. An arm whose controller lags also stands still while it reverses.
     patience: float = 0.0
-    begins: float = 0.0  # The same for an arm that has not followed yet, and may need time to begin [s].
+    begins: float = 0.0  # The same time for an arm that has not followed yet, and may need time to begin [s].
 
 
-# Limits for a driver that takes joint commands. Its filter and its session may just have begun [rad].
+# Limits for a driver that takes joint commands [rad]. Its filter and its session may need a moment to begin.
 JOINTS = StandstillLimits(least=0.01, ahead=0.01, begins=0.05)
 # Limits for a controller that takes poses. Its inverse kinematics may lag by 0.4 s [rad], [m].
 LAGGING_JOINTS = StandstillLimits(least=0.01, ahead=0.01, patience=0.08, begins=0.4)
@@ -59,7 +60,7 @@ class StandstillWatch:
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything: the arm may stand still from now on."""
+        """Forget everything. The arm is judged again after a whole window of states."""
         # For each measured state: its time, the command, and the measured path since the first state.
         self._seen: deque[tuple[float, Array, Array]] = deque()
         self._measured: Array | None = None
@@ -104,7 +105,7 @@ class StandstillWatch:
 
 
 class StandingArms:
-    """Judges all arms by their joints."""
+    """Finds arms that stand still, from their commanded and measured joint positions."""
 
     def __init__(self, robot: Robot, limits: StandstillLimits, takers: Callable[[str], str]) -> None:
         self._joints = {arm: its.joints for arm, its in robot.arms.items()}

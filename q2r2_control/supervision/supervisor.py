@@ -1,4 +1,4 @@
-"""Decide when the controller may move the arms: activation, loss, pause, stop and homing. Every loop uses this object.
+"""Decide when the controller may move the arms: activation, faults, pause, stop and homing. Every loop uses this class.
 
     inactive --joint states good and at rest--> active --fault--> braking --at rest--> inactive
                                                 active --stop--> braking --at rest--> stopped --reset--> inactive
@@ -31,10 +31,12 @@ from q2r2_control.supervision.targets import TargetStreams
 from q2r2_control.types import Array, Reference, RobotState
 
 _REST = 1e-4  # The reference is at rest if no joint is faster [rad/s].
-# A joint that is this far from the reference and slower than this may have no driver any more [rad], [rad/s].
+# If a joint is farther from the reference than the first value and slower than the second one, its driver may be gone
+# [rad], [rad/s].
 _OFF_REFERENCE, _STILL = 0.02, 0.05
 
-# An admittance displaces the targets, by the measured state and a time step [s].
+# A function of an admittance. It gets the targets by arm, the measured state and a time step [s], and returns the
+# displaced targets.
 Displace = Callable[[dict[str, pin.SE3 | None], RobotState, float], dict[str, pin.SE3 | None]]
 
 
@@ -108,7 +110,7 @@ class Supervisor:
         return self.phase in (Phase.ACTIVE, Phase.BRAKING) and self._watch.fault is None
 
     def arm_state(self, arm: str) -> str:
-        """Return the activity of one arm: following, homing or holding; or the phase in which no arm moves."""
+        """Return the activity of one arm: following, homing or holding; outside the phase active, the phase's name."""
         if self.phase is not Phase.ACTIVE:
             return str(self.phase)
         if self.homing.active:
@@ -120,13 +122,13 @@ class Supervisor:
 
     @property
     def measured(self) -> bool:
-        """Whether the newest state is good enough for the arms to brake by it, even if their session is lost."""
+        """Whether the arms may brake from the newest measured state, even if their session is lost."""
         return self._watch.believed
 
     def update_state(
         self, state: RobotState | Reason, now: float, passed: float = 0.0, lost: Reason | None = None
     ) -> None:
-        """Take a joint state, or the reason why there is none.
+        """Take a joint state, or the reason why there is no state.
 
         Args:
             state: See :meth:`JointWatch.observe`.
@@ -152,8 +154,8 @@ class Supervisor:
             arm: The arm.
             pose: The tool's target in the world frame; None if the message was not a pose.
             now: The time of receipt [s].
-            number: The number of the message at its publisher, if it is known.
-            due: The time at which the tool is to be there [s]; None if that is at once.
+            number: The sequence number that the publisher gave the message; None if it is unknown.
+            due: The time at which the tool should reach the target [s]; None for at once.
         """
         tools: list[pin.SE3] = []
         if not self.targets.follows_on(arm, now):
@@ -177,7 +179,8 @@ class Supervisor:
         Args:
             now: The time of the loop [s].
             dt: Time by which the reference advances [s].
-            posture: Where the joints go that the targets leave free (nv,) [rad]; None for the home posture.
+            posture: The posture that the joints approach as far as the targets leave them free (nv,) [rad]; None for
+                the home posture.
 
         Returns:
             The reference for the plant; None if nothing may be commanded.
@@ -186,7 +189,7 @@ class Supervisor:
             if self._watch.settled(now):
                 self._activate()
             return None
-        # The states are checked in every phase, because arms that brake by a measured state need a good one.
+        # The states are checked in every phase, because some drives need good states to brake.
         fault = self._watch.check(now)
         if self.phase is Phase.STOPPED:
             return None
@@ -251,8 +254,9 @@ class Supervisor:
     def stalled(self, duration: float, now: float) -> None:
         """Deactivate the arms after the loop stood still for ``duration`` [s].
 
-        The arms have come to rest without us, and may have been moved. The old reference could be a jump. They are
-        activated again where they rest. Targets that waited meanwhile do not begin a new stream.
+        Meanwhile the arms have come to rest by themselves, and somebody may have moved them. A command at the old
+        reference could make them jump. The arms are therefore activated again where they rest. Targets that waited
+        during the standstill do not begin a new stream.
         """
         if self.phase not in (Phase.ACTIVE, Phase.BRAKING):
             return

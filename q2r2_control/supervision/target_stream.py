@@ -30,9 +30,9 @@ _JUMP, _TURN = 0.05, 0.25
 class StreamSettings:
     """The rules for a stream of targets; they may be changed at run time."""
 
-    timeout: float = STREAM_TIMEOUT  # [s]
-    engage_distance: float = 0.03  # [m]
-    engage_angle: float = 0.3  # [rad]
+    timeout: float = STREAM_TIMEOUT  # A stream ends if no target comes for longer than this [s].
+    engage_distance: float = 0.03  # A stream must begin at most this far from the tool [m].
+    engage_angle: float = 0.3  # A stream must begin turned from the tool by at most this angle [rad].
     linked: bool = True  # Whether all arms hold when the targets of one arm cease, see TargetStreams.
 
 
@@ -57,7 +57,7 @@ class TargetStream:
     def __init__(self, settings: StreamSettings) -> None:
         self._settings = settings
         self.pose: pin.SE3 | None = None  # The target that the arm follows; None while the arm holds.
-        self.stamp = -math.inf  # The time of the last target that was a pose.
+        self.stamp = -math.inf  # The time of the last target, whether it was followed or not.
         # The last target, whether it was followed or not. None if the next target begins a stream.
         self._last: pin.SE3 | None = None
 
@@ -87,8 +87,8 @@ class TargetStream:
         Args:
             pose: The target.
             tools: The poses at which a stream may begin: the reference's tool, and the measured tool if it is known.
-                An arm that was pushed away from its reference is engaged where it is. An arm that follows a stream
-                already needs none.
+                With the measured tool, an arm that was pushed away from its reference can be engaged where it is. The
+                poses are not used, and may be missing, while the arm follows a stream.
             now: The time of receipt [s].
         """
         self.expire(now)
@@ -125,13 +125,13 @@ def apart(a: pin.SE3, b: pin.SE3) -> tuple[float, float]:
 # Times between two targets from which a velocity is computed [s]. A shorter time is too inexact, and after a longer one
 # the targets are taken as steps.
 _SHORTEST, _LONGEST = 0.001, 0.025
-_LOOKAHEAD = 2.5  # Periods for which a line goes on: one target may be lost, and the next one late.
+_LOOKAHEAD = 2.5  # Targets are extrapolated for this many periods: one target may be lost, and the next one late.
 # The target is extrapolated only if the last prediction was this exact [m], [rad].
 _EVEN, _EVEN_TURN = 1.5e-3, 0.01
 
 
 class TargetExtrapolator:
-    """Extrapolates the targets of one stream that moves evenly. All times are those at which targets are due [s]."""
+    """Extrapolates the targets of one stream while they move evenly. All times tell when targets are due [s]."""
 
     def __init__(self) -> None:
         self.reset()
@@ -147,7 +147,7 @@ class TargetExtrapolator:
         self._even = False
 
     def put(self, pose: pin.SE3, due: float | None) -> None:
-        """Take a target. ``due`` is the time at which the tool is to be there; None if it is not known."""
+        """Take a target. ``due`` is the time at which the tool should reach it [s]; None if that is not known."""
         if due is None:
             self.reset()
             self._pose = pose
@@ -155,7 +155,7 @@ class TargetExtrapolator:
         last, gap, twist = self._at, due - self._due, self._twist
         self._pose, self._due, self._at = pose, due, floats_of(pose)
         if 0.0 <= gap < _SHORTEST:
-            return  # Its sender was late with the last target.
+            return  # The sender was late with the last target, so the two targets give no velocity.
         self._twist, self._even = None, False
         if last is None or not _SHORTEST <= gap <= _LONGEST:
             return

@@ -12,8 +12,8 @@ from q2r2_control.events import Reason, ReasonKind
 from q2r2_control.supervision.reasons import SupervisionReason
 from q2r2_control.supervision.target_stream import Origins, StreamSettings, TargetExtrapolator, TargetStream
 
-# The usual delay may grow by this per second. The clocks of two hosts drift apart more slowly, and the delay of a
-# frozen sender grows much faster.
+# The usual delay may grow by this much per second [s/s]. The clocks of two hosts drift apart more slowly, and the delay
+# of a frozen sender grows much faster.
 _DRIFT = 1e-3
 _CLOCK_WAS_SET = 1.0  # If all messages are late for longer than this, a clock was set [s].
 
@@ -21,9 +21,9 @@ _CLOCK_WAS_SET = 1.0  # If all messages are late for longer than this, a clock w
 class DelayWatch:
     """Finds late messages of one topic, which must not move an arm. All times are times of receipt [s].
 
-    A sender that was frozen while it sent a target finishes when it wakes up, and then an old target leaves. The delay
-    is the time of receipt less the time of sending. Both may be of different hosts' clocks, so that only the change of
-    the delay counts.
+    If the process of a sender is frozen while it sends a target, the target leaves when the process wakes up, and is
+    old by then. The delay of a message is the time of receipt minus the time of sending. The two times may come from
+    the clocks of different hosts, so only the change of the delay counts.
     """
 
     def __init__(self, allowed: float) -> None:
@@ -36,7 +36,7 @@ class DelayWatch:
         """Return by how much a message is too late [s]; 0 if it is in time or if its delay is not known.
 
         Args:
-            delay: Time of receipt less time of sending [s]; not finite if it is not known.
+            delay: Time of receipt minus time of sending [s]; not finite if it is not known.
             now: Time of receipt [s].
         """
         if not math.isfinite(delay):
@@ -51,21 +51,24 @@ class DelayWatch:
         return delay - usual
 
 
-# No publisher sends more often than this, and no message arrives later than this. If sequence numbers grow faster, they
-# come from another publisher.
+# No publisher sends more often than _MAX_RATE_HZ, and no message takes longer than _MAX_DELIVERY_S. If sequence numbers
+# grow faster than that, they come from another publisher.
 _MAX_RATE_HZ, _MAX_DELIVERY_S = 2000.0, 0.1
-_ALONE = 1.0  # Time after the last break, after which a single publisher is assumed again [s].
+_ALONE = 1.0  # A break in the sequence counts for this time. Without breaks, one publisher is assumed again [s].
 
 
 class SequenceWatch:
-    """Finds a second publisher by the sequence numbers of one topic. All times are times of receipt [s]."""
+    """Finds a second publisher by the sequence numbers of one topic. All times are times of receipt [s].
+
+    A break in the sequence is a number that cannot come from the publisher of the number before.
+    """
 
     def __init__(self) -> None:
         self._number, self._stamp = 0, -math.inf
         self._breaks: deque[float] = deque()
 
     def take(self, number: int, now: float, timeout: float) -> int:
-        """Look at the number of a message; returns the count of recent breaks in the sequence.
+        """Take the sequence number of a message. Return the number of recent breaks in the sequence.
 
         The count is 0 for a single publisher and 1 for a publisher that replaced another one. Two breaks or more show
         two publishers that take turns. After a silence of ``timeout`` the numbers may begin anywhere, because a
@@ -109,7 +112,7 @@ class TargetStreams:
         return self.follows(arm)
 
     def age(self, arm: str, now: float) -> float:
-        """Return the time since the last target of an arm that was a pose [s]."""
+        """Return the time since an arm's last valid target, followed or not [s]."""
         return now - self._streams[arm].stamp
 
     def offer(
@@ -129,8 +132,8 @@ class TargetStreams:
             pose: The target; None if the message was not a pose.
             tools: See :meth:`TargetStream.offer`.
             now: The time of receipt [s].
-            number: The number of the message at its publisher, if it is known.
-            forbidden: Why no arm may follow targets now; None if arms may.
+            number: The sequence number that the publisher gave the message; None if it is unknown.
+            forbidden: Why no arm may follow targets now; None if arms may follow targets.
             due: See :meth:`TargetExtrapolator.put`.
         """
         stream = self._streams[arm]
@@ -177,7 +180,7 @@ class TargetStreams:
             stream.reset()
 
     def expire(self, now: float) -> list[Reason]:
-        """End the streams that have run dry; returns a reason for each arm that holds since the last call."""
+        """End the streams whose targets have ceased. Return the reasons of all ends since the last call."""
         for arm in self._streams:
             self._expire(arm, now)
         ended, self._newly_ended = self._newly_ended, []
@@ -190,7 +193,7 @@ class TargetStreams:
             self._hold_linked(arm, self.ended[arm])
 
     def _hold_linked(self, ended: str, why: Reason) -> None:
-        """Let the other linked arms hold as well: one operator moves all arms, and expects none to go on alone."""
+        """Let the other linked arms hold as well: one operator moves all arms, and expects no arm to go on alone."""
         for arm, stream in self._streams.items():
             if self._settings.linked and arm != ended and stream.following:
                 stream.drop()

@@ -1,4 +1,4 @@
-"""Keep a late tick from becoming a jump: bound the time, and the way, by which one tick moves the reference.
+"""Keep a late tick from causing a jump: bound the time by which a tick advances the reference, and so its distance.
 
 A plant takes one command per period. From one command to the next a joint may move as far as its velocity limit allows
 in one period, even if the command comes late. A late tick therefore moves the reference by the time t that has passed
@@ -7,8 +7,8 @@ joint, with its acceleration limit a. Otherwise t is reduced until this holds, b
 thus catches up at once. Fast motion goes along the same path, later. A command that was clipped joint by joint would
 leave the path that was certified.
 
-A plant that is given velocities goes on at the last one while no command comes (``coasts``). Then the reference goes on
-as well, by the time that has passed, up to 0.1 s. The commanded velocity stays within its limit.
+A plant that takes velocity commands keeps moving at the last velocity while no command comes (``coasts``). Then the
+reference also advances by the time that has passed, up to 0.1 s. The commanded velocity stays within its limit.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import pinocchio as pin
 from q2r2_control.config.teleop import GuardSettings
 from q2r2_control.types import LONGEST_DT, Array
 
-_ROUNDING = 1e-9  # Share of a period by which a tick in time may differ from it.
+_ROUNDING = 1e-9  # The gap before a punctual tick may exceed the period by this share of it.
 
 
 class TickPacer:
@@ -52,9 +52,9 @@ class TickPacer:
         """
         if not gap > self.period * (1.0 + _ROUNDING):
             return gap if gap > 0.0 else 0.0
-        # A tick that is less than half a period late is jitter. After that a command counts as missing.
+        # A tick that is less than half a period late is jitter. If it is later, commands count as missing.
         self.missed_ticks += max(round(gap / self.period) - 1, 0)
-        # The time after which each joint may have moved as far as it may.
+        # For each joint, the time in which it can move at most as far as one period permits.
         longest = 2.0 * self._way / (np.abs(v) + np.sqrt(v * v + 2.0 * self._acceleration * self._way))
         step = min(gap, LONGEST_DT if self._coasts else max(self.period, float(longest.min())))
         self.stretched += gap - step
@@ -101,7 +101,7 @@ class PoseRateLimiter:
     If the target moves faster than the limit, it has jumped, and u is 0. Rotations are limited in the same way, by the
     rotation vector from pose to target. All poses are in one frame. A late step moves the pose no farther than the
     velocity limits allow in one period, see :class:`TickPacer`. After a gap of more than 0.1 s the motion begins from
-    rest, because whatever follows the pose stands at the last one.
+    rest, because whatever follows the pose has come to rest at the last pose.
     """
 
     def __init__(self, settings: GuardSettings, period: float) -> None:
@@ -116,8 +116,8 @@ class PoseRateLimiter:
         self.settings = settings
         self._linear.limits = settings.max_velocity, settings.max_acceleration
         self._angular.limits = settings.max_angular_velocity, settings.max_angular_acceleration
-        # A step changes the velocity first and then moves by the new velocity for all of dt. The way of the
-        # acceleration is a dt^2, not half of that.
+        # A step changes the velocity first, and then moves at the new velocity for all of dt. The acceleration thus
+        # adds the distance a dt^2, not half of that. For this reason the pacer gets twice the acceleration.
         velocities, accelerations = np.array([self._linear.limits, self._angular.limits]).T
         self._pacer = TickPacer(self._period, velocities, 2.0 * accelerations)
 
@@ -142,7 +142,7 @@ class PoseRateLimiter:
         """Return the pose at ``now`` [s], one step nearer to the target.
 
         Args:
-            target: The target; None, and one that is not finite, let the pose brake and hold.
+            target: The target. If it is None or not finite, the pose brakes and holds.
             now: The time [s]. If it does not advance, the pose stays the same.
 
         Returns:
@@ -151,7 +151,7 @@ class PoseRateLimiter:
         gap = now - self._now
         if self.pose is None or not gap > 0.0:
             return self.pose
-        if gap > LONGEST_DT:  # The follower has come to rest meanwhile, or will do so soon.
+        if gap > LONGEST_DT:  # Whatever follows the pose has come to rest meanwhile, or will soon do so.
             self._linear.velocity = self._angular.velocity = np.zeros(3)
         dt = gap
         if gap > self._period:
@@ -180,7 +180,7 @@ class _Limited:
     """The velocity of a position or a rotation, within limits of velocity and acceleration."""
 
     limits: tuple[float, float]  # The limits of velocity and acceleration.
-    velocity: Array  # (3,)
+    velocity: Array  # (3,) [m/s] or [rad/s].
 
     @property
     def speed(self) -> float:
@@ -190,7 +190,7 @@ class _Limited:
         """Return the step towards a moving target, and whether a limit has reduced it.
 
         Args:
-            lag: Vector from here to the target (3,).
+            lag: Vector from the pose to the target (3,).
             way: Motion of the target in this step (3,).
             dt: Duration of the step [s].
         """

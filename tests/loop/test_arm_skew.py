@@ -18,7 +18,7 @@ from tests.control.test_arm_skew import Ways, beside_each_other, swung
 from tests.support.processes import cell, cell_robot
 
 DT, PERIOD, LAG = 0.005, 0.005, 0.04  # Periods of the loop and of the drivers' messages, and the lag of their arms [s].
-HAPPENS = 1.51  # At this time, both arms move to the left at their fastest [s].
+HAPPENS = 1.51  # The time of the fault, at which both arms move to the left at their highest speed [s].
 
 
 class TwoDrivers:
@@ -75,7 +75,7 @@ class TwoDrivers:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("are_watched", [True, False])
-def test_an_arm_that_stands_still_is_not_hit_by_the_other_one_if_both_are_monitored(are_watched: bool) -> None:
+def test_an_arm_that_stands_still_is_not_hit_by_the_other_arm_if_their_lags_are_watched(are_watched: bool) -> None:
     arms = TwoDrivers(are_watched)
     arms.run_until(HAPPENS)
     assert min(arms.margins) >= 0.0

@@ -23,7 +23,7 @@ DT = 0.004
 
 
 class Arms:
-    """Both arms at home, as the plant of another program measures them."""
+    """Both arms at rest at home, with a control loop whose commands do not move them."""
 
     def __init__(self, owns_plant: bool, obstacles: tuple[str, ...] = ()) -> None:
         config, robot = cell(), cell_robot()
@@ -80,7 +80,7 @@ def test_a_target_far_from_its_tool_is_refused_and_moves_nothing() -> None:
     assert arms.tick(tool).refusals == {}
 
 
-def test_an_untrusted_state_is_not_used_for_the_push() -> None:
+def test_joint_states_that_are_not_finite_are_not_trusted() -> None:
     arms = Arms(owns_plant=True)
     arms.loop.activate(arms.state, arms.now)
     assert arms.tick().trusted
@@ -91,7 +91,7 @@ def test_an_untrusted_state_is_not_used_for_the_push() -> None:
     assert not step.trusted
 
 
-def test_arms_that_lost_their_session_brake_by_their_state_also_after_its_return() -> None:
+def test_arms_that_lost_their_session_brake_from_their_states_until_a_state_jumps() -> None:
     arms = Arms(owns_plant=True)
     arms.loop.activate(arms.state, arms.now)
     arms.loop.observe(arms.state, arms.now, DT, lost=Reason.of(FriReason.FRI_DROPPED, arm="left"))
@@ -119,7 +119,7 @@ def test_while_the_arms_do_not_move_a_held_gripper_may_only_go_back(
 
 
 class ReportedHand(Arms):
-    """A hand far from the arms that was reported at the first tick and never again."""
+    """Arms, and a moving obstacle far from them that is reported only once, before the first tick."""
 
     def __init__(self, owns_plant: bool) -> None:
         super().__init__(owns_plant, ("hand",))
@@ -138,7 +138,7 @@ def test_the_age_of_a_hands_report_grows_with_the_clock_when_the_loop_stalls() -
     arms.loop.activate(arms.state, arms.now)
     first = arms.now + DT
     for tick in range(200):
-        arms.now += 0.06 if tick % 40 == 39 else 0.0  # The tick still lasts DT.
+        arms.now += 0.06 if tick % 40 == 39 else 0.0  # The loop stalls, but this tick still lasts DT.
         arms.tick()
         assert arms.now - first - 1e-9 <= arms.age <= arms.now - first + DT + 1e-5
 

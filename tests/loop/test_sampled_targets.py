@@ -22,7 +22,7 @@ def controller() -> CartesianController:
 
 
 def wave(start: pin.SE3, t: float) -> pin.SE3:
-    """Return a sine of up to 0.2 m/s with a rotation of up to 0.6 rad/s."""
+    """Return the pose at ``t`` [s] of a sinusoidal motion, at up to 0.2 m/s and 0.6 rad/s."""
     turn = pin.exp3(np.array([0.0, 0.0, 0.3 * math.sin(2.0 * t)]))
     return pin.SE3(start.rotation @ turn, start.translation + np.array([0.0, 0.1 * math.sin(2.0 * t), 0.0]))
 

@@ -23,7 +23,7 @@ def pipeline(
 
 
 class RecordingPlant(KinematicPlant):
-    """A plant that keeps every command and counts calls of close. ``disturb`` makes its measured states."""
+    """A plant that keeps every command and counts calls of close. ``disturb`` changes the states that it measures."""
 
     def __init__(self) -> None:
         super().__init__(cell_robot(), cell())

@@ -18,7 +18,7 @@ _LATE = 0.0005  # Largest delay of messages [s].
 
 
 class WeighedArm(StillArm):
-    """An arm that measures the torques of a robot with a load that the client does not know."""
+    """An arm whose measured torques are those of a robot with a load. The client does not know this load."""
 
     def __init__(self, robot: Robot, arm: str) -> None:
         self._robot, self._joints, self._data = robot, robot.arms[arm].joints, robot.model.createData()
@@ -61,8 +61,9 @@ def slow_run(
     prepare: Callable[[PendantCabinets], None] = lambda cabinets: None,
     listener: Callable[[Moment], None] | None = None,
 ) -> SlowRun:
-    """Return a slow run of ``config`` with arms like ``truth`` of type ``arm``. ``prepare`` gets the cabinets.
+    """Return a slow run of ``config`` behind virtual cabinets.
 
+    The arms have the type ``arm`` and the masses of ``truth``. ``prepare`` gets the cabinets before the run.
     ``listener`` gets each tick's moment.
     """
 

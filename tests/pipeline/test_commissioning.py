@@ -61,7 +61,7 @@ def test_a_joint_has_to_follow_and_to_move_alone(motion: JointMotion) -> None:
 
 
 @pytest.mark.slow
-def test_an_arm_that_a_hand_leads_stops_within_its_certified_stop_and_the_latency(config: Config) -> None:
+def test_an_arm_whose_hand_lets_go_stops_within_its_certified_stop_and_the_latency(config: Config) -> None:
     with slow_run(config) as run:
         report = measure_stop(run, "left")
     assert report.tool_speed_mm_s == pytest.approx(30.0, abs=1.0)
@@ -70,7 +70,10 @@ def test_an_arm_that_a_hand_leads_stops_within_its_certified_stop_and_the_latenc
 
 
 def moments(robot: Robot, on: float, engaged: bool = True) -> list[Moment]:
-    """Return a motion of the left arm's A2 at 0.1 rad/s for a second, and ``on`` [s] longer than its hand asks for."""
+    """Return the moments of a motion of the left arm's A2 at 0.1 rad/s.
+
+    The arm follows its hand for one second, and then moves on for ``on`` [s].
+    """
     v = np.zeros(robot.model.nv)
     v[1] = 0.1
     none, slow = np.zeros_like(v), np.full_like(v, 5.0)

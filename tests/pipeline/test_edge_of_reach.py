@@ -19,17 +19,17 @@ from tests.support.processes import Watch, cell
 
 SECONDS, RATE = 110.0, 72.0  # Duration [s], and rate of the hands [Hz].
 LET_THROUGH = 1.0  # Time between two delays of the network [s].
-# Delays of the network [s]. Nine of ten last ten samples, and the tenth is longer than the gate's timeout.
+# Delays of the network [s]. Nine of ten delays hold up ten samples. The tenth delay is longer than the gate's timeout.
 HELD_UP = 0.13, 0.165
 FROM, BEYOND = -0.15, 0.15  # Range of the targets relative to the edge of reach [m].
-# Longest time in which a target moves and its tool does not, as where the target turns at its farthest [s].
+# Longest time in which a target may move while its tool does not, for example where the target reverses [s].
 STALL = 0.16
 SLOW, STEP = 0.05, 9.0  # Speeds between these belong to a moving target. A faster target has jumped [m/s].
 _WAITS = 0.4  # An operator whose arm does not follow presses after this time [s].
 
 
 class Bursts(SampleTiming):
-    """Samples at an even rate. Those of every delay arrive together at its end."""
+    """Samples at an even rate. All samples that a delay holds up arrive together at its end."""
 
     def __init__(self) -> None:
         self._t = 0.0
@@ -92,7 +92,7 @@ class Sweeping(PlayedInput):
 
 
 def stalls(ticks: list[Tick], arm: str) -> list[float]:
-    """Return each time in which the target moves while the tool does not [s]."""
+    """Return the durations for which the target moves while the tool does not [s]."""
     found = [0.0]
     for before, tick in pairwise(ticks):
         target, last = tick.targets[arm].pose, before.targets[arm].pose

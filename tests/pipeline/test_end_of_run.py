@@ -1,4 +1,4 @@
-"""A run ends by a request or a failure. The arms are at rest before, and all resources are released."""
+"""A run ends by a request or a failure. Before its end, the arms come to rest, and all resources are released."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class TestStop:
         assert speed(watch.ticks[-1]) < 1e-3
         assert summary.at_rest
 
-    def test_a_request_before_the_run_ends_it_at_once_and_the_next_one_runs(self) -> None:
+    def test_a_request_before_the_run_ends_it_at_once_and_does_not_end_the_next_run(self) -> None:
         loop = pipeline()
         loop.stop()
         assert loop.run(10.0, realtime=False).ticks == 1

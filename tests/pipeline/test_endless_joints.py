@@ -1,4 +1,4 @@
-"""A plant that reports endless joints within one turn moves like one that counts their turns."""
+"""Arms move alike whether the plant wraps the angles of endless joints to one turn, or counts their turns."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from q2r2_control.types import RobotState
 
 
 class WrappedPlant(KinematicPlant):
-    """A plant that reports endless joints within the turn that ends a hundredth of a radian above home."""
+    """A plant that wraps the angles of endless joints to one turn, which ends 0.01 rad above the home posture."""
 
     def state(self) -> RobotState:
         state, end = super().state(), self._robot.home + 0.01

@@ -65,7 +65,7 @@ class SeldomAskedGrippers(KinematicPlant):
 
 def test_fingers_are_monitored_at_their_width_also_if_the_gripper_is_seldom_read() -> None:
     config, hands = cell(), LeftUpperPresses("circle")
-    hands.again = 1.25  # The gripper is half closed.
+    hands.again = 1.25  # At this time the gripper is half closed.
     slow = {
         side: arm.model_copy(update={"gripper": arm.gripper.model_copy(update={"speed": 0.05})})
         for side, arm in config.arms.items()
@@ -106,7 +106,7 @@ def test_what_is_gripped_is_part_of_the_tool_until_it_is_put_down() -> None:
     assert max(jumps[gripped - 1 : gripped + 20]) < 5e-4
 
 
-def test_a_run_after_one_that_ended_with_a_held_object_compensates_no_weight() -> None:
+def test_a_new_run_compensates_no_weight_of_an_object_that_was_held_at_the_end_of_the_last_run() -> None:
     config = object_cell({"mass": 2.0})
     loop = Pipeline.from_config(config, input=ScriptedInput("circle"), plant="mujoco", mode="torque")
     drive: Any = loop.drive
@@ -122,7 +122,7 @@ def test_a_run_after_one_that_ended_with_a_held_object_compensates_no_weight() -
 class LeftUpperPresses(ScriptedInput):
     """The left hand presses its upper button at 1.0 s and once more, and moves in between."""
 
-    again = 1.6  # [s]
+    again = 1.6  # Time of the second press [s].
 
     def poll(self, now: float) -> list[HandSample]:
         held = 1.0 <= now < 1.1 or self.again <= now < self.again + 0.1

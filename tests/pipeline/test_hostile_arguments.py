@@ -1,4 +1,4 @@
-"""A run refuses hostile values of a program by ConfigError, or keeps every promise of its ticks."""
+"""A run refuses hostile values from a program with a ConfigError, or keeps the contract at every tick."""
 
 from __future__ import annotations
 

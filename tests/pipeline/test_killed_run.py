@@ -41,7 +41,7 @@ def test_arms_of_a_killed_run_come_to_rest_within_their_certified_stop(config: C
 
 
 class LeadingThread:
-    """A replacement for :class:`HelperProcess`: arms behind virtual cabinets, in simulated time."""
+    """A replacement for :class:`HelperProcess`, which moves arms behind virtual cabinets in simulated time."""
 
     def __init__(self, what: str, module: str, on_answer: Callable[[Moment], None]) -> None:
         self.fault: str | None = None

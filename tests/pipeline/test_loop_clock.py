@@ -71,7 +71,10 @@ def test_simulated_time_takes_no_real_time_and_is_never_late() -> None:
 
 
 def paced_run(monkeypatch: pytest.MonkeyPatch, ticks: int, busy_s: float) -> tuple[LoopClock, float]:
-    """Return a paced clock after its ticks, each of which keeps the computer busy, and the time that they took [s]."""
+    """Take ``ticks`` of a paced clock, each of which keeps the computer busy for ``busy_s``.
+
+    Return the clock, and the time that the ticks took [s].
+    """
     computer = LateSleeper([])
     monkeypatch.setattr(loop_clock, "time", computer)
     loop, began = LoopClock(PERIOD, realtime=False, pace=WallPace()), computer.monotonic()
@@ -146,7 +149,7 @@ def test_states_of_a_plant_with_another_clock_that_jumps_back_count_as_new() -> 
         assert (seen.stamp, passed) == (now, expected)
 
 
-def test_a_repeated_state_is_as_old_as_the_time_that_the_plant_was_given() -> None:
+def test_a_repeated_state_ages_by_the_time_for_which_the_plant_was_advanced() -> None:
     clock, stopped = PlantClock(state(0.0)), state(0.0)
     for tick in range(1, 4):
         clock.give(0.25)

@@ -1,4 +1,4 @@
-"""Loops adapt to the computer: simulated time that it paces, and a rate that it can keep."""
+"""Loops adapt to the computer: its clock may pace simulated time, and a loop in real time gets a rate that it keeps."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def ticks_of(duration: float, *, paced: bool, busy_s: float = 0.0) -> list[objec
 
 
 @pytest.mark.slow
-def test_a_paced_run_is_the_same_to_the_bit_as_a_fast_one_and_as_one_on_a_slow_computer() -> None:
+def test_a_paced_run_equals_an_unpaced_run_to_the_bit_also_on_a_slow_computer() -> None:
     fast = ticks_of(0.9, paced=False)
     assert len(fast) >= 450
     assert ticks_of(0.9, paced=True) == fast

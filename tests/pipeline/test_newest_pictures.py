@@ -28,9 +28,9 @@ from tests.cameras.videos import FPS, HEIGHT, WIDTH, number_in, number_of_jpeg, 
 from tests.recording.runs import ROOT, pipeline
 from tests.support.pictures import needs_opengl
 
-COUNT = 200  # Pictures of the video.
-LONGEST = 60.0  # Time after which a run ends in vain, far above the usual one [s].
-ENOUGH = 12  # Different pictures that a policy sees.
+COUNT = 200  # Number of pictures in the video.
+LONGEST = 60.0  # A run ends after this time even if what it waits for never happens. Usually it is much shorter [s].
+ENOUGH = 12  # Number of different pictures that a policy has to see.
 SIMULATED = {"position": (1.9, 0.0, 1.0), "look_at": (0.4, 0.0, 0.3), "width": 64, "height": 48, "rate": 30}
 
 

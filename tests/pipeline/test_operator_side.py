@@ -62,7 +62,7 @@ def test_engaging_is_felt_by_both_hands_and_every_vibration_ends_before_the_next
 
 
 @pytest.mark.slow
-def test_both_hands_feel_more_and_more_when_an_arm_is_driven_at_the_other_and_then_nothing() -> None:
+def test_both_hands_feel_stronger_pulses_while_the_arms_come_closer_and_nothing_afterwards() -> None:
     hands = FeltHands(left=straight(0.5 * -np.eye(3)[1]))
     pipeline(hands).run(5.0, realtime=False)
     for hand in SIDES:

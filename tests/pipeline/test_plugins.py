@@ -69,14 +69,14 @@ def elbow_at_the_end(config: Config) -> float:
 
 
 @pytest.mark.slow
-def test_an_input_a_plant_and_a_task_of_the_page_run_in_one_pipeline(file: Path) -> None:
+def test_the_input_the_plant_and_the_task_in_docs_extending_run_in_one_pipeline(file: Path) -> None:
     config = load_config(str(file))
     assert "elbows_out" in config.control.tasks
     without = config.model_copy(update={"control": config.control.model_copy(update={"tasks": {}})})
     assert elbow_at_the_end(config) > elbow_at_the_end(without) + 0.05
 
 
-def test_a_cell_or_a_node_may_name_a_preset_of_the_page(tmp_path: Path, file: Path) -> None:
+def test_a_cell_or_a_node_may_name_the_preset_in_docs_extending(tmp_path: Path, file: Path) -> None:
     data = external()
     data["external"] |= {"preset": "compliant"}
     other = load_config(str(changed(tmp_path / "other.yaml", data))).external
@@ -91,7 +91,7 @@ def test_a_cell_or_a_node_may_name_a_preset_of_the_page(tmp_path: Path, file: Pa
 
 
 @pytest.mark.slow
-def test_an_input_of_the_page_engages_in_a_real_time_run_too(file: Path) -> None:
+def test_the_input_in_docs_extending_engages_in_a_real_time_run_too(file: Path) -> None:
     loop = Pipeline.from_config(load_config(str(file)), plant="kinematic")
     summary = loop.run(1.0)
     assert {event.destination for event in summary.events} >= {"engaged"}

@@ -1,4 +1,4 @@
-"""A recorded motion is repeated by each kind of action of its dataset, which are sent at their times."""
+"""Each kind of action in a dataset repeats the recorded motion, if the actions are sent at their times."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ pytestmark = pytest.mark.slow
 
 FPS = 30
 DURATION = 5.0  # [s]
-CHUNK = 16  # Number of actions. The next chunk replaces half of them.
+CHUNK = 16  # Number of actions in a chunk. The next chunk replaces half of them.
 
 
 def tools_of(loop: Pipeline) -> list[dict[str, pin.SE3]]:
-    """Collect the measured tools of a run, tick by tick."""
+    """Return a list that gets the measured tool poses of each tick of the next run."""
     tools: list[dict[str, pin.SE3]] = []
     loop.listeners.append(lambda tick: tools.append(tick.tools))
     return tools
 
 
 class Playback:
-    """A policy that sends the frames of a dataset at their times, some of them ahead."""
+    """A policy that sends the actions of a dataset in chunks. A chunk begins with the action that is due."""
 
     def __init__(self, policy: PolicyInput, actions: Array) -> None:
         self._policy, self._actions, self._next = policy, actions, 0
@@ -44,7 +44,7 @@ class Playback:
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[dict[str, pin.SE3]], dict[str, Array]]:
-    """Return the tools of a run in MuJoCo that come together and turn, and the vectors of its dataset."""
+    """Return the tool poses of a run in MuJoCo, and the vectors of its dataset. The tools come together and turn."""
     loop = pipeline("meet", "mujoco")
     tools = tools_of(loop)
     file = file_of(record(tmp_path_factory.mktemp("recordings"), loop, DURATION))

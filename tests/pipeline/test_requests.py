@@ -48,7 +48,7 @@ def test_a_press_by_a_program_engages_arms_with_present_hands_and_pauses_no_arm(
         assert moved[-1][1] == "engaged"
 
 
-def test_a_press_of_a_program_holds_no_dead_man() -> None:
+def test_a_press_by_a_program_does_not_hold_a_dead_mans_switch() -> None:
     bindings = BindingSettings(lower=Action.NONE, grip=Action.DEAD_MAN)
     loop = pipeline(teleop=TeleopSettings(bindings=bindings))
     loop.listeners.append(lambda tick: loop.engage())
@@ -56,7 +56,7 @@ def test_a_press_of_a_program_holds_no_dead_man() -> None:
 
 
 @pytest.mark.slow
-def test_springs_change_on_a_ramp_and_only_in_torque_mode() -> None:
+def test_stiffnesses_change_gradually_and_only_in_torque_mode() -> None:
     loop = pipeline(plant="mujoco", mode="torque")
     seen: list[float] = []
 

@@ -1,4 +1,4 @@
-"""Targets that lead a plant that is late."""
+"""Targets that are moved ahead of time, because the plant is late."""
 
 from __future__ import annotations
 

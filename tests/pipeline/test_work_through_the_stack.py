@@ -1,4 +1,4 @@
-"""Work that is led by hand samples through the whole stack in MuJoCo is as safe and as exact as with targets alone."""
+"""Work with hand samples through the whole stack in MuJoCo is as safe and as exact as work with targets alone."""
 
 from __future__ import annotations
 

@@ -38,7 +38,10 @@ HOLDING = ("paused", "lost")  # States of an arm that was engaged.
 
 
 class ArmRig:
-    """The hand and the robot of an arm. With ``follows``, the tool is at the newest target. ``sends_tool``: on /tf."""
+    """The hand and the robot of one arm.
+
+    If ``follows`` is True, the tool is always at the newest target. If ``sends_tool`` is True, its pose is on /tf.
+    """
 
     def __init__(
         self,
@@ -51,7 +54,7 @@ class ArmRig:
     ) -> None:
         """With ``answers``, the rig reports like the built-in controller.
 
-        By default, it does so if it takes its targets.
+        By default, it does so if it takes the targets that are meant for that controller.
         """
         self.arm, self.node = arm, node
         self.hand, self.tool = HAND, TOOL
@@ -115,7 +118,7 @@ class ArmRig:
             time.sleep(PERIOD / 2)
 
     def let_the_hand_rest(self) -> None:
-        """Send a hand at rest until the controller's filter, which is slowest at rest, has reached it."""
+        """Send a hand at rest until the controller's filter, which is slowest at rest, has reached the hand's pose."""
         self.sent = 0
         self.wait(lambda: self.sent > 2.0 / PERIOD, "the hand rests")
 
@@ -208,7 +211,7 @@ class ArmRigs:
         self.wait(condition, what)
 
     def press(self, button: str = "lower") -> None:
-        """Press a button of all hands, which is no chord: it is held, and then released, for several messages."""
+        """Press one button of each hand, which is no chord. Hold it, and then release it, for several messages."""
         for held in (True, False):
             for rig in self.rigs:
                 setattr(rig, button, held)
@@ -219,7 +222,7 @@ class ArmRigs:
 
 
 def stamped_transform(parent: str, child: str, pose: pin.SE3) -> TransformStamped:
-    """Return the transform of a frame in another one, as on /tf, without a stamp."""
+    """Return the transform of a frame in another frame, as on /tf, without a stamp."""
     message = TransformStamped(child_frame_id=child)
     message.header.frame_id = parent
     message.transform.rotation, to = stamped_pose(pose, "", 0.0).pose.orientation, message.transform.translation
@@ -242,7 +245,7 @@ def assert_same(pose: pin.SE3 | None, other: pin.SE3, tolerance: float) -> None:
 
 
 def target_of(rig: ArmRig, number: int = 0) -> pin.SE3:
-    """Return the first target that came, or another one."""
+    """Return the target with this index among those that came."""
     pose = pose_of(rig.targets[number].pose)
     assert pose is not None
     return pose

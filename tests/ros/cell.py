@@ -106,7 +106,7 @@ class Cell:
         return stream
 
     def stop_and_reset(self, at_home: bool = False) -> None:
-        """Stop and reset the controller. With ``at_home``, the simulation puts the arms there meanwhile."""
+        """Stop and reset the controller. With ``at_home``, the simulation puts the arms at home meanwhile."""
         assert self.call("/cartesian_controller/stop").success
         wait_until(lambda: self.state("phase") == "stopped", "the controller is stopped")
         if at_home:
@@ -176,8 +176,8 @@ def changed_cell(folder: Path, **sections: dict[str, Any]) -> str:
     return str(file)
 
 
-# On a machine with other load, torques through ROS arrive some periods late. Springs of the default stiffness bear 8 ms
-# of delay, which is one period here. These springs bear several periods.
+# On a machine with other load, torques through ROS arrive some periods late. With the default stiffness, the impedance
+# is stable up to a delay of 8 ms, which is one period here. With this stiffness it is stable up to several periods.
 SOFT = {"translational_stiffness": 300.0, "rotational_stiffness": 20.0, "nullspace_stiffness": 10.0}
 
 
@@ -186,7 +186,7 @@ def shifted(pose: pin.SE3, *by: float) -> pin.SE3:
 
 
 SLOW = 0.05  # This is 3 % of a joint's limit: the arm still settles, but no longer follows [rad/s].
-REST = 0.01  # [rad/s]
+REST = 0.01  # A joint that is slower than this rests [rad/s].
 REST_TIME = 0.3  # Time for which joints have to be slower than that [s].
 # The window is longer than the time in which a starved robot catches up, and shorter than a jump takes [s].
 SPEED_WINDOW = 0.2
@@ -272,7 +272,7 @@ class JointRecorder:
 
     @contextmanager
     def tools_rest(self, within: float, what: str) -> Iterator[None]:
-        """Assert that no tool is farther than ``within`` [m] from where it was, at any joint state meanwhile."""
+        """Assert, at each joint state in the ``with`` block, that no tool has moved farther than ``within`` [m]."""
         first = self.states[-1]
         yield
         for arm in self._robot.arms:

@@ -1,4 +1,4 @@
-"""Two hands that drive the simulated arms through all their nodes. Tests kill, freeze and restart these nodes."""
+"""Two hands that move the simulated arms through all their nodes. Tests kill, freeze and restart these nodes."""
 
 from __future__ import annotations
 

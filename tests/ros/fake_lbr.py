@@ -16,7 +16,7 @@ from q2r2_control.types import Array
 PERIOD = 0.005  # Period of the driver [s].
 TAU = 0.04  # Default time constant of its filter of positions [s].
 NARROWER = math.radians(1.0)  # The driver's limits are narrower than the model's by this angle [rad].
-SAME = 3e-4  # Largest distance of a first command from the cabinet's own position, outside a limit [rad].
+SAME = 3e-4  # Largest permitted difference between a first command and the cabinet's own position [rad].
 SAG = 2e-3  # The measured joints hang this far below their commands [rad].
 BRAKES = 10.0  # Deceleration of a cabinet whose client is gone [rad/s^2].
 TOPICS = {"for Jazzy": ("lbr_joint_position_command", "lbr_state"), "of 2024": ("joint_position", "state")}
@@ -25,15 +25,15 @@ _ORDER = [2, 0, 1, 3, 4, 6, 5]  # Order of the joints in its joint states.
 
 
 class FakeLbr:
-    """A driver that follows commands only in commanding active.
+    """A driver that follows commands only in the session state commanding active.
 
-    Everything that would end the connection is in ``trips``.
+    ``trips`` lists everything that would end the connection.
     """
 
     def __init__(self, robot: Robot, arm: str, tau: float = TAU) -> None:
         """The time constant of the filter of positions is ``tau`` [s]."""
         joints = robot.arms[arm].joints
-        self._share = 1.0 if tau == 0.0 else 1.0 - math.exp(-PERIOD / tau)  # Share of the way in one period.
+        self._share = 1.0 if tau == 0.0 else 1.0 - math.exp(-PERIOD / tau)  # Share of the distance per period.
         # Positions and velocities as commanded to the cabinet [rad], [rad/s].
         self.q, self.v = robot.home[joints].copy(), np.zeros(len(joints))
         self.session, self.quality, self.safety = Session.MONITORING_READY, Quality.EXCELLENT, Safety.NORMAL
@@ -43,7 +43,7 @@ class FakeLbr:
         self.target: Array | None = None  # The newest command of this session.
         self.ipo = self.q  # The cabinet's own motion stays where the session began. Commands are added to it.
         self._fastest = robot.velocity_limit[joints] * (1.0 + _ROUNDING)
-        away = NARROWER + self._fastest * PERIOD  # The limit is that of its guard safe_stop, the narrower one.
+        away = NARROWER + self._fastest * PERIOD  # The driver's guard safe_stop has this narrower limit.
         self._lower, self._upper = robot.position_lower[joints] + away, robot.position_upper[joints] - away
 
     def begin(self) -> None:

@@ -17,10 +17,10 @@ from tests.ros.fake_lbr import SAME, TOPICS
 from tests.ros.virtual_lbrs import Operator, VirtualLbrs
 
 _NEAR = 1e-9  # Relative tolerance of limits.
-_UNEVEN = 0.004  # Relative tolerance of the times between ticks, which follow their clock.
+_UNEVEN = 0.004  # Relative tolerance of the time between two ticks, because the node's clock makes it uneven.
 _NOTICED = 0.15  # Time until the end of a session is noticed, by late states or by a silence of 0.1 s [s].
 _RESTARTED = 1.0  # Shortest time until a driver's process is restarted [s].
-_ALLOWANCE = 0.2  # Time after that of the certified stop, because real braking may be a little slower [s].
+_ALLOWANCE = 0.2  # Braking may last longer than the certified stop by this time [s].
 _LONGEST_STOP = 1.0  # Longest time from the end of a session to rest [s].
 _CREEPS = 1e-3  # A slower joint counts as resting [rad/s].
 _STUCK = 20.0  # A session in which nothing moves for this time will never move [s].
@@ -150,7 +150,7 @@ class LbrSoak:
             virtual.at(virtual.now + (_RESTARTED if self._how == "a driver ends" else 0.0), partial(self._rearm, *arms))
 
     def _move(self, by: Array, times: int) -> None:
-        """Move an arm as by hand guiding, within what the controller may command."""
+        """Move both arms by small steps, as in hand guiding, within the limits of the controller."""
         margin, robot = self.virtual.node._controller.settings.position_margin, self.virtual.robot
         for (arm, driver), step in zip(self.virtual.drivers.items(), by, strict=True):
             joints = robot.arms[arm].joints
@@ -161,7 +161,7 @@ class LbrSoak:
             self.virtual.at(self.virtual.now + 0.01, partial(self._move, by, times - 1))
 
     def _rearm(self, *arms: str) -> None:
-        """Start one session before the other. A cabinet begins when its arm is at rest."""
+        """Begin the sessions of ``arms`` at different random times. A cabinet begins when its arm is at rest."""
         for arm in arms:
             self.virtual.at(self.virtual.now + float(self.random.uniform(0.05, 0.6)), partial(self._begin, arm))
 

@@ -1,7 +1,8 @@
 """Processes that a test starts, each ended by its own id, with its output in a failure's report; and waiting for nodes.
 
-A node takes one to two seconds of a processor to import, and a test of a whole set starts five. They are forked from a
-server that has imported it all once, before any of ROS is initialised; what runs then is what ``python -m`` runs.
+To import a node takes one to two seconds of processor time, and a test of a whole set starts five nodes. Therefore they
+are forked from a server that has imported all modules once, before ROS is initialised. A forked process then runs the
+same code as ``python -m`` does.
 """
 
 from __future__ import annotations
@@ -162,7 +163,7 @@ def environment_of(domain: int, folder: Path) -> dict[str, str]:
 def wait_until(
     condition: Callable[[], object], what: str, details: Callable[[], object] | None = None, patience: float = PATIENCE
 ) -> None:
-    """Wait until ``condition`` holds. Fails with ``what`` and ``details`` after a time far longer than it takes."""
+    """Wait until ``condition`` holds. Fail with ``what`` and ``details`` after ``patience`` [s], a generous time."""
     deadline = time.monotonic() + patience
     while not condition():
         if time.monotonic() > deadline:

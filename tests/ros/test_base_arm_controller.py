@@ -62,7 +62,7 @@ def test_an_arm_engages_where_it_is_follows_pauses_and_resumes_without_a_jump(
     assert max(steps(rig.targets)) < 0.02
     assert all(abs(np.linalg.norm(_quaternion(target)) - 1.0) < 1e-12 for target in rig.targets)
     assert (0.0, 0.0) in rig.pulses
-    assert len(rig.pulses) >= 6  # There are two engagements and a pause, each with its end.
+    assert len(rig.pulses) >= 6  # Two engagements and a pause were felt: three pulses and their ends.
     assert process.interrupt() == 0
 
 
@@ -72,7 +72,7 @@ def _quaternion(target: Any) -> list[float]:
 
 
 def test_an_arm_that_hangs_below_its_target_resumes_with_that_target(rig: ArmRig, processes: Processes) -> None:
-    """Another controller moves the arm and reports no command, so that the last target is what it holds."""
+    """Another controller moves the arm and reports no command. The last target counts as the pose that it holds."""
     rig.start(processes)
     rig.engage()
     rig.wait(lambda: rig.targets, "targets come")
@@ -111,7 +111,7 @@ def test_a_silent_hand_pauses_the_arm_and_its_return_moves_nothing(rig: ArmRig, 
 
 
 def test_a_node_that_stood_still_in_a_tick_sends_no_target_of_the_past(rig: ArmRig, processes: Processes) -> None:
-    """It sends neither the target that it had computed, nor the rest of its last motion."""
+    """The node sends neither the target that it had computed, nor the rest of its last motion."""
     process = processes.start_module("tests.ros.programs.stalling_arm", *as_arguments(*patient({})))
     rig.wait_until_connected()
     rig.engage()

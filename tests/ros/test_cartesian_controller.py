@@ -128,12 +128,12 @@ def test_a_second_publisher_of_targets_during_motion_stops_the_arm_and_is_named(
     # Only its own motion of 1 cm is allowed.
     assert max(np.linalg.norm(tool - begin.translation) for tool in tools) < 0.03
     stream.poses["left"] = shifted(begin, 0.0, 0.0, 0.2)
-    time.sleep(1.5)  # The time is longer than two publishers count.
+    time.sleep(1.5)  # After this time, one publisher is assumed again.
     stream.poses["left"] = cell.tool("left")
     wait_until(lambda: cell.state("left_state") == "following", "the stream that is left begins anew")
 
 
-def test_the_controller_follows_in_another_layout_and_frame_and_in_simulated_time(
+def test_the_controller_follows_with_other_topics_in_another_frame_and_in_simulated_time(
     cell: Cell, robot: Robot, processes: Processes
 ) -> None:
     cell.call("/cartesian_controller/stop")

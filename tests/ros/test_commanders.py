@@ -1,4 +1,4 @@
-"""Other programs that command the driven arms, and a receiver that stands still, are named and stop both arms."""
+"""If another program commands the arms, or a receiver stands still, both arms stop and the culprit is named."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.ros.processes import wait_until
 pytestmark = pytest.mark.alone
 
 TOPIC = "/joint_trajectory"
-# A busy machine may need long to find that an arm stands still. Until then, there is no deviation.
+# On a busy machine, it may take long until a standing arm is found. Meanwhile its deviation must not be a fault.
 LONG = "deviation_time:=8.0", "max_deviation:=1.0"
 
 
@@ -67,7 +67,7 @@ def test_a_second_publisher_of_commands_stops_both_arms_and_is_named(driven: Dri
     assert {driven.state(f"{arm}_state") for arm in driven.robot.arms} == {"stopped"}
     driven.end_streams()
 
-    # The second publisher is silent: after a reset, the controller drives beside it and listens.
+    # The second publisher is silent: after a reset, the controller commands beside it and listens.
     assert driven.call("/cartesian_controller/reset").success
     wait_until(lambda: driven.state("phase") == "active", "it is active again", lambda: driven.states)
     driven.engage("left", "right")

@@ -1,4 +1,4 @@
-"""Nodes that are killed or frozen stop both arms, which only a press moves again."""
+"""If a node is killed or frozen, both arms stop. Only a press lets them move again."""
 
 from __future__ import annotations
 
@@ -53,7 +53,10 @@ def moving(started: Cockpit) -> Iterator[Cockpit]:
 
 
 def stopped(moving: Cockpit, what: str, fault: float) -> JointRecorder:
-    """Assert that both arms rest after a fault at that time [s] without a jump, and return how soon."""
+    """Assert that both arms come to rest without a jump after a fault, and print how soon.
+
+    ``fault`` is the time of the fault [s]. Return the recorder of the joints.
+    """
     joints = moving.cell.joints
     speed, slow = joints.stop_after(fault)
     print(f"\n{what}: from {speed:.2f} rad/s slow within {1e3 * slow:.0f} ms")

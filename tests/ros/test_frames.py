@@ -61,7 +61,7 @@ def test_a_frame_is_found(frame: str, within: str, pose: pin.SE3, received: floa
     assert placement.received == received
 
 
-def test_unconnected_frames_are_not_found_even_in_a_ring(tree: FrameTree) -> None:
+def test_unconnected_frames_are_not_found_even_if_transforms_form_a_ring(tree: FrameTree) -> None:
     assert tree.find("tool", "elsewhere") is None
     tree.set(read(stamped_transform("tool", "world", A)), 4.0)
     assert tree.find("tool", "elsewhere") is None
@@ -78,7 +78,7 @@ def test_an_invalid_transform_is_ignored(bad: float, tree: FrameTree) -> None:
     np.testing.assert_allclose(placement.pose.homogeneous, B.homogeneous, atol=1e-12)
 
 
-def test_a_name_that_is_not_text_is_the_fault_of_another_node_and_ends_nothing(node: Any) -> None:
+def test_a_message_with_a_name_that_is_not_text_is_dropped_and_the_next_one_is_read(node: Any) -> None:
     dropped: list[str] = []
     node.drop = lambda topic, text: dropped.append(topic)  # Nodes of the package have this method.
     listener = FrameListener(node)
@@ -100,7 +100,7 @@ def send_from(node: Any, name: str, pose: pin.SE3, counted: int) -> Any:
 
 
 @pytest.mark.parametrize(("second", "disagree"), [(A, False), (C, True)], ids=["the same pose", "another pose"])
-def test_two_publishers_of_a_frame_block_it_if_they_disagree(
+def test_two_publishers_of_a_frame_are_a_conflict_only_if_they_disagree(
     second: pin.SE3, disagree: bool, domain: int, node: Any
 ) -> None:
     node.now = 0.0  # Nodes of the package have this attribute.
@@ -122,7 +122,7 @@ def test_two_publishers_of_a_frame_block_it_if_they_disagree(
         node.destroy_timer(timer)
 
 
-def test_a_listener_keeps_only_the_frames_on_requested_ways_and_follows_changes_of_these(node: Any) -> None:
+def test_a_listener_keeps_only_frames_that_are_needed_and_notices_a_new_parent(node: Any) -> None:
     node.now = 0.0
     listener = FrameListener(node)
     publisher = node.create_publisher(TFMessage, "/tf", 10)

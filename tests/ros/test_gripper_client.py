@@ -26,7 +26,7 @@ _CLOSED = 0.05  # [m]
 
 
 class Bench:
-    """A client, a gripper that reaches or refuses every goal, and the test, which gives permissions."""
+    """A gripper's client, a gripper that reaches or refuses every goal, and grants that the test sends."""
 
     def __init__(self, domain: int, kind: GripperType = GripperType.GRIPPER_COMMAND, topic: str = "/gripper") -> None:
         self._nodes = ExitStack()
@@ -105,8 +105,8 @@ def test_a_gripper_moves_on_as_more_is_permitted_and_reports_its_opening_only_at
     wait_until(lambda: bench.asked and bench.asked[-1] == [1.0, 1.0], "it says what it was commanded to")
 
 
-def test_a_wish_without_an_answer_is_dropped_and_reported(bench: Bench) -> None:
-    bench.grant(1.0, 1.0)  # The permission belongs to an earlier wish.
+def test_a_request_without_an_answer_is_dropped_and_reported(bench: Bench) -> None:
+    bench.grant(1.0, 1.0)  # The grant belongs to an earlier request.
     bench.command(close=True)
     bench.wait(lambda: bench.client.problem, "it gives up")
     assert bench.client.problem == "/gripper goes no farther: the controller that grants openings does not answer"
@@ -115,7 +115,7 @@ def test_a_wish_without_an_answer_is_dropped_and_reported(bench: Bench) -> None:
     assert bench.openings() == []
 
 
-def test_a_press_without_a_server_ends_the_wish_before_it(bench: Bench) -> None:
+def test_a_press_without_a_server_ends_the_request_before_it(bench: Bench) -> None:
     bench.command(close=False)
     bench.grant(1.0, 0.4)
     bench.wait(lambda: bench.asked and bench.asked[-1] == [1.0, 0.4], "it opens a part of the way")
@@ -141,7 +141,7 @@ def test_a_gripper_follows_a_trigger_at_most_ten_times_a_second(bench: Bench, mo
     assert asked == pytest.approx([0.96, 0.56, 0.0])
 
 
-def test_a_refused_goal_on_the_way_ends_the_wish(bench: Bench) -> None:
+def test_a_refused_goal_on_the_way_ends_the_request(bench: Bench) -> None:
     bench.command(close=True)
     bench.grant(0.0, 0.0)
     bench.wait(lambda: bench.client.closed, "it is closed")
@@ -156,7 +156,7 @@ def test_a_refused_goal_on_the_way_ends_the_wish(bench: Bench) -> None:
     assert bench.client.state == "closed"
 
 
-def test_a_gripper_behind_a_topic_waits_too_and_two_presses_before_an_answer_are_two(domain: int) -> None:
+def test_a_gripper_with_a_command_topic_waits_too_and_two_presses_before_an_answer_both_count(domain: int) -> None:
     with closing(Bench(domain, GripperType.FLOAT64_MULTI_ARRAY, "/fingers")) as bench:
         bench.client.toggle(time.monotonic())
         bench.client.toggle(time.monotonic())

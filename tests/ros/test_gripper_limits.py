@@ -1,4 +1,4 @@
-"""Grippers ask the controller before they move. As in the pipeline, fingers are monitored where they are."""
+"""Grippers ask the controller before they move. As in the pipeline, fingers are monitored at their real openings."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _FINGERS = ("left_finger_joint_1", "left_finger_joint_2")
 
 
 class Gripper:
-    """The left gripper, commanded like by an arm's node, and the measured motion of its fingers."""
+    """Commands the left gripper as an arm's node does, and reads the measured motion of its fingers."""
 
     def __init__(self, cell: Cell) -> None:
         self.began = 0.0
@@ -91,7 +91,7 @@ def _go(stream: Stream, goal: pin.SE3) -> None:
     stream.poses["left"] = goal
 
 
-def test_a_gripper_that_does_not_close_holds_its_object(cell: Cell) -> None:
+def test_a_gripper_that_is_commanded_to_close_and_stands_still_holds_its_object(cell: Cell) -> None:
     wanted = cell.node.create_publisher(Float64MultiArray, "/q2r2/right/target_frame/wanted_opening", LATCHED_QOS)
     assert cell.state("right_holds_object") is False
     wanted.publish(Float64MultiArray(data=[0.3, math.nan]))  # There is no goal, so that the gripper stays open.
@@ -103,7 +103,7 @@ def test_a_gripper_that_does_not_close_holds_its_object(cell: Cell) -> None:
     wait_until(lambda: cell.state("right_holds_object") is False, "the object does not count any more")
 
 
-def test_an_invalid_opening_is_refused_by_name_and_the_last_one_stays(cell: Cell) -> None:
+def test_an_invalid_opening_is_dropped_with_a_warning_and_the_last_one_stays(cell: Cell) -> None:
     bad, topic = [0.5, 3.0], "/q2r2/left/target_frame/wanted_opening"
     gripper = Gripper(cell)
     gripper.grants.ask(1.0)
@@ -115,7 +115,7 @@ def test_an_invalid_opening_is_refused_by_name_and_the_last_one_stays(cell: Cell
     cell.node.destroy_publisher(sender)
 
 
-def test_a_gripper_opens_as_far_as_proven(cell: Cell, module_processes: Processes, config: str) -> None:
+def test_a_gripper_opens_as_far_as_is_proven_safe(cell: Cell, module_processes: Processes, config: str) -> None:
     gripper = Gripper(cell)
     wait_until(lambda: gripper.grants.answered, "the controller answers")
     stream = cell.engage("left")
@@ -149,7 +149,7 @@ def test_a_gripper_opens_as_far_as_proven(cell: Cell, module_processes: Processe
     start_controller(module_processes, *PATIENT, config=config)
     wait_until(lambda: cell.state("phase") == "active", "the new controller is active")
     gripper.pass_time(1.5)
-    # The fingers rest where they are just proven. At most a millimetre of tracking is given back.
+    # The gripper is as open as is proven safe, so the arms stay. They may only correct about a millimetre of error.
     assert cell.joints.tool_farthest_from(rest, gripper.began) < 0.002
     assert 0.3 < gripper.opening < 0.5
 

@@ -48,7 +48,7 @@ class Arrivals:
         self._number = 0
 
     def arrive(self, message: Any, took: int | None = None) -> None:
-        """Deliver a message; ``took`` is its time on the way [ns], for callbacks that examine it."""
+        """Deliver a message; ``took`` is its travel time [ns], for callbacks that examine it."""
         if took is None:
             self._subscription.callback(message)
             return
@@ -82,7 +82,7 @@ def test_a_late_target_is_passed_on_as_none_and_reported(context: Any, robot: Ro
     node.destroy_node()
 
 
-def test_a_target_from_before_the_standstill_of_its_sender_is_late_by_its_stamp(
+def test_the_stamp_shows_that_a_target_was_made_before_its_sender_stood_still(
     context: Any, robot: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     node = BaseNode("intake", context=context)
@@ -209,7 +209,7 @@ def test_publishers_on_one_topic_are_merged_by_joint_and_a_missing_joint_is_name
     q += 0.1
     send(5, 14)
     np.testing.assert_allclose(taken[-1].q, [*(q[:5] - 0.1), *q[5:]])
-    assert taken[-1].stamp == taken[-2].stamp  # The state is of the first publisher, which may have ended.
+    assert taken[-1].stamp == taken[-2].stamp  # The first publisher, which may have ended, has sent the oldest part.
     send(0, 5)
     assert taken[-1].stamp > taken[-2].stamp
     node.destroy_node()

@@ -1,4 +1,4 @@
-"""Two arms behind lbr_fri_ros2_stack, with the names of its releases: sessions that begin and end, and its guards."""
+"""Two arms behind lbr_fri_ros2_stack, with the topics of each release: sessions begin and end, and no guard trips."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from tests.ros.test_intakes import Arrivals
 from tests.ros.virtual_lbrs import Operator, lbr_cell, virtual_lbrs
 
 PAGE = Path(__file__).parents[2] / "docs/kuka.md"
-# The rows of the page's table.
+# The rows of that page's table of filters.
 FILTERS = re.findall(r"^\| (0[.\d]*) \| ([.\d]+) \| ([.\d]+) \|$", PAGE.read_text(), re.MULTILINE)
 
 
@@ -69,10 +69,10 @@ def test_a_session_that_begins_while_the_arms_still_brake_gets_no_command_of_the
 
 
 @pytest.mark.parametrize(("tau", "delay", "speed"), [tuple(map(float, row)) for row in FILTERS])
-def test_the_drivers_filter_delays_a_ramp_and_is_faster_after_two_commands_as_the_page_says(
+def test_the_drivers_filter_delays_a_steady_motion_and_is_faster_after_two_commands_as_docs_kuka_says(
     tau: float, delay: float, speed: float, robot: Robot
 ) -> None:
-    driver, ramp = FakeLbr(robot, "left", tau), 0.2  # [rad/s]
+    driver, ramp = FakeLbr(robot, "left", tau), 0.2  # ``ramp`` is the speed of the commanded joints [rad/s].
     driver.begin()
     for tick in range(200):
         driver.take(
@@ -103,7 +103,7 @@ def test_an_arm_is_ready_only_after_its_driver_reports_commanding_active(domain:
     with virtual_lbrs("for Jazzy", domain) as virtual:
         Operator(virtual)
         supervisor, left, right = virtual.node._supervisor, virtual.drivers["left"], virtual.drivers["right"]
-        # There is no broadcaster.
+        # The left driver has no state broadcaster.
         virtual.change = lambda topic, message: None if topic == "/left/lbr_state" else message
         for driver in virtual.drivers.values():
             driver.begin()

@@ -31,7 +31,7 @@ from tests.ros.processes import wait_until
 pytestmark = pytest.mark.alone
 
 
-STILL = 5e-3  # [rad]
+STILL = 5e-3  # A joint at rest moves less than this [rad].
 
 
 class Managed(Cell):
@@ -83,7 +83,7 @@ def test_the_controller_starts_active_and_rests_before_it_answers_a_deactivation
     assert cell.lifecycle() == "inactive"
     assert not cell.ask(Transition.TRANSITION_CLEANUP)
     last = np.array(cell.commands[-1].points[0].velocities)
-    assert np.abs(last).max() < 1e-3  # The last command is one at rest.
+    assert np.abs(last).max() < 1e-3  # The last command is at rest.
     time.sleep(0.3)
     cell.commands.clear()
     at_rest = cell.q.copy()

@@ -185,12 +185,12 @@ def test_an_arm_whose_tool_is_on_a_topic_pauses_when_that_topic_ends(
     assert "/left/current_pose from /test" in rig.state["last_event"]
 
 
-# The first takes poses, the second takes joints of the built-in controller.
+# The first preset takes poses. The second preset takes joint commands of the built-in controller.
 @pytest.mark.parametrize("preset", ["fzi", "jtc"])
-def test_an_arm_waits_while_the_tool_of_its_controller_is_elsewhere(
+def test_an_arm_waits_while_the_safe_target_is_far_from_its_tool(
     rig: ArmRig, node: Any, processes: Processes, preset: str
 ) -> None:
-    safe = offset(TOOL, (0.0, 0.0, 0.15))  # The pose is that of a tool_frame that is not the cell's.
+    safe = offset(TOOL, (0.0, 0.0, 0.15))  # A wrong tool_frame would cause this distance.
     publisher = node.create_publisher(PoseStamped, "/cartesian_controller/safe_target/left", 10)
     timer = node.create_timer(0.01, lambda: publisher.publish(stamped_pose(safe, "world", 0.0)))
     node.create_subscription(PoseStamped, "/theirs/target_frame", lambda _: None, 10)

@@ -33,7 +33,7 @@ def marker(**changes: Any) -> Marker:
 
 
 class Taken:
-    """An intake with its messages, and the lines that its node logs."""
+    """An obstacle intake. A call delivers a marker, and ``said`` lists the warnings that the node logs."""
 
     def __init__(self, context: Any, controller: CartesianController, monkeypatch: pytest.MonkeyPatch) -> None:
         self.node = BaseNode("intake", context=context)

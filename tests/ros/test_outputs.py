@@ -249,7 +249,7 @@ def test_a_listener_that_ended_before_is_not_reported(node: Any, listener: RosPr
     listener.wait()
     publisher.begin()
     assert Stream(publisher, 100.0).run(3.0 * TIMEOUT) is None
-    assert publisher.listeners == 1  # The graph says so.
+    assert publisher.listeners == 1  # The graph still lists it.
 
 
 def test_an_endpoint_keeps_the_name_of_its_node_when_the_graph_has_lost_it() -> None:

@@ -1,7 +1,7 @@
 """Another project's controller moves the arms. Its targets keep its rules in both modes.
 
-This package's own controller stands in for it, with another name and topics. The left arm's node sends it the hand's
-target itself, the right arm's what the built-in controller makes of that.
+This package's own controller stands in for it, with another name and topics. The left arm's node, in mode raw, sends it
+the hand's target. The right arm's node, in mode filtered, sends it the built-in controller's safe target.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ JOINTS = ("lbr_position", "lbr_torque", "forward_position", "jtc")
 
 
 class Theirs:
-    """The controller of both arms that replaces another project's, and all targets that it gets."""
+    """The controller of both arms, which stands in for another project's controller, and all targets that it gets."""
 
     def __init__(self, node: Any, processes: Processes, robot: Robot) -> None:
         self._processes, self.robot = processes, robot
@@ -82,7 +82,10 @@ class Theirs:
         self.targets[arm].append((message, self.cell.joints.tool(arm)))
 
     def assert_rules_kept(self) -> None:
-        """Assert unit quaternions in the arm's own frame, and streams that begin at the tool at the preset's speed."""
+        """Assert that all targets keep the preset's rules.
+
+        They have unit quaternions in the arm's own frame. Streams begin at the tool, and move at the preset's speed.
+        """
         fastest = PRESETS[PRESET].guard.max_velocity * 1.1
         for arm, targets in self.targets.items():
             assert len(targets) > 30, "on a slow computer not all of them are heard"
@@ -109,7 +112,7 @@ def distance(one: pin.SE3, other: pin.SE3) -> float:
 
 @pytest.fixture
 def theirs(domain: int, robot: Robot, processes: Processes, tmp_path: Path) -> Iterator[Theirs]:
-    """Return robot and both controllers. The built-in controller has only the right arm, because it moves neither."""
+    """Return the cell with both controllers. The built-in one has only the right arm, and moves no arm itself."""
     cell = yaml.safe_load(find_resource(CONFIG).read_text())
     del cell["arms"]["left"]
     (right_arm := tmp_path / "right_arm.yaml").write_text(yaml.safe_dump(cell))
@@ -134,7 +137,7 @@ def start_arm(node: Any, processes: Processes, arm: str, mode: str) -> ArmRig:
     return rig
 
 
-def test_a_controller_gets_targets_by_its_rules_in_both_modes(
+def test_a_controller_gets_targets_that_keep_its_rules_in_both_modes(
     theirs: Theirs, processes: Processes, domain: int
 ) -> None:
     joints = theirs.cell.joints
@@ -210,7 +213,7 @@ def test_moveit_servo_is_switched_to_poses_after_each_of_its_starts(node: Any, m
 
 
 @pytest.mark.parametrize("name", ["fzi", "mayr", "crisp", "kuka_lbr_clik"])
-def test_a_preset_that_is_not_run_differs_from_the_tested_one_only_in_names_and_requests(name: str) -> None:
+def test_a_preset_that_no_test_runs_differs_from_the_tested_preset_only_in_names_and_requests(name: str) -> None:
     preset, run = PRESETS[name], PRESETS[PRESET]
     assert (preset.hold, preset.guard, preset.takes_targets) == (run.hold, run.guard, run.takes_targets)
     assert preset.command_type is None

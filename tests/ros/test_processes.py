@@ -195,7 +195,7 @@ def test_arms_have_separate_processes_on_request_and_a_cell_with_one_arm_has_its
 
 
 @pytest.mark.parametrize(("stance", "hand"), [("side_by_side", "right"), ("mirror", "left")])
-def test_in_a_cell_with_one_arm_a_scripted_input_has_only_the_hand_that_leads_it(
+def test_in_a_cell_with_one_arm_a_scripted_input_has_only_the_hand_that_moves_it(
     tmp_path: Path, stance: str, hand: str
 ) -> None:
     cell = yaml.safe_load((ROOT / "config" / "iiwa7.yaml").read_text())
@@ -219,7 +219,7 @@ def test_every_node_of_a_set_is_an_executable(tmp_path: Path) -> None:
 
 @pytest.fixture
 def launch(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """A replacement for launch, which is not in the Python registry. It keeps the arguments of its classes."""
+    """A replacement for the package launch, which is not on PyPI. It keeps the arguments of launch's classes."""
     made = MagicMock()
     made.LaunchConfiguration = lambda name: SimpleNamespace(perform=lambda context: context[name])
     made.ParameterValue = lambda value, value_type: (value, value_type)

@@ -85,9 +85,9 @@ def recorder(node: Any, processes: Processes, tmp_path: Path) -> RunningRecorder
 
 
 def record_poses(recorder: RunningRecorder, node: Any, count: int) -> bytes:
-    """Publish poses of a hand slowly enough for best effort.
+    """Publish ``count`` poses of a hand, so slowly that best effort loses none.
 
-    Return the beginning of the last one after it is recorded.
+    Wait until the last message is in the file. Return its first 8 bytes, which contain the seconds of its stamp.
     """
     publisher = node.create_publisher(PoseStamped, HAND, STREAM_QOS)
     message = PoseStamped()
@@ -103,7 +103,9 @@ def record_poses(recorder: RunningRecorder, node: Any, count: int) -> bytes:
     return last
 
 
-def test_messages_are_in_the_file_to_the_byte_without_ros(recorder: RunningRecorder, node: Any, tmp_path: Path) -> None:
+def test_messages_are_in_the_file_to_the_byte_and_are_read_without_ros(
+    recorder: RunningRecorder, node: Any, tmp_path: Path
+) -> None:
     from rosbags.highlevel import AnyReader
 
     # Bytes between a message's fields are arbitrary memory of the sender. Compare with the bytes of another listener.
@@ -130,7 +132,7 @@ def test_messages_are_in_the_file_to_the_byte_without_ros(recorder: RunningRecor
 
 
 def late_recorder(rig: ArmRig, node: Any, processes: Processes, folder: Path) -> RunningRecorder:
-    """Press before there is a recorder, which is refused, and return one that the arm's node has heard of."""
+    """Press before a recorder runs, which is refused. Then start a recorder that the arm's node knows."""
     squeeze(rig)
     rig.wait(
         lambda: rig.state["last_event_kind"] == TeleopReason.NO_RECORDING, "without a recorder nothing is recorded"

@@ -27,7 +27,7 @@ from tests.ros.processes import CONFIG, PATIENCE, Processes, States, wait_until
 need_ros()
 
 
-# The command first tries ROS in a separate process, and then listens for this time [s].
+# Time limit of a command, which first tries ROS in a separate process and then listens [s].
 LONG = 4.0 * PATIENCE
 COMMAND = (sys.executable, "-m", "q2r2_control", "ros")
 CELL = load_config(CONFIG)
@@ -62,7 +62,8 @@ def test_rates_are_those_of_the_senders_and_only_states_are_listened_to(node: An
 
 
 def test_a_watch_shuts_its_executor_down_before_python_ends(node: Any, processes: Processes) -> None:
-    # Python destroys in any order what is left then. rclpy prints a traceback if an executor comes after its parts.
+    # When Python ends, it destroys the remaining objects in any order. rclpy prints a traceback if an executor is
+    # destroyed after its parts.
     code = f"""
 import gc
 from rclpy.executors import Executor
@@ -189,6 +190,6 @@ def test_a_line_gives_the_reason_for_the_state_of_an_arm(nodes: tuple[NodeView, 
     assert (left.name, right.name, right.node) == ("left", "right", "")
 
 
-def test_two_nodes_of_one_arm_have_two_rows() -> None:
+def test_two_nodes_of_one_arm_have_two_views() -> None:
     views = arm_views((arm(), NodeView("/other", "ok", "running", 0.1, ARM)), CELL)
     assert [(view.name, view.node) for view in views] == [("left", "/left_arm"), ("left", "/other"), ("right", "")]

@@ -130,7 +130,7 @@ def test_the_script_waits_for_a_ready_arm_and_presses_until_it_follows(node: Any
 
 
 class PlayedHand(SimulationInput):
-    """A left hand whose clock and whose arm's report belong to the test."""
+    """A scripted left hand. The test sets its clock and the report of its arm."""
 
     now = 0.0
 
@@ -165,7 +165,7 @@ def test_an_arm_is_not_engaged_again_after_a_request_of_another_program(kind: st
 
 
 @pytest.mark.parametrize("engaged", [True, False])
-def test_the_last_press_of_a_work_pauses_an_arm_and_engages_no_arm(engaged: bool, context: Any) -> None:
+def test_the_last_press_of_a_script_may_pause_an_arm_and_engages_no_arm(engaged: bool, context: Any) -> None:
     hand = PlayedHand("meet", context)
     hand.play(0.9)
     assert hand.play(9.0, engaged=True, last_event_kind="pressed") == 1

@@ -28,7 +28,7 @@ from q2r2_control.teleop.teleop import Teleop
 
 
 class WayHome:
-    """A client in step with the test, which is the controller. It begins when the controller goes home by itself."""
+    """The client of the services for the way home, and a teleop layer. The test plays the controller."""
 
     def __init__(self) -> None:
         self.teleop = Teleop(TeleopSettings(), ["left", "right"])
@@ -37,7 +37,10 @@ class WayHome:
         self._client: Any = HomeClient(node, "/c")
 
     def update(self, now: float, goes: bool, outcome: Reason | None = None) -> list[str]:
-        """Return the events of this time [s]: the new state of an arm, and the reason."""
+        """Update the client at ``now`` [s]; ``goes``: whether the controller reports that it goes home.
+
+        Return the events, each as the new state of an arm and the reason.
+        """
         self._client.update(self.teleop, goes, outcome, now)
         return [f"{event.destination}: {kinds(event.reason)}" for event in self.teleop.take_events()]
 
@@ -98,7 +101,7 @@ def both(context: Any) -> Iterator[tuple[LeftArmController, RightArmController]]
 
 
 @pytest.mark.parametrize(("left", "right", "in_step"), [(1, 1, True), (1, 2, False), (None, None, False)])
-def test_the_relation_of_tools_is_corrected_only_by_references_of_the_same_time(
+def test_the_relation_of_tools_is_corrected_only_if_both_references_have_the_same_stamp(
     left: int | None, right: int | None, in_step: bool, both: tuple[Any, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     loop, stamps = both[0].loop, {"left": left, "right": right}

@@ -1,4 +1,4 @@
-"""A controller that takes velocities gets those of the guarded target, and zero where nothing shall move."""
+"""A controller that takes velocities gets the velocities of the guarded target, and zero if the arm should rest."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from geometry_msgs.msg import TwistStamped
 from q2r2_control.ros.nodes.arm_controllers import LeftArmController
 from q2r2_control.teleop.arm_states import ArmState
 
-PERIOD = 0.01  # of the node's ticks [s]
+PERIOD = 0.01  # Period of the node's ticks [s].
 BASE = pin.SE3(pin.rpy.rpyToMatrix(0.0, 0.0, np.pi / 2.0), np.array([0.0, 0.5, 0.0]))  # In the world frame.
 TOOL = pin.SE3(np.eye(3), np.array([0.5, 0.0, 0.4]))
 
@@ -50,7 +50,7 @@ class Driven:
         self.step(self.at)
 
     def newest(self) -> tuple[Array, Array]:
-        """The newest velocity that the receiver has taken."""
+        """Return the newest velocity that the receiver has taken: linear [m/s] and angular [rad/s]."""
         while self._taken.qsize():
             message = self._taken.get()
             assert message.header.frame_id == "world"
@@ -103,7 +103,7 @@ def test_the_velocity_is_that_of_the_target_in_the_axes_of_the_base(driven: Driv
     moving(driven)
 
 
-def test_a_target_that_jumps_is_as_fast_as_the_guard_allows(driven: Driven) -> None:
+def test_after_a_jump_of_the_target_the_velocity_stays_within_the_limits_of_the_guard(driven: Driven) -> None:
     limits = driven.output.guard.settings
     far = pin.SE3(np.eye(3), TOOL.translation + np.array([1000.0, 0.0, 0.0]))
     speeds = [0.0]

@@ -90,10 +90,10 @@ class VirtualLbrs:
     def __init__(self, node: CartesianControllerNode, robot: Robot, release: str, seed: int) -> None:
         self.node, self.robot, self.random = node, robot, np.random.default_rng(seed)
         self.drivers = {arm: FakeLbr(robot, arm) for arm in SIDES}
-        self.now = 1.0  # [s]
+        self.now = 1.0  # The virtual time [s].
         self._clock: Any = node.get_clock()
         self.frozen_until = 0.0  # Time until which the node is frozen [s].
-        # Changes messages of drivers; None loses them.
+        # A function that changes a driver's message on a topic. If it returns None, the message is lost.
         self.change: Callable[[str, Any], Any] = lambda topic, message: message
         self.on_command: Callable[[str, Array], None] = lambda arm, q: None
         self._queue: list[tuple[float, int, Callable[[], None]]] = []
@@ -195,7 +195,7 @@ class Operator:
         elif not self.moves and ready and virtual.now >= self.not_before and random.random() < 0.1:
             self.moves, self._began = True, virtual.now
             self._starts = {arm: virtual.robot.tool_pose(virtual.measured(), arm) for arm in SIDES}
-            # The target is out of reach, at joint limits, or as fast as the joints can move.
+            # A far target is out of reach, at joint limits, or as fast as the joints can move.
             far = random.random() < 0.3
             scale = (0.8, 1.5) if far else (0.12, 0.3)
             self._ways = {

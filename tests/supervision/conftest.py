@@ -10,7 +10,7 @@ from q2r2_control.config.control import SupervisionSettings
 from q2r2_control.supervision.joint_watch import watch_settings
 
 CONFIG = "config/dual_iiwa7.yaml"
-# A state that is not finite is a fault at once.
+# With these settings, a state that is not finite is a fault at once.
 STRICT = watch_settings(SupervisionSettings(unusable_time=0.0), yields=False)
 
 

@@ -1,4 +1,4 @@
-"""Arms at different places of their common reference brake together, whichever loop moves them."""
+"""Arms that follow their common reference with different lags brake together, whichever loop moves them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ PERIOD = 0.005  # Period of the arms' messages [s].
 def timings(
     left: float = 0.0, right: float = 0.0, silent: tuple[float, float] = (0.0, 0.0), noise: float = 0.0
 ) -> dict[str, ArmTiming]:
-    """Return the timing of two arms with these lags, with ``silent`` and ``noise`` in periods."""
+    """Return the timings of two arms. All arguments are in periods; ``left`` and ``right`` are the arms' lags."""
     behind = {"left": left, "right": right}
     return {
         arm: ArmTiming(PERIOD * lag, PERIOD * quiet, PERIOD, PERIOD * noise)
@@ -44,13 +44,13 @@ def timings(
         pytest.param({}, False, id="arms that move as one"),
     ],
 )
-def test_arms_are_slowed_while_their_lags_differ(found: dict[str, ArmTiming], holds: bool) -> None:
+def test_arms_brake_while_their_lags_differ_by_more_than_is_allowed(found: dict[str, ArmTiming], holds: bool) -> None:
     watch = SkewWatch()
     watch.observe(found, 0.0)
     assert watch.holds == holds
 
 
-def test_the_window_contains_the_allowed_skew_and_two_more_messages() -> None:
+def test_the_window_is_the_allowed_skew_and_two_more_message_periods() -> None:
     found = timings()
     assert skew_window(found, 0.004) == pytest.approx(allowed_skew(found) + 2.0 * PERIOD + 0.004)
     found["left"] = ArmTiming(0.0, 0.0, 2.0 * PERIOD)
@@ -58,7 +58,7 @@ def test_the_window_contains_the_allowed_skew_and_two_more_messages() -> None:
     assert skew_window({"left": found["left"]}, 0.004) == 0.0
 
 
-def test_after_a_long_difference_of_lags_the_arm_that_is_behind_is_named() -> None:
+def test_if_lags_differ_for_too_long_the_arm_that_is_behind_is_named() -> None:
     watch = SkewWatch()
     watch.observe(timings(), 0.0)
     watch.observe(timings(right=4.0), 0.05)
@@ -69,7 +69,7 @@ def test_after_a_long_difference_of_lags_the_arm_that_is_behind_is_named() -> No
     assert sentence(fault) == "right: 20 ms behind the other arm; allowed: 11 ms"
 
 
-def test_arms_that_are_apart_from_the_beginning_are_stopped_after_a_tenth_of_a_second() -> None:
+def test_arms_whose_lags_differ_from_the_beginning_are_stopped_after_a_tenth_of_a_second() -> None:
     watch, found = SkewWatch(), []
     for now in (5.0, 5.09, 5.11):
         watch.observe(timings(left=4.0), now)
@@ -77,14 +77,17 @@ def test_arms_that_are_apart_from_the_beginning_are_stopped_after_a_tenth_of_a_s
     assert found == [False, False, True]
 
 
-def test_both_arms_brake_while_one_is_behind_and_go_on_when_it_is_not(
+def test_both_arms_brake_while_one_is_behind_and_go_on_when_it_has_caught_up(
     robot: Robot, controller: CartesianController
 ) -> None:
     world = World(robot, controller)
     left, right = world.engage_both()
 
     def go(seconds: float, skew: float) -> float:
-        """Lead both tools to 50 mm above their start, and return the speed of the fastest joint at the end [rad/s]."""
+        """Send both tools to 50 mm above their start, while the left arm lags by ``skew`` periods.
+
+        Return the speed of the fastest joint at the end [rad/s].
+        """
         for _ in range(round(seconds / DT)):
             world.supervisor.skew.observe(timings(left=skew), world.now)
             world.run(DT, raised(left, 0.05), right=raised(right, 0.05))
@@ -101,7 +104,7 @@ def test_both_arms_brake_while_one_is_behind_and_go_on_when_it_is_not(
     assert controller.tool_pose("left").translation[2] == pytest.approx(left.translation[2] + 0.05, abs=1e-3)
 
 
-def test_arms_that_stay_apart_are_activated_again_from_rest(robot: Robot, controller: CartesianController) -> None:
+def test_arms_whose_lags_stay_different_begin_again_from_rest(robot: Robot, controller: CartesianController) -> None:
     world = World(robot, controller)
     left, right = world.engage_both()
     for _ in range(60):

@@ -34,7 +34,7 @@ MIN_DISTANCE, TOLERANCE = 0.02, 0.01  # [m]
 
 
 def swing(robot: Robot, angle: float) -> list[Array]:
-    """Return postures from home on, in which the left elbow swings inwards by ``angle`` [rad] while no tool moves."""
+    """Return postures that begin at home. The left elbow swings inwards by ``angle`` [rad] while no tool moves."""
     data, arm, q = robot.model.createData(), robot.arms["left"], robot.home.copy()
     tool, step = robot.tool_pose(q, "left"), SPEED * DT
     postures, last = [q.copy()], np.eye(7)[2]
@@ -51,7 +51,7 @@ def swing(robot: Robot, angle: float) -> list[Array]:
 
 @pytest.fixture(scope="module")
 def config(robot: Robot, tmp_path_factory: pytest.TempPathFactory) -> Config:
-    """Return the cell with a post that the left elbow meets on its way, but the reference's elbow does not."""
+    """Return the cell with a post. The left elbow meets it during the swing, but the reference's elbow does not."""
     data = robot.model.createData()
     pin.forwardKinematics(robot.model, data, swing(robot, POST)[-1])
     elbow = data.oMi[robot.model.getJointId("left_A4")].translation
@@ -108,12 +108,12 @@ def test_elbows_may_swing_while_the_tools_rest_but_not_too_close_to_other_bodies
     assert event.kind is SupervisionReason.TOO_CLOSE
     assert event.detail["pair"].startswith("left_link_")
     assert event.detail["pair"].endswith("|post_0")
-    # The first state that is too close counts. The next one is nearer only by the elbow's motion in between.
+    # The first state that is too close stops the arms, so the distance is too small by one tick's motion at most.
     assert MIN_DISTANCE - TOLERANCE - 1e-3 < event.detail["distance"] <= MIN_DISTANCE - TOLERANCE
 
 
-def test_the_measured_pair_that_lacks_most_of_its_own_distance_is_named(robot: Robot) -> None:
-    """Another pair is closer, but may be."""
+def test_the_pair_that_is_farthest_below_its_own_required_distance_is_named(robot: Robot) -> None:
+    """Another pair is closer, but it is allowed to be that close."""
     _, pair = sorted(robot.distances(robot.home), key=lambda pair: pair.distance)[:2]
     kept = NamedPairDistance(pair=(pair.name_a, pair.name_b), distance=pair.distance + 0.03)
     controller = CartesianController(robot, ControllerSettings(pairs=(kept,)))
@@ -129,9 +129,9 @@ def test_the_measured_pair_that_lacks_most_of_its_own_distance_is_named(robot: R
 
 
 @pytest.mark.parametrize(("joint", "by"), [(0, 0.1), (6, 0.4)], ids=["by a distance", "by an angle alone"])
-def test_a_tool_that_is_away_from_its_reference_starts_over(world: World, joint: int, by: float) -> None:
+def test_an_arm_whose_tool_stays_away_from_the_reference_starts_over(world: World, joint: int, by: float) -> None:
     moved = world.robot.home.copy()
-    # This is more than a stream's beginning allows, but less than a joint's deviation allows.
+    # The tool is too far away for a stream to begin there, but the joint is not too far from its reference.
     moved[joint] += by
     steps = [world.robot.home + share * (moved - world.robot.home) for share in np.linspace(0.0, 1.0, 40)]
     world.show(steps + [moved] * round(0.4 / DT))
@@ -190,7 +190,7 @@ def test_an_arm_whose_targets_end_in_motion_comes_to_rest_without_going_back(wor
     assert heights[-1] > max(heights) - 1e-4
 
 
-def test_the_way_home_leads_the_tools_until_they_arrive_and_accepts_no_targets(config: Config) -> None:
+def test_on_the_way_home_the_tools_move_until_they_arrive_and_targets_are_refused(config: Config) -> None:
     world = World(config)
     q = world.robot.home.copy()
     q[[1, 8]] += 0.2

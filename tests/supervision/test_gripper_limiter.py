@@ -1,6 +1,6 @@
-"""A gripper moves only as far as the controller has proven.
+"""A gripper moves only as far as the controller has proven to be safe.
 
-The controller knows its opening and whether it holds an object.
+The controller knows the gripper's opening, and whether the gripper holds an object.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def controller() -> CartesianController:
 
 
 class Cell:
-    """The arms at their reference, with grippers that move at their speed to their commands."""
+    """Arms that are always at their reference, with grippers that move to their commands at their own speed."""
 
     def __init__(self, controller: CartesianController) -> None:
         controller.reset(controller.robot.home)
@@ -51,7 +51,7 @@ class Cell:
             self.motion.advance(DT)
             least, greatest = self.controller.openings["left"]
             for opening in (self.granted["left"], self.motion.openings["left"]):
-                # A gripper does not jump: half of the tolerance is always there.
+                # The interval contains half of the tolerance on each side of the opening.
                 assert least <= max(opening - 0.5 * TOLERANCE / STROKE, 0.0)
                 assert greatest >= min(opening + 0.5 * TOLERANCE / STROKE, 1.0)
             assert self.controller.openings["right"][1] == 1.0
@@ -67,7 +67,7 @@ def gripper(controller: CartesianController) -> Cell:
     return Cell(controller)
 
 
-def test_a_closed_gripper_needs_less_room_and_asks_for_nothing_at_rest(gripper: Cell) -> None:
+def test_the_interval_shrinks_around_a_closed_gripper_and_does_not_change_at_rest(gripper: Cell) -> None:
     gripper.run(0.0, 0.5)
     assert gripper.granted["left"] == gripper.motion.openings["left"] == 0.0
     assert gripper.controller.openings["left"][0] == 0.0
@@ -77,7 +77,7 @@ def test_a_closed_gripper_needs_less_room_and_asks_for_nothing_at_rest(gripper: 
     assert gripper.asked == asked < 12
 
 
-def test_a_gripper_opens_as_far_as_proven_asks_once_in_5_ms_and_opens_fully_if_there_is_room(gripper: Cell) -> None:
+def test_a_gripper_opens_as_far_as_is_proven_asks_every_5_ms_and_opens_fully_in_free_space(gripper: Cell) -> None:
     gripper.run(0.0, 1.6, BESIDE)
     assert not gripper.limiter.held
     gripper.run(1.0, 0.4, BESIDE)
@@ -136,7 +136,7 @@ def test_a_gripper_that_is_forced_into_another_body_is_named_and_may_close(gripp
         assert gripper.granted["left"] == wanted
 
 
-def test_a_gripper_with_an_earlier_command_counts_with_that_opening_at_once(controller: CartesianController) -> None:
+def test_a_gripper_that_was_commanded_before_counts_with_that_opening_at_once(controller: CartesianController) -> None:
     controller.reset(controller.robot.home)
     limiter = GripperLimiter(controller)
     limiter.resume({"left": 0.0, "right": 0.3}, {"left": 0.2, "right": math.nan}, 1.0)
@@ -147,7 +147,7 @@ def test_a_gripper_with_an_earlier_command_counts_with_that_opening_at_once(cont
     assert controller.openings["left"][1] < 0.3
 
 
-def test_an_opening_counts_for_as_long_as_the_gripper_may_take(controller: CartesianController) -> None:
+def test_an_opening_counts_for_the_longest_delay_of_the_gripper(controller: CartesianController) -> None:
     least = {}
     for remembered in (0.05, 0.3):
         controller.reset(controller.robot.home)
@@ -194,7 +194,7 @@ def test_turning_fingers_wait_above_the_table_before_they_close_and_go_on_by_the
     assert controller.tool_pose("left").translation[2] > above_table(0.006).translation[2] + 0.005
 
 
-def test_a_gripper_whose_bodies_may_not_shrink_yet_is_not_held(gripper: Cell) -> None:
+def test_a_gripper_whose_smaller_interval_is_refused_does_not_count_as_held_up(gripper: Cell) -> None:
     controller = gripper.controller
     gripper.run(0.0, 0.05)
     with patch.object(controller, "set_opening", return_value=("finger", "table")):
@@ -273,8 +273,8 @@ def test_without_measurements_the_last_known_state_stays(hand: Hand) -> None:
     assert hand.run(1.0, 0.5, measured=math.nan)
 
 
-def test_where_no_opening_is_measured_a_closed_gripper_holds() -> None:
-    """The cell has no joints of this gripper."""
+def test_a_gripper_without_measured_opening_holds_its_object_while_it_is_commanded_closed() -> None:
+    """The cell names no joints for the left gripper."""
     data = BLOCK_CELL.model_dump()
     data["arms"]["left"]["gripper"]["joints"] = ()
     bare = type(BLOCK_CELL).model_validate(data)
@@ -286,7 +286,7 @@ def test_where_no_opening_is_measured_a_closed_gripper_holds() -> None:
     assert held == [False, True, True, False]
 
 
-def test_a_gripper_that_may_begin_late_gets_that_time() -> None:
+def test_a_gripper_holds_an_object_only_after_it_stood_still_for_the_stall_time() -> None:
     for stall in (0.2, 0.5):
         grip = Grip(0.025, stall)
         held = [at for at in np.arange(0.0, 1.0, 0.01) if grip.look(0.0, 1.0, float(at))]

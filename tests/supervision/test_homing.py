@@ -1,4 +1,4 @@
-"""The way home from any posture: all joints move, every promise holds, and it can be interrupted."""
+"""The way home from any posture: all joints move, the contract holds, and the way home can be interrupted."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from tests.supervision.conftest import CONFIG, STRICT, unhurried
 from tests.support.reasons import kinds
 
 DT = 0.004  # [s]
-LONGEST = 60.0  # [s]
+LONGEST = 60.0  # Longest time that the way home may take [s].
 
 
 class World:
@@ -156,7 +156,7 @@ def test_while_no_way_is_known_the_arms_rest_and_a_tick_examines_at_most_two_sam
         at = homing.step(q, np.zeros_like(q), DT).joints
         assert at is not None
         assert np.array_equal(at, q)
-        assert distances.call_count - before <= 3  # One more call computes the margin at the begin of the way.
+        assert distances.call_count - before <= 3  # One more call measures the distances at the start.
         ticks += 1
     assert homing.outcome is CommonReason.HOMING_NO_WAY
     assert ticks > 100
@@ -222,7 +222,10 @@ def test_the_fastest_joint_goes_home_at_0_3_rad_per_second(robot: Robot) -> None
 
 
 class Beside(World):
-    """A world with a body that is reported 30 times a second from ``begin`` [s] on. No link comes too near."""
+    """A world with an obstacle that is reported 30 times a second from ``begin`` [s] on.
+
+    At each tick it asserts that no link comes too close to the obstacle.
+    """
 
     def __init__(self, controller: CartesianController, q: Array, thing: MovingObstacle, begin: float = 0.0) -> None:
         super().__init__(controller.robot, controller, q)

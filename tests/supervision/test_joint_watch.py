@@ -86,7 +86,7 @@ def test_the_first_fault_stays_until_states_are_accepted_again(joints: Joints) -
 
 
 @pytest.mark.parametrize("what", ["position", "velocity", "external torque"])
-def test_a_number_that_is_not_finite_is_bridged_for_a_while_and_then_named(joints: Joints, what: str) -> None:
+def test_a_number_that_is_not_finite_is_ignored_for_a_while_and_then_reported(joints: Joints, what: str) -> None:
     bad = {
         "position": lambda stamp: state(np.nan, stamp),
         "velocity": lambda stamp: state(0.0, stamp, v=np.inf),
@@ -150,7 +150,7 @@ def test_arms_that_creep_are_not_settled_and_resting_arms_are_after_the_settle_t
     assert not watch.settled(now + SETTINGS.state_timeout + 1e-6), "the newest state is too old"
 
 
-def test_arms_whose_session_is_lost_may_brake_by_states_that_still_come(joints: Joints) -> None:
+def test_arms_whose_session_is_lost_may_brake_from_states_that_still_come(joints: Joints) -> None:
     joints.watch.lose(Reason.of(CommonReason.LOOP_STALLED, duration=1.0))
     assert joints.fault() is CommonReason.LOOP_STALLED
     assert joints.watch.believed
@@ -161,7 +161,7 @@ def test_arms_whose_session_is_lost_may_brake_by_states_that_still_come(joints: 
     assert not joints.watch.believed
 
 
-def test_arms_that_lose_their_session_during_another_fault_may_not_brake_by_their_states(joints: Joints) -> None:
+def test_arms_that_lose_their_session_during_another_fault_may_not_brake_from_their_states(joints: Joints) -> None:
     joints.watch.observe(Reason.of(RosReason.BAD_JOINT_STATES, text="elbow is missing"), joints.now)
     joints.watch.lose(Reason.of(CommonReason.LOOP_STALLED, duration=1.0))
     assert not joints.watch.believed

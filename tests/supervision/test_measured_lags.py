@@ -13,12 +13,12 @@ DT = 0.005  # Period of ticks [s].
 
 
 def swing(robot: Robot, t: float) -> Array:
-    """Return a swing of all joints at up to 0.6 rad/s. They rest before time 0."""
+    """Return the posture at ``t`` [s] of joints that swing at up to 0.6 rad/s. They rest before time 0."""
     return np.asarray(robot.home + 0.3 * (1.0 - np.cos(2.0 * max(t, 0.0))))
 
 
 def found(robot: Robot, lags: dict[str, float], now: float) -> dict[str, float]:
-    """Return the lags that are found at ``now`` [s] for arms with these lags."""
+    """Return the lags that are found at ``now`` [s] for arms whose true lags are ``lags`` [s]."""
     watch, q = MeasuredLags(robot), robot.home.copy()
     for t in np.arange(-0.5, now, DT):
         watch.note(swing(robot, t), float(t))
@@ -41,13 +41,13 @@ def test_resting_and_reversing_arms_get_the_least_possible_difference_of_lags(ro
         assert abs(lags["left"] - lags["right"]) <= 0.011
 
 
-def test_an_arm_is_taken_for_at_most_0_4_s_behind(robot: Robot) -> None:
+def test_the_largest_lag_that_is_found_is_0_4_s(robot: Robot) -> None:
     """An arm that is farther away was moved by something else."""
     assert found(robot, dict.fromkeys(SIDES, 0.6), 1.2) == pytest.approx(dict.fromkeys(SIDES, 0.4), abs=0.011)
 
 
-def test_a_resting_arm_counts_as_far_behind_as_the_moving_arm(robot: Robot) -> None:
-    """All lags explain where the resting arm is."""
+def test_a_resting_arm_gets_the_same_lag_as_the_moving_arm(robot: Robot) -> None:
+    """Any lag explains the posture of the resting arm."""
     watch, left = MeasuredLags(robot), robot.arms["left"].joints
 
     def at(t: float) -> Array:
@@ -60,7 +60,7 @@ def test_a_resting_arm_counts_as_far_behind_as_the_moving_arm(robot: Robot) -> N
     assert watch.behind(at(0.7), dict.fromkeys(SIDES, 0.8)) == pytest.approx(dict.fromkeys(SIDES, 0.1), abs=0.011)
 
 
-def test_a_reference_that_begins_again_has_no_lag_from_its_past(robot: Robot) -> None:
+def test_after_a_restart_earlier_references_give_no_lag(robot: Robot) -> None:
     watch = MeasuredLags(robot)
     watch.note(swing(robot, 0.7), 0.7)
     watch.restart()

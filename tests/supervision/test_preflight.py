@@ -46,7 +46,7 @@ def test_a_home_without_a_certified_stop_is_a_fault(robot: Robot, controller: Ca
 
 
 @pytest.mark.parametrize(("room", "left"), [(0.3, None), (0.2005, "0.0005"), (0.1, "0")])
-def test_a_joint_without_room_between_its_margins_is_a_fault(
+def test_a_joint_without_range_between_its_margins_is_a_fault(
     robot: Robot, monkeypatch: pytest.MonkeyPatch, room: float, left: str | None
 ) -> None:
     lower, upper = robot.position_lower.copy(), robot.position_upper.copy()
@@ -81,7 +81,7 @@ def test_limits_in_degrees_are_a_fault_and_a_joint_of_many_turns_is_not_a_fault(
     lower, upper, fastest = robot.position_lower.copy(), robot.position_upper.copy(), robot.velocity_limit.copy()
     for limits in (lower, upper, fastest):
         limits[2] = np.rad2deg(limits[2])
-    upper[3], fastest[4] = 100.0, 60.0  # One of both alone may be right.
+    upper[3], fastest[4] = 100.0, 60.0  # One large limit alone may be right.
     for name, limits in (("position_lower", lower), ("position_upper", upper), ("velocity_limit", fastest)):
         monkeypatch.setattr(robot, name, limits)
     (fault,) = preflight_faults(robot, SETTINGS, None)

@@ -29,7 +29,7 @@ FROZEN_AT = 0.6  # [s]
 
 
 def swinging(speed: float, hertz: float) -> Callable[[float], Array]:
-    """Return joints that begin at rest and move to and fro; ``speed`` is the largest one [rad/s]."""
+    """Return joints that begin at rest and move to and fro; ``speed`` is their largest speed [rad/s]."""
     turn = 2.0 * np.pi * hertz
     return lambda t: np.array([0.0, 1.0, -0.4]) * speed / turn * (1.0 - np.cos(turn * max(t, 0.0)))
 
@@ -58,16 +58,17 @@ def findings(
     ticks: Callable[[float], bool] = lambda t: True,
     state_period: float = DT,
 ) -> Iterator[float]:
-    """Return times of findings about an arm with a ``delay`` and a first-order ``lag`` [s], until it is frozen.
+    """Yield the times at which the watch reports an arm [s].
 
-    Its controller keeps the command of when it was frozen. ``heard``: whether a state comes; ``ticks``: whether the
-    loop ticks, without which the arm gets no command either.
+    The arm follows its commands with a ``delay`` [s] and a first-order ``lag`` [s]. From ``frozen_at`` on, its driver
+    holds the last command. ``heard(t)``: whether a state arrives. ``ticks(t)``: whether the loop ticks; otherwise no
+    command is sent.
     """
     watch, measured, stamp, command = StandstillWatch(limits), asked(0.0), 0.0, asked(0.0)
     seen, next_state = measured, 0.0
     for t in np.arange(0.0, seconds, DT):
         measured = measured + (command - measured) * (DT / lag)
-        if t < frozen_at and ticks(t):  # A command of one tick moves the arm until the next one.
+        if t < frozen_at and ticks(t):  # The arm follows the command of one tick until the next tick.
             command = asked(t - delay)
         if t >= next_state and heard(t):
             seen, stamp, next_state = measured, t, next_state + state_period
@@ -126,7 +127,7 @@ def test_a_late_controller_may_begin_late_again_after_a_rest() -> None:
 
 
 def test_nothing_is_judged_where_the_loop_or_the_states_have_a_gap() -> None:
-    """A loop that stood still sent no commands to follow. Nothing is known about an arm that is not heard."""
+    """A loop that stood still sent no commands. Without states nothing is known about the arm."""
 
     def gap(t: float) -> bool:
         return not FROZEN_AT < t < FROZEN_AT + 0.08
@@ -155,7 +156,7 @@ def test_fifty_states_a_second_are_enough() -> None:
 
 
 class Cell:
-    """A supervisor of arms that another process named ``/jtc`` moves."""
+    """A supervisor of arms that other processes move, named ``/left_jtc`` and ``/right_jtc``."""
 
     def __init__(self, robot: Robot, controller: CartesianController) -> None:
         self.tool = controller.tool_pose

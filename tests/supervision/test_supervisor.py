@@ -42,7 +42,7 @@ class World:
         return self._robot.tool_pose(self.q, arm)
 
     def engage(self, by: float = 0.0, seconds: float = 0.3) -> pin.SE3:
-        """Let the left arm follow and move up ``by`` [m]. Return where it begins."""
+        """Let the left arm follow and move up ``by`` [m]. Return its tool pose before the motion."""
         self.run(0.2)
         tool = self.tool("left")
         self.run(0.02, tool)
@@ -51,7 +51,7 @@ class World:
         return tool
 
     def engage_both(self) -> tuple[pin.SE3, pin.SE3]:
-        """Let both arms follow. Return where their targets begin."""
+        """Let both arms follow targets at rest. Return these targets."""
         self.run(0.2)
         left, right = self.tool("left"), self.tool("right")
         self.run(0.1, left, right=right)
@@ -61,7 +61,7 @@ class World:
     def run(
         self, seconds: float, target: pin.SE3 | None = None, sees: bool = True, right: pin.SE3 | None = None
     ) -> None:
-        """Let time pass with a steady target of the left arm and the ``right`` one, with or without joint states."""
+        """Let time pass with constant targets of the left and the ``right`` arm. ``sees``: whether states come."""
         zero = np.zeros_like(self.q)
         for _ in range(round(seconds / DT)):
             self.now += DT
@@ -171,7 +171,7 @@ def test_two_publishers_for_one_linked_arm_stop_both_arms(world: World) -> None:
 
 
 @pytest.mark.parametrize("linked", [True, False], ids=["that its sender ends", "of an arm that is not linked"])
-def test_a_stream_can_stop_only_its_own_arm(world: World, linked: bool) -> None:
+def test_the_end_of_a_stream_may_stop_only_its_own_arm(world: World, linked: bool) -> None:
     world.streams.linked = linked
     _, right = world.engage_both()
     if linked:
@@ -219,7 +219,7 @@ def test_lost_joint_states_brake_the_arms_and_their_return_moves_nothing(world: 
     assert kinds(world.supervisor.events[1]) == "joint_states: states_silent"
 
 
-def test_a_joint_that_cannot_hold_against_gravity_is_stopped_with_the_torque(
+def test_a_joint_that_cannot_hold_against_gravity_is_stopped_and_the_reason_tells_the_torque(
     world: World, robot: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(robot, "torque_limit", np.full_like(robot.torque_limit, 1e-3))
@@ -257,7 +257,7 @@ def test_homing_ends_at_home_and_takes_no_targets(world: World) -> None:
     assert world.supervisor.arm_state("left") == "holding"
 
 
-def test_a_stream_goes_on_anywhere_but_after_a_silence_only_from_the_tool() -> None:
+def test_a_stream_may_go_anywhere_but_after_a_silence_it_has_to_begin_at_the_tool() -> None:
     stream = TargetStream(StreamSettings())
     assert stream.offer(TOOL, [TOOL], 0.0) is None
     assert stream.offer(raised(TOOL, 0.2), [], 0.1) is None
@@ -288,7 +288,7 @@ def test_targets_that_begin_elsewhere_are_followed_after_they_jump_to_the_tool_o
     assert silent.offer(TOOL, [TOOL], 0.2) is None
 
 
-def test_a_stream_that_was_dropped_does_not_continue_where_it_stands() -> None:
+def test_a_stream_that_was_dropped_is_refused_even_at_the_tool() -> None:
     stream = TargetStream(StreamSettings())
     assert stream.offer(TOOL, [TOOL], 0.0) is None
     stream.drop()
@@ -297,7 +297,7 @@ def test_a_stream_that_was_dropped_does_not_continue_where_it_stands() -> None:
     assert stream.offer(TOOL, [TOOL], 0.02) is None
 
 
-def test_arms_that_nothing_moves_are_noticed_and_a_new_receiver_gets_no_jump(world: World) -> None:
+def test_arms_whose_receiver_is_gone_are_noticed_and_a_new_receiver_gets_no_jump(world: World) -> None:
     tool = world.engage()
     world.blocked = True  # The program that moved the arms is gone.
     world.run(0.3, raised(tool, 0.06))

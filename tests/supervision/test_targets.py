@@ -1,4 +1,4 @@
-"""Messages of frozen senders and of two publishers are found. Even motion stays even in a loop with other ticks."""
+"""Messages of frozen senders and of two publishers are found. Even motion stays even in a loop of another period."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def breaks(numbers: list[int]) -> list[int]:
 
 
 @pytest.mark.parametrize("other", [1, 205, 90_000], ids=["younger", "almost in step", "older"])
-def test_two_publishers_that_alternate_break_the_numbers_at_the_third_and_fifth_message(other: int) -> None:
+def test_two_publishers_that_alternate_are_found_at_the_third_and_fifth_message(other: int) -> None:
     found = breaks([number for step in range(20) for number in (200 + step, other + step)])
     assert found[2] >= 1
     assert all(count >= 2 for count in found[4:])
@@ -119,7 +119,11 @@ def circling(t: float) -> pin.SE3:
 
 
 def played(pose: Callable[[float], pin.SE3], until: float, *, lines: bool, jitter: float = 4e-4) -> list[pin.SE3]:
-    """Return the loop's target at each tick. Both tick late by up to ``jitter`` [s], and messages take as long."""
+    """Return the loop's target at each tick.
+
+    The sender and the loop tick late by up to ``jitter`` [s]. A message takes 0.5 ms and up to ``jitter`` more.
+    ``lines``: whether the time at which each target is due is known, so that targets are extrapolated.
+    """
     random, line, clock = np.random.default_rng(0), TargetExtrapolator(), TickClock(LOOP)
     sent = [SENDER * k + random.uniform(0.0, jitter) for k in range(int(until / SENDER))]
     received = [t + 5e-4 + random.uniform(0.0, jitter) for t in sent]
@@ -140,12 +144,12 @@ def ripple(targets: list[pin.SE3]) -> float:
     return float(np.std(speeds) / np.mean(speeds))
 
 
-def test_an_even_motion_stays_even_which_it_does_not_without_interpolation() -> None:
+def test_an_even_motion_stays_even_only_with_extrapolation() -> None:
     assert ripple(played(circling, 3.0, lines=True)) < 0.02
     assert ripple(played(circling, 3.0, lines=False)) > 0.3
 
 
-def test_the_path_is_that_of_the_targets() -> None:
+def test_extrapolated_targets_stay_on_the_path_of_the_targets() -> None:
     for found in played(circling, 3.0, lines=True)[10:]:
         middle = found.translation - np.array([0.5, 0.0, 0.4])
         assert np.linalg.norm(middle) == pytest.approx(RADIUS, abs=2e-4)

@@ -117,14 +117,14 @@ class Watched:
         return self.guard.pose
 
     def step(self, target: pin.SE3 | None, dt: float = DT) -> pin.SE3:
-        if self.now + dt - self.now > LONGEST_DT:  # The target has come to rest in this time.
+        if self.now + dt - self.now > LONGEST_DT:  # After such a gap the motion begins from rest.
             self.velocity = np.zeros(3), np.zeros(3)
         before, last = self.pose, self.velocity
         self.now += dt
         after = self.guard.step(target, self.now)
         assert after is not None
         ways = after.translation - before.translation, pin.log3(after.rotation @ before.rotation.T)
-        if dt > self._period:  # A late step moves the target by no more than a period allows.
+        if dt > self._period:  # A late step moves the pose by no more than one period allows.
             for way, fastest in zip(ways, FASTEST, strict=True):
                 assert math.hypot(*way) <= fastest * self._period * (1 + 1e-6) + 1e-9
             speeds = np.array([math.hypot(*velocity) for velocity in last])
@@ -147,7 +147,10 @@ def moving() -> Watched:
 
 
 def circle(t: float, radius: float, period: float) -> pin.SE3:
-    """Return a circle through the origin that starts within half a second, with rotation on its way."""
+    """Return the pose at ``t`` [s] on a circle through the origin, which is turned to and fro on the way.
+
+    The motion accelerates for half a second.
+    """
     phase = 2 * math.pi / period * (t * t if t < 0.5 else t - 0.25)
     return pose(radius * (math.cos(phase) - 1), radius * math.sin(phase), 0.0, (0.0, 0.0, 0.5 * math.sin(phase)))
 
@@ -192,7 +195,7 @@ def test_a_jump_is_followed_without_overshoot_in_the_time_that_the_limits_requir
     assert 0 < held_back <= watched.guard.clipped <= steps
 
 
-def test_without_a_target_the_guard_brakes_and_rests() -> None:
+def test_without_a_target_the_guarded_pose_brakes_and_stays_at_rest() -> None:
     watched = moving()
     for _ in range(math.ceil(0.4 / LIMITS.max_acceleration / DT) + 1):
         watched.step(None)

@@ -42,14 +42,17 @@ _MARKER_PERIOD, _CONDITION_PERIOD = 0.05, 0.04  # Times between two messages [s]
 
 
 class TargetMarkers:
-    """The markers of one arm. Axes and ball are in the tool's frame, so that a paused target is at the actual tool."""
+    """The RViz markers of one arm.
+
+    The axes and the ball are given in the tool's frame. While the arm is paused, they therefore stay at the real tool.
+    """
 
     def __init__(self, arm: str, tool_frame: str, world_frame: str) -> None:
         self._arm, self._tool_frame, self._world_frame = arm, tool_frame, world_frame
         self._path: deque[Array] = deque(maxlen=_PATH_POINTS)
 
     def at(self, target: pin.SE3 | None, tool: pin.SE3 | None, engaged: bool, now: float) -> list[Marker]:
-        """Return the markers of a target and a tool in the world frame at ``now`` [s]; none without a known tool."""
+        """Return the markers at ``now`` [s] for a target and a tool pose in the world frame; [] if ``tool`` is None."""
         if tool is None:
             return []
         shown = target if engaged and target is not None else tool
@@ -152,7 +155,10 @@ class _Condition(BaseModel):
 
 
 class ConditionPublishers:
-    """Publishes the conditions of the arms while somebody listens."""
+    """Publishes each arm's condition while its topic has subscribers.
+
+    A condition is the spare distance, the joints at a limit and the contact force.
+    """
 
     def __init__(self, node: BaseNode, arms: Any, conditions: ArmConditions) -> None:
         self._conditions = conditions

@@ -40,9 +40,9 @@ _RETRY = 1.0  # The service is called again after this time without an answer [s
 class ArmOutputs:
     """The outputs of one arm: one in mode raw, and up to two in mode filtered.
 
-    In mode filtered, ``first`` drives the built-in controller, and its result is relayed to the arm's controller. The
-    relay starts when the arm is engaged and the built-in controller has its tool at the arm's tool. It continues in
-    pauses, so that the arm comes to rest as the built-in controller does.
+    In mode filtered, ``first`` sends the hand's target to the built-in controller. The safe target that this controller
+    publishes is relayed to the arm's own controller. The relay starts when the arm is engaged, if the safe target is
+    near the measured tool. It continues during pauses, so that the arm comes to rest as the built-in controller does.
     """
 
     def __init__(self, node: BaseNode, arm: str, values: ArmParameters, safe_target: PoseTopic) -> None:
@@ -123,7 +123,7 @@ class ArmOutputs:
         return {output.topic: output.sent for output in self._all}
 
     def take_fault(self, now: float) -> Reason | None:
-        """Check the controllers. If the arm has to pause because of one, return the reason once."""
+        """Check the controllers. If a fault of a controller has to pause the arm, return the reason once."""
         faults = [output.take_fault(now) for output in reversed(self._all)]
         if self._last is not None and faults[0] is not None:
             self._relaying = False
@@ -162,7 +162,7 @@ class ArmOutputs:
     def relay(
         self, engaged: bool, tool: pin.SE3 | None, base: pin.SE3 | None, now: float, decided: float
     ) -> Reason | None:
-        """Pass on the safe target of the built-in controller; returns why the arm has to pause."""
+        """Pass on the safe target of the built-in controller. Return why the arm has to pause, or None."""
         if self._last is None:
             return None
         safe, fault = self._safe_target.at(now), None
@@ -170,12 +170,12 @@ class ArmOutputs:
         if not self._relaying and engaged:
             self._relaying, fault = self._safe_problem is None and tool is not None, self._safe_problem
         self._relaying = self._relaying and safe is not None
-        # A stream starts at the measured tool, from which the safe target may differ by the arm's steady-state offset.
+        # A stream starts at the measured tool, and the safe target may differ from it by the arm's steady-state offset.
         self._last.step(safe if self._relaying else None, tool, base, now, decided, start=tool)
         return _refused(fault)
 
     def away(self, safe: pin.SE3 | None, tool: pin.SE3 | None) -> Reason | None:
-        """Return a reason if the built-in controller has its tool elsewhere, so that it would not follow this arm."""
+        """Return a reason if the safe target is so far from the measured tool that no relay may begin, else None."""
         if safe is None or tool is None:
             return None
         distance, angle = apart(safe, tool)
@@ -191,11 +191,11 @@ class ArmOutputs:
 
 
 class FollowWatch:
-    """Watches whether the built-in controller follows an arm's targets, by its topic ``~/following/<arm>``.
+    """Watches whether the built-in controller follows an arm's targets, as its topic ``~/following/<arm>`` reports.
 
     The controller drops a stream for its own reasons, such as missing joint states. After that it accepts only a new
-    stream, for which the arm has to be paused. The controller is ready only while it reports on ``~/state``. Otherwise
-    it may have no joint states, or be another controller, for which these targets are not made.
+    stream, for which the arm has to be paused. The controller is ready only while it reports on ``~/state``. If it does
+    not report, it may have no joint states, or it may be a different controller, which must not get these targets.
     """
 
     def __init__(self, node: BaseNode, controller: str, arm: str, timeout: float) -> None:
@@ -205,9 +205,11 @@ class FollowWatch:
         self._since = math.inf  # Time since which targets have been sent and not followed [s].
         self._followed_since = math.inf  # Time since which targets have been sent and followed [s].
         self._node, self._state_topic = node, f"{controller}/state"
-        self._unready: Reason | None = None  # Why it is not ready, by the newest report.
-        self._starts, self._reported_at = 0, -math.inf  # Starts of the controller, and time of the newest report [s].
-        self._is_there, self._looked = False, -math.inf  # Whether a node reports, and when the graph was asked [s].
+        self._unready: Reason | None = None  # Why the controller is not ready, as its newest report says.
+        # The number of the controller's starts, and the time of its newest report [s].
+        self._starts, self._reported_at = 0, -math.inf
+        # Whether a node publishes ``~/state``, and the time at which the graph was last asked for it [s].
+        self._is_there, self._looked = False, -math.inf
         self.homing = False  # Whether the controller reports that it goes home.
         self.homing_outcome: Reason | None = None  # How the last way home ended, if nobody interrupted it.
         self.gripper_held = ""  # The pair of bodies that stops the gripper.
@@ -234,7 +236,10 @@ class FollowWatch:
             self._starts, self._reported_at, self._unready = starts, -math.inf, None
 
     def refusal(self, sending: bool, now: float) -> Reason | None:
-        """Return a reason if targets are sent, and are followed no more or not yet after the timeout; else None."""
+        """Return a reason if the controller does not follow the targets that are sent, else None.
+
+        Either it has ceased to follow them, or it has not begun within the timeout.
+        """
         if self.homing:
             return None
         followed = sending and self._follows is True
@@ -242,7 +247,7 @@ class FollowWatch:
             self._since = math.inf
             self._followed_since = min(self._followed_since, now) if followed else math.inf
             return None
-        # The report on the end of an earlier stream may come late, before this stream is answered.
+        # If the controller seemed to follow for less than _ANSWER, the report about an earlier stream's end came late.
         dropped = now - self._followed_since > _ANSWER
         self._since, self._followed_since = min(self._since, now), math.inf
         if not (dropped or now - self._since > self._timeout):
@@ -278,7 +283,7 @@ class FollowWatch:
 
 
 class CommandType:
-    """Sets MoveIt Servo to its type of targets after each of its starts.
+    """Tells MoveIt Servo after each of its starts which type of targets it will get.
 
     Raises :class:`ConfigError` if moveit_msgs is missing.
     """

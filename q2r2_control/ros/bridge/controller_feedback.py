@@ -1,10 +1,11 @@
-"""Outputs of the built-in controller besides joint commands: safe targets, the arms that follow, openings of grippers.
+"""Outputs of the built-in controller besides joint commands: safe targets, which arms follow, openings of grippers.
 
-Fingers and held objects are bodies, which must not collide. Openings are 0 closed .. 1 fully open. The client of a
-gripper publishes the wanted opening and the last commanded one. Its topic is the topic of the arm's targets with
-``/wanted_opening`` at its end. On ``~/opening/<arm>`` the controller answers with the wanted opening and the proven
-one, which the client commands. Without a client, without measured fingers, or with another controller of the arms,
-fingers may be anywhere on their way.
+Fingers and held objects are bodies that must not collide. Openings are numbers from 0, closed, to 1, fully open. The
+client of a gripper publishes the wanted opening and the last commanded opening. The name of its topic is the name of
+the arm's topic of targets with ``/wanted_opening`` at its end. On ``~/opening/<arm>`` the controller answers with the
+wanted opening and the opening that is proven to be safe. The client commands the second one. The fingers count as
+anywhere between closed and open if there is no client, if they are not measured, or if another controller moves the
+arms.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ from q2r2_control.types import Array, Reference, RobotState, StepStatus
 _STATUSES = tuple(StepStatus)
 # Time until a gripper moves to a granted opening [s]. The answer has to arrive, and ten goals are sent per second.
 GRIPPER_DELAY = 0.3
-_DISCOVERY = 1.0  # Time until earlier messages have arrived at a new node, even on a busy machine [s].
+_DISCOVERY = 1.0  # Time in which the latched messages of other nodes reach a new node, even on a busy machine [s].
 _UNMEASURED = "its fingers are not in the joint states, or nothing is proven while the arms are stopped"
 _MARKER_PERIOD = 0.1  # Time between two markers [s].
 _FAR, _NEAR = 0.10, 0.02  # The marker is green beyond the first distance, and red below the second [m].
@@ -172,7 +173,8 @@ class GripperLimits:
     def awaits(self, now: float) -> bool:
         """Return whether a measured gripper may have a commanded opening that is not known here yet.
 
-        Without it, fingers may be anywhere on their way, and arms at rest near an object would move away from it.
+        Without this opening, the fingers count as anywhere between closed and open. Arms that rest near an object would
+        then move away from it.
         """
         if time.monotonic() - self._began > _DISCOVERY:
             return False

@@ -26,7 +26,7 @@ from q2r2_control.supervision.target_stream import apart
 from q2r2_control.supervision.targets import SequenceWatch
 
 _TF, _TF_STATIC = "tf", "tf_static"
-# Two publishers whose poses of a frame differ by more than this are about different robots [m], [rad].
+# If two publishers send poses of a frame that differ by more than this, they are about different robots [m], [rad].
 _SAME = 0.05, 0.1
 _REMEMBERED = 2.0  # Time for which such a difference is remembered [s].
 _PAUSE = 1.0  # After a silence of this time a publisher may have been restarted [s].
@@ -62,7 +62,7 @@ def read_transforms(message: bytes) -> Sequence[ReadTransform]:
 
 
 class Placement(NamedTuple):
-    """The pose of a frame in another one."""
+    """The pose of a frame in another frame."""
 
     pose: pin.SE3
     received: float  # The oldest receipt time of its transforms [s]; inf if all of them are static.
@@ -75,10 +75,10 @@ class FrameTree:
         self._edges: dict[str, tuple[ReadTransform, float]] = {}  # By frame, its transform and receipt time [s].
         self._found: dict[tuple[str, str], Placement] = {}  # Placements that were found since the last transform.
         self._used: set[str] = set()  # Frames in the chains of transforms that were found.
-        self._all = True  # Whether a frame was not found, so that any transform may be needed.
+        self._all = True  # True if the last search found no chain, so that any new transform may be needed.
 
     def set(self, transform: ReadTransform, received: float) -> None:
-        """Store one transform with its receipt time [s], inf for a static one. One without a pose is ignored."""
+        """Store a transform with its receipt time [s], inf if it is static. Ignore it if its numbers are no pose."""
         if transform.is_pose:
             self._edges[transform.child_frame_id] = transform, received
             self._found.clear()
@@ -99,18 +99,18 @@ class FrameTree:
         return None
 
     def wants(self, frame: str) -> bool:
-        """Return whether the pose of ``frame`` is needed. Few links of a robot are."""
+        """Return whether the pose of ``frame`` is needed. The poses of most links are not needed."""
         return self._all or frame in self._used
 
     def moves_far(self, transform: ReadTransform) -> bool:
-        """Return whether a transform moves its frame far from the last one."""
+        """Return whether a transform is far from the last transform of the same frame."""
         before = self._edges.get(transform.child_frame_id)
         if before is None or not transform.is_pose:
             return False
         return any(np.greater(apart(before[0].pose, transform.pose), _SAME))
 
     def upwards(self, frame: str) -> Iterator[tuple[str, Placement]]:
-        """Yield the frame and all its ancestors, with the frame's pose in each. A ring of parents also ends."""
+        """Yield the frame and all its ancestors, with the frame's pose in each, and each of them only once."""
         frame, pose, received = _name(frame), pin.SE3.Identity(), math.inf
         seen: set[str] = set()
         while frame not in seen:

@@ -45,11 +45,11 @@ class OpeningGrants:
 
     @property
     def granted(self) -> float | None:
-        """The opening on the way to the requested one that may be commanded now; None before an answer."""
+        """The opening that may be commanded now, on the way to the requested opening; None before an answer."""
         return None if self._answer is None or self._answer[0] != self._wanted else self._answer[1]
 
     def ask(self, opening: float) -> None:
-        """Request an opening until the next request."""
+        """Request an opening. The request holds until the next request."""
         self._wanted = opening
         self._tell()
 
@@ -68,26 +68,27 @@ class OpeningGrants:
 
 
 class GripperClient:
-    """Opens and closes one gripper. No call waits.
+    """Opens and closes one gripper. No method waits for an answer.
 
-    ``closed`` is its known state, which is open before the first result. A gripper that has stalled holds an object,
-    which is a success for any status of the goal. A topic gives no result, so that the state changes with the command.
-    With ``grants``, each command goes only as far as the built-in controller allows, until the request is fulfilled.
+    ``closed`` is the gripper's known state, False before the first result. If a gripper has stalled, it holds an
+    object, and its goal has succeeded whatever the goal's status is. A gripper that takes commands on a topic gives no
+    result, so its state changes with the command. With ``grants``, each command goes only as far as the built-in
+    controller allows, until the request is fulfilled.
     """
 
     def __init__(self, node: Node, name: str, settings: GripperSettings, grants: OpeningGrants | None = None) -> None:
         self.closed = False
-        self.holds = False  # Whether it closed on an object, by the result of the last goal.
+        self.holds = False  # Whether it closed on an object, as the result of the last goal says.
         self.problem: str | None = None
         self._node, self._name, self._settings, self._grants = node, name, settings, grants
-        self._goal_closed: bool | None = None  # Whether the current goal closes it; None without a goal.
+        self._goal_closed: bool | None = None  # Whether the current goal closes the gripper; None without a goal.
         self._position: float | None = None  # The last position that the gripper reported.
         self._sent, self._asked = -math.inf, 1.0  # The last request: its time [s] and its opening.
         self._commanded: float | None = None  # The last commanded opening.
-        self._begins = False  # Whether no command was sent for the last request yet.
+        self._begins = False  # True until the first command for the last request is sent.
         self._commanded_at = -math.inf  # Time of the last command [s].
-        self._waits = False  # Whether it waits until the whole request is granted.
-        self._closes = False  # Whether the last request is a smaller opening than the one before.
+        self._waits = False  # True while only a part of the requested motion is granted.
+        self._closes = False  # Whether the last request is a smaller opening than the request before.
         self._goals = 0
         self._publisher = self._client = None
         if settings.action_type is GripperType.FLOAT64_MULTI_ARRAY:
@@ -105,7 +106,7 @@ class GripperClient:
 
     @property
     def opening(self) -> float:
-        """The opening that the gripper reported last: 0 closed .. 1 open; 1 before any, -inf if it cannot report."""
+        """The last reported opening: 0 closed .. 1 open; 1 before the first report, -inf if there are no reports."""
         if self._client is None or self._position is None:
             return -math.inf if self._client is None else 1.0
         closed, opened = self._settings.closed_position, self._settings.open_position
@@ -191,7 +192,7 @@ class GripperClient:
         answer.add_done_callback(lambda future: self._answered(future.result(), number))
 
     def check(self, now: float) -> None:
-        """Continue with granted openings, and give up a goal without a result in time."""
+        """Continue with granted openings, and give up a goal whose result does not come in time."""
         if self._waits:
             self._go_on(now)
         elif self._goal_closed is not None and now - self._commanded_at > _RESULT_TIMEOUT:

@@ -35,7 +35,7 @@ _KINDS: dict[MessageType, tuple[type, Callable[[Any], HandMessage]]] = {
 
 @lru_cache(maxsize=32)
 def _serialized(inputs: HandInputs) -> bytes:
-    """Return the message of a hand's controls, which change seldom."""
+    """Return the serialized message of a hand's controls. It is cached, because the controls seldom change."""
     return bytes(serialize_message(convert.inputs_message(inputs)))
 
 
@@ -85,7 +85,7 @@ class HandPublishers:
                 self.publish(topic, message, frame, sample.pose_stamp)
 
     def subscribers(self, hand: str) -> int:
-        """Return the number of subscribers of the topics of ``hand``, without a recorder."""
+        """Return the number of subscribers of the topics of ``hand``. The recorder does not count."""
         publishers = [publisher for topic, publisher in self._publishers.items() if HAND_TOPICS[topic].hand == hand]
         recorder = f"{self._node.get_namespace().rstrip('/')}{RECORDER}"
         matched = sum(publisher.get_subscription_count() for publisher in publishers)
@@ -114,9 +114,10 @@ def subscribe_to_haptics(node: Node, vibrate: Callable[[HapticFeedback], None]) 
 
 
 class HandIntake:
-    """Subscribes to the topics of the hand that drives an arm, and of the other hand after it first drives the arm.
+    """Takes the messages of the hand that drives an arm. Subscribes to a hand's topics when it first drives the arm.
 
-    Messages go to ``on_pose`` and ``on_inputs``, which pass them to :meth:`put_pose` and :meth:`put_inputs`.
+    Messages go to ``on_pose`` and ``on_inputs``, which pass them to :meth:`put_pose` and :meth:`put_inputs`. If
+    ``on_pose`` is None, poses go to :meth:`put_pose` directly.
     """
 
     def __init__(

@@ -41,16 +41,19 @@ from q2r2_control.types import ArmTiming, Array, RobotState
 from q2r2_control.wording import sentence
 
 _SHARED = "joint_states"  # The default topic.
-_LATEST = 0.02  # Greatest delay beyond the usual one with which a target's stamp still tells when it is due [s].
-_OLD = 0.5  # A target that is older than the one before by this much was made before its sender stood still [s].
+_LATEST = 0.02  # If a target's delay exceeds the usual delay by more, its stamp does not tell when it is due [s].
+# If a target is older at its receipt than the target before was, by more than this, its sender stood still after making
+# it [s].
+_OLD = 0.5
 # Longest period of joint states from which the lags of two arms can be compared [s], and the weight of a new period.
 _LONGEST_PERIOD, _PERIOD_SHARE = 0.02, 0.05
-COMMAND_TIME = 0.01  # Time of a command to its driver and arm, if drivers do not report it [s].
+COMMAND_TIME = 0.01  # Time from a command to the arm's motion, if drivers do not report this time [s].
 _PARTS = 64  # Largest number of sets of joint names whose joints are remembered.
 _LAG_NOISE = 0.01  # Noise of a lag that is estimated from joint states [s].
 _WARNING_TIME = 1.0  # Time for which refused targets are reported [s].
-# Takes the target of an arm in the world frame, or None if it is not a pose; the time [s]; the number of the message;
-# and the time at which the target is due [s], or None.
+# A function that takes a target, and returns why it is not followed, or None. Its arguments are: the arm; the target in
+# the world frame, or None if the message was no pose; the time of receipt [s]; the message's number or None; the time
+# at which the target is due [s], or None.
 Take = Callable[[str, pin.SE3 | None, float, int | None, float | None], Reason | None]
 TakeState = Callable[[RobotState | Reason, float], None]
 Look = Callable[[JointNumbers], None]
@@ -85,7 +88,7 @@ class TargetIntake:
         self.rejected = dict.fromkeys(robot.arms, 0)
 
     def subscribe(self, take: Take, release: Callable[[str], None]) -> None:
-        """Pass each target to ``take``, and the arm whose sender ends its stream to ``release``."""
+        """Pass each target to ``take``. If a sender ends the stream of an arm, pass the arm's name to ``release``."""
         for arm, topic in self.topics.items():
             on_target = partial(self._on_target, take, arm)
             self._node.create_subscription(PoseStamped, topic, on_target, COMMAND_QOS, raw=True)
@@ -132,10 +135,10 @@ class TargetIntake:
         return stamp + stamps.usual if known else None
 
     def _stood_still(self, arm: str, made: int, received: float) -> float:
-        """Return for how long the sending process was frozen between making and sending a target [s]; 0 if shortly.
+        """Return for how long the sender was frozen between making and sending a target [s]; 0 if not for long.
 
-        Only the stamp of the target tells this, if the process froze just before its middleware took the time of
-        sending.
+        If the process froze just before its middleware recorded the time of sending, only the stamp of the target shows
+        this.
         """
         (before, usual), self._newest[arm] = self._newest[arm], (made, received - 1e-9 * made)
         late = received - 1e-9 * made - usual
@@ -171,8 +174,8 @@ class JointIntake:
     ) -> None:
         """Declare the parameters; raises :class:`ConfigError`.
 
-        With ``needs_external_torque``, no state is good without external torques, and their topic must be set unless
-        they are ``told_by_drivers``.
+        With ``needs_external_torque``, no state is good without external torques. Their topic must then be set, unless
+        drivers report the torques (``told_by_drivers``).
         """
         self._node, self._needs_external_torque = node, needs_external_torque
         self._topics: dict[str, list[str]] = {}  # By topic, the arms whose joints it carries.
@@ -199,7 +202,8 @@ class JointIntake:
         self.state: RobotState | None = None  # The newest state of all arms.
         self._own_names: set[str] = set()  # Topics on which the arms' own names have come.
         self.theirs: dict[str, str] = {}  # By our name of a joint, the different name that its driver uses.
-        # Reports of drivers: why arms do not follow, and near which posture (nv,) they hold the arms [rad].
+        # What drivers report: why arms do not follow, or None; and for a measured posture (nv,), the posture at which
+        # the drivers hold the arms (nv,) [rad], or None.
         self.driver_fault: Callable[[], Reason | None] = lambda: None
         self.driver_held: Callable[[Array], Array | None] = lambda q: None
 
@@ -222,7 +226,7 @@ class JointIntake:
         return float(self._stamps[self._joints[topic]].min())
 
     def timings(self, now: float) -> dict[str, ArmTiming]:
-        """Return timings at ``now`` [s] of arms with separate topics; none if all share one or there is no state."""
+        """Return the timing of each arm at ``now`` [s]; {} if all arms share one topic, or if there is no state."""
         if len(self._topics) < 2 or self.state is None:
             return {}
         silent = {topic: now - self._stamp(topic) for topic in self._topics}
@@ -291,9 +295,9 @@ class JointIntake:
         return part
 
     def _named_otherwise(self, topic: str, given: Sequence[str]) -> list[str]:
-        """Return the sender's own names of an arm's joints, if they can be known. They are logged once."""
+        """Return the sender's own names of an arm's joints; [] if they cannot be found. They are logged once."""
         names = self._names[topic]
-        # Any robot may publish on the default topic. A topic that has carried the arm's own names needs no others.
+        # Any robot may publish on the default topic. If a topic has carried our names, no other names are needed.
         if topic == _SHARED or len(self._topics[topic]) > 1 or topic in self._own_names:
             return []
         theirs = called_otherwise(tuple(names), tuple(given), self._others[topic])
@@ -319,7 +323,7 @@ class JointIntake:
 
 
 class Fingers:
-    """The joints of the grippers of a cell, among joint states."""
+    """Finds the finger joints of a cell's grippers in joint states."""
 
     def __init__(self, robot: Robot, config: Config) -> None:
         self._grippers = {

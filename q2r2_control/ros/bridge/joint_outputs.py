@@ -1,4 +1,7 @@
-"""Send joint commands, on one topic or on one for each arm. The parameter ``output`` selects drive and messages."""
+"""Send joint commands, on one topic for all arms or one topic for each arm.
+
+The parameter ``output`` selects the drive and the kind of messages.
+"""
 
 from __future__ import annotations
 
@@ -35,11 +38,11 @@ NONE = "none"
 
 
 class Kind(ABC):
-    """One kind of message, for the control loop's period [s] and a robot."""
+    """One kind of command message. It is made for the control loop's period [s] and a robot."""
 
     topic: ClassVar[str]  # The default topic.
-    older: str | None = None  # The last part of the topic in older releases of the receiver, which gets it too.
-    mode = CommandMode.POSITION  # The mode of the drive whose commands it carries.
+    older: str | None = None  # The topic's last part in older releases of the receiver. Commands are sent there too.
+    mode = CommandMode.POSITION  # The mode of the drive whose commands this kind carries.
     joints_each: int | None = None  # The number of joints that a message must have; None for any number.
     message: Any  # The type of the messages.
 
@@ -232,7 +235,7 @@ class JointOutput:
     def waits(self) -> bool:
         """Return whether nothing should be sent in this tick, so that the last command can be acknowledged.
 
-        The reference must not move on during this time, because it would be sent as one jump afterwards.
+        The reference must not move on during this time, because the arms would jump afterwards.
         """
         # All publishers are asked, because each has its own gap.
         return True in [channel.publisher.waits() for channel in self._channels]
@@ -241,8 +244,8 @@ class JointOutput:
         """Return a reason if the receiver of the commands has gone, or if there is a new one; else None.
 
         It is called before each command. Receivers are checked only while the arms are ``off_reference``, because a
-        check costs a message at times. Torques are not checked: arms that yield are off their reference by design, and
-        a torque for the measured posture is no jump.
+        check sometimes costs a message. Receivers of torques are not checked: compliant arms are off their reference by
+        design, and a torque for the measured posture causes no jump.
         """
         publishers = [channel.publisher for channel in self._channels]
         before, self._listeners = self._listeners, sum(publisher.listeners for publisher in publishers)

@@ -20,7 +20,7 @@ from q2r2_control.types import Array, CommandMode
 STATE_TOPICS = {"lbr_state": "for Jazzy", "state": "of 2024"}  # A driver's topics, and the releases that have them.
 _SILENT = 0.5  # A driver without a message for this time has gone [s].
 _RESTART = 1.0  # The restart of a driver's process takes longer than this [s].
-_SAG = 0.01  # Largest distance of measured joints from commanded ones, unless something else moved the arm [rad].
+_SAG = 0.01  # If measured joints are farther from commanded joints than this, something else moved the arm [rad].
 _WANTED = {CommandMode.POSITION: CommandKind.POSITION, CommandMode.TORQUE: CommandKind.TORQUE}
 
 
@@ -43,10 +43,11 @@ class LbrDrivers:
         """Listen to the drivers in ``namespaces``, by arm; ``on_torques`` gets the external torques (nv,) [Nm]."""
         self._node, self._robot, self._namespaces, self._mode = node, robot, dict(namespaces), mode
         self._on_torques, self._torques = on_torques, np.zeros(robot.model.nv)
-        self._held = np.full(robot.model.nv, np.nan)  # [rad]; NaN without a session, or if not known.
+        # The posture at which the arms are held (nv,) [rad]; NaN without a session, or if it is not known.
+        self._held = np.full(robot.model.nv, np.nan)
         self._newest: dict[str, tuple[Any, float]] = {}  # By arm, the newest state and its time [s].
-        # Namespaces of drivers whose session has ended since commands began. Further commands would not fit as a first
-        # command of a new session.
+        # Namespaces of drivers whose session has ended since commands began. They get no more commands, because a new
+        # session needs another first command.
         self.withheld: set[str] = set()
         kind = import_module("lbr_fri_idl.msg").LBRState
         for arm, namespace in self._namespaces.items():
@@ -72,7 +73,8 @@ class LbrDrivers:
     def held(self, q: Array) -> Array | None:
         """Return the posture (nv,) at which the arms are held, which the next command has to equal [rad].
 
-        An arm without such a posture near its measured ``q`` (nv,) [rad] is held at ``q``. With torques, return None.
+        If an arm's posture is not known or not near the measured ``q`` (nv,) [rad], its joints are those of ``q``.
+        Return None if the commands are torques.
         """
         if self._mode is not CommandMode.POSITION:
             return None

@@ -1,4 +1,4 @@
-"""Settings that change while a node runs. Settings that are set together change all, or none with a reason."""
+"""Settings that change while a node runs. If several are set together, all of them change, or none with a reason."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def make_control_live(node: BaseNode, controller: CartesianController) -> None:
 
 
 def make_impedance_live(node: BaseNode, impedance: ImpedanceController) -> None:
-    """Declare the parameters of the impedance in torque mode, which ramps to new values."""
+    """Declare the parameters of the impedance in torque mode. It changes gradually to new values."""
     for name in LIVE_IMPEDANCE:
         field = ImpedanceSettings.model_fields[name]
         value, bounds = getattr(impedance.settings, name), range_of(field)

@@ -22,7 +22,7 @@ from q2r2_control.ros.bridge.wire import JointNumbers, Template, read_pose
 from q2r2_control.types import QUEST_CONTROLS, Array, HandInputs, RobotState
 
 _UNIT = 1e-3  # Allowed error of a quaternion's norm.
-_OLDEST = 0.1  # Messages wait only for the next tick. A greater age means that the clock was set [s].
+_OLDEST = 0.1  # A message waits only until the next tick. A greater age means that the clock was set [s].
 
 
 def ended_topic(target_topic: str) -> str:
@@ -217,7 +217,7 @@ def _stem_and_number(name: str) -> tuple[str, str]:
 
 @lru_cache(maxsize=64)  # Publishers send the same names again and again.
 def order_of(given: tuple[str, ...], names: tuple[str, ...]) -> Array | str:
-    """Return the index of each of ``names`` among the ``given`` ones, or the fault of these in one line."""
+    """Return the index of each of ``names`` in ``given``, or one line that says what is wrong with ``given``."""
     if len(set(given)) != len(given):
         return "a joint is named twice"
     if missing := [name for name in names if name not in given]:

@@ -43,7 +43,7 @@ class ArmParameters:
     """The checked parameters of an arm controller."""
 
     base_frame: str  # The frame of the controller's targets.
-    world_frame: str  # The frame whose axes are those of the hand.
+    world_frame: str  # A motion of the hand along its axes moves the tool along the axes of this frame.
     tool_frame: str
     controller: str  # The name of the controller's node.
     prefix: str  # The text for {ctrl} in the preset.
@@ -51,9 +51,9 @@ class ArmParameters:
     current_pose_topic: str  # "" for the pose from /tf.
     builtin_node: str  # The name of the built-in controller's node.
     builtin_prefix: str
-    tool_timeout: float  # [s]
-    listener_timeout: float  # [s]
-    rate: float  # [Hz]
+    tool_timeout: float  # Greatest age of the tool pose and of the safe target [s].
+    listener_timeout: float  # Longest time without acknowledgements of the controller [s].
+    rate: float  # Rate of targets [Hz].
     preset: Preset
     mode: Mode
     gripper_topic: str
@@ -205,7 +205,7 @@ def _value(node: BaseNode, name: str, default: Any, field: FieldInfo, read_only:
 
 
 def may_be_none(field: FieldInfo) -> bool:
-    """Return whether a setting may be None. Its parameter is 0 then, which such a field never allows itself."""
+    """Return whether a setting may be None. The parameter 0 then means None, because no such setting may be 0."""
     return type(None) in getattr(field.annotation, "__args__", ())
 
 

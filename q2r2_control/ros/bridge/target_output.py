@@ -1,4 +1,4 @@
-"""The last step before the controller of an arm, which gets only targets on the terms of its preset."""
+"""Send targets to the controller of an arm, as the controller's preset requires."""
 
 from __future__ import annotations
 
@@ -25,11 +25,12 @@ from q2r2_control.supervision.tick_pacer import PoseRateLimiter
 from q2r2_control.teleop.arm_states import ArmState
 
 _GRAPH_PERIOD = 0.1  # Time between two queries of the graph for subscribers [s].
-# After a subscriber appeared, the graph is asked at every tick, because it knows an endpoint before it knows its node.
-# Until the node is known nothing is sent: it may be the restarted controller, whose first target must not be a jump.
-# If the node is not known after this time, an engaged arm is paused [s].
+# After a subscriber appeared, the graph is asked at every tick, because it lists an endpoint before the name of the
+# endpoint's node. Until the name is known nothing is sent: the node may be the restarted controller, whose first target
+# must not be a jump. If the name is not known after this time, an engaged arm is paused [s].
 _NAME_TIMEOUT = 3.0
-# Time from a stream's last target to its end, which is on another topic and must not arrive before the target [s].
+# Time from a stream's last target to the message that ends the stream [s]. That message is on another topic, and must
+# not arrive before the target.
 _LAST_ON_ITS_WAY = 0.03
 # A tool farther from a held target than this was moved by something else, and the target is not repeated.
 _HELD = 0.15, 0.6  # [m, rad]
@@ -39,8 +40,8 @@ class TargetOutput:
     """Publishes one arm's target, or its velocity, to one controller, through a :class:`PoseRateLimiter`.
 
     The limiter starts at the tool, so that engaging moves nothing. When the target ends, the limiter brakes, and the
-    preset says whether the last pose is repeated then. The pose is never repeated if the tool is elsewhere, nor to a
-    restarted controller, because both would be a jump.
+    preset says whether the last pose is repeated then. The pose is never repeated if the tool is far from it, nor to a
+    restarted controller, because the arm would jump.
     """
 
     def __init__(
@@ -76,7 +77,8 @@ class TargetOutput:
         self._endpoints: set[bytes] = set()  # Endpoints of the controller.
         self._listeners = 0
         self._unknown = False  # Whether a subscriber's node is not known yet.
-        self._asked_at = self._appeared_at = -math.inf  # Times of the last query of the graph and of a subscriber [s].
+        # Times at which the graph was last asked, and at which a subscriber last appeared [s].
+        self._asked_at = self._appeared_at = -math.inf
         self.starts = 0  # How often the controller has appeared.
 
     @property
@@ -90,7 +92,7 @@ class TargetOutput:
 
     @property
     def unready(self) -> Reason | None:
-        """The reason if the topic has no subscriber, or one whose node is not known yet, or None."""
+        """The reason if the topic has no subscriber, or a subscriber whose node is not known yet; else None."""
         if self._publisher.listeners == 0:
             return Reason.of(RosReason.NO_SUBSCRIBER, topic=f"{self.topic} ({self.preset.message})")
         return self._unknown_node if self._unknown and not self.following else None
@@ -130,11 +132,11 @@ class TargetOutput:
 
         Args:
             target: The target of the tool, in the world frame; None while the arm is paused.
-            tool: The measured tool, in the world frame; None if not known.
-            base: The frame of the controller's targets, in the world frame; None if not known.
+            tool: The measured tool pose, in the world frame; None if it is not known.
+            base: The frame of the controller's targets, in the world frame; None if it is not known.
             now: The time [s].
             decided: See :func:`publish_in_time`.
-            start: The begin of a stream; by default its first target.
+            start: The pose at which a new stream begins, in the world frame; None for the first target itself.
             state: The state of the arm. In PAUSING the stream continues, because the press may become another gesture.
                 In PAUSED it ends in order. If it stops in another way, the built-in controller also holds linked arms.
         """
@@ -183,7 +185,7 @@ class TargetOutput:
         self.guard.reset(None, now)
 
     def _present(self) -> int:
-        """Return the number of subscribers, with those that the graph lists before the publisher can send to them."""
+        """Return the number of subscribers. The graph may list some before the publisher can send to them."""
         return max(self._publisher.listeners, self._node.handle.get_count_subscribers(self.topic))
 
     def _holds(self, tool: pin.SE3 | None, state: ArmState, now: float) -> bool:

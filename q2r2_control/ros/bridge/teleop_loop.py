@@ -27,12 +27,15 @@ if TYPE_CHECKING:
     from q2r2_control.ros.nodes.base_arm_controller import BaseArmController
 
 
-_TIME_PERIOD = 0.05  # Time between two looks whether time stands still [s].
+_TIME_PERIOD = 0.05  # Time between two checks whether simulated time stands still [s].
 _PATIENCE = 2.0  # Time to wait for an answer, for a controller to go home, and for a report of the recorder [s].
 
 
 class HomeClient:
-    """Calls ``~/home`` and ``~/hold`` of the controller by the state of the teleop layer. It never waits."""
+    """Calls the controller's service ``~/home`` when the teleop layer goes home, and ``~/hold`` when it ends that.
+
+    It never waits for an answer.
+    """
 
     def __init__(self, node: Node, controller: str | None) -> None:
         """``controller`` is the name of the built-in controller; None if the arms' controller has no way home."""
@@ -118,7 +121,7 @@ class RecorderLink:
         node.create_subscription(String, self._topic, self._on_state, STREAM_QOS)
 
     def update(self, marks: EpisodeMarks) -> list[Reason]:
-        """Update the marks before the teleoperation of a tick; returns the reasons of new events of its services."""
+        """Update the marks before the teleoperation of a tick. Return the reasons of new events at the recorder."""
         if self._state is not None:
             marks.restore(self._state)
             self._state = None
@@ -141,14 +144,14 @@ class RecorderLink:
 class TickInputs(NamedTuple):
     """An arm and its controller in one tick. Poses are in the world frame."""
 
-    tool: pin.SE3 | None  # The measured tool.
-    commanded: pin.SE3 | None  # The tool in the controller's reference, or the best substitute that is known.
+    tool: pin.SE3 | None  # The measured tool pose.
+    commanded: pin.SE3 | None  # The tool pose in the controller's reference, or the best substitute that is known.
     reference: int | None  # Stamp of that reference by the controller's clock [ns]; None if there is none.
     obstacle: Reason | None  # Why the arm may not be engaged.
 
 
 class TeleopLoop:
-    """Ticks the node of one arm, or of both arms. One :class:`Teleop` then decides for both at one moment."""
+    """Ticks the node of one arm or the nodes of both arms. One :class:`Teleop` decides for both arms in each tick."""
 
     def __init__(self) -> None:
         self.nodes: list[BaseArmController] = []
@@ -187,7 +190,7 @@ class TeleopLoop:
                 node.feedback.haptics.start_pulse(Event(now, node.arm_name, node.state, node.state, reason))
         faults = {node.arm_name: node.begin_tick(now) for node in nodes}
         # The time is read after the nodes were judged, because the process may have been frozen in the middle of this
-        # tick. A gap in the node's own ticks is looked at first, because it makes others look silent.
+        # tick. A gap in the node's own ticks is checked first, because it makes other nodes look silent.
         gap, self._ticked = nodes[0].now - self._ticked, now
         if gap > teleop.settings.gate.timeout:
             self._pause(now, Reason.of(RosReason.NODE_STALLED, duration=gap))
@@ -223,7 +226,7 @@ class TeleopLoop:
             self.teleop.pause(now, reason)
 
     def _watch_time(self) -> None:
-        """Pause the arms if simulated time stands still. The hands go on, and must not be followed later."""
+        """Pause the arms if simulated time stands still. The hands move on, which must not be followed later."""
         timeout = self.teleop.settings.gate.timeout
         if (problem := self.nodes[0].clock_problem(timeout)) is None:
             return

@@ -238,7 +238,7 @@ _POSE = struct.Struct("<7d")
 
 
 def read_pose(message: Any) -> PoseNumbers:
-    """Read a PoseStamped, serialized or not; raises SerdeError for bytes that are none."""
+    """Read a PoseStamped, serialized or not; raises SerdeError for bytes that are no PoseStamped."""
     if isinstance(message, bytes):
         walk = _Walk(message)
         sec, nanosec = _STAMP.unpack_from(message, walk.skip(8))

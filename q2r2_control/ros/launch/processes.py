@@ -45,7 +45,7 @@ class NodeProcess:
     ros_arguments: tuple[str, ...] = ()  # Further arguments for ROS, such as "-r", "__ns:=/cell".
 
     def command(self) -> list[str]:
-        """Return the command that starts it with this Python. A text that looks like a number, as "3", stays a text."""
+        """Return the command that starts the process with this Python. A text such as "3" stays a text."""
         parameters = [
             part
             for key, value in self.parameters.items()
@@ -69,7 +69,7 @@ def nodes_of(
         source: The source of the hands: an installed input, "none", or None for the cell's input.
         robot: "mujoco", "none", or "auto", which is mujoco for ``controller: builtin`` and else none.
         recording: Parameters of the recorder, which starts first and ends last; None for no recorder.
-        separate: Whether each arm is a process with its own teleoperation.
+        separate: Whether each arm has a process and a teleoperation of its own.
         page: Host and port of the page in a browser; None for no page.
     """
     if robot not in ROBOTS:
@@ -104,7 +104,7 @@ def nodes_of(
 def in_ros(
     nodes: Iterable[NodeProcess], arguments: Sequence[str], namespace: str | None, sim_time: bool
 ) -> list[NodeProcess]:
-    """Return ``nodes`` with more ``arguments`` for ROS, in a ``namespace``, and with ``sim_time`` by the topic /clock.
+    """Return ``nodes`` with more ``arguments`` for ROS, in a ``namespace``. With ``sim_time``, /clock gives the time.
 
     Raises :class:`ConfigError` for an invalid namespace.
     """
@@ -140,10 +140,11 @@ def run_together(nodes: Sequence[NodeProcess], say: Callable[[str], None]) -> in
     """Start ``nodes`` and pass each line that they print to ``say``, after the node's name; returns the exit code.
 
     Ctrl-C or SIGTERM ends all of them. The exit code is then 0, or 3 if a node reports by this code that its recording
-    failed. A node that ends by itself is reported at once and ends the others, with exit code 1. No node is restarted.
-    Each node is a session of its own, so that Ctrl-C in a terminal reaches it only from here, in order. If this process
-    is killed, Linux interrupts all nodes, because arms must not move in a teleoperation that cannot be ended. ``say``
-    is called by several threads, one at a time. Missing message packages are built first.
+    failed. If a node ends by itself, this is reported at once, the others are ended, and the exit code is 1. No node is
+    restarted. Each node runs in a session of its own. Ctrl-C in a terminal therefore reaches the nodes only through
+    this function, one after the other. If this process is killed, Linux interrupts all nodes, because arms must not
+    move in a teleoperation that cannot be ended. ``say`` is called by several threads, one at a time. Missing message
+    packages are built first.
 
     Raises:
         UpError: If ROS cannot be used.

@@ -1,1 +1,4 @@
-"""One module for each executable, or the executables of both arms; ``launch.executables`` runs them."""
+"""The nodes: one module for each executable, and one module for the executables of both arms.
+
+``launch.executables`` runs them.
+"""

@@ -1,4 +1,4 @@
-"""The arms of this project's cell; a model for the arms of other robots."""
+"""The nodes that teleoperate the arms of this project's cell. They are an example for the arms of other robots."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from q2r2_control.ros.nodes.base_arm_controller import BaseArmController
 
 
 class LeftArmController(BaseArmController):
-    """Drives the left arm's built-in controller, in the frame of its cell."""
+    """Teleoperates the left arm through its built-in controller, with targets in the world frame of the cell."""
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("left", **kwargs)
 
 
 class RightArmController(BaseArmController):
-    """Drives the right arm's built-in controller, in the frame of its cell."""
+    """Teleoperates the right arm through its built-in controller, with targets in the world frame of the cell."""
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("right", **kwargs)

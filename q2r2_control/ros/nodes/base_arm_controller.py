@@ -1,4 +1,4 @@
-"""Teleoperate one arm as a ROS node. Another robot is a subclass with its own names, see arm_controllers.py."""
+"""Teleoperate one arm as a ROS node. Another robot needs a subclass with its own names, see arm_controllers.py."""
 
 from __future__ import annotations
 
@@ -43,11 +43,11 @@ class BaseArmController(BaseNode):
     """A node by which one arm follows one hand.
 
     It takes the topics of the hand, and publishes the target pose, gripper goals, markers and vibrations. Its name is
-    ``<arm_name>_<robot_name>_arm_controller``. The other arguments are the defaults of the parameters with their names.
-    ``preset`` names the terms of the controller that is driven: topic, rate, speeds, and what it needs in pauses.
+    ``<arm_name>_<robot_name>_arm_controller``. The other arguments are defaults of the parameters with the same names.
+    ``preset`` names what the arm's controller requires: topic, rate, speeds, and what it needs in pauses.
     ``filter_window_size``, in samples of a 75 Hz headset, sets ``teleop.filter.smoothing_delay``. ``partner`` is the
-    node of the other arm in this process, see ``run_arms`` of :mod:`arm_controllers`: both arms then are one
-    teleoperation, as in ``q2r2 run``. Without it a fault pauses this node's own arm only.
+    node of the other arm in this process, see ``run_arms`` of :mod:`arm_controllers`. Both arms then share one
+    teleoperation, as in ``q2r2 run``. Without ``partner``, a fault pauses this node's own arm only.
 
     Steps to override: :meth:`setup_parameters`, :meth:`setup_state`, :meth:`setup_interfaces`, :meth:`current_pose`,
     :meth:`pose_callback`, :meth:`inputs_callback`, :meth:`toggle_gripper`.
@@ -90,7 +90,8 @@ class BaseArmController(BaseNode):
         except BaseException:
             self.destroy_node()  # A node that is never returned could keep the process from ending.
             raise
-        # At the first log line rclpy searches all modules for its origin, for some 60 ms. This must not be at a press.
+        # For its first log line rclpy takes some 60 ms, because it searches all modules for the line's origin. An
+        # operator's press must not wait for that.
         self.get_logger().info(f"the {self.hand} hand moves the target on {self.outputs.first.topic}")
 
     def setup_parameters(self) -> ArmParameters:
@@ -153,7 +154,7 @@ class BaseArmController(BaseNode):
         self.gripper.toggle(self.now)
 
     def begin_tick(self, now: float) -> Reason | None:
-        """Update :attr:`inputs` at ``now`` [s]; returns why the arm has to hold, apart from its hand, or None."""
+        """Update :attr:`inputs` at ``now`` [s]. Return why the arm has to hold whatever its hand asks for, or None."""
         tool, base, controlled = self.current_pose(), self._base(), self._safe_target.at(now)
         obstacle = self._obstacle(tool, base, controlled)
         silence = None if self.state in _WITHOUT_HAND else self.intake.silence(now)
@@ -232,7 +233,7 @@ class BaseArmController(BaseNode):
         if (held := self.outputs.gripper_held) is not None:
             return WARN, held, values
         if self.state in AT_REST:
-            # The reason for which an earlier press was refused is over.
+            # An earlier press may have been refused, but for a reason that no longer exists.
             return OK, f"ready to engage ({self.feedback.paused})", values
         return OK, self.feedback.last_line, values
 
@@ -245,7 +246,10 @@ class BaseArmController(BaseNode):
     def _obstacle(
         self, tool: pin.SE3 | None, base: pin.SE3 | None, controlled: pin.SE3 | None
     ) -> tuple[bytes, Reason] | None:
-        """Return why the arm may not be engaged now, apart from its hand, and the level for the diagnostics."""
+        """Return the level for the diagnostics and the reason why the arm may not be engaged now, or None.
+
+        A silent hand is not considered here.
+        """
         values = self.parameters
         if (conflict := self._conflict()) is not None:
             return ERROR, conflict
@@ -255,7 +259,7 @@ class BaseArmController(BaseNode):
         if base is None:
             return WARN, Reason.of(RosReason.NO_TRANSFORM, frame=values.base_frame, world=values.world_frame)
         unready = self.outputs.unready
-        # An arm that follows may lag. An arm that holds would be engaged and lost at every press.
+        # An arm that follows may lag behind the safe target. An arm that holds would begin and fail at every press.
         if self.outputs.builtin and self.state in HOLDING and (away := self.outputs.away(controlled, tool)):
             unready = unready or Reason(RosReason.CONTROLLER_REFUSES, cause=away)
             if self.state is ArmState.IDLE:
@@ -263,11 +267,14 @@ class BaseArmController(BaseNode):
         return None if unready is None else (WARN, unready)
 
     def _conflict(self) -> Reason | None:
-        """Return a reason if two nodes publish different things of which the arm can follow only one, else None."""
+        """Return a reason if several nodes publish where only one node may, or disagree about a frame; else None."""
         return self.outputs.conflict or self.intake.conflict or self._frames.conflict(self.parameters.tool_frame)
 
     def _commanded(self, tool: pin.SE3, reference: pin.SE3 | None) -> pin.SE3:
-        """Return the commanded tool for leash and anchors; with another controller the tool or the last target."""
+        """Return the commanded tool pose, for leash and anchors.
+
+        It is the tool pose of the controller's ``reference`` if that is known, and else the last target or ``tool``.
+        """
         if self.engaged:
             return self._target.command_for(tool) if reference is None else reference
         reference = reference or self.outputs.first.last_sent
@@ -290,7 +297,7 @@ class BaseArmController(BaseNode):
                 node.set_parameters_atomically(changed)
 
     def _on_engage(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Press for the hand, with the same conditions. An arm that follows already is left alone."""
+        """Engage the arm as a press of its hand would, under the same conditions. Do nothing if it already follows."""
         response.success = not self.engaged
         response.message = f"{self.arm_name} follows its hand already" if self.engaged else f"{self.arm_name}: pressed"
         if not self.engaged:

@@ -1,9 +1,10 @@
 """``cartesian_controller``: the built-in controller for all arms of a cell. It turns target poses into joint commands.
 
-Each kind of topic exists once for all arms or once for each arm, as the robot needs it. Targets are on
-``/q2r2/left/target_frame`` or ``left.target_topic``, joint states on ``joint_states`` or ``left.joint_states_topic``,
-and commands on ``output_topic`` or ``left.output_topic``. Moving obstacles are on ``~/obstacles``. With the output
-``none`` another controller moves the arms, and follows ``~/safe_target/left``. :mod:`supervisor` has the rules for
+Targets of the left arm are on ``/q2r2/left/target_frame``; the parameter ``left.target_topic`` names another topic.
+Joint states of all arms are on ``joint_states``; ``left.joint_states_topic`` names another topic for the left arm.
+Commands are on the topic that the parameter ``output_topic`` names for all arms, or ``left.output_topic`` for the left
+arm. Parameters of other arms begin with their names. Moving obstacles are on ``~/obstacles``. With the output ``none``
+another controller moves the arms, and follows ``~/safe_target/left``. The module :mod:`supervisor` has the rules for
 targets.
 """
 
@@ -47,7 +48,7 @@ from q2r2_control.types import LONGEST_DT, Reference
 from q2r2_control.wording import sentence
 
 _LONGEST_STOP = 3.0  # Longest time until the arms rest at the end [s].
-_QUIET = 0.3  # Other commanders must be silent for this long first [s].
+_QUIET = 0.3  # The node commands only after other commanders have been silent for this time [s].
 _LONGEST_ACTIVATION = 2.0  # Longest time of an activation in addition to the settle time [s].
 _SAFE_TARGET_PERIOD = 0.02  # Time between two safe targets if nodes only listen to them [s].
 
@@ -82,7 +83,8 @@ class CartesianControllerNode(ManagedNode):
             self._output.withheld = told.withheld
         streams, external = StreamSettings(linked=config.teleop.linked), ExternalSettings()
         watch = watch_settings(config.supervision, self._output.drive.yields)
-        # A message with a bad number among good ones comes from another publisher, and is not bridged.
+        # If single joint states have numbers that are not finite, another publisher sends them. They are a fault at
+        # once.
         watch.unusable_time = 0.0
         make_watching_live(self, streams, watch, external)
         self._watch = watch
@@ -107,12 +109,12 @@ class CartesianControllerNode(ManagedNode):
             standstill=self._standstill(output),
         )
         self._supervisor = self._loop.supervisor
-        # Arms of another controller are judged with fingers that count as their whole way.
+        # If another controller moves the arms, their fingers count as anywhere between closed and open.
         asking = {} if self._only_leads else self._targets.topics
         self._grippers = GripperLimits(self, config, self._loop, asking)
         self._clock_of_ticks = TickClock(self._period)
         self._reference: Reference | None = None
-        self._commanding, self._advances = False, 0  # The second is the number of ticks in which time has passed.
+        self._commanding, self._advances = False, 0  # ``_advances`` counts the ticks in which time has passed.
         # Another controller follows every safe target. Nodes that only listen need the newest one.
         every = 1 if self._only_leads else max(round(_SAFE_TARGET_PERIOD * rate), 1)
         self._feedback = ControllerFeedback(self, self._controller, self._targets, every)
@@ -150,7 +152,7 @@ class CartesianControllerNode(ManagedNode):
         # A late tick makes no jump, and a clock that was set back moves nothing.
         gap = now - self._last_tick
         dt = self._loop.pace(gap)
-        if gap > max(LONGEST_DT, self._watch.timeout):  # Without ticks for as long as arms may be without states.
+        if gap > max(LONGEST_DT, self._watch.timeout):  # There was no tick for longer than states may be missing.
             self._supervisor.stalled(gap, now)
         self._last_tick = now
         self.ticked += 1
@@ -257,7 +259,10 @@ class CartesianControllerNode(ManagedNode):
         return WARN if refused else OK, "; ".join([*doing, *map(sentence, ended.values())]), values
 
     def begin(self) -> str | None:
-        """Begin to command the arms where they stand; returns why not, if they move or another node commands them."""
+        """Begin to command the arms where they stand. Return why this is not possible, or None.
+
+        It is not possible if the arms move or if another node commands them.
+        """
         self._tick_until(lambda: False, _QUIET)
         if (other := self._others.commander(_QUIET)) is not None:
             return sentence(other)
@@ -296,7 +301,8 @@ class CartesianControllerNode(ManagedNode):
         advances = self._advances
         try:
             while self._supervisor.phase is Phase.BRAKING and (now := time.monotonic()) < deadline:
-                # Joint states still have to come in. Ticks do the rest, unless simulated time has ended already.
+                # ``go_on`` takes joint states and runs ticks. If simulated time has ended, ticks no longer brake the
+                # arms, and they are braked here.
                 go_on()
                 if self._advances != advances:
                     advances, last = self._advances, now

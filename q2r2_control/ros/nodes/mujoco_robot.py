@@ -1,9 +1,9 @@
-"""``mujoco_robot``: the simulated cell as a ROS robot. It takes joint commands; Cartesian targets are a controller's.
+"""``mujoco_robot``: the simulated cell as a ROS robot. It takes joint commands. Cartesian targets need a controller.
 
 Joint positions come in on any one of ``joint_trajectory`` (one point), ``joint_commands`` (JointState) and
 ``position_commands`` (Float64MultiArray in the order of the joints in ``joint_states``, all arms). Velocities come in
 on ``velocity_commands`` and torques on ``torque_commands``, in the same order. The newest command counts. Without
-commands the arms brake, and after ``hold_after`` they stand on their position servos, whatever drove them before.
+commands the arms brake, and after ``hold_after`` their position servos hold them, whatever commanded them before.
 """
 
 from __future__ import annotations
@@ -57,7 +57,9 @@ class _Motion:
 
 
 class GripperServer:
-    """Serves ``topic``. A newer goal aborts the older one. Fingers that stop on an object have stalled and succeeded.
+    """Serves the action ``topic`` of a gripper. A new goal aborts the goal before.
+
+    If the fingers stop on an object, the goal has succeeded, and its result says ``stalled``.
 
     The ``max_effort`` of a goal is not used. :meth:`update` processes goals, because a waiting callback would block the
     node.
@@ -125,7 +127,7 @@ class GripperServer:
 
 
 class MujocoRobot(BaseNode):
-    """Runs a :class:`SimulatedCell` in real time between its topics, services and actions."""
+    """Runs a :class:`SimulatedCell` in real time, and connects it to topics, services and actions."""
 
     ticks = True
 
@@ -136,7 +138,7 @@ class MujocoRobot(BaseNode):
         tf_rate = self.parameter("tf_rate", 50.0, "transforms per second [Hz]", within=(1, 1000))
         # Vibrations need external torques fifty times a second, and an admittance needs them at every tick.
         felt = rate if config.admittance.enabled else 50.0
-        self._external_period, self._external_due = 1.0 / felt, 0.0  # [s]
+        self._external_period, self._external_due = 1.0 / felt, 0.0  # Period and next time of external torques [s].
         hold_after = self.parameter("hold_after", 0.1, "without commands [s]", within=(0.01, 1))
         max_jump = self.parameter("max_jump", 0.1, "of a commanded position [rad]", within=(0.001, 7))
         self._robot = Robot.from_config(config)
@@ -176,7 +178,7 @@ class MujocoRobot(BaseNode):
         self._tf_static.publish(fixed.at(self._cell.plant.data, self.now))
 
     def _make_subscriptions(self) -> None:
-        # Each arm may have its own sender, and the message of one must not replace that of the other.
+        # Each arm may have its own sender, and one sender's message must not replace the other sender's message.
         commands = QoSProfile(depth=2 * len(self._robot.arms), reliability=ReliabilityPolicy.RELIABLE)
         names, move, push = self._robot.joint_names, self._cell.command_velocities, self._cell.command_torques
         kinds: tuple[tuple[type, str, Callable[[Any], str | None]], ...] = (
@@ -277,7 +279,10 @@ class MujocoRobot(BaseNode):
 
 
 def link_transforms(model: Any, without: Collection[str]) -> tuple[LinkTransforms, LinkTransforms]:
-    """Return the transforms of a model's links with a joint, and of all others, except bodies named in ``without``."""
+    """Return the transforms of a model's links with a joint, and those of its other links.
+
+    Bodies that are named in ``without`` are left out.
+    """
     links = [index for index in range(1, model.nbody) if model.body(index).name not in without]
     moving = [index for index in links if model.body_jntnum[index]]
     return LinkTransforms(model, moving), LinkTransforms(model, [index for index in links if index not in moving])

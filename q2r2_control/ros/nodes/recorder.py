@@ -59,12 +59,12 @@ _SERVICES = {
     "mark": TeleopReason.MARK,
     Action.NEXT_SUBTASK: TeleopReason.SUBTASK_BEGINS,
 }
-HANDOVER_PERIOD = 0.02  # Time between two looks at new messages. A message waits for two of them at most [s].
+HANDOVER_PERIOD = 0.02  # New messages are passed on with this period. A message waits for two periods at most [s].
 _STREAM_QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 class RecorderNode(BaseNode):
-    """Writes a file from its start to its end. Controls of the operator and services mark the episodes in it."""
+    """Writes one file, from the node's start to its end. The operator's controls and services mark episodes in it."""
 
     ticks = True
 

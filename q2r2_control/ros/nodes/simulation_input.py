@@ -17,7 +17,7 @@ from q2r2_control.ros.bridge.hand_topics import HandPublishers, subscribe_to_hap
 from q2r2_control.ros.monitoring import HandListeners
 from q2r2_control.types import SIDES, HandSample
 
-_PERIOD = 0.002  # Time between two polls of another input [s].
+_PERIOD = 0.002  # Time between two polls of an input that is not a script [s].
 _SHORTEST, _LONGEST = 0.001, 0.02  # Shortest and longest time between two checks for due samples [s].
 # Times of the script at which it is decided whether the buttons are pressed, and whether the hands move [s].
 _BEFORE_PRESS, _BEFORE_MOTION = FIRST_PRESS - 0.1, START - 0.05

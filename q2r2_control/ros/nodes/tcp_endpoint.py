@@ -28,7 +28,7 @@ from q2r2_control.types import SIDES, HandFault
 from q2r2_control.viewer.headset_table import topic_line, topic_table
 from q2r2_control.wording import sentence
 
-_TABLE_PERIOD, _LINES_PERIOD = 0.2, 1.0  # [s]
+_TABLE_PERIOD, _LINES_PERIOD = 0.2, 1.0  # Times between two updates of the table, and between two reports in lines [s].
 _SERVER_LOG = logging.getLogger("q2r2_control.inputs.headset")
 
 

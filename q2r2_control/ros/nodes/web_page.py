@@ -1,4 +1,4 @@
-"""``web_page``: shows in browsers what the nodes of a cell publish. As the recorder, it listens to no commands.
+"""``web_page``: shows in browsers what the nodes of a cell publish. Like the recorder, it listens to no commands.
 
 Its buttons call services that every node may call.
 """
@@ -57,7 +57,7 @@ from q2r2_control.viewer.web.page import Page
 
 _PERIOD = 1.0 / 30.0  # Time between two frames [s].
 _LOOK_PERIOD = 0.5  # Time between two searches for nodes [s].
-# The queue is deep enough for all ticks in the time of a frame.
+# The queue is deep enough for all ticks between two frames.
 _STREAM_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
 _PICTURE_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 _OF_RECORDER = PageRequest.RECORD, PageRequest.MARK, PageRequest.SUBTASK
@@ -66,7 +66,7 @@ _UNREADABLE = SerdeError, ValueError, KeyError, IndexError, TypeError
 
 
 class WebPage(BaseNode):
-    """Draws the data that it has received, and passes on the requests of the page's buttons."""
+    """Shows the newest data that it has received, and passes on the requests of the page's buttons."""
 
     ticks = True
 
@@ -91,7 +91,8 @@ class WebPage(BaseNode):
         self._start: RunStart | None = None
         self._events: list[Event] = []
         self._marks = EpisodeMarks()
-        self._number, self._shown, self._slowest = -1, -1, 0.0  # Newest tick, last shown one, longest time [s].
+        # The numbers of the newest tick and of the last shown tick, and the longest computation since then [s].
+        self._number, self._shown, self._slowest = -1, -1, 0.0
         self._states, self._notice = NodeStates(self, namespace=self.get_namespace()), ""
         self._controller, self._recorder = self.name_in_set("cartesian_controller"), self.name_in_set(RECORDER)
         self._trigger_clients: dict[str, Any] = {}
@@ -179,7 +180,7 @@ class WebPage(BaseNode):
             self._notice = f"{name}: {future.result().message}"
 
     def _show(self) -> None:
-        """Carry out the requests of the page's users, and draw the newest tick."""
+        """Carry out the requests of the page's users, and show the newest tick."""
         while not self._asked.empty():
             self._serve(self._asked.get())
         waiting, self._waiting = self._waiting, []

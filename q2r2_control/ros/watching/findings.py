@@ -72,9 +72,9 @@ def error(what: str, cure: str) -> Finding:
 
 
 def examine_set(view: SetView, expected: Collection[str]) -> list[Finding]:
-    """Return the findings of a set of nodes, or none if no node runs.
+    """Return the findings of a set of nodes; [] if no node runs.
 
-    ``expected`` are the ends of the names of expected nodes, such as ``left_arm_controller``.
+    ``expected`` are the last parts of the names of expected nodes, such as ``left_arm_controller``.
     """
     if not view.nodes:
         return []
@@ -159,7 +159,8 @@ PACKAGES = (
     *("sensor_msgs", "std_msgs", "std_srvs", "trajectory_msgs", "visualization_msgs"),
 )
 _GREATEST_DOMAIN = 232
-# This code also tries each message package by the code in its argument. Its last line is one JSON object.
+# Another process runs this code, which starts a node. For each message package, it also executes the code that its
+# argument contains. Its last line of output is one JSON object.
 _TRY = """
 import json, sys
 import rclpy
@@ -178,7 +179,7 @@ _INSTALL = f"{install_line('ros')}, or source a ROS 2 Jazzy"
 
 
 def examine_environment(environment: Mapping[str, str]) -> tuple[dict[str, str], list[Finding]]:
-    """Return facts by name, and findings; ``environment`` is that of the process, as the user has set it."""
+    """Return facts by name, and findings; ``environment`` has the environment variables as the user has set them."""
     findings = []
     domain = environment.get("ROS_DOMAIN_ID") or "0"
     if not (domain.isdecimal() and int(domain) <= _GREATEST_DOMAIN):

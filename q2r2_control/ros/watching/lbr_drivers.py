@@ -118,7 +118,7 @@ def _compare_limits(view: DriverView, cell: Config, robot: Robot) -> Iterator[Fi
     low, high, fastest = (
         np.array([float(limits[theirs[name]].get(key, "0")) for name in ours]) for key in ("lower", "upper", "velocity")
     )
-    if view.state is not None:  # The driver's safe_stop keeps one step from its limits.
+    if view.state is not None:  # The driver's safe_stop allows no position within one step of its limits.
         low, high = low + fastest * view.state.sample_time, high - fastest * view.state.sample_time
     lower, upper = robot.position_lower[joints], robot.position_upper[joints]
     margin = np.maximum(low - lower, upper - high)

@@ -1,7 +1,8 @@
-"""Listen only to the reports of a set's nodes on ``~/state``, so that the set runs as without the listener.
+"""Listen only to the reports of a set's nodes on ``~/state``, so that the listener does not change what the set does.
 
-An arm without a controller would take a listener of its targets for a controller, and could be engaged. A controller
-stops commanding arms whose commands get a new receiver. Therefore each sender counts its own messages and reports that.
+An arm's node would take a listener to its targets for a controller, and would let the arm be engaged. A controller
+stops commanding arms whose commands get a new receiver. Therefore each sender counts its messages, and reports the
+number.
 """
 
 from __future__ import annotations
@@ -76,7 +77,7 @@ class SetListener:
                 self._sent.setdefault((name, topic), deque(maxlen=_COUNTS)).append((time.monotonic(), count))
 
     def _rate(self, topic: str) -> float | None:
-        """Return the rate of all nodes that count their messages on a topic [Hz], or None."""
+        """Return the sum of the rates of all nodes that count their messages on a topic [Hz]; None without counts."""
         rates = []
         for name in self._publishers[topic]:
             counts = self._sent.get((name, topic))
@@ -86,7 +87,10 @@ class SetListener:
         return sum(rates) if rates else None
 
     def _is_shown(self, topic: str, members: set[str]) -> bool:
-        """Return whether a node of the set expects the topic, or sends it and it is counted or received."""
+        """Return whether a node of the set expects the topic, or sends it.
+
+        A topic that is sent is shown only if its sender counts the messages, or if somebody receives them.
+        """
         if topic in _OWN or "/_action/" in topic or topic.removesuffix("/state") in members:
             return False
         if members.intersection(self._publishers[topic]):
@@ -114,7 +118,7 @@ def watch_set(
 ) -> SetView:
     """Listen for ``duration`` [s] or until ``stop``, and return the last view; raises :class:`WatchError`.
 
-    ``show`` gets all views before. With ``drivers``, KUKA drivers are listened to as well.
+    ``show`` gets all earlier views. With ``drivers``, KUKA drivers are listened to as well.
     """
     set_up_middleware(os.environ)
     try:

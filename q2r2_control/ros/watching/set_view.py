@@ -1,4 +1,4 @@
-"""A set of nodes at one moment: nodes by their reports, topics by the graph, and arms in words."""
+"""A set of nodes at one moment: the reports of its nodes, its topics in the graph, and a sentence on each arm."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _MOVES = {
 
 @dataclass(frozen=True, slots=True)
 class NodeView:
-    """A node of the set by its last report on ``~/state``."""
+    """What the last report of one node on ``~/state`` says."""
 
     name: str  # The full name.
     level: str  # One of ok, warn and error.
@@ -126,7 +126,7 @@ class SetView:
 
 
 def arm_views(nodes: tuple[NodeView, ...], cell: Config) -> tuple[ArmView, ...]:
-    """Return a row for every node of an arm, and for every arm of ``cell`` without a node."""
+    """Return a view for every node of an arm, and for every arm of ``cell`` without a node."""
     controller = next((node for node in nodes if node.is_controller), None)
     views = []
     for arm in cell.arms:
