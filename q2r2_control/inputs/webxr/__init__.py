@@ -2,6 +2,5 @@
 
 ``webxr`` is the input, in the process of the control loop. ``server`` is the process that serves ``page`` and its
 socket, and ``page_messages`` reads the messages of the page. ``certificate`` makes the certificate and the token that
-HTTPS needs.
-``usb`` forwards a port of a headset on a cable to this computer.
+HTTPS needs. ``usb`` connects a headset by a cable: it forwards a port of the headset to this computer.
 """
