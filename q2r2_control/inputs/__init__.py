@@ -1,11 +1,11 @@
 """Sources of hand samples. To add an input, implement ``Input`` of ``base``.
 
-``scripted`` plays hand motions, and ``played`` makes samples of them. The motions that handle parts are in
-``assembly``. ``headset`` is the TCP server for the Quest2ROS app. ``messages`` and ``session`` are its protocol without
-sockets. ``listener`` accepts connections and decides which client drives, and ``connections`` serves the clients.
-``webxr`` is a page in a headset's browser instead, and ``page_door`` decides who may open it. ``hand_stream`` turns the
-messages of both into samples. ``moved_frame`` and ``samples`` find poses that must not be followed, and queue the
-others. ``headset_check`` tells people which data arrive.
+``scripted`` contains hand motions, and ``played`` plays them as samples. The motions that handle parts are in
+``assembly`` and ``contact_work``. ``headset`` is the TCP server for the Quest2ROS app. ``messages`` and ``session`` are
+its protocol without sockets. ``listener`` accepts connections and decides which client drives, and ``connections``
+serves the clients. ``webxr`` serves a page for a headset's browser, which replaces the app, and ``page_door`` decides
+who may open the page. ``hand_stream`` turns the messages of the app or of the page into samples. ``moved_frame`` and
+``samples`` find poses that must not be followed, and queue the others. ``headset_check`` tells people which data come.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The addresses of this computer, for people and for certificates."""
+"""Find the network addresses of this computer, for people and for certificates."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
-EVERY_NETWORK = ("", "0.0.0.0", "::")  # Hosts to listen on all networks.
+EVERY_NETWORK = ("", "0.0.0.0", "::")  # A server with one of these hosts listens on all networks.
 NO_NETWORK = "of this machine (it has no network now)"
 # Linux: requests about a network interface by its name, and flags of the interface's state.
 _GET_FLAGS, _GET_ADDRESS = 0x8913, 0x8915
@@ -19,7 +19,7 @@ _GLOBAL_SCOPE, _TENTATIVE_OR_DEPRECATED = 0x00, 0x60
 
 
 def reachable_addresses(host: str) -> tuple[str, ...]:
-    """Return the addresses by which others reach a server on ``host``. The address of the default route comes first."""
+    """Return the addresses at which other computers reach a server on ``host``, the default route's address first."""
     if host not in EVERY_NETWORK:
         return (host,)
     found = [address for address in (_way_out(socket.AF_INET, "192.0.2.1"), *_ipv4_addresses()) if address]
@@ -29,8 +29,11 @@ def reachable_addresses(host: str) -> tuple[str, ...]:
 
 
 def _way_out(family: socket.AddressFamily, elsewhere: str) -> str | None:
-    """Return the address of this computer on the route to ``elsewhere``, an address that is for documentation only."""
-    # A UDP socket that connects sends nothing, and only selects the route.
+    """Return this computer's address on the route to ``elsewhere``; None without such a route.
+
+    ``elsewhere`` is an address that is reserved for documentation.
+    """
+    # To connect a UDP socket sends nothing. It only selects the route.
     with suppress(OSError), socket.socket(family, socket.SOCK_DGRAM) as probe:
         probe.connect((elsewhere, 9))
         return str(probe.getsockname()[0])
@@ -49,7 +52,7 @@ def _ipv4_addresses() -> Iterator[str]:
 
 
 def _ipv6_addresses() -> Iterator[str]:
-    """Yield the addresses with global scope. Those of one link need the link's name, which no URL has."""
+    """Yield the addresses with global scope. A link-local address needs the link's name, which a URL cannot have."""
     with suppress(OSError):
         for line in _IPV6_TABLE.read_text().splitlines():
             digits, _, _, scope, flags, _ = line.split()

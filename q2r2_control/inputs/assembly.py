@@ -1,7 +1,7 @@
 """Small assembly work of two hands, as way points. The hands pick up parts on the table of config/dual_iiwa7.yaml.
 
-Nothing is corrected during the work. The places of the parts are known, and each tool arrives as precisely as the robot
-follows the hand.
+Nothing is corrected during the work. The positions of the parts are known, and each tool arrives as precisely as the
+robot follows the hand.
 """
 
 from __future__ import annotations
@@ -13,12 +13,15 @@ from dataclasses import replace
 from q2r2_control.inputs.contact_work import CARRY, PEG, WIPE
 from q2r2_control.inputs.way_points import LEFT_HOME, RIGHT_HOME, HandWork, WayPoint
 
-# A block of 60 mm, held 17 mm above its middle.
+# Heights of the tool at a block and over it [m]. The block is 60 mm high, and is held 17 mm above its middle.
 _GRIP, _OVER = 0.243, 0.33
 
 
 def _meeting(middle: float) -> dict[str, tuple[WayPoint, ...]]:
-    """Return way points with which both hands bring their blocks to ``middle`` [m] from the cell's centre, and back."""
+    """Return way points with which both hands bring their blocks to the middle of the cell, and back.
+
+    There the tools are ``middle`` [m] to the left and to the right of the cell's centre.
+    """
     left: tuple[WayPoint, ...] = (
         (1.4, 0.55, 0.25, 0.35, 0.0, 0.0),  # Over the block.
         (3.2, 0.55, 0.25, _GRIP, 0.0, 0.0),  # Go down around the block.
@@ -36,7 +39,7 @@ def _meeting(middle: float) -> dict[str, tuple[WayPoint, ...]]:
 
 MEET = HandWork(
     duration=17.4,
-    tools=_meeting(0.065),  # There the grippers nearly touch.
+    tools=_meeting(0.065),  # At this distance the grippers nearly touch.
     steps=(
         (0.0, "each hand reaches for its block"),
         (3.2, "both grasp"),
@@ -47,11 +50,11 @@ MEET = HandWork(
     ),
     presses={"left": (3.5, 14.9), "right": (3.7, 15.1)},
 )
-# Both hands move to one place. Each target gets 65 mm away from its tool, which the leash allows, and the hands then
-# bring the blocks back.
+# Both hands move to the same position. Each target gets 65 mm away from its tool, which the leash allows. The hands
+# then bring the blocks back.
 CLASH = replace(MEET, tools=_meeting(0.0))
 
-_LOW = 0.216  # Height with the finger tips 3 mm above the table [m].
+_LOW = 0.216  # Height of the tool at which the finger tips are 3 mm above the table [m].
 GRASP = HandWork(
     duration=10.6,
     tools={
@@ -118,12 +121,13 @@ STACK = HandWork(
     presses={"left": (2.2, 6.7), "right": (6.3, 11.3)},
 )
 
-# The bar lies along y. The hands hold it from both sides, tilted so that their wrists are farther apart than the
-# fingers. If the tools pointed straight down, the wrists would keep them 60 mm too far apart for the bar.
+# The bar lies along y. The hands hold it at both ends, and the tools are tilted so that the wrists are farther apart
+# than the fingers. If the tools pointed straight down, the wrists would keep them 60 mm too far apart for the bar.
 _TILT, _TURN = 0.4, 0.5 * math.pi
-_BAR_LOW = 0.2193  # Height with the lower corners of the tilted finger tips 3 mm above the table [m].
+_BAR_LOW = 0.2193  # Height of a tilted tool at which its finger tips are 3 mm above the table [m].
 _OFF = 0.045  # Distance of each tool from the bar's middle, along the bar [m].
-_BACK_Y, _BACK_Z = 0.09 * math.sin(_TILT), 0.09 * math.cos(_TILT)  # Offset of a tool before and after a grasp [m].
+# Distance of a tool from its grasp pose along y and z, before and after the grasp [m].
+_BACK_Y, _BACK_Z = 0.09 * math.sin(_TILT), 0.09 * math.cos(_TILT)
 _LEFT, _RIGHT = (-_TILT, -_TURN), (_TILT, _TURN)
 HANDOVER = HandWork(
     duration=18.4,
@@ -166,7 +170,7 @@ HANDOVER = HandWork(
 )
 
 
-# All pieces of work, in the order in which they can follow each other.
+# All works, in the order in which they can follow each other.
 WORKS: Mapping[str, HandWork] = {
     "meet": MEET,
     "clash": CLASH,

@@ -38,13 +38,13 @@ class Input(Protocol):
 
     - ``options``: The names of keyword arguments of ``from_config``. Each is an option of ``q2r2 run``, or ``say``, a
       function that prints a line.
-    - ``cell``: A function that returns a cell with the settings that this input knows better, such as its own axes.
+    - ``cell``: A function that changes a cell's settings to the ones that this input needs, such as its own axes.
     - ``executable``: The ROS executable that is started for this input instead of ``hand_input``.
-    - ``feels``: False if there is no device that could vibrate, so that no feedback is computed.
+    - ``feels``: False if there is no device that could vibrate. No vibrations are then computed.
     - ``simulated``: True if the samples depend only on the times of the polls, so that a run may be in simulated time.
     """
 
-    controls: DeviceControls  # The buttons and axes that its samples have.
+    controls: DeviceControls  # The buttons and axes that the samples of this input have.
 
     @property
     def connected(self) -> bool:
@@ -73,16 +73,16 @@ class Input(Protocol):
 
 @runtime_checkable
 class PolicySource(Input, Protocol):
-    """An input that also has actions of a policy. In each run, ``prepare`` is called before ``start``."""
+    """An input that also gives the actions of a policy. In each run, ``prepare`` is called before ``start``."""
 
     def prepare(self, robot: Robot, realtime: bool) -> None:
-        """Prepare for a run of ``robot``. In simulated time, the loop has to wait for the policy."""
+        """Prepare for a run of ``robot``. If ``realtime`` is False, the loop has to wait for the policy's answers."""
 
     def chunks(self) -> list[ActionChunk]:
         """Return the chunks that came since the last call, oldest first. The method never waits and never raises."""
 
     def observe(self, observation: Observation) -> None:
-        """Give the policy the state of a tick, whose numbers never change. In real time the method never waits."""
+        """Give the policy a tick's observation, whose numbers never change. In real time the method never waits."""
 
 
 def check_samples(samples: list[HandSample]) -> list[HandSample]:
@@ -114,7 +114,7 @@ def is_simulated(source: str) -> bool:
 
 
 def adapted(source: str, config: Config) -> Config:
-    """Return a cell with the settings that an input knows better, such as its bindings, as ``q2r2 run`` does.
+    """Return the cell with the settings that an input needs, such as its bindings. ``q2r2 run`` changes them likewise.
 
     Args:
         source: The name of an installed input.

@@ -1,4 +1,7 @@
-"""Serve the clients of the headset server, in its own thread: which client drives, which wait, bytes in and out."""
+"""Serve the clients of the headset server, in the server's thread.
+
+It decides which client drives and which clients wait, and it receives and sends the bytes.
+"""
 
 from __future__ import annotations
 
@@ -25,23 +28,26 @@ from q2r2_control.inputs.session import HeadsetSession, Reception, log_frame
 from q2r2_control.types import HapticFeedback
 
 KEEPALIVE_AFTER = 1.0  # The server sends a keepalive if it has sent nothing for longer [s].
-SILENCE_ALLOWED = 2.0  # A driver without a whole frame for longer is dropped [s]. The app sends a keepalive after 1 s.
+# A driver that sends no whole frame for longer than this is dropped [s]. The app sends a keepalive after 1 s.
+SILENCE_ALLOWED = 2.0
 TURN = 0.05  # Longest wait for the network. Timeouts are checked this often [s].
-_RECEIVE_BYTES = 1 << 12  # About 40 messages. Between two such portions, the control loop gets the interpreter.
+_RECEIVE_BYTES = 1 << 12  # Bytes to read at once: about 40 messages. Between two reads, the control loop can run.
 MAX_FRAMES_PER_SECOND = 2000  # The app sends about 450. More would take processor time from the control loop.
 
 _LOG = logging.getLogger("q2r2_control.inputs.headset")
 
 
 class Client(Peer):
+    """A connected client: its socket, the state of its protocol, and the times of its last frames."""
+
     def __init__(self, connection: socket.socket, host: str, peer: str, now: float) -> None:
         self.session = HeadsetSession()
         registrations = self.session.published, self.session.subscribed
         super().__init__(peer, host, since=now, last_frame=now, registrations=registrations)
         self.socket = connection
         self.decoder = FrameDecoder()
-        self.refused_hosts: set[str] = set()
-        self.announced = False  # Whether the log names this client.
+        self.refused_hosts: set[str] = set()  # Hosts that the log has named as refused while this client drives.
+        self.announced = False  # Whether the log has a line that this client is connected.
         self.last_sent = now
         self._frames = RateLimit(MAX_FRAMES_PER_SECOND)
 
@@ -64,14 +70,14 @@ class Client(Peer):
 class Handlers:
     """Methods that the server's thread calls."""
 
-    admitted: Callable[[Client], None]  # Called if a client drives from now on.
-    lost: Callable[[str], None]  # Called with the reason if the driver is gone.
+    admitted: Callable[[Client], None]  # Called when a client begins to drive.
+    lost: Callable[[str], None]  # Called with the reason when the driver's connection has ended.
     receive: Callable[[Client, WireFrame, float], None]  # Takes a driver's frame and time [s]. May raise ProtocolError.
     due: Callable[[], Iterable[HapticFeedback]]  # Returns the vibrations to send to the driver.
 
 
 class Connections:
-    """Serves the driver, and each newcomer until :func:`~q2r2_control.inputs.listener.decide` has decided on it."""
+    """Serves the driver and all newcomers. :func:`~q2r2_control.inputs.listener.decide` decides which client drives."""
 
     def __init__(
         self, door: TcpListener, allow: Sequence[Network] | None, clock: Callable[[], float], handlers: Handlers
@@ -79,7 +85,7 @@ class Connections:
         self._door, self._allow, self._clock, self._handlers, self._log = door, allow, clock, handlers, door.log
         self._driver: Client | None = None
         self._waiting: list[Client] = []  # In the order of their arrival.
-        self._unwelcome: set[str] = set()  # Hosts outside ``allow`` that the log has named.
+        self._unwelcome: set[str] = set()  # Hosts outside ``allow`` that the log has already named.
         self._last_fault = ""
         self._waker, self._waiter = socket.socketpair()
         self._waker.setblocking(False)
@@ -90,17 +96,17 @@ class Connections:
 
     def wake(self) -> None:
         """Make :meth:`serve` return soon. Any thread may call this at any time."""
-        # A full pipe wakes the thread as well. If the pipe is closed, there is no thread.
+        # If the pipe is full, the thread wakes up anyway. If the pipe is closed, the thread has ended.
         with suppress(OSError):
             self._waker.send(b"\0")
 
     def serve(self) -> None:
         """Wait for the network once, for ``TURN`` at most, and handle all events."""
-        # All data that were sent before this time are read before a decision about a client. Otherwise a client could
-        # count as silent because this thread, or the whole process, stood still.
+        # All data that were sent before this time are read before the decisions about clients. Otherwise a client could
+        # count as silent after this thread, or the whole process, has stood still.
         asked = self._clock()
         self._watch_door(asked)
-        # A connection ends in its own event or after this loop, so that no event belongs to an ended connection.
+        # A connection ends only in its own event or after this loop. No event can then belong to an ended connection.
         for key, _ in self._selector.select(TURN):
             key.data()
         self._settle(asked)
@@ -110,7 +116,7 @@ class Connections:
         self._log.flush(now)
 
     def report(self, error: Exception) -> None:
-        """Log a fault of the server itself. The same fault is logged only once in a row."""
+        """Log a fault of the server itself. If the same fault repeats, it is logged only once."""
         if repr(error) != self._last_fault:
             _LOG.error("headset server: unexpected fault, dropping the headset", exc_info=error)
         self._last_fault = repr(error)
@@ -127,7 +133,10 @@ class Connections:
             open_one.close()
 
     def _watch_door(self, now: float) -> None:
-        """Accept connections within the rate. Others wait in the kernel, which takes no time of this process."""
+        """Watch for new connections only while the rate allows some.
+
+        Other connections wait in the kernel, which takes no time of this process.
+        """
         watched = self._door.accepts.is_open(now)
         if watched and not self._door_watched:
             self._selector.register(self._door, selectors.EVENT_READ, self._accept)
@@ -147,7 +156,7 @@ class Connections:
         """Decide which client drives. All data that were sent before ``now`` [s] have been read."""
         driver = self._driver
         if driver is not None and now - driver.last_frame > SILENCE_ALLOWED:
-            self._drop(driver, f"no frame for {SILENCE_ALLOWED:g} s")  # Such a client would keep others out.
+            self._drop(driver, f"no frame for {SILENCE_ALLOWED:g} s")  # Otherwise this client would keep others out.
         for client in tuple(self._waiting):
             if not is_allowed(client.host, self._allow):
                 self._refuse(client, f"{client.host} is not in headset.allow", self._unwelcome)
@@ -205,7 +214,7 @@ class Connections:
     def _send(self, client: Client, now: float) -> None:
         outgoing = client.session.outgoing
         if not outgoing and client is self._driver:
-            # Vibrations are encoded only now, so that a client that reads late gets only the newest one.
+            # Vibrations are encoded only now, so that a client that reads late gets only the newest vibration.
             for vibration in self._handlers.due():
                 client.session.queue_haptic(vibration)
             if not outgoing and now - client.last_sent > KEEPALIVE_AFTER:

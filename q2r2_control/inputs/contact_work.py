@@ -1,4 +1,4 @@
-"""Work with contact forces: both hands carry a tray, a hand wipes the table with a sponge, a peg goes into a hole."""
+"""Work with contact forces: two hands carry a tray, a hand wipes the table with a sponge, a peg goes into a hole."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ import math
 from q2r2_control.inputs.way_points import LEFT_HOME, RIGHT_HOME, HandWork, WayPoint
 
 _TURN = 0.5 * math.pi  # With this turn, the fingers close along x [rad].
-_X, _Y, _HELD = 0.64, 0.10, 0.235  # Places of the tools at the tray's handles [m].
-_CARRIED = (_X - 0.115, _HELD + 0.11)
+_X, _Y, _HELD = 0.64, 0.10, 0.235  # Position x, y and z of the left tool at the tray's handle [m]. The right is at -y.
+_CARRIED = (_X - 0.115, _HELD + 0.11)  # x and z of both tools where the tray is carried to [m].
 
 
 def _at_handle(side: float) -> tuple[WayPoint, ...]:
-    """Return way points over the handle at this ``side`` of the tray's middle, and around the handle."""
+    """Return way points over one handle and then down around it. ``side`` is 1 for the left handle, otherwise -1."""
     turn = -side * _TURN
     return (
         (2.2, _X, side * _Y, _HELD + 0.09, 0.0, turn),
@@ -58,7 +58,7 @@ CARRY = HandWork(
 )
 
 _SPONGE_X, _SPONGE_Y, _SPONGE_HELD = 0.60, 0.42, 0.248
-_WIPING = _SPONGE_HELD - 0.012  # Lower, so that the springs of the impedance and of the sponge press [m].
+_WIPING = _SPONGE_HELD - 0.012  # Height of the tool while it wipes [m]. It is lower, so that the sponge is pressed.
 _STROKES = ((0.72, 0.42), (0.72, 0.39), (0.60, 0.39), (0.60, 0.36), (0.72, 0.36))
 WIPE = HandWork(
     duration=19.4,
@@ -87,9 +87,9 @@ WIPE = HandWork(
 )
 
 _PEG, _HOLE = (0.60, -0.40), (0.66, -0.24)
-_PEG_HELD = 0.265  # The tool is 30 mm above the middle of a peg of 70 mm [m].
-_ON_TOP = _PEG_HELD + 0.04  # The peg stands on the socket [m].
-# The search: turns of the spiral, its greatest radius [m], and how far the target is below the socket's top [m].
+_PEG_HELD = 0.265  # Height of the tool at the peg [m]. It is 30 mm above the middle of the peg, which is 70 mm long.
+_ON_TOP = _PEG_HELD + 0.04  # Height of the tool when the peg stands on the socket [m].
+# The search for the hole: turns of the spiral, its greatest radius [m], and depth of the target below ``_ON_TOP`` [m].
 _TURNS, _WIDEST, _PRESSED = 4, 0.004, 0.005
 
 

@@ -1,4 +1,4 @@
-"""Turn the messages of one headset at a time into samples for the loop, and into figures for people."""
+"""Turn the messages of the headset that drives into samples for the loop, and into statistics for people."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ class HandStream:
 
         Args:
             watch: Finds poses that must not be followed.
-            tell: Gets each message instead of the loop.
+            tell: Gets each message. Then no samples are queued for the loop.
         """
         self._watch, self._tell = watch, tell
         self._samples, self._tracker = SampleQueue(), HandTracker()
-        self._lock = threading.Lock()  # Protects the figures.
+        self._lock = threading.Lock()  # Protects the statistics.
         self._recorders: dict[str, TopicRecorder] = {}
-        self.peer: str | None = None  # The headset that drives.
+        self.peer: str | None = None  # The headset that drives; None if there is none.
         self._connections = 0
         self._last_disconnect: str | None = None
 
     @property
     def connected(self) -> bool:
-        """Whether a headset drives, and :meth:`take` has shown every lost connection."""
+        """Whether a headset drives, and no earlier lost connection is still to be noticed by a :meth:`take`."""
         return self.peer is not None and not self._samples.is_cut
 
     def admit(self, peer: str) -> None:
@@ -47,8 +47,9 @@ class HandStream:
             self.peer = peer
 
     def lose(self, reason: str) -> None:
-        """Note that the headset that drove is gone."""
-        self._samples.cut()  # Done before the peer changes, so that `connected` is not true too early for the next one.
+        """Note that the connection of the headset that drove is lost."""
+        # This comes before the peer changes. Otherwise `connected` could be True for the next headset too early.
+        self._samples.cut()
         with self._lock:
             self.peer, self._last_disconnect = None, reason
 

@@ -25,7 +25,7 @@ _LOG = logging.getLogger(__name__)
 
 
 def watch_of(config: Config) -> HandsWatch:
-    """Return a watch for those faults of a headset's hands that the cell's settings name."""
+    """Return a watch for the faults of a headset's poses, with the settings of the cell."""
     headset = config.headset
     return HandsWatch(headset.frozen_time, headset.watch_frame, config.teleop.gate.timeout)
 
@@ -41,8 +41,8 @@ class HeadsetServer:
         port: The port to listen on; 0 for any free port.
         clock: Stamps the samples when their bytes are received [s].
         listener: Gets each message at once, in the receiving thread. In this case, :meth:`poll` returns nothing.
-        allow: The networks whose hosts may connect; None for all. :func:`~q2r2_control.inputs.listener.decide` decides
-            which of their clients drives.
+        allow: The networks whose hosts may connect; None for all networks. If several clients connect,
+            :func:`~q2r2_control.inputs.listener.decide` decides which one drives.
         watch: Finds poses that must not be followed.
         say: Gets lines for people when the server listens: its address, and who can drive.
     """
@@ -67,10 +67,10 @@ class HeadsetServer:
         self._stream = HandStream(watch or HandsWatch(), listener)
         self._thread: threading.Thread | None = None
         self._stop = threading.Event()
-        self._owed: dict[str, HapticFeedback] = {}  # The newest vibration of each hand.
+        self._owed: dict[str, HapticFeedback] = {}  # The newest vibration of each hand that has not been sent yet.
         self._owed_lock = threading.Lock()
-        self._session_lock = threading.Lock()  # Neither poll nor send_haptic takes it.
-        self._client: Client | None = None  # The last client that was admitted.
+        self._session_lock = threading.Lock()  # Neither poll nor send_haptic waits for this lock.
+        self._client: Client | None = None  # The client that was admitted last; it may be gone.
 
     @classmethod
     def from_config(
@@ -107,7 +107,7 @@ class HeadsetServer:
 
     @property
     def connected(self) -> bool:
-        """Whether a headset is connected, and ``poll`` has shown every lost connection."""
+        """Whether a headset is connected, and no earlier lost connection is still to be noticed by a :meth:`poll`."""
         return self._stream.connected
 
     @property
@@ -120,7 +120,10 @@ class HeadsetServer:
         return self._stream.take()
 
     def send_haptic(self, feedback: HapticFeedback) -> None:
-        """Vibrate with values clipped to 0..1. Nothing happens if no headset listens, or if a value is not finite."""
+        """Let a hand vibrate. The values are clipped to 0..1.
+
+        Nothing happens if no headset is connected, or if a value is not finite.
+        """
         values = (feedback.frequency, feedback.amplitude)
         if feedback.hand not in SIDES or not all(map(math.isfinite, values)) or self._stream.peer is None:
             return
@@ -173,7 +176,7 @@ class HeadsetServer:
         self._stream.admit(client.peer)
 
     def _receive(self, client: Client, frame: WireFrame, now: float) -> None:
-        # The lock is taken for each frame, so that a snapshot never waits for many frames.
+        # The lock is released after each frame, so that a snapshot never waits for many frames.
         with self._session_lock:
             reception = client.receive(frame, now)
         if reception is not None:

@@ -19,13 +19,13 @@ from q2r2_control.types import SIDES, Array, HandSample
 
 SILENCE = 2.0  # Time without data before advice is given [s].
 _PERIOD = 0.05  # [s]
-_WINDOW = 0.5  # Length of the movement that is put in words [s].
-_STILL = 0.02  # A hand that moved less in the window is still [m].
+_WINDOW = 0.5  # The movement during this time before now is put in words [s].
+_STILL = 0.02  # A hand that has moved by less than this in the window counts as still [m].
 _DIRECTIONS = (("back -x", "forward +x"), ("right -y", "left +y"), ("down -z", "up +z"))
 
 
 class HandMovement:
-    """Puts one hand's recent movement in words, in the world's axes that the config's ``teleop.axes`` defines."""
+    """Puts one hand's recent movement in words, along the world's axes that the config's ``teleop.axes`` defines."""
 
     def __init__(self, axes: tuple[str, str, str]) -> None:
         self._axes: Array = axes_matrix(axes)
@@ -37,7 +37,7 @@ class HandMovement:
             self._positions.append((sample.pose_stamp, self._axes @ sample.position))
 
     def in_words(self, now: float) -> str:
-        """Return the dominant direction of the last half second: "forward +x", ..., "still", or "no data"."""
+        """Return the main direction of movement in the last half second: "forward +x", ..., "still", or "no data"."""
         while self._positions and self._positions[0][0] < now - _WINDOW:
             self._positions.popleft()
         if not self._positions:
@@ -56,7 +56,7 @@ class HandMovement:
 
 
 class CheckedServer(Protocol):
-    """A server to which headsets connect, by an app or by a page at ``url``."""
+    """A server to which a headset connects, with an app or with a page at ``url``."""
 
     @property
     def url(self) -> str | None: ...
@@ -68,7 +68,7 @@ class CheckedServer(Protocol):
 
 
 class HandWatch(Protocol):
-    """Watches the places of both hands, as :class:`CrossedHands` of the teleoperation does."""
+    """Watches the poses of both hands, and may warn about them. :class:`CrossedHands` is such a class."""
 
     def add(self, sample: HandSample) -> None: ...
 
@@ -79,11 +79,11 @@ class HandWatch(Protocol):
 class HeadsetCheck:
     statistics: HeadsetStatistics
     directions: dict[str, str]  # Direction of movement by hand, in words.
-    positions: dict[str, Array | None]  # Position by hand, in the world [m].
-    heard: bool  # Whether data came at some time.
-    missing: tuple[str, ...]  # Topics that a run needs and that never came.
+    positions: dict[str, Array | None]  # Position in the world frame (3,) [m], by hand; None without data.
+    heard: bool  # Whether a sample of a hand has ever come.
+    missing: tuple[str, ...]  # Topics that a run needs and of which no message has ever come.
     crossed: bool  # Whether the controllers seem to be swapped.
-    advice: tuple[str, ...]  # Lines of advice. They are empty if nothing is wrong.
+    advice: tuple[str, ...]  # Lines of advice; empty if nothing is wrong.
 
     def as_json(self) -> dict[str, Any]:
         return {
@@ -146,7 +146,7 @@ def watch_headset(
 
 
 def needed_topics(config: Config) -> tuple[str, ...]:
-    """Return the topics that a run needs: poses and inputs (with the buttons) of each hand that leads an arm."""
+    """Return the topics that a run needs: poses and inputs (with the buttons) of each hand that drives an arm."""
     same_side = config.teleop.stance is Stance.SIDE_BY_SIDE
     hands = {hand for hand in SIDES for arm in config.arms if (hand == arm) is same_side}
     needed = (MessageType.POSE, MessageType.INPUTS)
@@ -156,7 +156,7 @@ def needed_topics(config: Config) -> tuple[str, ...]:
 def advice_on_some(silent: tuple[str, ...], warning: str | None = None) -> tuple[str, ...]:
     """Return advice if some topics come and others are ``silent``, with one line for each hand.
 
-    The ``warning`` about the places of both hands, if there is one, comes first.
+    The ``warning`` about the poses of both hands comes first; None if there is none.
     """
     lines = [] if warning is None else [warning]
     for hand in SIDES:

@@ -1,4 +1,7 @@
-"""Accept connections at a bounded rate, decide which client drives, and tell people the addresses. No clock is read."""
+"""Accept connections at a bounded rate, decide which client drives, and tell people the addresses.
+
+Nothing here reads a clock: the caller passes the time.
+"""
 
 from __future__ import annotations
 
@@ -18,9 +21,10 @@ from q2r2_control.config.strict import Network
 from q2r2_control.errors import ConfigError
 from q2r2_control.inputs.addresses import reachable_addresses
 
-LINES_PERIOD = 1.0  # Time between two lines about one host [s].
-MAX_WAITING = 4  # Greatest number of clients that wait for a decision, one of each host.
-MAX_HOSTS_NAMED = 8  # Number of hosts with lines of their own within LINES_PERIOD. All other hosts share lines.
+LINES_PERIOD = 1.0  # Least time between two lines of the log about one host [s].
+MAX_WAITING = 4  # Greatest number of clients that wait for a decision. Each host has at most one of them.
+# Greatest number of hosts that the log names within LINES_PERIOD. All further hosts together count as one.
+MAX_HOSTS_NAMED = 8
 ONLY_THIS_MACHINE = ("127.0.0.1", "::1", "localhost")
 _OTHERS = "other hosts"
 
@@ -33,10 +37,11 @@ class RateLimit:
         self._start, self._taken = -math.inf, 0
 
     def is_open(self, now: float) -> bool:
-        """Return whether one more event is allowed at ``now`` [s]."""
+        """Return whether one more event is allowed at ``now`` [s]. The event is not counted."""
         return self._taken < self._count or now - self._start >= self._period
 
     def take(self, now: float) -> bool:
+        """Count an event at ``now`` [s] if it is allowed. Return whether it is allowed."""
         if now - self._start >= self._period:
             self._start, self._taken = now, 0
         if self._taken >= self._count:
@@ -47,17 +52,17 @@ class RateLimit:
 
 @dataclass
 class _Host:
-    since: float  # Time of its last line [s].
-    level: int = 0
-    text: str = ""  # The newest of the most important lines that are held back.
-    held_back: int = 0
+    since: float  # Time of the last line about this host [s].
+    level: int = 0  # Highest level of the lines that are held back.
+    text: str = ""  # The newest line of this level that is held back.
+    held_back: int = 0  # Number of lines that are held back.
 
 
 class HostLog:
     """Writes at most one line a second about each host.
 
-    A line that comes too early is held back. When the second is over, the newest of the most important lines is
-    written, with the number of the lines that are left out.
+    A line that comes too early is held back. When the second is over, the newest line of the highest level is written,
+    with the number of the lines that are left out.
     """
 
     def __init__(self, logger: logging.Logger) -> None:
@@ -89,21 +94,22 @@ class HostLog:
                     self._hosts[host] = _Host(now)
 
     def _write(self, level: int, text: str) -> None:
-        self._logger.log(level, "%s", text)  # The text is not used as a format, since it may quote a client.
+        self._logger.log(level, "%s", text)  # The text is no format string, since it may contain words of a client.
 
 
-# To accept a connection takes the interpreter, and so the control loop, about 0.1 ms. A client in the kernel's queue of
-# 128 is accepted within 0.35 s. If the queue is full, the kernel drops new clients, and a client tries again after 1 s.
-ACCEPTS, ACCEPTS_PERIOD = 20, 0.05  # Number of connections, and the period in which they are accepted [s].
-ANSWERS_PER_SECOND = 10  # Answers to one host. The app connects once a second.
+# To accept a connection occupies the interpreter for about 0.1 ms, and the control loop cannot run meanwhile. At the
+# following rate, a client in the kernel's queue of 128 waits 0.35 s at most. If the queue is full, the kernel drops new
+# clients, and a client tries again after 1 s.
+ACCEPTS, ACCEPTS_PERIOD = 20, 0.05  # At most this many connections are accepted in this period [s].
+ANSWERS_PER_SECOND = 10  # Greatest number of answers to one host in a second. The app connects once a second.
 _RESET = struct.pack("ii", 1, 0)  # SO_LINGER: close with a reset, which leaves nothing behind in the kernel.
 
 
 class TcpListener:
     """Listens on ``host`` and ``port``. Raises OSError, OverflowError or ValueError if that is not possible.
 
-    If a host connects more than ``ANSWERS_PER_SECOND`` times in a second, its connections are closed without an answer,
-    which takes the least time.
+    If a host connects more than ``ANSWERS_PER_SECOND`` times in a second, its further connections are closed without an
+    answer, because this takes the least time.
     """
 
     def __init__(self, host: str, port: int, log: HostLog) -> None:
@@ -121,7 +127,7 @@ class TcpListener:
         return self._socket.fileno()
 
     def arrivals(self, now: float) -> Iterator[tuple[socket.socket, str, str]]:
-        """Yield the connections within the rate: a socket that does not block, the host, and the peer.
+        """Yield the connections that the rate allows: a socket that does not block, the host, and the peer's host:port.
 
         The host of an IPv4 connection through an IPv6 socket is an IPv4 address.
         """
@@ -151,7 +157,7 @@ class TcpListener:
 
 
 def written(host: str, port: int) -> str:
-    """Return host and port in one text, such as ``[::1]:10000`` with IPv6."""
+    """Return host and port as one text, such as ``[::1]:10000`` for IPv6."""
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
 
@@ -161,7 +167,7 @@ def why_not_bound(error: Exception) -> str:
 
 
 def listening_socket(host: str, port: int, option: str) -> socket.socket:
-    """Return a socket of a page that listens on ``host`` and ``port``; a port of 0 stands for any free one.
+    """Return a socket for a page, which listens on ``host`` and ``port``. A ``port`` of 0 stands for any free port.
 
     Raises:
         ConfigError: If the address cannot be bound. The message begins with ``option``.
@@ -182,7 +188,7 @@ def app_settings(host: str, port: int) -> str:
 
 
 def access_lines(host: str, port: int, allow: Sequence[Network] | None) -> tuple[str, ...]:
-    """Return lines with the app's settings and who can drive now, for a server that listens on ``host``."""
+    """Return lines that tell the app's settings, and who can drive now, for a server that listens on ``host``."""
     if host in ONLY_THIS_MACHINE:
         return (f"{host} can be reached from this machine only; --host 0.0.0.0 admits the network",)
     if allow is None:
@@ -203,11 +209,13 @@ def is_loopback(host: str) -> bool:
         return host == "localhost"
 
 
-# Rules 1 to 4 are those of docs/headset.md, "Who drives". A driver without frames gives way only to its own peer, after
-# 37 periods of the app's poses. That is more than three times the time that pauses the arms. Without this rule, a link
-# that was lost without a message would keep other clients out for seconds.
-QUIET_ALLOWED = 0.5  # A driver without a frame for longer gives way to the same peer on a new connection [s].
-POSES_ALLOWED = 5.0  # A driver without a hand pose for longer gives way to a client that sends poses [s].
+# Rules 1 to 4 are in docs/headset.md, "Who drives". A driver that sends no frames gives way only to its own host, after
+# 37 periods of the app's poses. That is more than three times the time after which the arms pause. Without this rule, a
+# headset whose link was lost without a message could not drive again for seconds.
+# A driver without a frame for longer than this gives way to a new connection of the same headset [s].
+QUIET_ALLOWED = 0.5
+# A driver without a hand pose for longer than this gives way to a client that sends poses [s].
+POSES_ALLOWED = 5.0
 WAIT_ALLOWED = 2.0  # A newcomer that may not drive after this time is refused [s].
 
 
@@ -233,7 +241,11 @@ class Admission(Enum):
 
 
 def decide(driver: Peer | None, newcomer: Peer, now: float) -> tuple[Admission, str]:
-    """Decide on ``newcomer`` at ``now`` [s] by rules 2 to 4. The text says why it, or the ``driver``, has to leave."""
+    """Decide about ``newcomer`` at ``now`` [s] by rules 2 to 4.
+
+    Returns:
+        The decision, and why the newcomer or, if it is admitted, the ``driver`` has to leave; empty if nobody has to.
+    """
     if driver is None:
         return Admission.ADMIT, ""
     if now - driver.last_pose > POSES_ALLOWED:
@@ -252,10 +264,11 @@ def decide(driver: Peer | None, newcomer: Peer, now: float) -> tuple[Admission, 
 def verdicts(
     waiting: Sequence[SomePeer], driver: Callable[[], SomePeer | None], now: float
 ) -> Iterator[tuple[SomePeer, bool, str]]:
-    """Yield each newcomer that is admitted (True) or refused at ``now`` [s], and why it, or the driver, has to leave.
+    """Yield the decisions about newcomers at ``now`` [s]: the newcomer, True if it is admitted, and a reason.
 
-    Other newcomers go on waiting: the newest of each host, and ``MAX_WAITING`` at most. The driver may change between
-    two yields, so ``driver`` returns the present one.
+    The reason says why the refused newcomer, or the driver that it replaces, has to leave. Other newcomers go on
+    waiting: the newest client of each host, and ``MAX_WAITING`` clients at most. The driver may change between two
+    yields, so ``driver`` is a function that returns the present driver.
     """
     newest = {client.host: client for client in waiting}
     still_waiting = 0

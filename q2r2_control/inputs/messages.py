@@ -1,9 +1,9 @@
 """Read and write the data of the Quest2ROS app: frames of ROS-TCP-Connector 0.7, and the messages in them.
 
-This module has no sockets. A frame is ``u32 n | n bytes destination | u32 m | m bytes payload``, little-endian, in both
-directions (public source of Unity ROS-TCP-Connector 0.7.0). The package rosbags (de)serialises the messages. This
-module checks them more strictly than rosbags, to distinguish the dialects. If a message is read in the wrong dialect, a
-pose is noise and a button stays pressed.
+This module uses no sockets. A frame is ``u32 n | n bytes destination | u32 m | m bytes payload``, little-endian, in
+both directions (public source of Unity ROS-TCP-Connector 0.7.0). The package rosbags (de)serialises the messages. This
+module checks them more strictly than rosbags, to distinguish the dialects. In the wrong dialect, a pose would be read
+as meaningless numbers, and a button would seem to stay pressed.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ _FIXED_SIZES = {
 
 
 def decode(kind: MessageType, payload: bytes, dialect: Dialect) -> HandMessage:
-    """Read a pose, twist or inputs message. Its numbers may have any value, also NaN.
+    """Read a message: a pose, a twist, or the inputs of a hand. Its numbers may have any value, also NaN.
 
     Raises:
         ProtocolError: If a length, an encapsulation, a boolean or a string is not one of ``kind`` in ``dialect``.
@@ -129,7 +129,7 @@ def encode(vibration: HapticFeedback, dialect: Dialect) -> bytes:
 
 
 def warm_up() -> None:
-    """Compile every (de)serialiser now, so that no first message waits for it. This takes about 0.5 s per process."""
+    """Compile every (de)serialiser now, so that the first message need not wait. This takes about 0.5 s per process."""
     for dialect in Dialect:
         for kind in MessageType:
             message_types(dialect).get_msgdef(kind.full_name)
@@ -145,9 +145,9 @@ def message_types(dialect: Dialect) -> Typestore:
 
 
 def _check_bytes(kind: MessageType, payload: bytes, dialect: Dialect) -> None:
-    """Raise ProtocolError for bytes that rosbags accepts.
+    """Raise ProtocolError for wrong bytes that rosbags would accept.
 
-    These are spare bytes, other encapsulations, strings without their NUL, and booleans above 1.
+    Such bytes are spare bytes, other encapsulations, strings without their NUL, and booleans above 1.
     """
     ros2 = dialect is Dialect.ROS2
     length = int.from_bytes(payload[12:16], "little")  # Length of a pose's frame_id, in both dialects.
@@ -173,7 +173,8 @@ def _vector(message: Any) -> Array:
     return np.array([message.x, message.y, message.z])
 
 
-MAX_FRAME_BYTES = 1 << 20  # A hand message has under 200 bytes. A longer frame shows that its start was read wrongly.
+# A hand message has under 200 bytes. If a frame seems longer than this, its start was read at a wrong place.
+MAX_FRAME_BYTES = 1 << 20
 KEEPALIVE = bytes(8)  # A frame without destination and payload.
 
 
@@ -184,7 +185,7 @@ class WireFrame(NamedTuple):
 
 
 def encode_frame(destination: str, payload: bytes) -> bytes:
-    """Return the bytes of one frame from the server. Its destinations have no NUL in either dialect."""
+    """Return the bytes of one frame that the server sends. Its destination ends without NUL in both dialects."""
     name = destination.encode()
     return len(name).to_bytes(4, "little") + name + len(payload).to_bytes(4, "little") + payload
 
@@ -193,7 +194,7 @@ class FrameDecoder:
     """Cuts a byte stream into frames, however the network has split or joined them.
 
     Frames are taken one by one, so that whole frames before a fault are still used. The decoder holds at most one frame
-    of ``MAX_FRAME_BYTES`` and the last data of :meth:`feed`. After a :class:`ProtocolError`, the decoder is of no use.
+    of ``MAX_FRAME_BYTES`` and the last data of :meth:`feed`. After a :class:`ProtocolError` it must not be used again.
     """
 
     def __init__(self) -> None:
@@ -230,7 +231,7 @@ class FrameDecoder:
         return WireFrame(destination, payload, terminated=name.endswith(b"\0"))
 
     def finish(self) -> None:
-        """Tell the decoder that the stream has ended; raises :class:`ProtocolError` if that was inside a frame."""
+        """Note that the stream has ended. Raises :class:`ProtocolError` if it has ended inside a frame."""
         if self._buffer:
             raise ProtocolError(f"stream ended inside a frame, {len(self._buffer)} bytes after its start")
 

@@ -1,8 +1,8 @@
-"""Detect that the frame of the hands' poses has moved, and not the hands. Both hands then move as one rigid body.
+"""Detect that the frame in which the hands' poses are measured has moved, and not the hands.
 
 A frame moves in one step if the headset is recentred. The motion lasts longer if something carries the frame along,
-such as the operator's head. Both cases look like a motion of the two hands, and no arm may follow it. Human hands do
-not move as one rigid body, because each hand trembles and turns by itself.
+such as the operator's head. In both cases the two hands seem to move as one rigid body, and no arm may follow this
+motion. Human hands do not move as one rigid body, because each hand trembles and turns by itself.
 """
 
 from __future__ import annotations
@@ -22,19 +22,21 @@ _FARTHEST = 1e3  # Greatest coordinate. No tracking system reaches as far [m].
 
 
 class Move(NamedTuple):
-    """The size of a motion from one place to another, or a limit of it."""
+    """The size of a motion from one pose to another, or a limit on this size."""
 
     distance: float  # [m]
     angle: float  # [rad]
 
 
 class Place(NamedTuple):
+    """The pose of a hand, in the input's frame."""
+
     position: Array  # (3,) [m]
     rotation: Array  # (3, 3)
 
     @classmethod
     def of(cls, pose: HandPose) -> Place | None:
-        """Return the place of a pose; None if its numbers are not a pose."""
+        """Return the pose with a rotation matrix; None if the numbers of ``pose`` are not a pose."""
         length = math.sqrt(float(pose.quaternion @ pose.quaternion))
         if not 0.5 <= length <= 2.0 or not float(np.abs(pose.position).max()) <= _FARTHEST:
             return None
@@ -42,13 +44,13 @@ class Place(NamedTuple):
 
 
 class HandPair(NamedTuple):
-    """Both hands at one time, and the quantities that a motion of both as one rigid body does not change."""
+    """Both hands at one time, and the quantities that stay the same if both hands move as one rigid body."""
 
     t: float  # [s]
     left: Place
     right: Place
     seen: Array  # (3,) The right hand's position in the left hand's axes [m].
-    apart: float  # Distance of the hands [m].
+    apart: float  # Distance between the hands [m].
     turn: Array  # (3, 3) The right hand's rotation in the left hand's axes.
 
     @classmethod
@@ -58,10 +60,13 @@ class HandPair(NamedTuple):
 
 
 def moved_as_one(before: HandPair, after: HandPair, tolerance: Move) -> bool:
-    """Return whether distance, relative rotation and direction of the hands are unchanged, as after a rigid motion.
+    """Return whether the hands' distance, relative rotation and relative direction are the same in both pairs.
 
-    Let a hand's rotation have an error of the tolerance's angle. In the axes of this hand, the other hand then moves by
-    that angle times the distance of the hands. A smaller bound would allow less rotation noise than the tolerance.
+    They are the same after the two hands have moved as one rigid body.
+
+    If one hand's measured rotation has an error of the tolerance's angle, the other hand seems to move in its axes, by
+    this angle times the distance between the hands. The bound on ``seen`` contains this motion. Without it, less noise
+    of the rotation would be allowed than the tolerance says.
     """
     shift = math.dist(after.seen, before.seen)
     if (
@@ -72,27 +77,27 @@ def moved_as_one(before: HandPair, after: HandPair, tolerance: Move) -> bool:
     return 0.5 * (float(np.vdot(before.turn, after.turn)) - 1.0) >= math.cos(tolerance.angle)
 
 
-# A step is a motion from one sample to the next by more than _STEP. It is also more than _STANDS_OUT times the motion
-# at any of the last _BEFORE samples. From rest, this is 0.7 m/s within one sample, or more than 30 m/s^2.
+# A motion from one sample to the next is a step if two conditions hold. It is larger than _STEP, and it is larger than
+# _STANDS_OUT times each of the last _BEFORE motions. From rest, this is 0.7 m/s within one sample: over 30 m/s^2.
 _STEP = Move(0.010, math.radians(2.0))
 _STANDS_OUT, _BEFORE = 3.0, 4
 _PERIOD = 1.0 / 72.0  # Period of samples [s]. Samples come closer together if one was delayed on the way.
 _STEP_TOLERANCE = Move(0.002, math.radians(0.75))
-# In this time, hands move by _STEP from rest at 20 m/s^2 and 70 rad/s^2 [s]. Over a longer gap, they may move farther,
-# by the square of its length.
+# From rest, hands that accelerate at 20 m/s^2 and 70 rad/s^2 move by _STEP in this time [s]. In a longer gap between
+# two samples they may move farther, by the square of the ratio of both times.
 _STEP_GAP = 0.032
-# A frame that is carried along.
-_WINDOW = 1.5  # Length of the motion that is judged [s].
+# The next constants concern a frame that is carried along.
+_WINDOW = 1.5  # Duration of the recent motion that is judged [s].
 _CARRIED = 0.15  # Least distance that both hands move [m].
-_NEAR = 0.4 * _CARRIED
+_NEAR = 0.4 * _CARRIED  # A left hand that stays within this distance is not carried along [m].
 _CARRIED_TOLERANCE = Move(0.001, math.radians(0.5))
 _SAME_TIME = 0.01  # Messages of the two hands within this time belong together [s].
-_ALIVE = 0.05  # A pose does not wait for a hand that has had no pose for longer [s].
-_LONGEST_GAP = 0.15  # The motion of a hand across a longer gap is not judged [s].
-# Delay before a moved frame counts as a fault, since the buttons of an alignment may come after the poses that it
-# moves [s].
+_ALIVE = 0.05  # A pose does not wait for the other hand if that hand has had no pose for longer than this [s].
+_LONGEST_GAP = 0.15  # Motion across a longer gap between two poses of a hand is not judged [s].
+# A moved frame counts as a fault only after this delay [s]. If the operator has aligned the frame, the message of the
+# buttons may come after the poses.
 _CHORD_TIME = 0.04
-# A pose within this time after the buttons of an alignment is dropped, so that its receiver sees the buttons first [s].
+# A pose within this time after the buttons of an alignment is dropped, so that the receiver gets the buttons first [s].
 _CHORD_SEEN = 0.01
 
 
@@ -109,16 +114,17 @@ class MovedFrame:
     def __init__(self, fault_time: float) -> None:
         """Make a detector. After the frame has moved, each pose has a fault for ``fault_time`` [s]."""
         self._fault_time = fault_time
-        self._chords: dict[str, float] = {}  # Since when each hand holds the buttons of an alignment [s].
+        self._chords: dict[str, float] = {}  # Since when a hand has held both buttons, to align the frame, by hand [s].
         self.reset()
 
     def reset(self) -> None:
         """Forget everything that was received, except which hand holds the buttons of an alignment."""
         self._ways = {hand: _Way() for hand in SIDES}
         self._pairs: deque[HandPair] = deque()
-        self._near: HandPair  # Since this pair, the left hand is within _NEAR of its place. Set if there are pairs.
-        self._suspected: float | None = None
-        self._bad_until = -math.inf
+        # The left hand has stayed within _NEAR of its position in this pair ever since. Set if there are pairs.
+        self._near: HandPair
+        self._suspected: float | None = None  # When a step of the frame was detected that may be an alignment [s].
+        self._bad_until = -math.inf  # Until this time, poses have a fault [s].
 
     def take_inputs(self, hand: str, inputs: HandInputs, now: float) -> None:
         """Take the buttons of a hand. With both buttons the operator aligns the frame, which may then move."""
@@ -163,8 +169,8 @@ class MovedFrame:
             pairs.popleft()
         if math.dist(pair.left.position, self._near.left.position) > _NEAR:
             self._near = pair
-        # If the left hand stayed near one place for the whole window, the frame was not carried. A hand at rest then
-        # takes no further computation.
+        # If the left hand has stayed near one position for the whole window, the frame was not carried along. A hand at
+        # rest therefore costs no further computation.
         if self._near.t > pairs[0].t and _carried(pairs):
             self._bad_until = now + self._fault_time
             pairs.clear()
@@ -173,16 +179,16 @@ class MovedFrame:
 class _Way:
     """The recent motion of one hand."""
 
-    place: Place  # Set when the first place is added.
+    place: Place  # The newest pose. It is set when the first pose is added.
 
     def __init__(self) -> None:
         self.stamp = -math.inf
-        self.is_new = False  # Whether the newest place waits for the place of the other hand.
-        self.stands_out = False  # Whether the newest move is a step.
+        self.is_new = False  # Whether the newest pose has not yet been paired with a pose of the other hand.
+        self.stands_out = False  # Whether the newest motion is a step.
         self._moves: deque[Move] = deque(maxlen=_BEFORE)
 
     def add(self, place: Place, now: float) -> bool:
-        """Add the newest place. Return whether it continues the motion, without a long gap."""
+        """Add the newest pose. Return whether it continues the motion, without a long gap."""
         gap = now - self.stamp
         goes_on = gap <= _LONGEST_GAP
         if goes_on:
@@ -204,7 +210,7 @@ class _Way:
 
 
 def _carried(pairs: deque[HandPair]) -> bool:
-    """Return whether the newest pair is far from an earlier one, and all pairs since differ by rigid motions only."""
+    """Return whether both hands have moved far since an earlier pair, and always as one rigid body."""
     newest = pairs[-1]
     for pair in list(pairs)[-2::-1]:
         if not moved_as_one(pair, newest, _CARRIED_TOLERANCE):

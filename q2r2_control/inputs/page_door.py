@@ -1,4 +1,4 @@
-"""Decide who may open a page of this package: browsers of this machine, or browsers that know the token of its URL."""
+"""Decide who may open a page of this package: browsers on this machine, or browsers that know the token of its URL."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ def text_response(status: http.HTTPStatus, text: str, kind: str = "text/plain") 
 
 
 def protect(response: Response, policy: str) -> None:
-    """Add the headers of a page: its ``policy`` for content, no storage in a cache, and no URL for other sites."""
+    """Add the headers of a page: its content security ``policy``, no caching, and no referrer for other sites."""
     response.headers["Content-Security-Policy"] = policy
     response.headers["Cache-Control"] = "no-store"
-    response.headers["Referrer-Policy"] = "no-referrer"  # The URL has the token.
+    response.headers["Referrer-Policy"] = "no-referrer"  # The page's URL contains the token.
 
 
 def tls_context(certificate: str | None) -> ssl.SSLContext | None:
-    """Return the TLS settings of a PEM file with its key; None without a file.
+    """Return the TLS settings for a certificate, a PEM file with its private key; None without a file.
 
     Raises:
         ConfigError: If the file cannot be used.
@@ -53,12 +53,12 @@ def tls_context(certificate: str | None) -> ssl.SSLContext | None:
 
 
 class PageDoor:
-    """A socket that listens, and the check of every request to it.
+    """A listening socket for a page, and the check of every request to the socket.
 
-    A page of another site may not connect, since its ``Origin`` differs. A name from an attacker's DNS is refused too,
-    since the names of a loopback address are known. The port of a ``Host`` is not checked, because ssh may forward
-    another port, and an attacker's page already fails by its name. Beyond loopback, a request needs the token of the
-    URL.
+    A page of another site may not connect, since its ``Origin`` differs. An attacker may also let a DNS name of his own
+    lead to this machine. On a loopback address such a name is refused as ``Host``, since only known names are allowed.
+    The port in ``Host`` is not checked, because ssh may forward another port, and the name is enough to refuse an
+    attacker's page. On any other address, a request needs the token of the URL.
     """
 
     def __init__(
@@ -77,8 +77,8 @@ class PageDoor:
             port: The port to listen on; 0 for any free port.
             option: The option that error messages name.
             token: The token that a request needs, unless the host is a loopback address.
-            certificate: A PEM file with its key, to serve the page by HTTPS; None for HTTP.
-            addresses: The addresses in the URLs; without any, those of ``host``.
+            certificate: A PEM file with a certificate and its key, to serve the page by HTTPS; None for HTTP.
+            addresses: The addresses for the URLs; if empty, the addresses at which ``host`` can be reached.
 
         Raises:
             ConfigError: If the address cannot be bound, or if the certificate cannot be used.
@@ -110,7 +110,7 @@ class PageDoor:
 
     @property
     def _query(self) -> str:
-        """The part of a URL that has the token."""
+        """The part of a URL that contains the token; empty if there is no token."""
         return "" if self.token is None else f"/?token={self.token}"
 
     def _is_known(self, request: Request) -> bool:

@@ -1,4 +1,4 @@
-"""Play hands whose poses and buttons are functions of time, and the same in every run."""
+"""Play hands whose poses and buttons are functions of time. They are the same in every run."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from q2r2_control.types import QUEST_CONTROLS, SIDES, Array, HandInputs, HandSam
 
 # Least and greatest measured rate of a headset's samples [Hz].
 _RATES = (72.0, 76.0)
-_LONGEST_DROPOUT = 5  # Greatest number of samples that are lost together.
+_LONGEST_DROPOUT = 5  # Greatest number of samples that are lost one after the other.
 _RECEIPT_JITTER = 0.0015  # Scale of the exponential distribution of delays [s].
-_ROTATION_NOISE = math.radians(0.03)
+_ROTATION_NOISE = math.radians(0.03)  # Standard deviation of the noise about each axis [rad].
 
 
 class SampleTiming(ABC):
-    """Times, noise and delays of the samples of one hand.
+    """When the samples of one hand are measured, with what noise, and when they are received.
 
-    For each of the ``times``, ``measured`` is called first, and then ``lateness``.
+    The caller takes the next of the ``times``, then calls ``measured`` once, and then ``lateness`` once.
     """
 
     @abstractmethod
@@ -40,7 +40,7 @@ class SampleTiming(ABC):
 
 
 class EvenSampling(SampleTiming):
-    """Exact poses at an even rate [Hz]. Each is received after a random delay of up to ``jitter`` [s]."""
+    """Exact poses at a constant rate. Each pose is received after a random delay of up to ``jitter`` [s]."""
 
     def __init__(self, rate_hz: float, jitter: float = 0.0, seed: int | tuple[int, ...] = 0) -> None:
         self._rate, self._jitter, self._random = rate_hz, jitter, np.random.default_rng(seed)
@@ -53,16 +53,16 @@ class EvenSampling(SampleTiming):
 
 
 class HeadsetSampling(SampleTiming):
-    """The samples of a headset: uneven at 72-76 Hz, received late, and with sensor noise.
+    """Samples as of a headset: at an uneven rate of 72-76 Hz, received late, and with sensor noise.
 
     Args:
-        hand: The hand, which is a part of the seed.
+        hand: The hand. Each hand has other random numbers.
         seed: Seed of all random numbers.
         position_noise: Standard deviation of the noise along each axis [m].
         tremor: Add the tremor of a human hand, 8-12 Hz with about 1 mm and 0.3 degrees.
-        dropout_probability: Probability of every sample to be lost, with up to 4 more.
+        dropout_probability: Probability that a sample is lost. Up to 4 further samples are lost with it.
         shaky: Change the tremor to 6 Hz, 2 mm and 0.6 degrees.
-        lost: Start and end of a time in which all samples are lost [s].
+        lost: Start and end of a time span in which all samples are lost [s].
     """
 
     def __init__(
@@ -79,7 +79,7 @@ class HeadsetSampling(SampleTiming):
         self._lost = lost
         self._random = np.random.default_rng([seed, SIDES.index(hand)])
         self._position_noise, self._dropout_probability = position_noise, dropout_probability
-        # Two tones per degree of freedom rise and fall together like a real tremor.
+        # The sum of two tones per degree of freedom rises and falls in amplitude, like a real tremor.
         self._frequencies = self._random.uniform(*((5.5, 6.5) if shaky else (8.0, 12.0)), (6, 2))
         self._phases = self._random.uniform(0.0, 2.0 * math.pi, (6, 2))
         self._amplitudes = (1.0 if shaky else 0.5) * tremor * np.array([1e-3] * 3 + [math.radians(0.3)] * 3)
@@ -108,12 +108,15 @@ class HeadsetSampling(SampleTiming):
 HandPose = Callable[[str, float], pin.SE3]  # Hand, time since the first poll [s] -> pose in the input's frame.
 HandButtons = Callable[[str, float], HandInputs]  # Hand, time since the first poll [s] -> buttons.
 
-# The motion pauses if the input is not polled for longer than this [s].
+# If the input is not polled for longer than this, the motion waits for the next poll [s].
 _LONGEST_BACKLOG = 1.0
 
 
 class PlayedInput:
-    """Gives samples of hands along given paths. Their time starts at the first poll. Implements :class:`Input`."""
+    """Gives samples of hands that move as given functions of time say. The time starts at the first poll.
+
+    Implements :class:`Input`.
+    """
 
     controls = replace(QUEST_CONTROLS, words=replace(QUEST_CONTROLS.words, nobody="a script moves the hands"))
 
@@ -146,7 +149,7 @@ class PlayedInput:
         return self._pose(hand, t - (self._origin or 0.0))
 
     def poll(self, now: float) -> list[HandSample]:
-        """Return the samples that became due since the last poll, oldest first. Their receipt time is the due time."""
+        """Return the samples that became due since the last poll, oldest first. Each is stamped with its due time."""
         if not self._connected or not math.isfinite(now):
             return []
         if self._origin is None:
@@ -165,7 +168,7 @@ class PlayedInput:
         return sorted(samples, key=lambda sample: sample.pose_stamp)
 
     def due(self) -> float:
-        """Return when the next sample becomes due, on the clock of the polls [s]; inf if there was no poll yet."""
+        """Return when the next sample becomes due, on the clock of the polls [s]; inf before the first poll."""
         return math.inf if self._origin is None else self._origin + self._due
 
     def _first_due(self) -> float:

@@ -1,7 +1,8 @@
-"""Actions of a policy as an input. The actions have the same form as in a dataset.
+"""An input whose data are the actions of a policy. The actions have the same form as in a dataset.
 
-The numbers of an action are those of a feature of datasets, in the same order: :class:`ActionSpace`. The policy's own
-thread checks them, and converts them to tool poses. Teleop follows these poses as it follows a hand.
+An action has the same numbers as a feature of datasets, in the same order; see :class:`ActionSpace`. The policy's own
+thread checks them, and converts joint positions to tool poses. The teleop layer follows these poses as it follows a
+hand.
 """
 
 from __future__ import annotations
@@ -32,16 +33,20 @@ MOTION_FIELDS = ("x", "y", "z", "rx", "ry", "rz")
 _GAPS = 0.002, 0.5  # Least and greatest time from one action to the next [s].
 _MOST = 1000  # Greatest number of actions in a chunk.
 _NO_OPERATOR = replace(QUEST_CONTROLS, words=replace(QUEST_CONTROLS.words, nobody="a policy moves the arms"))
-_KEPT = 20  # Number of chunks that are kept between two ticks. These are the newest.
-_JOINED = 1.0  # Time that a computing policy has to finish when the run ends [s].
+_KEPT = 20  # Number of chunks that are kept between two ticks. If more come, the newest ones are kept.
+_JOINED = 1.0  # When the run ends, a policy that still computes is waited for, for this time [s].
 
 
 class ActionSpace(StrEnum):
-    """The numbers of an action, by the name of the feature of a dataset. Openings of all grippers may follow."""
+    """The kind of numbers in an action. Each value is the name of the dataset feature that has the same numbers.
+
+    The openings of all grippers may follow the numbers.
+    """
 
     JOINTS = "action"  # Joint positions of all arms [rad].
-    TOOL = "action.tool"  # Tool poses x y z [m] qx qy qz qw in the world.
-    TOOL_DELTA = "action.tool_delta"  # Motion to the next target, in the target's frame [m], rotation vector [rad].
+    TOOL = "action.tool"  # Tool poses x y z [m] qx qy qz qw in the world frame.
+    # Motions from each target pose to the next: displacement [m] and rotation vector [rad], in the axes of the first.
+    TOOL_DELTA = "action.tool_delta"
 
 
 def action_names(robot: Robot, space: ActionSpace) -> tuple[str, ...]:
@@ -108,7 +113,7 @@ class PolicyInput:
         self._thread: threading.Thread | None = None
         self._robot: Robot | None = None
         self._realtime, self._started = True, False
-        self._due = -np.inf  # When the policy is called again [s].
+        self._due = -np.inf  # The policy is called again for the first observation from this time on [s].
         self._errors = PolicyErrors()
 
     @classmethod
@@ -121,9 +126,14 @@ class PolicyInput:
         named: str = "--policy",
         **options: object,
     ) -> PolicyInput:
-        """Make an input. ``policy`` is "module:name" of a policy or its class; ``takeover`` is the name of an input.
+        """Make an input.
 
-        Errors about the policy begin with ``named``.
+        Args:
+            config: The cell.
+            policy: A policy or its class, as "module:name".
+            takeover: The name of the input whose hands may take over; None for no operator.
+            named: The words with which errors about the policy begin.
+            options: Keyword arguments for the input ``takeover``.
         """
         if policy is None:
             raise ConfigError("input policy: --policy MODULE:NAME is missing, which names the policy")
@@ -185,15 +195,16 @@ class PolicyInput:
             self.operator.close()
 
     def send(self, actions: npt.ArrayLike, times: npt.ArrayLike | None = None, names: Sequence[str] = ()) -> None:
-        """Send actions (n, size), or one action (size,). From their first time on, they replace all earlier actions.
+        """Send actions (n, size), or one action (size,). From the first action's time on, they replace earlier actions.
 
         The method never raises. Actions that cannot be used stop the arms, with a line that says why.
 
         Args:
             actions: The numbers of the actions.
-            times: When the arms follow each action (n,), on the loop's clock [s]. Without them, the first action is for
-                the time of the newest observation, and the others follow at the rate.
-            names: The names of the numbers, which are checked. Without them, only the number of values is checked.
+            times: The time of each action (n,), on the loop's clock [s]. Without them, the first action has the time of
+                the newest observation, and the others follow at the rate.
+            names: The names of an action's numbers, to be checked. Without them, only the length of an action is
+                checked.
         """
         try:
             chunk = self._checked(actions, times, names)
@@ -301,7 +312,7 @@ class PolicyInput:
 def _loaded(where: str, named: str) -> Policy:
     """Return the policy at "module:name", from this folder or installed; raises :class:`ConfigError` without one.
 
-    ``named`` is what the command line calls it.
+    Error messages begin with ``named``, which is what the command line calls the policy.
     """
     check_kind(named, where, str, "MODULE:NAME")
     module, _, name = where.partition(":")

@@ -12,7 +12,7 @@ import numpy as np
 from q2r2_control.errors import shown
 from q2r2_control.types import Array
 
-_LARGEST = 1e3  # Largest absolute value of any number [m or rad].
+_LARGEST = 1e3  # Largest allowed absolute value of a number in an action [m or rad].
 _logger = logging.getLogger(__name__)
 
 
@@ -39,7 +39,10 @@ def check_finite(values: Array, names: Sequence[str]) -> None:
 
 
 def check_names(names: Sequence[str], expected: Sequence[str], grippers: Sequence[str]) -> None:
-    """Raise :class:`UnusableError` unless ``names`` are the ``expected`` ones, and then some ``grippers``, in order."""
+    """Raise :class:`UnusableError` unless ``names`` are all ``expected`` names, and then none or some of ``grippers``.
+
+    The order of both has to be kept.
+    """
     for place, name in enumerate(expected):
         if place >= len(names) or names[place] != name:
             found = shown(names[place]) if place < len(names) else "missing"
@@ -57,7 +60,7 @@ class PolicyErrors:
 
     def show(self, error: BaseException) -> None:
         """Log ``error`` with its traceback, unless this type was logged from the same line before."""
-        own = error.__traceback__  # Its first frame is that of the caller, which is left out.
+        own = error.__traceback__  # Its first stack frame is the caller of the policy, which is left out.
         trace = None if own is None else own.tb_next
         frames = traceback.extract_tb(trace)
         place = f"{type(error).__name__} {[(frame.filename, frame.lineno) for frame in frames[-1:]]}"

@@ -1,4 +1,4 @@
-"""Make samples of the hands' messages, detect poses that must not be followed, and queue the samples for the loop."""
+"""Make samples from the hands' messages, detect poses that must not be followed, and queue samples for the loop."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from q2r2_control.inputs.moved_frame import MovedFrame, PoseVerdict
 from q2r2_control.inputs.session import Reception
 from q2r2_control.types import SIDES, HandFault, HandInputs, HandSample
 
-# The samples kept between two polls: 0.8 s of poses and inputs of two hands at 75 Hz. A loop that stalls for longer
-# pauses all arms.
+# Greatest number of samples kept between two polls: poses and inputs of two hands at 75 Hz for 0.8 s. If the loop
+# stalls for longer, all arms pause anyway.
 SAMPLES_KEPT = 256
 
 
 class HandTracker:
-    """Joins the poses and inputs of one connection. Each sample has the newest of both."""
+    """Joins the poses and inputs of one connection. Each sample has a hand's newest pose and newest inputs."""
 
     def __init__(self) -> None:
         self._poses: dict[str, tuple[HandPose, float, HandFault | None]] = {}
@@ -41,17 +41,17 @@ class HandTracker:
 
 
 class SampleQueue:
-    """Bounded queue between two threads. It keeps the newest samples, and shows that the connection was cut.
+    """Bounded queue between two threads. It keeps the newest samples, and shows that the connection was lost.
 
-    After :meth:`cut` the next two calls of :meth:`take` return nothing, and :attr:`is_cut` is true until the second. A
-    loop that checks :attr:`is_cut` once per tick, before or after :meth:`take`, thus notices a connection that was lost
-    and made again. Such a loop never reads the poses of two clients as one motion.
+    After :meth:`cut` the next two calls of :meth:`take` return nothing, and :attr:`is_cut` is True until the second
+    call. A loop that checks :attr:`is_cut` once per tick, before or after :meth:`take`, therefore notices even a
+    connection that was lost and made again at once. Such a loop never takes the poses of two clients for one motion.
     """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._samples: deque[HandSample] = deque(maxlen=SAMPLES_KEPT)
-        self._takes_owed = 0  # Number of the next takes that return nothing.
+        self._takes_owed = 0  # How many further calls of ``take`` return nothing.
 
     @property
     def is_cut(self) -> bool:
@@ -78,7 +78,8 @@ class SampleQueue:
             self._takes_owed = 2
 
 
-FROZEN_TIME = 0.5  # Time of 37 samples of a headset, whose noise changes each of them [s].
+# A pose that stays the same for this long is frozen [s]. A headset sends 37 samples meanwhile, and noise changes each.
+FROZEN_TIME = 0.5
 
 
 class Watched(NamedTuple):
@@ -90,9 +91,10 @@ class Watched(NamedTuple):
 class HandsWatch:
     """Finds poses of real hands that must not be followed: frozen poses, and poses after their frame has moved.
 
-    Sensor noise changes each pose of a hand at rest, so a pose that stays the same is a copy of an old one. A fault of
-    the frame lasts for twice ``timeout``. By then, watches for missing data have noticed that faulty poses are left
-    out. Only a pose after an unusually large step may be delayed, because it may wait for the other hand's pose.
+    Sensor noise changes each pose of a hand at rest, so a pose that stays the same is a copy of an old one. After the
+    frame has moved, poses are faulty for twice ``timeout``. A receiver that leaves faulty poses out then has no pose
+    for long enough to stop its arm. Only a pose after an unusually large step may be delayed, because it may wait for
+    the other hand's pose.
     """
 
     def __init__(
@@ -102,8 +104,8 @@ class HandsWatch:
 
         Args:
             frozen_time: A pose that stays the same for this long is frozen [s]; None if no pose counts as frozen.
-            frame: Whether to watch for a frame that moves.
-            timeout: Half the time for which a fault of the frame lasts [s].
+            frame: Whether to detect that the frame of the poses has moved.
+            timeout: Half the time for which poses are faulty after the frame has moved [s].
         """
         self._frozen_time, self._watches_frame, self._fault_time = frozen_time, frame, 2.0 * timeout
         self.reset()
@@ -111,12 +113,12 @@ class HandsWatch:
     def reset(self) -> None:
         """Start again for a new connection, whose poses do not continue the motion of the poses before."""
         self._numbers: dict[str, bytes] = {}  # The numbers of each hand's newest pose.
-        self._since: dict[str, float] = {}  # When these last changed [s].
+        self._since: dict[str, float] = {}  # By hand, the time at which these numbers last changed [s].
         self._frame = MovedFrame(self._fault_time) if self._watches_frame else None
         self._waiting: list[Watched] = []
 
     def receive(self, reception: Reception, now: float) -> list[Watched]:
-        """Return the messages to hand on after ``reception`` came at ``now`` [s], in this order."""
+        """Return the messages to pass on after ``reception`` has come at ``now`` [s], oldest first."""
         hand, message = reception.hand, reception.message
         if isinstance(message, HandInputs) and self._frame is not None:
             self._frame.take_inputs(hand, message, now)

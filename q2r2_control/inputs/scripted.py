@@ -1,7 +1,7 @@
-"""Scripted hands: ideal or human-like motion with button presses, the same in every run.
+"""Scripted hands: ideal or human-like motions with button presses, which are the same in every run.
 
-All motions are displacements from the start of each hand. Motions without assembly work are written for the left hand,
-and the right hand mirrors them left to right. The axes are x forwards, y to the left, and z up.
+A motion is a displacement from the pose that the hand has at the start. Motions without assembly work are written for
+the left hand, and the right hand mirrors them left to right. The axes are x forwards, y to the left, and z up.
 """
 
 from __future__ import annotations
@@ -23,9 +23,10 @@ from q2r2_control.robot.compose import compose
 from q2r2_control.types import SIDES, Array, HandInputs
 
 PRESS_DURATION = 0.15  # [s]
-FIRST_PRESS = 0.6  # When the lower buttons engage both arms [s].
-START = 1.2  # When the motion starts [s].
-_LAST_PRESS, _REST = 0.4, 0.6  # Time from the work to the press that pauses both arms, and from there to the end [s].
+FIRST_PRESS = 0.6  # Time at which the lower buttons engage both arms [s].
+START = 1.2  # Time at which the motion starts [s].
+# Time from the end of the work to the press that pauses both arms, and from this press to the end of the run [s].
+_LAST_PRESS, _REST = 0.4, 0.6
 _RAMP = 1.0  # Periodic motions accelerate for this long [s].
 
 # (t [s], frequency [Hz]) -> displacement (3,) [m] and rotation vector (3,) [rad] of a hand.
@@ -48,7 +49,7 @@ class HandTrajectory:
     duration: float | None = None  # [s]; None if the motion has no end.
     steps: tuple[tuple[float, str], ...] = ()  # Start of each step [s], and the step in words.
     grips: tuple[float, ...] = ()  # Times of taps on the left grip [s].
-    precise: tuple[tuple[float, float], ...] = ()  # Start and end of each time with both sticks pushed up [s].
+    precise: tuple[tuple[float, float], ...] = ()  # Start and end of each time span with both sticks pushed up [s].
     lost: tuple[float, float] = (math.inf, math.inf)  # Start and end of the time without tracking of the hands [s].
 
     def displacement(self, hand: str, t: float, frequency: float) -> tuple[Array, Array]:
@@ -61,7 +62,7 @@ class HandTrajectory:
         return displacement * (1.0, -1.0, 1.0), turn * (-1.0, 1.0, -1.0)
 
     def inputs(self, hand: str, t: float) -> HandInputs:
-        """Return the buttons of ``hand`` at time ``t`` [s]. The index trigger is pressed while the hand is closed."""
+        """Return the buttons of ``hand`` at time ``t`` [s]. The index trigger is held while the gripper is closed."""
         upper = self.upper_presses.get(hand, ())
         grips = self.grips if hand == "left" else ()
         pressed = [
@@ -79,7 +80,7 @@ class HandTrajectory:
 
 
 def _phase(t: float, frequency: float) -> float:
-    """Return the angle of a periodic motion, whose speed rises smoothly [rad]."""
+    """Return the phase angle of a periodic motion at ``t`` [rad]. Its speed rises smoothly at the start."""
     elapsed = max(t - START, 0.0)
     if elapsed < _RAMP:
         return math.pi * frequency * (elapsed - _RAMP / math.pi * math.sin(math.pi * elapsed / _RAMP))
@@ -87,19 +88,25 @@ def _phase(t: float, frequency: float) -> float:
 
 
 def _circle(t: float, frequency: float) -> tuple[Array, Array]:
-    """Return a circle of radius 0.1 m, sidewards and up, as in Quest2ROS2's SimulationInput."""
+    """Return the hand's displacement at ``t`` on a circle of radius 0.1 m, as in Quest2ROS2's SimulationInput.
+
+    The circle leads sidewards and up.
+    """
     phase = _phase(t, frequency)
     return np.array([0.0, 0.1 * math.sin(phase), 0.1 * (1.0 - math.cos(phase))]), np.zeros(3)
 
 
 def _line(t: float, frequency: float) -> tuple[Array, Array]:
-    """Return a line of 0.15 m there and back, forwards and up."""
+    """Return the hand's displacement at ``t`` on a line of 0.15 m, which leads forwards and up, and back."""
     way = 0.15 * (1.0 - math.cos(_phase(t, frequency))) / 2.0
     return way * np.array([0.6, 0.0, 0.8]), np.zeros(3)
 
 
 def _rotate(t: float, frequency: float) -> tuple[Array, Array]:
-    """Return a rotation of 30 degrees there and back about x, y and z in turn, 0.05 m above the start."""
+    """Return the hand's displacement at ``t``: it turns by 30 degrees and back, about x, y and z one after the other.
+
+    Meanwhile the hand is 0.05 m above its start.
+    """
     phase = _phase(t, frequency)
     turn = np.zeros(3)
     turn[int(phase / (2.0 * math.pi)) % 3] = math.radians(30.0) * (1.0 - math.cos(phase)) / 2.0
@@ -108,7 +115,7 @@ def _rotate(t: float, frequency: float) -> tuple[Array, Array]:
 
 
 def in_sequence(works: Sequence[tuple[str, HandWork]]) -> HandTrajectory:
-    """Return the motion of hands that do several named works one after the other, and then pause the arms."""
+    """Return the motion of hands that do several named works one after the other. At the end they pause the arms."""
     homes: dict[str, WayPoint] = {hand: (0.0, *HOME[hand], 0.0, 0.0) for hand in SIDES}
     points = {hand: [home] for hand, home in homes.items()}
     presses: dict[str, list[float]] = {hand: [] for hand in SIDES}
@@ -141,8 +148,8 @@ def _from_home(points: Sequence[WayPoint], hand: str, precise: Sequence[tuple[fl
 
     def displacement(t: float, frequency: float) -> tuple[Array, Array]:
         place, turn = way.at(t)
-        # With precision, the tool moves only a fraction of the hand's way. The hand therefore moves farther, and keeps
-        # this offset afterwards.
+        # With precision, the tool moves only by a fraction of the hand's motion. The hand therefore moves farther than
+        # the tool, and keeps this offset afterwards.
         fine = sum((way.at(min(max(t, begins), ends))[0] - way.at(begins)[0] for begins, ends in precise), np.zeros(3))
         return place - home + (1.0 / PRECISION_SCALE - 1.0) * fine, turn
 
@@ -158,7 +165,7 @@ TRAJECTORIES: Mapping[str, HandTrajectory] = {
 
 
 def place_of(seed: int, spread: float) -> tuple[float, float]:
-    """Return by how much the parts of all tasks are shifted along x and y, by up to ``spread`` [m] to any side."""
+    """Return a random shift of the parts of all tasks along x and y [m], of up to ``spread`` [m] to either side."""
     x, y = np.random.default_rng([seed, _PLACES]).uniform(-spread, spread, 2).tolist()
     return x, y
 
@@ -168,7 +175,7 @@ def trajectory_named(name: str, place: tuple[float, float] | None = None) -> Han
 
     Args:
         name: The trajectory, or works joined by ``+``.
-        place: By how much all parts are shifted along x and y [m].
+        place: The shift of all parts along x and y [m]; None if they are not shifted.
 
     Raises:
         ConfigError: If the name is unknown, or if a place is given for a motion without parts.
@@ -186,17 +193,18 @@ def trajectory_named(name: str, place: tuple[float, float] | None = None) -> Han
     return in_sequence([(work, WORKS[work]) for work in works])
 
 
-_PLACES = 7  # Second seed, so that places do not depend on other random numbers of the same first seed.
-_PACE = 1.25  # Speed of hasty hands, relative to the written motion.
-_HESITATIONS, _HESITATES = 3, 0.4  # Number of hesitations, and length of each [s].
-# Times since a headset lost the hands: it sees them again, they engage, they carry, and the work goes on [s].
+_PLACES = 7  # Second seed. It makes the shifts independent of other random numbers with the same first seed.
+_PACE = 1.25  # Speed of hasty hands, as a multiple of the speed in the trajectory.
+_HESITATIONS, _HESITATES = 3, 0.4  # Number of hesitations, and the duration of each [s].
+# Times after the headset has lost the hands, at which it sees them again, they engage, they carry, and they go on [s].
 _LOST, _ENGAGES, _CARRIES, _GOES_ON = 1.0, 1.3, 1.6, 2.1
-_EARLY = (0.1, 0.45)  # Range of the fraction of the work at which this happens, before a tool presses on anything.
-_NO_PRESS = (0.3, 0.6)  # Times before and after a press in which the hands do not stop [s].
+# Range of the fraction of the work after which the headset loses the hands. No tool presses on anything so early.
+_EARLY = (0.1, 0.45)
+_NO_PRESS = (0.3, 0.6)  # Hands do not stop within these times before and after a press [s].
 
 
 def hurried(work: HandTrajectory, seed: int) -> HandTrajectory:
-    """Return the same work by hasty hands: faster, with hesitation, and once lost by the headset for a second.
+    """Return the same work of hasty hands. They are faster and hesitate, and the headset loses them once for a second.
 
     After the loss, the hands wait until the headset sees them again, engage both arms again, and go on.
     """
@@ -241,12 +249,12 @@ def hurried(work: HandTrajectory, seed: int) -> HandTrajectory:
     )
 
 
-# Poses of an operator's hands at the start. Only the motion from there moves an arm.
+# Poses of an operator's hands at the start, in the input's frame. Arms follow only the motion from there.
 HANDS_AT_REST = {
     "left": pin.SE3(pin.rpy.rpyToMatrix(0.1, -0.2, 0.3), np.array([0.35, 0.25, 1.1])),
     "right": pin.SE3(pin.rpy.rpyToMatrix(-0.1, -0.2, -0.3), np.array([0.35, -0.25, 1.1])),
 }
-_DROPOUT_PROBABILITY = 0.005
+_DROPOUT_PROBABILITY = 0.005  # Probability that a sample is lost.
 _DIFFERENCE = 1e-4  # Half the time step of a central difference of the ideal pose [s].
 DEFAULT_TRAJECTORY = "meet"
 # Length of an iiwa 7 from its first joint to its last. The motions are written for an arm of this length [m].
@@ -261,11 +269,11 @@ class ScriptedInput(PlayedInput):
         hands: The hands that have samples.
         human: Sample the hands as :class:`HeadsetSampling` does, with tremor and dropouts.
         seed: Seed of all random numbers.
-        rate_hz: Even rate of the samples of hands that are neither ``human`` nor ``shaky`` [Hz].
+        rate_hz: Constant rate of the samples if neither ``human`` nor ``shaky`` is True [Hz].
         frequency_hz: Repetitions of circle, line and rotate per second [Hz].
         jitter: Greatest delay of each evenly sampled pose [s].
         scale: Factor of all distances of the trajectory. Rotations are not scaled.
-        shaky: Sample the hands as with ``human``, but with more tremor. The hands work as :func:`hurried` says.
+        shaky: Sample the hands as with ``human``, but with more tremor. The hands are hasty; see :func:`hurried`.
         spread: Greatest shift of the parts of a task [m]; see :func:`place_of`.
 
     Raises:
@@ -327,7 +335,8 @@ class ScriptedInput(PlayedInput):
     ) -> ScriptedInput:
         """Make an input whose motions are scaled to the shortest arm of the cell, if it is shorter than an iiwa 7.
 
-        ``fast`` changes nothing, because the samples depend on the times of the polls only, simulated or not.
+        ``fast`` changes nothing, because the samples depend only on the times of the polls. It makes no difference
+        whether these are simulated.
         """
         shortest = min(compose(config).arm_lengths().values())
         scale = min(shortest / _FULL_LENGTH, 1.0)

@@ -21,10 +21,10 @@ from q2r2_control.inputs.messages import (
 )
 from q2r2_control.types import SIDES, HandFault, HapticFeedback
 
-MAX_OUTGOING_BYTES = 1 << 16  # Size of the answers that a client may leave unread.
+MAX_OUTGOING_BYTES = 1 << 16  # Greatest size of the answers that a client may leave unread.
 MAX_COMMAND_BYTES = 1 << 14  # Greatest length of the JSON of a system command. Commands of the app have under 200.
-MAX_TOPICS = 64  # Number of topics that a client may name. The app names about ten.
-MAX_INCOMPLETE = 64  # Number of registrations without topic or type that are answered in one session.
+MAX_TOPICS = 64  # Greatest number of topics that a client may name. The app names about ten.
+MAX_INCOMPLETE = 64  # Greatest number of registrations without topic or type in one session.
 
 
 class HandTopic(NamedTuple):
@@ -54,16 +54,17 @@ class Reception(NamedTuple):
     topic: str  # Name without leading slash.
     hand: str
     message: HandMessage
-    fault: HandFault | None = None  # The fault of a pose that the headset itself reports.
-    virtual: bool = False  # True if keys or a gamepad move the hand, so that it rests without noise.
+    fault: HandFault | None = None  # The fault that the headset itself reports for a pose.
+    virtual: bool = False  # True if keys or a gamepad move the hand. The pose of a hand at rest then has no noise.
 
 
 def log_frame(level: str, text: str) -> bytes:
-    """Return the frame of a line for the app's console; ``level`` is log, warn or error."""
+    """Return a frame that writes a line to the app's console. ``level`` is log, warn or error."""
     return encode_frame(f"__{level}", json.dumps({"text": text}).encode())
 
 
-# The app takes any other first frame for that of an endpoint of another version, and ignores it.
+# The first frame that the server sends. The app takes any other first frame for that of another version of the server,
+# and ignores it.
 HANDSHAKE = encode_frame(
     "__handshake",
     json.dumps({"version": "v0.7.0", "metadata": json.dumps({"protocol": Dialect.ROS2.value})}).encode(),
@@ -75,26 +76,26 @@ class _IncompleteRegistrationError(Exception):
 
 
 class HeadsetSession:
-    """The protocol state of one client. :meth:`receive` takes its frames, and :attr:`outgoing` has the bytes for it.
+    """The protocol state of one client. :meth:`receive` takes its frames; :attr:`outgoing` has the bytes to send to it.
 
-    The server sends first, in ROS2, before the client's dialect is known. An app that is set to ROS1 logs an error and
-    goes on. The dialect follows from the NUL that only ROS2 clients put behind every destination. Each payload then has
-    to fit this dialect, so that no message is read by guessing.
+    The server sends first, in the dialect ROS2, before the client's dialect is known. An app that is set to ROS1 logs
+    an error and goes on. The client's first frame shows its dialect: only ROS2 clients put a NUL behind every
+    destination. Each payload then has to fit this dialect, so that no message is read by guessing.
 
     Data on topics outside ``HAND_TOPICS`` is counted and ignored. A registration whose topic or type the app's user
     left empty gets an error for the app's console, as from Unity's own endpoint. An unknown command, a name that no
-    topic can have, or a payload that its topic cannot have raises a :class:`ProtocolError`. The two sides then do not
-    speak the same protocol.
+    topic can have, and a payload that does not fit its topic raise a :class:`ProtocolError`, because the two sides then
+    do not speak the same protocol.
     """
 
     def __init__(self) -> None:
         self.dialect: Dialect | None = None
         self.published: dict[str, str] = {}  # Topic without leading slash -> type, as registered.
-        self.subscribed: dict[str, str] = {}  # Topic without leading slash -> the client's own spelling of it.
-        self.unknown_topics: Counter[str] = Counter()
+        self.subscribed: dict[str, str] = {}  # Topic without leading slash -> the name as the client writes it.
+        self.unknown_topics: Counter[str] = Counter()  # Number of messages on topics outside ``HAND_TOPICS``.
         self.outgoing = bytearray(HANDSHAKE)
-        self._skip_body = False
-        self._incomplete = 0
+        self._skip_body = False  # Whether the next frame is the body of a service call, which is ignored.
+        self._incomplete = 0  # Number of registrations without topic or type so far.
 
     def receive(self, frame: WireFrame) -> Reception | None:
         """Take one frame, and return the hand's message if the frame has one.
@@ -187,7 +188,7 @@ class HeadsetSession:
 
 
 def _parameters(command: str, payload: bytes) -> dict[str, Any]:
-    """Return the JSON object of a system command. Too deep nesting or too long a number counts as no JSON."""
+    """Return the JSON object of a system command. JSON with too deep nesting or too long a number is refused too."""
     if len(payload) > MAX_COMMAND_BYTES:
         raise ProtocolError(f"{command!r:.60}: {len(payload)} bytes, at most {MAX_COMMAND_BYTES} are allowed")
     try:
@@ -231,16 +232,16 @@ class TopicStatistics:
 
 @dataclass(frozen=True, slots=True)
 class HeadsetStatistics:
-    """A snapshot of the server. After a disconnect, dialect and topics are those of the last connection."""
+    """A snapshot of the server. If no headset is connected, dialect and topics are those of the last connection."""
 
     address: tuple[str, int]  # Bound host and port.
     peer: str | None  # Host and port of the connected headset, as host:port; None if there is none.
     dialect: Dialect | None
     topics: dict[str, TopicStatistics]
-    unknown_topics: dict[str, int]  # Number of messages that nothing here reads, by topic.
+    unknown_topics: dict[str, int]  # By topic that nothing here reads: the number of messages.
     published: tuple[str, ...]  # Topics that the app announced.
     subscribed: tuple[str, ...]  # Topics that the app listens to.
-    connections: int  # Number since the server was started.
+    connections: int  # Number of connections since the server was started.
     last_disconnect: str | None  # The reason of the last disconnection.
 
 

@@ -1,4 +1,7 @@
-"""Work of two hands as way points of the tools in the world. The hands make the same motions, from any start."""
+"""Work of two hands, as way points of their tools in the world frame.
+
+The hands repeat the motions of the tools, wherever the hands are at the start.
+"""
 
 from __future__ import annotations
 
@@ -10,27 +13,27 @@ import pinocchio as pin
 
 from q2r2_control.types import Array
 
-# Time [s], place x y z [m], tilt about x [rad], and a turn about z that is applied before the tilt [rad].
+# Time [s], position x y z [m], tilt about x [rad], and a turn about z that is applied before the tilt [rad].
 WayPoint = tuple[float, float, float, float, float, float]
 
 _X, _Z = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
 
 
 def minimum_jerk(fraction: float) -> float:
-    """Return the fraction of the way at a ``fraction`` of the time, clipped to 0 .. 1 (Flash and Hogan, 1985)."""
+    """Return the fraction of the path at a ``fraction`` of the time, clipped to 0 .. 1 (Flash and Hogan, 1985)."""
     s = min(max(fraction, 0.0), 1.0)
     return s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
 
 
 class WayPoints:
-    """A motion through ``points``, whose times have to rise. Before the first and after the last point it rests."""
+    """A motion through ``points``, whose times have to rise. Before the first point and after the last, it rests."""
 
     def __init__(self, points: Sequence[WayPoint]) -> None:
         table = np.array(points, dtype=np.float64)
         self._times, self._values = table[:, 0], table[:, 1:]
 
     def at(self, t: float) -> tuple[Array, Array]:
-        """Return the place (3,) [m] and the rotation vector (3,) [rad] at ``t`` [s]."""
+        """Return the position (3,) [m] and the rotation vector (3,) [rad] at ``t`` [s]."""
         times, values = self._times, self._values
         index = int(np.clip(np.searchsorted(times, t, side="right") - 1, 0, len(times) - 2))
         share = minimum_jerk((t - times[index]) / (times[index + 1] - times[index]))
@@ -41,7 +44,7 @@ class WayPoints:
         return where[:3], pin.log3(pin.exp3(tilt * _X) @ pin.exp3(turn * _Z))
 
 
-# Places of the tools at home [m]. They point straight down, and their fingers close along y.
+# Positions of the tools at home [m]. The tools point straight down, and their fingers close along y.
 HOME: Mapping[str, tuple[float, float, float]] = {"left": (0.50, 0.25, 0.38), "right": (0.50, -0.25, 0.38)}
 LEFT_HOME, RIGHT_HOME = (*HOME["left"], 0.0, 0.0), (*HOME["right"], 0.0, 0.0)
 
@@ -51,12 +54,14 @@ class HandWork:
     """The motion of both hands, from home and back to home."""
 
     duration: float  # [s]
-    tools: Mapping[str, tuple[WayPoint, ...]]  # Way points after home, by hand, at rising times. Other hands rest.
+    # By hand, the way points after home, at rising times. A hand that is not a key rests.
+    tools: Mapping[str, tuple[WayPoint, ...]]
     steps: tuple[tuple[float, str], ...]  # Start of each step [s], and the step in words.
     presses: Mapping[str, tuple[float, ...]] = field(default_factory=dict)  # Presses of the upper button, by hand [s].
     grips: tuple[float, ...] = ()  # Taps of the left grip, which begin or end a carry [s].
     engages: tuple[float, ...] = ()  # Presses of both lower buttons [s].
-    precise: tuple[tuple[float, float], ...] = ()  # Start and end of each time with both sticks up, for precision [s].
+    # Start and end of each time span in which both sticks are pushed up, for precision [s].
+    precise: tuple[tuple[float, float], ...] = ()
 
     def moved(self, x: float, y: float) -> HandWork:
         """Return the same work on parts that are shifted by ``x`` and ``y`` [m] along the axes of the world."""

@@ -1,4 +1,4 @@
-"""Hands that an operator moves on a page in a browser, without a headset."""
+"""An input without a headset: the operator drags the tools on a page in a browser."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _MOTION = ("stance", "axes", "position_scale", "rotation_scale", "axis_scales", 
 
 
 def web_cell(config: Config) -> Config:
-    """Return the cell with the page's controls. A tool moves as far as it is dragged on the page."""
+    """Return the cell with the page's controls, and with scales of 1: a tool moves as far as it is dragged."""
     usual = TeleopSettings()
     changes = {name: getattr(usual, name) for name in _MOTION} | {"bindings": _BINDINGS}
     return config.model_copy(update={"teleop": config.teleop.model_copy(update=changes)})
@@ -37,8 +37,8 @@ def web_cell(config: Config) -> Config:
 class WebInput:
     """Gives samples that the page's server sends. Implements :class:`~q2r2_control.inputs.base.Input`.
 
-    A drag acts as a dead man's switch. If a page sends nothing any more, the teleop layer's gate detects it, as with a
-    headset. ``clock`` stamps each hand when it is received [s].
+    A drag acts as a dead man's switch. If a page stops sending, the teleop layer's gate stops the arm, as with a
+    headset. ``clock`` gives the time at which each hand is received [s].
     """
 
     controls = DeviceControls(buttons=("drag", "gripper"), axes=(), words=_WORDS)
@@ -62,14 +62,17 @@ class WebInput:
     def receive(
         self, hand: str, position: Sequence[float], quaternion: Sequence[float], controls: Mapping[str, float]
     ) -> None:
-        """Take a hand at ``position`` [m] and ``quaternion`` x y z w, with its ``controls``; from any thread."""
+        """Take the pose of a hand, ``position`` [m] and ``quaternion`` x y z w, and its ``controls``.
+
+        Any thread may call this.
+        """
         now = self._clock()
         inputs = HandInputs(more=dict(controls))
         self._driven = True
         self._samples.put(HandSample(hand, np.array(position), np.array(quaternion), now, inputs, now))
 
     def lose(self) -> None:
-        """Note that the page that drove is gone. Any thread may call this."""
+        """Note that the connection to the driving page is lost. Any thread may call this."""
         self._samples.cut()
         self._driven = False
 

@@ -19,10 +19,10 @@ from q2r2_control.teleop.hand_motion import ArmMeasurements, HandMotion, Shares
 from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.types import Array, HandInputs, HandSample, Pose
 
-# All three are shares of a trigger's whole way.
-_SLACK = 0.05  # Not every controller reaches the outermost part at either end.
-_HYSTERESIS = 0.02  # A trigger that moves by less than this is trembling.
-_PICK_UP = 0.05  # A trigger that is this near to the gripper's opening begins to move it.
+# The next three numbers are shares of a trigger's travel.
+_SLACK = 0.05  # The first and the last part of the travel have no effect, since not every trigger reaches its ends.
+_HYSTERESIS = 0.02  # A smaller motion of the trigger counts as tremor and changes nothing.
+_PICK_UP = 0.05  # The trigger begins to move the gripper when it is this near to the gripper's opening.
 
 
 OPEN, CLOSED = 1.0, 0.0
@@ -32,7 +32,7 @@ class AnalogGripper:
     """The opening that a trigger asks for, from 0 for closed to 1 for fully open.
 
     After a new connection, a change of the stance or a stop, the trigger moves nothing until it reaches the opening
-    that the gripper has. A gripper that holds an object therefore does not open because nobody presses the trigger yet.
+    that the gripper has. A gripper that holds an object therefore stays closed although nobody presses the trigger yet.
     """
 
     def __init__(self, bindings: BindingSettings, speed: float) -> None:
@@ -60,7 +60,7 @@ class AnalogGripper:
             self._wanted = wanted
 
     def opening(self, opening: float, now: float) -> float:
-        """Return the opening at ``now`` [s] of a gripper that was commanded to ``opening`` at the last call."""
+        """Return the opening to command at ``now`` [s]. ``opening`` is the one that was commanded at the last call."""
         passed, self._at = now - self._at, now
         if self._wanted is None or not self._picked_up or not math.isfinite(passed):
             return opening
@@ -69,7 +69,7 @@ class AnalogGripper:
 
 
 class ArmTeleop:
-    """Drives one arm by one hand. Engaging anchors both of them at their present poses, see :class:`HandMotion`."""
+    """Moves one arm as its hand asks. Engaging anchors hand and tool at their poses; see :class:`HandMotion`."""
 
     def __init__(self, arm: str, settings: TeleopSettings) -> None:
         self.arm = arm
@@ -83,7 +83,8 @@ class ArmTeleop:
         self._gate = PoseGate(settings.gate)
         self._use_controls(settings)
         self._inputs_stamp = -math.inf  # Time of the newest reading of the controls [s].
-        self.heard_of = False  # Whether a reading of the hand's controls has ever come.
+        # Whether a reading of the hand's controls has come, since the start or since a program gave the arms back.
+        self.heard_of = False
         self._presses: list[Press] = []
         self.gripped: bool | None = None  # True if the dead man was just pressed, False if it was just let go.
         self._aligned_at = 0.0
@@ -98,7 +99,7 @@ class ArmTeleop:
 
         Args:
             settings: The new settings.
-            last: The last target, from which an engaged arm goes on.
+            last: The last target in the world frame. An engaged arm is anchored there, so that it does not jump.
             now: The time [s].
         """
         if of_controls(settings) != of_controls(self._settings):
@@ -142,7 +143,7 @@ class ArmTeleop:
         return None
 
     def change(self, cause: Cause, now: float, reason: Reason) -> None:
-        """Change the state by a cause that does not engage the arm. Presses that began before are dropped."""
+        """Change the state by a cause that does not engage the arm. Presses that are not finished are dropped."""
         self._gestures.cancel()
         self._presses.clear()
         self.gripped = None
@@ -162,12 +163,12 @@ class ArmTeleop:
         return presses
 
     def press_to_engage(self) -> None:
-        """Press the button that engages, in the place of the hand. Nothing happens if no button engages."""
+        """Act as if the hand pressed the button that engages. Nothing happens if no button engages."""
         bound = self._settings.bindings.bound()
         self._presses += [Press(one.control, one.gesture) for one in bound if one.action is Action.PAUSE_TOGGLE][:1]
 
     def forget(self) -> None:
-        """Forget everything that was received. A control counts again only after it was seen released."""
+        """Forget all samples. A control counts again only after a reading has shown it released."""
         self._gate.reset()
         self.motion.forget()
         self._inputs_stamp = -math.inf
@@ -178,11 +179,11 @@ class ArmTeleop:
         self.gripped = None
 
     def act(self, presses: Iterable[Press], around: ArmMeasurements, now: float, chord: bool) -> None:
-        """Change the state by this hand's gestures and by the alignment chord.
+        """Change the state of the arm as this hand's gestures and the alignment chord ask, and move the gripper.
 
         Args:
             presses: The gestures of this hand.
-            around: The state of the arms.
+            around: The measured and the commanded tool poses, and the obstacles to engaging.
             now: The time [s].
             chord: Whether either hand holds the alignment chord.
         """
@@ -190,7 +191,7 @@ class ArmTeleop:
             self.go(Cause.LET_GO, now, Reason(TeleopReason.DEAD_MAN_RELEASED))
         if chord:
             self._aligned_at = now
-            # A press of this hand that is still undecided is not decided by the other hand's chord.
+            # While it is open which gesture this hand makes, only its own chord counts, not the other hand's chord.
             if self.state is not ArmState.PAUSING or self.chord:
                 self.go(Cause.CHORD, now, Reason(TeleopReason.ALIGNMENT_CHORD))
         elif self.state is ArmState.ALIGNING and self._gate.pose is not None and self._gate.stamp >= self._aligned_at:
@@ -204,7 +205,7 @@ class ArmTeleop:
             self.gripper = self._analog.opening(self.gripper, now)
 
     def target(self, now: float, expected: Pose | None = None) -> Pose:
-        """Return the target at ``now`` [s] of an engaged arm's tool, or of the frame of two tools that carry.
+        """Return the target pose of an engaged arm's tool, or of the frame between two tools that carry one object.
 
         Args:
             now: The time [s].
@@ -253,7 +254,7 @@ class ArmTeleop:
         return 0.0 if Action.TRANSLATION_LOCK in held else share, 0.0 if Action.ROTATION_LOCK in held else share
 
     def go(self, cause: Cause, now: float, reason: Reason) -> None:
-        """Change the state by ``cause``. Presses that began before go on."""
+        """Change the state by ``cause``. Presses that are not finished go on."""
         state = next_state(self.state, cause)
         if state is not self.state:
             self.events.append(Event(now, self.arm, self.state, state, reason))
@@ -265,5 +266,5 @@ def pressed(control: str) -> Reason:
 
 
 def of_controls(settings: TeleopSettings) -> tuple[object, ...]:
-    """Return the settings of the hands' controls."""
+    """Return those of the settings that concern buttons, triggers and gestures, for comparison."""
     return settings.bindings, settings.chord_window, settings.hold_time, settings.gripper_speed

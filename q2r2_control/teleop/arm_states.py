@@ -10,7 +10,7 @@ from q2r2_control.teleop.reasons import REFUSALS
 
 
 class ArmState(StrEnum):
-    """The state of one arm. It holds in every state but ENGAGED, CARRIED, POLICY and HOMING."""
+    """The state of one arm. The arm holds in every state except ENGAGED, CARRIED, POLICY and HOMING."""
 
     IDLE = "idle"  # The arm was never engaged.
     ENGAGED = "engaged"
@@ -47,7 +47,7 @@ class Cause(StrEnum):
 
 
 class Who(StrEnum):
-    """The arms whose state changes."""
+    """Which arms change their state in a transition."""
 
     ARM = "the arm"
     LINKED = "both arms; with `linked: false` the arm"
@@ -96,10 +96,10 @@ def next_state(state: ArmState, cause: Cause) -> ArmState:
 
 
 def is_refusal(event: Event) -> bool:
-    """Return whether the operator asked for something that was refused, so that nothing changed."""
+    """Return whether the event is a refused request of the operator, so that no state changed."""
     return event.kind in REFUSALS and event.source == event.destination
 
 
 def is_fault(event: Event) -> bool:
-    """Return whether an arm stopped without a press of its operator, or refused a press."""
+    """Return whether a fault has stopped an arm, or a press was refused."""
     return (event.destination == ArmState.LOST and event.source != event.destination) or is_refusal(event)

@@ -1,4 +1,4 @@
-"""Carry out the actions for both arms, for which either hand may ask: stop, way home, carrying, recording."""
+"""Carry out the actions that concern both arms: stop, motion home, carrying, recording. Either hand may ask."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ _OUTCOMES = {Action.RECORD_FAILURE: TeleopReason.EPISODE_FAILED, Action.RECORD_S
 
 
 class EpisodeMarks:
-    """Turns presses that mark episodes into events. The recording has these events, as it has all events.
+    """Turns the presses that mark episodes into events. The recording contains them, as it contains all events.
 
-    An episode begins with its first subtask. A run in which no episode ever begins is one episode itself.
+    An episode begins with its first subtask. If no episode begins in a run, the whole run is one episode.
     """
 
     actions = (
@@ -38,12 +38,15 @@ class EpisodeMarks:
         self.recorded = False  # Whether the run is recorded.
         self.open = False  # Whether an episode has begun and not ended.
         self.any = False  # Whether there is an episode that could be discarded.
-        self.begun = False  # Whether an episode has ever begun, so that the run itself is no episode.
-        self.subtask = 1  # The number of the subtask that goes on.
-        self.subtasks: Sequence[str] = ()  # The names of all subtasks, in their order; empty if they have none.
+        self.begun = False  # Whether an episode has begun in this run. If not, the whole run is one episode.
+        self.subtask = 1  # The number of the present subtask, from 1.
+        self.subtasks: Sequence[str] = ()  # The names of all subtasks, in their order; empty if subtasks have no names.
 
     def apply(self, action: Action) -> Reason:
-        """Take a press of the operator; returns the reason of the event. Success and failure end the episode."""
+        """Apply an action that the operator asks for, and return the reason for the event.
+
+        Success and failure end the episode.
+        """
         if not self.recorded:
             return Reason(TeleopReason.NO_RECORDING)
         if action is Action.RECORD_MARK:
@@ -87,7 +90,7 @@ class EpisodeMarks:
         self.begun, self.subtask, self.subtasks = state["episode_begun"], state["subtask"], state["subtasks"]
 
     def follow(self, kind: ReasonKind) -> None:
-        """Take an event that somebody else has recorded."""
+        """Apply an event to the state. The event may come from another program, which has recorded it."""
         if kind in _OUTCOMES.values():
             self.open = False
         elif kind is TeleopReason.SUBTASK_BEGINS:
@@ -103,10 +106,13 @@ _Poses = Mapping[str, pin.SE3]
 
 
 class CarryMode:
-    """One hand moves both tools, which hold one object. Both arms stop together, so that neither pulls at it."""
+    """One hand moves both tools, which hold one object. Both arms stop together, so that neither pulls at the object.
+
+    ``leader`` is the arm whose hand moves both tools. The follower is the other arm.
+    """
 
     def __init__(self, leader: ArmTeleop, follower: ArmTeleop, tools: _Poses, now: float) -> None:
-        """Begin to carry at time ``now`` [s]. See :class:`CarriedTools` for ``tools``."""
+        """Begin to carry at time ``now`` [s]. ``tools`` are the tool poses by arm (world frame)."""
         self.leader, self._follower = leader, follower
         self._tools = CarriedTools(tools)
         self._keeper = RelationKeeper()
@@ -129,8 +135,8 @@ class CarryMode:
 
         Args:
             now: The time [s].
-            expected: The tools in the controller's reference.
-            at_once: The same tools, if both are of one moment; else empty.
+            expected: The tool poses at the controller's reference, by arm.
+            at_once: The same poses if both belong to one moment; otherwise empty.
         """
         tools, leader, follower = self._tools, self.leader.arm, self._follower.arm
         slowest = tools.slowest(tools.frames_of(expected))
@@ -149,7 +155,7 @@ class BothArms:
     def __init__(self, settings: TeleopSettings, names: Iterable[str]) -> None:
         self.arms = {name: ArmTeleop(name, settings) for name in names}
         self.carry: CarryMode | None = None
-        self.asks_home: str | None = None  # The arm whose hand asked for the way home; None if no hand did.
+        self.asks_home: str | None = None  # The arm whose hand asked to move home; None if no hand has asked.
         self.marks = EpisodeMarks()
         self.use(settings)
         self.assign_hands(settings.stance)
@@ -172,7 +178,11 @@ class BothArms:
             arm.change(cause, now, reason)
 
     def act(self, around: ArmMeasurements, now: float) -> dict[str, list[Press]]:
-        """Carry out the actions for both arms; returns, for each arm, the presses that concern this arm only."""
+        """Carry out the actions that concern both arms.
+
+        Returns:
+            For each arm, the presses that are left for this arm alone.
+        """
         presses = {name: arm.take_presses(now) for name, arm in self.arms.items()}
         grips = any(arm.gripped or arm.chord for arm in self.arms.values())
         if not grips and not any(presses.values()):
@@ -206,7 +216,7 @@ class BothArms:
 
         Args:
             now: The time [s].
-            asked_by: The arm whose hand asks for it; None if a program does.
+            asked_by: The arm whose hand asks to move home; None if a program asks.
             problem: Why the arms may not go home, if the caller knows a reason.
         """
         if self.any_in(ArmState.ALIGNING):
@@ -231,7 +241,7 @@ class BothArms:
         self.carry = None
 
     def _take_up(self, arm: ArmTeleop, around: ArmMeasurements) -> Anchor | Reason:
-        """Return the tool's pose at which an arm begins to carry, or the reason why it may not."""
+        """Return the tool pose at which an arm begins to carry, or the reason why the arm may not begin."""
         if arm.state is not ArmState.ENGAGED:
             if arm.state not in AT_REST:
                 return Reason.of(TeleopReason.OTHER_ARM_BUSY, state=str(arm.state))

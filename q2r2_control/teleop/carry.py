@@ -1,9 +1,9 @@
-"""Let one hand move two tools as one body, as two arms do that carry one box.
+"""Let one hand move two tools as one rigid body, for two arms that carry one box.
 
 The hand is anchored to a frame in the middle between both tools. The axes of this frame are those of the world at the
-beginning, and both tools keep their poses in it. Nothing jumps at the beginning, and the relation between both targets
-is exact. If an arm is held up, the frame waits for it, on a leash that is shorter than the leash of one arm. The load
-is then neither torn nor crushed.
+beginning, and both tools keep their poses in it. No target jumps at the beginning, and both targets move exactly as one
+rigid body, except for the small correction of :class:`RelationKeeper`. If an arm is held up, a leash keeps the frame
+near this arm. This leash is shorter than the leash of one arm, so that the load is neither torn nor crushed.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from q2r2_control.quaternions import Vector, floats_of, se3_of
 from q2r2_control.teleop.leash import Workspace
 from q2r2_control.types import LONGEST_DT, Array, Pose, pose_of
 
-# Gain of the loop that keeps the relation [1/s]. A first-order loop with the delay T, here 0.07 s, is stable below
-# pi / (2 T).
+# Gain of the loop that keeps the relative pose of the tools [1/s]. A first-order loop with the delay T, here 0.07 s, is
+# stable below pi / (2 T).
 _GAIN = 20.0
-_MAX_SHIFT = 0.01, 0.05  # By how much the loop shifts a target at most [m], [rad].
+_MAX_SHIFT = 0.01, 0.05  # Greatest distance and angle by which the loop shifts a target [m], [rad].
 
 
 class CarriedTools:
-    """The tools of both arms as parts of one moving frame."""
+    """The frame between two tools, and the constant poses of both tools in this frame."""
 
     def __init__(self, tools: Mapping[str, pin.SE3]) -> None:
         """``tools`` are the present poses of both tools, measured or commanded, in the world frame."""
@@ -33,11 +33,11 @@ class CarriedTools:
         self._in_frame = {arm: self.frame.actInv(tool) for arm, tool in tools.items()}
 
     def frames_of(self, tools: Mapping[str, pin.SE3]) -> dict[str, pin.SE3]:
-        """Return, for each of ``tools``, the pose of the frame that belongs to the tool's pose."""
+        """Return, for each tool pose, the pose that the frame has if the tool is there. All are in the world frame."""
         return {arm: tools[arm] * placed.inverse() for arm, placed in self._in_frame.items() if arm in tools}
 
     def slowest(self, frames: Mapping[str, pin.SE3]) -> pin.SE3 | None:
-        """Return the one of ``frames`` that is farthest from the target of the frame."""
+        """Return the pose of ``frames`` that is farthest from the target of the frame; None if there are none."""
         return max(frames.values(), key=self._away, default=None)
 
     def tool_at(self, arm: str, frame: pin.SE3) -> pin.SE3:
@@ -49,17 +49,18 @@ class CarriedTools:
         return {arm: self.tool_at(arm, frame) for arm in self._in_frame}
 
     def _away(self, frame: pin.SE3) -> float:
-        """Return the distance of a frame from its target, as the distance at the farther tool [m]."""
+        """Return a bound on the distance from a tool to its target if the frame is at ``frame`` [m]."""
         lever = max(float(np.linalg.norm(tool.translation)) for tool in self._in_frame.values())
         turn = float(np.linalg.norm(pin.log3(frame.rotation @ self.frame.rotation.T)))
         return float(np.linalg.norm(frame.translation - self.frame.translation)) + lever * turn
 
 
 class RelationKeeper:
-    """Shifts the target of the carried tool so that the tools themselves keep their relation, not only their targets.
+    """Shifts the target of the carried tool so that not only the targets but the tools keep their relative pose.
 
-    Each arm lags behind its target by some millimetres, each by others. The frame of the carried tool is shifted by c
-    with the first-order loop
+    Each arm lags behind its target by some millimetres, and the two arms by different distances. Each tool pose gives
+    one pose of the frame between the tools. So that both poses agree, a first-order loop shifts the carried tool's
+    frame by c:
 
         dc/dt = g (frame of the leading tool - frame of the carried tool),  |c| bounded.
     """
@@ -72,8 +73,8 @@ class RelationKeeper:
         """Update the shift.
 
         Args:
-            leading: Frame that belongs to the leading tool in the controller's reference.
-            carried: Frame that belongs to the carried tool there.
+            leading: Pose of the frame by the leading tool at the controller's reference (world frame).
+            carried: Pose of the frame by the carried tool at the controller's reference (world frame).
             now: The time [s].
         """
         dt = 0.0 if self._now is None else min(max(now - self._now, 0.0), LONGEST_DT)
@@ -84,7 +85,7 @@ class RelationKeeper:
         self._turn = pin.exp3(_at_most(turn, _MAX_SHIFT[1]))
 
     def frame(self, asked: pin.SE3) -> pin.SE3:
-        """Return the target of the carried tool's frame, if ``asked`` is that of the leading tool's frame."""
+        """Return the target of the carried tool's frame. ``asked`` is the target of the leading tool's frame."""
         return pose_of(self._turn @ asked.rotation, asked.translation + self._shift)
 
 
@@ -94,19 +95,19 @@ def _at_most(vector: Array, length: float) -> Array:
 
 
 class CarriedWorkspace:
-    """Keeps both tools in the workspaces of their arms, by moving the frame."""
+    """Keeps both tools in the workspaces of their arms, by shifting the frame between them."""
 
     def __init__(self, tools: CarriedTools, boxes: Mapping[str, Workspace]) -> None:
         self._tools, self._boxes = tools, boxes
         self.reset()
 
     def reset(self) -> None:
-        self.slip = 0.0  # The part of the hand's way that the frame has not followed [m].
+        self.slip = 0.0  # Length of the hand's motion that the frame has not followed since the reset [m].
         for box in self._boxes.values():
             box.reset()
 
     def hold(self, frame: Pose) -> Vector | None:
-        """Return the permitted position of a frame whose target is ``frame``; None if ``frame`` itself is permitted.
+        """Return the permitted position (world frame) for the target ``frame`` [m]; None if ``frame`` is permitted.
 
         See :meth:`Workspace.hold`.
         """

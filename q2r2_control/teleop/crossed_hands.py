@@ -1,4 +1,4 @@
-"""Find a left and a right controller that the operator has swapped."""
+"""Find out whether the operator has swapped the left and the right controller."""
 
 from __future__ import annotations
 
@@ -15,32 +15,33 @@ from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.types import SIDES, Array, HandSample
 from q2r2_control.wording import sentence
 
-CROSSED_FOR = 3.0  # The hands count as crossed after this time without a moment in which they were not [s].
+CROSSED_FOR = 3.0  # The hands count as crossed if they were crossed at every moment of this time [s].
 CROSSED = Reason.of(TeleopReason.HANDS_CROSSED, time=CROSSED_FOR)
-_BY = 0.1  # Distance to the wrong side from which on a moment counts [m].
-_AGREES = 0.5  # Least cosine between the pointing direction of each controller and that of both together.
-_NEWEST = 0.2  # A pose that is older does not count [s].
+_BY = 0.1  # Hands are crossed at a moment if they are at least this far on the wrong side of each other [m].
+_AGREES = 0.5  # Least cosine between each controller's pointing direction and the mean direction of both.
+_NEWEST = 0.2  # A pose that is older than this does not count [s].
 
 
 class CrossedHands:
-    """Watches on which side of each other both hands are, in the frame of the operator.
+    """Watches whether the left hand is to the left of the right hand, seen by the operator.
 
-    Nobody tells where the operator faces, so the controllers do: both point forward, along the x axis of their own
-    frames, and their mean horizontal direction is the operator's forward direction. The distance of the left hand from
-    the right one along the operator's left is negative if the hands are crossed.
+    The samples do not say where the operator faces, so the controllers have to show it. Both point forward along the
+    x axis of their own frames. Their mean horizontal direction is taken as the operator's forward direction. The
+    displacement from the right hand to the left hand, measured towards the operator's left, is negative if the hands
+    are crossed.
 
-    Hands that cross in ordinary work do so for moments, or at less than 10 cm, or turn their controllers apart. Such
-    moments begin the time of 3 s anew, and so does a moment in which one hand is not tracked. Swapped controllers stay
-    on the wrong side from the beginning. The result is a warning only, since an operator may also cross the arms on
-    purpose.
+    In ordinary work, hands cross only for moments, or by less than 10 cm, or with controllers that point in different
+    directions. Such a moment starts the 3 s anew, and so does a moment in which one hand is not tracked. Swapped
+    controllers stay on the wrong side from the beginning. The result is only a warning, since an operator may also
+    cross the arms on purpose.
     """
 
     def __init__(self, axes: Sequence[str]) -> None:
-        """``axes`` are those of ``teleop.axes``."""
+        """``axes`` are the signed axes of the setting ``teleop.axes``, from the input's frame to the world frame."""
         self._axes: Array = axes_matrix(axes)
         self._hands: dict[str, tuple[float, Array, Array]] = {}  # By hand: time [s], position [m], pointing direction.
-        self._since = math.inf  # Since when the hands have been crossed [s].
-        self._at = -math.inf  # Time of the newest moment that was judged [s].
+        self._since = math.inf  # Time since which the hands have been crossed [s]; infinite if they are not crossed.
+        self._at = -math.inf  # Time of the newest sample at which both hands were judged [s].
 
     def add(self, sample: HandSample) -> None:
         """Take a sample of either hand. A pose that cannot be used counts as a hand that is not tracked."""
@@ -52,13 +53,13 @@ class CrossedHands:
         placement = se3_of(pose)
         points = self._axes @ placement.rotation @ self._axes.T[:, 0]
         self._hands[sample.hand] = stamp, self._axes @ placement.translation, points
-        if stamp - self._at > _NEWEST:  # Nobody has seen both hands meanwhile.
+        if stamp - self._at > _NEWEST:  # Both hands have not been judged for too long.
             self._since = math.inf
         if self._hands.keys() == {*SIDES}:
             self._judge(stamp)
 
     def crossed(self, now: float) -> bool:
-        """Return whether the hands have been crossed for :data:`CROSSED_FOR` until ``now`` [s]."""
+        """Return whether the hands are crossed at ``now`` and were so for at least :data:`CROSSED_FOR` [s]."""
         return now - self._at <= _NEWEST and self._at - self._since >= CROSSED_FOR
 
     def warning(self, now: float) -> str | None:

@@ -1,9 +1,10 @@
 """Turn the irregular samples of a trembling hand into a smooth pose at every control tick, with one known delay.
 
-:class:`Interpolator` plays the samples back a constant time after their receipt, so that the control loop sees straight
-lines instead of steps every 13 ms. :class:`OneEuro` then removes the tremor, and :class:`RestingPose` the noise of a
-hand at rest. All parameters are in seconds. The operator therefore feels the same at every rate of the headset and of
-the loop. Rotations are filtered by their rotation vectors, for which q and -q are the same.
+:class:`Interpolator` plays the samples back a constant time after their receipt. The control loop then sees straight
+lines between the samples instead of a step every 13 ms. :class:`OneEuro` then removes the tremor, and
+:class:`RestingPose` the noise of a hand at rest. No setting counts samples or ticks, so the filter feels the same at
+every rate of the headset and of the loop. Rotations are filtered as rotation vectors, because a quaternion and its
+negative are the same rotation.
 """
 
 from __future__ import annotations
@@ -16,19 +17,21 @@ from q2r2_control.config.teleop import FilterSettings
 from q2r2_control.quaternions import IDENTITY, Quaternion, Vector, normalized, turn_between, turned_by
 from q2r2_control.types import Pose
 
-_MIN_SPACING = 0.005  # Samples that are closer are merged, because the jitter of receipt would look like speed [s].
+# Samples that arrive closer together are merged, because the jitter of their receipt would look like speed [s].
+_MIN_SPACING = 0.005
 _USUAL_PERIOD = 1.0 / 75.0  # Period of a headset's samples that is assumed until it is measured [s].
-_PHASE_SHARE, _PERIOD_SHARE = 0.2, 0.02  # Shares of a sample's jitter by which its time, and the period, are corrected.
-_CATCH_UP = 0.5  # After a gap in the stream, the missed motion is made up within this share of the gap.
+# Gains of the delay-locked loop: the shares of a sample's jitter that correct the sample's time and the period.
+_PHASE_SHARE, _PERIOD_SHARE = 0.2, 0.02
+_CATCH_UP = 0.5  # After a gap in the stream, the output catches up with the hand within this share of the gap.
 
 
 class Interpolator:
     """Plays samples back ``delay`` seconds after their receipt, on straight lines from sample to sample.
 
-    A headset measures at even times, and its samples arrive at uneven times. The jitter would look like speed. A
+    A headset measures at even times, but its samples arrive at uneven times. This jitter would look like speed. A
     delay-locked loop (Adriaensen 2005) removes it. The loop starts again when a sample is half a period early or late.
-    If no sample comes for longer than ``delay``, the output rests at the newest one, because nothing is extrapolated.
-    The motion that was missed is then made up within a part of the gap, and not at once.
+    If no sample comes for longer than ``delay``, the output rests at the newest sample, because nothing is
+    extrapolated. When samples come again, the output does not jump: it catches up within ``_CATCH_UP`` of the gap.
     """
 
     def __init__(self, delay: float, period: float = _USUAL_PERIOD) -> None:
@@ -45,9 +48,10 @@ class Interpolator:
 
     def reset(self, position: Vector, rotation: Quaternion, now: float) -> None:
         self._knots, self._velocity = deque([(now - self.delay, position, rotation)]), None
-        # The time of the last sample, and the time at which the motion missed in a gap is made up [s].
+        # The time of the last sample, and the time at which the output has caught up after a gap [s].
         self._stamp, self._caught_up = now, -math.inf
-        self._even = -math.inf  # The time at which the last sample was measured, plus a constant [s].
+        # Estimate of the time at which the last sample was measured, plus a constant [s].
+        self._even = -math.inf
         self._period = self._usual_period
 
     def add(self, position: Vector, rotation: Quaternion, stamp: float, now: float) -> None:
@@ -63,12 +67,12 @@ class Interpolator:
         self._even = stamp
         while len(knots) > 1 and stamp - knots[-1][0] < _MIN_SPACING:
             knots.pop()
-        # The output reaches every sample after the whole delay, also a late one, so that it need not move faster.
+        # A late sample is also reached no earlier than half the delay from now, so that the output need not be faster.
         earliest = max(self._caught_up, knots[0][0] + max(self.delay / 2.0, _MIN_SPACING))
         knots.append((max(stamp, earliest), position, rotation))
 
     def at(self, now: float) -> tuple[Vector, Quaternion, Vector]:
-        """Return the position, the rotation, and the rotation vector since the last call, at ``now`` [s].
+        """Return the position and the rotation at ``now`` [s], and the rotation vector from the last call to this one.
 
         ``now`` must not go back.
         """
@@ -88,7 +92,7 @@ class Interpolator:
             x, y, z = x + dt * linear[0], y + dt * linear[1], z + dt * linear[2]
             turn = dt * angular[0], dt * angular[1], dt * angular[2]
             rotation = turned_by(rotation, turn)
-        # The next line starts here, so that a sample that replaces another one makes no step of the output.
+        # The present line now starts at the output. If a new sample replaces the line's end, the output does not step.
         knots[0] = playhead, (x, y, z), rotation
         return (x, y, z), rotation, turn_between(last, rotation) if passed else turn
 
@@ -96,10 +100,11 @@ class Interpolator:
 class OneEuro:
     """One-Euro filter (Casiez, Roussel, Vogel, CHI 2012) of a vector or a rotation, with the same delay at every speed.
 
-    The cutoff rises with speed: f = min_cutoff + beta |v|. The original filter lags by tau = 1 / (2 pi f). Its delay
-    changes along a path, which bends the path. Here the input is moved ahead by (tau - delay) v, where v is the
-    filter's own estimate of the velocity. At constant velocity the output then lags by exactly ``delay``. This lead is
-    bounded, since tau v <= 1 / (2 pi beta), and so is the overshoot when the hand stops suddenly.
+    The cutoff rises with speed: f = min_cutoff + beta |v|. The original filter lags by tau = 1 / (2 pi f). This delay
+    changes with the speed, and so the output leaves the hand's path. Here the input is moved ahead by (tau - delay) v,
+    where v is the filter's own estimate of the velocity. At constant velocity the output then lags by exactly
+    ``delay``. Since tau |v| <= 1 / (2 pi beta), this displacement is bounded. So is the overshoot when the hand stops
+    suddenly.
     """
 
     def __init__(self, min_cutoff: float, beta: float, derivative_cutoff: float, delay: float) -> None:
@@ -118,8 +123,8 @@ class OneEuro:
         The integration is a backward Euler step. It is stable for every dt, and exact at constant velocity and dt.
 
         Args:
-            error: Input minus output before the tick, as a rotation vector for rotations.
-            step: Input minus the input of the tick before, likewise.
+            error: This tick's input minus the last tick's output. For rotations it is a rotation vector.
+            step: This tick's input minus the last tick's input, in the same form.
             dt: Duration of the tick, above 0 [s].
         """
         x, y, z = self._velocity
@@ -134,8 +139,8 @@ class OneEuro:
 class PoseFilter:
     """Interpolates and filters the pose of one hand.
 
-    At constant velocity the output lags by :attr:`FilterSettings.delay`. A change of velocity needs about
-    1 / (2 pi derivative_cutoff) to come through.
+    At constant velocity the output lags by :attr:`FilterSettings.delay`. After a change of velocity it takes about
+    1 / (2 pi derivative_cutoff) until the lag is this one again.
     """
 
     def __init__(self, settings: FilterSettings) -> None:
@@ -156,12 +161,12 @@ class PoseFilter:
 
     def add(self, pose: Pose, stamp: float, now: float) -> None:
         """Add a sample received at ``stamp`` [s]."""
-        # Rounding errors of quaternion products add up. The few products between two samples do not matter.
+        # Rounding errors of quaternion products add up. Normalising once a sample is enough.
         self._out = self._out[0], normalized(self._out[1])
         self._interpolator.add(*pose, stamp, now)
 
     def at(self, now: float) -> Pose:
-        """Return the filtered pose at ``now`` [s]; the same pose again if the time does not advance."""
+        """Return the filtered pose at ``now`` [s]; the last pose if ``now`` is not after the last call."""
         dt = now - self._now
         if dt <= 0.0:
             return self._out
@@ -178,22 +183,24 @@ class PoseFilter:
         return self._out
 
 
-# A hand is at rest if two conditions hold. The mean of its newest samples is this near to the mean of all samples since
-# it came to rest. No sample is farther from that mean than the noise of a headset makes one in thousands [m], [rad].
-# Both bounds grow if more noise is measured.
+# A hand is at rest if two conditions hold. First, the mean of its ``_NEWEST`` newest samples is within ``_DRIFTED`` of
+# the mean of all samples since it came to rest [m], [rad]. Second, each sample is within ``_FAR`` of that mean of all
+# [m], [rad]. The noise of a headset puts one sample in thousands farther away. Both bounds grow with measured noise.
 _NEWEST, _DRIFTED, _FAR = 8, (0.35e-3, 2e-3), (1.0e-3, 5e-3)
 _NOISE = 0.2e-3, 1.0e-3  # The noise of one axis that is assumed until it is measured [m], [rad].
 _NOISE_SAMPLES = 4, 50  # Weight of the assumed noise, and greatest weight of the measured noise, in samples.
 _LONGEST = 150  # Greatest number of samples in the mean: two seconds of a headset at 75 Hz.
-_TRUSTED = 10, 50  # Numbers of samples from which the mean begins to count, and from which it counts fully.
+_TRUSTED = 10, 50  # Number of samples at which the weight of the mean begins to grow from 0, and at which it is 1.
 _LEAVING = 0.05  # When the hand moves again, the weight of the mean falls to zero within this time [s].
-_TURNED = 0.3  # After a turn by more than this a new rest begins, since only short rotation vectors average well [rad].
+# A hand that has turned by more than this is at rest anew, since only short rotation vectors average well [rad].
+_TURNED = 0.3
 
-_Sample = Sequence[float]  # Position [m] and rotation vector from the origin [rad]. Six floats cost less than NumPy.
+# Position [m], and rotation vector from the rotation ``_origin`` [rad]. Six floats are faster than a NumPy array.
+_Sample = Sequence[float]
 
 
 class RestingPose:
-    """Draws the filtered pose of a hand at rest towards the mean of its samples."""
+    """Moves the filtered pose of a hand at rest towards the mean of the hand's samples, so that noise has no effect."""
 
     def __init__(self) -> None:
         self.forget()
@@ -203,8 +210,8 @@ class RestingPose:
         self._newest: deque[_Sample] = deque(maxlen=_NEWEST)
         self._mean: _Sample = (0.0,) * 6
         self._count = 0  # Number of samples of this rest.
-        self._held: Pose = (0.0, 0.0, 0.0), IDENTITY  # The mean towards which the pose is drawn.
-        self._leaving = False  # Whether that mean belongs to a rest that is over.
+        self._held: Pose = (0.0, 0.0, 0.0), IDENTITY  # The mean towards which the filtered pose is moved.
+        self._leaving = False  # Whether the hand has left ``_held`` and the weight of this mean is falling to 0.
         self._share, self._now = 0.0, 0.0
         self._last: deque[_Sample] = deque(maxlen=2)
         self._noise, self._noise_count = [one**2 for one in _NOISE], _NOISE_SAMPLES[0]  # The variance of one axis.
@@ -233,13 +240,13 @@ class RestingPose:
                 self._leave(newest, _NEWEST)
 
     def begin(self, newest: Pose, now: float) -> Pose:
-        """Return the pose of the hand at ``now`` [s]: the mean if the hand is at rest, else its ``newest`` pose."""
+        """Return the hand pose for an anchor at ``now`` [s]: the mean if the hand rests, otherwise ``newest``."""
         self._now, self._leaving, self._share = now, False, self._trusted
         self._held = self._mean_pose() if self._share > 0.0 else newest
         return self._held
 
     def draw(self, pose: Pose, now: float) -> Pose:
-        """Return the filtered ``pose`` at ``now`` [s], drawn towards the mean by the weight of the mean."""
+        """Return the filtered ``pose`` at ``now`` [s], moved towards the mean as far as the weight of the mean says."""
         passed, self._now = max(now - self._now, 0.0) / _LEAVING, now
         if self._leaving:
             self._share = max(self._share - passed, 0.0)
@@ -265,9 +272,9 @@ class RestingPose:
         return (x, y, z), turned_by(self._origin, (a, b, c))
 
     def _measure_noise(self, sample: _Sample) -> None:
-        """Measure the noise by second differences, which are zero in steady motion.
+        """Estimate the noise of one axis from the second differences of samples, which are 0 at constant velocity.
 
-        The mean square of second differences of white noise is six times its variance.
+        White noise of variance s² has second differences of variance 6 s². Three axes together give 18 s².
         """
         if len(self._last) == 2:
             self._noise_count = min(self._noise_count + 1, _NOISE_SAMPLES[1])

@@ -15,16 +15,17 @@ from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.types import HandSample, Pose
 
 _MAX_COORDINATE = 1e6  # No tracking system reaches as far [m].
-_QUATERNION_LENGTHS = (1e-6, 1e6)  # A quaternion of another length is no rotation with rounding errors.
-# Least time over which a speed is measured [s]. Messages that a network held up arrive within a millisecond.
+_QUATERNION_LENGTHS = (1e-6, 1e6)  # A shorter or longer quaternion is not taken for a rotation.
+# Least time over which a speed is measured [s]. Messages that a network held up arrive less than 1 ms apart, so that
+# the speed between two of them would mean nothing.
 _SPEED_WINDOW = 0.05
 
 
 class PoseGate:
-    """Accepts usable poses of one hand, and gives the reason against the others.
+    """Accepts the usable poses of one hand, and gives the reason why another pose is not usable.
 
     All times are times of receipt. A stamp later than ``now`` counts as ``now``, so that it cannot disable the
-    watchdog. A sample that is older than the last one was overtaken by a newer message, and is ignored.
+    watchdog. A sample that is older than the last one is ignored, because a newer message has overtaken it.
     """
 
     def __init__(self, settings: GateSettings) -> None:
@@ -34,13 +35,13 @@ class PoseGate:
     def reset(self) -> None:
         # The newest pose, in the input's frame; None if there is none, or if it was not usable.
         self.pose: Pose | None = None
-        self.stamp = -math.inf  # Time of the newest pose, whether it was usable or not [s].
+        self.stamp = -math.inf  # Time of the newest pose, usable or not [s].
         self._problem: Reason | None = None
         self._way: deque[tuple[float, Pose]] = deque()  # Recent poses. The first one is about _SPEED_WINDOW old.
 
     @property
     def problem(self) -> Reason | None:
-        """Why no arm may be anchored to the newest pose; None if one may."""
+        """Why an arm may not be anchored to the newest pose; None if it may."""
         return None if self.pose is not None else self._problem or Reason(TeleopReason.NO_POSE)
 
     def stale(self, now: float) -> bool:
@@ -51,8 +52,9 @@ class PoseGate:
         """Judge the pose of a sample.
 
         Returns:
-            Whether the pose is new and usable, so that an arm may be anchored to it; and the reason why an engaged arm
-            must not follow it, or None. After a jump both are given: the new place may be an anchor.
+            True if the pose is new and usable, so that an arm may be anchored to it; and the reason why an engaged arm
+            must not follow it, or None. After a jump the pose is usable and there is a reason: the arm must not follow
+            the jump, but may be anchored to the new pose.
         """
         stamp = min(float(sample.pose_stamp), now)
         if math.isnan(stamp):

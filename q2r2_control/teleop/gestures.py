@@ -1,4 +1,4 @@
-"""Recognise taps, holds and the alignment chord of a hand's controls, and the actions that last while held."""
+"""Recognise taps, holds and the alignment chord of a hand's controls, and the actions that last while one is held."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from q2r2_control.events import Reason
 from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.types import HandInputs
 
-_STUCK_AFTER = 1.0  # Delay before the operator is told of a control that was held from the first reading on [s].
-# A control counts as held above the first number and as let go below the second one. Noise in between changes nothing.
+# If a control has been held since the first reading, the operator is told after this time [s].
+_STUCK_AFTER = 1.0
+# Travels above which a control becomes held, and below which it becomes let go. Noise in between changes nothing.
 _HELD, _LET_GO = 0.6, 0.4
 
 
@@ -39,7 +40,7 @@ def _is_held(control: str, inputs: HandInputs, was_held: bool) -> bool:
 class HeldControls:
     """The actions of one hand that last while their control is held.
 
-    A control counts only after it was seen released since the connection came up. A reading of NaN counts as let go.
+    A control counts only after a reading of this connection has shown it let go. A reading of NaN counts as let go.
     """
 
     def __init__(self, bindings: BindingSettings) -> None:
@@ -51,7 +52,7 @@ class HeldControls:
         self.forget()
 
     def forget(self) -> None:
-        """Count all controls as let go. A control that is held now counts again only after it was seen released."""
+        """Count all controls as let go. A control counts again only after a reading has shown it let go."""
         self._seen_let_go: set[str] = set()
         self.actions: frozenset[Action] = frozenset()
 
@@ -69,13 +70,14 @@ class GestureRecognizer:
     """Turns the levels of buttons, triggers and stick into gestures. Each gesture is reported once.
 
     The two buttons of a chord hardly ever go down in the same sample. A tap of a button is therefore reported after
-    ``chord_window`` [s], or at its release if that is earlier. If the other button goes down meanwhile, it was a chord,
-    and no tap is reported. If a control is bound to a hold as well, a tap is reported at its release, and a hold after
-    ``hold_time``. A stop must not wait: ``DOWN`` reports a press at once. It may only be used to stop motion, because
-    the press may still become a chord, which stops motion as well.
+    ``chord_window`` [s], or at its release if the release is earlier. If the other button goes down before, the press
+    is a chord, and no tap is reported. If a control is bound to a hold as well, a tap is reported at its release, and a
+    hold after ``hold_time`` [s]. A stop must not wait, so ``DOWN`` reports every press at once. ``DOWN`` may only be
+    used to stop motion, because the press may still become a chord, which stops motion as well.
 
     A button that goes down while the other one is held makes a chord at any time. After a chord both buttons have to be
-    released before either of them counts again. The same holds for a control that is held at the first reading.
+    released before either of them counts again. Likewise, a control that is held at the first reading counts only after
+    its release.
     """
 
     def __init__(self, settings: TeleopSettings) -> None:
@@ -94,14 +96,14 @@ class GestureRecognizer:
         self.forget()
 
     def cancel(self) -> None:
-        """Drop all unfinished gestures but a stop. A control that is held has to be released before it counts again."""
+        """Drop all unfinished gestures except one that stops the arms. A held control counts after its release."""
         for control in self._controls.values():
             control.mute()
 
     def forget(self) -> None:
-        """Drop everything. A control counts again only after it was seen released."""
+        """Drop all gestures and readings. A control counts again only after a reading has shown it let go."""
         self.chord = False  # Whether both buttons were pressed together, and one of them is still held.
-        self._first = -math.inf  # Time of the first reading since then [s].
+        self._first = -math.inf  # Time of the first reading after this call [s].
         self._told_stuck = False
         for control in self._controls.values():
             control.forget()
@@ -120,7 +122,7 @@ class GestureRecognizer:
             control.seen_up |= not level
             if gesture is not None:
                 found.append(Press(name, gesture))
-            # Together with the other button the press is a chord, or the end of one.
+            # A button that goes down while the other one is down, or during a chord, is not reported as a press.
             if rises and not (name in BUTTONS and (self.chord or (inputs.button_upper and inputs.button_lower))):
                 control.begin(stamp)
                 found.append(Press(name, Gesture.DOWN))
@@ -135,7 +137,7 @@ class GestureRecognizer:
         return found
 
     def take_stuck(self, now: float) -> Reason | None:
-        """Return a reason, once, if controls have no effect because they were held from the first reading on."""
+        """Return a reason, only once, if controls have no effect because they were held at every reading so far."""
         if self._told_stuck or self._first == -math.inf or now - self._first <= _STUCK_AFTER:
             return None
         stuck = [name for name, control in self._controls.items() if control.down and not control.seen_up]
@@ -149,7 +151,7 @@ class GestureRecognizer:
 
 
 class _Control:
-    """The level of one control, and its press as long as the gesture is not decided."""
+    """One control: whether it is held, and its present press as long as the kind of gesture is not decided."""
 
     def __init__(self, waits: float, hold: float, stops: Gesture | None) -> None:
         """Make a control that counts as held.
@@ -157,13 +159,14 @@ class _Control:
         Args:
             waits: Time for which a tap waits for the other button of a chord [s].
             hold: Duration of a hold; infinite if the control has no hold [s].
-            stops: The gesture of this control that stops the arms, if any.
+            stops: The gesture of this control that stops the arms, or None.
         """
         self._waits, self._hold, self._stops = waits, hold, stops
         self.forget()
 
     def forget(self) -> None:
-        self.down = True  # Until it is seen released, so that only a press that was seen from its start counts.
+        # The control counts as held until a reading shows it let go. Only a press that was seen from its start counts.
+        self.down = True
         self.seen_up = False
         self.cancel()
 

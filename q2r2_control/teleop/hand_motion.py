@@ -1,4 +1,4 @@
-"""Turn the usable poses of one hand into targets of its tool."""
+"""Turn the usable poses of one hand into target poses for the tool that the hand moves."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from q2r2_control.teleop.leash import Leash, Workspace
 from q2r2_control.teleop.relative import RelativeMotion
 from q2r2_control.types import Array, Pose, moved_by
 
-Shares = tuple[float, float]  # The present shares of the scales of positions and of rotations.
+Shares = tuple[float, float]  # Factors of the scales of position and rotation: 1 normally, 0 for a lock.
 
 
 class HandMotion:
     """Maps the motion of one hand to a tool, or to the frame between two tools that carry one object.
 
-    After :meth:`anchor` the tool never makes up for earlier motion of the hand, because no state has that motion.
+    After :meth:`anchor` the tool never follows earlier motion of the hand, because nothing keeps that motion.
     """
 
     def __init__(self, arm: str, settings: TeleopSettings) -> None:
@@ -39,12 +39,12 @@ class HandMotion:
         self._motion, self._unslipped = RelativeMotion.of(settings), RelativeMotion.of(settings)
         self._shares: Shares = (1.0, 1.0)
         self.filtered: Pose | None = None  # The filtered pose of the hand from which the last target was computed.
-        # The newest pose of the hand, and its target if leash and workspace had never held the target back.
+        # The newest pose of the hand, and the target that it would have without leash and workspace since the anchor.
         self._newest: tuple[Pose, Pose] | None = None
         self._bound_one_tool()
 
     def _bound_one_tool(self) -> None:
-        """Move this arm's tool only, from now on, without any slip so far."""
+        """Move only this arm's tool from now on, and no longer two tools. The slip begins at 0."""
         self._carried: CarriedTools | None = None
         self._leash = Leash(self._settings.leash)
         self._workspace: Workspace | CarriedWorkspace = self.workspace()
@@ -54,7 +54,7 @@ class HandMotion:
 
     @property
     def slip(self) -> tuple[float, float]:
-        """Distance [m] and angle [rad] by which leash and workspace held the target back since the anchor."""
+        """Distance [m] and angle [rad] by which leash and workspace have held the target back since the anchor."""
         return self._leash.position.slip + self._workspace.slip, self._leash.rotation.slip
 
     def forget(self) -> None:
@@ -87,8 +87,8 @@ class HandMotion:
         """Move the frame of ``tools`` from now on, until the next anchor.
 
         Args:
-            tools: Both tools.
-            other: The other arm.
+            tools: Both tools and the frame between them, which the hand moves.
+            other: The name of the other arm.
             box: The workspace of the other arm.
             now: The time [s].
         """
@@ -98,13 +98,13 @@ class HandMotion:
         self._rescale(self._hand(now), floats_of(tools.frame), self._shares)
 
     def target(self, newest: Pose | None, expected: Pose | None, shares: Shares, now: float) -> Pose:
-        """Return the target of the tool, or of the frame, in the world frame.
+        """Return the target pose of the tool, or of the frame between two tools, in the world frame.
 
         Args:
-            newest: The newest pose of the hand; without it there is no leash.
-            expected: The tool, or the frame, in the controller's reference. The leash keeps the target near it; without
-                it there is no leash.
-            shares: The present shares of the scales.
+            newest: The newest pose of the hand, not filtered; None if there is none. There is then no leash.
+            expected: The pose of the tool, or of the frame, at the controller's reference (world frame). The leash
+                keeps the target near this pose. None if it is not known. There is then no leash.
+            shares: The present factors of the scales.
             now: The time [s].
         """
         hand = self.filtered = self._hand(now)
@@ -126,7 +126,7 @@ class HandMotion:
         return self._rest.draw(self._filter.at(now), now)
 
     def _rescale(self, hand: Pose, tool: Pose, shares: Shares) -> None:
-        """Anchor hand and tool, and use other shares of the scales from now on."""
+        """Anchor the hand and the tool at these poses, and use other factors of the scales from now on."""
         self._shares, self._newest = shares, None
         self._motion.rescale(*shares, hand, tool)
         self._unslipped.rescale(*shares, hand, tool)
@@ -136,26 +136,27 @@ MAX_OFFSET = 0.05, 0.1  # Greatest plausible distance of a measured tool from it
 
 
 class Anchor(NamedTuple):
-    """The pose at which an arm is engaged, in the world frame."""
+    """The tool pose (world frame) at which an arm is engaged."""
 
-    tool: pin.SE3  # The measured position and the commanded orientation of the tool.
-    offset: Array | None = None  # Measured position less commanded position (3,) [m]; None if not known.
+    tool: pin.SE3  # The measured position with the commanded orientation.
+    offset: Array | None = None  # Measured position minus commanded position (3,) [m]; None if not known.
 
 
 @dataclass(slots=True)
 class ArmMeasurements:
-    """The state of the arms in one tick. All poses are in the world frame."""
+    """The tool poses of all arms in one tick, by arm. All poses are in the world frame."""
 
-    tools: Mapping[str, pin.SE3]  # The measured tools.
-    targets: Mapping[str, pin.SE3]  # The targets of the last tick.
-    commanded: Mapping[str, pin.SE3] | None = None  # The tools in the controller's reference.
+    tools: Mapping[str, pin.SE3]  # The measured tool poses.
+    targets: Mapping[str, pin.SE3]  # The target poses of the last tick.
+    commanded: Mapping[str, pin.SE3] | None = None  # The tool poses at the controller's reference.
     obstacles: Mapping[str, Reason] = field(default_factory=dict)  # For each arm that may not be engaged, the reason.
-    in_step: bool = True  # Whether all poses in ``commanded`` are of one moment.
+    in_step: bool = True  # Whether all poses in ``commanded`` belong to one moment.
 
     def anchor(self, arm: str) -> Anchor | None:
-        """Return the pose at which ``arm`` may be engaged; None if its tool is not known.
+        """Return the pose at which ``arm`` may be engaged; None if its tool pose is not measured.
 
-        The orientation is the commanded one, or the one of the last target if no command is known.
+        The orientation is the commanded one. If no commands are known, it is the last target's orientation, and without
+        a last target the measured one.
         """
         measured = self.tools.get(arm)
         if measured is None:
@@ -170,7 +171,10 @@ class ArmMeasurements:
         return Anchor(self.targets[arm]) if arm in self.targets else None
 
     def expected(self, arm: str, offset: Array | None) -> Pose | None:
-        """Return where the command should bring the tool, if it is measured with this ``offset``; None if not known."""
+        """Return the tool pose that should be measured after the command (world frame); None if not known.
+
+        ``offset`` is the measured position minus the commanded one (3,) [m]; None if it is not known.
+        """
         if self.commanded is None or (commanded := self.commanded.get(arm)) is None:
             return None
         (x, y, z), rotation = pose = floats_of(commanded)
@@ -180,11 +184,17 @@ class ArmMeasurements:
         return (x + by_x, y + by_y, z + by_z), rotation
 
     def lag(self, arm: str, offset: Array | None) -> float:
-        """Return the distance of the tool in the controller's reference from its last target [m]."""
+        """Return the distance from the expected tool position to the last target [m]; 0 if one is not known.
+
+        See :meth:`expected`.
+        """
         pose, target = self.expected(arm, offset), self.targets.get(arm)
         return 0.0 if pose is None or target is None else math.dist(pose[0], target.translation)
 
 
 def with_offset(commanded: pin.SE3, offset: Array | None) -> pin.SE3:
-    """Return where a tool should be measured that is commanded to be at ``commanded``."""
+    """Return the tool pose that should be measured if ``commanded`` is commanded.
+
+    Both poses are in the world frame. See :class:`Anchor` for ``offset``.
+    """
     return commanded if offset is None else moved_by(commanded, offset)

@@ -19,10 +19,10 @@ class Pulse(NamedTuple):
     amplitude: float  # Relative amplitude, from 0 to 1.
     duration: float  # [s]
     meaning: str
-    strongest: float | None = None  # The amplitude to which it grows, if it grows.
+    strongest: float | None = None  # Greatest amplitude, if the amplitude grows with a quantity; otherwise None.
 
     def grown(self, share: float) -> Pulse:
-        """Return the vibration with a share of its growth, from 0 to 1."""
+        """Return the vibration with a greater amplitude: at ``share`` 0 the least one, at 1 or more the strongest."""
         most = self.amplitude if self.strongest is None else self.strongest
         return self._replace(amplitude=self.amplitude + (most - self.amplitude) * min(share, 1.0))
 
@@ -65,6 +65,7 @@ _WHILE_STATE_STAYS: dict[ReasonKind, Pulse] = {
     TeleopReason.EPISODE_DISCARDED: EPISODE_DISCARDED,
 }
 
+# Slip is the distance or the angle by which leash and workspace have held the target back.
 _SLIP_STEP = 0.02  # Slip of the target's position from pulse to pulse [m].
 _SLIP_ANGLE_STEP = 0.1  # Slip of the target's rotation from pulse to pulse [rad].
 _NEAR_STEP, _NEAR_FROM = 0.005, 0.05  # Approach from pulse to pulse, and the distance at which pulses begin [m].
@@ -73,22 +74,22 @@ _PAUSE = 0.05  # Pause between two vibrations, so that they are felt as two [s].
 
 
 class ArmCondition(NamedTuple):
-    """The surroundings and the joints of an arm, as its hand feels them."""
+    """What the hand feels of an arm: bodies near it, joints at their limits, and the contact force."""
 
-    spare: float  # By how much the arm may still approach another body; infinite if none is near [m].
+    spare: float  # Distance by which the arm may still approach another body; infinite if no body is near [m].
     limits: frozenset[str]  # Joints at a position limit.
     force: float | None  # Contact force at the tool; None if it is not measured [N].
 
 
 class HapticPulses:
-    """The vibrations of one arm's hand, see :data:`VOCABULARY`.
+    """Computes the vibrations of the hand that drives one arm. See :data:`VOCABULARY`.
 
-    A message ends each of them, because the headset's app vibrates until it is told to stop.
+    A second message ends each vibration, because the headset's app vibrates until it is told to stop.
     """
 
     def __init__(self, settings: HapticSettings | None = None) -> None:
-        self.strength = (settings or HapticSettings()).strength  # Factor of all amplitudes, from 0 for none to 1.
-        self._ends: float | None = None
+        self.strength = (settings or HapticSettings()).strength  # Factor of all amplitudes, from 0 to 1.
+        self._ends: float | None = None  # Time at which the present vibration ends [s]; None if nothing vibrates.
         self._next = 0.0  # Earliest time of the next vibration [s].
         self._amplitude, self._felt_by = 0.0, ""
         self._slipped = _Steps(_SLIP_STEP), _Steps(_SLIP_ANGLE_STEP)
@@ -98,7 +99,7 @@ class HapticPulses:
         self._waiting: Pulse | None = None
 
     def start_pulse(self, event: Event) -> None:
-        """Start the pulse for an event of the arm."""
+        """Ask for the vibration that belongs to an event of the arm, if there is one."""
         if is_fault(event):
             self._want(FAULT)
         elif event.source == event.destination:
@@ -112,13 +113,13 @@ class HapticPulses:
             self._want(PAUSED)
 
     def slip(self, slip: float, slip_angle: float) -> None:
-        """Take how far the target has slipped since the arm was engaged [m], [rad]."""
+        """Take the slip: how far leash and workspace have held the target back since the last anchor [m], [rad]."""
         position, rotation = self._slipped
         if position.grew(slip) | rotation.grew(slip_angle):  # Both have to be updated.
             self._want(SLIP)
 
     def notice(self, condition: ArmCondition) -> None:
-        """Start a pulse if the arm comes near to something, touches it, or reaches a joint limit."""
+        """Ask for a vibration if the arm comes near to a body, its contact force grows, or it reaches a joint limit."""
         nearness = max(_NEAR_FROM - condition.spare, 0.0)
         if self._nearness.grew(nearness):
             self._want(NEAR.grown(nearness / _NEAR_FROM))
@@ -135,7 +136,10 @@ class HapticPulses:
         self._grasps = holds
 
     def at(self, now: float, hand: str) -> HapticFeedback | None:
-        """Return the message for ``hand``, which drives the arm at ``now`` [s], or None."""
+        """Return the message that begins or ends a vibration at ``now`` [s], or None.
+
+        ``hand`` drives the arm now. A message that ends a vibration goes to the hand that the vibration began in.
+        """
         if self._ends is not None and now >= self._ends:
             self._ends, self._next = None, now + _PAUSE
             return HapticFeedback(self._felt_by, 0.0, 0.0)  # This hand may not drive the arm any more.
@@ -154,7 +158,10 @@ class HapticPulses:
 
 
 class _Steps:
-    """Counts the steps by which a quantity grows. It may shrink by two steps before they are counted again."""
+    """Counts the steps by which a quantity grows.
+
+    A step that was counted is counted again only after the quantity has shrunk by two steps.
+    """
 
     def __init__(self, step: float) -> None:
         self._step, self._counted = step, 0

@@ -1,19 +1,20 @@
-"""The leash between a tool and its target. It bounds the distance of a target from a tool that cannot follow.
+"""The leash between a tool and its target. It bounds their distance if the tool cannot follow the target.
 
 An arm that is stretched out or blocked cannot follow its hand. Without a leash the hand would have to come all the way
 back before the arm moves again. If a target would go beyond the leash, the anchor of the relative motion shifts. The
-target stays at the end of the leash, and the hand moves it from there. Position and rotation have a leash each.
+target stays at the end of the leash, and the hand moves it from there. There is one leash for the position and one for
+the rotation.
 
-**Slack.** Suppose that a leash is taut, that the tool is blocked in its direction, and that the hand comes back by more
-than its tremor. Then the target is put at the tool, which follows the hand from there. The unfiltered poses decide
-whether the hand comes back, because the filtered ones swing back by millimetres when a hand stops. Position and
-rotation are put at the tool together. A blocked tool rests where the pulls of both targets balance, and would follow
-the one that is left, by up to 50 mm.
+**Slack.** Suppose that a leash is taut, that the tool is blocked in the direction of the leash, and that the hand comes
+back by more than its tremor. Then the target is put at the tool pose, and the tool follows the hand from there. The
+unfiltered hand poses decide whether the hand comes back, because filtered poses swing back by millimetres when a hand
+stops. The target's position and rotation are put at the tool pose together. A blocked tool rests where the pulls of the
+two balance. If only one of them were put there, the tool would follow the other one, by up to 50 mm.
 
 **Why the arm does not jump.** The only state of the controller is its reference, which is at rest while the tool is
-blocked. A target at the tool therefore asks for no motion. The controller also follows the velocity of its target. It
-ignores a step that is faster than three times the tool's limit, which is 9 m/s or 30 rad/s at most. The slack is
-dropped only in a tick that is short enough for the step to be that fast.
+blocked. A target at the tool pose therefore asks for no motion. The controller also follows the velocity of its target,
+but ignores a step that is faster than three times the tool's speed limit. This is 9 m/s or 30 rad/s at most. The target
+is put at the tool pose only in a tick so short that this step is faster than that.
 """
 
 from __future__ import annotations
@@ -25,17 +26,17 @@ from q2r2_control.quaternions import Vector, turn_between, turned_by
 from q2r2_control.teleop.relative import RelativeMotion
 from q2r2_control.types import Interval, Pose
 
-# The way back of a hand that drops the slack [m], [rad]. It is more than tremor, which is 0.2 mm and 0.2 degrees to
-# either side, and more than the noise of a headset. The farthest samples of a hand at rest are about seven standard
-# deviations apart, of 0.2 mm and 0.03 degrees.
+# If the hand comes back by more than this, the target is put at the tool pose [m], [rad]. It is more than tremor, which
+# is 0.2 mm and 0.2 degrees to either side, and more than the noise of a headset. This noise has a standard deviation of
+# 0.2 mm and 0.03 degrees, and two samples of a hand at rest are at most about seven standard deviations apart.
 _WAY_BACK = 1.5e-3, 12e-3
-# A tool that is slower counts as blocked [m/s], [rad/s]. It stops within a fraction of a millimetre.
+# A tool that is slower counts as blocked [m/s], [rad/s]. A tool of this speed stops within a fraction of a millimetre.
 _HELD_UP = 0.05, 0.2
-# No controller takes a faster step of a target as its motion, whatever its settings are [m/s], [rad/s].
+# With any settings, a controller ignores the velocity of a target that steps faster than this [m/s], [rad/s].
 _NO_MOTION = 10.0, 35.0
 _ROUNDING = 1e-9  # Of a distance [m], and of a cosine.
 
-_Tick = tuple[Pose, Pose, float]  # The tool, the newest pose of the hand, and the time [s] of the last tick.
+_Tick = tuple[Pose, Pose, float]  # Of one tick: tool pose, unslipped target (see ``Leash.target``), and time [s].
 
 
 class ComponentLeash:
@@ -50,19 +51,19 @@ class ComponentLeash:
         """Begin with a slack leash and no slip."""
         self.slip = 0.0  # The sum of all shifts of the target since the reset [m or rad].
         self.taut = False
-        self._back = 0.0  # The way back of the hand since it was farthest [m or rad].
+        self._back = 0.0  # How far the hand has come back towards the tool since it was farthest [m or rad].
 
     def releases_slack(self, way: Vector, by_hand: Vector, by_tool: Vector, dt: float) -> bool:
-        """Return whether the slack is to be dropped.
+        """Return whether the target is to be put at the tool pose, because the hand comes back from a blocked tool.
 
         Args:
-            way: From the tool to the target.
-            by_hand: Motion of the unfiltered hand in this tick.
-            by_tool: Motion of the tool in this tick.
+            way: Displacement from the tool to the target [m or rad].
+            by_hand: Motion of the unslipped target since the last tick, which is the unfiltered hand's motion.
+            by_tool: Motion of the tool since the last tick.
             dt: Duration of the tick [s].
         """
         distance = math.hypot(*way)
-        # A leash that was taut stays so until the distance is below half of its length: then the tool has caught up.
+        # A taut leash stays taut until the distance is below half of its length. The tool has then caught up.
         self.taut = distance >= self._length or (self.taut and distance >= 0.5 * self._length)
         if not self.taut:
             self._back = 0.0
@@ -72,12 +73,13 @@ class ComponentLeash:
         return self._back > self._way_back and held_up and distance > self._no_motion * dt
 
     def drop(self, way: Vector) -> Vector:
+        """Put the target at the tool pose: return the displacement 0, and count ``way`` as slip."""
         self.taut, self._back = False, 0.0
         self.slip += math.hypot(*way)
         return 0.0, 0.0, 0.0
 
     def hold(self, way: Vector) -> Vector | None:
-        """Return the shortened way from the tool to the target; None if the leash does not reach its end."""
+        """Return ``way`` (tool to target) cut to the length of the leash; None if it is not longer than the leash."""
         distance = math.hypot(*way)
         if distance <= self._length:
             return None
@@ -87,14 +89,14 @@ class ComponentLeash:
 
 
 class Leash:
-    """Keeps the target of one arm near its tool, as the module's text says."""
+    """Keeps the target of one arm near its tool. The module's docstring says how and why."""
 
     def __init__(self, settings: LeashSettings) -> None:
         limits = list(zip(_WAY_BACK, _HELD_UP, _NO_MOTION, strict=True))
         self.position = ComponentLeash(settings.distance, *limits[0])
         self.rotation = ComponentLeash(settings.angle, *limits[1])
         self._components = self.position, self.rotation
-        # Distance and cosine of half the angle at which the leash is looked at, just before it ends.
+        # Distance, and cosine of half the angle, from which on the leashes are computed. They are just before its ends.
         self._distance = math.inf if settings.distance is None else settings.distance - _ROUNDING
         self._cosine = -math.inf if settings.angle is None else math.cos(0.5 * settings.angle) + _ROUNDING
         self._last: _Tick | None = None
@@ -106,23 +108,24 @@ class Leash:
         self._last = None
 
     def anchor_anew(self) -> None:
-        """Forget the last tick, because the hand was anchored again where it is. The slip stays."""
+        """Forget the last tick, because the hand was anchored again at its present pose. The slip stays."""
         self._last = None
 
     def target(self, motion: RelativeMotion, hand: Pose, newest: Pose, tool: Pose, now: float) -> Pose:
-        """Return the target for ``hand``, no farther from the tool than the leash reaches.
+        """Return the target pose (world frame) for ``hand``, no farther from the tool than the leashes reach.
 
         Args:
-            motion: Maps the hand to its target. If the leash pulls, it is anchored again, so that the hand moves the
-                target from there.
-            hand: The filtered pose of the hand.
-            newest: The target for the unfiltered hand if nothing had ever slipped.
-            tool: The tool, in the world frame.
+            motion: Maps the hand to its target. If a leash moves the target, ``motion`` is anchored again, so that the
+                hand moves the target from there.
+            hand: The filtered pose of the hand, in the input's frame.
+            newest: The unslipped target (world frame): the one that the unfiltered hand would have if no leash and no
+                workspace had held a target back since the anchor.
+            tool: The tool pose, in the world frame.
             now: The time [s].
         """
         target, last = motion.target_floats(hand), self._last
         self._last = this = tool, newest, now
-        # The first target is the anchor. It must not move the arm, wherever the plant measures the tool.
+        # The first target is the anchor. It must not move the arm, even if the tool is measured somewhere else.
         if last is None or not (self.position.taut or self.rotation.taut or self._ends(tool, target)):
             return target
         way, turn = self._pull(target, last, this)
@@ -134,20 +137,29 @@ class Leash:
         return target
 
     def hold(self, target: Pose, tool: Pose) -> Pose:
-        """Return a target that no hand moves, no farther from ``tool`` (world frame) than the leash reaches."""
+        """Return ``target``, moved to be no farther from ``tool`` than the leashes reach. Both are in the world frame.
+
+        This is for targets that no hand moves.
+        """
         if not self._ends(tool, target):
             return target
         way, turn = (component.hold(way) for component, way in zip(self._components, _ways(tool, target), strict=True))
         return _put(target, tool, way, turn)
 
     def _ends(self, tool: Pose, target: Pose) -> bool:
-        """Return whether the target is as far away as a leash reaches. This is cheap, as it is False in most ticks."""
+        """Return whether the target is as far away as a leash reaches.
+
+        It is not in most ticks, so this check is made cheap.
+        """
         (start, (a, b, c, d)), (end, (x, y, z, w)) = tool, target
         # The scalar product of two unit quaternions is the cosine of half the angle between them, up to its sign.
         return math.dist(start, end) >= self._distance or abs(a * x + b * y + c * z + d * w) <= self._cosine
 
     def _pull(self, target: Pose, last: _Tick, this: _Tick) -> list[Vector | None]:
-        """Return the ways from the tool to the new position and rotation of the target; None for one that stays."""
+        """Return the displacements from the tool to the new target, of position and rotation.
+
+        A displacement is None if its part of the target stays.
+        """
         (last_tool, last_newest, before), (tool, newest, now) = last, this
         ways = _ways(tool, target)
         moves = zip(self._components, ways, _ways(last_newest, newest), _ways(last_tool, tool), strict=True)
@@ -160,12 +172,13 @@ class Leash:
 
 
 def _ways(start: Pose, end: Pose) -> tuple[Vector, Vector]:
+    """Return the displacement [m] and the rotation vector [rad] from ``start`` to ``end``."""
     ((x, y, z), rotation), ((to_x, to_y, to_z), turned) = start, end
     return (to_x - x, to_y - y, to_z - z), turn_between(rotation, turned)
 
 
 def _put(target: Pose, tool: Pose, way: Vector | None, turn: Vector | None) -> Pose:
-    """Return the target moved to this ``way`` and ``turn`` from the tool; None leaves its position or rotation."""
+    """Return the target at the displacements ``way`` and ``turn`` from the tool; None leaves position or rotation."""
     (position, rotation), ((x, y, z), tool_rotation) = target, tool
     if way is not None:
         position = x + way[0], y + way[1], z + way[2]
@@ -177,19 +190,22 @@ def _dot(one: Vector, other: Vector) -> float:
 
 
 class Workspace:
-    """Keeps the targets of one arm in a box, or no farther outside than its tool was at the anchor."""
+    """Keeps the targets of one arm in a box. If the tool was outside at the anchor, they may stay that far outside."""
 
     def __init__(self, settings: WorkspaceSettings | None) -> None:
         self._sides: tuple[Interval, ...] = () if settings is None else (settings.x, settings.y, settings.z)
         self.reset()
 
     def reset(self) -> None:
-        """Begin at a new anchor. The next target is at the tool, which may be outside of the box."""
+        """Begin at a new anchor. The next target is at the tool pose, which may be outside of the box."""
         self._bounds: list[Interval] | None = None
-        self.slip = 0.0  # The part of the hand's way that targets have not followed since the reset [m].
+        self.slip = 0.0  # Length of the hand's motion that the targets have not followed since the reset [m].
 
     def hold(self, target: Pose) -> Vector | None:
-        """Return the position to which ``target`` (world frame) is held back, for a new anchor; None if it is not."""
+        """Return the permitted position nearest to ``target`` (world frame) [m]; None if ``target`` is permitted.
+
+        The caller anchors the motion there.
+        """
         asked = target[0]
         if self._bounds is None:
             self._bounds = [(min(side[0], at), max(side[1], at)) for side, at in zip(self._sides, asked, strict=False)]

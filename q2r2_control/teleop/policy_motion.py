@@ -1,10 +1,10 @@
 """Turn the action chunks of a policy into targets of one arm, on one time line.
 
-A chunk is followed from its first time on, or from now on if it is late. From there on it replaces all older chunks.
-Positions between two actions are cubic in time, and rotations turn evenly. If two chunks differ at the moment of the
-change, the difference fades out, so that the target does not jump. Chunks of motions have no such difference, because
-they begin at the target. The last action counts for :data:`SILENT`. After that the arm rests, because a policy that
-sends nothing has failed.
+A chunk is followed from the time of its first action, or at once if this time has passed. It then replaces all older
+chunks. Positions between two actions are cubic in time, and rotations turn at constant speed. If two chunks differ at
+the moment of the change, the difference fades out, so that the target does not jump. Chunks of motions have no such
+difference, because they begin at the present target. The last action counts for :data:`SILENT`. After that the arm
+rests, because a policy that sends nothing has failed.
 """
 
 from __future__ import annotations
@@ -24,9 +24,10 @@ from q2r2_control.teleop.leash import Leash, Workspace
 from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.types import ActionChunk, Array, Pose
 
-SILENT = 0.5  # Time without a new action, after which an arm rests [s].
+SILENT = 0.5  # The last action of a plan counts for this time. After that the arm rests [s].
 _FADING = 0.5, 2.0  # Greatest speed at which the difference between two chunks fades [m/s], [rad/s].
-_AHEAD = 10.0  # A chunk whose time is farther from now was stamped by another clock [s].
+# If a time of a chunk is farther from now, before or after, another clock has stamped the chunk [s].
+_AHEAD = 10.0
 
 
 class _Plan(NamedTuple):
@@ -35,7 +36,8 @@ class _Plan(NamedTuple):
     start: float  # Time from which the plan is followed [s].
     chunk: ActionChunk
     times: list[float]  # Times of the poses [s].
-    poses: list[Pose]  # In the world frame; for motions, in the frame in which the first motion begins.
+    # In the world frame. For a chunk of motions, relative to the tool pose at which the first motion begins.
+    poses: list[Pose]
     grippers: list[float]  # Openings of the gripper; empty if the policy does not command it.
 
     @property
@@ -49,7 +51,7 @@ class PolicyMotion:
     def __init__(self, arm: str, settings: TeleopSettings) -> None:
         self._arm = arm
         self._plans: list[_Plan] = []  # The plans that have not begun, in order of time.
-        self._plan: _Plan | None = None  # The plan that is followed.
+        self._plan: _Plan | None = None  # The plan that the arm follows; None if it follows none.
         self.configure(settings)
 
     def configure(self, settings: TeleopSettings) -> None:
@@ -68,7 +70,7 @@ class PolicyMotion:
         self._plan = None
 
     def receive(self, chunk: ActionChunk, now: float) -> Reason | None:
-        """Take a chunk that came at ``now``; returns why it cannot be used, or None.
+        """Take a chunk that has come at ``now``, and return why it cannot be used; None if it can.
 
         A chunk whose actions are all in the past is ignored.
         """
@@ -83,7 +85,7 @@ class PolicyMotion:
             poses = [_pose(numbers) for numbers in chunk.tools[self._arm].tolist()]
         else:
             poses = _added_up(chunk.motions[self._arm].tolist())
-            if len(times) == 1:  # A single motion is made in full even if it is late, or a part would be missing.
+            if len(times) == 1:  # A single motion that comes late begins now. Otherwise its first part would be lost.
                 times[0] = max(times[0], now)
             times.append(times[-1] + chunk.period)
         if jump := self._jump(times, poses):
@@ -97,7 +99,7 @@ class PolicyMotion:
         return None
 
     def _jump(self, times: list[float], poses: list[Pose]) -> Reason | None:
-        """Return a fault if two actions are farther apart than a hand may move, else None."""
+        """Return a fault if two successive actions are farther apart than the gate lets a hand move, else None."""
         gate = self._settings.gate
         for (before, start), (after, end) in pairwise(zip(times, poses, strict=True)):
             distance, angle = math.dist(start[0], end[0]), math.hypot(*turn_between(start[1], end[1]))
@@ -112,20 +114,31 @@ class PolicyMotion:
         return any(plan.start <= now < plan.end for plan in self._plans)
 
     def begin(self, tool: Pose, now: float) -> Reason | None:
-        """Begin to follow the newest plan with the tool at ``tool`` (world frame); returns why not, or None."""
+        """Begin to follow the newest plan that is due.
+
+        Args:
+            tool: The tool pose (world frame).
+            now: The time [s].
+
+        Returns:
+            Why the arm cannot begin; None if it has begun.
+        """
         self._plan = None
         self._workspace.reset()
         return self.advance(tool, now)
 
     def advance(self, tool: Pose | None, now: float) -> Reason | None:
-        """Change to the plan for ``now``; returns why the arm cannot follow one, or None.
+        """Change to the plan that is due at ``now``.
 
-        If something holds the arm up, the leash holds its target. A new chunk may begin at this target, or where the
-        last chunk led.
+        If something holds the arm up, the leash keeps the target near the tool. A new chunk may begin at this target,
+        or at the pose to which the last chunk would have led.
 
         Args:
-            tool: The tool in the controller's reference; None if not known.
+            tool: The tool pose at the controller's reference (world frame); None if not known.
             now: The time [s].
+
+        Returns:
+            Why the arm can follow no plan; None if it follows one.
         """
         due = [plan for plan in self._plans if plan.start <= now]
         self._plans = self._plans[len(due) :]
@@ -140,7 +153,11 @@ class PolicyMotion:
         return None
 
     def _change(self, plan: _Plan, places: list[Pose], now: float) -> Reason | None:
-        """Follow ``plan``, beginning at the nearest of ``places``; returns why not, or None."""
+        """Follow ``plan`` from now on. Return why this is not possible, or None.
+
+        The target begins at the one of the poses ``places`` (world frame) that is nearest to the plan. A plan of
+        motions begins at the first of them.
+        """
         if self._arm in plan.chunk.motions:
             plan = plan._replace(poses=_moved_to(places[0], _interpolated(plan, now), plan.poses))
         planned, turned = _interpolated(plan, now)
@@ -158,7 +175,7 @@ class PolicyMotion:
         return None
 
     def _at(self, now: float) -> Pose:
-        """Return the pose of the plan at ``now``, plus what is left of the difference from the plan before."""
+        """Return the plan's pose at ``now``, plus what has not yet faded of the difference from the plan before it."""
         assert self._plan is not None
         (x, y, z), rotation = _interpolated(self._plan, now)
         left = 1.0 - min((now - self._began) / self._fades, 1.0)
@@ -170,10 +187,10 @@ class PolicyMotion:
         )
 
     def target(self, tool: Pose | None, now: float) -> Pose:
-        """Return the target of the tool (world frame), within its workspace and its leash.
+        """Return the target pose of the tool (world frame), within its workspace and its leash.
 
         Args:
-            tool: The tool in the controller's reference; None if not known.
+            tool: The tool pose at the controller's reference (world frame); None if not known. There is then no leash.
             now: The time [s].
         """
         target = self._at(now)
@@ -209,7 +226,7 @@ def _pose(numbers: list[float]) -> Pose:
 
 
 def _added_up(motions: list[list[float]]) -> list[Pose]:
-    """Return the poses to which the motions lead one after the other, in the frame in which they begin."""
+    """Return the first pose and the pose after each motion, relative to the first pose."""
     at = pin.SE3.Identity()
     poses = [floats_of(at)]
     for x, y, z, a, b, c in motions:
@@ -219,13 +236,13 @@ def _added_up(motions: list[list[float]]) -> list[Pose]:
 
 
 def _moved_to(place: Pose, origin: Pose, poses: list[Pose]) -> list[Pose]:
-    """Return ``poses`` moved as a whole, so that ``origin`` comes to ``place``."""
+    """Return ``poses`` after the one rigid motion that moves the pose ``origin`` to the pose ``place``."""
     move = se3_of(place) * se3_of(origin).inverse()
     return [floats_of(move * se3_of(pose)) for pose in poses]
 
 
 def _place(times: list[float], t: float) -> tuple[int, float]:
-    """Return the index of the action before ``t``, and the share of the time to the next one that has passed."""
+    """Return the index of the last action up to ``t``, and the share of the time to the next action that has passed."""
     index = min(max(bisect_right(times, t) - 1, 0), max(len(times) - 2, 0))
     if len(times) == 1:
         return 0, 0.0
@@ -236,7 +253,7 @@ def _interpolated(plan: _Plan, t: float) -> Pose:
     """Return the pose of a plan at ``t``.
 
     Positions are a cubic Hermite spline through all actions, with the mean velocity of the neighbours at each action.
-    Rotations turn evenly from action to action.
+    Rotations turn at constant speed from action to action.
     """
     times, poses = plan.times, plan.poses
     index, share = _place(times, t)
@@ -256,7 +273,7 @@ def _interpolated(plan: _Plan, t: float) -> Pose:
 
 
 def _velocity(times: list[float], poses: list[Pose], index: int) -> Vector:
-    """Return the mean velocity at an action, from the actions beside it [m/s]."""
+    """Return the velocity at an action: the mean from the action before it to the action after it [m/s]."""
     first, last = max(index - 1, 0), min(index + 1, len(times) - 1)
     h, start, end = times[last] - times[first], poses[first][0], poses[last][0]
     return (end[0] - start[0]) / h, (end[1] - start[1]) / h, (end[2] - start[2]) / h

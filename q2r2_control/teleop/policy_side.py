@@ -1,4 +1,4 @@
-"""Decide which arms follow a policy: those that no operator drives, until the actions end or have a fault."""
+"""Decide which arms follow a policy: the arms that no operator drives, until the actions end or have a fault."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from q2r2_control.types import ActionChunk, Array
 class PolicySide:
     """Lets a policy drive the arms.
 
-    If an operator has a device, arms wait for a press after a fault. Without an operator they go on with the next chunk
-    that begins at the tool. Linked arms begin together or not at all, since they may hold one object. This holds for
-    all arms for which a chunk has actions, and for all arms that a fault has stopped together.
+    After a fault, an arm whose hand has sent readings waits for a press. An arm without an operator goes on with the
+    next chunk that begins at its tool pose. Linked arms begin together or not at all, since they may hold one object.
+    These are all arms for which the newest chunk has actions, and all arms that a fault has stopped together.
     """
 
     def __init__(self, arms: Mapping[str, ArmTeleop], settings: TeleopSettings) -> None:
@@ -31,7 +31,7 @@ class PolicySide:
         self._told: dict[str, ReasonKind] = {}  # For each arm, why its last actions were refused.
         self._linked = settings.linked
         self._asked: set[str] = set()  # Arms for which the newest chunk has actions.
-        self._stopped: set[str] = set()  # Linked arms that a fault stopped, and that nothing has moved since.
+        self._stopped: set[str] = set()  # Linked arms that a fault has stopped together and that have not moved since.
         self.seen = False  # Whether a policy has sent anything in this run.
 
     def configure(self, settings: TeleopSettings) -> None:
@@ -42,11 +42,13 @@ class PolicySide:
     def update(
         self, chunks: Sequence[ActionChunk], around: ArmMeasurements, now: float, clock_fault: Reason | None
     ) -> None:
-        """Take the chunks of a tick, stop arms whose actions have ended or have a fault, and begin with other arms.
+        """Take the chunks of one tick, and decide which arms follow the policy.
+
+        Arms whose actions have ended or have a fault stop. Without a fault, arms that may follow begin to.
 
         Args:
             chunks: The new chunks.
-            around: The state of the arms.
+            around: The tool poses and the obstacles of this tick.
             now: The time [s].
             clock_fault: Why the loop's clock cannot be trusted, or None.
         """
@@ -57,7 +59,7 @@ class PolicySide:
         faults: dict[str, Reason] = {}
         for name, motion in self._motions.items():
             if motion.following and self._arms[name].state is not ArmState.POLICY:
-                motion.forget()  # The arm was stopped or taken over. It goes on with the next chunk.
+                motion.forget()  # The arm was stopped, or a hand has taken it over. It may go on with the next chunk.
         for chunk in chunks:
             self._asked = {*chunk.tools, *chunk.motions} or self._asked
             for name, motion in self._motions.items():
@@ -76,7 +78,7 @@ class PolicySide:
         return [name for name, arm in self._arms.items() if arm.state in states]
 
     def _refuse(self, faults: Mapping[str, Reason], now: float) -> None:
-        """Stop arms that follow. For other arms the fault is recorded once, not for every chunk."""
+        """Stop the arms with faults. If such an arm does not follow the policy, record a kind of fault only once."""
         following = self._in(ArmState.POLICY)
         for name, fault in faults.items():
             self._motions[name].forget()
@@ -101,7 +103,7 @@ class PolicySide:
         return not any(self._arms[other].heard_of for other in lost)
 
     def _begin(self, around: ArmMeasurements, now: float) -> None:
-        """Let arms follow that may and for which there is a plan. Linked arms begin all at once."""
+        """Let the arms begin that may follow the policy and have a plan. Linked arms begin together or not at all."""
         ready = [name for name in self._arms if self._may_begin(name, around) and self._motions[name].counts(now)]
         if not ready or (self._linked and not self._wanted().issubset(ready)):
             return
@@ -115,11 +117,11 @@ class PolicySide:
                 self._motions[name].forget()
             elif name not in faults:
                 self._told.pop(name, None)
-                self._arms[name].offset = None  # Actions are targets for the controller, without an offset.
+                self._arms[name].offset = None  # Actions are targets for the controller, so no offset is added.
                 self._arms[name].go(Cause.POLICY_ACTS, now, Reason(TeleopReason.POLICY_ACTS))
 
     def _wanted(self) -> set[str]:
-        """Return the linked arms that have to begin together, because nobody moves them now."""
+        """Return the arms that have to begin together if arms are linked. Arms that move already are not among them."""
         self._stopped = {name for name in self._stopped if self._arms[name].state is ArmState.LOST}
         moved = self._in(ArmState.POLICY, ArmState.ENGAGED, ArmState.CARRIED)
         return (self._stopped | (self._asked & self._arms.keys())).difference(moved)

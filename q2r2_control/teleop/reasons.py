@@ -41,7 +41,7 @@ class TeleopReason(ReasonKind):
     OBSTACLE_IN_THE_WAY = "obstacle_in_the_way", "{name} is in the way: {pair}"
     SETTINGS_CHANGED = "settings_changed", "settings changed"
     CONTROL_CHANGED = "control_changed", "control changed"
-    # A warning, which stops nothing.
+    # A warning, which stops no arm.
     HANDS_CROSSED = (
         "hands_crossed",
         "the left hand has been to the right of the right hand for {time:g} s: are the two controllers swapped?",
@@ -84,7 +84,7 @@ class TeleopReason(ReasonKind):
     CLOCK_NOT_FINITE = "clock_not_finite", "the clock is not finite"
     CLOCK_WENT_BACK = "clock_went_back", "the clock went back by {duration:.3f} s"
     LINKED = "linked", "linked to {arm}: {cause}"
-    # Obstacles to a request.
+    # Causes of a refusal: why a request cannot be carried out now.
     TOOL_UNKNOWN = "tool_unknown", "the tool's pose is not known"
     CONTROLS_HELD = "controls_held", "{controls} held since the hand was first heard of: let go first"
     STOPPED = "stopped", "stopped, {control} goes on"
@@ -104,7 +104,7 @@ _NOT_RECORDED = {_K.NO_RECORDING, _K.RECORDING_ENDED, _K.NO_EPISODE, _K.NO_OPEN_
 REFUSALS: frozenset[ReasonKind] = frozenset({*_NOT_DONE, *_NOT_RECORDED})
 _C = CommonReason
 _WAY_HOME = {_C.HOMING, _C.HOMING_ARRIVED, _C.HOMING_HELD_UP, _C.HOMING_NO_WAY, _C.HOMING_INTERRUPTED, _C.HOMING_ENDED}
-# The hand's data did not come in time.
+# Reasons that say that a hand's data did not come in time.
 SILENCES: frozenset[ReasonKind] = frozenset({_K.POSE_SILENT, _K.POSE_GAP, _K.INPUTS_SILENT})
-# Requests to hold, and the results of a way home.
+# Requests that arms hold, and the beginning and the outcomes of a motion home.
 HOLD_REQUESTS: frozenset[ReasonKind] = frozenset({_K.PAUSE_SERVICE, _K.RESET_SERVICE, *_WAY_HOME})

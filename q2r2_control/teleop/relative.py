@@ -1,4 +1,4 @@
-"""Relative motion: the tool repeats the motion of the hand since both were anchored."""
+"""Relative motion: the tool repeats the motion that the hand has made since hand and tool were anchored."""
 
 from __future__ import annotations
 
@@ -26,13 +26,15 @@ from q2r2_control.quaternions import (
 from q2r2_control.types import Array, Pose
 
 _REFLECTION = np.diag([1.0, -1.0, 1.0])  # Left and right change sign. Forward and up do not.
-# Beyond this angle the anchor follows the hand, because rotation vectors are not continuous beyond a full turn.
+# If the hand has turned by more than this angle, the rotation is anchored anew [rad]. Beyond a full turn, rotation
+# vectors would not be continuous.
 _REANCHOR_ANGLE = 1.5 * math.pi
-_CONTINUOUS = 1.0  # Rotation vectors of one continuous motion differ by less than this between two calls [rad].
+# In a continuous motion, the rotation vectors of two successive calls differ by less than this [rad].
+_CONTINUOUS = 1.0
 
 
 class RelativeMotion:
-    """Maps hand poses to tool poses, relative to an anchor of both.
+    """Maps hand poses to tool poses, relative to an anchor: one pose of the hand and one of the tool.
 
     With M the signed permutation ``axes``, preceded by S = diag(1, -1, 1) in the stance ``mirror_reflected``, a hand
     pose (p, R) counts in the world as (M p, M R M'). With anchors hand0 and tool0, ``target`` is
@@ -43,10 +45,11 @@ class RelativeMotion:
 
     as in Quest2ROS2 (HRI 2026) for scales of 1 in the base frame. The caller decides which hand drives which arm.
 
-    Every rotation has a second, longer rotation vector. The one that continues the vector of the previous call is used.
-    With a scale other than 1 the tool then does not flip when the hand passes half a turn.
+    Every rotation has two rotation vectors: a short one and a longer one in the opposite direction. The vector that
+    continues the previous call's vector is used. With a scale other than 1 the tool then does not flip when the hand
+    passes half a turn.
 
-    Methods that take tuples of floats are for the loop. They check nothing.
+    The methods that take tuples of floats are for the loop, and do not check their arguments.
 
     Raises:
         ConfigError: If a value is not allowed in :class:`TeleopSettings`.
@@ -71,7 +74,7 @@ class RelativeMotion:
         if settings.stance is Stance.MIRROR_REFLECTED:
             self._map = _REFLECTION @ self._map
         self._axes = self._scaled_axes()
-        # M exp(w) M' = exp(det(M) M w): if M reflects, a turn becomes a turn the other way.
+        # M exp(w) M' = exp(det(M) M w): if M is a reflection, a rotation changes its direction.
         self._turn_map: Array = np.linalg.det(self._map) * self._map
         self._turn_axes = _axes_of(self._turn_map)
         self._hand_position: Vector | None = None
@@ -85,10 +88,10 @@ class RelativeMotion:
         return cls(settings.stance, settings.position_scale, settings.rotation_frame, *scales)
 
     def anchor(self, hand: pin.SE3, tool: pin.SE3) -> None:
-        """Let ``hand`` (input's frame) correspond to ``tool`` (world frame) from now on.
+        """Let the pose ``hand`` (input's frame) correspond to the pose ``tool`` (world frame) from now on.
 
         Raises:
-            Q2R2Error: If one of them is not a finite pose, as in :meth:`target` and :meth:`hand`.
+            Q2R2Error: If one of the poses is not finite or no rotation. :meth:`target` and :meth:`hand` check likewise.
         """
         self.anchor_floats(_checked_floats("anchor: hand", hand), _checked_floats("anchor: tool", tool))
 
@@ -97,7 +100,10 @@ class RelativeMotion:
         self.anchor_rotation(hand[1], tool[1])
 
     def rescale(self, position: float, rotation: float, hand: Pose, tool: Pose) -> None:
-        """Use these shares of the scales from now on, and anchor ``hand`` and ``tool``, so that nothing jumps."""
+        """Multiply the scales of the settings by these factors from now on, and anchor ``hand`` and ``tool``.
+
+        The new anchor keeps the target from jumping.
+        """
         self._scale, self._rotation_scale = position * self._full[0], rotation * self._full[1]
         self._axes = self._scaled_axes()
         self.anchor_floats(hand, tool)
@@ -150,15 +156,15 @@ class RelativeMotion:
         return product(tool, turn) if self._in_tool_frame else product(turn, tool)
 
     def _in_world(self, turn: Quaternion) -> Quaternion:
-        """Return a rotation of the hand in the world frame: M R M'."""
+        """Return the rotation in the world frame that a rotation of the hand stands for: M R M'."""
         (i, a), (j, b), (k, c) = self._turn_axes
         return a * turn[i], b * turn[j], c * turn[k], turn[3]
 
     def hand(self, tool: pin.SE3) -> pin.SE3:
         """Return the hand pose in the input's frame whose :meth:`target` is ``tool``.
 
-        If the rotation is more than half a turn from the anchor, the shorter way round is taken. With a scale of 0 the
-        hand keeps its position or rotation.
+        If the rotation is more than half a turn from the anchor, the hand turns the shorter way round. With a scale of
+        0 the returned pose has the position or the rotation of the anchored hand.
 
         Raises:
             Q2R2Error: If nothing has been anchored.
@@ -192,13 +198,13 @@ def _checked_floats(name: str, pose: pin.SE3) -> Pose:
 
 
 def _axes_of(matrix: Array) -> list[tuple[int, float]]:
-    """Return, for each axis of a scaled signed permutation, the axis that it comes from, and the factor."""
+    """Return, for each row of a scaled signed permutation, the column of its only entry, and this entry."""
     sources = np.abs(matrix).argmax(axis=1)
     return [(int(j), float(row[j])) for row, j in zip(matrix, sources, strict=True)]
 
 
 def _continued(vector: Vector, previous: Vector) -> Vector:
-    """Return the rotation vector that continues ``previous``, of the two that describe one rotation."""
+    """Return the rotation vector that continues ``previous``: ``vector``, or the longer one of the same rotation."""
     angle = math.hypot(*vector)
     if angle == 0.0:
         return vector

@@ -1,4 +1,4 @@
-"""Teleoperate all arms: turn hand samples into targets of the tools, once per control tick."""
+"""Teleoperate all arms: turn the samples of the hands into the target tool poses, once per control tick."""
 
 from __future__ import annotations
 
@@ -21,29 +21,31 @@ from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.types import ActionChunk, ArmTarget, HandSample
 
 _BY_HANDS = ArmState.ENGAGED, ArmState.CARRIED
-_LED = FOLLOWING - {ArmState.CARRIED, ArmState.POLICY}  # States in which an arm follows its own hand.
+_LED = FOLLOWING - {ArmState.CARRIED, ArmState.POLICY}  # States in which an arm's own hand drives it.
 
 
 class Teleop:
     """Lets hands drive arms relative to anchors, and stops the arms at faults. :mod:`arm_states` has the transitions.
 
-    An engaged arm stops if no pose or no reading of the buttons comes for ``gate.timeout`` of receipt time, if a pose
-    is not finite or not a rotation, and if the hand jumps or is faster than the gate allows. It also stops at a fault
-    that the input reports, a lost connection, a stalled loop, and a clock that went back by more than ``gate.timeout``.
-    With ``linked`` the other arm stops as well. Only a new press engages again. The alignment chord of either hand
-    stops both arms, because it moves the frame of both hands.
+    An engaged arm stops if no pose or no reading of the buttons has been received for ``gate.timeout``, if a pose is
+    not finite or its quaternion is no rotation, and if the hand jumps or is faster than the gate allows. It also stops
+    if the input reports a fault, if the connection is lost, if the loop stalls, and if the clock goes back by more than
+    ``gate.timeout``. With ``linked`` the other arm stops as well. Only a new press engages an arm again. The alignment
+    chord of either hand stops both arms, because it moves the frame in which the poses of both hands are measured.
 
-    If several presses come at once, a stop goes first, then the alignment chord, then a pause, then the others. Either
-    hand may ask for actions of both arms. While :attr:`homing`, the caller moves the arms home.
+    If several presses come at once, a stop is carried out first, then the alignment chord, then a pause, then the
+    others. Either hand may ask for the actions that concern both arms. While :attr:`homing` is True, the caller moves
+    the arms home.
 
-    :meth:`update` raises for no input: samples of unknown hands, old, repeated or in bursts, and any ``now``.
+    :meth:`update` never raises because of its input. Samples may be of unknown hands, old, repeated or in bursts, and
+    ``now`` may be any number.
     """
 
     def __init__(self, settings: TeleopSettings, arms: Sequence[str]) -> None:
         self._pair = BothArms(settings, arms)
         self._arms = self._pair.arms
         self._policy = PolicySide(self._arms, settings)
-        self.marks = self._pair.marks  # The operator's marks of episodes in the recording.
+        self.marks = self._pair.marks  # Turns the presses that mark episodes into events.
         self._commanded: dict[str, pin.SE3] = {}
         self._now: float | None = None
         self._use(settings)
@@ -54,10 +56,13 @@ class Teleop:
         self._crossed = CrossedHands(settings.axes)
 
     def change(self, settings: TeleopSettings, now: float) -> Reason | None:
-        """Use other settings from now on, without a jump; returns why that is not possible now, or None.
+        """Use other settings from now on. The targets do not jump.
 
-        The hand of an arm, the directions of its axes and the meaning of its controls may change only while the arms
-        hold.
+        The hand that drives an arm, the directions of the axes, and the actions of the controls may change only while
+        the arms hold.
+
+        Returns:
+            Why the settings cannot change now; None if they have changed.
         """
         before = self.settings
         turned = (before.stance, before.axes) != (settings.stance, settings.axes)
@@ -87,7 +92,7 @@ class Teleop:
 
     @property
     def interventions(self) -> dict[str, bool]:
-        """For each arm, whether a hand moves it in the place of a policy that has sent actions before."""
+        """For each arm, whether a hand moves it although a policy has sent actions in this run."""
         return {name: self._policy.seen and arm.state in _BY_HANDS for name, arm in self._arms.items()}
 
     @property
@@ -125,13 +130,13 @@ class Teleop:
 
         Args:
             samples: The new samples of all hands.
-            tools: The measured poses of the tools, in the world frame.
-            now: The time, of the same clock as the samples' stamps [s].
-            commanded: The tools in the controller's reference, near which the leash keeps targets; without it there is
-                no leash.
-            obstacles: For each arm that may not be engaged now, the reason from outside of this layer.
-            in_step: Whether all poses in ``commanded`` are of one moment, so that they may correct the relation of two
-                tools that carry.
+            tools: The measured tool poses, in the world frame.
+            now: The time, by the same clock as the samples' stamps [s].
+            commanded: The tool poses at the controller's reference, in the world frame. The leash keeps each target
+                near this pose. Without it there is no leash.
+            obstacles: For each arm that may not be engaged now, the reason. The caller knows it, and not this class.
+            in_step: Whether all poses in ``commanded`` belong to one moment. Only then may they correct the relative
+                pose of two tools that carry one object.
             chunks: The new action chunks of a policy.
 
         Returns:
@@ -191,21 +196,21 @@ class Teleop:
         self._pair.home(now, None)
 
     def end_homing(self, now: float, outcome: Reason) -> None:
-        """End the way home with an ``outcome``: the arms have arrived, cannot go on, or have stopped by a fault."""
+        """End the motion home. The ``outcome`` says whether the arms have arrived, cannot go on, or had a fault."""
         fault = outcome.kind in (CommonReason.HOMING_FAULT, TeleopReason.NOT_HOMING)
         self._pair.change(Cause.FAULT if fault else Cause.HOMED, now, outcome)
 
     def record_event(self, now: float, reason: Reason) -> None:
-        """Record an event of both arms for the operator."""
+        """Record an event for the operator, once for each arm. No state changes."""
         for arm in self._arms.values():
             arm.record_event(now, reason)
 
     def mark(self, now: float, action: Action) -> None:
-        """Mark the recording for a program, as a hand may do; see :class:`EpisodeMarks`."""
+        """Mark the recording because a program asks for it, as a press of a hand does; see :class:`EpisodeMarks`."""
         next(iter(self._arms.values())).record_event(now, self.marks.apply(action))
 
     def reset(self, now: float, arm: str, reason: Reason) -> None:
-        """Let an arm hold, forget everything that came from its hand, and end a stop of all arms."""
+        """Let an arm hold, and forget all samples of its hand. If the operator has stopped the arms, end this stop."""
         self.hold(now, reason, arm)
         self._arms[arm].forget()
         self._pair.change(Cause.GO_ON, now, reason)
@@ -217,7 +222,10 @@ class Teleop:
         self.pause(now, reason, arm)
 
     def connection_lost(self, now: float) -> None:
-        """Stop every arm that a hand drives, and forget everything received, because the input is lost."""
+        """Stop the arms, and forget all samples, because the input is lost.
+
+        Arms go on to move home if a program has asked for it.
+        """
         now, _ = self._clock(now)
         if not self.homing or self._pair.asks_home is not None:
             self._pair.change(Cause.FAULT, now, Reason(TeleopReason.CONNECTION_LOST))
@@ -225,10 +233,9 @@ class Teleop:
             arm.forget()
 
     def pause(self, now: float, reason: Reason, arm: str | None = None) -> None:
-        """Let every arm hold until a new press, for a reason from outside of this layer.
+        """Let every arm hold until a new press, for a ``reason`` that the caller gives.
 
-        If ``arm`` is given, the reason concerns that arm. Other arms that follow their hands then hold only if they are
-        linked.
+        If ``arm`` is given, the reason concerns only that arm. The other arm then holds only if the arms are linked.
         """
         now, _ = self._clock(now)
         if arm is None or self.homing:
@@ -237,12 +244,18 @@ class Teleop:
             self._stop({arm: reason}, now)
 
     def press_to_engage(self, arm: str | None = None) -> None:
-        """Press the button that engages, in the place of one hand or both. A dead man cannot be pressed like this."""
+        """Act as if the hand of ``arm`` pressed the button that engages; without ``arm``, as if both hands did.
+
+        A dead man's switch cannot be held in this way.
+        """
         for name in self._arms if arm is None else (arm,):
             self._arms[name].press_to_engage()
 
     def give_back(self, now: float) -> None:
-        """Let the policy go on, because no hand drives an arm any more, until a hand sends again."""
+        """Let a policy move the arms that hands have driven.
+
+        After a fault the arms then wait for no press, until a reading of a hand comes again.
+        """
         now, _ = self._clock(now)
         reason = Reason(TeleopReason.POLICY_REQUESTED)
         self._pair.end_carry(now, reason)
@@ -251,7 +264,11 @@ class Teleop:
             arm.heard_of = False
 
     def _clock(self, now: float) -> tuple[float, Reason | None]:
-        """Return the time that counts, which does not go back, and a fault if the clock went back by too much."""
+        """Return the time to use, and a fault or None.
+
+        The time does not go back if the clock goes back by at most the timeout. It is a fault if the clock goes back by
+        more, is not finite, or is ahead by more than the timeout since the last call.
+        """
         last = self._now
         if not math.isfinite(now):
             return last or 0.0, Reason(TeleopReason.CLOCK_NOT_FINITE)
@@ -267,7 +284,7 @@ class Teleop:
         return now, Reason.of(TeleopReason.CLOCK_WENT_BACK, duration=last - now)
 
     def _disengage(self, faults: Mapping[str, Reason], now: float) -> None:
-        """Stop the arms whose hand has a fault. A fault has no effect if the arm holds anyway."""
+        """Stop the arms whose hands have faults. A fault has no effect on an arm that holds already."""
         if self.homing:
             if (fault := faults.get(self._pair.asks_home or "")) is not None:
                 self._pair.change(Cause.FAULT, now, Reason(CommonReason.HOMING_FAULT, cause=fault))

@@ -1,4 +1,4 @@
-"""Words for the episode that is recorded now, and for its subtask."""
+"""Tell people which episode and which subtask is recorded now."""
 
 from __future__ import annotations
 
@@ -17,7 +17,10 @@ _EPISODE_OVER = (
 
 
 class EpisodeWords:
-    """Follows the events of a recorded run. A run in which no episode ever begins is one episode itself."""
+    """Makes a line about the present episode from the events of a recorded run.
+
+    If no episode begins in a run, the whole run is one episode.
+    """
 
     def __init__(self, subtasks: Sequence[str]) -> None:
         """``subtasks`` are the names of an episode's subtasks, in their order; empty if they have no names."""

@@ -21,18 +21,18 @@ _DIGITS = 4  # Decimals of metres and quaternions.
 
 
 class ShownTick(NamedTuple):
-    """The shown part of a run at one tick. The process that sends the messages makes the words."""
+    """The data of one tick that are shown. The process that sends the messages makes the sentences from them."""
 
     tick: Tick
     binding: tuple[ActiveLimit, ...]  # Limits that held a step back since the last shown tick.
-    told: Mapping[str, Told]  # By arm.
+    told: Mapping[str, Told]  # By arm, the events that say why it is in its state.
     hands: Mapping[str, str]  # By arm, the hand that drives it.
     moved: Array | None  # MuJoCo's positions (qpos) of everything that moves.
     recording: str
 
 
 class RunDisplay:
-    """Makes the messages of the display, in the process that sends them. The robot is read there from its URDF."""
+    """Makes the messages of the display. This is done in the process that sends them, which reads the robot's URDF."""
 
     def __init__(self, run: ShownRobot, model: pin.Model, pairs: pin.GeometryModel, parts: Mapping[str, int]) -> None:
         """Prepare the display.
@@ -41,13 +41,14 @@ class RunDisplay:
         :func:`places_of_parts`.
         """
         self._run, self._model, self._pairs, self._parts = run, model, pairs, parts
-        # The page knows the device in the operator's hands, and replaces these names by the words for its controls.
+        # The texts contain names of controls in braces. The page knows the operator's device, and replaces the names by
+        # the words for the device's controls.
         bound = {binding.control for binding in run.config.teleop.bindings.bound()}
         self._words = run.words(DeviceWords(nouns={control: f"{{{control}}}" for control in bound}))
 
     def scene(self) -> ShownScene:
         """Return the meshes, each in the frame of a joint, and the loose parts."""
-        from q2r2_control.viewer.joint_tree import JointTree, colour_of  # It needs trimesh, which is an extra.
+        from q2r2_control.viewer.joint_tree import JointTree, colour_of  # It needs trimesh, which may be missing.
 
         self._tree, self._tightest = JointTree(self._run), TightestPair(self._model, self._pairs)
         self._data = self._tree.model.createData()
@@ -73,7 +74,7 @@ class RunDisplay:
         }
 
     def _joints_of_tool(self, joints: Array) -> list[int]:
-        """Return the last joint of an arm and all joints that it carries, such as fingers."""
+        """Return the index of an arm's last joint, and the indices of all joints that it carries, such as fingers."""
         model = self._tree.model
         return [int(joint) for joint in model.subtrees[model.getJointId(self._run.joint_names[joints[-1]])]]
 
@@ -114,6 +115,6 @@ def _rounded(pose: pin.SE3) -> Seven:
 
 
 def _part(moved: Array, at: int) -> Seven:
-    """Return the pose of a part with the quaternion x y z w. MuJoCo has w x y z."""
+    """Return the pose of a part, with the quaternion in the order x y z w. In MuJoCo's ``moved`` it is w x y z."""
     x, y, z, qw, qx, qy, qz = moved[at : at + 7].round(_DIGITS).tolist()
     return x, y, z, qx, qy, qz, qw

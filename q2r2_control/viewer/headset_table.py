@@ -1,4 +1,4 @@
-"""The messages of a headset as a table, which is either live or printed once."""
+"""A table of the messages of a headset. It is either live or printed once."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def short_text(message: HandMessage) -> str:
 
 
 def _numbers(values: Iterable[float]) -> str:
-    return " ".join(f"{round(value, 2) + 0.0:.2f}" for value in values)  # The addition of 0.0 turns -0.0 into 0.0.
+    return " ".join(f"{round(value, 2) + 0.0:.2f}" for value in values)  # Adding 0.0 turns -0.0 into 0.0.
 
 
 def headset_table(check: HeadsetCheck) -> Table:

@@ -1,4 +1,7 @@
-"""The run's side of its display on a headset. It sends ticks to the input's process, and obeys its buttons."""
+"""The part of a headset's display that belongs to the run.
+
+It sends ticks to the process that serves the headset's page, and does what the buttons of the page request.
+"""
 
 from __future__ import annotations
 
@@ -26,17 +29,22 @@ class DisplayInput(Input, Protocol):
     """An input whose device shows the run, as a headset does."""
 
     def show_on(self, display: Display, requests: Mapping[HeadsetRequest, Callable[[], None]]) -> None:
-        """Show a run by ``display``. Its buttons call ``requests``, in any thread. To be called before ``start``."""
+        """Show a run on the device. This is called before ``start``.
+
+        Args:
+            display: Makes the data that are shown.
+            requests: The function to call for each request of a button. Any thread may call it.
+        """
 
     def show(self, content: Any) -> bool:
-        """Show the newest state without waiting; return False if the last state is not sent yet."""
+        """Show the newest state. Return False if the last state is not sent yet. The method never waits."""
 
     def show_picture(self, jpeg: bytes) -> bool:
-        """Show the newest picture of a camera, in the same way as :meth:`show`. Any thread may call this."""
+        """Show the newest picture of a camera; otherwise like :meth:`show`. Any thread may call this."""
 
 
 class HeadsetView:
-    """A listener of one run. Each tick stores references, and the input's process gets them 30 times a second."""
+    """A listener of one run. It stores what each tick brings, and sends it to the input's process 30 times a second."""
 
     def __init__(self, source: DisplayInput, pipeline: Pipeline, recorded: bool) -> None:
         self._source = source

@@ -16,11 +16,11 @@ from q2r2_control.types import Array
 from q2r2_control.viewer.shown_robot import ShownRobot
 
 Colour = tuple[int, int, int]
-_SHARP = 0.6  # An edge with a larger angle is shaded as sharp, not as round [rad].
+_SHARP = 0.6  # Edges with a larger angle than this look sharp, and other edges look round [rad].
 
 
 class JointTree:
-    """All movable joints of arms and fingers, and the shapes that each of them carries."""
+    """All movable joints of arms and fingers, and the shapes that each joint carries."""
 
     def __init__(self, shown: ShownRobot) -> None:
         self.model = pin.buildModelFromXML(shown.urdf)
@@ -43,7 +43,8 @@ class JointTree:
             for kind in (pin.GeometryType.VISUAL, pin.GeometryType.COLLISION)
         )
         drawn = {shape.parentFrame for shape in visual.geometryObjects}
-        # A link without visual shapes shows its collision shapes. Envelopes would hide the shapes inside them.
+        # For a link without visual shapes, its collision shapes are drawn. Envelopes are not drawn, since they would
+        # hide the shapes inside.
         undrawn = (shape for shape in solid.geometryObjects if shape.parentFrame not in drawn)
         self._shapes = [
             *visual.geometryObjects,
@@ -51,7 +52,12 @@ class JointTree:
         ]
 
     def posture(self, q: Array, openings: Mapping[str, float]) -> Array:
-        """Return positions (nq,) of all joints, with arms at ``q`` (nv,) and grippers at ``openings`` (1 is open)."""
+        """Return the configuration (nq,) of all joints.
+
+        Args:
+            q: Positions of the arms' joints (nv,) [rad].
+            openings: By arm, the opening of its gripper, from 0 for closed to 1 for open.
+        """
         full: Array = pin.neutral(self.model)
         full[self._arms] = q
         for arm, (joints, closed, opened) in self._strokes.items():

@@ -21,9 +21,9 @@ from q2r2_control.viewer.tables import times_real_time
 from q2r2_control.wording import limit_name
 
 _REFRESH_RATE = 6.0  # [Hz]
-# A drawing thread needs milliseconds of Python at a time. The loop gets the interpreter back after this time [s].
+# The thread that draws computes for milliseconds at a time. The loop gets the interpreter back after this time [s].
 _SWITCH_INTERVAL = 2e-5
-_LIMITS_SHOWN, _BAR = 4, 20
+_LIMITS_SHOWN, _BAR = 4, 20  # Greatest number of limits that are named, and length of the progress bar [characters].
 _NEAR = 0.01  # A pair with a smaller margin is coloured [m].
 
 
@@ -49,14 +49,14 @@ class LiveTable:
         self._title, self._words = title, words
         self._steps, self._duration = steps, duration
         self._newest: Tick | None = None
-        self._count = 0
+        self._count = 0  # Number of ticks so far.
         self._binding: dict[ActiveLimit, None] = {}
         self._repelled: dict[str, None] = {}
         self._simulated_time, self._episodes = simulated_time, episodes
         self._drawn = (time.monotonic(), 0, 0.0)  # The last drawing: time [s], count of ticks, and time of the run [s].
 
     def __call__(self, tick: Tick) -> None:
-        """Store one tick."""
+        """Store one tick, to be shown later."""
         self._newest = tick
         self._count += 1
         self._binding.update(dict.fromkeys(tick.reference.report.binding))

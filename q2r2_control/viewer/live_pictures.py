@@ -1,4 +1,7 @@
-"""Pictures of one camera for spectators: of the simulated cell, which a process of its own takes, or of a real one."""
+"""Pictures of one camera for spectators.
+
+A process of its own takes the pictures of a simulated camera. The pictures of a real camera come from its stream.
+"""
 
 from __future__ import annotations
 
@@ -20,8 +23,8 @@ from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.process.helper_process import HelperProcess
 from q2r2_control.summary.tick import Tick
 
-_NICENESS = 19  # The loop and the hands have priority.
-_QUALITY = 70  # The quality of JPEG.
+_NICENESS = 19  # Lowest priority of the process, since the loop and the hands come first.
+_QUALITY = 70  # JPEG quality, from 0 to 100.
 _logger = logging.getLogger(__name__)
 
 
@@ -29,12 +32,15 @@ class PictureSetup(NamedTuple):
     """The first request to the process that takes pictures."""
 
     model: bytes  # A pickled mujoco.MjModel.
-    name: str
+    name: str  # Name of the camera.
     camera: CameraConfig
 
 
 def main(requests: Iterator[Any], answer: Callable[[bytes], None]) -> None:
-    """Answer each request with a JPEG. After the setup, each request holds MuJoCo's positions (qpos)."""
+    """Run the process. The first request is the setup; each further one has MuJoCo's positions (qpos).
+
+    The answer to each further request is a picture as JPEG.
+    """
     setup = next(requests, None)
     if setup is None:
         return
@@ -47,7 +53,10 @@ def main(requests: Iterator[Any], answer: Callable[[bytes], None]) -> None:
 
 
 class LivePictures(AbstractContextManager["LivePictures"]):
-    """A listener of one run, and a context around it. If it fails, it logs one line and the run goes on."""
+    """Shows pictures of the simulated cell during one run: a listener of the run, and a context around it.
+
+    If the process fails, one line is logged and the run goes on.
+    """
 
     def __init__(
         self,
@@ -86,7 +95,7 @@ class LivePictures(AbstractContextManager["LivePictures"]):
 
 
 class ShownPictures:
-    """Shows some of the pictures of a real camera, as a hearer of its :class:`CameraStream`."""
+    """Shows some of the pictures of a real camera. It is called with each picture of a :class:`CameraStream`."""
 
     def __init__(self, most: float, show: Callable[[bytes], object], watched: Callable[[], bool]) -> None:
         """``show`` gets up to ``most`` pictures a second, as long as ``watched`` returns True."""

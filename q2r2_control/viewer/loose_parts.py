@@ -1,4 +1,7 @@
-"""The loose parts of a simulated cell. Processes that only draw must not import this: they need no simulator."""
+"""The loose parts of a simulated cell.
+
+Processes that only draw must not import this module, because they have to work without the simulator.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The robot of a cell in the form that is sent to a process that draws it."""
+"""The data about a cell's robot that are sent to a process, so that the process can draw it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class ShownRobot:
     config: Config
     urdf: str
     joint_names: tuple[str, ...]
-    joints: Mapping[str, Array]  # By arm, indices of ``joint_names``.
+    joints: Mapping[str, Array]  # By arm, the indices of its joints in ``joint_names``.
     fingers: Mapping[str, tuple[str, ...]]  # By arm, the joints of its gripper.
 
     @classmethod
@@ -34,6 +34,6 @@ class ShownRobot:
         )
 
     def words(self, device: DeviceWords) -> ArmWords:
-        """Return the maker of sentences about the arms, in the words of the ``device`` that drives them."""
+        """Return an instance that makes sentences about the arms, in the words of the ``device`` that drives them."""
         joints = {arm: [self.joint_names[index] for index in its] for arm, its in self.joints.items()}
         return ArmWords(joints, self.config.teleop.bindings, device)

@@ -1,4 +1,4 @@
-"""The tables of all commands: figures and names under headings."""
+"""Printed tables, which all commands use: numbers and names under headings."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rich.text import Text
 
 Cell = Text | str | float | None
 _NARROWEST_NAME = 12  # A column of names is folded, but not to fewer characters than this.
-_WIDEST = 1000
+_WIDEST = 1000  # Width with which the width of a whole table is measured [characters].
 
 
 def figure_table(
@@ -23,9 +23,10 @@ def figure_table(
 ) -> Table:
     """Return a table of figures and names under headings; ``notes`` are lines below it.
 
-    The unit of a heading follows its last space, and is put into a second line. A column with a unit or with numbers is
-    aligned to the right and is never cut. Other columns continue in the next line. A row of one cell is the heading of
-    the rows below. If the console is too narrow, the table is wider than it. Therefore use :func:`print_table`.
+    In a column with a unit or with numbers, the last word of the heading is the unit, and is put into a second line.
+    Such a column is aligned to the right and is never cut. Text in other columns continues in the next line. A row of
+    one cell is the heading of the rows below. If the console is too narrow, the table is wider than the console.
+    Therefore print it by :func:`print_table`.
     """
     given = list(given)
     rows = [tuple(map(_shown, row)) for row in given]
@@ -53,7 +54,8 @@ def figure_table(
 def print_table(table: Table, console: Console) -> None:
     """Print a table without cutting figures off. Its lines may be longer than those of the console.
 
-    A terminal folds the notes below the table to the table's width. A file or another program gets a line a note.
+    On a terminal, the notes below the table are folded to the table's width. A file or another program gets each note
+    in one line.
     """
     of_title, table.min_width = table.min_width, None
     widths = Measurement.get(console, console.options.update(max_width=_WIDEST), table)
@@ -71,7 +73,7 @@ def print_table(table: Table, console: Console) -> None:
 def record_table(title: str, records: Sequence[Any], notes: Sequence[str] = ()) -> Table:
     """Return a table with a row for each field of ``records``, dataclasses of one type, and a column for each record.
 
-    The first field names the columns. A field that holds several figures has one cell for all of them.
+    The values of the first field are the headings of the columns. A field with several numbers has one cell for all.
     """
     name, *others = (field.name for field in fields(records[0]))
     columns = (name, *(str(getattr(record, name)) for record in records))
@@ -82,12 +84,12 @@ def record_table(title: str, records: Sequence[Any], notes: Sequence[str] = ()) 
 
 
 def times_real_time(factor: float) -> str:
-    """Return the speed of simulated time, with two digits where it is slow."""
+    """Return the speed of simulated time in words, with two digits if it is slow."""
     return f"{factor:.1f} x real time" if factor >= 0.995 else f"{factor:.2g} x real time"
 
 
 def short_figure(value: float | None) -> str:
-    """Return about three significant digits: two decimals below 10, one decimal below 100, and none above."""
+    """Return a number with about three digits: two decimals below 10, one below 100, and none above; "-" for None."""
     if value is None:
         return "-"
     digits = 2 if abs(value) < 9.995 else 1 if abs(value) < 99.95 else 0

@@ -1,4 +1,4 @@
-"""The place of the pair of bodies that has the smallest margin."""
+"""Find the nearest points of the tightest pair: the pair of bodies with the smallest margin."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from q2r2_control.types import Array, StepReport
 
 
 class TightestPair:
-    """Finds the nearest points of the pair that a report names, in one collision model."""
+    """Finds the nearest points of the tightest pair that a report names. It uses the bodies of one collision model."""
 
     def __init__(self, model: pin.Model, pairs: pin.GeometryModel) -> None:
         self._model, self._pairs = model, pairs
@@ -20,11 +20,14 @@ class TightestPair:
         self._names = pair_names(pairs)
 
     def place(self, q: Array) -> None:
-        """Put all bodies where the posture ``q`` (nv,) has them."""
+        """Move all bodies to their poses in the posture ``q`` (nv,) [rad]."""
         pin.updateGeometryPlacements(self._model, self._data, self._pairs, self.placed, q)
 
     def ends(self, report: StepReport) -> Array | None:
-        """Return the nearest points (2, 3) of the pair, with the bodies as placed [m]; None if it is not known."""
+        """Return the nearest points (2, 3) of the pair in the world frame [m]; None if the pair is not known.
+
+        The bodies are where :meth:`place` has put them.
+        """
         if report.tightest_pair not in self._names or not math.isfinite(report.margin):
             return None
         result = pin.computeDistance(self._pairs, self.placed, self._names.index(report.tightest_pair))

@@ -1,6 +1,6 @@
-"""Faults of a headset's data, which no arm may follow. The data come through the TCP door, in MuJoCo, in simulated
-time.
+"""Faults of a headset's data, which no arm may follow.
 
-At every tick of every run the controller's contract holds, and no arm has a target that nobody engaged. An arm that was
-let go stays at rest, and a target begins at its tool and never jumps: :mod:`tests.support.headset_in_step`.
+A fake headset sends the data over TCP. The arms are simulated by MuJoCo, in simulated time. At every tick of every run,
+:mod:`tests.support.headset_in_step` checks four things: the controller's contract holds, no arm has a target before it
+is engaged, an arm that was paused stays at rest, and each target begins at its tool pose and never jumps.
 """

@@ -1,4 +1,7 @@
-"""Hands are aligned, put elsewhere and engaged again, in all stances. No arm moves unless a hand moves it."""
+"""Operators align the frame, move their hands while an arm is paused, and engage again.
+
+No arm moves unless its hand moves it.
+"""
 
 from __future__ import annotations
 
@@ -15,13 +18,17 @@ from tests.support.headset_in_step import InStepRun, Operator
 
 pytestmark = pytest.mark.slow
 
+# Displacement of the frame by an alignment, or of the hands during a pause.
 ANEW = pin.SE3(pin.exp3(np.array([0.0, 0.0, math.radians(120.0)])), np.array([0.4, 0.0, 0.0]))
-STILL = 5e-4  # [m]
+STILL = 5e-4  # Largest motion of a tool that counts as none [m].
 again_and_again = pytest.mark.parametrize("times", [10, pytest.param(100, marks=pytest.mark.soak)])
 
 
 def aligned(op: Operator, shift: float, samples: int) -> Iterator[float]:
-    """Align by the left hand's chord. After each of ``samples``, the frame moves by a share of the way to ``ANEW``."""
+    """Align by the left hand's chord. The frame moves ``samples`` samples after the buttons are pressed.
+
+    It moves by the share ``shift`` of ``ANEW``.
+    """
     op.lower.add("left")
     op.upper.add("left")
     yield samples * op.period
@@ -63,7 +70,7 @@ def test_an_alignment_by_one_hand_moves_no_arm_and_no_gripper(
 
 
 @again_and_again
-def test_an_arm_under_an_unknown_load_sinks_no_farther_when_it_resumes_again_and_again(times: int) -> None:
+def test_an_arm_under_an_unknown_load_sinks_no_farther_when_it_is_paused_and_engaged_many_times(times: int) -> None:
     def script(op: Operator) -> Iterator[float]:
         op.noise = 1e-9
         yield from op.engage()
@@ -72,7 +79,7 @@ def test_an_arm_under_an_unknown_load_sinks_no_farther_when_it_resumes_again_and
         yield from op.press(*SIDES)
         for hand, at in op.hands.items():
             op.hands[hand] = pin.SE3(ANEW.rotation @ at.rotation, at.translation + ANEW.translation)
-        yield 2.0  # The arm comes to rest on its spring.
+        yield 2.0  # The arm comes to rest on the spring of its impedance.
         marks.append(op.now)
         yield from op.press(*SIDES)
         for _ in range(2 * times):  # Each turn has a pause and an engagement.
@@ -101,20 +108,21 @@ def test_an_arm_under_an_unknown_load_sinks_no_farther_when_it_resumes_again_and
     ("mode", "mujoco", "load", "off"),
     [
         (CommandMode.TORQUE, {}, 42.0, 1e-3),
-        # With soft joints, the sag of the tool depends on the posture: it is 2.6 mm more where this arm rests at the
-        # end.
+        # With soft joints, the sag of the tool depends on the posture. Where this arm rests at the end, it is 2.6 mm
+        # more.
         (CommandMode.POSITION, {"position_stiffness": 1500.0}, 75.0, 3.5e-3),
     ],
     ids=["on the spring of torque mode", "of soft joints"],
 )
-def test_an_arm_that_hangs_by_2_cm_and_is_engaged_in_full_motion_again_and_again_has_no_lag_in_its_sag(
+def test_a_sagging_arm_that_is_engaged_many_times_during_motion_keeps_its_sag_without_lag(
     mode: CommandMode, mujoco: dict[str, object], load: float, off: float, times: int
 ) -> None:
     """The hand moves to and fro at up to 0.6 m/s.
 
-    It lets go for one sample where the tool is fastest, in both directions.
+    In each direction it releases the dead man's switch for one sample, where the tool is fastest. The commands go on
+    from the reference, and at the end the measured tool is at its target.
     """
-    turns, sampled = 30, 0.014  # Samples of a cycle, and their period [s].
+    turns, sampled = 30, 0.014  # Number of samples in a cycle of the motion, and their period [s].
 
     def script(op: Operator) -> Iterator[float]:
         op.noise, op.period = 1e-9, sampled
@@ -149,7 +157,7 @@ def test_an_arm_that_hangs_by_2_cm_and_is_engaged_in_full_motion_again_and_again
     assert math.dist(last.tools["left"].translation, target.translation) < off
 
 
-def test_an_arm_that_was_pushed_away_is_engaged_there_and_does_not_spring_back() -> None:
+def test_an_arm_that_was_pushed_away_stays_there_when_it_is_engaged() -> None:
     def script(op: Operator) -> Iterator[float]:
         yield 0.1
         op.plant.push("left", np.array([0.0, 140.0, 0.0, 0.0, 0.0, 0.0]), 2.0)

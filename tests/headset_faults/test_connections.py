@@ -1,4 +1,4 @@
-"""Connections that end, fall silent, or deliver late: both arms pause, and only a new press engages them."""
+"""Connections that end, fall silent, or deliver late: both arms stop, and only a new press engages them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.support.headset_in_step import PERIOD, InStepRun, Operator
 pytestmark = pytest.mark.slow
 
 AWAY = pin.SE3(pin.exp3(np.array([0.2, 1.0, 0.3])), np.array([0.2, -0.1, 0.3]))
-A_TICK = 0.002  # [s]
+A_TICK = 0.002  # Period of the loop [s].
 
 
 def go_elsewhere(op: Operator) -> Iterator[float]:
@@ -41,7 +41,9 @@ def break_the_protocol(headset: FakeHeadset) -> None:
 
 
 @pytest.mark.parametrize("end", [FakeHeadset.reset, break_the_protocol])
-def test_a_connection_that_ends_in_mid_motion_pauses_both_arms(end: Callable[[FakeHeadset], None]) -> None:
+def test_a_connection_that_ends_during_motion_stops_both_arms_until_a_new_press(
+    end: Callable[[FakeHeadset], None],
+) -> None:
     def script(op: Operator) -> Iterator[float]:
         yield from op.engage()
         yield from op.move((0.05, 0.05, 0.0), seconds=0.3)
@@ -56,7 +58,7 @@ def test_a_connection_that_ends_in_mid_motion_pauses_both_arms(end: Callable[[Fa
 
 
 @pytest.mark.parametrize("alive", [False, True], ids=["silent", "silent but for keepalives and buttons"])
-def test_a_headset_that_sends_no_poses_in_mid_motion_pauses_both_arms_in_time(alive: bool) -> None:
+def test_a_headset_that_stops_sending_poses_during_motion_stops_both_arms_within_the_timeout(alive: bool) -> None:
     stopped = []
 
     def script(op: Operator) -> Iterator[float]:
@@ -77,7 +79,10 @@ def test_a_headset_that_sends_no_poses_in_mid_motion_pauses_both_arms_in_time(al
 
 
 def late_by(duration: float) -> Callable[[Operator], Iterator[float]]:
-    """Return a headset at uneven 30 .. 72 Hz that loses 5 % of its samples, on a network that stands still twice."""
+    """Return a script in which the network stands still twice, for ``duration`` [s] each time.
+
+    The headset sends at an uneven rate of 30 to 72 Hz, and 5 % of its samples are lost.
+    """
 
     def script(op: Operator) -> Iterator[float]:
         random = np.random.default_rng(7)
@@ -98,13 +103,13 @@ def late_by(duration: float) -> Callable[[Operator], Iterator[float]]:
     return script
 
 
-def test_bursts_within_the_timeout_are_followed_without_a_jump() -> None:
+def test_samples_that_come_in_bursts_within_the_timeout_are_followed_without_a_jump() -> None:
     run = InStepRun(late_by(0.08))
     assert run.reasons("lost") == []
     assert run.states == {"engaged"}
 
 
-def test_bursts_of_200_ms_pause_both_arms_and_late_samples_move_nothing() -> None:
+def test_samples_held_up_for_200_ms_stop_both_arms_and_move_no_arm_when_they_come() -> None:
     run = InStepRun(late_by(0.2))
     assert "pose_silent" in run.reasons("lost")
     assert [len(run.watch.engagements(arm)) for arm in SIDES] == [1, 1]

@@ -1,4 +1,4 @@
-"""Poses that are not motions of a hand: jumps, moving frames, frozen numbers, and clocks."""
+"""Poses that change, or stay the same, without a motion of the hand: jumps, moving frames and frozen numbers."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.support.headset_in_step import InStepRun, Operator, Sender
 
 pytestmark = pytest.mark.slow
 
-# A displacement by 0.5 m and 90 degrees.
+# Displacement by 0.5 m and 90 degrees.
 AWAY = pin.SE3(pin.exp3(np.array([0.0, 0.0, 0.5 * math.pi])), np.array([0.3, -0.4, 0.0]))
 STILL = 5e-4  # Largest motion of a tool whose hand has only the noise of its sensor [m].
 
@@ -25,7 +25,7 @@ def assert_still(run: InStepRun) -> None:
 
 
 def jumping(op: Operator, hands: tuple[str, ...], count: float) -> Sender:
-    """Measure the next ``count`` samples of these hands in a frame 0.5 m and 90 degrees away."""
+    """Return a sender that moves the next ``count`` poses of ``hands`` by ``AWAY``, as a frame that has moved does."""
     left = dict.fromkeys(SIDES, 0.0) | dict.fromkeys(hands, count)
 
     def sent(hand: str, position: Array, quaternion: Array) -> bytes:
@@ -43,7 +43,7 @@ def jumping(op: Operator, hands: tuple[str, ...], count: float) -> Sender:
     [(("left",), 1), (("right",), math.inf), (SIDES, math.inf)],
     ids=["left, for one sample", "right, for good", "both, as a frame does"],
 )
-def test_a_jump_moves_no_arm_and_pauses_both(hands: tuple[str, ...], count: float) -> None:
+def test_a_jump_of_the_poses_moves_no_arm_and_stops_both_arms(hands: tuple[str, ...], count: float) -> None:
     def script(op: Operator) -> Iterator[float]:
         yield from op.engage()
         yield 0.2
@@ -72,7 +72,7 @@ def test_a_frame_that_steps_by_less_than_all_gates_moves_no_arm() -> None:
     assert_still(run)
 
 
-def test_frozen_poses_with_live_buttons_pause_both_arms_and_engage_no_arm() -> None:
+def test_frozen_poses_stop_both_arms_and_engage_no_arm_although_buttons_still_come() -> None:
     def script(op: Operator) -> Iterator[float]:
         yield from op.engage()
         yield from op.move((0.0, 0.05, 0.0), seconds=0.3)

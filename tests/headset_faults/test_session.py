@@ -1,4 +1,7 @@
-"""A session without a fault: both hands move, pause, the left one turns, resume, and close the grippers."""
+"""A session without a fault.
+
+Both hands move and pause, the left hand turns in the pause, and both engage again and close the grippers.
+"""
 
 from __future__ import annotations
 
@@ -15,9 +18,10 @@ from tests.support.processes import changes, speed
 
 pytestmark = pytest.mark.slow
 
-CIRCLE, RADIUS, SWAY = 4.0, 0.1, 0.2  # Period [s], radius [m] and sideways motion [m] of the hands.
-TURN = pin.exp3(np.array([math.radians(120.0), 0.0, 0.0]))  # Rotation of the left hand in the pause.
-shown: list[tuple[float, dict[str, pin.SE3]]] = []  # The hands, each with the time from which it is shown [s].
+CIRCLE, RADIUS, SWAY = 4.0, 0.1, 0.2  # Period [s] and radius [m] of the hands' circle, and their rotation [rad].
+TURN = pin.exp3(np.array([math.radians(120.0), 0.0, 0.0]))  # Rotation of the left hand during the pause.
+# The poses of the hands, with the time from which they are sent [s].
+shown: list[tuple[float, dict[str, pin.SE3]]] = []
 
 
 def circle(op: Operator) -> Iterator[float]:
@@ -54,7 +58,7 @@ def run() -> InStepRun:
 
 
 @pytest.mark.parametrize("arm", SIDES)
-def test_the_buttons_engage_pause_and_resume_and_the_tool_stands_still_while_the_hand_turns(
+def test_the_buttons_engage_and_pause_and_engage_again_and_the_tool_rests_while_the_hand_turns(
     run: InStepRun, arm: str
 ) -> None:
     assert changes(run.summary.events, arm)[:4] == [

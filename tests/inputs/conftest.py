@@ -17,6 +17,6 @@ def clock() -> HandClock:
 
 @pytest.fixture
 def server(clock: HandClock) -> Iterator[HeadsetServer]:
-    """Return a running server. Its time changes only in the test, so that a slow machine causes no timeout."""
+    """Return a running server. Only the test advances its clock, so that a slow machine causes no timeout."""
     with running(HeadsetServer(port=0, clock=clock)) as server:
         yield server

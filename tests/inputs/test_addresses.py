@@ -29,7 +29,7 @@ IPV6 = """fe800000000000000000000000000001 02 40 20 80 eth0
 
 @pytest.fixture
 def networks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """A computer that reaches other networks through Wi-Fi."""
+    """Make this computer look as if it had these interfaces, with the default route through Wi-Fi."""
 
     def ioctl(_: object, what: int, request: bytes) -> bytes:
         flags, address = INTERFACES[request[:16].rstrip(b"\0").decode()]
@@ -50,13 +50,13 @@ def networks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("networks")
-def test_every_connected_network_has_its_address_with_the_default_route_first() -> None:
+def test_all_addresses_of_connected_networks_are_named_and_the_default_routes_address_comes_first() -> None:
     assert reachable_addresses("0.0.0.0") == ("10.0.0.7", "192.168.1.5")
     assert reachable_addresses("::") == ("10.0.0.7", "192.168.1.5", "2001:db8::5")
     assert reachable_addresses("192.168.1.5") == ("192.168.1.5",)
 
 
-def test_a_computer_without_a_network_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_computer_without_a_network_has_a_text_instead_of_an_address(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("socket.if_nameindex", list)
     monkeypatch.setattr("q2r2_control.inputs.addresses._way_out", lambda *_: None)
     assert reachable_addresses("0.0.0.0") == (NO_NETWORK,)

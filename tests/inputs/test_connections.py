@@ -1,4 +1,4 @@
-"""Clients that are served or refused over real TCP, and the limits of strangers beside the driving headset."""
+"""Clients over real TCP: which are served, which wait or are refused, and that none disturbs the driving headset."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from tests.support.headset_server import (
     warnings,
 )
 
-HERE, ELSEWHERE = "127.0.0.1", "127.0.0.2"  # Two hosts from the view of a server.
+HERE, ELSEWHERE = "127.0.0.1", "127.0.0.2"  # Two addresses that a server takes for two hosts.
 
 
 @contextmanager
@@ -46,13 +46,16 @@ def move(headset: FakeHeadset, server: HeadsetServer, x: float = 0.0) -> None:
 
 
 def assert_refused(headset: FakeHeadset, because: bytes) -> None:
-    """Assert a refusal after a greeting. Without the greeting, the app would report an endpoint of another version."""
+    """Assert that the headset gets a handshake and then a refusal that contains ``because``.
+
+    Without a handshake, the app would report a server of another version.
+    """
     assert next_topic(headset) == "__handshake"
     assert_ended(headset, because)
 
 
 def assert_ended(headset: FakeHeadset, because: bytes) -> None:
-    """Assert that the reason is the server's last message to the app."""
+    """Assert that the server's last message to the app is an error that contains ``because``."""
     last = ("", b"")
     while (frame := headset.read_frame()) is not None:
         last = frame
@@ -64,7 +67,7 @@ def drives(server: HeadsetServer, headset: FakeHeadset) -> bool:
     return server.statistics.peer == "{}:{}".format(*headset.socket.getsockname())
 
 
-def test_a_second_headset_is_refused_with_a_reason_and_eight_hosts_get_one_line_each_while_one_drives(
+def test_while_one_headset_drives_others_are_refused_with_a_reason_and_eight_hosts_get_one_line_each(
     server: HeadsetServer, clock: HandClock, caplog: pytest.LogCaptureFixture
 ) -> None:
     hosts = [f"127.0.0.{number}" for number in range(1, 14)]
@@ -76,12 +79,12 @@ def test_a_second_headset_is_refused_with_a_reason_and_eight_hosts_get_one_line_
             clock.advance(A_LINE_LATER)
             move(first, server)
         assert server.connected
-        lines = warnings(caplog)  # The lines are read before the driver ends its connection, perhaps by a reset.
+        lines = warnings(caplog)  # Read before the driver ends its connection, since this may give another line.
     assert [f"headset {host}:" in line for host, line in zip(hosts, lines, strict=False)] == [True] * 8
     assert "refused: 127.0.0.1:" in lines[0]
 
 
-def test_a_peer_that_comes_back_after_a_silently_lost_link_takes_its_place_at_once_as_a_new_connection(
+def test_a_headset_that_comes_back_after_a_silently_lost_link_drives_at_once_as_a_new_connection(
     server: HeadsetServer, clock: HandClock, caplog: pytest.LogCaptureFixture
 ) -> None:
     with driving(server) as lost:
@@ -115,7 +118,7 @@ def test_a_newcomer_that_sends_nothing_is_refused_after_two_seconds(server: Head
         assert drives(server, idle)
 
 
-def test_at_most_four_hosts_wait_each_with_its_newest_connection(server: HeadsetServer) -> None:
+def test_at_most_four_hosts_wait_and_of_each_only_the_newest_connection(server: HeadsetServer) -> None:
     hosts = [f"127.0.0.{number}" for number in range(2, 7)]
     with connect(server):
         waiting = [connect(server, source=host) for host in (*hosts[:4], hosts[0])]
@@ -128,7 +131,7 @@ def test_at_most_four_hosts_wait_each_with_its_newest_connection(server: Headset
         headset.close()
 
 
-def test_messages_of_a_waiting_newcomer_reach_no_arm_and_its_faults_end_only_its_own_connection(
+def test_data_of_a_waiting_client_reach_no_arm_and_its_faults_end_only_its_own_connection(
     server: HeadsetServer, clock: HandClock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with driving(server) as first:
@@ -149,7 +152,7 @@ def test_messages_of_a_waiting_newcomer_reach_no_arm_and_its_faults_end_only_its
         move(first, server, 2.0)
 
 
-def test_a_server_that_stood_still_does_not_treat_a_live_headset_as_silent(
+def test_after_the_server_has_stood_still_a_headset_that_sends_does_not_count_as_silent(
     server: HeadsetServer, clock: HandClock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     selector = server._connections._selector
@@ -157,7 +160,7 @@ def test_a_server_that_stood_still_does_not_treat_a_live_headset_as_silent(
     frozen: list[bool] = []
 
     def look_and_stand_still(timeout: float) -> list[Any]:
-        """The process freezes when it has read the second headset's bytes. Those of the first one arrive meanwhile."""
+        """Freeze the process after it has read the second headset's bytes. Meanwhile the first one's bytes arrive."""
         found = look(timeout)
         if found and not frozen:
             frozen.append(True)
@@ -188,7 +191,7 @@ def test_a_flood_of_connections_does_not_keep_another_host_from_being_served(
         assert not drives(server, headset), "no more than 20 in 0.05 s"
 
         def has_had_its_turn() -> bool:
-            # If the server's thread did not run between two steps above, it accepted twenty connections only once.
+            # If the server's thread did not run between two steps above, it accepted only twenty connections in both.
             clock.advance(0.0501)
             time.sleep(0.02)
             return drives(server, headset)
@@ -220,7 +223,7 @@ def test_only_hosts_of_allowed_networks_are_served(clock: HandClock, caplog: pyt
 
 
 @pytest.mark.skipif(not socket.has_dualstack_ipv6(), reason="this machine has no IPv6")
-def test_an_allowed_ipv4_network_is_allowed_through_ipv6_too(clock: HandClock) -> None:
+def test_an_allowed_ipv4_network_is_also_allowed_through_an_ipv6_socket(clock: HandClock) -> None:
     with running(HeadsetServer("::", 0, clock=clock, allow=(ip_network("127.0.0.0/8"),))) as server:
         with FakeHeadset(("::1", server.address[1])) as headset:
             assert_refused(headset, b"::1 is not in headset.allow")
@@ -229,8 +232,10 @@ def test_an_allowed_ipv4_network_is_allowed_through_ipv6_too(clock: HandClock) -
             eventually(lambda: drives(server, headset))
 
 
-def test_a_headset_that_reads_again_is_sent_the_rest(server: HeadsetServer, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Only the network's readiness wakes the server here, because it would otherwise wait for an hour."""
+def test_a_headset_that_reads_late_still_gets_all_answers(
+    server: HeadsetServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The server's own period is set to one hour. Only a socket that becomes writable can therefore wake it."""
     monkeypatch.setattr(connections, "TURN", 3600.0)
     with connect(server) as headset:
         client = server._client
@@ -238,7 +243,7 @@ def test_a_headset_that_reads_again_is_sent_the_rest(server: HeadsetServer, monk
         for number in range(50):  # Many topics make the answers long.
             headset.send(headset.command("__publish", topic=f"{number:_>200}", message_name="std_msgs/Empty"))
         asked = 0
-        while len(client.session.outgoing) < 30000:  # The network is full when two or more answers wait.
+        while len(client.session.outgoing) < 30000:  # As soon as two or more answers wait, the socket is full.
             headset.send(headset.command("__topic_list"))
             move(headset, server)
             asked += 1

@@ -1,4 +1,4 @@
-"""The headset server over real TCP: its messages to the app, its faults, and that the loop never waits for it."""
+"""The headset server over real TCP: its messages to the app, clients with faults, and that the loop never waits."""
 
 from __future__ import annotations
 
@@ -45,7 +45,9 @@ every_dialect = pytest.mark.parametrize("dialect", DIALECTS)
 
 @every_dialect
 @pytest.mark.parametrize("slash", [False, True], ids=["bare names", "leading slash"])
-def test_a_headset_is_greeted_answered_and_its_hands_arrive(server: HeadsetServer, dialect: str, slash: bool) -> None:
+def test_a_headset_gets_a_handshake_and_answers_and_its_hands_arrive(
+    server: HeadsetServer, dialect: str, slash: bool
+) -> None:
     with FakeHeadset(server.address, dialect, slash) as headset:
         assert next_topic(headset) == "__handshake"
         headset.send(headset.registrations())
@@ -63,7 +65,9 @@ def test_a_headset_is_greeted_answered_and_its_hands_arrive(server: HeadsetServe
     assert (right.hand, right.position.tolist()) == ("right", [0.4, 0.5, 0.6])
 
 
-def test_a_pose_is_stamped_at_receipt_and_keeps_its_original_stamp(server: HeadsetServer, clock: HandClock) -> None:
+def test_a_sample_has_the_time_of_receipt_and_the_statistics_keep_the_headsets_own_stamp(
+    server: HeadsetServer, clock: HandClock
+) -> None:
     with connect(server) as headset:
         headset.send(headset.pose("left", (0.0, 0.0, 0.0), IDENTITY, frame_id="headset"))
         (first,) = collect(server, 1)
@@ -76,7 +80,7 @@ def test_a_pose_is_stamped_at_receipt_and_keeps_its_original_stamp(server: Heads
     assert (last.stamp, last.frame_id) == (12.0000005, "headset")
 
 
-def test_a_silent_server_sends_a_keepalive_and_sends_everything_without_delay(
+def test_a_server_with_nothing_to_send_sends_a_keepalive_and_no_bytes_are_delayed_to_be_joined(
     server: HeadsetServer, clock: HandClock
 ) -> None:
     with connect(server) as headset:
@@ -87,13 +91,13 @@ def test_a_silent_server_sends_a_keepalive_and_sends_everything_without_delay(
 
 
 @every_dialect
-def test_haptics_arrive_as_two_floats_clipped_to_their_range(server: HeadsetServer, dialect: str) -> None:
+def test_vibrations_arrive_as_two_floats_that_are_clipped_to_0_to_1(server: HeadsetServer, dialect: str) -> None:
     with registered(server, dialect) as headset:
         server.send_haptic(HapticFeedback("left", frequency=0.5, amplitude=7.0))
         payload = headset.read_until(HAPTIC)
         assert len(payload) == (8 if dialect == "ros1" else 12)
         assert struct.unpack("<2f", payload[-8:]) == (0.5, 1.0)
-        for value in (math.nan, -math.inf):  # These values are not sent.
+        for value in (math.nan, -math.inf):  # Vibrations with these values are not sent.
             server.send_haptic(HapticFeedback("left", value, 1.0))
             server.send_haptic(HapticFeedback("left", 1.0, value))
         server.send_haptic(HapticFeedback("right", 1.0, 1.0))
@@ -102,7 +106,7 @@ def test_haptics_arrive_as_two_floats_clipped_to_their_range(server: HeadsetServ
         assert struct.unpack("<2f", headset.read_until(HAPTIC)[-8:]) == (0.0, 0.25)
 
 
-def test_haptics_without_a_headset_or_a_subscription_do_nothing(server: HeadsetServer) -> None:
+def test_vibrations_without_a_headset_or_a_subscription_are_dropped(server: HeadsetServer) -> None:
     server.send_haptic(HapticFeedback("left", 1.0, 1.0))
     with connect(server) as headset:
         server.send_haptic(HapticFeedback("left", 1.0, 1.0))
@@ -121,7 +125,7 @@ def test_a_headset_that_does_not_read_gets_only_the_newest_vibration_and_the_nex
         network.send.side_effect = BlockingIOError  # The network behaves as if the other end did not read.
         for step in range(51):
             server.send_haptic(HapticFeedback("left", step / 50.0, 1.0))
-            time.sleep(0.001)  # In this time, an unbounded queue would grow.
+            time.sleep(0.001)  # The server's thread runs meanwhile. A queue without a bound would grow.
         headset.send(headset.pose("left", (1.0, 2.0, 3.0), IDENTITY))
         assert collect(server, 1)[0].position.tolist() == [1.0, 2.0, 3.0]
         network.send.side_effect = None
@@ -139,7 +143,7 @@ def test_a_headset_that_does_not_read_gets_only_the_newest_vibration_and_the_nex
         assert next_topic(second) == "q2r_right_hand_haptic_feedback"
 
 
-def test_a_listener_gets_every_message_in_order_and_poll_gets_no_message(clock: HandClock) -> None:
+def test_a_listener_gets_every_message_in_order_and_poll_then_returns_nothing(clock: HandClock) -> None:
     heard: list[Watched] = []
     with running(HeadsetServer(port=0, clock=clock, listener=heard.append)) as server, connect(server) as headset:
         for index in range(100):
@@ -154,7 +158,9 @@ def test_a_listener_gets_every_message_in_order_and_poll_gets_no_message(clock: 
         assert server.poll(0.0) == []
 
 
-def test_a_frozen_pose_has_its_fault_but_a_new_connection_has_no_fault(server: HeadsetServer, clock: HandClock) -> None:
+def test_a_frozen_pose_has_a_fault_and_after_a_new_connection_the_same_pose_has_none(
+    server: HeadsetServer, clock: HandClock
+) -> None:
     for expected in ([None, None, HandFault.FROZEN], [None, None]):
         with connect(server) as headset:
             assert faults(server, headset, len(expected), lambda: clock.advance(0.3)) == expected
@@ -162,7 +168,7 @@ def test_a_frozen_pose_has_its_fault_but_a_new_connection_has_no_fault(server: H
 
 
 def faults(server: HeadsetServer, headset: FakeHeadset, count: int, wait: Callable[[], None]) -> list[HandFault | None]:
-    """Return the faults of the same pose, which is sent again and again."""
+    """Send the same pose ``count`` times, and ``wait`` after each time. Return the faults of the samples."""
     found = []
     for _ in range(count):
         headset.send(headset.pose("left", (1.0, 2.0, 3.0), IDENTITY))
@@ -171,7 +177,7 @@ def faults(server: HeadsetServer, headset: FakeHeadset, count: int, wait: Callab
     return found
 
 
-def test_settings_of_a_cell_reach_the_server() -> None:
+def test_the_server_uses_the_headset_settings_of_the_cell() -> None:
     cell = load_config("config/dual_iiwa7.yaml")
     quick = cell.headset.model_copy(update={"port": 0, "frozen_time": 0.1})
     server = make_input("headset", cell.model_copy(update={"headset": quick}))
@@ -180,7 +186,7 @@ def test_settings_of_a_cell_reach_the_server() -> None:
         assert faults(server, headset, 2, lambda: time.sleep(0.15)) == [None, HandFault.FROZEN]
 
 
-def test_no_data_of_a_lost_connection_reach_the_next_one(server: HeadsetServer) -> None:
+def test_no_data_of_a_lost_connection_are_in_the_samples_of_the_next_connection(server: HeadsetServer) -> None:
     with connect(server) as first:
         first.send(first.inputs("left", lower=True) + first.pose("left", (1.0, 2.0, 3.0), IDENTITY))
         collect(server, 1)
@@ -208,7 +214,7 @@ def cut_off(headset: FakeHeadset, clock: HandClock) -> None:
     headset.close()
 
 
-# Other tests check framing and sessions. These cases are one of each kind.
+# One case of each kind of fault. Other tests check more cases of wrong frames and sessions.
 FAULTS: dict[str, tuple[Callable[[FakeHeadset, HandClock], object], str]] = {
     "silence": (lambda _, clock: clock.advance(2.1 - A_LINE_LATER), "no frame for 2 s"),
     "oversized frame": (lambda one, _: one.send(struct.pack("<I1sI", 1, b"a", 1 << 20)), "at most 1048576"),
@@ -222,7 +228,7 @@ FAULTS: dict[str, tuple[Callable[[FakeHeadset, HandClock], object], str]] = {
 
 
 @pytest.mark.parametrize("fault", list(FAULTS))
-def test_a_fault_drops_that_client_with_one_line_and_the_next_is_served(
+def test_a_client_with_a_fault_is_dropped_with_one_line_and_the_next_client_is_served(
     server: HeadsetServer, clock: HandClock, fault: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     break_down, reason = FAULTS[fault]
@@ -266,7 +272,7 @@ def test_an_unexpected_exception_is_logged_and_ends_only_that_connection(
     assert_serves(server)
 
 
-def test_poll_and_haptics_do_not_wait_for_a_snapshot_or_for_decoding(server: HeadsetServer) -> None:
+def test_poll_and_send_haptic_do_not_wait_for_the_locks_of_other_threads(server: HeadsetServer) -> None:
     with connect(server) as headset, server._session_lock, server._stream._lock:
         headset.send(headset.pose("left", (1.0, 2.0, 3.0), IDENTITY))
 
@@ -289,7 +295,7 @@ def test_an_address_that_cannot_be_bound_is_named_and_the_default_is_loopback(se
         server.start()
 
 
-def test_closing_frees_port_and_thread_and_may_come_twice(server: HeadsetServer) -> None:
+def test_close_frees_the_port_and_ends_the_thread_and_may_be_called_twice(server: HeadsetServer) -> None:
     with connect(server) as headset:
         server.close()
         server.close()

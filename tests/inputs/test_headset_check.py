@@ -1,4 +1,4 @@
-"""The report of headset-check: the direction of each hand's motion, and the advice if nothing comes."""
+"""The report of headset-check: the direction of each hand's movement, and advice if data are missing."""
 
 from __future__ import annotations
 
@@ -50,13 +50,13 @@ def moved(axes: tuple[str, str, str], way: tuple[float, float, float], duration:
         (WORLD, (0.01, 0.0, 0.0), "still"),
     ],
 )
-def test_the_dominant_direction_is_named(
+def test_the_main_direction_of_a_movement_is_named(
     axes: tuple[str, str, str], way: tuple[float, float, float], words: str
 ) -> None:
     assert moved(axes, way).in_words(5.45) == words
 
 
-def test_only_the_last_half_second_counts() -> None:
+def test_only_the_movement_of_the_last_half_second_counts() -> None:
     movement = moved(WORLD, (0.1, 0.0, 0.0))
     assert movement.in_words(5.89) == "still"
     assert movement.in_words(5.91) == "no data"
@@ -80,7 +80,7 @@ def test_hostile_positions_neither_raise_nor_hide_the_real_positions(value: floa
     ],
     ids=["this machine only", "on the network", "connected and silent", "after a lost connection"],
 )
-def test_the_advice_is_about_the_most_likely_cause(
+def test_the_advice_names_the_most_likely_cause_of_missing_data(
     changes: dict[str, Any], says: tuple[str, ...], not_said: str
 ) -> None:
     text = "\n".join(advice(replace(NOBODY, **changes)))
@@ -98,7 +98,7 @@ def with_one_arm(cell: Config, arm: str, stance: Stance) -> Config:
     return cell.model_copy(update={"arms": {arm: cell.arms[arm]}, "teleop": teleop})  # type: ignore[index]
 
 
-def test_a_run_needs_poses_and_inputs_of_each_hand_that_leads_an_arm(cell: Config) -> None:
+def test_a_run_needs_poses_and_inputs_of_each_hand_that_drives_an_arm(cell: Config) -> None:
     def of(hand: str) -> set[str]:
         return {f"q2r_{hand}_hand_pose", f"q2r_{hand}_hand_inputs"}
 
@@ -109,7 +109,7 @@ def test_a_run_needs_poses_and_inputs_of_each_hand_that_leads_an_arm(cell: Confi
 
 
 def check_of(server: HeadsetServer, cell: Config, sent: str) -> HeadsetCheck:
-    """Return the last state after the server has what a headset ``sent``, such as "left pose, right inputs"."""
+    """Return the report after a headset has ``sent`` messages, such as "left pose, right inputs"."""
     with FakeHeadset(server.address) as headset:
         topics = [words.split() for words in sent.split(", ")]
         for hand, kind in topics:
@@ -144,7 +144,7 @@ def test_the_report_names_messages_that_a_run_needs_and_that_did_not_come(
 
 
 class TwoHands:
-    """A server whose hands are where the test says, 75 times a second of its own clock."""
+    """A server with 80 samples a second of two resting hands, at ``left_y`` and -``left_y`` [m] along y."""
 
     url = None
     statistics = NOBODY
@@ -160,7 +160,7 @@ class TwoHands:
 
 
 @pytest.mark.parametrize(("left_y", "crossed"), [(0.2, False), (-0.2, True)])
-def test_swapped_controllers_are_named(left_y: float, crossed: bool, cell: Config) -> None:
+def test_the_report_warns_of_swapped_controllers(left_y: float, crossed: bool, cell: Config) -> None:
     seen: list[HeadsetCheck] = []
     check = watch_headset(TwoHands(left_y), cell, None, seen.append, lambda: True, CrossedHands(cell.teleop.axes))
     assert check.crossed is crossed

@@ -1,4 +1,4 @@
-"""The door: bounded rates, a log that counts suppressed lines, who may drive, and messages about addresses."""
+"""The listener of the headset server: bounded rates, a log with few lines, who may drive, and texts about addresses."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from q2r2_control.inputs.listener import (
 INFO, WARNING = logging.INFO, logging.WARNING
 
 
-def test_a_rate_limit_applies_to_each_period_and_does_not_carry_over() -> None:
+def test_a_rate_limit_allows_its_count_in_each_period_and_saves_nothing_for_the_next_period() -> None:
     limit = RateLimit(3, 0.5)
     assert [limit.take(10.0) for _ in range(5)] == [True, True, True, False, False]
     assert not limit.is_open(10.25)
@@ -53,7 +53,7 @@ class Lines(logging.Logger):
         self.lines.append(f"{record.levelname} {record.getMessage()}")
 
 
-def test_the_first_line_of_a_host_is_written_at_once_and_later_ones_once_a_second_with_their_number() -> None:
+def test_the_first_line_about_a_host_is_written_at_once_and_then_one_line_a_second_counts_the_others() -> None:
     lines = Lines()
     log = lines.log_of_hosts
     for index in range(3000):
@@ -81,7 +81,7 @@ def test_a_line_that_came_too_early_is_written_later_and_the_most_important_line
     assert lines.lines[2:] == ["WARNING refused (1 more left out)"]
 
 
-def test_hosts_do_not_silence_each_other_but_more_than_eight_share_a_line() -> None:
+def test_each_of_eight_hosts_has_lines_of_its_own_and_all_further_hosts_share_one_line() -> None:
     lines = Lines()
     for index in range(100):
         lines.log_of_hosts.write(f"host {index}", WARNING, f"line {index}", 10.0)
@@ -91,7 +91,7 @@ def test_hosts_do_not_silence_each_other_but_more_than_eight_share_a_line() -> N
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "::", ""])
-def test_a_server_on_every_network_names_an_address_that_can_be_typed_into_the_app(host: str) -> None:
+def test_a_server_on_all_networks_names_addresses_of_this_machine_for_the_app(host: str) -> None:
     assert written("127.0.0.1", 10007) == "127.0.0.1:10007"
     assert written("::", 10007) == "[::]:10007"
     settings = app_settings(host, 10007)
@@ -144,7 +144,7 @@ SILENT = replace(BACK, registrations=({}, {}))
         pytest.param(QUIET, replace(SILENT, since=NOW - 2.1), Admission.REFUSE, id="waited in vain"),
     ],
 )
-def test_a_client_that_sends_poses_drives_and_a_peer_that_comes_back_replaces_itself(
+def test_a_client_with_poses_replaces_a_driver_without_and_a_headset_that_comes_back_replaces_itself(
     driver: Peer | None, newcomer: Peer, verdict: Admission
 ) -> None:
     decided, reason = decide(driver, newcomer, NOW)
@@ -153,7 +153,7 @@ def test_a_client_that_sends_poses_drives_and_a_peer_that_comes_back_replaces_it
         assert (newcomer.peer if verdict is Admission.ADMIT else driver.peer) in reason
 
 
-def test_a_driver_that_lost_its_place_because_it_was_quiet_moves_no_arm() -> None:
+def test_a_driver_gives_way_only_after_the_timeout_that_stops_its_arms() -> None:
     assert 2 * STREAM_TIMEOUT < QUIET_ALLOWED < 0.5 * SILENCE_ALLOWED
     assert WAIT_ALLOWED < POSES_ALLOWED
 

@@ -1,4 +1,4 @@
-"""Frames and messages are read from bytes that were written by hand. Data that only resemble a message are refused."""
+"""Frames and messages are read from bytes that are written by hand here. Bytes that are no message are refused."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from q2r2_control.types import HandInputs
 
 ROS1, ROS2 = Dialect.ROS1, Dialect.ROS2
 
-# IEEE 754 numbers by hand, little-endian: 1.0 is 3FF0..., 2.0 is 4000..., -1.0 is BFF0..., 0.5 is 3FE0...; also floats.
+# Little-endian IEEE 754 numbers: first doubles (1.0 is 3FF0..., 2.0 is 4000...), then floats, whose names end with _F.
 ONE, TWO, MINUS_ONE, HALF, ZERO = (
     bytes.fromhex(text)
     for text in ("000000000000f03f", "0000000000000040", "000000000000f0bf", "000000000000e03f", "0000000000000000")
@@ -35,7 +35,7 @@ ONE, TWO, MINUS_ONE, HALF, ZERO = (
 ONE_F, MINUS_ONE_F, HALF_F, ZERO_F = (bytes.fromhex(text) for text in ("0000803f", "000080bf", "0000003f", "00000000"))
 CDR = bytes.fromhex("00010000")
 STAMP = bytes.fromhex("0c000000 0065cd1d")  # The stamp is 12 s and 500,000,000 ns.
-# Position 1 2 0.5, and the identity as Unity's connector sends it.
+# Position 1 2 0.5, and the identity rotation as the app sends it, with w = -1.
 NUMBERS = ONE + TWO + HALF + ZERO + ZERO + ZERO + MINUS_ONE
 
 POSES = {
@@ -54,17 +54,17 @@ every_kind = pytest.mark.parametrize("kind", list(PAYLOADS))
 
 
 def pose_with_frame(dialect: Dialect, frame_id: bytes) -> bytes:
-    """Return a pose whose ``frame_id`` has these bytes on the wire. In ROS 2 they end with NUL."""
+    """Return the bytes of a pose whose ``frame_id`` has these bytes. In the dialect ROS2 they have to end with NUL."""
     length = len(frame_id).to_bytes(4, "little")
     if dialect is ROS1:
-        # The number 256 of the sequence looks like an encapsulation.
+        # The first four bytes are the sequence number 256, which looks like the encapsulation of a ROS2 message.
         return bytes.fromhex("00010000") + STAMP + length + frame_id + NUMBERS
     text = STAMP + length + frame_id
     return CDR + text + b"\xaa" * (-len(text) % 8) + NUMBERS
 
 
 @every_dialect
-def test_messages_are_read_as_sent_including_their_stamp_and_w_of_minus_one(dialect: Dialect) -> None:
+def test_messages_are_read_as_they_were_sent_including_the_stamp_and_a_w_of_minus_one(dialect: Dialect) -> None:
     pose, twist, inputs = (decode(kind, payload[dialect], dialect) for kind, payload in PAYLOADS.items())
     assert isinstance(pose, HandPose)
     assert isinstance(twist, HandTwist)
@@ -78,7 +78,7 @@ def test_messages_are_read_as_sent_including_their_stamp_and_w_of_minus_one(dial
 
 @every_dialect
 @pytest.mark.parametrize("name", ["map", "träume"])
-def test_a_frame_id_shifts_the_pose_and_is_kept(dialect: Dialect, name: str) -> None:
+def test_a_pose_after_a_frame_id_of_any_length_is_read_and_the_frame_id_is_kept(dialect: Dialect, name: str) -> None:
     wire_name = name.encode() + (b"\0" if dialect is ROS2 else b"")
     pose = decode(MessageType.POSE, pose_with_frame(dialect, wire_name), dialect)
     assert isinstance(pose, HandPose)
@@ -161,7 +161,7 @@ def test_random_and_mutated_bytes_raise_nothing_but_protocol_errors() -> None:
     assert 1800 < refused < 2400
 
 
-# These bytes are written by hand from the protocol: length 4, "/abc", length 3, "xyz".
+# A frame by the protocol: length 4, "/abc", length 3, "xyz".
 ABC = b"\x04\x00\x00\x00/abc\x03\x00\x00\x00xyz"
 ABC_NUL = b"\x05\x00\x00\x00/abc\x00\x03\x00\x00\x00xyz"
 
@@ -177,7 +177,7 @@ def frames(*chunks: bytes) -> list[WireFrame]:
     return found
 
 
-def test_a_frame_is_read_and_written_as_by_hand_and_only_one_nul_is_removed() -> None:
+def test_a_frame_has_the_bytes_of_the_protocol_and_only_one_nul_is_removed() -> None:
     assert encode_frame("/abc", b"xyz") == ABC
     assert frames(ABC) == [WireFrame("/abc", b"xyz", terminated=False)]
     assert frames(KEEPALIVE) == [WireFrame("", b"", terminated=False)]

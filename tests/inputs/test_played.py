@@ -1,4 +1,4 @@
-"""Headset errors added to exact poses: noise of the wanted size, uneven times, and other errors only if asked for."""
+"""Errors of a headset that are added to exact poses: noise and uneven times, and other errors only if asked for."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ HAND = pin.SE3(pin.exp3(np.array([0.3, -0.2, 0.9])), np.array([0.4, 0.2, 1.1]))
 
 
 def measured(sampling: SampleTiming, count: int) -> tuple[Array, Array]:
-    """Return times (n,) [s] of a resting hand's samples and their errors (n, 6): position [m], rotation [rad]."""
+    """Sample a resting hand. Return the times (n,) [s] and the errors (n, 6) of position [m] and rotation [rad]."""
     times, added = [], []
     for t in islice(sampling.times(), count):
         pose = sampling.measured(HAND, t)
@@ -26,7 +26,7 @@ def measured(sampling: SampleTiming, count: int) -> tuple[Array, Array]:
     return np.array(times), np.array(added)
 
 
-def test_even_samples_are_exact_and_at_once() -> None:
+def test_even_samples_are_exact_and_received_without_delay() -> None:
     times, added = measured(EvenSampling(50.0), 101)
     np.testing.assert_allclose(times, 0.02 * np.arange(101), rtol=1e-15)
     np.testing.assert_allclose(added, 0.0, atol=1e-12)
@@ -43,7 +43,7 @@ def test_headset_noise_has_the_wanted_size_and_no_sample_is_lost(noise: float) -
     assert 1.0 / 72.5 < gaps.max() <= 1.0 / 72.0
 
 
-def test_tremor_and_dropouts_come_at_the_wanted_times() -> None:
+def test_tremor_and_dropouts_have_the_wanted_size_and_length() -> None:
     times, added = measured(HeadsetSampling("right", 3, tremor=True, dropout_probability=0.005), 4000)
     assert 0.3e-3 < added[:, :3].std(axis=0).max() < 1e-3
     assert 0.02 < np.diff(times).max() < 6.0 / 72.0

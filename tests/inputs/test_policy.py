@@ -1,4 +1,4 @@
-"""Actions of a policy are checked where they come in, and one line names each fault."""
+"""The policy input checks each action, and tells each fault in one line."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_the_policy_input_is_a_policy_source() -> None:
     assert isinstance(opened(), PolicySource)
 
 
-def test_joint_positions_become_tool_poses_and_the_posture() -> None:
+def test_joint_positions_of_an_action_become_tool_poses_and_a_posture() -> None:
     q = robot().home + 0.1
     chunk = sent(opened(), [[*q, 0.3, 2.0]], [5.0])
     assert chunk.fault is None
@@ -115,7 +115,7 @@ def test_a_quaternion_that_is_not_a_rotation_is_named() -> None:
     assert "action 0: the quaternion of right has the length 0" in sentence(chunk.fault)
 
 
-def test_a_policy_is_asked_on_its_own_thread_and_again_when_half_of_its_actions_are_over() -> None:
+def test_a_policy_runs_on_its_own_thread_and_is_called_again_when_half_of_its_actions_are_over() -> None:
     threads: list[str] = []
     chunks: list[ActionChunk] = []
 
@@ -141,7 +141,7 @@ def test_a_policy_is_asked_on_its_own_thread_and_again_when_half_of_its_actions_
 
 
 def asked(policy: PolicyInput, time: float = 1.0) -> str:
-    """Return the sentence of the fault after a policy was asked in simulated time."""
+    """Call the policy with an observation, and return the sentence about the fault of its actions."""
     policy.observe(observed(time))
     (chunk,) = policy.chunks()
     assert chunk.fault is not None
@@ -176,13 +176,13 @@ def test_the_traceback_of_a_policy_is_logged_once_for_each_error(caplog: pytest.
     assert "_ask" not in first, "the traceback begins in the policy"
 
 
-def test_a_policy_that_returns_nothing_gets_a_message_about_that() -> None:
+def test_a_policy_that_returns_none_is_a_fault_that_says_so() -> None:
     told = asked(of_function(lambda seen: None))
     assert told.endswith("the policy returned None; allowed: an array of actions (n, size)")
 
 
 @pytest.mark.parametrize("error", [SystemExit(3), GeneratorExit()], ids=repr)
-def test_a_policy_that_ends_its_thread_is_named_and_asked_again(error: BaseException) -> None:
+def test_a_policy_that_raises_an_exit_is_a_fault_and_is_called_again(error: BaseException) -> None:
     def leaves(observation: Observation) -> Array:
         raise error
 
@@ -213,7 +213,9 @@ def test_a_signal_that_ends_the_program_is_not_a_fault_of_the_policy() -> None:
         asked(of_function(interrupted))
 
 
-def test_the_command_line_names_a_policy_of_this_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_policy_is_found_by_its_name_in_the_working_directory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "my_policy.py").write_text(
         "class Still:\n    rate = 20.0\n    def __call__(self, seen): return seen.state.q\n"
     )

@@ -1,6 +1,6 @@
-"""Poses that are not motions of the hands are found, but human motions pass.
+"""Samples of hands: joining data that arrive separately, a queue for the loop, and poses that must not be followed.
 
-Samples join data that arrive separately.
+Frozen poses and a moving frame are faults. Human motions are not.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def test_each_sample_has_the_newest_pose_and_inputs_with_their_receipt_times_and
         tracker.update("left", HandInputs(), 10.4),
         tracker.update("left", pose(3.0), 10.5),
         tracker.update("left", HandTwist(np.zeros(3), np.zeros(3)), 10.6),
-        tracker.update("right", PRESSED, 10.7),  # The right hand waits for its first pose.
+        tracker.update("right", PRESSED, 10.7),  # There is no sample of the right hand before its first pose.
         tracker.update("right", pose(4.0), 10.8),
     ]
     assert [one and (one.position[0], one.pose_stamp, one.inputs, one.inputs_stamp, one.fault) for one in made] == [
@@ -64,7 +64,7 @@ def test_a_full_queue_keeps_the_newest_samples() -> None:
     assert [one.pose_stamp for one in queue.take()] == [float(index) for index in range(1000 - SAMPLES_KEPT, 1000)]
 
 
-def test_a_cut_is_reported_at_one_tick_whether_it_came_before_or_after_the_samples_were_taken() -> None:
+def test_a_loop_notices_a_lost_connection_whether_it_checks_before_or_after_it_takes_the_samples() -> None:
     for look_first in (True, False):
         queue = SampleQueue()
         queue.put(sample(1.0))
@@ -81,7 +81,7 @@ def test_a_cut_is_reported_at_one_tick_whether_it_came_before_or_after_the_sampl
 
 
 Message = tuple[float, str, HandPose | HandInputs]
-STEP_AT = 30 * PERIOD  # [s]
+STEP_AT = 30 * PERIOD  # Time at which the frame steps [s].
 CHORD, RELEASED = HandInputs(button_upper=True, button_lower=True), HandInputs()
 
 
@@ -99,7 +99,7 @@ def faults(watched: Iterable[Watched]) -> set[tuple[str, HandFault]]:
 
 
 def moved(samples: Iterable[Message], by: Callable[[float, str], pin.SE3]) -> Iterator[Message]:
-    """Return the same pose in a frame that has moved."""
+    """Yield the poses as seen in a frame that moves. ``by`` is its motion at a time [s], for a hand."""
     for t, hand, pose in samples:
         assert isinstance(pose, HandPose)
         rotation = pin.Quaternion(pose.quaternion).matrix()
@@ -107,7 +107,7 @@ def moved(samples: Iterable[Message], by: Callable[[float, str], pin.SE3]) -> It
 
 
 def stepped(shift: float, degrees: float, hands: tuple[str, ...] = SIDES) -> Callable[[float, str], pin.SE3]:
-    """Return a frame that moves once, by ``shift`` [m] and about the vertical."""
+    """Return the motion of a frame that steps once, by ``shift`` [m] and by ``degrees`` about the vertical axis."""
     step = pin.SE3(pin.exp3(np.array([0.0, 0.0, math.radians(degrees)])), shift * np.array([0.6, 0.0, 0.8]))
     return lambda t, hand: step if t >= STEP_AT and hand in hands else pin.SE3.Identity()
 
@@ -124,11 +124,11 @@ def test_a_pose_that_stays_equal_to_the_last_bit_is_frozen_whatever_its_stamp() 
     assert found == [t for t, _, _ in still if t >= 0.5]
     changed = replace(pose, position=np.nextafter(pose.position, 1e9))
     assert handed_on([*still, (1.0, "left", changed)])[-1].fault is None
-    # A hand at rest has the noise of its sensor.
+    # A real hand at rest is not frozen, since its sensor has noise.
     assert faults(handed_on(TwoHands(rest, 1, (0.0, 0.0), tremor=False, noise=1e-7).samples(2.0))) == set()
 
 
-def test_a_hand_that_keys_move_may_rest_without_noise() -> None:
+def test_a_hand_that_is_moved_by_keys_may_rest_without_noise() -> None:
     (_, _, pose), *_ = resting()
     watch = HandsWatch()
     virtual = Reception("q2r_left_hand_pose", "left", pose, virtual=True)
@@ -139,7 +139,7 @@ def test_a_hand_that_keys_move_may_rest_without_noise() -> None:
 
 @pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize(("shift", "degrees"), [(0.015, 0.0), (0.0, 3.0), (0.4, 120.0)], ids=str)
-def test_a_frame_that_steps_is_a_fault_of_both_hands_from_its_first_pose(
+def test_a_step_of_the_frame_is_a_fault_of_both_hands_from_the_first_pose_after_it(
     shift: float, degrees: float, seed: int
 ) -> None:
     watched = handed_on(moved(resting(seed), stepped(shift, degrees)))
@@ -153,7 +153,7 @@ def test_a_frame_that_steps_is_a_fault_of_both_hands_from_its_first_pose(
     assert len(after) > len(bad)
 
 
-def test_a_step_of_one_hand_is_passed_on_in_order_so_that_the_gate_judges_it() -> None:
+def test_poses_after_a_step_of_one_hand_are_passed_on_in_order_so_that_the_gate_judges_them() -> None:
     for hand in SIDES:
         samples = list(moved(resting(), stepped(0.3, 0.0, (hand,))))
         watched = handed_on(samples)
@@ -164,7 +164,7 @@ def test_a_step_of_one_hand_is_passed_on_in_order_so_that_the_gate_judges_it() -
             assert stamps == sorted(stamps)
 
 
-def test_a_hand_does_not_wait_for_another_hand_that_is_absent() -> None:
+def test_the_pose_of_one_hand_does_not_wait_for_a_hand_that_sends_nothing() -> None:
     alone = [message for message in moved(resting(), stepped(0.1, 0.0)) if message[1] == "right"]
     watch = HandsWatch()
     for t, hand, pose in alone:
@@ -173,7 +173,7 @@ def test_a_hand_does_not_wait_for_another_hand_that_is_absent() -> None:
 
 @pytest.mark.parametrize("begins", [-0.03, 0.0001, 0.02], ids=str)
 @pytest.mark.parametrize("first", SIDES)
-def test_an_alignment_is_not_a_fault_whether_buttons_or_poses_come_first(first: str, begins: float) -> None:
+def test_an_alignment_is_no_fault_whether_the_buttons_or_the_poses_come_first(first: str, begins: float) -> None:
     messages = [*moved(resting(), stepped(0.3, 60.0)), (STEP_AT + begins, first, CHORD)]
     messages.append((STEP_AT + begins + 0.15, first, RELEASED))
     watched = handed_on(sorted(messages, key=lambda message: message[0]))
@@ -181,7 +181,7 @@ def test_an_alignment_is_not_a_fault_whether_buttons_or_poses_come_first(first: 
     assert watched[-1].stamp == max(t for t, _, _ in messages)
 
 
-def test_after_the_chord_is_let_go_a_step_is_a_fault_again() -> None:
+def test_after_the_release_of_the_chord_a_step_of_the_frame_is_a_fault_again() -> None:
     chord = [(0.05, "left", CHORD), (0.15, "left", RELEASED)]
     messages = sorted([*moved(resting(), stepped(0.1, 0.0)), *chord], key=lambda message: message[0])
     assert {hand for hand, _ in faults(handed_on(messages))} == set(SIDES)
@@ -189,7 +189,7 @@ def test_after_the_chord_is_let_go_a_step_is_a_fault_again() -> None:
 
 def test_a_frame_that_turns_with_the_head_is_a_fault_of_both_hands() -> None:
     def nodding(t: float, hand: str) -> pin.SE3:
-        """Return poses under a head that turns by 35 degrees in 1.2 s."""
+        """Return the motion of a frame that follows the head, which turns by 35 degrees in 1.2 s."""
         return pin.SE3(pin.exp3(np.array([0.0, 0.0, math.radians(35.0) * minimum_jerk(t / 1.2)])), np.zeros(3))
 
     coupled = list(moved(TwoHands(rest, 3, (0.0, 0.0), tremor=False).samples(1.5), nodding))
@@ -199,7 +199,7 @@ def test_a_frame_that_turns_with_the_head_is_a_fault_of_both_hands() -> None:
 
 @pytest.mark.parametrize("tremor", [True, False], ids=["trembling", "without tremor"])
 @pytest.mark.parametrize("seed", [0, 1])
-def test_human_hands_on_a_light_box_are_not_a_moving_frame(
+def test_human_hands_that_carry_a_light_box_are_not_taken_for_a_moving_frame(
     seed: int, tremor: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("_CARRIED_TOLERANCE", "_STEP_TOLERANCE"):
@@ -209,7 +209,7 @@ def test_human_hands_on_a_light_box_are_not_a_moving_frame(
 
 
 def snatch(t: float) -> pin.SE3:
-    """Move both hands by 0.2 m, to and fro, from rest to 1.2 m/s at 18 m/s^2 and then into a sudden stop."""
+    """Return the motion of both hands: 0.2 m to and fro, at 18 m/s^2 up to 1.2 m/s, and each time a sudden stop."""
     stroke, phase = divmod(t, 0.4)
     ramp = 1.2 / 18.0
     way = min(9.0 * min(phase, ramp) ** 2 + 1.2 * max(phase - ramp, 0.0), 0.2)
@@ -217,7 +217,7 @@ def snatch(t: float) -> pin.SE3:
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_hands_that_start_as_fast_as_possible_with_samples_lost_and_late_are_not_a_moving_frame(seed: int) -> None:
+def test_fast_hands_with_lost_and_late_samples_are_not_taken_for_a_moving_frame(seed: int) -> None:
     random = np.random.default_rng(seed)
     lost = {index for index in range(600) if random.random() < 0.05}
     samples = [
@@ -230,8 +230,8 @@ def test_hands_that_start_as_fast_as_possible_with_samples_lost_and_late_are_not
     assert len(watched) >= len(samples) - 1
 
 
-def test_hands_that_start_together_while_samples_are_lost_do_not_look_like_a_moved_frame() -> None:
-    """The hands accelerate with 16 m/s^2 for 60 ms, without anything that distinguishes them from one rigid body."""
+def test_hands_that_start_together_while_samples_are_lost_are_not_taken_for_a_moved_frame() -> None:
+    """Both hands accelerate at 16 m/s^2 for 60 ms, exactly like one rigid body. All samples of this time are lost."""
 
     def reach(t: float) -> pin.SE3:
         return pin.SE3(np.eye(3), np.array([0.0, 8.0 * min(max(t - STEP_AT, 0.0), 0.06) ** 2, 0.0]))

@@ -1,4 +1,4 @@
-"""Scripted hands: the properties that the demo and the tracking tests need."""
+"""Scripted hands: the properties on which the demo and the tests of tracking rely."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_equal_seeds_give_equal_samples_for_any_times_of_polling() -> None:
     assert flat(often)[: len(seldom)] == flat(seldom)
 
 
-def test_stamps_are_on_the_callers_clock_and_never_in_its_future() -> None:
+def test_stamps_are_by_the_callers_clock_and_never_later_than_now() -> None:
     script = ScriptedInput("circle", human=True)
     script.start()
     last = dict.fromkeys(SIDES, -math.inf)
@@ -53,7 +53,7 @@ def test_hands_move_smoothly_slowly_and_within_reach(trajectory: str, hand: str)
     script, dt = ScriptedInput(trajectory), 0.01
     poses = [script.hand_pose(hand, tick * dt) for tick in range(2100)]
     way = np.array([pose.translation - poses[0].translation for pose in poses])
-    # Some hands reach farther than a precise tool.
+    # A hand with precision moves farther than its tool.
     lowest = -0.211 if trajectory == "peg" else -0.164 if trajectory in WORKS else 0.0
     assert way[:, 2].min() > lowest - 1e-9
     assert np.abs(way).max() <= (0.355 if trajectory == "carry" else 0.25) + 1e-9
@@ -71,7 +71,7 @@ def test_hands_move_smoothly_slowly_and_within_reach(trajectory: str, hand: str)
 
 
 @EVERY
-def test_the_hands_are_still_from_the_first_press_until_the_arm_is_engaged(trajectory: str) -> None:
+def test_the_hands_rest_until_the_first_press_has_engaged_the_arms(trajectory: str) -> None:
     samples = [s for s in play(ScriptedInput(trajectory), 2.0) if s.pose_stamp < 1.1]
     assert any(s.inputs.button_lower for s in samples)
     assert not samples[0].inputs.button_lower
@@ -86,7 +86,7 @@ def test_the_right_hand_mirrors_the_left() -> None:
         np.testing.assert_allclose(reflection @ left @ reflection, right, atol=1e-12)
 
 
-def test_no_sample_comes_before_start_or_after_close_and_samples_wait_while_nobody_polls() -> None:
+def test_samples_come_only_between_start_and_close_and_the_motion_waits_while_nobody_polls() -> None:
     script = ScriptedInput("circle", hands=("left",))
     assert (script.connected, script.poll(0.0)) == (False, [])
     script.start()
@@ -126,7 +126,7 @@ def test_a_wrong_setting_is_refused_with_what_is_allowed(arguments: dict[str, ob
 
 
 @pytest.mark.parametrize("trajectory", ["circle", "meet"])
-def test_the_motion_for_an_iiwa_equals_the_written_one_to_the_bit(trajectory: str) -> None:
+def test_on_an_iiwa_the_motion_equals_the_written_motion_bit_for_bit(trajectory: str) -> None:
     written = flat(play(ScriptedInput(trajectory), 4.0))
     for name in ("dual_iiwa7", "dual_iiwa14", "iiwa7"):
         assert flat(play(ScriptedInput.from_config(load_config(f"config/{name}.yaml"), trajectory), 4.0)) == written
@@ -144,7 +144,7 @@ def test_shorter_arms_move_shorter_distances_and_turn_by_the_same_angles() -> No
         np.testing.assert_allclose(ways[1], 0.82 / 1.12 * ways[0], rtol=1e-3)
 
 
-def test_way_points_begin_at_the_tools_of_the_shipped_cell() -> None:
+def test_the_home_of_the_way_points_is_where_the_tools_of_the_shipped_cell_are_at_home() -> None:
     robot = Robot.from_config(load_config("config/dual_iiwa7.yaml"))
     for arm, home in HOME.items():
         np.testing.assert_allclose(robot.tool_pose(robot.home, arm).translation, home, atol=1e-4)
@@ -162,7 +162,7 @@ def test_every_work_has_rising_times_and_ends_at_home_with_open_grippers(work: H
 
 
 @pytest.mark.parametrize("name", ["meet+grasp", "handover+stack"])
-def test_the_steps_of_works_come_in_order_and_with_the_name_of_the_work(name: str) -> None:
+def test_the_steps_of_several_works_are_in_order_and_each_begins_with_the_name_of_its_work(name: str) -> None:
     trajectory = trajectory_named(name)
     begins, words = zip(*trajectory.steps, strict=True)
     assert begins == tuple(sorted(begins))
@@ -186,7 +186,7 @@ def test_works_in_sequence_do_the_same_as_each_work_alone() -> None:
         assert both.upper_presses[hand] == pytest.approx(presses)
 
 
-def test_a_hand_with_precision_moves_four_times_as_far_as_the_tool_and_pushes_its_stick() -> None:
+def test_with_precision_a_hand_moves_four_times_as_far_as_the_tool_and_pushes_its_stick() -> None:
     trajectory, tool = trajectory_named("peg"), WayPoints(WORKS["peg"].tools["right"])
     ((begins, ends),) = trajectory.precise
     for first, last, farther in ((3.0, begins, 1.0), (begins, ends, 4.0), (ends, 24.0, 1.0)):
@@ -198,7 +198,7 @@ def test_a_hand_with_precision_moves_four_times_as_far_as_the_tool_and_pushes_it
     assert not trajectory_named("meet").precise
 
 
-def test_the_hand_is_where_its_way_points_say_and_rests_at_each() -> None:
+def test_a_motion_reaches_its_way_points_in_time_and_rests_at_each() -> None:
     way = WayPoints([(1.0, 0.0, 0.0, 0.0, 0.0, 0.0), (2.0, 0.1, 0.0, 0.2, 0.0, 0.0), (4.0, 0.1, -0.3, 0.2, 0.4, 1.2)])
     for t, place, tilt, turn in (
         (0.0, (0.0, 0.0, 0.0), 0.0, 0.0),
@@ -216,7 +216,7 @@ def test_the_hand_is_where_its_way_points_say_and_rests_at_each() -> None:
 
 
 @pytest.mark.slow
-def test_shaky_hands_are_lost_for_a_second_engage_again_and_complete_the_work() -> None:
+def test_the_headset_loses_shaky_hands_for_a_second_and_they_engage_again_and_complete_the_work() -> None:
     for seed in range(20):
         calm, hasty = trajectory_named("carry"), hurried(trajectory_named("carry"), seed)
         assert hasty.duration is not None
@@ -239,7 +239,7 @@ def test_shaky_hands_are_lost_for_a_second_engage_again_and_complete_the_work() 
         assert np.ptp(way, axis=0) == pytest.approx((0.14, 0.15, 0.148), abs=1e-3)
 
 
-def test_shaky_hands_tremble_twice_as_far_and_slower() -> None:
+def test_shaky_hands_tremble_twice_as_far_and_at_a_lower_frequency() -> None:
     def trembling(shaky: bool) -> tuple[float, float]:
         sampling = HeadsetSampling("left", 1, position_noise=0.0, tremor=True, shaky=shaky)
         x = [sampling.measured(pin.SE3.Identity(), t).translation[0] for t in np.arange(0.0, 10.0, 0.005)]
@@ -252,7 +252,7 @@ def test_shaky_hands_tremble_twice_as_far_and_slower() -> None:
     assert most == pytest.approx(2.0 * least, rel=0.2)
 
 
-def test_hands_reach_for_parts_where_the_seed_places_them() -> None:
+def test_hands_reach_for_the_parts_where_the_seed_has_shifted_them() -> None:
     places = {seed: place_of(seed, 0.02) for seed in range(20)}
     assert len(set(places.values())) == 20
     assert 0.015 < np.abs(list(places.values())).max() <= 0.02

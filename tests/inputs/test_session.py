@@ -1,4 +1,4 @@
-"""The messages of a client and the answers to them, byte for byte, without sockets."""
+"""The protocol of one client: its messages and the server's answers, byte for byte, without sockets."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def session() -> HeadsetSession:
     return new
 
 
-def test_the_first_message_is_the_handshake_with_a_version_that_the_app_accepts() -> None:
+def test_the_servers_first_message_is_a_handshake_with_a_version_that_the_app_accepts() -> None:
     ((name, payload),) = answers(HeadsetSession())
     handshake = json.loads(payload)
     assert name == "__handshake"
@@ -86,7 +86,9 @@ def test_a_change_of_dialect_ends_the_session(session: HeadsetSession, dialect: 
 
 
 @every_dialect
-def test_a_registration_can_be_removed_even_if_it_does_not_exist(session: HeadsetSession, dialect: Dialect) -> None:
+def test_a_registration_can_be_removed_and_removing_it_again_is_no_error(
+    session: HeadsetSession, dialect: Dialect
+) -> None:
     session.receive(command(dialect, "__publish", topic="a", message_name="std_msgs/Empty"))
     session.receive(command(dialect, "__subscribe", topic="b", message_name="std_msgs/Empty"))
     for _ in range(2):
@@ -200,7 +202,7 @@ def test_data_on_unknown_topics_are_ignored_and_counted_for_a_bounded_number_of_
 
 
 @pytest.mark.parametrize("name", ["__publish", "__subscribe"])
-def test_registrations_are_bounded(session: HeadsetSession, name: str) -> None:
+def test_a_client_that_registers_too_many_topics_is_dropped(session: HeadsetSession, name: str) -> None:
     for index in (0, *range(MAX_TOPICS)):
         session.receive(command(Dialect.ROS2, name, topic=f"topic_{index}", message_name="a/B"))
     with pytest.raises(ProtocolError, match="topics registered"):
@@ -213,7 +215,7 @@ def test_a_destination_that_no_topic_can_have_ends_the_session(session: HeadsetS
         session.receive(frame(Dialect.ROS1, name, b"x"))
 
 
-def test_answers_to_a_client_that_never_reads_are_bounded(session: HeadsetSession) -> None:
+def test_a_client_that_leaves_too_many_answers_unread_is_dropped(session: HeadsetSession) -> None:
     question = command(Dialect.ROS2, "__topic_list")
     session.receive(question)
     for _ in range(MAX_OUTGOING_BYTES // len(session.outgoing) - 1):
@@ -223,14 +225,16 @@ def test_answers_to_a_client_that_never_reads_are_bounded(session: HeadsetSessio
 
 
 @every_dialect
-def test_haptics_go_to_the_subscribed_spelling_in_the_dialect(session: HeadsetSession, dialect: Dialect) -> None:
+def test_vibrations_go_to_the_topic_as_the_client_wrote_it_in_the_clients_dialect(
+    session: HeadsetSession, dialect: Dialect
+) -> None:
     session.receive(command(dialect, "__subscribe", topic="/" + HAPTIC, message_name="a/B"))
     session.queue_haptic(HapticFeedback("left", 0.5, 1.0))
     header = b"\0\1\0\0" if dialect is Dialect.ROS2 else b""
     assert answers(session) == [("/" + HAPTIC, header + bytes.fromhex("0000003f 0000803f"))]
 
 
-def test_no_haptics_go_to_a_client_without_a_subscription_or_after_its_end(session: HeadsetSession) -> None:
+def test_no_vibrations_go_to_a_client_that_has_not_subscribed_or_has_unsubscribed(session: HeadsetSession) -> None:
     session.queue_haptic(HapticFeedback("left", 0.5, 1.0))
     session.receive(command(Dialect.ROS2, "__subscribe", topic=HAPTIC, message_name="a/B"))
     session.queue_haptic(HapticFeedback("right", 0.5, 1.0))

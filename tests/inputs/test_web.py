@@ -1,4 +1,4 @@
-"""A page's hands: dragging moves the tool equally, letting go pauses it, and silence or a closed page stops the arm."""
+"""An input whose hands are dragged on a page: a drag moves the tool, and a page that fails stops the arm."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from q2r2_control.types import Array
 from tests.pipeline.loops import pipeline
 from tests.support.processes import cell, changes
 
-BEGIN, END = 0.2, 0.8  # Begin and end of the drag [s].
-WAY = np.array([0.03, 0.0, 0.05])  # [m]
+BEGIN, END = 0.2, 0.8  # Times at which the drag begins and ends [s].
+WAY = np.array([0.03, 0.0, 0.05])  # Displacement by the drag [m].
 
 
 class Page:
-    """A page that drags the left tool, with 50 answers a second."""
+    """A page that drags the left tool, and sends its pose 50 times a second."""
 
     def __init__(self, silent_at: float = np.inf, gone_at: float = np.inf) -> None:
         self.now, self.next = 0.0, BEGIN
@@ -43,7 +43,7 @@ class Page:
         self.next = self.next + 0.02 if tick.t < END else np.inf
 
 
-def test_a_drag_moves_the_tool_by_the_same_distance_and_letting_go_pauses_it() -> None:
+def test_a_drag_moves_the_tool_by_the_same_distance_and_the_arm_pauses_when_the_drag_ends() -> None:
     page = Page()
     summary = page.loop.run(1.5, realtime=False)
     engaged, paused = changes(list(summary.events), "left")
@@ -58,7 +58,7 @@ def test_a_drag_moves_the_tool_by_the_same_distance_and_letting_go_pauses_it() -
     [(Page(silent_at=0.4), "pose_silent"), (Page(gone_at=0.4), "connection_lost")],
     ids=["falls silent", "is gone"],
 )
-def test_a_page_that_fails_stops_the_arm(page: Page, reason: str) -> None:
+def test_a_page_that_falls_silent_or_is_gone_stops_the_arm(page: Page, reason: str) -> None:
     summary = page.loop.run(1.2, realtime=False)
     assert changes(list(summary.events), "left")[-1] == ("engaged", "lost", reason)
     assert page.tools[-1] == pytest.approx(page.tools[-100], abs=1e-6)

@@ -17,7 +17,7 @@ from q2r2_control.teleop.teleop import Teleop
 from q2r2_control.types import SIDES, ArmTarget, Array, HandInputs, HandSample
 from tests.support.reasons import kinds
 
-TICK = 0.001
+TICK = 0.001  # Period of the loop [s].
 PERIOD = 0.013  # Period of the hands' samples [s].
 
 
@@ -52,12 +52,13 @@ class Operator:
     commanded: dict[str, pin.SE3] | None = None
     in_step: bool = True
     obstacles: dict[str, Reason] = field(default_factory=dict)
-    lower: set[str] = field(default_factory=set)  # Hands that hold the button.
-    upper: set[str] = field(default_factory=set)
-    # Displacements of other controls, by the names of their bindings.
+    lower: set[str] = field(default_factory=set)  # Hands that hold the lower button.
+    upper: set[str] = field(default_factory=set)  # Hands that hold the upper button.
+    # By control, how far it is pushed, from 0 to 1. The names of the controls are those of the bindings.
     held: dict[str, float] = field(default_factory=dict)
-    only: str | None = None  # The hand that pushes them; None if both do.
+    only: str | None = None  # The hand that pushes the controls in ``held``; None if both hands do.
     silent: set[str] = field(default_factory=set)  # Hands that send nothing.
+    # Changes each sample before it is sent.
     alter: Callable[[HandSample], HandSample] = lambda received: received
     events: list[Event] = field(default_factory=list)
     targets: dict[str, ArmTarget] = field(default_factory=dict)
@@ -67,7 +68,7 @@ class Operator:
         self._next_sample = self.now
 
     def samples(self) -> list[HandSample]:
-        """Return the data that both hands send now."""
+        """Return the samples that the hands send now."""
         found = [
             sample(hand, self.hands[hand], self.now, lower=hand in self.lower, upper=hand in self.upper)
             for hand in SIDES
@@ -95,7 +96,10 @@ class Operator:
     def run(
         self, duration: float, move: Callable[[float], dict[str, pin.SE3]] | None = None
     ) -> list[dict[str, ArmTarget]]:
-        """Tick for ``duration``; ``move`` gives the hands' poses over the time since the call."""
+        """Tick for ``duration`` [s], and return the targets of each tick.
+
+        ``move`` returns the poses of the hands at the time since the call [s]; without it the hands rest.
+        """
         start, history = self.now, []
         while self.now < start + duration - TICK / 2:
             if move is not None:
@@ -104,7 +108,7 @@ class Operator:
         return history
 
     def press(self, *hands: str, button: str = "lower") -> None:
-        """Press a button for 0.15 s, after which it rests for 0.1 s."""
+        """Press a button with each of ``hands`` for 0.15 s, and release it for 0.1 s."""
         held = self.lower if button == "lower" else self.upper
         held.update(hands)
         self.run(0.15)
@@ -112,14 +116,14 @@ class Operator:
         self.run(0.1)
 
     def push(self, control: str, hand: str = "left") -> None:
-        """Push a control for 0.1 s, after which it rests for 0.1 s."""
+        """Push a control fully for 0.1 s, and release it for 0.1 s."""
         self.only, self.held = hand, {control: 1.0}
         self.run(0.1)
         self.held = {}
         self.run(0.1)
 
     def place(self, arm: str = "left") -> pin.SE3:
-        """Return the target of an arm that has one."""
+        """Return the target pose of an arm (world frame). The arm has to follow something."""
         target = self.targets[arm].pose
         assert target is not None
         return target
@@ -164,7 +168,7 @@ def engaged(**changes: object) -> Operator:
 
 
 def waving(driver: Operator, speed: float = 0.2) -> Callable[[float], dict[str, pin.SE3]]:
-    """Return a motion of both hands sideways with rotation, from where they are."""
+    """Return a motion of both hands from their present poses: sideways, while they turn about z."""
     start = dict(driver.hands)
     return lambda t: {
         hand: pin.SE3(pin.exp3(np.array([0.0, 0.0, speed * t])) @ at.rotation, at.translation + sidewards(speed * t))

@@ -1,4 +1,4 @@
-"""Actions for both arms: stop, the way home, and a gripper that follows a trigger."""
+"""Actions that concern both arms, which are stopping and moving home; and a gripper that follows a trigger."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def engaged(**bindings: str) -> Operator:
 
 
 class TestAStop:
-    def test_a_stop_stops_both_arms_in_its_own_sample(self) -> None:
+    def test_a_stop_stops_both_arms_at_the_first_sample_with_the_press(self) -> None:
         driver = engaged()
         driver.run(0.3, waving(driver))
         driver.only, driver.held = "right", {"grip": 1.0}
@@ -32,7 +32,7 @@ class TestAStop:
         assert all(target.pose is None for target in driver.targets.values())
         assert not any(map(is_fault, driver.events))
 
-    def test_after_a_stop_nothing_moves_until_it_is_undone_and_a_press_engages(self) -> None:
+    def test_after_a_stop_no_arm_moves_until_the_stop_is_ended_and_a_press_engages(self) -> None:
         driver = engaged()
         driver.push("grip")
         driver.push("stick_down")
@@ -49,7 +49,7 @@ class TestAStop:
         driver.press(*SIDES)
         assert driver.states == ENGAGED
 
-    def test_a_stop_comes_before_all_other_simultaneous_presses(self) -> None:
+    def test_of_simultaneous_presses_a_stop_is_carried_out_first(self) -> None:
         driver = engaged()
         driver.lower, driver.upper = {"left"}, {"left"}
         driver.held, driver.only = {"grip": 1.0, "stick_down": 1.0}, "right"
@@ -60,13 +60,13 @@ class TestAStop:
         driver.run(0.3)
         assert driver.states == STOPPED
 
-    def test_a_stop_is_over_for_both_arms_when_one_is_reset(self) -> None:
+    def test_resetting_one_arm_ends_the_stop_of_both_arms(self) -> None:
         driver = engaged()
         driver.push("grip")
         driver.teleop.reset(driver.now, "left", Reason(TeleopReason.RESET_SERVICE))
         assert driver.states == PAUSED
 
-    def test_a_stop_for_which_a_button_is_held_is_not_lost_by_a_fault(self) -> None:
+    def test_a_stop_whose_button_is_still_held_is_carried_out_although_a_fault_comes_before(self) -> None:
         driver = engaged(upper_hold="stop")
         driver.upper = {"left"}
         driver.run(0.3)
@@ -78,12 +78,12 @@ class TestAStop:
 
 
 class TestTheWayHome:
-    def test_either_hand_can_send_both_arms_home_and_the_caller_says_where_the_way_ends(self) -> None:
+    def test_either_hand_can_send_both_arms_home_and_the_caller_ends_the_motion(self) -> None:
         driver = engaged()
         driver.push("stick_down", "right")
         assert driver.states == HOMING
         assert driver.teleop.homing
-        driver.assert_holds()  # The hands lead no arm.
+        driver.assert_holds()  # The hands drive no arm.
         driver.teleop.end_homing(driver.now, Reason(CommonReason.HOMING_ARRIVED))
         driver.run(0.1)
         assert driver.states == PAUSED
@@ -92,7 +92,7 @@ class TestTheWayHome:
         driver.press(*SIDES)
         assert driver.states == ENGAGED
 
-    def test_the_way_home_is_refused_only_for_obstacles_of_the_arm_whose_hand_asks(self) -> None:
+    def test_homing_is_refused_only_for_an_obstacle_of_the_arm_whose_hand_asks(self) -> None:
         for blocked, states in (("left", PAUSED), ("right", HOMING)):
             driver = engaged()
             driver.press(*SIDES)
@@ -102,7 +102,7 @@ class TestTheWayHome:
 
     @pytest.mark.parametrize("hand", SIDES)
     @pytest.mark.parametrize("control", ["lower", "upper", "stick_down"])
-    def test_any_press_ends_the_way_home_and_has_no_other_effect(self, control: str, hand: str) -> None:
+    def test_any_press_ends_the_motion_home_and_has_no_other_effect(self, control: str, hand: str) -> None:
         driver = engaged()
         driver.push("stick_down")
         if control in ("lower", "upper"):
@@ -112,7 +112,7 @@ class TestTheWayHome:
         assert driver.states == PAUSED
         assert [driver.targets[arm].gripper for arm in SIDES] == [1.0, 1.0]
 
-    def test_the_way_home_ends_as_a_fault_if_the_hand_that_asked_is_lost_but_not_with_the_other_hand(self) -> None:
+    def test_homing_ends_with_a_fault_if_the_hand_that_asked_is_lost_but_not_if_the_other_hand_is(self) -> None:
         driver = engaged()
         driver.push("stick_down")
         driver.silent = {"right"}
@@ -123,7 +123,7 @@ class TestTheWayHome:
         assert driver.states == LOST
         assert {kinds(event.reason) for event in driver.events[-2:]} == {"homing_fault: pose_silent"}
 
-    def test_a_way_home_that_no_hand_asked_for_needs_no_hand(self) -> None:
+    def test_homing_that_a_program_asked_for_needs_no_hand(self) -> None:
         driver = hands.operator(bindings=BINDINGS)
         driver.silent = set(SIDES)
         driver.run(0.3)
@@ -137,7 +137,7 @@ class TestTheWayHome:
         driver.press("left")
         assert driver.states == PAUSED
 
-    def test_the_way_home_is_refused_while_something_is_in_the_way(self) -> None:
+    def test_homing_is_refused_while_the_hand_that_asks_has_no_pose(self) -> None:
         driver = hands.operator(bindings=BINDINGS)
         driver.alter = lambda received: spoilt(received, pose_stamp=-math.inf)
         driver.run(0.3)
@@ -196,7 +196,7 @@ class TestAGripperThatFollowsATrigger:
         driver.run(0.2)
         assert driver.targets["left"].gripper == pytest.approx(0.5)
 
-    def test_the_last_bit_to_both_ends_is_not_lost_to_the_hysteresis(self) -> None:
+    def test_the_gripper_closes_and_opens_fully_although_the_last_motion_of_the_trigger_is_small(self) -> None:
         driver = self.driver()
         for nearly, pressed, opening in ((0.94, 0.96, 0.0), (0.06, 0.04, 1.0)):
             driver.held = {"trigger": nearly}

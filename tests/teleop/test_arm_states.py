@@ -1,4 +1,4 @@
-"""The table of states: it agrees with the docs, and only an engagement lets an arm follow its hand."""
+"""The transitions between the states of an arm. The docs show the same table."""
 
 from __future__ import annotations
 
@@ -9,17 +9,18 @@ import pytest
 from q2r2_control.teleop.arm_states import TRANSITIONS, ArmState, Cause, Transition, Who, next_state
 from tests.support.docs import table_rows
 
+# States in which an arm holds.
 RESTS = set(ArmState) - {ArmState.ENGAGED, ArmState.CARRIED, ArmState.POLICY, ArmState.HOMING}
 
 
 def documented(sources: str, cause: str, destination: str, who: str) -> Transition:
-    """Return the transition of a row of the table in the docs."""
+    """Return the transition that a row of the table in the docs describes."""
     named = frozenset(map(ArmState, re.findall(r"`(\w+)`", sources)))
     states = set(ArmState) - named if "any but" in sources else named
     return Transition(frozenset(states), Cause(cause), ArmState(destination.strip("`")), Who(who))
 
 
-def test_the_table_in_the_docs_equals_the_one_in_the_code() -> None:
+def test_the_transitions_in_the_docs_equal_the_transitions_in_the_code() -> None:
     rows = table_rows("operator.md")
     assert {documented(*row) for row in rows if row[-1] in list(Who)} == set(TRANSITIONS)
 
@@ -37,7 +38,7 @@ def test_only_an_operator_or_a_policy_can_start_the_motion_of_an_arm() -> None:
 
 
 @pytest.mark.parametrize("state", ArmState)
-def test_a_stop_works_in_every_state_and_ends_only_by_itself(state: ArmState) -> None:
+def test_a_stop_works_in_every_state_and_ends_only_by_the_control_that_stops(state: ArmState) -> None:
     assert next_state(state, Cause.STOP) is ArmState.STOPPED
     ends = [cause for cause in Cause if next_state(ArmState.STOPPED, cause) is not ArmState.STOPPED]
     assert ends == [Cause.GO_ON]

@@ -1,4 +1,4 @@
-"""The actions of triggers, sticks and buttons. None of them makes a target jump."""
+"""The actions that controls are bound to: precision, locks, a dead man's switch. No control makes a target jump."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def engaged(**bindings: str) -> Operator:
 
 
 def shift(driver: Operator, way: np.ndarray, turn: np.ndarray, duration: float = 1.0) -> list:
-    """Return a motion of both hands by ``way`` [m] and ``turn`` [rad], and then rest."""
+    """Move both hands by ``way`` [m] and ``turn`` [rad], and let them rest. Return the targets of all ticks."""
     start = dict(driver.hands)
 
     def move(t: float) -> dict[str, pin.SE3]:
@@ -60,7 +60,7 @@ def test_a_held_control_scales_the_motion_while_it_is_held_and_nothing_jumps(
     assert_smooth(history)
 
 
-def test_pressing_and_releasing_during_motion_does_not_cause_a_jump_either() -> None:
+def test_controls_that_are_pressed_and_released_during_motion_make_no_target_jump() -> None:
     driver = engaged(grip="precision", trigger="rotation_lock", stick_up="translation_lock")
     wave = waving(driver, 0.2)
     history, random = [], np.random.default_rng(2)
@@ -71,7 +71,7 @@ def test_pressing_and_releasing_during_motion_does_not_cause_a_jump_either() -> 
     assert driver.states == ENGAGED
 
 
-def test_an_arm_that_is_engaged_while_precision_is_held_begins_with_it() -> None:
+def test_an_arm_that_is_engaged_while_precision_is_held_moves_with_precision_at_once() -> None:
     driver = hands.operator(bindings={"grip": "precision"})
     driver.run(0.1)
     driver.held = {"grip": 1.0}
@@ -103,7 +103,7 @@ class TestADeadMan:
         assert {event.kind for event in driver.events} == {"dead_man_held", "dead_man_released"}
         assert not any(map(is_fault, driver.events))
 
-    def test_a_dead_man_that_is_held_through_a_fault_has_to_be_released_first(self) -> None:
+    def test_a_dead_man_that_stays_held_during_a_fault_engages_only_after_its_release(self) -> None:
         driver = self.driver()
         driver.held = {"grip": 1.0}
         driver.run(0.05)
@@ -136,7 +136,7 @@ class TestADeadMan:
             assert driver.states == LOST
 
     @pytest.mark.parametrize("let_go", [False, True])
-    def test_after_an_alignment_a_dead_man_goes_on_only_if_it_is_still_held(self, let_go: bool) -> None:
+    def test_after_an_alignment_the_arms_follow_again_only_if_the_dead_man_is_still_held(self, let_go: bool) -> None:
         driver = self.driver()
         driver.held = {"grip": 1.0}
         driver.run(0.05)
@@ -158,7 +158,7 @@ class TestADeadMan:
         assert driver.states == PAUSED
 
 
-def test_a_pedal_of_the_device_engages_while_it_is_held_and_another_one_can_be_tapped() -> None:
+def test_a_pedal_of_the_device_can_be_a_dead_man_and_a_knob_can_stop_the_arms_by_a_hold() -> None:
     driver = hands.operator(bindings={"lower": "none", "device": {"pedal": "dead_man", "knob_hold": "stop"}})
     driver.run(0.1)
     for more, expected in (({"pedal": 1.0}, ENGAGED), ({}, PAUSED), ({"knob": 0.9}, PAUSED), ({"knob": 0.9}, STOPPED)):
@@ -177,7 +177,7 @@ def test_a_control_that_trembles_about_its_threshold_is_pressed_and_released_onc
 
 
 @pytest.mark.parametrize("control", HELD)
-def test_every_control_moves_from_0_to_1_without_any_other(control: str) -> None:
+def test_pushing_one_control_raises_its_own_travel_to_1_and_no_other_travel(control: str) -> None:
     inputs = HandInputs(**PUSHED[control])
     assert travel(control, inputs) == 1.0
     assert all(travel(other, inputs) <= 0.0 for other in HELD if other != control)
@@ -202,7 +202,7 @@ def test_every_control_moves_from_0_to_1_without_any_other(control: str) -> None
         ({"grip": "gripper_analog"}, "upper is gripper_toggle and grip is gripper_analog; allowed: one of them"),
     ],
 )
-def test_ambiguous_and_empty_bindings_are_refused(given: dict[str, str], said: str) -> None:
+def test_bindings_that_are_ambiguous_or_engage_no_arm_are_refused(given: dict[str, str], said: str) -> None:
     with pytest.raises(ConfigError) as error:
         BindingSettings.model_validate(given)
     assert said in str(error.value)

@@ -1,4 +1,4 @@
-"""Two tools that one hand moves as one body: their relation, the begin and the end, and that nothing jumps."""
+"""One hand moves two tools as one rigid body: their relative pose, beginning and end, and that no target jumps."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ CARRYING = {"left": "engaged", "right": "carried"}
 
 
 def carrying(*hands: str, **changes: object) -> Operator:
-    """Return a driver whose left hand carries, after ``hands`` were engaged."""
+    """Return an operator who has engaged the arms of ``hands`` and whose left hand then moves both tools."""
     driver = operator(bindings=BINDINGS, **changes)
     driver.engage(*hands)
     driver.push("grip")
@@ -34,7 +34,7 @@ def relation(targets: dict[str, ArmTarget]) -> pin.SE3:
 
 
 def turning(driver: Operator, way: float = 0.2, angle: float = 0.6) -> Callable[[float], dict[str, pin.SE3]]:
-    """Return a motion in which the left hand moves and turns within a second, and the right one moves freely."""
+    """Return a motion: the left hand moves and turns within a second, while the right hand waves independently."""
     left, right = (driver.hands[hand] for hand in SIDES)
 
     def move(t: float) -> dict[str, pin.SE3]:
@@ -50,7 +50,7 @@ def turning(driver: Operator, way: float = 0.2, angle: float = 0.6) -> Callable[
 
 
 class TestBothTools:
-    def test_carried_tools_keep_their_relation_at_every_tick_and_turn_about_the_point_between_them(self) -> None:
+    def test_carried_tools_keep_their_relative_pose_at_every_tick_and_turn_about_the_point_between_them(self) -> None:
         driver = carrying()
         before, start = relation(driver.targets), {arm: driver.place(arm) for arm in SIDES}
         for targets in driver.run(1.5, turning(driver)):
@@ -70,13 +70,13 @@ class TestBothTools:
         assert_smooth(history)
 
     @pytest.mark.parametrize("hand", SIDES)
-    def test_carried_tools_follow_the_hand_that_asked(self, hand: str) -> None:
+    def test_carried_tools_follow_the_hand_that_asked_to_carry(self, hand: str) -> None:
         driver = engaged(bindings=BINDINGS)
         driver.push("grip", hand)
         assert driver.states == {hand: "engaged", ("right" if hand == "left" else "left"): "carried"}
         assert [arm for arm, target in driver.targets.items() if target.hand is not None] == [hand]
 
-    def test_carrying_needs_only_the_arm_of_its_hand_engaged_and_moves_no_arm_at_its_begin(self) -> None:
+    def test_carrying_may_begin_with_one_arm_engaged_and_moves_no_arm_at_its_beginning(self) -> None:
         driver = carrying("left")
         assert driver.place("right").isApprox(driver.tools["right"], 1e-6)
 
@@ -98,7 +98,7 @@ class TestBothTools:
         [(True, 0.5, 0.003, 0.011), (False, 0.5, -1e-9, 1e-9), (True, 0.401, 0.0009, 0.001 + 1e-9)],
         ids=["by poses of one moment", "not by those of two", "no farther than the box"],
     )
-    def test_both_tools_keep_their_relation_at_the_leash(
+    def test_the_carried_target_is_shifted_so_that_lagging_tools_keep_their_relative_pose(
         self, in_step: bool, top: float, least: float, greatest: float
     ) -> None:
         driver = carrying(workspace={"right": {"x": [0.3, 0.7], "y": [-0.7, 0.7], "z": [0.3, top]}})
@@ -144,7 +144,7 @@ class TestItEnds:
         driver.press(*SIDES)
         assert driver.states == ENGAGED
 
-    def test_after_carrying_each_arm_has_its_own_leash_and_its_own_box(self) -> None:
+    def test_after_carrying_the_engaged_arm_has_its_own_leash_and_its_own_box_again(self) -> None:
         box = {"x": [0.3, 0.9], "y": [-0.7, 0.7], "z": [0.1, 0.8]}
         driver = carrying(workspace={"left": box, "right": box | {"x": [0.3, 0.51]}})
         driver.press("left")
@@ -157,7 +157,7 @@ class TestItEnds:
         assert 0.09 < np.linalg.norm(away) < 0.1 + 1e-6  # The distance is smaller if the hand has come back a little.
 
     @pytest.mark.parametrize("hand", SIDES)
-    def test_carrying_ends_with_an_alignment_after_which_neither_arm_goes_on_by_itself(self, hand: str) -> None:
+    def test_an_alignment_ends_carrying_and_then_no_arm_moves_without_a_press(self, hand: str) -> None:
         driver = carrying()
         driver.lower, driver.upper = {hand}, {hand}
         driver.run(0.3)
@@ -167,14 +167,14 @@ class TestItEnds:
         driver.assert_holds()
 
     @pytest.mark.parametrize("linked", [True, False])
-    def test_carrying_ends_with_a_fault_of_the_hand_that_leads(self, linked: bool) -> None:
+    def test_carrying_ends_with_a_fault_of_the_hand_that_moves_both_tools(self, linked: bool) -> None:
         driver = carrying(linked=linked)
         driver.silent = {"left"}
         driver.run(0.3)
         assert driver.states == {"left": "lost", "right": "lost" if linked else "paused"}
         driver.assert_holds()
 
-    def test_carrying_does_not_end_with_a_fault_of_the_other_hand_which_may_be_put_down(self) -> None:
+    def test_carrying_goes_on_if_the_other_controller_is_put_down(self) -> None:
         driver = carrying()
         driver.silent = {"right"}
         history = driver.run(1.0, turning(driver))

@@ -1,4 +1,4 @@
-"""Settings that change while the arms move: nothing jumps, the new values hold, and some changes are refused."""
+"""Settings that change while the arms move: no target jumps, and some changes are refused until the arms hold."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_a_moving_arm_goes_on_without_a_jump(changes: dict[str, object]) -> None
     [{"stance": "mirror"}, {"axes": ("+y", "-x", "+z")}, {"bindings": {"grip": "home"}}, {"hold_time": 1.0}],
     ids=["stance", "axes", "bindings", "hold_time"],
 )
-def test_a_change_of_stance_axes_or_controls_waits_until_both_arms_hold(changes: dict[str, object]) -> None:
+def test_a_change_of_stance_axes_or_controls_is_refused_until_both_arms_hold(changes: dict[str, object]) -> None:
     driver = engaged()
     refusal = driver.teleop.change(settings(driver, **changes), driver.now)
     assert kinds(refusal) == "arms_must_hold"

@@ -1,4 +1,4 @@
-"""Swapped controllers are noticed and said, and hands that cross while they work are not."""
+"""A warning comes for swapped controllers, and none for hands that cross during ordinary work."""
 
 from __future__ import annotations
 
@@ -20,7 +20,14 @@ Places = Callable[[float], dict[str, pin.SE3]]
 
 
 def after(places: Places, seconds: float = 5.0, axes: tuple[str, str, str] = WORLD, spoil: float = math.inf) -> bool:
-    """Whether hands at these ``places`` are crossed at the end; the left one is not usable at the time ``spoil``."""
+    """Return whether hands with these poses count as crossed at the end.
+
+    Args:
+        places: Returns the poses of the hands at a time [s].
+        seconds: Duration of the motion [s].
+        axes: The setting ``teleop.axes``.
+        spoil: Time at which a pose of the left hand is not usable [s].
+    """
     hands = CrossedHands(axes)
     for t in np.arange(0.0, seconds, 0.0125):
         for hand in SIDES:
@@ -30,7 +37,10 @@ def after(places: Places, seconds: float = 5.0, axes: tuple[str, str, str] = WOR
 
 
 def swapped(by: float = 0.4, heading: float = 0.0, turns: float = 0.0) -> Places:
-    """Hands ``by`` [m] on the wrong sides of an operator who faces ``heading``, and ``turns`` each outward [rad]."""
+    """Return the poses of resting hands that are ``by`` [m] on the wrong side of each other.
+
+    The operator faces ``heading`` [rad]. Each controller is turned outwards by ``turns`` [rad].
+    """
     left = np.array([math.sin(heading), -math.cos(heading), 0.0]) * by / 2.0
     room = pin.rpy.rpyToMatrix(0.0, 0.0, heading)
     made = {
@@ -46,7 +56,7 @@ def test_swapped_controllers_are_noticed_wherever_the_operator_faces(heading: fl
     assert not after(swapped(by=-0.4, heading=heading))
 
 
-def test_the_axes_of_the_input_count() -> None:
+def test_hands_are_compared_in_the_axes_of_the_input() -> None:
     made = {hand: pose(*place) for hand, place in (("left", (0.2, 1.0, 0.3)), ("right", (-0.2, 1.0, 0.3)))}
     assert after(lambda t: made, axes=UNITY), "right is +x in the frame of Unity"
     assert not after(lambda t: {"left": made["right"], "right": made["left"]}, axes=UNITY)
@@ -62,16 +72,16 @@ def test_the_axes_of_the_input_count() -> None:
     ],
     ids=["less than 10 cm", "controllers turned apart", "to and fro", "for 2.5 s only"],
 )
-def test_hands_that_cross_in_ordinary_work_are_not_crossed(places: Places) -> None:
+def test_hands_that_cross_in_ordinary_work_do_not_count_as_crossed(places: Places) -> None:
     assert not after(places)
 
 
-def test_hands_of_which_one_was_not_tracked_meanwhile_are_not_crossed_yet() -> None:
+def test_hands_count_as_crossed_only_after_both_were_tracked_for_the_whole_time() -> None:
     assert not after(swapped(), spoil=3.0)
     assert after(swapped(), spoil=1.0)
 
 
-def test_one_hand_and_old_poses_say_nothing() -> None:
+def test_one_hand_alone_or_with_old_poses_never_counts_as_crossed() -> None:
     hands = CrossedHands(WORLD)
     for t in np.arange(0.0, 5.0, 0.0125):
         hands.add(sample("left", swapped()(t)["left"], float(t)))
@@ -89,7 +99,7 @@ def crossed_operator(spoil: Callable[[HandSample], HandSample] = lambda one: one
     return driver
 
 
-def test_at_engaging_one_line_says_so_and_the_arms_follow_all_the_same() -> None:
+def test_engaging_with_swapped_controllers_records_one_warning_and_the_arms_still_follow() -> None:
     driver = crossed_operator()
     driver.run(3.5)
     driver.press(*SIDES)
@@ -101,7 +111,7 @@ def test_at_engaging_one_line_says_so_and_the_arms_follow_all_the_same() -> None
     assert driver.states == ENGAGED
 
 
-def test_an_operator_with_each_controller_in_its_hand_is_told_nothing() -> None:
+def test_engaging_with_each_controller_in_the_right_hand_records_no_warning() -> None:
     driver = Operator()
     driver.run(3.5)
     driver.press(*SIDES)

@@ -1,4 +1,4 @@
-"""Faults and hostile input: every arm stops, stays, and engages again only with a new press."""
+"""Faults and invalid input: the arms stop, and engage again only by a new press."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ FAULTS: dict[str, Callable[[HandSample], HandSample]] = {
 
 @pytest.mark.parametrize("linked", [True, False], ids=["linked", "each for itself"])
 @pytest.mark.parametrize("reason", list(FAULTS))
-def test_a_fault_of_the_left_hand_disengages(reason: str, linked: bool) -> None:
+def test_a_fault_of_the_left_hand_stops_its_arm_and_a_linked_arm_until_a_press(reason: str, linked: bool) -> None:
     driver = engaged(linked=linked)
     driver.alter = lambda s: FAULTS[reason](s) if s.hand == "left" else s
     history = driver.run(0.3, waving(driver))
@@ -58,7 +58,7 @@ def test_a_fault_of_the_left_hand_disengages(reason: str, linked: bool) -> None:
 
 
 @pytest.mark.parametrize("linked", [True, False], ids=["linked", "each for itself"])
-def test_a_stop_of_one_arm_by_other_code_stops_the_linked_one_once(linked: bool) -> None:
+def test_if_the_caller_stops_one_arm_a_linked_arm_stops_too_but_only_once(linked: bool) -> None:
     driver = engaged(linked=linked)
     driver.teleop.pause(driver.now, Reason(TeleopReason.TOOL_UNKNOWN), "left")
     assert driver.states == (LOST if linked else {"left": "lost", "right": "engaged"})
@@ -87,7 +87,7 @@ def test_a_reset_arm_holds_until_a_press_after_a_new_sample_of_its_hand() -> Non
     assert driver.states == ENGAGED
 
 
-def test_silence_disengages_within_the_timeout_and_a_tick() -> None:
+def test_silence_of_the_hands_stops_the_arms_within_the_timeout_and_one_tick() -> None:
     driver = engaged()
     driver.tick(driver.samples())
     driver.silent = set(SIDES)
@@ -128,7 +128,9 @@ def test_a_lost_connection_pauses_every_arm_and_requires_new_poses_and_a_new_pre
     ],
     ids=["stale", "never received", "not usable"],
 )
-def test_engaging_is_refused_if_poses_are_refused(alter: Callable[[HandSample], HandSample], reason: str) -> None:
+def test_engaging_is_refused_if_the_hand_has_no_usable_pose(
+    alter: Callable[[HandSample], HandSample], reason: str
+) -> None:
     driver = operator()
     driver.alter = alter
     driver.run(0.3)
@@ -138,7 +140,7 @@ def test_engaging_is_refused_if_poses_are_refused(alter: Callable[[HandSample], 
 
 
 @pytest.mark.parametrize("tools", [{}, dict.fromkeys(SIDES, pose(math.nan))], ids=["missing", "not finite"])
-def test_engaging_is_refused_if_the_tools_pose_is_refused(tools: dict[str, pin.SE3]) -> None:
+def test_engaging_is_refused_if_the_tool_pose_is_missing_or_not_finite(tools: dict[str, pin.SE3]) -> None:
     driver = operator()
     driver.tools = tools
     driver.engage()
@@ -146,7 +148,7 @@ def test_engaging_is_refused_if_the_tools_pose_is_refused(tools: dict[str, pin.S
     assert driver.refusals() == {"not_engaged: tool_unknown"}
 
 
-def test_a_stalled_loop_disengages_instead_of_catching_up() -> None:
+def test_after_a_stall_of_the_loop_the_arms_stop_instead_of_catching_up() -> None:
     driver = engaged()
     driver.run(0.1, waving(driver))
     driver.hands = {hand: pose(1.0) for hand in SIDES}
@@ -156,7 +158,7 @@ def test_a_stalled_loop_disengages_instead_of_catching_up() -> None:
 
 
 @pytest.mark.parametrize("back", [0.001, 0.1], ids=["a millisecond", "a tenth of a second"])
-def test_a_clock_that_goes_back_a_little_holds_the_target(back: float) -> None:
+def test_if_the_clock_goes_back_a_little_the_target_stays(back: float) -> None:
     driver = engaged()
     driver.run(0.2, waving(driver))
     before = driver.targets
@@ -166,7 +168,7 @@ def test_a_clock_that_goes_back_a_little_holds_the_target(back: float) -> None:
 
 
 @pytest.mark.parametrize("now", [math.nan, math.inf, -math.inf, -1e9, 0.0, 1e12], ids=str)
-def test_a_clock_that_cannot_be_followed_disengages_and_a_press_on_the_new_clock_engages(now: float) -> None:
+def test_an_unusable_clock_stops_the_arms_and_a_press_by_the_new_clock_engages_them(now: float) -> None:
     driver = engaged()
     driver.run(0.2, waving(driver))
     targets = driver.teleop.update(driver.samples(), driver.tools, now)

@@ -1,4 +1,4 @@
-"""Filters: the stated delay, the tremor, and the limits of a hostile stream's effect."""
+"""The filter of hand poses: its delay, how it reduces tremor, and that its output never jumps."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ STILL = pose(0.1, 0.2, 0.3, (0.4, 0.5, 0.6))
 
 
 def follow(path: Path, duration: float = 3.0, dt: float = 0.002, period: float = 1 / 75) -> tuple[float, list[pin.SE3]]:
-    """Return the filter's delay and its output at every tick."""
+    """Return the filter's delay [s], and its output at every tick for samples along ``path``."""
     pose_filter = PoseFilter(FilterSettings())
     pose_filter.reset(floats_of(path(0.0)), 0.0)
     due, outputs = period, []
@@ -34,9 +34,7 @@ def follow(path: Path, duration: float = 3.0, dt: float = 0.002, period: float =
 
 @pytest.mark.parametrize("dt", [0.001, 0.02], ids="loop of {} s".format)
 @pytest.mark.parametrize("speed", [0.02, 2.0], ids="{} per second".format)
-def test_the_output_of_a_steady_motion_is_late_by_exactly_the_stated_delay_at_any_speed(
-    speed: float, dt: float
-) -> None:
+def test_the_output_lags_a_steady_motion_by_exactly_the_stated_delay_at_any_speed(speed: float, dt: float) -> None:
     def path(t: float) -> pin.SE3:
         return pose(speed * t, 0.7 * speed * t, -0.5 * speed * t, (0.0, 0.0, speed * t))
 
@@ -48,7 +46,7 @@ def test_the_output_of_a_steady_motion_is_late_by_exactly_the_stated_delay_at_an
 
 
 @pytest.mark.parametrize("frequency", [8.0, 12.0], ids="{} Hz".format)
-def test_tremor_of_a_resting_hand_is_reduced_to_less_than_two_fifths(frequency: float) -> None:
+def test_the_tremor_of_a_resting_hand_is_reduced_to_less_than_two_fifths_of_its_size(frequency: float) -> None:
     def path(t: float) -> pin.SE3:
         wave = math.sin(2 * math.pi * frequency * t)
         return pose(0.001 * wave, 0.0, 0.0, (0.0, math.radians(0.3) * wave, 0.0))
@@ -59,7 +57,7 @@ def test_tremor_of_a_resting_hand_is_reduced_to_less_than_two_fifths(frequency: 
     assert max(abs(pin.log3(output.rotation)[1]) for output in rest) < math.radians(0.4 * 0.3)
 
 
-def test_the_overshoot_of_a_hand_that_stops_suddenly_is_smaller_than_its_lead() -> None:
+def test_the_overshoot_after_a_sudden_stop_of_the_hand_is_bounded() -> None:
     def path(t: float) -> pin.SE3:
         return pose(0.3 * min(t, 1.0))
 
@@ -69,7 +67,10 @@ def test_the_overshoot_of_a_hand_that_stops_suddenly_is_smaller_than_its_lead() 
 
 
 def largest_step(arrivals: list[tuple[float, list[tuple[float, float]]]]) -> float:
-    """Return the largest step of the output in 1 ms, for samples (stamp, x) that arrive at given times."""
+    """Return the largest step of the output between two ticks of 1 ms [m].
+
+    ``arrivals`` are times [s], each with the samples (stamp [s], x [m]) that arrive then.
+    """
     pose_filter = PoseFilter(FilterSettings())
     pose_filter.reset(floats_of(pose()), 0.0)
     outputs: list[float] = []
@@ -102,7 +103,10 @@ def test_the_output_is_continuous_after_gaps_and_bursts_of_the_stream(
 
 
 def speeds(arrivals: list[tuple[float, float]], velocity: float, since: float) -> np.ndarray:
-    """Return the output speeds after a time, for a steady hand's samples with times of measurement and receipt [s]."""
+    """Return the speed of the output at each tick after ``since`` [s], for a hand with constant ``velocity`` [m/s].
+
+    ``arrivals`` are the times of measurement and of receipt of each sample [s].
+    """
     pose_filter = PoseFilter(FilterSettings())
     pose_filter.reset(floats_of(pose()), 0.0)
     outputs, queue = [], list(arrivals)
@@ -115,19 +119,19 @@ def speeds(arrivals: list[tuple[float, float]], velocity: float, since: float) -
     return np.diff(outputs)[round(since / 0.001) :] / 0.001
 
 
-def test_jitter_of_receipt_hardly_changes_the_speed() -> None:
+def test_jitter_of_receipt_hardly_changes_the_output_speed() -> None:
     late = np.random.default_rng(5).exponential(0.0015, 300).clip(max=0.01)
     arrivals = [(n / 75, n / 75 + late[n]) for n in range(300)]
     assert np.std(speeds(arrivals, 0.5, 1.0)) < 0.04 * 0.5
 
 
-def test_motion_that_was_missed_in_a_gap_is_caught_up_at_a_bounded_speed() -> None:
+def test_after_a_gap_the_output_catches_up_with_the_hand_at_a_bounded_speed() -> None:
     arrivals = [(n / 75, n / 75) for n in range(300) if not 1.5 < n / 75 < 1.6]
     assert speeds(arrivals, 0.5, 1.0).max() < 3.5 * 0.5
 
 
-def test_a_slow_motion_comes_through_with_the_time_constant_of_the_least_cutoff() -> None:
-    # Without beta, the filter is of first order: share = dt / (tau + dt), and the input is ahead by (tau - delay) v.
+def test_without_beta_the_filter_is_of_first_order_with_the_time_constant_of_the_least_cutoff() -> None:
+    # With beta = 0, a tick corrects the share dt / (tau + dt) of the error. The input is ahead by (tau - delay) v.
     dt, tau, derivative_tau = 0.002, 1.0 / (2.0 * math.pi * 1.5), 1.0 / (2.0 * math.pi * 4.0)
     one_euro = OneEuro(min_cutoff=1.5, beta=0.0, derivative_cutoff=4.0, delay=0.03)
     share = dt / (tau + dt)
@@ -137,7 +141,7 @@ def test_a_slow_motion_comes_through_with_the_time_constant_of_the_least_cutoff(
     assert one_euro.correction((0.01, 0.0, 0.0), (0.001, 0.0, 0.0), dt) == pytest.approx((expected, 0.0, 0.0))
 
 
-def test_a_rotation_stays_a_rotation_after_long_filtering() -> None:
+def test_the_filtered_quaternion_keeps_the_length_1_for_a_long_time() -> None:
     pose_filter = PoseFilter(FilterSettings())
     pose_filter.reset(floats_of(STILL), 0.0)
     for tick in range(20_000):

@@ -67,13 +67,13 @@ def test_a_quaternion_of_either_sign_and_any_length_is_the_same_rotation(factor:
     ],
     ids=["a fast move passes", "a jump is a fault", "a fast turn passes", "a jump of the rotation is a fault"],
 )
-def test_limits_between_two_samples(moved: object, fault: str | None) -> None:
+def test_a_jump_between_two_samples_is_a_fault_and_a_fast_motion_is_not(moved: object, fault: str | None) -> None:
     usable, found = gate().receive(sample("left", moved, 1.013), 1.013)
     assert usable
     assert kinds(found) == (fault or "")
 
 
-def test_the_watchdog_counts_receipt_time_and_only_new_poses() -> None:
+def test_the_watchdog_measures_receipt_time_and_an_old_pose_does_not_reset_it() -> None:
     passed = gate()
     assert not passed.stale(1.15)
     passed.receive(GOOD, 1.14)
@@ -94,11 +94,11 @@ def test_a_pose_that_arrives_after_a_newer_one_is_ignored() -> None:
     assert passed.pose[0][0] == 0.1
 
 
-def test_poses_too_far_apart_in_time_are_a_fault_even_if_they_arrive_together() -> None:
+def test_a_gap_between_two_poses_is_a_fault_even_if_the_watchdog_has_not_run_in_between() -> None:
     assert kinds(gate().receive(replace(GOOD, pose_stamp=1.2), 1.2)[1]) == "pose_gap"
 
 
-def test_before_any_pose_inputs_alone_are_not_a_fault_but_a_stamp_that_is_not_finite_is_one() -> None:
+def test_samples_without_a_pose_yet_are_no_fault_but_a_pose_stamp_of_nan_is_a_fault() -> None:
     fresh = PoseGate(GateSettings())
     assert fresh.receive(replace(GOOD, pose_stamp=-math.inf, quaternion=np.zeros(4)), 1.0) == (False, None)
     assert fresh.receive(replace(GOOD, pose_stamp=math.nan), 1.0)[1] is not None
@@ -107,7 +107,10 @@ def test_before_any_pose_inputs_alone_are_not_a_fault_but_a_stamp_that_is_not_fi
 
 
 def faults_of_a_motion(speed: float, receipts: list[float], turning: bool = False) -> list[str]:
-    """Return faults of a hand at constant speed [m/s or rad/s], sampled at 75 Hz and received at these times [s]."""
+    """Return the fault of each sample of a hand at constant ``speed`` [m/s or rad/s]; "" if it has none.
+
+    The hand is measured at 75 Hz, and the samples are received at the times ``receipts`` [s].
+    """
     passed = PoseGate(GateSettings())
     found = []
     for index, stamp in enumerate(receipts):
@@ -130,14 +133,17 @@ def test_a_hand_that_moves_faster_than_any_operator_is_a_fault(speed: float, tur
 
 
 @pytest.mark.parametrize("stall", [0.04, 0.08, 0.13])
-def test_samples_that_a_network_held_up_and_delivers_at_once_do_not_count_as_speed(stall: float) -> None:
-    """The hand moves at 2 m/s. Samples of ``stall`` arrive within a millisecond: 26 mm in 0.1 ms."""
+def test_samples_that_a_network_held_up_and_delivers_at_once_are_no_fault_of_speed(stall: float) -> None:
+    """The hand moves at 2 m/s. For ``stall`` [s] nothing arrives; then all samples of this time come, 0.1 ms apart.
+
+    Successive samples are 27 mm apart.
+    """
     end = EVEN[20] + stall
     receipts = [max(t, end + 1e-4 * (index - 20)) if t > EVEN[20] else t for index, t in enumerate(EVEN)]
     assert faults_of_a_motion(2.0, sorted(receipts)) == [""] * len(EVEN)
 
 
-def test_a_jump_is_a_fault_of_its_own_and_gives_no_speed() -> None:
+def test_a_jump_is_one_fault_and_no_speed_is_measured_across_it() -> None:
     passed = PoseGate(GateSettings(max_speed=1.0))
     for stamp in EVEN[:10]:
         passed.receive(sample("left", pose(), stamp), stamp)

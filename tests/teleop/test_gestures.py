@@ -25,9 +25,9 @@ def recognizer(**bindings: str) -> GestureRecognizer:
 def play(
     script: str, bindings: dict[str, str] | None = None, period: float = 0.01, start_released: bool = True
 ) -> list[tuple[Press, float]]:
-    """Return presses and their times of report.
+    """Return the presses that are reported, with the time of each report [s].
 
-    Each letter of ``script`` is a reading: . none, u upper, l lower, b both.
+    Each letter of ``script`` is a reading of the buttons that are held: . none, u upper, l lower, b both.
     """
     gestures = recognizer(**(bindings or {}))
     found, t = [], 0.0
@@ -62,7 +62,7 @@ SCRIPTS: dict[str, tuple[dict[str, str], str, list[tuple[Press, float]]]] = {
 
 
 @pytest.mark.parametrize(("bindings", "script", "expected"), SCRIPTS.values(), ids=SCRIPTS)
-def test_one_gesture_is_reported_once(
+def test_each_gesture_is_reported_once_at_the_expected_time(
     bindings: dict[str, str], script: str, expected: list[tuple[Press, float]]
 ) -> None:
     assert play(script, bindings) == expected
@@ -93,7 +93,7 @@ def test_a_press_of_exactly_the_hold_time_is_a_hold() -> None:
     assert reported == [HELD_FOR]
 
 
-def test_cancelling_drops_everything_except_a_stop_that_has_begun() -> None:
+def test_cancelling_drops_all_presses_except_a_stop_whose_button_is_held() -> None:
     gestures = recognizer(upper_hold="stop", lower_hold="home")
     gestures.receive(HandInputs(), 0.0)
     gestures.receive(HandInputs(button_upper=True), 0.01)
@@ -103,13 +103,13 @@ def test_cancelling_drops_everything_except_a_stop_that_has_begun() -> None:
     gestures.receive(HandInputs(), 1.0)
     gestures.receive(HandInputs(button_upper=True), 1.1)
     gestures.cancel()
-    assert gestures.receive(HandInputs(), 1.2) == []  # There is no stop, so that nothing is reported.
+    assert gestures.receive(HandInputs(), 1.2) == []  # The press was too short for a stop, so nothing is reported.
     gestures.receive(HandInputs(button_lower=True), 1.3)
     gestures.cancel()
     assert gestures.due(3.0) == gestures.receive(HandInputs(button_lower=True), 3.1) == []
 
 
-def test_readings_that_arrive_late_and_together_count_at_their_own_times() -> None:
+def test_readings_that_arrive_late_and_together_are_judged_by_their_own_stamps() -> None:
     gestures = recognizer(lower_hold="home")
     found = []
     for stamp, inputs in ((0.0, HandInputs()), (0.1, HandInputs(button_lower=True)), (0.8, HandInputs())):
@@ -120,7 +120,7 @@ def test_readings_that_arrive_late_and_together_count_at_their_own_times() -> No
 @pytest.mark.parametrize("control", HELD)
 def test_taps_of_triggers_and_sticks_are_reported_at_once_because_they_are_part_of_no_chord(control: str) -> None:
     gestures = recognizer(**{control: "home"})
-    # The control counts as held from before.
+    # A control that is held at the first reading does not count.
     assert gestures.receive(HandInputs(**PUSHED[control]), 0.0) + gestures.due(1.0) == []
     gestures.receive(HandInputs(), 1.1)
     assert gestures.receive(HandInputs(**PUSHED[control]), 1.2) == [Press(control, Gesture.DOWN)]

@@ -1,4 +1,4 @@
-"""Arms that hang lower than their commands: engaging them moves neither the tool nor the command."""
+"""Arms that sag: their tools are measured lower than commanded. Engaging moves neither the tool nor the command."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from q2r2_control.teleop.hand_motion import MAX_OFFSET
 from q2r2_control.types import SIDES, Array
 from tests.teleop.hands import Operator, engaged, operator, waving
 
-SAG = np.array([0.005, 0.0, -0.02])
+SAG = np.array([0.005, 0.0, -0.02])  # Measured position of a tool minus the commanded one [m].
 
 
 def hanging(driver: Operator, by: Array = SAG) -> Operator:
-    """Let all tools hang ``by`` away from their commands."""
+    """Let all measured tools be ``by`` [m] away from their commands."""
     driver.commanded = {arm: pin.SE3(tool.rotation, tool.translation - by) for arm, tool in driver.tools.items()}
     return driver
 
 
 def command(driver: Operator, arm: str = "left") -> Array:
-    """Return the position that the controller gets."""
+    """Return the position (3,) of the target that the controller gets [m]."""
     asked = driver.targets[arm].command
     assert asked is not None
     return asked.translation
@@ -29,7 +29,7 @@ def target(driver: Operator) -> Array:
     return driver.place().translation
 
 
-def test_the_target_begins_at_the_tool_and_the_command_where_it_was() -> None:
+def test_the_target_begins_at_the_measured_tool_and_the_command_at_its_last_position() -> None:
     driver = hanging(operator())
     assert driver.commanded is not None
     driver.engage()
@@ -39,7 +39,7 @@ def test_the_target_begins_at_the_tool_and_the_command_where_it_was() -> None:
     np.testing.assert_allclose(target(driver) - command(driver), SAG, atol=1e-12)
 
 
-def test_a_tool_far_from_its_command_was_pushed_and_the_command_begins_at_the_tool() -> None:
+def test_if_the_tool_is_far_from_its_command_the_command_begins_at_the_measured_tool() -> None:
     driver = hanging(operator(), np.array([0.0, 1.01 * MAX_OFFSET[0], 0.0]))
     driver.engage()
     np.testing.assert_allclose(command(driver), driver.tools["left"].translation, atol=1e-9)
@@ -57,7 +57,7 @@ def test_each_engagement_uses_the_present_sag_and_changed_settings_do_not_alter_
     np.testing.assert_allclose(command(driver) - target(driver), -SAG, atol=1e-12)
 
 
-def test_the_leash_is_measured_from_the_hanging_tool() -> None:
+def test_the_leash_is_measured_from_the_sagging_tool() -> None:
     for way in (0.2, -0.2):
         driver = hanging(operator(leash={"distance": 0.03}))
         driver.engage()
@@ -66,7 +66,7 @@ def test_the_leash_is_measured_from_the_hanging_tool() -> None:
         np.testing.assert_allclose(off, (0.0, np.sign(way) * 0.03, 0.0), atol=1e-6)
 
 
-def test_an_arm_that_was_never_engaged_is_carried_without_a_jump_of_either_command() -> None:
+def test_carrying_an_arm_that_was_never_engaged_makes_no_command_jump() -> None:
     driver = hanging(operator(bindings={"grip": "carry"}))
     assert driver.commanded is not None
     driver.engage("left")

@@ -53,7 +53,7 @@ def feedback(pulse: Pulse) -> HapticFeedback:
 
 
 @pytest.mark.parametrize(("happens", "pulse"), EVENTS.values(), ids=EVENTS)
-def test_an_event_is_felt_once_and_ends(happens: Event, pulse: Pulse) -> None:
+def test_an_event_causes_one_vibration_that_ends(happens: Event, pulse: Pulse) -> None:
     haptics = HapticPulses()
     haptics.start_pulse(happens)
     assert haptics.at(1.0, "left") == feedback(pulse)
@@ -62,13 +62,13 @@ def test_an_event_is_felt_once_and_ends(happens: Event, pulse: Pulse) -> None:
     assert haptics.at(9.0, "left") is None
 
 
-def test_a_pause_that_is_complete_is_not_felt_again() -> None:
+def test_a_pause_is_felt_when_it_begins_and_not_again_when_it_is_confirmed() -> None:
     haptics = HapticPulses()
     haptics.start_pulse(event("pausing", "paused", TeleopReason.PRESSED))
     assert haptics.at(1.0, "left") is None
 
 
-def test_slipping_is_felt_at_every_further_distance_and_again_after_engaging() -> None:
+def test_slip_is_felt_at_each_further_step_and_again_after_a_new_engagement() -> None:
     haptics = HapticPulses()
     felt = []
     for tick in range(100):
@@ -100,7 +100,7 @@ def test_a_weaker_vibration_does_not_interrupt_a_stronger_one() -> None:
 
 
 def felt(haptics: HapticPulses, since: float, until: float) -> list[HapticFeedback]:
-    """Return everything that is sent in that time [s], at 1000 ticks a second."""
+    """Return all messages that are sent from ``since`` to ``until`` [s], at 1000 ticks a second."""
     ticks = range(round((until - since) * 1000))
     return [sent for tick in ticks if (sent := haptics.at(since + 0.001 * tick, "left")) is not None]
 
@@ -109,7 +109,7 @@ def condition(spare: float = 1.0, limits: tuple[str, ...] = (), force: float | N
     return ArmCondition(spare, frozenset(limits), force)
 
 
-def test_approach_is_felt_at_every_5_mm_and_stronger_when_nearer_and_retreat_is_not_felt() -> None:
+def test_an_approach_is_felt_at_every_5_mm_and_more_strongly_when_nearer_and_a_retreat_is_not_felt() -> None:
     haptics = HapticPulses()
     felt_at: list[float] = []
     for tick in range(200):  # The margin falls from 60 mm to 0, where it trembles, and rises again.
@@ -132,7 +132,7 @@ def test_a_contact_is_felt_at_every_5_newtons_and_stronger_at_larger_forces() ->
     assert pulses.CONTACT.amplitude < felt_at[0] < felt_at[5] < felt_at[-1] == pytest.approx(0.8)
 
 
-def test_a_joint_limit_and_a_grasp_are_each_felt_once_while_they_last() -> None:
+def test_reaching_a_joint_limit_and_grasping_are_each_felt_once() -> None:
     haptics = HapticPulses()
     sent = []
     for tick in range(10):

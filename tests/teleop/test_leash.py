@@ -1,4 +1,7 @@
-"""The leash: alone on an arm that does not move, then in the closed loop with a stretched or blocked arm."""
+"""The leash between a tool and its target.
+
+It is tested alone with a tool that does not move, and in the closed loop with a stretched or blocked arm.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +34,7 @@ MOTIONS = {
 
 
 class Tied:
-    """A hand, a motion and a leash to a tool. Every tick is 1 ms."""
+    """A hand whose relative motion moves a target, and a leash between this target and a tool. A tick takes 1 ms."""
 
     def __init__(self, motion: RelativeMotion, **settings: float | None) -> None:
         self.motion, self.leash = motion, Leash(LeashSettings.model_validate(settings))
@@ -48,7 +51,7 @@ class Tied:
         return self.target
 
     def go(self, twist: Array, ticks: int) -> list[pin.SE3]:
-        """Move the hand by ``twist`` (6,) each tick."""
+        """Move the hand by ``twist`` (6,) [m, rad] in each tick, and return the targets."""
         return [self.tick(moved(self.hand, twist)) for _ in range(ticks)]
 
     @property
@@ -69,7 +72,7 @@ def along(*values: float) -> Array:
 
 
 @pytest.mark.parametrize("motion", MOTIONS.values(), ids=MOTIONS.keys())
-def test_a_target_within_the_leash_is_the_relative_motion_bit_for_bit(motion: RelativeMotion) -> None:
+def test_a_target_within_the_leash_equals_the_relative_motion_bit_for_bit(motion: RelativeMotion) -> None:
     random = np.random.default_rng(51)
     tied, bounds = Tied(motion, distance=0.1, angle=0.5), [*[0.02] * 3, *[0.1] * 3]
     hands = [moved(HAND, random.uniform(-1.0, 1.0, 6) * bounds) for _ in range(200)]
@@ -80,7 +83,7 @@ def test_a_target_within_the_leash_is_the_relative_motion_bit_for_bit(motion: Re
 
 
 @pytest.mark.parametrize("motion", MOTIONS.values(), ids=MOTIONS.keys())
-def test_a_taut_leash_holds_the_target_at_its_length_and_counts_the_slip(motion: RelativeMotion) -> None:
+def test_a_taut_leash_keeps_the_target_at_its_length_from_the_tool_and_counts_the_slip(motion: RelativeMotion) -> None:
     tied = Tied(motion, distance=0.1, angle=0.5)
     way, turn = 0.6, 0.9
     for target in tied.go(along(way / 600, 0, 0, 0, 0, turn / 600), 600):
@@ -113,14 +116,14 @@ def test_a_target_is_held_at_the_end_of_the_leash_and_not_before(turning: bool, 
 
 
 @pytest.mark.parametrize("settings", [{"distance": None}, {"angle": None}, {"distance": None, "angle": None}], ids=str)
-def test_without_a_leash_the_target_may_be_anywhere(settings: dict[str, None]) -> None:
+def test_without_a_leash_the_target_may_be_at_any_distance_from_the_tool(settings: dict[str, None]) -> None:
     tied = Tied(RelativeMotion(), **settings)
     tied.go(along(0.001, 0, 0, 0.002, 0, 0), 1000)
     assert tied.distance == pytest.approx(1.0 if "distance" in settings else 0.1)
     assert tied.angle == pytest.approx(2.0 if "angle" in settings else 0.5)
 
 
-def test_a_taut_target_moves_with_its_tool_without_a_step() -> None:
+def test_a_target_on_a_taut_leash_moves_with_its_tool_without_a_step() -> None:
     tied = Tied(RelativeMotion(), distance=0.1, angle=0.5)
     tied.go(along(0.001), 300)
     before = tied.target
@@ -135,13 +138,16 @@ def test_a_taut_target_moves_with_its_tool_without_a_step() -> None:
 
 @pytest.mark.parametrize("motion", MOTIONS.values(), ids=MOTIONS.keys())
 @pytest.mark.parametrize("turning", [False, True], ids=["position", "rotation"])
-def test_a_hand_that_comes_back_takes_the_target_from_the_tool_at_once(motion: RelativeMotion, turning: bool) -> None:
+def test_when_the_hand_comes_back_the_target_starts_at_the_tool_and_follows_the_hand_at_once(
+    motion: RelativeMotion, turning: bool
+) -> None:
     tied = Tied(motion, distance=0.1, angle=0.5)
     out = along(0, 0, 0, 0, 0, 0.002) if turning else along(0.001)
     tied.go(out, 900)
     farthest, held = tied.hand, tied.target
     tied.go(-0.1 * out, 200)
-    # The effect is as if the hand had been at the tool when it was farthest, except for a part that may be tremor.
+    # The target is as if the hand had been anchored at the tool when it was farthest, except for the first part of the
+    # way back, which may be tremor.
     motion.anchor(farthest, TOOL)
     expected = motion.target(tied.hand)
     missing = expected.actInv(tied.target)
@@ -152,7 +158,7 @@ def test_a_hand_that_comes_back_takes_the_target_from_the_tool_at_once(motion: R
     assert (tied.leash.rotation.slip if turning else tied.leash.position.slip) > 0.1
 
 
-def test_headset_noise_of_a_resting_hand_drops_no_slack() -> None:
+def test_the_noise_of_a_resting_hand_never_puts_the_target_at_the_tool() -> None:
     tied, random = Tied(RelativeMotion(), distance=0.1, angle=0.5), np.random.default_rng(4)
     tied.go(along(0.001), 300)
     start, noise = tied.hand, np.zeros(6)
@@ -164,7 +170,7 @@ def test_headset_noise_of_a_resting_hand_drops_no_slack() -> None:
         assert tied.distance > 0.098
 
 
-def test_a_tool_that_follows_is_not_slowed() -> None:
+def test_the_target_is_not_put_at_a_tool_that_still_follows() -> None:
     tied = Tied(RelativeMotion(), distance=0.1, angle=0.5)
     tied.go(along(0.001), 300)
     for _ in range(150):
@@ -173,7 +179,7 @@ def test_a_tool_that_follows_is_not_slowed() -> None:
         assert target.translation[0] - tied.tool.translation[0] > 0.02  # The target was never put at the tool.
 
 
-def test_slack_is_dropped_only_in_a_tick_that_is_too_short_to_count_as_motion() -> None:
+def test_the_target_is_put_at_the_tool_only_in_a_tick_too_short_for_the_step_to_count_as_motion() -> None:
     tied = Tied(RelativeMotion(), distance=0.1, angle=0.5)
     tied.go(along(0.001), 300)
     for _ in range(4):
@@ -183,7 +189,7 @@ def test_slack_is_dropped_only_in_a_tick_that_is_too_short_to_count_as_motion() 
     assert tied.distance < 1e-12
 
 
-def test_a_new_engagement_starts_with_slack_at_the_tool() -> None:
+def test_a_new_engagement_begins_at_the_tool_with_a_slack_leash_and_no_slip() -> None:
     driver = engaged()
     driver.commanded = dict(driver.tools)
     start = dict(driver.hands)
@@ -201,20 +207,20 @@ def test_a_new_engagement_starts_with_slack_at_the_tool() -> None:
         assert first.slip == first.slip_angle == 0.0
 
 
-# Directions of a hand's motion in the world, in which the arm can follow only a part of the way [m].
+# Motions of a hand in the world frame that the arm can follow only in part [m].
 OUT = {
     "stretched out forwards": np.array([1.0, 0.0, 0.0]),
     "blocked by the table": np.array([0.0, 0.0, -0.65]),
     "blocked by the other arm": np.array([0.0, -1.2, 0.0]),
 }
-HELD, BACK = 6.0, 0.002  # Time after which the hand goes back [s], and distance [m].
-RATE = 500.0
+HELD, BACK = 6.0, 0.002  # Time at which the hand begins to come back [s], and by how much it comes back [m].
+RATE = 500.0  # Rate of the loop [Hz].
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("out", OUT.values(), ids=OUT)
-def test_an_arm_held_up_rests_and_follows_the_first_millimetres_back_at_once_and_without_a_lurch(out: Array) -> None:
-    """The left hand moves out smoothly within 2.5 s, trembles there, and comes back at ``HELD``."""
+def test_an_arm_that_is_held_up_rests_and_then_follows_the_hand_back_at_once_without_a_lurch(out: Array) -> None:
+    """The left hand moves away smoothly within 2.5 s, trembles there, and comes back by ``BACK`` at ``HELD``."""
     farthest = float(np.linalg.norm(out))
 
     def hand(t: float) -> Array:
@@ -234,9 +240,10 @@ def test_an_arm_held_up_rests_and_follows_the_first_millimetres_back_at_once_and
     assert way[held] - way[start] < farthest - 0.45  # The arm was held up for half a metre.
     resting = (t > HELD - 0.5) & (t < HELD)
     acceleration = np.array([np.linalg.norm(tick.reference.a) for tick in ticks])[resting]
-    assert np.sqrt(np.mean(acceleration**2)) < 0.2  # An arm in free motion has 0.39 here.
+    assert np.sqrt(np.mean(acceleration**2)) < 0.2  # For an arm in free motion this is 0.39.
     assert speed[resting].max() < 0.01
-    # An almost straight arm needs a while for the second one. An arm that was pushed aside comes back as well.
+    # An almost straight arm needs a while for the second millimetre. An arm that was pushed aside also comes back to
+    # its path.
     assert -2.0 * BACK < way[soon] - way[held] < -0.5 * BACK
     assert way[later] - way[held] > -2.0 * BACK
     assert speed[t >= HELD].max() < 0.05  # The hand comes back at 0.04 m/s.

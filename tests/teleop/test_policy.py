@@ -1,4 +1,8 @@
-"""Actions of a policy become targets. They are interpolated, replaced without a jump, and end with the stream."""
+"""Actions of a policy become targets.
+
+Targets are interpolated between actions, and do not jump when a new chunk replaces the old one. Arms rest if no chunks
+come.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +26,7 @@ PERIOD = 0.05  # Period of actions [s].
 
 
 def chunk(times: npt.ArrayLike, ways: Array, arms: tuple[str, ...] = SIDES, **more: object) -> ActionChunk:
-    """Return actions at ``times`` that move the tools ``ways`` (n,) [m] along x from :data:`TOOLS`."""
+    """Return actions at ``times`` whose tool poses are ``ways`` (n,) [m] along x away from :data:`TOOLS`."""
     tools = {arm: np.array([floats_of_moved(TOOLS[arm], way) for way in ways]) for arm in arms}
     return ActionChunk(np.array(times), PERIOD, tools=tools, **more)  # type: ignore[arg-type]
 
@@ -33,7 +37,7 @@ def floats_of_moved(tool: pin.SE3, way: float) -> tuple[float, ...]:
 
 
 class Run:
-    """A teleop layer whose arms are at their last targets."""
+    """A teleop layer with tools that reach each target by the next tick, unless ``blocked`` is True."""
 
     def __init__(self, settings: TeleopSettings | None = None) -> None:
         self.teleop = Teleop(settings or TeleopSettings(), SIDES)
@@ -49,7 +53,10 @@ class Run:
             self.tools |= {arm: target.pose for arm, target in self.targets.items() if target.pose is not None}
 
     def ways(self, seconds: float, *chunks: ActionChunk) -> Array:
-        """Return the positions of the left tool along x after each tick [m]."""
+        """Tick for ``seconds`` and return the left tool's displacement along x after each tick [m].
+
+        The ``chunks`` come in the first tick.
+        """
         found = []
         for _ in range(round(seconds / TICK)):
             self.tick(*chunks)
@@ -64,7 +71,7 @@ class Run:
         return [kinds(event.reason) for event in self.teleop.take_events() if event.arm == arm]
 
 
-def test_the_first_target_is_the_tool_and_actions_are_reached_at_their_times() -> None:
+def test_the_first_target_is_the_tool_pose_and_each_action_is_reached_at_its_time() -> None:
     run = Run()
     times = run.now + TICK + PERIOD * np.arange(6)
     wanted = 0.1 * (times - times[0]) ** 2
@@ -76,7 +83,7 @@ def test_the_first_target_is_the_tool_and_actions_are_reached_at_their_times() -
     assert np.abs(np.diff(ways)).max() < 0.1 * TICK
 
 
-def test_a_newer_chunk_is_used_from_its_first_time_on_and_the_difference_fades_without_a_jump() -> None:
+def test_a_newer_chunk_is_followed_from_its_first_time_on_and_the_difference_fades_without_a_jump() -> None:
     run = Run()
     start = run.now + TICK
     old = chunk(start + PERIOD * np.arange(20), np.zeros(20))
@@ -87,14 +94,14 @@ def test_a_newer_chunk_is_used_from_its_first_time_on_and_the_difference_fades_w
     assert np.abs(np.diff(ways)).max() <= 0.6 * TICK + 1e-9
 
 
-def test_a_newer_chunk_also_replaces_actions_whose_time_has_not_come() -> None:
+def test_a_newer_chunk_replaces_a_chunk_that_has_not_begun_yet() -> None:
     run = Run()
     later = chunk(run.now + 0.3 + PERIOD * np.arange(10), np.full(10, 0.03))
     newer = chunk(run.now + PERIOD * np.arange(20), np.zeros(20))
     assert np.abs(run.ways(0.6, later, newer)).max() < 1e-12
 
 
-def test_a_late_chunk_is_followed_from_its_present_part_on_and_a_past_one_is_left_out() -> None:
+def test_a_late_chunk_is_followed_from_now_on_and_a_chunk_that_is_past_is_ignored() -> None:
     run = Run()
     past = chunk(run.now - 2.0 + PERIOD * np.arange(10), np.full(10, 0.05))
     run.ways(0.1, past)
@@ -104,7 +111,7 @@ def test_a_late_chunk_is_followed_from_its_present_part_on_and_a_past_one_is_lef
     assert ways[-1] == pytest.approx(0.08, abs=1e-3)
 
 
-def test_relative_motions_continue_from_the_target_and_a_single_late_one_is_made_in_full() -> None:
+def test_motions_continue_from_the_target_and_a_single_late_motion_is_made_in_full() -> None:
     run = Run()
     motion = np.tile([0.01, 0.0, 0.0, 0.0, 0.0, 0.2], (1, 1))
     for index in range(5):
@@ -113,7 +120,7 @@ def test_relative_motions_continue_from_the_target_and_a_single_late_one_is_made
         assert turned[2] == pytest.approx(0.2 * (index + 1), rel=0.05)
 
 
-def test_a_policy_that_stalls_ends_in_rest_with_a_reason_and_goes_on_with_a_chunk_that_begins_at_the_tool() -> None:
+def test_a_policy_that_stalls_stops_its_arms_and_a_chunk_that_begins_at_the_tools_moves_them_again() -> None:
     run = Run()
     run.ways(0.1, chunk(np.array([run.now]), np.array([0.01])))
     run.ways(SILENT - 0.11)
@@ -142,12 +149,12 @@ def test_an_action_that_jumps_stops_both_arms_and_is_not_followed(way: Array, re
     assert run.reasons("right") == []
 
 
-# Positions of the left tool [m].
+# Displacements of the left tool along x, for four actions [m].
 STAYS, JUMPS, JUMPS_LATER = np.zeros(4), np.full(4, 1.0), np.array([0.0, 0.0, 1.0, 1.0])
 
 
 def for_both(run: Run, left: Array) -> ActionChunk:
-    """Return one chunk for both arms, in which the right arm stays."""
+    """Return one chunk for both arms: ``left`` has the displacements of the left tool, and the right tool stays."""
     times = np.array(run.now + PERIOD * np.arange(4), dtype=np.float64)
     ways = zip(SIDES, (left, STAYS), strict=True)
     tools = {arm: chunk(times, its, (arm,)).tools[arm] for arm, its in ways}
@@ -156,7 +163,7 @@ def for_both(run: Run, left: Array) -> ActionChunk:
 
 @pytest.mark.parametrize("left", [JUMPS, JUMPS_LATER], ids=["from the tool", "between two actions"])
 @pytest.mark.parametrize("before", [0.1, 0.0], ids=["after both followed", "from the first chunk on"])
-def test_linked_arms_begin_together_or_not_at_all(before: float, left: Array) -> None:
+def test_linked_arms_begin_to_follow_a_policy_together_or_not_at_all(before: float, left: Array) -> None:
     run = Run()
     run.ways(before, *[for_both(run, STAYS)] * (before > 0.0))
     for _ in range(5):
@@ -166,7 +173,7 @@ def test_linked_arms_begin_together_or_not_at_all(before: float, left: Array) ->
     assert run.states() == {"policy"}
 
 
-def test_arms_that_a_fault_stopped_together_do_not_go_on_with_actions_for_one_of_them() -> None:
+def test_linked_arms_that_a_fault_has_stopped_do_not_follow_actions_for_only_one_arm() -> None:
     run = Run()
     run.ways(0.1, for_both(run, STAYS))
     run.ways(0.1, for_both(run, JUMPS))
@@ -174,7 +181,7 @@ def test_arms_that_a_fault_stopped_together_do_not_go_on_with_actions_for_one_of
     assert run.states() == {"lost"}
 
 
-def test_an_arm_that_is_not_linked_goes_on_alone() -> None:
+def test_an_arm_that_is_not_linked_goes_on_when_the_other_arm_has_a_fault() -> None:
     run = Run(TeleopSettings(linked=False))
     run.ways(0.1, for_both(run, STAYS))
     run.ways(0.1, for_both(run, JUMPS))
@@ -182,7 +189,7 @@ def test_an_arm_that_is_not_linked_goes_on_alone() -> None:
     assert {arm: str(state) for arm, state in run.teleop.states.items()} == {"left": "lost", "right": "policy"}
 
 
-def test_an_unusable_action_is_reported_once_while_nothing_moves() -> None:
+def test_unusable_actions_are_reported_once_while_no_arm_follows_the_policy() -> None:
     run = Run()
     fault = ActionChunk(np.zeros(0), PERIOD, fault=Reason.of(CommonReason.POLICY_UNUSABLE, text="no numbers"))
     for _ in range(10):
@@ -191,7 +198,7 @@ def test_an_unusable_action_is_reported_once_while_nothing_moves() -> None:
     assert run.reasons() == ["policy_refused: policy_unusable"]
 
 
-def test_times_of_another_clock_are_refused() -> None:
+def test_actions_with_times_of_another_clock_are_refused() -> None:
     run = Run()
     run.tick(chunk(np.array([run.now + 1e9]), np.array([0.0])))
     assert run.reasons() == ["policy_refused: policy_unusable"]
@@ -207,7 +214,7 @@ def test_grippers_change_at_the_time_of_the_action() -> None:
     assert run.targets["right"].gripper == 1.0
 
 
-def test_actions_that_curve_in_all_directions_are_followed_between_their_times_too() -> None:
+def test_between_actions_the_target_follows_a_parabola_through_them_in_all_directions() -> None:
     run = Run()
     run.now = 0.0
     way, times = np.array([0.1, -0.2, 0.3]), np.array([TICK + PERIOD * index for index in range(8)])
@@ -219,12 +226,12 @@ def test_actions_that_curve_in_all_directions_are_followed_between_their_times_t
     run.tick(ActionChunk(times, PERIOD, tools={"left": actions}))
     while run.now < times[-2]:
         run.tick()
-        # The velocity at the first action is that of the first segment, since nothing is known of the time before.
+        # Nothing is known of the time before the first action. Its velocity is the mean velocity up to the next action.
         allowed = 2e-4 if run.now < times[1] else 1e-9
         np.testing.assert_allclose(run.tools["left"].translation, place(run.now), atol=allowed)
 
 
-def test_a_tap_takes_an_arm_from_the_policy_and_the_next_one_closes_a_gripper_that_it_opened() -> None:
+def test_a_tap_takes_over_an_arm_and_a_second_tap_closes_the_gripper_that_the_policy_opened() -> None:
     run = Run()
 
     def hands(lower: bool = False, upper: bool = False) -> tuple[HandSample, ...]:
@@ -263,7 +270,7 @@ def test_targets_stay_in_the_workspace() -> None:
     assert run.ways(0.9, chunk(run.now + PERIOD * np.arange(20), 0.004 * np.arange(20.0))).max() == pytest.approx(0.02)
 
 
-def test_an_operator_whose_data_ended_has_to_press_before_the_policy_goes_on() -> None:
+def test_after_the_data_of_a_hand_have_ended_the_policy_may_not_move_its_arm_without_a_press() -> None:
     run = Run()
 
     def hands(lower: bool) -> tuple[HandSample, ...]:

@@ -1,4 +1,4 @@
-"""Relative motion: the tool's motion when the hand moves."""
+"""Relative motion: how the target moves when the hand moves."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def anchored(hand: pin.SE3, tool: pin.SE3, **settings: object) -> RelativeMotion
     scale=st.floats(0.1, 5.0),
     axes=st.sampled_from([("+x", "+y", "+z"), ("+z", "-x", "+y")]),
 )
-def test_a_hand_can_be_put_where_the_target_has_any_wanted_pose(
+def test_for_any_target_pose_there_is_a_hand_pose_that_leads_to_it(
     hand: pin.SE3, tool: pin.SE3, wanted: pin.SE3, stance: str, frame: str, scale: float, axes: tuple[str, ...]
 ) -> None:
     settings: dict[str, object] = {"stance": stance, "rotation_frame": frame, "scale": scale, "axes": axes}
@@ -57,7 +57,7 @@ def test_a_hand_can_be_put_where_the_target_has_any_wanted_pose(
 
 @quick
 @given(hand=poses, tool=poses, moved=poses)
-def test_the_tool_moves_like_the_hand_in_the_world_about_its_own_axes_or_reflected(
+def test_the_tool_repeats_the_motion_of_the_hand_in_the_world_frame_in_its_own_axes_or_reflected(
     hand: pin.SE3, tool: pin.SE3, moved: pin.SE3
 ) -> None:
     way, turn = moved.translation - hand.translation, moved.rotation @ hand.rotation.T
@@ -71,7 +71,7 @@ def test_the_tool_moves_like_the_hand_in_the_world_about_its_own_axes_or_reflect
 
 
 @pytest.mark.parametrize("frame", FRAMES)
-def test_scales_multiply_the_way_and_the_rotation_vector(frame: str) -> None:
+def test_scales_multiply_the_displacement_and_the_rotation_vector(frame: str) -> None:
     motion = anchored(pose(), pose(), scale=0.5, rotation_scale=2.0, rotation_frame=frame)
     target = motion.target(pose(0.2, -0.4, 0.6, (0.1, 0.2, -0.3)))
     np.testing.assert_allclose(target.translation, [0.1, -0.2, 0.3], atol=1e-12)
@@ -102,8 +102,10 @@ AXES = [
 
 
 @pytest.mark.parametrize("axes", AXES, ids=" ".join)
-def test_every_axis_convention_gives_the_world_what_the_hand_did_in_the_world(axes: tuple[str, str, str]) -> None:
-    """The same physical motion, written in the input's frame, moves the tool as it does when written in the world's."""
+def test_one_physical_motion_moves_the_tool_alike_in_every_axis_convention_of_the_input(
+    axes: tuple[str, str, str],
+) -> None:
+    """A motion is expressed in the input's frame and in the world frame. Both descriptions move the tool alike."""
     to_world = np.array([[float(axis[0] + "1") * (name == axis[1]) for name in "xyz"] for axis in axes])
 
     def as_sent(physical: pin.SE3) -> pin.SE3:

@@ -1,6 +1,6 @@
-"""The mean of a resting hand is more exact than its samples.
+"""The pose of a resting hand is the mean of its samples, which is more exact than each of them.
 
-A moving hand is followed as without it, and nothing jumps.
+For a moving hand the mean has no effect. The filtered pose never jumps between the two cases.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ AXIS = np.array([0.6, 0.0, 0.8])  # Axis about which the hand turns.
 
 
 class Filtered:
-    """A hand filter with or without its mean at rest. The samples are of a hand that moves along x and turns."""
+    """The filtered pose of a hand that moves along x and turns: ``plain`` without the mean, ``drawn`` with it."""
 
     def __init__(self, noise: float = NOISE) -> None:
         self._random, self._noise = np.random.default_rng(4), noise / NOISE
@@ -44,7 +44,7 @@ class Filtered:
         return floats_of(self.hand * pin.SE3(pin.exp3(noise[3:]), noise[:3]))
 
     def run(self, seconds: float, speed: float = 0.0, turning: float = 0.0) -> None:
-        """Run with the ``speed`` [m/s] and ``turning`` [rad/s] of the hand."""
+        """Move the hand with constant ``speed`` [m/s] and angular speed ``turning`` [rad/s]."""
         for _ in range(round(seconds / TICK)):
             self.t += TICK
             self.x += speed * TICK
@@ -66,7 +66,7 @@ def angle(one: pin.SE3, other: pin.SE3) -> float:
     return float(np.linalg.norm(pin.log3(one.rotation.T @ other.rotation)))
 
 
-def test_with_the_mean_the_noise_of_a_resting_hand_is_at_most_a_third() -> None:
+def test_the_mean_reduces_the_noise_of_a_resting_hand_to_less_than_a_third() -> None:
     filtered = Filtered()
     filtered.run(23.0)
     rested = slice(round(3.0 / TICK), None)
@@ -88,7 +88,7 @@ def test_a_hand_that_starts_to_move_is_followed_at_once_without_a_jump(speed: fl
     assert np.linalg.norm(drawn - plain, axis=1).max() < max(0.45e-3, 2e-3 * speed)
     steps = np.linalg.norm(np.diff(drawn[round(0.5 / TICK) :], axis=0), axis=1) / TICK
     assert steps.max() < 1.2 * speed + 0.025
-    # When it moves faster than the noise, only the filter's output is used.
+    # If the hand moves clearly faster than the noise, the mean has no effect.
     if speed >= 0.03:
         moving = slice(round(2.3 / TICK), round(2.95 / TICK))
         assert np.array_equal(drawn[moving], plain[moving])
@@ -97,7 +97,7 @@ def test_a_hand_that_starts_to_move_is_followed_at_once_without_a_jump(speed: fl
 
 @dataclass
 class NoisyOperator(Operator):
-    """An operator with a noisy headset, whose tools are at their targets."""
+    """An operator with a noisy headset. The tools are at their targets after each :meth:`follow`."""
 
     noise: float = NOISE
 
@@ -119,7 +119,7 @@ class NoisyOperator(Operator):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("noise", "within"), [(NOISE, 0.5e-3), (3.0 * NOISE, 1e-3), (5.0 * NOISE, 2e-3)])
-def test_a_hundred_pauses_of_a_resting_hand_with_noise_hardly_displace_the_tool(noise: float, within: float) -> None:
+def test_a_hundred_pauses_with_a_noisy_resting_hand_hardly_displace_the_tool(noise: float, within: float) -> None:
     driver = NoisyOperator(noise=noise)
     start = dict(driver.tools)
     after_engaging = []
@@ -138,7 +138,7 @@ def test_a_hundred_pauses_of_a_resting_hand_with_noise_hardly_displace_the_tool(
 
 
 @pytest.mark.parametrize("turning", [0.1, 6.0])
-def test_the_rest_of_a_hand_is_exact_after_rotations_of_any_size(turning: float) -> None:
+def test_the_mean_rotation_of_a_resting_hand_is_exact_after_a_turn_of_any_size(turning: float) -> None:
     filtered = Filtered()
     filtered.run(2.0, turning=turning)
     filtered.run(4.0)

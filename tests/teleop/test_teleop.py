@@ -1,4 +1,4 @@
-"""The teleop layer as a whole: engaging, pausing, grippers, chords. Targets are checked at every tick."""
+"""The whole teleop layer: engaging, pausing, grippers, chords. Targets are checked at every tick."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def test_all_arms_start_idle_and_the_first_press_of_a_lower_button_engages_only_
     assert [(e.arm, e.source, e.destination, e.kind) for e in driver.events] == [("left", "idle", "engaged", "pressed")]
 
 
-def test_a_target_names_its_hand_and_there_is_none_while_the_arm_holds() -> None:
+def test_a_target_contains_the_filtered_hand_pose_which_is_none_while_the_arm_holds() -> None:
     driver = engaged()
     driver.run(0.3, waving(driver))
     driver.run(1.5)
@@ -77,7 +77,7 @@ def test_pausing_stops_at_the_first_reading_of_the_button() -> None:
     assert driver.states == {"left": "paused", "right": "engaged"}
 
 
-def test_resuming_sets_new_anchors_and_keeps_the_orientation() -> None:
+def test_engaging_again_starts_at_the_measured_position_with_the_orientation_of_the_last_target() -> None:
     driver = engaged()
     history = driver.run(0.5, waving(driver))
     driver.lower = set(SIDES)
@@ -95,7 +95,7 @@ def test_resuming_sets_new_anchors_and_keeps_the_orientation() -> None:
         np.testing.assert_allclose(first.rotation, carried[arm], atol=1e-9)
 
 
-def test_a_thousand_pauses_with_the_hand_turning_in_between_do_not_drift() -> None:
+def test_a_thousand_pauses_between_which_the_hand_turns_do_not_move_the_tool() -> None:
     teleop, tool, now = Teleop(TeleopSettings(), ("left",)), pose(0.5, 0.1, 0.4, (3.0, 0.2, 0.1)), 0.0
     random, hand, firsts = np.random.default_rng(0), pose(), []
     for press in range(2001):
@@ -146,7 +146,7 @@ def test_a_chord_moves_no_gripper_stops_both_arms_and_sets_new_anchors_when_rele
     assert_smooth(history)
 
 
-def test_an_alignment_ends_only_with_a_pose_that_came_after_the_buttons_were_released() -> None:
+def test_an_alignment_ends_only_when_a_pose_comes_after_the_buttons_were_released() -> None:
     driver = engaged()
     driver.lower, driver.upper = set(SIDES), set(SIDES)
     driver.run(0.05)
@@ -165,7 +165,10 @@ DT = 0.002
 
 
 def tracking_error(script: ScriptedInput, duration: float) -> tuple[float, float]:
-    """Return RMS distance [mm] and angle [deg] of the left target from the ideal path, over all engaged ticks."""
+    """Return the RMS distance [mm] and the RMS angle [deg] between the left target and its ideal pose.
+
+    The ideal pose is where the hand was, earlier by the delay of the filter. All ticks with an engaged arm count.
+    """
     teleop = Teleop(TeleopSettings(), SIDES)
     tools = {"left": pose(0.5, 0.4, 0.5, (3.0, 0.1, 0.2)), "right": pose(0.5, -0.4, 0.5)}
     script.start()

@@ -1,4 +1,4 @@
-"""The box of targets: they never leave it, and go back inwards at once. Axes have scales."""
+"""Targets never leave their workspace box, and come back from its sides at once. Each axis can have a scale."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from q2r2_control.teleop.leash import Workspace
 from q2r2_control.types import SIDES
 from tests.teleop.hands import TICK, Operator, assert_smooth, engaged, operator
 
-# The box is around the left tool of the operator's tests, which is at (0.5, 0.4, 0.4).
+# Workspace around the left tool, which is at (0.5, 0.4, 0.4) [m]. See ``Operator.tools``.
 BOX = {"x": [0.4, 0.65], "y": [0.3, 0.6], "z": [0.3, 0.5]}
 
 
 def shift(driver: Operator, way: tuple[float, float, float], duration: float) -> list[np.ndarray]:
-    """Return the left target's positions while both hands move evenly by ``way`` and then rest."""
+    """Move both hands by ``way`` [m] at constant speed, and let them rest. Return the left target's positions [m]."""
     start = dict(driver.hands)
 
     def move(t: float) -> dict[str, pin.SE3]:
@@ -33,14 +33,14 @@ def test_a_target_never_leaves_its_box_and_comes_back_with_the_hand_at_once() ->
     driver = engaged(workspace={"left": BOX})
     out = shift(driver, (0.3, 0.0, 0.0), 1.0)
     assert max(position[0] for position in out) <= 0.65
-    assert out[-1][0] > 0.64  # The target is at the side, except for the overshoot of the filter when the hand stops.
+    assert out[-1][0] > 0.64  # The target is at the side of the box, except for overshoot when the hand stops.
     assert driver.targets["left"].slip > 0.1
     assert driver.targets["right"].slip == 0.0
     back = shift(driver, (-0.1, 0.05, -0.05), 0.5)
     np.testing.assert_allclose(back[-1] - out[-1], (-0.1, 0.05, -0.05), atol=1e-3)
 
 
-def test_an_arm_that_is_engaged_outside_does_not_jump_and_may_only_move_inwards() -> None:
+def test_a_tool_that_is_outside_of_its_box_does_not_jump_and_may_only_move_inwards() -> None:
     driver = operator(workspace={"left": BOX | {"x": [0.6, 0.8]}})
     driver.engage()
     np.testing.assert_allclose(driver.place().translation, driver.tools["left"].translation, atol=1e-6)
@@ -51,7 +51,7 @@ def test_an_arm_that_is_engaged_outside_does_not_jump_and_may_only_move_inwards(
 
 
 @pytest.mark.parametrize("at", [0.6499, 0.66])
-def test_a_hand_that_trembles_at_a_side_does_not_drift_away_from_it(at: float) -> None:
+def test_a_target_at_a_side_of_the_box_does_not_drift_while_the_hand_trembles(at: float) -> None:
     workspace = Workspace(WorkspaceSettings.model_validate(BOX))
     position, way = (at, 0.4, 0.4), 0.0
     assert workspace.hold((position, IDENTITY)) is None

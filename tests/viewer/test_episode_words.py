@@ -1,4 +1,4 @@
-"""Words for the episode and the subtask that go on."""
+"""The line that tells which episode and which subtask is recorded."""
 
 from __future__ import annotations
 
@@ -30,7 +30,9 @@ BEGINS, ENDS, DISCARDED = (
         ((), [BEGINS, SECOND], "records episode 1, subtask 2"),
     ],
 )
-def test_the_words_follow_what_the_operator_tells(names: tuple[str, ...], told: list[Reason], text: str) -> None:
+def test_the_line_shows_the_episode_and_the_subtask_after_each_event(
+    names: tuple[str, ...], told: list[Reason], text: str
+) -> None:
     words = EpisodeWords(names)
     words.follow(Event(0.0, "left", "paused", "paused", reason) for reason in told)
     assert words.text == text

@@ -1,4 +1,4 @@
-"""The messages of a run to the page in headsets, in the shapes for which the page's scripts are checked."""
+"""The messages of a run to the page of a headset. They have the types with which the page's scripts are checked."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_the_scene_contains_the_parts_of_the_task_and_the_links_that_move_with_e
     assert not set(scene["hands"]["left"]) & set(scene["hands"]["right"])
 
 
-def test_a_moment_has_parts_at_their_places_leashes_and_the_tightest_pair(
+def test_a_state_has_the_poses_of_parts_the_tightest_pair_and_texts_with_controls_in_braces(
     display: RunDisplay, plant: MujocoPlant, robot: Robot
 ) -> None:
     display.scene()
@@ -67,17 +67,17 @@ def test_a_moment_has_parts_at_their_places_leashes_and_the_tightest_pair(
     assert state["pair"] is not None
     ends = np.array(state["pair"]["ends"])
     assert np.linalg.norm(ends[0] - ends[1]) > 0.0
-    # The page fills in the words of the device.
+    # The page replaces these names by the words of the device.
     assert state["arms"]["left"]["why"] == "{lower}"
     assert "{lower} to engage" in state["arms"]["left"]["next"]
 
 
-def test_the_processes_that_draw_load_no_simulator() -> None:
+def test_processes_that_only_draw_do_not_import_the_simulator() -> None:
     modules = "q2r2_control.viewer.headset_display, q2r2_control.viewer.web.exchange"
     check = f"import sys, {modules}; sys.exit('mujoco' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", check], check=False).returncode == 0
 
 
-def test_without_a_simulation_there_are_no_parts(robot: Robot) -> None:
+def test_without_a_simulated_plant_no_loose_parts_are_shown(robot: Robot) -> None:
     assert places_of_parts(object(), cell()) == {}
     assert DeviceWords().noun("lower button") == "lower button"

@@ -1,4 +1,4 @@
-"""Topics of a headset in words: messages that came, that did not come, and that have stopped."""
+"""A headset's topics as text: topics with messages, topics without any, and topics whose messages have stopped."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ POSE = HandPose(np.array([0.1, -0.001, 2.0]), np.array([0.0, 0.0, 0.0, -1.0]), 0
 TOPIC = TopicStatistics(count=12, rate=75.0, age=0.25, last=POSE)
 
 
-def test_a_line_has_count_rate_age_and_rounded_values_or_says_that_nothing_came() -> None:
+def test_the_line_of_a_topic_has_count_rate_age_and_rounded_values_or_says_that_nothing_came() -> None:
     pose = "0.10 0.00 2.00 m, quaternion 0.00 0.00 0.00 -1.00"
     assert topic_line("pose", TOPIC, False) == f"pose: 12 messages, 75 Hz, 0.25 s old: {pose}"
     assert topic_line("pose", TOPIC, True).startswith("pose: timeout, 12 messages")
@@ -25,7 +25,7 @@ def test_a_line_has_count_rate_age_and_rounded_values_or_says_that_nothing_came(
     assert short_text(HandInputs()).startswith("held: none")
 
 
-def test_a_table_has_a_row_for_each_topic_and_marks_those_that_stopped() -> None:
+def test_the_table_has_a_row_for_each_topic_and_marks_topics_that_have_stopped() -> None:
     text = printed(topic_table("hands", {"pose": TOPIC, "inputs": None, "twist": TOPIC}, ["inputs", "twist"]), 160)
     for name, expected in (("pose", "0.25"), ("inputs", "timeout  nothing yet"), ("twist", "timeout  0.10 0.00 2.00")):
         (row,) = (line for line in text.splitlines() if name in line)

@@ -1,4 +1,4 @@
-"""The live table: its content, and its drawing on a real terminal, which is one end of a pseudo-terminal."""
+"""The live table: its contents, and how it is drawn on a terminal. The terminal is one end of a pseudo-terminal."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from tests.viewer.conftest import tick_at
 JOINTS = {side: [f"{side}_A{number}" for number in range(1, 8)] for side in ("left", "right")}
 
 
-def test_it_shows_states_errors_distances_and_grippers_of_the_newest_tick(robot: Robot) -> None:
+def test_the_table_shows_states_errors_distances_and_grippers_of_the_newest_tick(robot: Robot) -> None:
     table = LiveTable("demo", ArmWords(JOINTS, BindingSettings()))
     table(tick_at(robot, 1.0, engaged=False))
     table(replace(tick_at(robot, 2.0, distance=0.0234), held_grippers={"left": ("left_finger_0", "block_0")}))
@@ -40,7 +40,7 @@ def test_it_shows_states_errors_distances_and_grippers_of_the_newest_tick(robot:
     assert "paused" not in text
 
 
-def test_it_shows_the_episode_and_the_subtask_that_are_recorded(robot: Robot) -> None:
+def test_the_table_shows_the_episode_and_the_subtask_that_are_recorded(robot: Robot) -> None:
     words = ArmWords(JOINTS, BindingSettings())
     table = LiveTable("demo", words, episodes=EpisodeWords(("reach", "grasp [the] cube")))
     begun = (Reason(TeleopReason.EPISODE_BEGINS), Reason.of(TeleopReason.SUBTASK_BEGINS, number=2, name="grasp"))
@@ -49,7 +49,7 @@ def test_it_shows_the_episode_and_the_subtask_that_are_recorded(robot: Robot) ->
     assert "records episode 1, subtask 2: grasp [the] cube" in printed(table.render(), 160)
 
 
-def test_names_and_progress_are_complete_in_80_columns(robot: Robot) -> None:
+def test_the_table_cuts_off_no_name_and_no_progress_in_80_columns(robot: Robot) -> None:
     table = LiveTable("demo", ArmWords(JOINTS, BindingSettings()), ((0.0, "meet: both grasp"),), 10.0)
     tick = tick_at(robot, 2.5)
     pair = ("right_hand_e_finger_1_envelope_0", "left_hand_e_finger_1_envelope_0")
@@ -58,7 +58,7 @@ def test_names_and_progress_are_complete_in_80_columns(robot: Robot) -> None:
     assert "…" not in printed(table.render(), 80)
 
 
-def test_it_shows_each_arm_s_session_with_its_cabinet(robot: Robot) -> None:
+def test_the_table_shows_each_arm_s_session_with_its_cabinet(robot: Robot) -> None:
     table = LiveTable("demo", ArmWords(JOINTS, BindingSettings()))
     sessions = {"left": "commanding active, connection good, drives active", "right": "not heard"}
     table(replace(tick_at(robot, 0.0), sessions=sessions))
@@ -67,7 +67,7 @@ def test_it_shows_each_arm_s_session_with_its_cabinet(robot: Robot) -> None:
     assert sessions["left"] in text
 
 
-def test_it_shows_the_step_of_the_work_and_how_much_of_it_is_done(robot: Robot) -> None:
+def test_the_table_shows_the_step_of_the_work_and_how_much_of_the_work_is_done(robot: Robot) -> None:
     steps = ((0.0, "stack: the left hand reaches for a block"), (2.0, "stack: it grasps"), (3.0, "stack: it lifts"))
     table = LiveTable("demo", ArmWords(JOINTS, BindingSettings()), steps, 10.0)
     table(tick_at(robot, 2.5))
@@ -76,7 +76,7 @@ def test_it_shows_the_step_of_the_work_and_how_much_of_it_is_done(robot: Robot) 
     assert "━" * 5 + "·" * 15 + " 25%" in text
 
 
-def test_it_shows_every_limit_that_was_at_work_since_the_last_drawing(robot: Robot) -> None:
+def test_the_table_shows_every_limit_that_was_at_work_since_the_table_was_last_drawn(robot: Robot) -> None:
     table = LiveTable("demo", ArmWords(JOINTS, BindingSettings()))
     tick = tick_at(robot, 0.0)
     report = replace(tick.reference.report, binding=(ActiveLimit(LimitKind.VELOCITY, ("left_A2",)),))

@@ -1,4 +1,4 @@
-"""Moving obstacles on the page: at their reported places, in a colour that shows whether reports have ended."""
+"""Moving obstacles on the page: at their reported poses, in a colour that shows whether their reports have ended."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from q2r2_control.viewer.web.figure import ObstacleFigure
 from tests.pipeline.loops import pipeline
 from tests.support.processes import cell
 
-AT = (0.6, 1.4, 0.4)
+AT = (0.6, 1.4, 0.4)  # Position of the obstacles [m].
 
 
 @pytest.fixture
@@ -28,7 +28,7 @@ def server() -> Iterator[viser.ViserServer]:
     made.stop()
 
 
-def test_each_tick_of_a_run_has_the_obstacles_as_reported_and_their_age() -> None:
+def test_each_tick_of_a_run_has_the_reported_obstacles_with_the_age_of_their_reports() -> None:
     loop = pipeline(control=cell().control.model_copy(update={"moving_obstacles": ("hand", "box")}))
     known = MovingObstacle(shape="sphere", size=(0.1,), position=AT, speed=0.1, age=0.05)
     moments = {0.1: ("hand", known), 0.2: ("box", known.model_copy(update={"speed": 0.0})), 0.5: ("hand", None)}

@@ -17,14 +17,14 @@ from q2r2_control.inputs.webxr.webxr import WebXrInput
 from tests.web.browser import ARGUMENTS, CHROMIUM, HIDDEN, PATIENCE, VIEW, WebRun, one_processor
 from tests.web.headset_page import Listen
 
-_COARSE = 0.5  # Ratio of pixels, which is coarse because a processor draws them.
+_COARSE = 0.5  # Pixels of a picture per pixel of the page. They are few because no graphics card draws them.
 Open = Callable[..., Page]
 Start = Callable[..., WebRun]
 
 
 @pytest.fixture(scope="session")
 def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[BrowserContext]:
-    """Start one browser for all tests. Its own requests for updates are off."""
+    """Start one browser for all tests. It looks for no updates of its own."""
     folder = tmp_path_factory.mktemp("profile")
     with ExitStack() as stack:
         with one_processor():
@@ -46,7 +46,7 @@ def open_page(browser: BrowserContext) -> Iterator[Open]:
     pages: list[Page] = []
 
     def open_one(url: str, script: str | None = None) -> Page:
-        """Open a page. A page that is not viser's runs ``script`` before its own scripts."""
+        """Open a page. If ``script`` is given, it is the headset's page, and runs the script before its own scripts."""
         pages.append(browser.new_page())
         if script is not None:
             pages[-1].add_init_script(script)
@@ -63,7 +63,7 @@ def open_page(browser: BrowserContext) -> Iterator[Open]:
 
 @pytest.fixture
 def start(tmp_path: Path) -> Iterator[Start]:
-    """Start runs with a page, each of which ends with the test."""
+    """Return a function that starts a run with a page. The runs end with the test."""
     runs: list[WebRun] = []
 
     def start_one(*command: str) -> WebRun:
@@ -77,7 +77,7 @@ def start(tmp_path: Path) -> Iterator[Start]:
 
 @pytest.fixture
 def listen(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Listen]:
-    """Start servers of a headset's page, each of which ends with the test."""
+    """Return a function that starts a server of a headset's page. The servers end with the test."""
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
     with ExitStack() as stack:
 

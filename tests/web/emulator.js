@@ -1,16 +1,16 @@
-// A headset that is not there: Meta's emulator, and hands that tremble as real ones do.
+// An emulated headset: Meta's emulator, with hands that tremble like real hands.
 const device = new IWER.XRDevice(IWER.metaQuest3);
-device.installRuntime({ forceInstall: true }); // Chromium has a WebXR of its own, without a device
+device.installRuntime({ forceInstall: true }); // replaces Chromium's own WebXR, which has no device
 device.stereoEnabled = false;
 device.quaternion.set(-0.25, 0, 0, 0.968); // the head looks down, at the arms
-const NOISE = 2e-5; // of a position [m]
+const NOISE = 2e-5; // width of the noise of each coordinate [m]
 window.headset = device;
 window.hands = { left: [-0.2, 1.2, -0.4], right: [0.2, 1.2, -0.4] }; // x right, y up, z back [m]
-window.guessed = false; // whether poses are guesses, as of controllers out of sight; the emulator calls all of them so
+window.guessed = false; // whether poses are only guessed, as if the headset did not see the controllers; the emulator itself would say so always
 Object.defineProperty(XRPose.prototype, "emulatedPosition", { get: () => window.guessed });
 window.frames = 0;
 window.vibrations = [];
-window.said = null; // by the run, the newest
+window.said = null; // the newest state of the run
 
 const tremble = () => {
   window.frames += 1;
@@ -23,7 +23,8 @@ const tremble = () => {
 };
 requestAnimationFrame(tremble);
 
-// In so many frames, as people reach. The right hand goes half as far: human hands never move as one.
+// Moves the hands smoothly within a number of frames. The right hand moves half as far, because two human hands never
+// move as one rigid body.
 window.carry = async (way, frames) => {
   const from = structuredClone(window.hands);
   for (let frame = 1; frame <= frames; frame++) {
@@ -37,7 +38,7 @@ window.carry = async (way, frames) => {
 window.hold = (buttons, hand, value) => {
   for (const button of buttons) device.controllers[hand].updateButtonValue(button, value);
 };
-window.pulses = 0; // felt
+window.pulses = 0; // number of vibrations that were started or ended
 const actuator = Object.getPrototypeOf(device.controllers.left.inputSource.gamepad.hapticActuators[0]);
 const felt = actuator.pulse;
 actuator.pulse = function (...all) {
@@ -51,7 +52,7 @@ window.press = async (button, frames = 8) => {
   }
 };
 
-window.full = false; // whether the socket takes nothing at the moment
+window.full = false; // whether data wait in the socket, so that the page sends nothing
 const Socket = globalThis.WebSocket;
 globalThis.WebSocket = class extends Socket {
   get bufferedAmount() {

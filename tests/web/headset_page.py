@@ -1,4 +1,4 @@
-"""A headset's page without a headset: its messages to a run, and the answers of the run's server."""
+"""A stand-in for the page in a headset: it sends messages to the server of a run, and reads the answers."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def hand(x: float, *buttons: bool, **more: Any) -> dict[str, Any]:
 
 
 class Page:
-    """A page that numbers its messages."""
+    """The connection of a page, which numbers its messages. The page itself has the number ``number``."""
 
     def __init__(self, source: WebXrInput, number: str = "1") -> None:
         assert source.url is not None
@@ -44,7 +44,7 @@ class Page:
         self.socket.close()
 
     def ended(self) -> str:
-        """Return the reason why the run has ended it."""
+        """Wait until the server closes the connection. Return the code and the reason."""
         with suppress(ConnectionClosed):
             for _ in self.socket:
                 pass
@@ -64,7 +64,7 @@ def samples(source: WebXrInput, until: Callable[[list[HandSample]], object]) -> 
 
 def refused(source: WebXrInput, origin: str | None = None, query: str | None = None) -> bool:
     """Return whether the server refuses the socket."""
-    # The client of websockets reads and writes from two threads, which an SSL connection does not allow.
+    # The client of the package websockets reads and writes in two threads, which an SSL connection does not allow.
     assert source.url is not None
     scheme, host, _, token, _ = urlsplit(source.url)
     connection = HTTPConnection(host, timeout=60.0)

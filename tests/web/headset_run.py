@@ -1,4 +1,4 @@
-"""A run that a headset's page drives, whose time passes slowly: a busy machine makes no hand late.
+"""A run that a headset's page drives. The run's time passes slowly, so that no hand is late on a busy machine.
 
 python -m tests.web.headset_run PAUSE
 """

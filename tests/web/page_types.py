@@ -1,4 +1,6 @@
-"""Writes TypeScript types of the page's messages, of the classes that say their shapes: for a check of its scripts.
+"""Write the types of the page's messages in TypeScript, with which the page's scripts are checked.
+
+The types are made from the Python classes of the messages.
 
 python -m tests.web.page_types FILE
 """
@@ -16,12 +18,12 @@ from q2r2_control.inputs.webxr.page_messages import PageMessage
 from q2r2_control.inputs.webxr.shown import FromRun
 
 _PLAIN = {"string": "string", "number": "number", "integer": "number", "boolean": "boolean", "null": "null"}
-# These tuples have no class of their own, so that a schema does not name them.
+# These tuples have no class of their own, so no schema contains their names.
 _NAMED = f"type Point = [{', '.join(['number'] * 3)}];\ntype Seven = [{', '.join(['number'] * 7)}];\n"
 
 
 def types() -> str:
-    """Return declarations for all scripts of the page."""
+    """Return the declarations of all types that the page's scripts use."""
     found: dict[str, Any] = {}
     for shape in (PageMessage, FromRun):
         schema = TypeAdapter(shape).json_schema(mode="validation")
@@ -54,7 +56,7 @@ def _type_of(schema: dict[str, Any]) -> str:
 
 
 def main() -> None:
-    """Write the given file."""
+    """Write the types to the file that the command line names."""
     file = Path(sys.argv[1])
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text(types(), encoding="utf-8")

@@ -1,4 +1,7 @@
-"""A run for the headset's page without robot and loop. Its display is given, and requests of buttons are kept."""
+"""A stand-in for a run, without robot and loop, for tests of the headset's page.
+
+The test gives the states that the page shows, and sees the requests of its buttons.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +35,7 @@ STATE: ShownState = {
 
 
 class GivenDisplay:
-    """A display that shows states unchanged."""
+    """A display whose states come from the test and are shown unchanged."""
 
     def scene(self) -> ShownScene:
         return {
@@ -51,7 +54,7 @@ class GivenDisplay:
 
 
 class ShownRun:
-    """An input that shows :data:`STATE` after its start."""
+    """Shows states on the page of an input, and keeps the requests of its buttons in ``asked``."""
 
     def __init__(self, source: WebXrInput) -> None:
         self.asked: list[str] = []

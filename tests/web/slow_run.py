@@ -1,4 +1,4 @@
-"""A run with its page whose time passes slowly: a busy machine makes neither a hand nor a page late.
+"""A run with its page. The run's time passes slowly, so that no hand and no page is late on a busy machine.
 
 python -m tests.web.slow_run INPUT PORT PAUSE
 """
@@ -17,13 +17,14 @@ from q2r2_control.summary.tick import Tick
 from q2r2_control.viewer.web import view
 from tests.support.processes import cell
 
-_SILENT, _STANDS = 0.5, 1.0  # Longest silence of an engaged hand [s], and the duration of each later tick [s].
+# If an engaged hand has been silent for the first time [s] of the run, each tick takes the second time [s].
+_SILENT, _STANDS = 0.5, 1.0
 
 
 class SlowTime:
-    """The loop's time, in which a tick of 1 ms takes at least ``pause`` [s].
+    """The clock of the loop. A tick of 1 ms takes at least ``pause`` [s] of real time.
 
-    It all but stands still while an engaged arm waits for a page that is busy drawing.
+    While an engaged arm waits for a page that is busy drawing, the clock nearly stands still.
     """
 
     def __init__(self, pause: float) -> None:
@@ -40,7 +41,7 @@ class SlowTime:
 
 
 def patient(config: Config) -> Config:
-    """Return the cell with a gate that waits long for a browser."""
+    """Return the cell with a long timeout of the gate, since a browser may be slow."""
     gate = config.teleop.gate.model_copy(update={"timeout": 2.0})
     return config.model_copy(update={"teleop": config.teleop.model_copy(update={"gate": gate})})
 
@@ -53,7 +54,7 @@ def main(source: str, port: int, pause: float) -> None:
     hands = WebInput(slow) if is_web else make_input("scripted", config, trajectory=source)
     pipeline = Pipeline.from_config(config, input=hands, plant="kinematic")
     pipeline.listeners.append(slow.pass_by)
-    view._PERIOD = 0.2  # A processor draws the page, which takes long.
+    view._PERIOD = 0.2  # Drawing the page takes long, because no graphics card does it.
     with view.PageView("127.0.0.1", port) as page:
         print(f"page: {page.begin(pipeline, 'slow', False)}", file=sys.stderr, flush=True)
         print(json.dumps(pipeline.run(realtime=False).as_json()))

@@ -1,4 +1,4 @@
-"""viser accepts only messages that this page sends. No message of one browser changes a control for the others."""
+"""viser gets only messages that this page sends. No message of one browser changes a widget for other browsers."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ REFUSED = [
     {"type": "TransformControlsDragStartMessage", "name": "/gizmos/left", "owner": "", "more": 1},
     {"type": "TransformControlsDragStartMessage", "name": ["/gizmos/left"], "owner": ""},
 ]
-# These updates would change viser's own record of a control, or give it a value of another kind.
+# These updates would change viser's own data of a widget, or give the widget a value of another type.
 CHANGES: list[dict[str, Any]] = [
     {"removed": True},
     {"update_cb": []},
@@ -52,13 +52,13 @@ def gui() -> Iterator[viser.GuiApi]:
 
 @pytest.fixture
 def asked() -> list[object]:
-    """Return the requests of the buttons of the page."""
+    """Return a list to which the page appends the requests of its buttons."""
     return []
 
 
 @pytest.fixture
 def page(asked: list[object]) -> Iterator[Callable[[], PageClient]]:
-    """Open a page of a run."""
+    """Return a function that opens the page of a run."""
     with PageView("127.0.0.1", 0) as view:
         url = view.serve(pipeline(ScriptedInput("circle")), "hostile", on_request=asked.append)
         yield lambda: PageClient(url)
@@ -83,8 +83,8 @@ def test_a_message_that_this_page_never_sends_is_refused(message: dict[str, Any]
         assert messages.admitted(msgspec.msgpack.encode(known)) is not None
 
 
-def test_a_field_that_is_sent_twice_has_one_meaning(gui: viser.GuiApi) -> None:
-    """viser reads the last one of two fields with the same name."""
+def test_a_field_that_is_sent_twice_cannot_make_viser_read_another_message(gui: viser.GuiApi) -> None:
+    """Of two fields with the same name, viser reads the last one."""
     messages = BrowserMessages()
     camera = [("type", "TransformControlsDragEndMessage"), ("name", "/a"), ("owner", ""), ("type", "ShareUrlRequest")]
     content = bytes([0x80 + len(camera)]) + b"".join(msgspec.msgpack.encode(part) for pair in camera for part in pair)
@@ -92,7 +92,7 @@ def test_a_field_that_is_sent_twice_has_one_meaning(gui: viser.GuiApi) -> None:
     assert admitted is None or msgspec.msgpack.decode(admitted)["type"] != "ShareUrlRequest"
 
 
-def test_a_control_accepts_only_values_of_its_kind_and_range(gui: viser.GuiApi) -> None:
+def test_a_widget_accepts_only_values_of_its_type_and_range(gui: viser.GuiApi) -> None:
     messages = BrowserMessages()
     slider, box = gui.add_slider("share", 0.1, 1.0, 0.1, 0.5), gui.add_checkbox("shadows", False)
     text = gui.add_text("text", "")
@@ -111,7 +111,7 @@ def test_a_control_accepts_only_values_of_its_kind_and_range(gui: viser.GuiApi) 
         assert not any(admits(handle, {"value": 1.0, "min": -9.0}) or admits(handle, one) for one in CHANGES)
 
 
-def test_a_button_counts_at_most_ten_times_a_second_and_a_stop_always(gui: viser.GuiApi) -> None:
+def test_a_button_counts_at_most_ten_times_a_second_but_every_press_of_stop_counts(gui: viser.GuiApi) -> None:
     now = 0.0
     messages, stops = BrowserMessages(lambda: now), []
     messages.watch(gui)
@@ -127,13 +127,13 @@ def test_a_button_counts_at_most_ten_times_a_second_and_a_stop_always(gui: viser
     assert messages.admitted(changed(uuid_of(home), {"value": True})) is not None, "a flood of another button"
 
 
-def test_stop_works_whatever_another_page_sends(page: Callable[[], PageClient], asked: list[object]) -> None:
+def test_the_stop_button_works_whatever_another_page_sends(page: Callable[[], PageClient], asked: list[object]) -> None:
     with page() as hostile, page() as honest:
         for label in ("Stop", "Pause"):
             for updates in CHANGES:
                 hostile.send("GuiUpdateMessage", uuid=hostile.button(label), updates=updates)
         hostile.send("ShareUrlRequest")
-        # When this press arrives, the server has read all messages before it.
+        # When this press has an effect, the server has read all messages before it.
         hostile.press("Bring both arms home")
         wait_until(lambda: asked)
         honest.press("Pause")

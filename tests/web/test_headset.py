@@ -1,4 +1,4 @@
-"""The page in an emulated headset, from entering VR to the arms of the simulated cell."""
+"""The page in an emulated headset drives the arms of the simulated cell."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ LOWER = {"left": "x-button", "right": "a-button"}
 UPPER = {"left": "y-button", "right": "b-button"}
 # One browser opens both pages. A page in the driver's browser would count as the driver's own page, loaded again.
 ANOTHER_BROWSER = "Storage.prototype.getItem = () => null"
-ORANGE = (255.0, 107.0, 13.0)  # Colour of the arms' rings.
+ORANGE = (255.0, 107.0, 13.0)  # Colour of the rings on the drawn arms.
 
 
 def emulated() -> str:
-    """The script of an emulated headset, and of the tests' requests to it."""
+    """Return the script that emulates a headset and gives the tests functions to control it."""
     assert EMULATOR.exists(), f"{EMULATOR} is missing: make test-web fetches it with npm"
     return f"{EMULATOR.read_text()};{Path(__file__).with_name('emulator.js').read_text()}"
 
 
 @pytest.fixture
 def enter(open_page: Open) -> Any:
-    """Open a page in an emulated headset, and enter VR or AR."""
+    """Return a function that opens a page in an emulated headset, and enters VR or AR."""
 
     def enter_one(url: str, mode: str = "vr") -> Page:
         page = open_page(url, emulated())
@@ -44,7 +44,7 @@ def enter(open_page: Open) -> Any:
 
 
 def begin(page: Page, mode: str = "vr") -> None:
-    """Enter from the page, as after a reload."""
+    """Enter VR or AR from the page, when the page has a state of the run."""
     wait_until(lambda: said(page) is not None)
     page.click(f"#immersive-{mode}")
     wait_until(lambda: page.evaluate("Boolean(headset.activeSession)"))
@@ -52,13 +52,13 @@ def begin(page: Page, mode: str = "vr") -> None:
 
 
 def frames(page: Page, count: int) -> None:
-    """Let the emulator draw this many frames."""
+    """Wait until the emulator has drawn ``count`` more frames."""
     drawn = page.evaluate("frames")
     wait_until(lambda: page.evaluate("frames") >= drawn + count)
 
 
 def said(page: Page) -> dict[str, Any] | None:
-    """Return the newest state that the page got from the run."""
+    """Return the newest state that the page has got from the run; None if it has none."""
     state: dict[str, Any] | None = page.evaluate("said")
     return state
 
@@ -70,14 +70,14 @@ def arms(page: Page, what: str) -> list[Any]:
 
 
 def wait_for(page: Page, states: str, why: str = "") -> None:
-    """Wait until both arms are in a state, for a reason."""
+    """Wait until both arms are in the state ``states``, with a reason that contains ``why``."""
     wait_until_said(
         page, lambda: arms(page, "state") == [states] * 2 and all(why in words for words in arms(page, "why"))
     )
 
 
 def wait_until_said(page: Page, condition: Callable[[], object]) -> None:
-    """Wait until the page got this. Otherwise, the failure contains the last message."""
+    """Wait until ``condition`` is true. If it does not become true, the error contains the page's newest state."""
     try:
         wait_until(condition)
     except AssertionError as error:
@@ -95,7 +95,9 @@ def targets(page: Page) -> Array:
     return np.array(arms(page, "target"))[:, :3]
 
 
-def test_hands_engage_the_arms_move_them_by_the_rooms_axes_and_feel_it(enter: Any, start: Start) -> None:
+def test_hands_engage_the_arms_and_move_them_along_the_axes_of_the_room_and_feel_vibrations(
+    enter: Any, start: Start
+) -> None:
     run = start(*RUN)
     page = enter(run.url)
     wait_for(page, "idle", "not engaged yet")
@@ -107,7 +109,7 @@ def test_hands_engage_the_arms_move_them_by_the_rooms_axes_and_feel_it(enter: An
     assert np.allclose(targets(page)[1] - before[1], 0.5 * np.array([0.07, 0.05, 0.06]), atol=2e-3)
     wait_for(page, "engaged", "follows the hand")
     wait_until(lambda: count(pixels(page), ORANGE) > 5)  # The robot is visible, not only its board.
-    # The chord of the app stops both arms, and a pause after it counts as one.
+    # The alignment chord of the left hand stops both arms. Afterwards a press still pauses them.
     page.evaluate("hold(['x-button', 'y-button'], 'left', 1)")
     wait_for(page, "aligning")
     page.evaluate("hold(['x-button', 'y-button'], 'left', 0)")
@@ -117,13 +119,13 @@ def test_hands_engage_the_arms_move_them_by_the_rooms_axes_and_feel_it(enter: An
     felt = page.evaluate("vibrations.filter(one => one.amplitude > 0).map(one => one.hand)")
     assert {"left", "right"} <= set(felt)
     assert page.evaluate("pulses") > 3
-    page.evaluate("document.getElementById('leave').click()")  # The button is behind what the emulator draws.
+    page.evaluate("document.getElementById('leave').click()")  # The emulator draws over the button.
     wait_until(lambda: not page.evaluate("Boolean(headset.activeSession)"))
     run.interrupt()
     assert run.end()["at_rest"]
 
 
-def test_if_the_hands_are_lost_in_any_way_the_arms_stop_until_a_new_press(enter: Any, start: Start) -> None:
+def test_the_arms_stop_until_a_new_press_in_whatever_way_the_hands_are_lost(enter: Any, start: Start) -> None:
     run = start(*RUN)
     page = enter(run.url)
 
@@ -160,7 +162,7 @@ def test_if_the_hands_are_lost_in_any_way_the_arms_stop_until_a_new_press(enter:
     assert run.end()["at_rest"]
 
 
-def test_fingers_beside_a_controller_that_was_laid_down_move_no_arm(enter: Any, start: Start) -> None:
+def test_fingers_move_no_arm_after_the_controllers_were_laid_down(enter: Any, start: Start) -> None:
     run = start(*RUN)
     page = enter(run.url)
     press(page, LOWER)
@@ -170,7 +172,7 @@ def test_fingers_beside_a_controller_that_was_laid_down_move_no_arm(enter: Any, 
     page.evaluate("carry([0.0, 0.05, 0.0], 60)")
     frames(page, 20)
     wait_for(page, "lost")
-    # The controllers are taken up again, and a press engages.
+    # The operator picks up the controllers again, and a press engages the arms.
     page.evaluate("headset.primaryInputMode = 'controller'")
     frames(page, 60)
     wait_for(page, "lost")
@@ -180,7 +182,9 @@ def test_fingers_beside_a_controller_that_was_laid_down_move_no_arm(enter: Any, 
     assert run.end()["at_rest"]
 
 
-def test_the_first_headset_drives_and_another_one_gets_a_message(enter: Any, start: Start, open_page: Open) -> None:
+def test_the_first_headset_drives_and_the_page_of_another_headset_says_so(
+    enter: Any, start: Start, open_page: Open
+) -> None:
     run = start(*RUN)
     page = enter(run.url, "ar")
     other = open_page(run.url, ANOTHER_BROWSER)

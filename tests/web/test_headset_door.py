@@ -1,4 +1,4 @@
-"""Access to a headset's page: hosts, tokens, certificates and cables."""
+"""Who may open a headset's page: hosts, tokens and certificates; and headsets on a USB cable."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from tests.web.headset_page import Listen, refused
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def test_only_our_own_page_connects_and_from_other_machines_only_with_the_token(
+def test_only_the_servers_own_page_connects_and_from_other_machines_only_with_the_token(
     listen: Listen,
 ) -> None:
     lines: list[str] = []
@@ -50,7 +50,7 @@ def test_only_our_own_page_connects_and_from_other_machines_only_with_the_token(
     assert not any("certificate" in line for line in lines)
 
 
-def test_a_certificate_is_renewed_before_it_expires_and_for_another_address(tmp_path: Path) -> None:
+def test_a_certificate_is_renewed_before_it_expires_or_if_it_does_not_name_an_address(tmp_path: Path) -> None:
     now = datetime(2026, 1, 1, tzinfo=UTC)
 
     def made(address: str, later: int = 0) -> tuple[bytes, str | None]:
@@ -72,7 +72,7 @@ def test_a_certificate_is_renewed_before_it_expires_and_for_another_address(tmp_
     assert "cannot be read" in str(made("10.0.0.7")[1])
 
 
-def test_each_network_of_this_computer_has_a_url_a_code_and_a_name_in_the_certificate(
+def test_each_address_of_this_computer_has_a_url_a_qr_code_and_a_name_in_the_certificate(
     listen: Listen, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     networks = ("192.168.1.5", "10.0.0.7")
@@ -91,7 +91,7 @@ def test_each_network_of_this_computer_has_a_url_a_code_and_a_name_in_the_certif
     assert set(networks) <= {str(name.value) for name in names}
 
 
-def test_a_cable_needs_adb_and_its_message_says_what_is_missing(
+def test_a_headset_on_a_cable_needs_adb_and_an_error_says_what_is_missing(
     listen: Listen, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
@@ -149,7 +149,7 @@ def test_the_extra_of_the_page_names_all_of_its_packages() -> None:
     assert named.issuperset(_PACKAGES)
 
 
-def test_a_used_port_and_a_cable_to_another_address_give_one_clear_line(
+def test_a_used_port_and_a_cable_with_another_host_and_a_bad_certificate_give_one_clear_line(
     listen: Listen,
 ) -> None:
     source = listen()

@@ -1,4 +1,4 @@
-"""The page's server: the driver, and the samples that are made of a page's messages."""
+"""The server of a headset's page: which page drives, and the samples that its messages become."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.web.headset_page import Listen, Page, hand, samples
 NOISE = np.random.default_rng(3)
 
 
-def test_a_hand_arrives_as_the_page_sent_it_with_all_its_controls(listen: Listen) -> None:
+def test_a_hand_arrives_as_the_page_sent_it_with_all_controls(listen: Listen) -> None:
     source = listen()
     with closing(Page(source)) as page:
         sent = hand(1.0, True, False, True) | {"axes": [0.1, -0.2, 0.3, 0.4]}
@@ -49,7 +49,7 @@ def test_a_hand_arrives_as_the_page_sent_it_with_all_its_controls(listen: Listen
         pytest.param({"fault": "hand_frame_moved"}, HandFault.FRAME_MOVED, id="a recentred room"),
     ],
 )
-def test_a_pose_that_the_headset_only_guesses_is_a_fault(
+def test_a_missing_or_guessed_pose_and_a_moved_frame_are_faults_of_the_sample(
     listen: Listen, told: dict[str, Any], fault: HandFault
 ) -> None:
     source = listen()
@@ -58,13 +58,13 @@ def test_a_pose_that_the_headset_only_guesses_is_a_fault(
         assert samples(source, len)[0].fault is fault
 
 
-def test_of_simultaneous_messages_the_newest_pose_counts_and_every_button(listen: Listen) -> None:
+def test_of_messages_that_come_together_the_newest_pose_counts_and_no_press_is_lost(listen: Listen) -> None:
     source = listen()
     with closing(Page(source)) as page:
         page.send(left=hand(0.0))
         samples(source, len)
         burst = [hand(x, False, x == 4.0) for x in (1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0)]
-        # All messages come in one piece of the stream, as after a silence of the Wi-Fi.
+        # All messages arrive at once, as after an interruption of the Wi-Fi.
         frames = []
         with page.socket.protocol_mutex:
             for index, one in enumerate(burst):
@@ -92,7 +92,7 @@ def test_of_simultaneous_messages_the_newest_pose_counts_and_every_button(listen
         pytest.param("x" * (LONGEST + 1), id="too long"),
     ],
 )
-def test_garbage_ends_only_its_own_page(listen: Listen, content: str | bytes) -> None:
+def test_an_invalid_message_ends_only_the_connection_of_its_own_page(listen: Listen, content: str | bytes) -> None:
     source = listen()
     with closing(Page(source)) as page:
         page.socket.send(content)
@@ -102,7 +102,7 @@ def test_garbage_ends_only_its_own_page(listen: Listen, content: str | bytes) ->
         assert samples(source, len)[0].position[0] == 5.0
 
 
-def test_numbers_that_are_not_finite_arrive_so_that_the_gate_judges_them(
+def test_poses_that_are_not_finite_arrive_unchanged_so_that_the_gate_judges_them(
     listen: Listen,
 ) -> None:
     source = listen()
@@ -113,7 +113,7 @@ def test_numbers_that_are_not_finite_arrive_so_that_the_gate_judges_them(
     assert sample.fault is None
 
 
-def test_a_flood_ends_its_page(listen: Listen) -> None:
+def test_a_flood_of_messages_ends_the_connection_of_its_page(listen: Listen) -> None:
     source = listen()
     with closing(Page(source)) as page:
         try:
@@ -124,16 +124,16 @@ def test_a_flood_ends_its_page(listen: Listen) -> None:
         assert "messages in a second" in page.ended()
 
 
-def test_the_first_page_drives_and_one_that_comes_back_takes_its_place(listen: Listen) -> None:
+def test_the_first_page_drives_and_a_reloaded_page_replaces_its_own_old_connection(listen: Listen) -> None:
     source = listen(silence=PATIENCE)
     with closing(Page(source, "1")) as first:
         first.send(left=hand(1.0))
         samples(source, len)
         peer = source.statistics.peer
         with closing(Page(source, "2")) as second:
-            # The second words come from a machine so busy that the first page has been silent for a while.
+            # The second text comes if the machine is so busy that the first page has been silent for a while.
             assert second.ended() in (f"4001 {peer} drives", f"4001 {peer} is connected")
-        # The page tries again after a silence of the first connection, which was lost without a message.
+        # The first connection falls silent, as if it were lost without a message. The same page tries to connect again.
         with ExitStack() as tries:
 
             def comes_back() -> bool:
@@ -178,7 +178,7 @@ def test_the_newest_picture_reaches_the_page_that_drives(listen: Listen) -> None
         received: list[str | bytes] = []
 
         def has_the_newest() -> bool:
-            page.send(left=hand(1.0))  # A page goes on sending. A picture follows one of its messages.
+            page.send(left=hand(1.0))  # The server sends a picture only after a message of the page.
             with suppress(TimeoutError):
                 received.append(page.socket.recv(timeout=0.05))
             return received[-1:] == [b"newest"]

@@ -1,4 +1,4 @@
-"""Words and buttons of the page for headsets on a screen, and the board that it shows in VR."""
+"""The headset's page on a screen: its texts and buttons. In VR: the board with the texts."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[ShownRun]:
 
 
 def shows(run: ShownRun, page: Page, condition: Callable[[], object]) -> None:
-    """Show the state again and again until the page shows it."""
+    """Let the run send its state again and again until ``condition`` is true."""
 
     def look() -> object:
         run.show()
@@ -45,7 +45,7 @@ def opened(run: ShownRun, open_page: Open, script: str = "") -> Page:
     return page
 
 
-def test_stop_and_home_are_buttons_and_reach_the_run(run: ShownRun, open_page: Open) -> None:
+def test_each_press_of_the_buttons_home_pause_and_stop_reaches_the_run_once(run: ShownRun, open_page: Open) -> None:
     page = opened(run, open_page)
     page.click("#home")
     wait_until(lambda: run.asked == ["home"])
@@ -53,14 +53,16 @@ def test_stop_and_home_are_buttons_and_reach_the_run(run: ShownRun, open_page: O
     wait_until(lambda: run.asked == ["home", "pause"])
     page.click("#stop")
     wait_until(lambda: run.asked == ["home", "pause", "stop"])
-    # The space key, which engages a flown hand, presses neither button again.
+    # The space key, which engages the arm of a hand that is moved by keys, presses no button again.
     page.click("#fly")
     page.keyboard.press("Space")
     page.wait_for_timeout(500)
     assert run.asked == ["home", "pause", "stop"]
 
 
-def test_a_state_has_its_colour_and_the_tab_the_name_of_the_cell(run: ShownRun, open_page: Open) -> None:
+def test_the_page_shows_a_state_in_its_colour_and_the_tab_shows_the_name_of_the_cell(
+    run: ShownRun, open_page: Open
+) -> None:
     page = opened(run, open_page)
     colour = page.evaluate("getComputedStyle(document.querySelector('.state')).backgroundColor")
     assert colour == f"rgb{RED}"
@@ -68,7 +70,7 @@ def test_a_state_has_its_colour_and_the_tab_the_name_of_the_cell(run: ShownRun, 
     assert page.inner_text("#arms").count("lost") == 2  # Each arm's state is shown once.
 
 
-def test_words_are_those_of_the_used_device(run: ShownRun, open_page: Open) -> None:
+def test_texts_name_the_controls_of_the_device_that_is_used(run: ShownRun, open_page: Open) -> None:
     page = opened(run, open_page)
 
     def next_of(row: int) -> str:
@@ -141,7 +143,7 @@ def test_a_watching_page_sees_the_driver_and_the_state_and_may_only_stop(run: Sh
     wait_until(lambda: "connected" in other.inner_text("#link"))  # The other page may drive now.
 
 
-def test_a_run_that_is_over_says_so_on_its_page(run: ShownRun, open_page: Open) -> None:
+def test_the_page_says_that_the_run_is_over_and_tries_to_connect_again(run: ShownRun, open_page: Open) -> None:
     page = opened(run, open_page)
     page.click("#fly")
     assert page.locator("#keys").is_visible()
@@ -155,7 +157,7 @@ def test_a_run_that_is_over_says_so_on_its_page(run: ShownRun, open_page: Open) 
     assert count(pixels(page), (230.0, 40.0, 40.0)) > 20  # The last picture stays.
     assert page.locator("#fly").is_disabled()
     assert page.locator("#keys").is_hidden()
-    # The page tries again at once when somebody looks at it.
+    # If somebody looks at the page again, it tries at once to connect.
     page.evaluate("""() => {
         window.tries = 0;
         const Socket = WebSocket;
@@ -190,7 +192,9 @@ BOARD = """async (state) => {
 }"""
 
 
-def test_the_board_has_readable_letters_and_moves_to_where_the_operator_looks(run: ShownRun, open_page: Open) -> None:
+def test_the_board_has_readable_letters_and_follows_the_direction_in_which_the_operator_looks(
+    run: ShownRun, open_page: Open
+) -> None:
     state = STATE | {"arms": {"left": arm("left", why="paused by {lower}")}}
     board = opened(run, open_page).evaluate(BOARD, state)
     assert min(board["degrees"]) >= 1.5

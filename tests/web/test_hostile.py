@@ -1,4 +1,4 @@
-"""Many, slow, dead or hostile pages do not change a run, and cannot make its loop wait."""
+"""A run does not change, and its loop does not wait, if there are many pages, slow or hostile pages, or frozen ones."""
 
 from __future__ import annotations
 
@@ -45,7 +45,10 @@ def joined(url: str) -> ClientConnection:
 
 
 def played(loop: Pipeline, acts: Mapping[float, Callable[[], object]]) -> Array:
-    """Return joint positions (ticks, nv) of a run in simulated time, with actions at some of its times."""
+    """Return the joint positions (ticks, nv) of a run in simulated time [rad].
+
+    ``acts`` are functions to call, by the time of the run at which they are called [s].
+    """
     positions, due = [], sorted(acts)
 
     def follow(tick: Tick) -> None:
@@ -63,10 +66,10 @@ def circling() -> Pipeline:
     return pipeline(ScriptedInput("circle"))
 
 
-def test_watchers_garbage_and_a_page_that_stands_still_change_nothing(
+def test_many_watchers_invalid_messages_and_a_frozen_page_process_do_not_change_the_run(
     view: PageView, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(view_module, "_PERIOD", 0.0)  # There are more frames than a pipe has room for.
+    monkeypatch.setattr(view_module, "_PERIOD", 0.0)  # More frames are sent than fit into a pipe.
     loop = circling()
     url = view.begin(loop, "hostile", False)
     page = view._process.pid
@@ -101,7 +104,7 @@ def test_watchers_garbage_and_a_page_that_stands_still_change_nothing(
     assert np.array_equal(watched, played(circling(), {}))
 
 
-def test_a_slider_allows_no_speed_above_the_cells_and_no_invalid_value(view: PageView) -> None:
+def test_a_slider_allows_no_speed_above_the_cells_speed_and_no_invalid_value(view: PageView) -> None:
     loop = circling()
     view.begin(loop, "sliders", False)
     usual = loop.config.control.max_linear_speed
@@ -117,7 +120,7 @@ def test_a_slider_allows_no_speed_above_the_cells_and_no_invalid_value(view: Pag
     assert seen == [(1.0, 1.0), *[(0.5, 0.5)] * 5, (1.0, 0.5), (0.5, 0.5), (1.0, 0.5)]
 
 
-def test_a_flood_of_requests_is_reduced_except_for_stops() -> None:
+def test_a_flood_of_requests_is_thinned_out_but_stops_always_pass() -> None:
     passed: list[object] = []
     answer = LimitedAnswers(passed.append, clock=lambda: 0.0)
     for _ in range(1000):

@@ -8,7 +8,7 @@ from q2r2_control.viewer.web.pace import BrowserPace
 
 
 class Browser:
-    """A pace by a clock that the test sets."""
+    """A browser that sends positions, and the measurement of its pace, by a clock that the test sets."""
 
     def __init__(self) -> None:
         self.now = 100.0
@@ -25,7 +25,7 @@ def browser() -> Browser:
     return Browser()
 
 
-def test_a_browser_in_time_is_not_blamed_even_after_the_drag(browser: Browser) -> None:
+def test_a_browser_that_sends_in_time_gets_no_advice_even_after_the_drag(browser: Browser) -> None:
     browser.send(0.02)
     assert browser.pace.advice(silent=False) == ""
     browser.pace.end()
@@ -34,7 +34,7 @@ def test_a_browser_in_time_is_not_blamed_even_after_the_drag(browser: Browser) -
     assert browser.pace.advice(silent=True).startswith("The positions of the dragged tool came too late. Let go, then")
 
 
-def test_a_slow_browser_is_named_with_its_rate_the_needed_one_and_the_cure(browser: Browser) -> None:
+def test_the_advice_for_a_slow_browser_has_its_rate_the_needed_rate_and_the_cure(browser: Browser) -> None:
     browser.send(0.02)
     browser.send(0.5, 1)
     browser.send(0.02)
@@ -49,7 +49,7 @@ def test_a_slow_browser_is_named_with_its_rate_the_needed_one_and_the_cure(brows
     assert browser.pace.advice(silent=False) == ""
 
 
-def test_a_browser_that_sends_nothing_at_all_is_named_while_it_is_silent(browser: Browser) -> None:
+def test_a_browser_that_sends_nothing_at_all_gets_advice_while_it_is_silent(browser: Browser) -> None:
     browser.now += 0.4
     assert "no position for 0.40 s" in browser.pace.advice(silent=False)
 

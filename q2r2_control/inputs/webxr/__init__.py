@@ -1,6 +1,6 @@
-"""Hands that a web page in a headset's browser sends. Nothing has to be installed on the headset.
+"""An input from a web page in a headset's browser, which sends the hands. Nothing is installed on the headset.
 
-``webxr`` is the input, on the loop's side. ``server`` is the process that serves ``page`` and its socket, and
-``page_messages`` reads the messages of the page. ``certificate`` makes the certificate and the token that HTTPS needs.
-``usb`` forwards a port of a headset on a cable to this computer.
+``webxr`` is the input, in the process of the control loop. ``server`` is the process that serves ``page`` and its
+socket, and ``page_messages`` reads the messages of the page. ``certificate`` makes the certificate and the token that
+HTTPS needs. ``usb`` connects a headset by a cable: it forwards a port of the headset to this computer.
 """

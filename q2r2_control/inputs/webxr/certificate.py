@@ -1,4 +1,4 @@
-"""Make a certificate and a token of this installation on first use. The private key never leaves its folder."""
+"""Make this installation's certificate and token at their first use. The private key never leaves its folder."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from q2r2_control.errors import InputError
 from q2r2_control.extras import install_line
 from q2r2_control.inputs.addresses import NO_NETWORK
 
-_VALID = timedelta(days=365)
-_RENEWED = timedelta(days=7)  # Time before the expiry at which a certificate is renewed.
+_VALID = timedelta(days=365)  # Time from now to the expiry of a new certificate.
+_RENEWED = timedelta(days=7)  # A certificate that expires within this time is replaced by a new one.
 
 
 def installation_folder() -> Path:
@@ -35,9 +35,10 @@ def installation_token(folder: Path) -> str:
 
 
 def own_certificate(folder: Path, addresses: Sequence[str], now: datetime) -> tuple[Path, str | None]:
-    """Return a PEM file with certificate and key for a server at ``addresses``, and a line if it is a new one.
+    """Return a PEM file with certificate and key for a server at ``addresses``, and a line for people if it is new.
 
-    A new file is made if there is none, if the certificate expires within a week, and for further addresses.
+    A new file is made if there is none, if its certificate expires within a week, or if the certificate does not name
+    all ``addresses``.
 
     Raises:
         InputError: If the package cryptography is missing, or if the file cannot be written.

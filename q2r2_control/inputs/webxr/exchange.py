@@ -1,4 +1,4 @@
-"""The data that the input of a run and the process of its page exchange."""
+"""The data that a run's input and the process that serves its page send to each other."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from q2r2_control.inputs.webxr.shown import ShownScene, ShownState
 
 
 class Display(Protocol):
-    """Makes the data that a headset shows of a run. The run makes this object, and the page's process uses it."""
+    """Makes the data of a run that a headset shows. The run makes this instance, and the page's process uses it."""
 
     def scene(self) -> ShownScene:
         """Return the data that is sent once to each page, as JSON."""
@@ -24,13 +24,13 @@ class Display(Protocol):
 
 @dataclass(frozen=True)
 class HeadsetPageSetup:
-    """The first message to the process."""
+    """The first message to the process that serves the page."""
 
     host: str
     port: int  # The port to listen on; 0 for any free port.
     allow: Sequence[Network] | None  # Networks that may connect; None for all.
-    addresses: Sequence[str]  # Addresses by which others reach the page.
-    certificate: str | None  # A PEM file with its key; None for HTTP.
+    addresses: Sequence[str]  # Addresses at which other computers reach the page.
+    certificate: str | None  # A PEM file with a certificate and its key; None for HTTP.
     token: str
     silence: float  # A page that drives is dropped if it sends nothing for this time [s].
     display: Display | None
@@ -50,7 +50,7 @@ class Admitted(NamedTuple):
 
 
 class Lost(NamedTuple):
-    """The page that drove is gone."""
+    """The connection to the page that drove has ended."""
 
     reason: str
 
@@ -62,7 +62,7 @@ class Received(NamedTuple):
 
 
 class Requested(NamedTuple):
-    """A button of a page was pressed."""
+    """What a button of a page requests."""
 
     request: HeadsetRequest
 
@@ -75,7 +75,7 @@ class Logged(NamedTuple):
 
 
 class Shown(NamedTuple):
-    """The newest state of the run, for the display."""
+    """The newest state of the run, which the page shows."""
 
     content: Any
 

@@ -1,4 +1,4 @@
-"""A page that is connected, and the data that the server's process sends to it."""
+"""A page that is connected, and the data that still have to be sent to it."""
 
 from __future__ import annotations
 
@@ -16,38 +16,39 @@ from q2r2_control.inputs.webxr.page_messages import PageMessage
 from q2r2_control.inputs.webxr.shown import FromRun, ShownVibration
 from q2r2_control.types import HapticFeedback
 
-MAX_MESSAGES_PER_SECOND = 300  # Headsets send up to 120.
+MAX_MESSAGES_PER_SECOND = 300  # A page that sends more is dropped. Headsets send up to 120.
 
 _LONGEST_REASON = 120  # Greatest length of the reason for which a socket is closed [bytes].
 
 
 class PageClient(Peer):
-    """A page that is connected."""
+    """A page that is connected. It may drive, wait or only watch."""
 
     def __init__(self, connection: ServerConnection, host: str, peer: str, page: str, now: float) -> None:
-        # A page keeps its number when it is reloaded. The number thus has the role of the app's registrations.
+        # A page keeps its number when it is reloaded. Like the app's registrations, the number shows that a page is the
+        # same as before.
         super().__init__(peer, host, since=now, last_frame=now, registrations=({"page": page} if page else {}, {}))
         self.connection = connection
-        self.newest: PageMessage | None = None  # The newest message, if it is not passed on yet.
+        self.newest: PageMessage | None = None  # The newest message; None if it has been passed on.
         self.acknowledged = -1  # Number of the newest message.
-        self.refused_hosts: set[str] = set()
-        self.due = asyncio.Event()
-        self.vibrations: dict[str, HapticFeedback] = {}  # The newest vibration of each hand.
-        self.shown: Any = None
-        self.picture: bytes | None = None
-        self.driver: str | None = None  # The driver, if a page that watches has not been told yet.
+        self.refused_hosts: set[str] = set()  # Hosts that the log has named as refused while this page drives.
+        self.due = asyncio.Event()  # Set if something has to be sent.
+        self.vibrations: dict[str, HapticFeedback] = {}  # The newest vibration of each hand that is not sent yet.
+        self.shown: Any = None  # The newest state of the run; None if it has been sent.
+        self.picture: bytes | None = None  # The newest picture of a camera; None if it has been sent.
+        self.driver: str | None = None  # The driver, which a page that watches has to be told; None if it knows.
         self.rate = RateLimit(MAX_MESSAGES_PER_SECOND)
         self.reason = ""  # Why the server has closed the socket.
         self.closing: asyncio.Future[None] | None = None
 
     def end(self, code: int, reason: str) -> None:
-        """Begin to close the socket. The page decides how long this takes."""
+        """Begin to close the socket. This takes until the page answers."""
         self.reason = reason
         shown = reason.encode()[:_LONGEST_REASON].decode(errors="ignore")
         self.closing = asyncio.ensure_future(self.connection.close(code, shown))
 
     async def send_newest(self, scene: str | None, display: Display | None) -> None:
-        """Send the ``scene``, and then only the newest data, whenever the page has received the data before."""
+        """Send the ``scene`` first, and then the newest data each time they are due. Older data are left out."""
         connection = self.connection
         with suppress(ConnectionClosed):
             if scene is not None:

@@ -1,4 +1,4 @@
-"""Read the messages of the page: JSON of the hands, once per frame of the headset. This module has no sockets."""
+"""Read the messages of the page: the hands as JSON, once for each picture of the headset. No sockets are used."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from q2r2_control.inputs.webxr.shown import Seven
 from q2r2_control.types import QUEST_CONTROLS, DeviceControls, HandFault, HandInputs
 
 LONGEST = 4096  # Greatest length of a message [bytes]. Messages of the page have under 600.
-# A pinch is one of bare fingers, or a touch of a phone's screen. These devices have no other button.
+# The button "pinch" is a pinch of bare fingers, or a touch of a phone's screen. These devices have no other button.
 _NOUNS = {**QUEST_WORDS.nouns, "lower": "A, X or Space", "upper": "B, Y or G", "pinch": "the pinch"}
 _ABSENT = "nothing: no browser drives, open the page"
 CONTROLS = DeviceControls(
@@ -29,7 +29,7 @@ CONTROLS = DeviceControls(
 
 
 class HeadsetRequest(StrEnum):
-    """The requests of the page's buttons. A page that watches may only request a stop."""
+    """What the buttons of the page request. A page that only watches may request nothing but a stop."""
 
     STOP = "stop"  # Bring the arms to rest, and end the run.
     HOME = "home"
@@ -47,7 +47,7 @@ class _PageModel(BaseModel):
 
 
 class HeadsetHand(_PageModel):
-    """One hand. Its numbers may have any value, also NaN, since the gate checks the numbers of every headset."""
+    """One hand. Its numbers may have any value, also NaN, since the teleop layer's gate checks them."""
 
     # Position [m] and quaternion x y z w, in a frame with x forward, y left and z up; None if not known.
     pose: Seven | None
@@ -57,12 +57,12 @@ class HeadsetHand(_PageModel):
 
 
 class PageMessage(_PageModel):
-    """The message of one frame. A message without hands says only that the page is alive."""
+    """The message for one picture of the headset. Without hands it only says that the page is alive."""
 
     seq: int = Field(ge=0, le=1 << 53)
     hands: dict[_Hand, HeadsetHand] = Field(default_factory=dict)
     request: HeadsetRequest | None = None  # The request of a button of the page.
-    virtual: bool = False  # True if keys or a gamepad move the hands, so that they rest without noise.
+    virtual: bool = False  # True if keys or a gamepad move the hands. Poses of hands at rest then have no noise.
 
     @property
     def controls(self) -> dict[str, tuple[bool, ...]]:

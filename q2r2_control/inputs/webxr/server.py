@@ -1,4 +1,4 @@
-"""The process that serves the page and its socket on one port. It decides which page drives, and passes on new data."""
+"""The process that serves the page and its socket on one port. It decides which page drives, and passes data on."""
 
 from __future__ import annotations
 
@@ -44,9 +44,9 @@ from q2r2_control.inputs.webxr.page_messages import LONGEST, HeadsetRequest, rea
 from q2r2_control.types import HapticFeedback
 
 REFUSED, DROPPED, OVER, FREE = 4001, 4002, 4003, 4004  # Codes of a closed socket, which the page reads.
-_MOST_WATCHERS = 8
-_WATCHED = 0.1  # Time between two states for pages that watch [s].
-_MOST_SOCKETS = 16
+_MOST_WATCHERS = 8  # Greatest number of pages that only watch.
+_WATCHED = 0.1  # Least time between two states that are sent to pages that watch [s].
+_MOST_SOCKETS = 16  # Greatest number of open pages.
 _KINDS = {".html": "text/html", ".js": "text/javascript", ".css": "text/css"}
 _POLICY = "default-src 'self'; connect-src 'self'; style-src 'self'; img-src 'self' blob: data:; base-uri 'none'"
 
@@ -61,8 +61,8 @@ class PageServer:
         self._driver: PageClient | None = None
         self._waiting: list[PageClient] = []
         self._watchers: list[PageClient] = []  # Pages that never drive.
-        self._watched = 0.0  # When the last state was shown to them [s].
-        self._sockets = 0
+        self._watched = 0.0  # When the last state was sent to pages that watch [s].
+        self._sockets = 0  # Number of open sockets.
         folder = files(__package__).joinpath("page")
         self._files = {file.name: file.read_text(encoding="utf-8") for file in folder.iterdir() if file.is_file()}
         self._scene = json.dumps({"scene": setup.display.scene()}) if setup.display is not None else None
@@ -113,7 +113,7 @@ class PageServer:
         host, _ = _peer_of(connection)
         if not is_allowed(host, self._setup.allow):
             return text_response(http.HTTPStatus.FORBIDDEN, f"{host} is not in headset.allow\n")
-        # The page's other files are in the public package, so that they are no secret.
+        # The other files of the page are no secret, since they are in the public package.
         reason = self._door.refusal(request, with_token=is_socket or name == "index.html")
         if reason is None and is_socket and self._sockets >= _MOST_SOCKETS:
             reason = f"{_MOST_SOCKETS} pages are open"
@@ -155,7 +155,7 @@ class PageServer:
             sending.cancel()
             self._forget(client, client.reason or reason)
             if client.closing is not None:
-                await client.closing  # Otherwise the server would close it without the reason.
+                await client.closing  # Otherwise the server would close the socket without the reason.
 
     def _receive(self, client: PageClient, text: str | bytes) -> None:
         now = self._clock()
@@ -171,7 +171,7 @@ class PageServer:
         if client is not self._driver:
             self._settle(now)
             return
-        # If several messages come together, only the newest counts. A message with other buttons is never left out.
+        # If several messages come together, only the newest is passed on. A change of the buttons is never left out.
         if client.newest is None:
             asyncio.get_running_loop().call_soon(self._pass_on, client)
         elif client.newest.controls != message.controls:
@@ -179,12 +179,12 @@ class PageServer:
         client.newest = message
 
     def _ask(self, client: PageClient, request: HeadsetRequest | None) -> None:
-        """Pass on the request of a button: a stop from every page, and any request from the page that drives."""
+        """Pass on what a button requests: a stop by every page, and everything by the page that drives."""
         if request is HeadsetRequest.STOP or (request is not None and client is self._driver):
             self._answer(Requested(request))
 
     def _watch_with(self, client: PageClient) -> None:
-        """Show the run to a page that never drives, while another one does."""
+        """Show the run to a page that only watches. This is possible only while another page drives."""
         if self._driver is None or len(self._watchers) >= _MOST_WATCHERS:
             reason = "nobody drives" if self._driver is None else f"{_MOST_WATCHERS} pages watch"
             client.end(FREE if self._driver is None else REFUSED, reason)
@@ -200,7 +200,7 @@ class PageServer:
             client.due.set()
 
     def _take(self, request: Any) -> None:
-        """Store a vibration, a state or a picture for the driver, and a state for pages that watch."""
+        """Take data of the run: a vibration, a state or a picture for the driver, and a state for pages that watch."""
         driver = self._driver
         if driver is None:
             return
@@ -216,13 +216,13 @@ class PageServer:
                         client.due.set()
             case CameraPicture():
                 driver.picture = request.jpeg
-                return  # The picture is sent after the next pose has come.
+                return  # The picture is sent later, with the next data that are due.
         driver.due.set()
 
     async def _watch(self) -> None:
-        """Drop a driver that is silent, and decide on pages that wait."""
+        """Drop a driver that is silent, and decide about the pages that wait. This is done every ``TURN``."""
         while True:
-            # All data that were sent before this time are read before a decision about a page, as in the TCP server.
+            # As in the TCP server, all data that were sent before this time are read before the decisions about pages.
             asked = self._clock()
             await asyncio.sleep(TURN)
             driver = self._driver
@@ -254,7 +254,7 @@ class PageServer:
         self._forget(client, reason)
 
     def _forget(self, client: PageClient, reason: str) -> None:
-        """Remove a page that is gone, or that may not drive any more. The method may be called twice."""
+        """Remove a page whose connection has ended, or that may not drive any more. May be called twice."""
         for pages in (self._waiting, self._watchers):
             if client in pages:
                 pages.remove(client)
@@ -282,14 +282,21 @@ def _logger_of(answer: Callable[[Any], None]) -> logging.Logger:
 
 
 def _peer_of(connection: ServerConnection) -> tuple[str, str]:
-    """Return the host (as IPv4 if the connection is IPv4 through IPv6), and host and port in one text for people."""
+    """Return the host, and host and port as one text for people.
+
+    The host of an IPv4 connection through an IPv6 socket is an IPv4 address.
+    """
     address, port = connection.remote_address[:2]
     host = str(getattr(ip_address(address), "ipv4_mapped", None) or address)
     return host, written(host, port)
 
 
 def main(requests: Iterator[Any], answer: Callable[[Any], None]) -> None:
-    """Answer with :class:`Listening`, and then with the data of the page that drives.
+    """Run the process. It answers with :class:`Listening`, and then with the data of the page that drives.
+
+    Args:
+        requests: The data from the run. The first one is the setup.
+        answer: Sends data to the run.
 
     Raises:
         ConfigError: If the address cannot be bound, or if the certificate cannot be used.

@@ -1,6 +1,6 @@
 """The types of the JSON that a run sends to the page. The types for the page's scripts are made from these classes.
 
-Poses are x y z qx qy qz qw in the world, in metres, and points are x y z. Colours are r g b, from 0 to 255.
+Poses are x y z [m] qx qy qz qw in the world frame, and points are x y z [m]. Colours are r g b, from 0 to 255.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class ShownMesh(TypedDict):
 
 
 class ShownPart(TypedDict):
-    """A loose part, drawn as a box."""
+    """A loose part, which is drawn as a box."""
 
     size: Point
     colour: Colour
@@ -35,16 +35,17 @@ class ShownScene(TypedDict):
 
     name: str
     meshes: list[ShownMesh]
-    hands: dict[str, list[int]]  # Joints that move with the tool, by arm.
+    hands: dict[str, list[int]]  # By arm, the joints whose meshes move with the tool.
     parts: dict[str, ShownPart]
-    floor: float  # [m]
+    floor: float  # Height of the floor [m].
     timeout: float  # An arm stops if no hand comes for this time [s].
 
 
 class ShownArm(TypedDict):
-    """An arm. In ``why`` and ``next``, a control has its name in braces, since only the page knows the device.
+    """An arm. ``why`` is the reason for its state, and ``next`` is what its operator can do.
 
-    ``hand`` is the hand that drives the arm, ``colour`` is that of the state, and ``silent`` says that the arm stopped
+    In both texts, the name of a control is in braces, since only the page knows the words of its device. ``hand`` is
+    the hand that drives the arm, ``colour`` is the colour of the state, and ``silent`` says that the arm has stopped
     because the data of its hand did not come in time.
     """
 
@@ -69,7 +70,7 @@ class ShownState(TypedDict):
     """A moment of a run."""
 
     arms: dict[str, ShownArm]
-    joints: list[Seven]  # Poses, by the index of the joint in the meshes.
+    joints: list[Seven]  # The poses of the joints. ``ShownMesh.joint`` is an index into this list.
     parts: dict[str, Seven]
     pair: ShownPair | None
     recording: str
@@ -88,6 +89,6 @@ class FromRun(TypedDict):
 
     scene: NotRequired[ShownScene]
     state: NotRequired[ShownState]
-    acknowledged: NotRequired[int]  # Sent with a state: the number of the newest message of the page.
+    acknowledged: NotRequired[int]  # Comes with a state: the number of the newest message that the page has sent.
     vibration: NotRequired[ShownVibration]
-    driver: NotRequired[str]  # Sent to a page that watches: the page that drives.
+    driver: NotRequired[str]  # The page that drives. Only pages that watch get this field.

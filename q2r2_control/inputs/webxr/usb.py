@@ -1,4 +1,4 @@
-"""A headset on a USB cable: adb forwards the headset's localhost to this machine, without HTTPS and Wi-Fi."""
+"""Connect a headset by a USB cable: adb forwards the headset's localhost to this machine, without HTTPS and Wi-Fi."""
 
 from __future__ import annotations
 
@@ -10,7 +10,11 @@ _PATIENCE = 15.0  # Longest time for adb, which may start a server of its own [s
 
 
 def reverse(port: int, *, remove: bool = False) -> None:
-    """Forward the headset's ``port`` to the same port here, or end this; raises :class:`InputError` if adb fails."""
+    """Forward the headset's ``port`` to the same port of this machine, or end this forwarding.
+
+    Raises:
+        InputError: If adb fails.
+    """
     command = ["adb", "reverse", *(["--remove", f"tcp:{port}"] if remove else [f"tcp:{port}"] * 2)]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=_PATIENCE, check=False)

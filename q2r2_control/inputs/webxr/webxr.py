@@ -1,4 +1,4 @@
-"""The input from a web page in a headset's browser, on the loop's side."""
+"""The input from a web page in a headset's browser. It runs in the process of the control loop."""
 
 from __future__ import annotations
 
@@ -44,9 +44,9 @@ from q2r2_control.process.helper_process import HelperProcess, reason_of
 from q2r2_control.types import SIDES, HandSample, HapticFeedback
 
 PORT = 8443
-_READY = 120.0  # Longest time until the process is ready before the run, on a busy computer [s].
-_PATIENCE, _LONGEST = 2.0, 10.0  # Longest time for the process to end while it is idle, and while it is busy [s].
-_ROOM = 2  # Number of messages that may wait for the process. The newest data matter more than a long queue.
+_READY = 120.0  # Longest time until the process is ready, on a busy computer [s].
+_PATIENCE, _LONGEST = 2.0, 10.0  # Longest time until the process ends if it is idle, and if it is busy [s].
+_ROOM = 2  # Number of messages that may wait for the process. More would only delay the newest data.
 _LOG = logging.getLogger(__name__)
 
 
@@ -54,7 +54,7 @@ _PACKAGES = ("websockets", "trimesh")  # Packages of the page. The extra `web` n
 
 
 def _check_packages() -> None:
-    """Raise :class:`InputError` with all packages of the page that are not installed."""
+    """Raise :class:`InputError` if packages of the page are not installed. The error names them all."""
     if missing := [package for package in _PACKAGES if find_spec(package) is None]:
         raise InputError(f"--input webxr needs {' and '.join(missing)}: {install_line('web')}")
 
@@ -62,9 +62,9 @@ def _check_packages() -> None:
 class WebXrInput:
     """Gives the hands of a headset's browser. Implements :class:`~q2r2_control.inputs.base.Input`.
 
-    A process of its own serves page and socket, so that neither HTTPS nor JSON takes the interpreter from the loop. Its
-    messages become samples as those of the Quest2ROS app do: :class:`~q2r2_control.inputs.hand_stream.HandStream`.
-    ``clock`` stamps them when they come from that process [s].
+    A process of its own serves page and socket, so that neither HTTPS nor JSON delays the loop. The messages of that
+    process become samples as the messages of the Quest2ROS app do; see
+    :class:`~q2r2_control.inputs.hand_stream.HandStream`. ``clock`` gives the time at which they come from it [s].
     """
 
     controls = CONTROLS
@@ -82,7 +82,7 @@ class WebXrInput:
         say: Callable[[str], None] = _LOG.info,
         silence: float = SILENCE_ALLOWED,
     ) -> None:
-        """A page that sends nothing for ``silence`` [s] is dropped. The gate stops the arms long before."""
+        """A page that sends nothing for ``silence`` [s] is dropped. The teleop layer stops the arms long before."""
         self.address = host, port  # After ``start``, the port is the one that was bound.
         self.urls: tuple[str, ...] = ()  # After ``start``, one URL for each address of this computer.
         self._clock, self._allow, self._usb, self._certificate, self._say = clock, allow, by_usb, certificate, say
@@ -109,7 +109,7 @@ class WebXrInput:
             ConfigError: If the host is not allowed.
             InputError: If a package of the page is not installed.
         """
-        _check_packages()  # The check comes before slow work, such as measuring the loop's rate.
+        _check_packages()  # This check comes before slow work, such as measuring the loop's rate.
         headset = HeadsetConfig(**(config.headset.model_dump() | ({} if host is None else {"host": host})))
         if usb and not is_loopback(headset.host):
             raise ConfigError(f"--usb with --host {headset.host}: allowed: 127.0.0.1, which the cable leads to")
@@ -125,15 +125,20 @@ class WebXrInput:
         return config.model_copy(update={"teleop": teleop})
 
     def show_on(self, display: Display, requests: Mapping[HeadsetRequest, Callable[[], None]]) -> None:
-        """Let pages show a run by ``display``, and make ``requests``. This is called before :meth:`start`."""
+        """Let pages show a run, and let their buttons have an effect. This is called before :meth:`start`.
+
+        Args:
+            display: Makes the data that the pages show.
+            requests: The function to call for each request of a button.
+        """
         self._display, self._requests = display, requests
 
     def show(self, content: Any) -> bool:
-        """Show the newest state of the run. Return False if the last state still waits. The method never waits."""
+        """Show the newest state of the run. Return False if the last state is not sent yet. The method never waits."""
         return self._process is not None and self._process.send(Shown(content), 1)
 
     def show_picture(self, jpeg: bytes) -> bool:
-        """Show the newest picture of a camera, as :meth:`show` does. Any thread may call this."""
+        """Show the newest picture of a camera; otherwise like :meth:`show`. Any thread may call this."""
         return self._process is not None and self._process.send(CameraPicture(jpeg), 1)
 
     def start(self) -> None:
@@ -174,7 +179,7 @@ class WebXrInput:
 
     @property
     def connected(self) -> bool:
-        """Whether a page drives, and ``poll`` has shown every lost connection."""
+        """Whether a page drives, and no earlier lost connection is still to be noticed by a :meth:`poll`."""
         return self._stream.connected and self._process is not None and self._process.alive
 
     @property
@@ -191,7 +196,10 @@ class WebXrInput:
         return self._stream.take()
 
     def send_haptic(self, feedback: HapticFeedback) -> None:
-        """Vibrate with values clipped to 0..1. Nothing happens if no page drives, or if a value is not finite."""
+        """Let a hand vibrate. The values are clipped to 0..1.
+
+        Nothing happens if no page drives, or if a value is not finite.
+        """
         values = (feedback.frequency, feedback.amplitude)
         if self._process is None or feedback.hand not in SIDES or not all(map(math.isfinite, values)):
             return
@@ -219,7 +227,7 @@ class WebXrInput:
         self._ready.clear()
 
     def _take(self, answer: Any) -> None:
-        """Handle an answer of the process. This runs in a thread of its own."""
+        """Handle data from the process. A thread of its own calls this."""
         match answer:
             case Received(receptions):
                 now = self._clock()
@@ -239,7 +247,7 @@ class WebXrInput:
                 self._ready.set()
 
     def _announce(self) -> None:
-        """Tell people the URLs of the page, as text and as codes for a camera."""
+        """Tell people the URLs of the page, as text and as QR codes for a camera."""
         host, port = self.address
         if self._usb:
             self._say(f"webxr: open http://localhost:{port} on the headset")

@@ -1,8 +1,7 @@
-"""Filter the messages of browsers, so that viser gets only those that this page sends, with no other fields.
+"""Filter the messages of browsers. viser gets only the kinds of messages that this page sends, with known fields.
 
-viser itself sets any attribute of a control that a client names, even its callbacks, and opens a public tunnel for
-any client that requests one. Therefore each message is decoded here first, and only its known fields are encoded again
-for viser.
+A client can make viser set any attribute of a widget, even the widget's callbacks, and can make viser open a public
+tunnel. Therefore each message is decoded here first, and only its known fields are encoded again for viser.
 """
 
 from __future__ import annotations
@@ -19,9 +18,9 @@ from q2r2_control.inputs.listener import RateLimit
 
 LONGEST_MESSAGE = 4096  # Allowed length [bytes]. The page's longest message, about its camera, has 400 bytes.
 MOST_MESSAGES = 1000  # Allowed messages of a browser per second. A browser that drags both tools sends 160.
-_PRESS_PERIOD = 0.1  # Least time between two presses of a button that count [s].
-_CHANGES = 10  # Allowed changes of a slider or a checkbox in that time. A browser sends 2.
-_FLOOD = 1008  # WebSocket's code for a breach of policy
+_PRESS_PERIOD = 0.1  # A second press of a button within this time is ignored [s].
+_CHANGES = 10  # Allowed changes of a slider or a checkbox within ``_PRESS_PERIOD``. A browser sends 2.
+_FLOOD = 1008  # Code of WebSocket for a connection that is closed because a client broke a rule.
 
 _Three = tuple[float, float, float]
 _Four = tuple[float, float, float, float]
@@ -94,7 +93,7 @@ _DECODER = msgspec.msgpack.Decoder(
 
 
 class BrowserMessages:
-    """Decides which messages of browsers viser gets. Only the thread of the server's event loop may use it."""
+    """Decides which messages of browsers viser gets. Only the thread of the server's event loop may call this class."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self.clock = clock
@@ -123,7 +122,8 @@ class BrowserMessages:
             return None
         if isinstance(message, GuiUpdateMessage) and not self._is_allowed(message.uuid, message.updates.value):
             return None
-        # The message is encoded again: if a browser sends two fields with one name, viser might read the other one.
+        # The message is encoded again. Otherwise, if a browser sent two fields with one name, viser could read the
+        # field that was not checked.
         encoded: bytes = msgspec.msgpack.encode(message)
         return encoded
 
@@ -147,14 +147,17 @@ class BrowserMessages:
 
 
 class FilteredConnection(ServerConnection):
-    """A browser's connection. viser gets only the messages that ``messages`` admits, and too many of them close it."""
+    """A browser's connection. viser gets only the messages that ``messages`` admits.
+
+    If a browser sends too many messages, the connection is closed.
+    """
 
     def __init__(self, *all: Any, messages: BrowserMessages, **settings: Any) -> None:
         super().__init__(*all, **settings)
         self._messages, self._rate = messages, RateLimit(MOST_MESSAGES)
 
     async def recv(self, decode: bool | None = None) -> Any:
-        """Return the next message that is admitted."""
+        """Wait for the next message that is admitted, and return it."""
         while True:
             content = await super().recv(decode)
             if not self._rate.take(self._messages.clock()):

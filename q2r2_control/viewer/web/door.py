@@ -18,7 +18,7 @@ from q2r2_control.inputs.page_door import PageDoor, protect, text_response
 from q2r2_control.viewer.web.browser_messages import LONGEST_MESSAGE, BrowserMessages, FilteredConnection
 from q2r2_control.viewer.web.page_file import PageFile
 
-_MOST_CLIENTS = 12
+_MOST_CLIENTS = 12  # Greatest number of open pages.
 # viser's page is one file with its scripts and styles. It compiles WebAssembly, and starts workers from blobs.
 # Its sorter of Gaussian splats evaluates text as code. The policy forbids this, because this page shows no splats.
 _POLICY = (
@@ -26,14 +26,14 @@ _POLICY = (
     "connect-src 'self' blob: data:; img-src 'self' blob: data:; font-src 'self' data:; worker-src 'self' blob: data:; "
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'; object-src 'none'"
 )
-_CLOSE_TIMEOUT = 1.0  # Time for a browser to confirm that a connection is closed [s].
+_CLOSE_TIMEOUT = 1.0  # Longest time until a browser confirms that a connection is closed [s].
 
 
 class Door(PageDoor):
-    """A page door whose token is the path of the page's URL, because viser's page connects to that path."""
+    """Checks the requests to viser's page. The token is the path of its URL, since the page connects to this path."""
 
     def __init__(self, host: str, port: int, certificate: str | None = None, addresses: Sequence[str] = ()) -> None:
-        """Open the socket, with the arguments of :class:`PageDoor`."""
+        """Open the socket. The arguments are those of :class:`PageDoor`."""
         super().__init__(host, port, "--web", secrets.token_urlsafe(16), certificate, addresses)
         self.messages = BrowserMessages()  # Decides which messages viser gets.
         self._clients = 0
@@ -54,9 +54,9 @@ class Door(PageDoor):
 
     @contextmanager
     def guards(self, name: str) -> Iterator[None]:
-        """Check all requests to servers of ``websockets`` that are started in this context, such as viser's.
+        """Check all requests to the servers that the package websockets starts in this context, such as viser's server.
 
-        The title of their page, which the browser's tab shows, is the ``name`` of a cell.
+        The browser's tab shows ``name``, the name of a cell, as the title of their page.
 
         Raises:
             ConfigError: If no server was started, because then nothing would check requests.

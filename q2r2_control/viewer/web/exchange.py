@@ -1,4 +1,4 @@
-"""The data that a run and the server of its page exchange."""
+"""The data that a run and the process that serves its page send to each other."""
 
 from __future__ import annotations
 
@@ -18,38 +18,38 @@ from q2r2_control.viewer.shown_robot import ShownRobot
 
 @dataclass(frozen=True)
 class PageSetup(ShownRobot):
-    """The first message to the server, with the cell and the address at which to listen."""
+    """The first message to the process: the cell, the contents of the page, and the address at which to listen."""
 
     host: str
-    port: int  # With 0, any free port.
-    addresses: tuple[str, ...]  # Addresses by which other computers reach the server.
-    certificate: str | None  # A PEM file with its key; None for plain HTTP.
+    port: int  # The port to listen on; 0 for any free port.
+    addresses: tuple[str, ...]  # Addresses at which other computers reach the server.
+    certificate: str | None  # A PEM file with a certificate and its key; None for plain HTTP.
     title: str
-    tools: Mapping[str, int]  # By arm, the frame of its tool in ``model``.
-    home: Array  # (nv,) [rad]
-    lower: Array  # (nv,) lower position limits [rad]
-    upper: Array  # (nv,) upper position limits [rad]
+    tools: Mapping[str, int]  # By arm, the index of its tool's frame in ``model``.
+    home: Array  # Joint positions at home (nv,) [rad].
+    lower: Array  # Lower position limits (nv,) [rad].
+    upper: Array  # Upper position limits (nv,) [rad].
     model: pin.Model
-    collision_model: pin.GeometryModel  # The model whose pairs are monitored.
-    parts: Mapping[str, int]  # By name of a loose object, the index in ``Frame.moved`` at which its pose begins.
+    collision_model: pin.GeometryModel  # The bodies, and the pairs that are kept apart.
+    parts: Mapping[str, int]  # By name of a loose part, the index in ``Frame.moved`` at which its pose begins.
     requests: tuple[PageRequest, ...]  # Requests that have a button.
     changes: tuple[PageSetting, ...]  # Settings that have a slider.
     device: DeviceWords  # Words for the device that drives the arms.
-    driven: bool  # Whether the page is the run's input.
+    driven: bool  # Whether the page is the run's input, so that it moves the arms.
     replayed: bool  # Whether the page shows a recorded run.
 
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """The newest tick, and everything collected since the last frame."""
+    """What the run sends to the page: the newest tick, and everything that has happened since the last frame."""
 
     tick: Tick
     events: tuple[Event, ...]
     binding: tuple[ActiveLimit, ...]  # Limits that held a step back.
-    ticks: int  # Count of ticks since the last frame.
+    ticks: int  # Number of ticks since the last frame.
     slowest: float  # Computing time of the slowest of these ticks [s].
     moved: Array | None  # MuJoCo's positions (qpos) of everything that moves.
-    end: float = 0.0  # Time of a replay up to which frames can be shown [s].
+    end: float = 0.0  # In a replay, the time up to which frames exist [s].
     ages: Mapping[str, float] = field(default_factory=dict)  # By arm, the age of the newest pose of its hand [s].
     why: Mapping[str, str] = field(default_factory=dict)  # By arm, why it is in its state, if another program knows it.
     driver: str = ""  # The person or page that drives, in words; empty if not known.
@@ -60,13 +60,13 @@ class Frame:
 class Ready(NamedTuple):
     """The server's first answer, which says that it listens."""
 
-    urls: tuple[str, ...]  # One for each address of the server.
+    urls: tuple[str, ...]  # One URL for each address of the server.
 
 
 class PageWatched(NamedTuple):
     """A browser connected or disconnected."""
 
-    pages: int  # Count of pages that are open now.
+    pages: int  # Number of pages that are open now.
 
 
 class PageHand(NamedTuple):
@@ -75,12 +75,12 @@ class PageHand(NamedTuple):
     hand: str
     position: tuple[float, ...]  # In the world frame [m].
     quaternion: tuple[float, ...]  # In the order x y z w.
-    drag: bool
-    gripper: bool
+    drag: bool  # Whether the page drags this hand's tool.
+    gripper: bool  # Whether the button of the gripper is pressed.
 
 
 class PageLost(NamedTuple):
-    """The page that drove has gone."""
+    """The connection to the page that drove has ended."""
 
 
 class PageSetting(StrEnum):
@@ -106,11 +106,11 @@ class PageSeek(NamedTuple):
 
 
 class PagePlay(NamedTuple):
-    """A replay shall play, or pause if it plays already."""
+    """The replay is to play, or to pause if it plays now."""
 
 
 class PageRequest(StrEnum):
-    """The requests of the page's buttons."""
+    """What the buttons of the page request."""
 
     STOP = "stop"
     RESET = "reset"  # Takes back a stop that does not end the run.

@@ -1,4 +1,4 @@
-"""A cell's robot in a scene, with meshes under a frame for each joint."""
+"""Draw a cell's robot, its collision shapes and moving obstacles in a scene."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _GHOST_OPACITY, _OBSTACLE_OPACITY = 0.35, 0.6
 
 
 class RobotFigure:
-    """The robot in a scene. A ``ghost`` is translucent."""
+    """The robot in a scene: a node for each joint, with the joint's meshes. A ``ghost`` is translucent."""
 
     def __init__(self, scene: viser.SceneApi, name: str, tree: JointTree, ghost: bool = False) -> None:
         self._tree, self._data = tree, tree.model.createData()
@@ -43,7 +43,7 @@ class RobotFigure:
             )
 
     def show(self, posture: Array) -> None:
-        """Draw all joints at ``posture`` (nq,)."""
+        """Draw the robot in the configuration ``posture`` (nq,)."""
         pin.forwardKinematics(self._tree.model, self._data, posture)
         for frame, placement in zip(self._frames, list(self._data.liMi)[1:], strict=True):
             place(frame, placement)
@@ -62,7 +62,7 @@ class CapsuleFigure:
                 self._shapes.append((index, node))
 
     def show(self, placed: pin.GeometryData) -> None:
-        """Draw all shapes where ``placed`` has them."""
+        """Draw all shapes at their poses in ``placed``."""
         for index, node in self._shapes:
             place(node, placed.oMg[index])
 
@@ -72,7 +72,8 @@ class ObstacleFigure:
 
     def __init__(self, scene: viser.SceneApi, name: str) -> None:
         self._scene, self._name = scene, name
-        self._drawn: dict[str, tuple[object, viser.SceneNodeHandle]] = {}  # Look and node of each obstacle.
+        # By obstacle: its shape, size and colour, and its node.
+        self._drawn: dict[str, tuple[object, viser.SceneNodeHandle]] = {}
 
     def show(self, reports: Mapping[str, ObstacleReport]) -> None:
         """Draw the obstacles of ``reports``, and remove all others."""

@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable
 
-_TOLD = 10.0  # Time for which a pause of the browser is told [s].
+_TOLD = 10.0  # After a pause of the browser, the advice is shown for this time [s].
 _CURE = (
     "Let go, then drag again. If it happens often, make the window smaller, close other programs, or open the page on "
     "another computer."
@@ -14,15 +14,18 @@ _CURE = (
 
 
 class BrowserPace:
-    """Notes the positions that a browser sends. Arms stop if none comes for ``allowed`` [s]; ``clock`` is in s."""
+    """Measures how often a browser sends positions, and gives advice if it is too seldom.
+
+    Arms stop if no position comes for ``allowed`` [s]. ``clock`` returns the time [s].
+    """
 
     def __init__(self, allowed: float, clock: Callable[[], float] = time.monotonic) -> None:
         self._allowed, self._clock = allowed, clock
         self.begin()
 
     def begin(self) -> None:
-        """Forget everything: a drag begins."""
-        self._heard: float | None = self._clock()  # Time of the newest position; None after the drag.
+        """Forget all times, because a drag begins."""
+        self._heard: float | None = self._clock()  # Time of the newest position [s]; None after the drag.
         self._silence, self._ended = 0.0, -math.inf  # The longest recent time without a position, and its end [s].
 
     def note(self) -> None:
@@ -40,7 +43,8 @@ class BrowserPace:
     def advice(self, silent: bool) -> str:
         """Return the cause and the cure of positions that come too late; empty if they come in time.
 
-        An arm is ``silent`` if it is lost because its hand did not come in time. The advice stays as long as it is.
+        ``silent`` says whether an arm is lost because its hand's data did not come in time. As long as it is, the
+        advice stays.
         """
         now, allowed = self._clock(), self._allowed
         silence = max(self._silence, 0.0 if self._heard is None else now - self._heard)

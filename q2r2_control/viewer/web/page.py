@@ -1,4 +1,4 @@
-"""The handle of the process that serves a page."""
+"""Start and use the process that serves a page in a browser."""
 
 from __future__ import annotations
 
@@ -34,23 +34,32 @@ def check_viser() -> None:
 
 
 class Page:
-    """A page and the process that serves it, as a context. No browser can keep the caller's process waiting."""
+    """A page and the process that serves it. At the end of the context, the process ends.
+
+    No browser can keep the caller's process waiting.
+    """
 
     def __init__(self, host: str, port: int, on_answer: Callable[[Any], None], certificate: Path | None = None) -> None:
-        """Start the process, which takes a second; raises :class:`ConfigError` without viser or a free port.
+        """Start the process, which takes a second.
 
-        ``on_answer`` gets the requests of browsers, in a thread of its own. Other computers get the page by HTTPS, with
-        your own ``certificate`` or else with the certificate of the headset's page.
+        Args:
+            host: The address to listen on. Other computers get the page by HTTPS.
+            port: The port to listen on; 0 for any free port.
+            on_answer: Gets the requests of browsers, in a thread of its own.
+            certificate: A PEM file for HTTPS; None for the certificate of the headset's page.
+
+        Raises:
+            ConfigError: If viser is not installed, or if the port is not free.
         """
         check_viser()
         listening_socket(host, port, "--web").close()  # A port in use is found before slow work, such as compiling.
         self._host, self._port, self._on_request = host, port, on_answer
         self._ready = Flag()
-        self.urls: tuple[str, ...] = ()  # One for each address of this computer; empty before :meth:`open`.
+        self.urls: tuple[str, ...] = ()  # One URL for each address of this computer; empty before :meth:`open`.
         self.lines: tuple[str, ...] = ()  # Lines for the user, with the URLs.
         self._certificate = certificate
         self.watched = False  # Whether any browser shows the page.
-        self._pictures: dict[str, bytes] = {}  # By camera, pictures that wait for the next frame.
+        self._pictures: dict[str, bytes] = {}  # By camera, the picture that waits for the next frame.
         try:
             # Only one frame may wait, because a newer frame is better than a queue of old ones.
             self._process = HelperProcess("serves the page", "q2r2_control.viewer.web.server", self._on_answer, room=1)
@@ -103,7 +112,7 @@ class Page:
         return self.urls[0]
 
     def _certified(self, addresses: Sequence[str]) -> tuple[str | None, tuple[str, ...]]:
-        """Return the PEM file for HTTPS, or None if only this computer reaches the page, and lines about the file."""
+        """Return the PEM file for HTTPS and lines about it. The file is None if only this computer reaches the page."""
         if is_loopback(self._host):
             return None, ()
         if self._certificate is not None:
@@ -120,11 +129,11 @@ class Page:
 
     @property
     def fault(self) -> str | None:
-        """The reason why the process has ended too early."""
+        """The reason why the process has ended too early; None if it has not."""
         return self._process.fault
 
     def send(self, frame: Frame) -> bool:
-        """Show a frame, and return True, or return False if the page is still busy with the last one."""
+        """Show a frame. Return False, and do nothing, if the page is still busy with the last frame."""
         pictures, self._pictures = self._pictures, {}
         sent = self._process.send(replace(frame, pictures=pictures) if pictures else frame, 1)
         if not sent:

@@ -1,4 +1,4 @@
-"""The panel beside the scene: states of the arms and their reasons, figures of the loop, and joints in their ranges."""
+"""The panel beside the scene: the arms' states with reasons, numbers of the loop, and joints in their ranges."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ from q2r2_control.viewer.web.panel_html import (
 from q2r2_control.wording import sentence
 
 _PERIOD = 0.2  # Period at which the table is drawn [s].
-_NEAR_LIMIT = 0.05  # Share of a joint's range that counts as near a limit.
-_EPISODES = 12  # Lines about episodes that are shown.
+_NEAR_LIMIT = 0.05  # A joint is near a limit within this share of its range.
+_EPISODES = 12  # Greatest number of lines about episodes that are shown.
 _OF_EPISODES = (
     *(
         TeleopReason.EPISODE_BEGINS,
@@ -66,7 +66,7 @@ _BUTTONS = {
 
 
 class Panel:
-    """Shows frames, and answers with the requests of the buttons and sliders."""
+    """Shows the run's newest data, and sends the requests of its buttons and sliders."""
 
     def __init__(
         self,
@@ -76,18 +76,26 @@ class Panel:
         answer: Callable[[Any], None],
         take_over: Callable[[viser.GuiButtonHandle, Callable[[], None]], None],
     ) -> None:
-        """Build the panel. ``take_over`` makes an action follow each press of a button, in any state of the widgets."""
+        """Build the panel.
+
+        Args:
+            server: The server of viser.
+            setup: The cell and the contents of the page.
+            driving: The gizmos that move the tools; None if the page moves no arm.
+            answer: Sends a request to the run.
+            take_over: Binds an action to a button, so that each press counts even if viser is busy.
+        """
         self._setup, self._driving, self._words = setup, driving, setup.words(setup.device)
         self._answer, self._take_over = answer, take_over
         self._binding: dict[ActiveLimit, None] = {}
         self._told: list[tuple[str, str]] = []  # Time and text of each line about episodes.
-        self._ticks, self._slowest = 0, 0.0
+        self._ticks, self._slowest = 0, 0.0  # Since the last table: number of ticks, and longest computing time [s].
         self._rates, self._times = deque[float](maxlen=HISTORY), deque[float](maxlen=HISTORY)  # [Hz], [us]
         self._moved: dict[PageSetting, float] = {}  # New values of moved sliders.
         self._shown = time.monotonic()
         self._newest: Frame | None = None
-        self._buttons: list[viser.GuiInputHandle[Any]] = []  # Buttons and sliders that end with the run.
-        self._drawn_last: tuple[float, Mapping[str, pin.SE3]] = 0.0, {}  # Time [s] and tools of the drawn table.
+        self._buttons: list[viser.GuiInputHandle[Any]] = []  # Buttons and sliders that are hidden when the run is over.
+        self._drawn_last: tuple[float, Mapping[str, pin.SE3]] = 0.0, {}  # Time [s] and tool poses of the last table.
         gui = server.gui
         gui.set_panel_label(setup.title)
         gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(60, 120, 216))
@@ -173,8 +181,8 @@ class Panel:
         self._buttons.append(slider)
 
     def follow(self, frame: Frame) -> None:
-        """Keep the content of a frame that may be shown later."""
-        if self._setup.replayed:  # Each frame holds all events to tell, and the time line can go back.
+        """Keep the contents of a frame, which may be shown later. This is called with every frame, shown or not."""
+        if self._setup.replayed:  # Each frame has all events that say why, since the time line can go back.
             self._words.told = {}
         self._words.follow(frame.events)
         for event in frame.events:
@@ -200,7 +208,7 @@ class Panel:
             self._table.content = self._drawn(self._newest, [], over=True)
 
     def show(self, frame: Frame) -> None:
-        """Draw the table and answer with the moved sliders, a few times a second."""
+        """Draw the table, and send the values of sliders that were moved. This is done only once in ``_PERIOD``."""
         self._newest = frame
         passed = time.monotonic() - self._shown
         if passed >= _PERIOD:
@@ -215,7 +223,7 @@ class Panel:
                 self._episodes.content, self._episodes.visible = table(self._told[-_EPISODES:]), True
             if (pictures := self._pictures) is not self._pictured:
                 self._pictured, self._cameras.visible = pictures, True
-                cameras = [*self._setup.config.cameras]  # Their order is that of the cell.
+                cameras = [*self._setup.config.cameras]  # Pictures are in the order of the cell's cameras.
                 names = sorted(pictures, key=lambda name: cameras.index(name) if name in cameras else len(cameras))
                 self._cameras.content = "".join(image(name, pictures[name]) for name in names)
             if (line := self._time_line) is not None and frame.tick.t != line.value:
@@ -283,7 +291,7 @@ class Panel:
         return "<br>".join(lines) + "".join(plots)
 
     def _tool_speed(self, tick: Tick, arm: str) -> str:
-        """Return the mean speed of an arm's measured tool since the last table, beside the cell's limit."""
+        """Return the mean speed of an arm's measured tool since the last table, and the cell's limit, as text [m/s]."""
         (t, tools), limit = self._drawn_last, self._setup.config.control.tool_speed_limit
         if arm not in tools or tick.t <= t:
             return ""

@@ -1,4 +1,4 @@
-"""Figures and words of the panel as HTML."""
+"""The HTML of the panel's numbers, words and plots."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from html import escape
 import numpy as np
 
 STYLE = "font-size:12px;line-height:1.35;padding:0 0.6em 0.4em"
-_GONE = 2.0  # A hand without poses for this time is not there any more [s].
-HISTORY = 150  # Count of values in a plot.
+_GONE = 2.0  # A hand without poses for longer than this is not shown any more [s].
+HISTORY = 150  # Number of values in a plot.
 
 
 def coloured(text: str, colour: tuple[int, int, int]) -> str:
@@ -22,7 +22,7 @@ def distance(metres: float) -> str:
 
 
 def milliseconds(age: float | None) -> str:
-    """Return the ``age`` of a hand's newest pose [s], or nothing if there is no hand any more."""
+    """Return the ``age`` [s] of a hand's newest pose in milliseconds; empty if there is no hand any more."""
     return "" if age is None or age > _GONE else f"{1e3 * age:.0f} ms"
 
 

@@ -1,4 +1,4 @@
-"""A replay on a page with a time line. Frames are kept, and shown at the recorded speed."""
+"""Replay a recorded run on a page with a time line. The frames are kept, and shown at the recorded speed."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from q2r2_control.viewer.arm_words import Told, told_after
 from q2r2_control.viewer.web.exchange import Frame, PagePlay, PageRequest, PageSeek
 from q2r2_control.viewer.web.view import PageView
 
-_KEPT = 0.05  # Time between kept frames, in the run's time [s].
-_PERIOD = 1.0 / 30.0  # Time between shown frames while the replay plays [s].
-_STILL = 0.25  # Time between shown frames while the replay is paused [s].
+_KEPT = 0.05  # Time between two frames that are kept, in the run's time [s].
+_PERIOD = 1.0 / 30.0  # Time between two frames that are shown while the replay plays [s].
+_STILL = 0.25  # Time between two frames that are shown while the replay is paused [s].
 
 
 class Playback:
@@ -34,14 +34,14 @@ class Playback:
         self._ended = Flag()
 
     def begin(self, pipeline: Pipeline, title: str) -> str:
-        """Serve the page of a replay before it begins, and return its URL; raises :class:`ConfigError`."""
+        """Serve the page before the replay begins, and return its URL; raises :class:`ConfigError` if it cannot."""
         url = self._view.serve(pipeline, title, replayed=True, on_request=self._on_request)
         pipeline.listeners.append(self)
         Thread(target=self._play, daemon=True).start()
         return url
 
     def __call__(self, tick: Tick) -> None:
-        """Keep the tick if a frame is due."""
+        """Keep a frame with this tick, if a frame is due."""
         self._ticks += 1
         self._slowest = max(self._slowest, tick.compute_time)
         self._told = told_after(self._told, tick.events)
@@ -61,7 +61,7 @@ class Playback:
         self._ended.set()
 
     def _on_request(self, request: Any) -> None:
-        """Obey a request of the page. The thread of the page's answers calls this."""
+        """Do what the page requests. The thread that receives the page's answers calls this."""
         if request is PageRequest.STOP:
             self._ended.set()
         elif isinstance(request, PagePlay):

@@ -1,4 +1,7 @@
-"""The run's side of its page. It sends ticks to the process that serves the page, and obeys the page's buttons."""
+"""The part of a page that belongs to the run.
+
+It sends ticks to the process that serves the page, and does what the buttons of the page request.
+"""
 
 from __future__ import annotations
 
@@ -36,10 +39,10 @@ _logger = logging.getLogger(__name__)
 
 
 class PageView(Page):
-    """A listener of one run, and a context around it. No browser can keep the loop waiting.
+    """Shows one run on a page: a listener of the run, and a context around it. No browser can keep the loop waiting.
 
-    Each tick stores references, and a thread gets them 30 times a second. If that thread is still busy with the last
-    ones, it gets newer ones later. If the page fails, one line is logged and the run goes on.
+    At each tick, references to the newest data are stored. A thread sends them 30 times a second. If this thread is
+    still busy with the last data, it sends newer data later. If the page fails, one line is logged and the run goes on.
     """
 
     def __init__(self, host: str, port: int, certificate: Path | None = None) -> None:
@@ -47,8 +50,9 @@ class PageView(Page):
 
         Args:
             host: The address to bind; 0.0.0.0 stands for all addresses of this computer.
-            port: The port; 0 for any free one.
-            certificate: A PEM file with a certificate and its key, with which the page comes over https.
+            port: The port; 0 for any free port.
+            certificate: A PEM file with a certificate and its key, for HTTPS; None for the certificate of the
+                headset's page.
 
         Raises:
             ConfigError: If viser is not installed, or if the address cannot be bound.
@@ -63,8 +67,8 @@ class PageView(Page):
         self._requests: dict[PageRequest, Callable[[], None]] = {}
         self._changes: dict[PageSetting, Callable[[float], None]] = {}
         self._hand_of: Callable[[str], str]  # Returns the hand that drives an arm.
-        self._source: object = None  # The input of the hands.
-        self._nobody = ""  # The reason why no person drives.
+        self._source: object = None  # The input from which the hands come.
+        self._nobody = ""  # Why no person drives, in words; empty if a person may drive.
         super().__init__(host, port, self._do, certificate)
 
     def begin(self, pipeline: Pipeline, title: str, recorded: bool) -> str:
@@ -94,7 +98,10 @@ class PageView(Page):
         replayed: bool = False,
         on_request: Callable[[Any], None] | None = None,
     ) -> str:
-        """Serve a page, and return its URL. If given, ``on_request`` gets the requests of its buttons, not the run."""
+        """Serve a page, and return its URL.
+
+        The requests of its buttons go to ``on_request`` if it is given, otherwise to the run.
+        """
         if on_request is not None:
             self._on_request = on_request
         config, plant = pipeline.config, pipeline.plant
@@ -176,7 +183,7 @@ class PageView(Page):
         return "nobody drives" if driver is None else f"the headset at {driver} drives"
 
     def _do(self, answer: Any) -> None:
-        """Obey an answer of the page. The thread of the answers calls this."""
+        """Do what an answer of the page requests. The thread that receives the answers calls this."""
         if isinstance(answer, PageRequest):
             self._requests[answer]()
         elif isinstance(answer, PageChange):
@@ -190,7 +197,10 @@ class PageView(Page):
 
 
 def _changes_of(pipeline: Pipeline) -> dict[PageSetting, Callable[[float], None]]:
-    """Return the effect of each slider. Speeds stay within the cell's, and a forbidden number changes nothing."""
+    """Return a function for each slider, which gets the slider's value.
+
+    Speeds stay within the cell's speeds. A value that is not allowed changes nothing.
+    """
     control, teleop, impedance = pipeline.config.control, pipeline.config.teleop, pipeline.config.impedance
 
     def limit_speed(part: float) -> None:

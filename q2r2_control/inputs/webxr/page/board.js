@@ -1,20 +1,21 @@
-// Where the board is: above what the operator looks at. It stays while the head moves a little, and then glides after.
+// The place of the board: above the direction in which the operator looks. It stays where it is while the head turns a
+// little. After a larger turn it follows.
 
-export const [BOARD_WIDTH, BOARD_DISTANCE] = [1.3, 1.5]; // [m]
-const ABOVE = 0.35; // of the way that the operator looks [rad]
-const [LOWEST, HIGHEST] = [-0.3, 0.8]; // of the board [rad]
-const [FAR, NEAR] = [0.35, 0.03]; // when it begins to glide, and when it has arrived [rad]
-const SHARE = 0.08; // of the way that is left, in a frame
+export const [BOARD_WIDTH, BOARD_DISTANCE] = [1.3, 1.5]; // width of the board, and its distance from the head [m]
+const ABOVE = 0.35; // angle of the board above the direction in which the operator looks [rad]
+const [LOWEST, HIGHEST] = [-0.3, 0.8]; // least and greatest elevation of the board [rad]
+const [FAR, NEAR] = [0.35, 0.03]; // the board begins to follow at the first angle, and stops at the second one [rad]
+const SHARE = 0.08; // share of the remaining angle that the board moves in a frame
 
 /** @param {number} angle */
 const wrapped = (angle) => Math.atan2(Math.sin(angle), Math.cos(angle));
 
 export class Board {
   constructor() {
-    this.known = false; // where the head is
-    this.yaw = 0;
-    this.pitch = 0;
-    this.glides = false;
+    this.known = false; // whether the pose of the head has come
+    this.yaw = 0; // direction of the board [rad]
+    this.pitch = 0; // elevation of the board [rad]
+    this.glides = false; // whether the board follows the head now
     /** @type {number[]} */
     this.eye = [0, 0, 0];
   }
@@ -36,8 +37,8 @@ export class Board {
   }
 
   /**
-   * The matrix of a square from -1 to 1, for a picture so many times as high as wide. It faces the operator.
-   * @param {number} aspect
+   * Return the matrix that turns a square from -1 to 1 into the board, which faces the operator.
+   * @param {number} aspect height of the board's picture divided by its width
    */
   place(aspect) {
     const [sin, cos] = [Math.sin(this.yaw), Math.cos(this.yaw)];

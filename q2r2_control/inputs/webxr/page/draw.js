@@ -1,28 +1,29 @@
-// Draws the run and the board in WebGL 2.
+// Draws the run, and the board with its texts, in WebGL 2.
 
 import { Board } from "./board.js";
 import { beamOf, inverseOf, matrixOf, projection, scaleOf, times } from "./matrices.js";
 import { boxOf, gridOf } from "./shapes.js";
 
-// The run's world as the operator has it: x forward, y left, z up, and the robot a step ahead.
+// The pose of the run's world frame (x forward, y left, z up) in the operator's room: the robot is a step ahead.
 const WORLD = new Float32Array([0, 0, -1, 0, -1, 0, 0, 0, 0, 1, 0, 0, 0, 0, -0.7, 1]);
 const ROOM = new Float32Array([1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]);
 const AXES = [[0.9, 0.2, 0.2], [0.2, 0.75, 0.3], [0.25, 0.45, 0.95]];
-const [LENGTH, THICKNESS, KNOB] = [0.1, 0.004, 0.02]; // of a target's axes, and its middle [m]
-const [LEASH, PAIR] = [0.003, 0.006]; // thickness of lines [m]
+const [LENGTH, THICKNESS, KNOB] = [0.1, 0.004, 0.02]; // size of a target's axes, and width of its knob [m]
+const [LEASH, PAIR] = [0.003, 0.006]; // thickness of the lines for the leash and the tightest pair [m]
 const [AMBER, RED, GREEN] = [[0.9, 0.63, 0.12], [0.84, 0.22, 0.22], [0.18, 0.63, 0.35]];
 const [GREY, LINES, GHOST] = [[0.35, 0.38, 0.41], [0.62, 0.66, 0.7], [0.47, 0.63, 0.9]];
-const SHORT = 0.01; // ways that are not drawn [m]
-const CALM = 0.1; // a pair with more to spare is green [m]
-const CONTROLLER = [0.035, 0.035, 0.11]; // [m]
-const FIELD_OF_VIEW = 0.9; // of the page, upwards [rad]
-const [DOWN, ACROSS] = [Math.sin(0.42), Math.cos(0.42)]; // of a look from 1.6 m up and 1.2 m behind
+const SHORT = 0.01; // a leash up to this length is not drawn [m]
+const CALM = 0.1; // the tightest pair is green if its margin is at least this [m]
+const CONTROLLER = [0.035, 0.035, 0.11]; // size of the box that shows a controller [m]
+const FIELD_OF_VIEW = 0.9; // vertical angle of view on the page [rad]
+// On the page, the camera is 1.6 m up and 1.2 m behind the origin of the room. It looks down by 0.42 rad.
+const [DOWN, ACROSS] = [Math.sin(0.42), Math.cos(0.42)];
 const BEHIND = new Float32Array([
   1, 0, 0, 0, 0, ACROSS, DOWN, 0, 0, -DOWN, ACROSS, 0,
   0, -1.6 * ACROSS + 1.2 * DOWN, -1.6 * DOWN - 1.2 * ACROSS, 1,
 ]);
-const [COARSER, COARSEST] = [0.8, 0.3]; // of the pixels along a side, where drawing is slow
-const [AR_OPACITY, GHOST_OPACITY] = [0.45, 0.35]; // of the robot in the operator's own room, and of a target's ghost
+const [COARSER, COARSEST] = [0.8, 0.3]; // factor of the pixels along a side each time drawing is slow, and the least one
+const [AR_OPACITY, GHOST_OPACITY] = [0.45, 0.35]; // opacity of the robot in AR, and of the gripper at a target
 
 const SHAPES = {
   vertex: `#version 300 es
@@ -51,7 +52,7 @@ const BOARDS = {
  */
 
 /**
- * Where each eye of a headset's frame is drawn, and how it sees; none where the head is not tracked.
+ * Return the viewport and the view matrix of each eye in a headset's frame; empty if the head is not tracked.
  * @param {XRFrame} frame
  * @param {XRReferenceSpace} space
  * @returns {Eye[]}
@@ -73,7 +74,7 @@ export class Drawing {
     /** @type {ShownScene | null} */
     this.scene = null;
     const gl = canvas.getContext("webgl2", { xrCompatible: true, antialias: true });
-    this.gl = /** @type {WebGL2RenderingContext} */ (gl); // null in a browser without it: the hands are sent all the same
+    this.gl = /** @type {WebGL2RenderingContext} */ (gl); // null without WebGL 2: the hands are sent all the same
     this.shapes = this.program(SHAPES);
     this.boards = this.program(BOARDS);
     const half = THICKNESS / 2;
@@ -90,8 +91,8 @@ export class Drawing {
     /** @type {Mesh | null} */
     this.grid = null;
     /** @type {WebGLSync | null} */
-    this.busy = null; // until the last picture on the page is drawn
-    this.sharpness = 1; // pixels of a picture on the page for each of the screen, along a side
+    this.busy = null; // signals that the last picture on the page is finished
+    this.sharpness = 1; // pixels of the picture per pixel of the page, along a side
   }
 
   /**
@@ -162,8 +163,8 @@ export class Drawing {
   }
 
   /**
-   * On the page itself, as seen from behind the robot, and return whether it is drawn: while the last picture is not
-   * finished, this would keep the page from its keys. Words stand beside it.
+   * Draw the run on the page, as seen from behind the robot, and return whether it was drawn. While the last picture is
+   * not finished, nothing is drawn, because the page could not react to keys meanwhile. The texts are beside the picture.
    * @param {ShownState | null} state
    */
   drawOnPage(state) {
@@ -180,7 +181,7 @@ export class Drawing {
     return true;
   }
 
-  // A picture that takes long gets fewer pixels from now on, since a processor may be drawing it.
+  // Draw fewer pixels from now on, because a picture took long. A computer without a graphics card may be drawing.
   coarsen() {
     this.sharpness = Math.max(COARSER * this.sharpness, COARSEST);
   }
@@ -189,9 +190,9 @@ export class Drawing {
    * @param {WebGLFramebuffer | null} framebuffer
    * @param {Eye[]} eyes
    * @param {ShownState | null} state
-   * @param {import("./panel.js").Panel | null} panel on the board
-   * @param {Float32Array[]} hands matrices in the room
-   * @param {boolean} transparent whether the operator sees the room
+   * @param {import("./panel.js").Panel | null} panel whose picture is on the board; null for no board
+   * @param {Float32Array[]} hands poses of the hands, as matrices in the operator's room
+   * @param {boolean} transparent whether the operator sees the real room, as in AR
    */
   draw(framebuffer, eyes, state, panel, hands, transparent) {
     const { gl } = this;
@@ -241,7 +242,7 @@ export class Drawing {
       this.shape(this.cube, WORLD, beamOf(pair.ends[0], pair.ends[1], PAIR), colour);
     }
     for (const { mesh, joint, colour } of this.robot) {
-      if (transparent && joint === 0) continue; // what does not move would hide the room
+      if (transparent && joint === 0) continue; // shapes that never move would hide the room
       this.shape(mesh, WORLD, places[joint], colour, transparent ? AR_OPACITY : 1);
     }
     for (const [name, arm] of Object.entries(arms)) {
@@ -251,7 +252,7 @@ export class Drawing {
   }
 
   /**
-   * A target's axes, a knob in the colour of the arm's state, and the leash from the tool to it.
+   * Draw a target's axes, a knob in the colour of the arm's state, and the leash from the tool to the target.
    * @param {ShownArm} arm
    * @param {Seven} target
    */
@@ -266,15 +267,15 @@ export class Drawing {
   }
 
   /**
-   * A translucent gripper at the target.
-   * @param {number[]} joints that go with the tool
-   * @param {Float32Array[]} places of all joints
+   * Draw a translucent gripper at the target.
+   * @param {number[]} joints whose shapes move with the tool
+   * @param {Float32Array[]} places poses of all joints, as matrices
    * @param {Seven} tool
    * @param {Seven} target
    */
   drawGhost(joints, places, tool, target) {
     const moved = times(matrixOf(target), inverseOf(matrixOf(tool)));
-    this.gl.depthMask(false); // what is behind it is seen through it
+    this.gl.depthMask(false); // shapes behind the gripper stay visible
     for (const { mesh, joint } of this.robot)
       if (joints.includes(joint)) this.shape(mesh, WORLD, times(moved, places[joint]), GHOST, GHOST_OPACITY);
     this.gl.depthMask(true);
@@ -282,8 +283,8 @@ export class Drawing {
 
   /**
    * @param {Mesh} mesh
-   * @param {Float32Array} space where `place` counts
-   * @param {Float32Array} place
+   * @param {Float32Array} space the pose of the frame in which `place` is given
+   * @param {Float32Array} place the pose of the shape, as a matrix
    * @param {number[]} colour
    */
   shape(mesh, space, place, colour, opacity = 1) {

@@ -1,18 +1,21 @@
-// Hands without a headset: keys or a gamepad move them, one at a time. They go the way of a headset's from here on.
+// Hands without a headset: keys or a gamepad move ("fly") them, one hand at a time. The run gets them like the hands of
+// a headset.
 
-const [SPEED, TURNING] = [0.15, 0.6]; // of a hand [m/s], [rad/s]
-const SLOWLY = 0.25; // with Shift
-const LONGEST = 0.05; // of a frame that a hand moves for [s]
-// A key counts for so long after it was pressed, and after each of its repeats: browsers do not always say that it is up.
-// Chromium on X begins to repeat after 660 ms, and goes on every 40 ms. A page that draws slowly hears it later.
+const [SPEED, TURNING] = [0.15, 0.6]; // linear and angular speed of a hand [m/s], [rad/s]
+const SLOWLY = 0.25; // factor of both speeds while Shift is held
+const LONGEST = 0.05; // longest time between two readings for which a hand moves [s]
+// A key counts as held for these times after its press, and after each of its repeats. Browsers do not always report that
+// a key was released. Chromium on X repeats a key after 660 ms, and then every 40 ms. A page that draws slowly hears of
+// it later.
 const [PRESSED, REPEATED] = [750, 600]; // [ms]
-// A button that was pressed between two messages is in the next one, also if it is up again. An arm whose hand is silent
-// for 150 ms stops. An older press is forgotten, because it would then engage the arm that it was to pause.
+// A button that was pressed between two messages is pressed in the next message, even if it is released by then. But an
+// arm whose hand sends nothing for 150 ms stops. The press is forgotten before that, or it would engage the arm again
+// that the operator wanted to pause.
 const TAPPED = 140; // [ms]
-const DEAD = 0.12; // of a stick
+const DEAD = 0.12; // displacements of a stick below this count as 0
 /** @type {Record<string, Seven>} */
 const START = { left: [0.3, 0.2, 1.1, 0, 0, 0, 1], right: [0.3, -0.2, 1.1, 0, 0, 0, 1] }; // x forward, y left, z up [m]
-// Each moves along or turns about an axis: 0 to 2 x y z, 3 to 5 about x y z.
+// By key: the index of a velocity and its sign. Indices 0 to 2 are motions along x y z, 3 to 5 are turns about x y z.
 /** @type {Record<string, [number, number]>} */
 const KEYS = {
   KeyW: [0, 1], KeyS: [0, -1], KeyA: [1, 1], KeyD: [1, -1], KeyE: [2, 1], KeyQ: [2, -1],
@@ -29,7 +32,7 @@ const PAD = { a: 0, b: 1, bumpers: { left: 4, right: 5 }, tilt: [[12, 4, 1], [13
 const isModified = ({ ctrlKey, metaKey, altKey, key }) => ctrlKey || metaKey || altKey || MODIFIERS.includes(key);
 
 /**
- * A quaternion x y z w after a turn by a small rotation vector, in the room's axes.
+ * Turn a quaternion x y z w by a small rotation vector [rad] along the axes of the hands' frame.
  * @param {number[]} quaternion
  * @param {number[]} vector
  */
@@ -42,13 +45,13 @@ function turned([x, y, z, w], [a, b, c]) {
 
 export class Flying {
   constructor() {
-    this.hand = "left"; // that moves
-    this.device = "keys"; // or a gamepad: what was used last
-    this.slow = false;
+    this.hand = "left"; // the hand that moves
+    this.device = "keys"; // the device that was used last: keys or gamepad
+    this.slow = false; // whether Shift is held
     /** @type {Map<string, number>} */
-    this.until = new Map(); // keys that are held -> when they count no more [ms]
+    this.until = new Map(); // key -> time until which it counts as held [ms]
     /** @type {Map<string, number>} */
-    this.taps = new Map(); // buttons that were pressed since the last message -> when they count no more [ms]
+    this.taps = new Map(); // button that was pressed since the last message -> time until which the press counts [ms]
     /** @type {Record<string, Seven>} */
     this.poses = structuredClone(START);
     this.then = performance.now();
@@ -67,22 +70,24 @@ export class Flying {
 
   /** @param {KeyboardEvent} event */
   press(event) {
-    // Such a press is the browser's: its dialogs keep the page from hearing that keys are up, and so does Cmd on a Mac.
+    // A key with a modifier is for the browser. During its dialogs, and while Cmd is held on a Mac, the page does not
+    // hear that keys are released.
     if (isModified(event)) return this.forget();
     if (!(event.code in KEYS || event.code in HANDS || BUTTONS.includes(event.code))) return;
     this.device = "keys";
-    event.preventDefault(); // Space would press the button that began this
-    if (event.repeat && !this.holds(event.code)) return; // what has ended begins with a new press only
+    event.preventDefault(); // otherwise Space would press the button "Fly" again
+    if (event.repeat && !this.holds(event.code)) return; // a key that counts as released needs a new press
     const until = performance.now() + (event.repeat ? REPEATED : PRESSED);
     this.until.set(event.code, until);
     if (BUTTONS.includes(event.code) && !event.repeat) this.taps.set(event.code, performance.now() + TAPPED);
-    // Only the last key repeats. The others move no more then, but a dead man among them holds while any key repeats.
+    // Of several held keys only the last one repeats, and the others count as released after a while. The buttons are an
+    // exception: they count as held as long as any key repeats, since a button may be a dead man's switch.
     for (const code of BUTTONS) if (this.holds(code)) this.until.set(code, until);
     this.choose(HANDS[event.code] ?? this.hand);
   }
 
   /**
-   * Choose the hand that moves. A button that was pressed for one hand is not pressed for the other one.
+   * Choose the hand that moves. Buttons that are pressed for one hand do not count for the other hand.
    * @param {string} hand
    */
   choose(hand) {
@@ -104,7 +109,7 @@ export class Flying {
   }
 
 
-  // The hands that were read last have been sent.
+  // Note that the hands of the last reading have been sent.
   told() {
     this.taps.clear();
   }
@@ -115,7 +120,7 @@ export class Flying {
   }
 
   /**
-   * Both hands, of which one has moved since the last frame.
+   * Move the chosen hand by the time since the last reading, and return both hands.
    * @returns {Record<string, HeadsetHand>}
    */
   read() {
@@ -157,7 +162,7 @@ export class Flying {
   }
 
   /**
-   * Both hands as untracked.
+   * Report both hands as untracked.
    * @returns {Record<string, HeadsetHand>}
    */
   lost() {

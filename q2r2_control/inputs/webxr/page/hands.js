@@ -1,7 +1,10 @@
-// Both hands as the run wants them. In WebXR x is right, y up and z back; in the run x is forward, y left and z up.
+// Reads both hands from WebXR, in the form that the run expects.
+// In WebXR x points right, y up and z back. In the run x points forward, y left and z up.
 
-const STRONGEST = 1000; // longest vibration; the run ends it before [ms]
-const SWAPPED = 300; // another source of a hand is untracked for so long, twice the time that pauses an arm [ms]
+const STRONGEST = 1000; // duration with which a vibration is started; the run ends it earlier [ms]
+// A hand that gets another input source counts as untracked for this time, which is twice the time after which an arm
+// pauses [ms].
+const SWAPPED = 300;
 
 /**
  * @param {XRRigidTransform} transform
@@ -13,13 +16,14 @@ export function poseOf(transform) {
   return [-z, -x, y, -turn.z, -turn.x, turn.y, turn.w];
 }
 
-// A transient source is there only while it pinches or touches. Such sources, and bare hands, are fingers.
+// A transient source exists only while fingers pinch or touch a screen. Transient sources and tracked hands are "bare".
 /** @param {XRInputSource} source */
 const isTransient = (source) => source.targetRayMode !== "tracked-pointer";
 /** @param {XRInputSource} source */
 const isBare = (source) => Boolean(source.hand) || isTransient(source);
 
-// Whether a headset has found something else, as fingers after a controller was laid down. The pinch of fingers is not.
+// Whether a hand has got another device, such as bare fingers after its controller was laid down. The pinch of fingers
+// that were tracked before, or its end, does not count.
 /**
  * @param {XRInputSource} known
  * @param {XRInputSource} source
@@ -27,7 +31,7 @@ const isBare = (source) => Boolean(source.hand) || isTransient(source);
 const isSwapped = (known, source) =>
   known !== source && !(isBare(known) && isBare(source) && (isTransient(known) || isTransient(source)));
 
-// Sticks, triggers and buttons of the mapping "xr-standard"; pinch is the only control of bare fingers and screens.
+// Reads sticks, triggers and buttons by the mapping "xr-standard". Bare fingers and screens have only the pinch.
 /**
  * @param {XRInputSource} source
  * @returns {{ buttons: [boolean, boolean, boolean], axes: [number, number, number, number] }}
@@ -53,11 +57,11 @@ export class Hands {
     /** @type {Map<string, XRInputSource>} */
     this.sources = new Map(); // hand -> its last source in this session
     /** @type {Map<string, number>} */
-    this.swapped = new Map(); // hand -> until when it is untracked [ms]
+    this.swapped = new Map(); // hand -> time until which it counts as untracked [ms]
     /** @type {Map<string, any>} */
-    this.actuators = new Map(); // hand -> what vibrates
+    this.actuators = new Map(); // hand -> the actuator that vibrates
     /** @type {Float32Array[]} */
-    this.places = []; // matrices of the hands of the last frame, in the room
+    this.places = []; // poses of the hands in the last frame, as matrices in the operator's room
   }
 
   get bare() {
@@ -65,10 +69,10 @@ export class Hands {
   }
 
   /**
-   * The hands of a frame. One that was there and is not any more is told as untracked.
+   * Read the hands of a frame. A hand that was there before and is missing now is reported as untracked.
    * @param {XRFrame} frame
    * @param {XRReferenceSpace} space
-   * @param {boolean} moved whether the space has moved
+   * @param {boolean} moved whether the reference space has moved just now
    */
   read(frame, space, moved) {
     /** @type {Record<string, HeadsetHand>} */
@@ -77,7 +81,7 @@ export class Hands {
     for (const source of frame.session.inputSources) {
       if (source.targetRayMode === "gaze") continue;
       const hand = source.handedness === "left" ? "left" : "right";
-      const onScreen = source.targetRayMode === "screen"; // a touch; the phone itself is the hand
+      const onScreen = source.targetRayMode === "screen"; // a touch: the pose of the phone is the hand's pose
       const of = source.gripSpace ?? source.targetRaySpace;
       const pose = onScreen ? frame.getViewerPose(space) : frame.getPose(of, space);
       const untracked = this.isNew(hand, source) || !pose || pose.emulatedPosition;
@@ -91,7 +95,7 @@ export class Hands {
   }
 
   /**
-   * Whether a hand has another source than before, which ends what the last one has engaged.
+   * Whether a hand has got another device just now. Its arm must then be engaged again.
    * @param {string} hand
    * @param {XRInputSource} source
    */
@@ -103,7 +107,7 @@ export class Hands {
   }
 
   /**
-   * All hands as untracked: the headset's menu covers the page, or the headset is off.
+   * Report all hands as untracked, because the headset's menu covers the page, or the headset was taken off.
    * @returns {Record<string, HeadsetHand>}
    */
   lost() {
@@ -116,6 +120,6 @@ export class Hands {
   }
 }
 
-// What vibrates in a hand; browsers differ in its name.
+// The actuator that vibrates in a hand. Browsers use different names for it.
 /** @param {any} gamepad */
 const actuatorOf = (gamepad) => gamepad?.hapticActuators?.[0] ?? gamepad?.vibrationActuator;

@@ -1,12 +1,13 @@
-// The socket to the run. The newest hands win: what would wait in the browser is left out, and never sent late.
+// The socket to the run. Only the newest hands are sent: if hands would have to wait in the browser, they are left out,
+// and not sent late.
 
-const [RETRY, SELDOM] = [2000, 10000]; // after a closed socket, and after the end of a run [ms]
-const ALIVE = 500; // between messages without hands [ms]
-const AGAIN = 10; // after what must not be left out had to wait [ms]
-const REMEMBERED = 64; // messages whose time of sending is known
-const [REFUSED, OVER, FREE] = [4001, 4003, 4004]; // why the run's server has closed a socket
+const [RETRY, SELDOM] = [2000, 10000]; // time until the next attempt, if a socket was closed and if the run is over [ms]
+const ALIVE = 500; // time without a message after which a message without hands is sent [ms]
+const AGAIN = 10; // time until a message that must not be left out is tried again [ms]
+const REMEMBERED = 64; // number of messages whose time of sending is kept
+const [REFUSED, OVER, FREE] = [4001, 4003, 4004]; // codes that say why the run's server has closed a socket
 
-// The same number after a reload, by which the run knows the page again.
+// The number of this page. It stays the same after a reload, so that the run recognises the page.
 function pageNumber() {
   const known = localStorage.getItem("q2r2-page");
   if (known) return known;
@@ -22,28 +23,28 @@ function pageNumber() {
  * @property {(vibration: ShownVibration) => void} vibration
  * @property {(jpeg: Blob) => void} picture
  * @property {() => void} closed
- * @property {() => boolean} drives whether somebody here wants to drive
+ * @property {() => boolean} drives whether this page's operator wants to drive
  */
 
 export class Link {
   /** @param {Handlers} handlers */
   constructor(handlers) {
     this.handlers = handlers;
-    this.text = "connecting"; // for people
-    this.age = NaN; // from a frame here to its acknowledgement [ms]
-    this.loss = 0; // share of the last frames that were left out
-    this.over = false; // the run has ended
-    this.watching = false; // another page drives
+    this.text = "connecting"; // the state of the connection, for people
+    this.age = NaN; // time from sending a message until the run has acknowledged it [ms]; NaN if not known
+    this.loss = 0; // share of the last messages that were left out
+    this.over = false; // whether the run has ended
+    this.watching = false; // whether this page only watches, because another page drives
     this.sequence = 0;
     /** @type {Map<number, number>} */
     this.sent = new Map(); // number of a message -> when it was sent [ms]
-    this.last = 0; // when one was sent [ms]
+    this.last = 0; // when the last message was sent [ms]
     /** @type {number | undefined} */
     this.retry = undefined;
     this.socket = this.connect();
     addEventListener("focus", () => {
       if (this.socket.readyState !== WebSocket.CLOSED) return;
-      clearTimeout(this.retry); // somebody looks: a run may have begun
+      clearTimeout(this.retry); // somebody looks at the page again, and a run may have begun
       this.connect();
     });
     setInterval(() => {
@@ -78,7 +79,8 @@ export class Link {
    */
   close(code, reason) {
     this.over ||= code === OVER;
-    // A page that may not drive looks on. One with hands tries again: its poses may count more than another page.
+    // A page that may not drive watches. But a page with hands tries again, because it may drive if the other page sends
+    // no poses.
     this.watching = code === REFUSED && !this.watching && !this.handlers.drives();
     if (this.over) this.text = "The run is over. The picture is its last moment. The next run at this address shows up here.";
     else this.text = reason || "not connected; the run may have ended, or its URL is an old one";
@@ -87,16 +89,16 @@ export class Link {
     this.retry = setTimeout(() => this.connect(), this.watching ? 0 : this.over ? SELDOM : RETRY);
   }
 
-  // Somebody here wants to drive, which a page that watches cannot.
+  // The operator wants to drive. A page that watches connects again for this, as a page that drives.
   drive() {
     if (this.watching) this.socket.close();
   }
 
   /**
-   * Send the hands, unless earlier ones still wait here, and return whether they are sent. Keys move `virtual` ones.
+   * Send the hands, unless earlier data still wait in the browser. Return whether they are sent.
    * @param {Record<string, HeadsetHand>} hands
-   * @param {boolean} virtual
-   * @param {HeadsetRequest | null} request of a button
+   * @param {boolean} virtual whether keys or a gamepad move the hands
+   * @param {HeadsetRequest | null} request what a button requests
    */
   send(hands, virtual = false, request = null) {
     const now = performance.now();
@@ -115,7 +117,7 @@ export class Link {
   }
 
   /**
-   * Say that hands are gone. No frame says so again, therefore this is not left out, but sent as soon as it can be.
+   * Report that hands are lost. No later message repeats this, so it is never left out, but sent as soon as possible.
    * @param {Record<string, HeadsetHand>} hands
    * @param {boolean} virtual
    */
@@ -124,12 +126,12 @@ export class Link {
   }
 
   /**
-   * Ask for what a button does, as soon as it can be sent on this connection. It says nothing of the hands.
+   * Send what a button requests, as soon as possible, in a message without hands.
    * @param {HeadsetRequest} request
-   * @param {WebSocket} socket
+   * @param {WebSocket} socket the connection at the time of the press; if it has been replaced, nothing is sent
    */
   ask(request, socket = this.socket) {
-    if (socket !== this.socket || this.send({}, false, request)) return; // a press is for the run that was seen
+    if (socket !== this.socket || this.send({}, false, request)) return; // a press is for the run that was shown
     setTimeout(() => this.ask(request, socket), AGAIN);
   }
 

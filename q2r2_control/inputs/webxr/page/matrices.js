@@ -1,6 +1,7 @@
-// Matrices column by column, as WebGL wants them.
+// 4 x 4 matrices for WebGL, whose 16 numbers are listed column by column.
 
 /**
+ * The matrix product a b.
  * @param {ArrayLike<number>} a
  * @param {ArrayLike<number>} b
  */
@@ -13,7 +14,7 @@ export function times(a, b) {
 }
 
 /**
- * Of a pose x y z qx qy qz qw.
+ * The matrix of a pose x y z qx qy qz qw.
  * @param {Seven} pose
  */
 export function matrixOf([px, py, pz, x, y, z, w]) {
@@ -35,13 +36,13 @@ export function inverseOf(m) {
 }
 
 /**
- * Along each axis, so many times as long.
+ * The matrix that stretches a shape along each axis by a factor.
  * @param {ArrayLike<number>} size
  */
 export const scaleOf = ({ 0: x, 1: y, 2: z }) => new Float32Array([x, 0, 0, 0, 0, y, 0, 0, 0, 0, z, 0, 0, 0, 0, 1]);
 
 /**
- * Of a cube with edges of 1, which becomes a beam from one point to another.
+ * The matrix that turns a cube with edges of 1 into a beam from one point to another.
  * @param {Point} from
  * @param {Point} to
  * @param {number} thickness
@@ -50,7 +51,7 @@ export function beamOf(from, to, thickness) {
   const way = to.map((value, axis) => value - from[axis]);
   const length = Math.max(Math.hypot(...way), 1e-6);
   const [x, y, z] = way.map((value) => value / length);
-  const side = Math.abs(z) < 0.9 ? [y, -x, 0] : [0, z, -y]; // across the way
+  const side = Math.abs(z) < 0.9 ? [y, -x, 0] : [0, z, -y]; // across the beam
   const scale = thickness / Math.hypot(...side);
   const [a, b, c] = side.map((value) => value * scale);
   const up = [y * c - z * b, z * a - x * c, x * b - y * a];
@@ -59,9 +60,9 @@ export function beamOf(from, to, thickness) {
 }
 
 /**
- * How a screen sees that is so many times as wide as high.
- * @param {number} aspect
- * @param {number} angle upwards [rad]
+ * The perspective projection of a camera.
+ * @param {number} aspect width of the picture divided by its height
+ * @param {number} angle vertical angle of view [rad]
  */
 export function projection(aspect, angle) {
   const [near, far, scale] = [0.1, 20, 1 / Math.tan(angle / 2)];

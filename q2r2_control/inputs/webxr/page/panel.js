@@ -1,18 +1,18 @@
-// What the run says, as a picture for the board that an operator in VR sees.
+// Draws the texts of the run as a picture, for the board that an operator in VR sees.
 
 import { nextOf, worded } from "./words.js";
 
-export const WIDTH = 1024; // of the board's picture [pixels]
-const PERIOD = 100; // between drawings [ms]
-const EDGE = 24;
-export const SMALLEST = 52; // letters [pixels]; capitals have CAPITAL of it
-export const CAPITAL = 0.7;
-const LINE = 1.22; // of a letter's size
+export const WIDTH = 1024; // width of the board's picture [pixels]
+const PERIOD = 100; // time between two drawings [ms]
+const EDGE = 24; // empty margin of the picture [pixels]
+export const SMALLEST = 52; // size of the smallest letters [pixels]
+export const CAPITAL = 0.7; // height of a capital letter divided by the size of the letters
+const LINE = 1.22; // height of a line divided by the size of its letters
 const [DIM, BRIGHT, WARNING] = ["#9aa4ae", "#e8ecf0", "#ff7070"];
 
 /**
- * A text's lines that fit a width.
- * @param {CanvasRenderingContext2D} context with the font of the text
+ * Split a text into lines that fit a width [pixels].
+ * @param {CanvasRenderingContext2D} context in which the font of the text is set
  * @param {string} text
  * @param {number} width
  */
@@ -34,15 +34,15 @@ export class Panel {
     this.canvas.height = WIDTH / 2;
     this.context = /** @type {CanvasRenderingContext2D} */ (this.canvas.getContext("2d"));
     /** @type {ImageBitmap | null} */
-    this.picture = null; // of a camera
-    this.drawn = -PERIOD;
-    this.changed = true; // since it was put on the board
+    this.picture = null; // the newest picture of a camera
+    this.drawn = -PERIOD; // when the panel was drawn last [ms]
+    this.changed = true; // whether the panel was drawn anew since it was put on the board
   }
 
   /**
    * @param {ShownState | null} state
    * @param {import("./link.js").Link} link
-   * @param {boolean} bare whether fingers are the hands
+   * @param {boolean} bare whether the operator uses bare fingers
    */
   draw(state, link, bare) {
     const now = performance.now();
@@ -56,7 +56,7 @@ export class Panel {
     });
     const text = rows.reduce((sum, { size }) => sum + LINE * size, 0);
     const scale = picture ? Math.min(1, 600 / picture.height) * Math.min(1, (WIDTH - 2 * EDGE) / picture.width) : 0;
-    canvas.height = Math.ceil(text + 2 * EDGE + (picture ? scale * picture.height + EDGE : 0)); // which clears it
+    canvas.height = Math.ceil(text + 2 * EDGE + (picture ? scale * picture.height + EDGE : 0)); // this clears it too
     context.fillStyle = "#1c2126";
     context.fillRect(0, 0, WIDTH, canvas.height);
     context.textBaseline = "top";
@@ -71,7 +71,7 @@ export class Panel {
   }
 
   /**
-   * Text, colour and size of each row.
+   * Return the text, the colour and the size of each row.
    * @param {ShownState | null} state
    * @param {import("./link.js").Link} link
    * @param {boolean} bare

@@ -1,9 +1,9 @@
-// Shapes as vertices and the triangles between them.
+// Makes shapes: vertices, and triangles that have these vertices as corners.
 
-const [CELLS, CELL] = [12, 0.5]; // of the floor's grid, and its width [m]
+const [CELLS, CELL] = [12, 0.5]; // number of cells along a side of the floor's grid, and the width of a cell [m]
 
 /**
- * A box from `low` to `high`.
+ * Make a box between two opposite corners.
  * @param {number[]} low
  * @param {number[]} high
  */
@@ -17,7 +17,7 @@ export function boxOf(low, high) {
 }
 
 /**
- * Lines on the floor, as thin boxes.
+ * Make the lines of the floor's grid, as thin boxes.
  * @param {number} floor height [m]
  */
 export function gridOf(floor) {

@@ -1,4 +1,5 @@
-// The run says `{lower}` where an operator has to press a control. Here it gets the word of the device in hand.
+// In the texts of the run, a control is a name in braces, such as `{lower}`. The page replaces it by the word for this
+// control on the operator's device.
 
 /** @type {Record<string, string>} */
 const STICKS = {
@@ -15,8 +16,9 @@ const WORDS = {
 };
 
 /**
+ * Replace the names in braces by the words of a device.
  * @param {string} text of the run
- * @param {string} device in hand: left or right (a controller), fingers, keys, gamepad
+ * @param {string} device that the operator uses: left or right (a controller), fingers, keys, gamepad
  */
 export function worded(text, device) {
   return text.replace(/\{(\w+)\}/g, (_, control) => WORDS[device]?.[control] ?? `${control} (not on this device)`);
