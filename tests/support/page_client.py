@@ -85,7 +85,8 @@ class PageClient:
 
     def order_of(self, what: str) -> float:
         """Return the place, from the top of the panel, of the folder ``what`` or of the HTML with this text."""
-        (uuid,) = {self._folders.get(what)} - {None} or {one for one, text in self._contents.items() if what in text}
+        named = [uuid for label, uuid in self._folders.items() if label == what]
+        (uuid,) = named or [uuid for uuid, text in self._contents.items() if what in text]
         return self._orders[uuid]
 
     def send(self, kind: str, **fields: Any) -> None:
