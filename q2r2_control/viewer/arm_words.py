@@ -11,13 +11,15 @@ from q2r2_control.config.bindings import MEANINGS, Action, BindingSettings
 from q2r2_control.device_words import NO_WORDS, DeviceWords
 from q2r2_control.events import Event, Reason
 from q2r2_control.summary.tick import Tick
-from q2r2_control.teleop.arm_states import ArmState, is_refusal
+from q2r2_control.teleop.arm_states import HOLDING, ArmState, is_refusal
 from q2r2_control.teleop.reasons import SILENCES, TeleopReason
 from q2r2_control.types import ActiveLimit, LimitKind
 from q2r2_control.wording import sentence
 
 # A tool within this distance of its target follows [m], [rad]. Beyond it, the sentence names what holds the tool back.
 _FOLLOWS, _TURNED = 0.005, 0.05
+_ANSWER_S = 4.0  # Time for which a pause is answered that changes nothing.
+_PAUSES = (TeleopReason.PAUSE_REQUESTED, TeleopReason.PAUSE_SERVICE)
 _HELD_BY = {LimitKind.POSITION: "at its limit", LimitKind.VELOCITY: "as fast as it may turn"}
 _FOLLOWS_WHAT = {str(ArmState.CARRIED): "goes with the other arm", str(ArmState.POLICY): "follows the policy"}
 
@@ -27,16 +29,19 @@ class Told(NamedTuple):
 
     change: Event | None = None  # The last change of state.
     refusal: Event | None = None  # The newest refusal since then.
+    pause: Event | None = None  # The newest request since then to pause the arm, which holds already.
 
     def after(self, event: Event) -> Told:
         """Return the events to tell after one more ``event``. Events without a change of state hide no reason."""
         if event.source != event.destination:
             return Told(event)
+        if event.kind in _PAUSES and event.destination in HOLDING:
+            return self._replace(pause=event)
         return Told(self.change, event) if is_refusal(event) else self
 
     @property
     def events(self) -> tuple[Event, ...]:
-        return tuple(event for event in self if event is not None)
+        return tuple(event for event in (self.change, self.refusal) if event is not None)
 
 
 def told_after(told: Mapping[str, Told], events: Iterable[Event]) -> dict[str, Told]:
@@ -75,8 +80,10 @@ class ArmWords:
         if tick.states[arm] in (ArmState.ALIGNING, ArmState.HOMING):
             return tick.states[arm]
         if not tick.engaged[arm]:
-            told = self.told.get(arm, Told()).events
-            return "; ".join(self._sentence(event.reason) for event in told) or "not engaged yet"
+            told = self.told.get(arm, Told())
+            sentences = [self._sentence(event.reason) for event in told.events] or ["not engaged yet"]
+            answered = told.pause is not None and tick.t - told.pause.t < _ANSWER_S
+            return "; ".join([*sentences, *(["already paused"] if answered else [])])
         distance, angle = tick.tracking_error(arm)
         if not (distance > _FOLLOWS or angle > _TURNED):
             return _FOLLOWS_WHAT.get(tick.states[arm], "follows the hand")

@@ -32,6 +32,8 @@ class PageClient:
         protocol = [Subprotocol(f"viser-v{viser.__version__}")]
         self._socket = connect(f"ws://{host}", origin=Origin(f"http://{host}"), subprotocols=protocol, max_size=None)
         self._contents: dict[str, str] = {}  # The HTML elements of the panel, by identifier.
+        self._folders: dict[str, str] = {}  # Identifiers of folders by label.
+        self._orders: dict[str, float] = {}  # Positions of the panel's elements from its top, by identifier.
         self.buttons: dict[str, str] = {}  # Identifiers of buttons by label.
         self.drawn: set[str] = set()  # Names of drawn meshes.
         self.pictures: list[bytes] = []  # Pictures of cameras, in the order of their arrival.
@@ -81,6 +83,12 @@ class PageClient:
         (uuid,) = (uuid for one, uuid in self.buttons.items() if one.startswith(label))
         return uuid
 
+    def order_of(self, what: str) -> float:
+        """Return the place, from the top of the panel, of the folder ``what`` or of the HTML with this text."""
+        named = [uuid for label, uuid in self._folders.items() if label == what]
+        (uuid,) = named or [uuid for uuid, text in self._contents.items() if what in text]
+        return self._orders[uuid]
+
     def send(self, kind: str, **fields: Any) -> None:
         """Send a message of viser's protocol, even one that no browser sends."""
         self._socket.send(msgspec.msgpack.encode({"type": kind, **fields}))
@@ -92,6 +100,10 @@ class PageClient:
         for one in told["messages"]:
             if one["type"] == "GuiButtonMessage":
                 self.buttons[one["props"]["label"]] = one["uuid"]
+            if one["type"] == "GuiFolderMessage":
+                self._folders[one["props"]["label"]] = one["uuid"]
+            if "order" in one.get("props", {}):
+                self._orders[one["uuid"]] = one["props"]["order"]
             if one["type"] == "MeshMessage":
                 self.drawn.add(one["name"])
             content = (one.get("props") or one.get("updates") or {}).get("content")

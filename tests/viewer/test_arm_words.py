@@ -94,6 +94,19 @@ def test_a_reason_stays_until_the_state_changes_with_a_refusal_beside_it(robot: 
     assert words(lost, told=(silent, refused, paused)) == "a program asks for a pause"
 
 
+def test_a_pause_of_an_arm_that_holds_is_answered_for_a_short_time(robot: Robot) -> None:
+    request, pause = Reason(TeleopReason.PAUSE_REQUESTED), Reason(TeleopReason.PAUSE_SERVICE)
+    lost = replace(tick_at(robot, 1.0, engaged=False), states={"left": "lost", "right": "idle"})
+    asked = Event(0.5, "left", "engaged", "engaged", request)
+    stops = Event(0.5, "left", "engaged", "lost", request)
+    assert words(lost, told=(asked, stops)) == "a program asks for a pause"
+    again = Event(0.9, "left", "lost", "lost", request)
+    assert words(lost, told=(asked, stops, again)) == "a program asks for a pause; already paused"
+    assert words(replace(lost, t=5.0), told=(asked, stops, again)) == "a program asks for a pause"
+    idle = replace(lost, states={"left": "idle", "right": "idle"})
+    assert words(idle, told=(Event(0.9, "left", "idle", "idle", pause),)) == "not engaged yet; already paused"
+
+
 def test_a_reason_uses_the_operators_name_of_a_control(robot: Robot) -> None:
     paused = tick_at(robot, 1.0, engaged=False)
     pressed = Event(0.5, "left", "pausing", "paused", Reason.of(TeleopReason.PRESSED, control="lower button"))

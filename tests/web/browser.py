@@ -159,24 +159,28 @@ _TOUCHED = (255.0, 255.0, 64.0)  # Colour of a gizmo under the mouse.
 _HANDLE, _PULLED = 0.13, 0.07  # Place of a gizmo's arrow along the tool's z axis [m].
 
 
-def grab(page: Page, arm: str) -> None:
-    """Press the mouse on the arrow of a tool at home, and pull it."""
+def grab(page: Page, arm: str, at: Array | None = None) -> None:
+    """Press the mouse on the arrow of a tool, and pull it; see :func:`on_arrow`."""
 
     def lights_up() -> bool:
-        page.mouse.move(*on_arrow(page, arm, _HANDLE))
+        page.mouse.move(*on_arrow(page, arm, _HANDLE, at))
         return count(pixels(page), _TOUCHED) > 0
 
     wait_until(lights_up)
     page.mouse.down()
-    drag(page, arm, _PULLED)
+    drag(page, arm, _PULLED, at)
 
 
-def drag(page: Page, arm: str, to: float) -> None:
-    """Move the mouse to the place where the arrow of a tool at home would be at ``to`` [m]."""
-    page.mouse.move(*on_arrow(page, arm, to), steps=6)
+def drag(page: Page, arm: str, to: float, at: Array | None = None) -> None:
+    """Move the mouse to the place where the arrow of a tool would be at ``to`` [m]; see :func:`on_arrow`."""
+    page.mouse.move(*on_arrow(page, arm, to, at), steps=6)
 
 
-def on_arrow(page: Page, arm: str, along: float) -> tuple[float, float]:
-    """Return the pixel of a point on the arrow of a tool at home, ``along`` its z axis [m]."""
+def on_arrow(page: Page, arm: str, along: float, at: Array | None = None) -> tuple[float, float]:
+    """Return the pixel of a point on the arrow of a tool, ``along`` its z axis [m].
+
+    The tool has its rotation at home, and the position ``at`` (3,) [m], by default that at home.
+    """
     robot = Robot.from_config(cell())
-    return on_screen(page, robot.tool_pose(robot.home, arm).act(np.array([0.0, 0.0, along])))
+    pose = robot.tool_pose(robot.home, arm)
+    return on_screen(page, (pose.translation if at is None else at) + pose.rotation @ np.array([0.0, 0.0, along]))

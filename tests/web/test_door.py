@@ -103,6 +103,7 @@ def test_the_tab_of_the_page_has_the_name_of_the_cell(encoding: str) -> None:
     PageFile("<two> arms").change(response)
     changed = gzip.decompress(response.body) if encoding == "gzip" else response.body
     assert b"<title>&lt;two&gt; arms</title>" in changed
+    assert b".mantine-Notifications-root {top: auto" in changed  # viser's notices would cover the arms.
     assert response.headers["Content-Length"] == str(len(response.body))
 
 

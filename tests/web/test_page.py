@@ -11,8 +11,20 @@ import pytest
 from q2r2_control.recording.about import About
 from q2r2_control.recording.recorder import Recorder
 from tests.pipeline.loops import pipeline
+from tests.support.page_client import PageClient
 from tests.support.processes import CELL
-from tests.web.browser import count, drag, grab, on_arrow, pixels, table, tool, wait_for, wait_for_row, wait_until
+from tests.web.browser import (
+    count,
+    drag,
+    grab,
+    on_arrow,
+    pixels,
+    table,
+    tool,
+    wait_for,
+    wait_for_row,
+    wait_until,
+)
 from tests.web.conftest import Open, Start
 
 ORANGE = (255.0, 107.0, 13.0)  # Colour of the arms' rings.
@@ -83,6 +95,32 @@ def test_a_page_drags_a_tool_like_a_hand_and_no_other_page_can_at_the_same_time(
     page.close()
     wait_for_row(other, "state", 0, "lost")
     assert "connection lost" in table(other)["why"][0]
+    run.interrupt()
+    assert run.end()["at_rest"]
+
+
+def test_arrows_come_back_to_the_tool_when_the_drag_cannot_engage_any_more(open_page: Open, start: Start) -> None:
+    run = start(SLOW, "web", "0", "0.01")
+    page = open_page(run.url)
+    wait_for(page, "certified")
+    grab(page, "left")
+    wait_for_row(page, "state", 0, "engaged")
+    with PageClient(run.url) as other:
+        other.press("Pause both arms")
+        wait_for_row(page, "why", 0, "a program asks for a pause")
+    wait_for_row(page, "next", 0, "let go, then drag again to engage")
+    # The mouse, which is still down, drags no arrow. The arrow at the tool begins a new drag.
+    seen = []
+    for to in (0.3, 0.45):
+        drag(page, "left", to)
+        page.wait_for_timeout(2e3)
+        seen.append(pixels(page))
+    assert np.abs(seen[1] - seen[0]).max() < 30.0
+    stood = tool(page)
+    page.mouse.up()
+    grab(page, "left", stood)
+    wait_for_row(page, "state", 0, "engaged")
+    wait_until(lambda: np.linalg.norm(tool(page) - stood) > 0.02)
     run.interrupt()
     assert run.end()["at_rest"]
 

@@ -10,6 +10,9 @@ from typing import Any
 import pinocchio as pin
 import viser
 
+from q2r2_control.events import Event
+from q2r2_control.teleop.arm_states import HOLDING, ArmState
+from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.viewer.web.exchange import Frame, PageHand, PageLost, PageSetup
 from q2r2_control.viewer.web.figure import place
 from q2r2_control.viewer.web.pace import BrowserPace
@@ -34,6 +37,8 @@ class Driving:
         self._gizmos: dict[int, tuple[viser.ClientHandle, _Gizmos]] = {}  # By page.
         self._driver: int | None = None
         self._dragged: dict[str, tuple[tuple[float, ...], tuple[float, ...]]] = {}  # By arm: position, x y z w.
+        self._spent: set[str] = set()  # Arms whose last drag cannot engage them any more.
+        self._gizmo_count = 0
         self._tools: dict[str, tuple[float, ...]] = {}  # By arm: x y z qx qy qz qw.
         server.on_client_connect(self._connect)
         server.on_client_disconnect(self._disconnect)
@@ -45,8 +50,8 @@ class Driving:
         return "drag a tool's arrows or rings to move it" if driver is None else f"page {driver + 1} drives"
 
     def next_step(self, arm: str, moves: bool) -> str:
-        """Return what to do next with an arm that is dragged although it does not move; empty otherwise."""
-        return "let go, then drag again to engage" if arm in self._dragged and not moves else ""
+        """Return what to do next with an arm that does not move although it is dragged; empty otherwise."""
+        return "let go, then drag again to engage" if not moves and arm in {*self._dragged, *self._spent} else ""
 
     def slowness(self, silent: bool) -> str:
         """Return why the hands of the page that drives come too late; see :meth:`BrowserPace.advice`."""
@@ -63,6 +68,15 @@ class Driving:
                         for pressed in (False, True, False):
                             self._send(arm, pressed)
 
+    def follow(self, frame: Frame) -> None:
+        """End each drag whose arm has stopped or was not engaged, because only a new drag can engage it."""
+        with self._lock:
+            for arm in {event.arm for event in frame.events if _ends_drag(event)} & self._dragged.keys():
+                self._send(arm, drag=False)
+                self._spent.add(arm)
+                self._replace_gizmo(arm)
+                self._forget_drag(arm)
+
     def show(self, frame: Frame) -> None:
         """Put the gizmos that nobody drags at the tools."""
         with self._lock:
@@ -76,16 +90,30 @@ class Driving:
     async def _connect(self, client: viser.ClientHandle) -> None:
         page, gizmos = client.client_id, _Gizmos()
         client.gui.add_html(f"<div style='font-size:12px;padding:0 0.6em'>this is page {page + 1}</div>")
-        for arm in self._arms:
-            gizmos[arm] = client.scene.add_transform_controls(f"/gizmos/{arm}", scale=_SIZE, depth_test=False)
-
-            async def drag(event: viser.TransformControlsEvent, arm: str = arm) -> None:
-                # There is no await, so that the pose belongs to this event.
-                self._drag(page, arm, event)
-
-            gizmos[arm].on_update(drag)
         with self._lock:
+            for arm in self._arms:
+                gizmos[arm] = self._add_gizmo(client, arm)
             self._gizmos[page] = client, gizmos
+
+    def _add_gizmo(self, client: viser.ClientHandle, arm: str) -> viser.TransformControlsHandle:
+        # Each gizmo has a name of its own. Under a known name, a browser would go on with the drag of the last one.
+        self._gizmo_count += 1
+        name = f"/gizmos/{arm}_{self._gizmo_count}"
+        gizmo = client.scene.add_transform_controls(name, scale=_SIZE, depth_test=False, visible=False)
+
+        async def drag(event: viser.TransformControlsEvent) -> None:
+            # There is no await, so that the pose belongs to this event.
+            self._drag(client.client_id, arm, event)
+
+        gizmo.on_update(drag)
+        return gizmo
+
+    def _replace_gizmo(self, arm: str) -> None:
+        """Take the gizmo of a dragged arm away from the mouse, which ends the drag in the browser."""
+        if self._driver is not None:
+            client, gizmos = self._gizmos[self._driver]
+            gizmos[arm].remove()
+            gizmos[arm] = self._add_gizmo(client, arm)
 
     async def _disconnect(self, client: viser.ClientHandle) -> None:
         with self._lock:
@@ -98,6 +126,7 @@ class Driving:
             if event.phase == "start" and self._driver in (None, page):
                 begins, self._driver = self._driver is None, page
                 self._dragged[arm] = _pose_of(event.target)
+                self._spent.discard(arm)
                 for held in (False, True):  # A control has to be released before a press counts.
                     self._send(arm, drag=held)
                 if begins:
@@ -109,10 +138,13 @@ class Driving:
                 self._dragged[arm] = _pose_of(event.target)
                 self._send(arm, drag=event.phase != "end")
                 if event.phase == "end":
-                    del self._dragged[arm]
-                    if not self._dragged:
-                        self._driver = None
-                        self._pace.end()
+                    self._forget_drag(arm)
+
+    def _forget_drag(self, arm: str) -> None:
+        del self._dragged[arm]
+        if not self._dragged:
+            self._driver = None
+            self._pace.end()
 
     def _ask(self, page: int) -> None:
         """Ask the page that drives for answers, each of which is a sample."""
@@ -148,6 +180,14 @@ class Driving:
             return
         position, quaternion = self._dragged[arm] if held else (self._tools[arm][:3], self._tools[arm][3:])
         self._answer(PageHand(arm, position, quaternion, held if drag is None else drag, gripper))
+
+
+def _ends_drag(event: Event) -> bool:
+    """Return whether the drag of the event's arm cannot engage it any more."""
+    if event.kind is TeleopReason.NOT_ENGAGED:
+        return True
+    stops = event.source != event.destination and event.destination in HOLDING | {ArmState.HOMING}
+    return stops and event.kind is not TeleopReason.DEAD_MAN_RELEASED  # That is the end of an earlier drag.
 
 
 def _pose_of(gizmo: viser.TransformControlsHandle) -> tuple[tuple[float, ...], tuple[float, ...]]:

@@ -16,13 +16,20 @@ _PHONE = (
     'div[style*="flex-grow: 1; height: 100%"]:has(canvas) '
     "{height: 50vh !important; flex: none !important; width: 100vw !important}}</style>"
 )
+# viser's notices, such as that about drawing without a graphics card, stand above the arms otherwise. On a phone they
+# cover the whole picture, so that only their titles are shown there.
+_NOTICES = (
+    "<style>.mantine-Notifications-root {top: auto !important; bottom: 1em !important} "
+    "@media (max-width: 576px) {.mantine-Notifications-root {bottom: calc(50vh + 0.5em) !important} "
+    ".mantine-Notification-description {display: none}}</style>"
+)
 
 
 class PageFile:
     """Changes viser's page for one cell."""
 
     def __init__(self, name: str) -> None:
-        self._head = f"<title>{escape(name)}</title>{_PHONE}".encode()
+        self._head = f"<title>{escape(name)}</title>{_PHONE}{_NOTICES}".encode()
         self._made: dict[bytes, bytes] = {}  # The changed page by viser's page, plain and compressed.
 
     def change(self, response: Response) -> None:

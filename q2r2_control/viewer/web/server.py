@@ -95,6 +95,8 @@ def main(requests: Iterator[Any], answer: Callable[[Any], None]) -> None:
     def read() -> None:
         for frame in requests:
             panel.follow(frame)
+            if driving is not None:
+                driving.follow(frame)
             newest.put(frame)
         newest.put(None)
 

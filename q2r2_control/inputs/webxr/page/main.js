@@ -123,9 +123,13 @@ function fly() {
     if (flying !== begun) return;
     requestAnimationFrame(onFrame);
     const now = performance.now();
-    if (!drawing.drawOnPage(state)) return;
-    if (kept.isSlow(now)) drawing.coarsen();
+    if (kept.isTired(now) || !drawing.drawOnPage(state)) return;
     kept.noteDrawn(now);
+    // The browser finishes the picture before this task. Where a processor draws, nothing else is done meanwhile.
+    setTimeout(() => {
+      kept.noteTook(performance.now());
+      if (kept.isSlow()) drawing.coarsen();
+    });
   };
   requestAnimationFrame(onFrame);
   // A page that draws slowly sends as often as any other one. A page that is hidden, has no focus, or stands still sends

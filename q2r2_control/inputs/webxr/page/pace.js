@@ -5,7 +5,8 @@ const LATE =
   "The hands came too late, although this browser sent them in time: the network or the run's computer is too busy. " +
   "Close other programs there, then engage again.";
 
-const SLOW = 50; // between two pictures; they get fewer pixels then [ms]
+const SLOW = 30; // that a picture takes; they get fewer pixels then [ms]
+const LONGEST_REST = 100; // between two pictures [ms]
 const KEPT = 4000; // of times that are counted [ms]
 export const BLIND = 500; // a hand is not sent if no picture was drawn for so long: its operator would not see the arms [ms]
 
@@ -15,6 +16,8 @@ export class Pace {
     this.sent = []; // when hands were sent [ms]
     /** @type {number[]} */
     this.drawn = []; // when a picture was drawn [ms]
+    this.took = 0; // by the last picture, in which the page does nothing else [ms]
+    this.rested = 0; // when the next picture may be drawn [ms]
     this.kept = ""; // advice while an arm is lost
     /** @type {{ now: number, silence: number }[]} */
     this.silences = []; // between two sent hands [ms]
@@ -33,14 +36,28 @@ export class Pace {
     this.drawn = [...this.drawn.filter((then) => now - then < KEPT), now];
   }
 
+  /** @param {number} now when the last picture is finished [ms] */
+  noteTook(now) {
+    this.took = now - (this.drawn[this.drawn.length - 1] ?? now);
+    this.rested = now + Math.min(this.took, LONGEST_REST);
+  }
+
+  /**
+   * Whether pictures have to wait, because keys and hands get at least as much time as pictures.
+   * @param {number} now [ms]
+   */
+  isTired(now) {
+    return now < this.rested;
+  }
+
   // The page sends nothing on purpose, which is no fault of the browser.
   rest() {
     this.sent = [];
   }
 
-  /** @param {number} now of a picture [ms] */
-  isSlow(now) {
-    return now - (this.drawn[this.drawn.length - 1] ?? now) > SLOW;
+  // The last picture has taken long.
+  isSlow() {
+    return this.took > SLOW;
   }
 
   /** @param {number} now [ms] */
