@@ -75,7 +75,7 @@ def test_number_and_name_of_each_subtask_are_in_the_file(file: Path) -> None:
         (
             TeleopReason.SUBTASK_BEGINS,
             {"number": 2, "name": "grasp the cube"},
-        ),  # The run may be one episode until here.
+        ),  # No episode has begun yet, so the whole run may be one episode.
         (TeleopReason.EPISODE_BEGINS, {}),
         (TeleopReason.SUBTASK_BEGINS, {"number": 2, "name": "grasp the cube"}),
         (TeleopReason.SUBTASK_BEGINS, {"number": 3, "name": "place"}),
