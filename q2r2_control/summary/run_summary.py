@@ -67,7 +67,8 @@ class Histogram:
 class TorqueSummary:
     """Figures of a run in torque mode."""
 
-    off_reference_s: dict[str, float]  # By arm, the time for which it was farther away than the impedance's error clip.
+    # By arm, the time for which its distance from the reference was larger than the impedance's error clip.
+    off_reference_s: dict[str, float]
     min_measured_distance_mm: float | None = None  # None if there is no monitored pair.
     measured_closest_pair: tuple[str, str] | None = None
     pressed_pairs: list[tuple[str, str]] = field(default_factory=list)  # Pairs that the wall has pushed apart.
@@ -78,13 +79,13 @@ class TorqueSummary:
 
     @property
     def met(self) -> bool:
-        """Whether measured links have met that may not touch, so that the measurement breaks the promise."""
+        """Whether two links that must not touch have touched, by the measured joint positions."""
         return (self.min_measured_distance_mm or 0.0) < 0.0
 
     def add(self, dt: float, impedance: ImpedanceReport, wall: WallReport) -> None:
         """Count one tick of ``dt`` [s]."""
         least = math.inf if self.min_measured_distance_mm is None else self.min_measured_distance_mm
-        # The distance is NaN if nothing was measured. It is then not less, and the tick counts as held.
+        # The distance is NaN if nothing was measured. The comparison is then False, and the tick counts as held.
         if 1e3 * wall.closest_distance < least:
             self.min_measured_distance_mm = 1e3 * wall.closest_distance
             self.measured_closest_pair = wall.closest_pair
@@ -107,8 +108,8 @@ class ArmSummary:
     rotation_error_deg_rms: float | None = None
     gripper_changes: int = 0
     gripper_held_s: float = 0.0  # Time for which something near the fingers held the gripper up.
-    gripper_held_by: tuple[str, str] | None = None  # Names of the geometries of the last pair that did so.
-    object_held_s: float | None = None  # Time for which the gripper held its object; None if it has none.
+    gripper_held_by: tuple[str, str] | None = None  # Names of the last two geometries that were then near each other.
+    object_held_s: float | None = None  # Time for which the gripper held its object; None if the arm has no object.
     slip_mm_max: float = 0.0  # Largest slip of the target in one engagement.
     slip_deg_max: float = 0.0
     yielded_mm_max: float = 0.0  # Largest displacement of the target by the admittance, in position mode.
@@ -167,7 +168,7 @@ class RunSummary:
             broken.append(f"measured {met} met: {self.torque.min_measured_distance_mm:.1f} mm")
         if self.uncertified_ticks:
             broken.append(f"{self.uncertified_ticks} ticks without a certificate")
-        # Both arms report one error of a policy, which is named once.
+        # Both arms report the same error of a policy. It is named only once.
         roots = (event.reason.root for event in self.events)
         broken += dict.fromkeys(sentence(root) for root in roots if root.kind is CommonReason.POLICY_UNUSABLE)
         if not self.at_rest:
