@@ -1,4 +1,4 @@
-"""A table and an HDF5 file have the numbers of the dataset."""
+"""The CSV files and HDF5 files of an export have the numbers of its episodes."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_a_table_has_the_subtask_of_each_line(tmp_path: Path) -> None:
     assert list(rows[0]) == [*HEAD, "subtask_index", "subtask"]
     found = [(int(row["subtask_index"]), row["subtask"]) for row in rows]
     assert found == [(0, "grasp the cube")] * 10 + [(1, "place")] * 15
-    assert len(read(made / "run-3.csv")) == TOLD[2].frames  # As it was without subtasks.
+    assert len(read(made / "run-3.csv")) == TOLD[2].frames  # ``read`` checks that it has no columns for subtasks.
 
 
 POSITIONS = ("left_A1", "left_gripper")

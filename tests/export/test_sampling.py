@@ -121,7 +121,7 @@ def poses(q: Array) -> list[Array]:
 
 
 def frames(seed: int = 0) -> dict[str, Array]:
-    """Return frames with joints that move through much of their range, and targets elsewhere than the tools."""
+    """Return frames whose joints move through much of their range. The targets differ from the tool poses."""
     random = np.random.default_rng(seed)
 
     def motion() -> Array:
@@ -196,7 +196,7 @@ def test_quaternions_do_not_jump_and_targets_have_the_signs_of_the_tools() -> No
                 assert (np.sum(quaternions[1:] * quaternions[:-1], axis=1) > 0.0).all()
             assert np.dot(tools[0], targets[0]) >= 0.0
             assert tools[0][np.abs(tools[0]).argmax()] > 0.0
-    assert flipped  # Without this, the test would show nothing.
+    assert flipped  # Otherwise no quaternion was recorded with a changed sign, and the test would show nothing.
 
 
 def test_grippers_that_are_never_measured_are_left_out() -> None:

@@ -18,7 +18,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 try:
     from lerobot.scripts.convert_dataset_v21_to_v30 import convert_dataset
 
-    OF_ALL = False  # True if the loader needs the folder of all datasets.
+    OF_ALL = False  # True if the converter needs the folder that contains all datasets.
 except ImportError:  # This is the import of lerobot 0.4.
     from lerobot.datasets.v30.convert_dataset_v21_to_v30 import convert_dataset
 

@@ -45,7 +45,7 @@ def add(
 ) -> None:
     """Add a tick of 1 ms at home. Both arms are engaged if the tool has an ``error`` relative to its target.
 
-    ``changes``: of the tick's record, or of its reference.
+    ``changes`` replaces fields of the tick, or ``q``, ``v``, ``a`` and ``report`` of its reference.
     """
     tick, arms = tick_at(statistics.robot, 0.0), statistics.robot.arms
     motion = {name: changes.pop(name) for name in ("q", "v", "a") if name in changes}

@@ -32,7 +32,7 @@ class Q2R2HandsConfig(TeleoperatorConfig):
 
 
 class Q2R2Hands(Teleoperator):
-    """Hands that engage an arm where it is by a press, as in ``q2r2 run``. The program has one cell of lerobot.
+    """Hands that engage the arms by a press, as in ``q2r2 run``. They move the cell that was created last.
 
     The hands have a clutch, so ``lerobot-rollout`` needs ``--strategy.smooth_handover=false``.
     """
