@@ -1,7 +1,8 @@
 """Run one controller in one work motion and compute its figures, and run the bench of our controller and its peers.
 
-All controllers get the same cell, limits, targets and ticks, in one process. Peers run open loop like ours, with
-targets ahead of time by their lag. Our controller also runs in free air. The difference is the cost of the pairs.
+All controllers get the same cell, limits, targets and ticks, in one process. Peers run open loop like our controller,
+and their targets are moved ahead of time by their lag. Our controller also runs in free air. The difference between
+its two runs is the cost of the monitored pairs.
 """
 
 from __future__ import annotations
@@ -196,7 +197,10 @@ def figures_of(
 
 
 def _errors(run: MotionRun, robot: Robot, motion: WorkMotion, began: int) -> tuple[Array, Array]:
-    """Return the distances (n, arms) of tools from their targets and from their last targets, by measured tick [m]."""
+    """Return two distances (n, arms) of the tools in the n measured ticks [m]: from their targets, and from the goal.
+
+    The goal is the last target.
+    """
     start = {arm: robot.tool_pose(robot.home, arm) for arm in robot.arms}
     goal = motion.targets(motion.ends, start)
     tools = np.array([[robot.tool_pose(q, arm).translation for arm in goal] for q in run.q[began:]])

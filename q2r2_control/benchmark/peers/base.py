@@ -26,7 +26,7 @@ PEERS = {
 }
 WITHOUT_ACCELERATION_LIMIT = ("mink",)
 INSTALL = install_line("bench")
-NEAREST_ROWS = 10  # Separation rows of a peer that gets only the nearest pairs.
+NEAREST_ROWS = 10  # Number of separation rows of a peer that gets only the nearest pairs.
 DETECTION_DISTANCE = 0.25  # Pairs farther apart than this need no exact distance [m].
 
 
@@ -95,7 +95,7 @@ def build_peers(names: Sequence[str], setup: PeerSettings) -> tuple[list[BenchCo
 
 
 class Leading:
-    """A peer whose targets are moved ahead of time along their paths, to make up for its lag."""
+    """A peer whose targets are moved ahead of time along their paths, to compensate for the peer's lag."""
 
     def __init__(self, peer: BenchController, gain: float) -> None:
         """Wrap ``peer``, whose tools have the ``gain`` [1/s]."""
