@@ -86,12 +86,12 @@ def undisturbed(answers: list[tuple[float, float]], stills: list[tuple[float, fl
 
 
 class ToolWay:
-    """The commanded and measured places of the tools in the ticks in which all arms were engaged."""
+    """The commanded and measured positions of the tools in the ticks in which all arms were engaged."""
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
         # Arrays of plain numbers are used here, because the garbage collector would search a list of arrays for more
-        # than 100 ms during the run. The commanded places are computed after the run, because that takes a twentieth
+        # than 100 ms during the run. The commanded positions are computed after the run, because that takes a twentieth
         # of the run's time.
         self._postures, self._tools = array("d"), array("d")
 
