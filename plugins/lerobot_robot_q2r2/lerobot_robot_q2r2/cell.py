@@ -46,7 +46,7 @@ class Q2R2CellConfig(RobotConfig):
     plant: str | None = None  # Name of an installed plant, such as fri; None for the cell's own plant.
     rate: float = 30.0  # Rate of the actions [Hz].
     simulated_time: bool = False  # If true, each action takes 1 / rate of simulated time, however slow lerobot is.
-    full_speed: bool = False  # If false, the joints of real robots move at most at a tenth of their speed.
+    full_speed: bool = False  # If false, real arms move at a tenth of the speed that the cell says.
     record: str | None = None  # Folder for recordings of q2r2; None to record nothing.
 
 
