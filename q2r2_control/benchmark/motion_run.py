@@ -29,7 +29,8 @@ PATIENCE = 3.0  # Longest time that a controller may take, as a multiple of the 
 JOLT = 5.0  # A larger change of a joint's acceleration in one tick is a jolt [rad/s^2].
 _TAIL = 0.5  # Duration at the end over which the acceleration at rest is computed [s].
 _SHORTEST_DT = 1e-9  # Duration of a tick that moves nothing [s].
-_DISTANCE_TICKS = 4  # Ticks between postures whose distances are measured. Near the nearest one, all are measured.
+# Distances are measured at one posture in so many ticks. Around the nearest of these postures, all are measured.
+_DISTANCE_TICKS = 4
 
 
 class OwnController:
@@ -99,10 +100,12 @@ class MotionFigures:
     done: float  # Share of the ticks; less than 1 if the controller was too slow.
     ticks: int = 0  # Measured ticks.
     failures: int = 0  # Measured ticks with an exception, no solution, or numbers that are not finite.
-    rms_error_mm: float | None = None  # Until the rest begins, of the tool with the larger error.
-    max_error_mm: float | None = None  # Until the rest begins, of either tool.
-    end_error_mm: float | None = None  # At the end, of either tool.
-    arrival_s: float | None = None  # From the motion's begin until both tools stay within 10 mm of the goal, if any.
+    rms_error_mm: float | None = None  # RMS error of the tool with the larger error, until the rest begins.
+    max_error_mm: float | None = None  # Largest error of either tool until the rest begins.
+    end_error_mm: float | None = None  # Largest error of either tool at the end.
+    # Time from the beginning of the motion until both tools stay within 10 mm of the goal. None if they do not stay
+    # there until the end, or if the motion has no goal.
+    arrival_s: float | None = None
     fallback_percent: float | None = None  # Share of ticks with the certified stop; None for a peer, which has none.
     min_distance_mm: float | None = None  # Least distance of the monitored pairs, by Coal.
     closest_pair: tuple[str, str] | None = None

@@ -39,7 +39,7 @@ class MissingPictures:
         """Count from ``begin`` [s] on, for a camera of ``rate`` [Hz]."""
         self.count = 0
         self._rate, self._newest = rate, begin
-        self._late: float | None = None  # How late the newest picture is, in periods; None before the first one.
+        self._late: float | None = None  # The sum of delays at the newest picture, in periods; None before any picture.
 
     def add(self, time: float) -> int:
         """Take the time of the next picture [s]. Return how many pictures are missing just before it."""

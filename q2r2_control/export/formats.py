@@ -63,7 +63,7 @@ def write_table(episode: EpisodeVectors, path: Path) -> None:
 
 
 def gather_tables(files: Sequence[Path], folder: Path) -> None:
-    """Move CSV files into a new ``folder``, and write the units of their columns. A recording's name becomes a file's.
+    """Move CSV files into a new ``folder``, under the names of their recordings, and write the units of their columns.
 
     Raises :class:`RecordingError` if two recordings have the same name.
     """

@@ -40,8 +40,8 @@ _LEAST_TRAVEL = 0.5  # A camera on an arm is compared with fixed ones if the arm
 _CORRELATES = 0.4  # The least correlation of each of these two.
 _OTHER_ARM = 0.2  # The sum of these two correlations is larger by this than the sum with the cameras' own arms.
 _STILL = 3.0  # A pixel of a view stands still if its brightness changes by less than this.
-# A camera is fixed if the share of its view that stands still is above the first number. It is on an arm if the share
-# is below the second number.
+# A camera seems to be fixed if the share of its view that stands still is above the first number. It seems to be on an
+# arm if this share is below the second number.
 _MOSTLY, _HARDLY = 0.5, 0.35
 
 
@@ -183,11 +183,11 @@ class _CameraLook:
 
 
 def _swapped(looks: dict[str, _CameraLook]) -> dict[str, str]:
-    """Return the cameras that were swapped, by name, each with the other one.
+    """Return the cameras that were swapped, by name, each with the camera with which it was swapped.
 
-    Two cameras on different arms are swapped if the pictures of each change with the arm of the other. For a fixed
-    camera and a camera on an arm there are two conditions: Hardly anything stands still in the view of the fixed one.
-    Most things stand still in the view of the other one.
+    Two cameras on different arms are swapped if each camera's pictures change with the motion of the other camera's
+    arm. For a fixed camera and a camera on an arm there are two conditions: Hardly anything stands still in the view of
+    the fixed camera. Most things stand still in the view of the camera on the arm.
     """
     found: dict[str, str] = {}
     for (one, first), (two, second) in combinations(looks.items(), 2):

@@ -103,7 +103,7 @@ class TimingFigures:
     """Figures of all ticks, the end of the run included. Shares and maxima are None if there are no ticks."""
 
     ticks: int  # The number of ticks that are in the file.
-    lost_ticks: int  # The number of ticks up to the last one that the recording lacks.
+    lost_ticks: int  # The number of ticks that are missing in the file, up to its last tick.
     lost_share: float | None
     longest_lost_s: float  # The longest time span that has no tick in the file.
     late_ticks: int  # The number of ticks that come more than 1.5 periods after the one before.

@@ -172,7 +172,7 @@ def heard_on(topic: str) -> str:
 
 
 def is_compressed(topic: str) -> bool:
-    """Return whether a camera's topic has CompressedImage messages. Its name tells, as in image_transport."""
+    """Return whether a camera's topic has CompressedImage messages. image_transport gives such topics this ending."""
     return topic.endswith("/compressed")
 
 

@@ -34,8 +34,8 @@ if TYPE_CHECKING:  # The ROS node does not import MuJoCo.
     from q2r2_control.plants.mujoco import MujocoPlant
 
 PATIENCE = 10.0  # Time to wait for a disk that hangs at the end of a run [s].
-# Size of the data that may wait to be sent [bytes]. As much may wait in the writer. A tick of two arms takes 1.6 kB,
-# and the nodes of two arms send some 0.6 MB a second.
+# Size of the data that may wait to be sent [bytes]. The same size may wait in the writer. A tick of two arms takes
+# 1.6 kB, and the nodes of two arms send some 0.6 MB a second.
 ROOM = 4 << 20
 # A warning is logged if the file is behind the run by more than the first time. There is no second warning before the
 # file is behind by less than the second time [s].

@@ -74,7 +74,7 @@ def replay(
     prepare: Callable[[Pipeline], None] = lambda pipeline: None,
     paced: bool = False,
 ) -> Replay:
-    """Run a recording again, with its own cell or another one.
+    """Run a recording again, with its own cell or with another cell.
 
     Without a ``plant``, the loop gets the recorded measurements, whatever it commands. With a ``plant``, that plant
     moves and is measured. Only a plant of the recorded kind can repeat the run to the bit, so ``compare`` is not

@@ -47,7 +47,7 @@ class Histogram:
         self._largest = 0.0
 
     def add(self, duration: float) -> None:
-        """Count one duration [s]. A negative one counts as zero, and one that is not finite does not count."""
+        """Count one duration [s]. A negative duration counts as zero. A duration that is not finite does not count."""
         if math.isfinite(duration):
             self._counts[int(min(max(duration / self._bin, 0.0), _BINS - 1))] += 1
             self._largest = max(self._largest, duration)
@@ -134,15 +134,15 @@ class RunSummary:
     duration_s: float
     loop_rate_hz: float
     real_time_factor: float | None  # Simulated seconds per second of the computer's clock; None in real time.
-    tick_us: Percentiles  # From polling the input to the command, without the plant.
-    lateness_us: Percentiles  # From when a tick was due to its beginning; None in simulated time.
-    input_to_command_ms: Percentiles  # From the receipt of a sample to the command to which it led.
+    tick_us: Percentiles  # Time from polling the input to the command, without the plant.
+    lateness_us: Percentiles  # Time by which ticks began after they were due; None in simulated time.
+    input_to_command_ms: Percentiles  # Time from the receipt of a sample to the command that follows from it.
     arms: dict[str, ArmSummary]
     min_distance_mm: float | None  # None if there is no monitored pair.
     closest_pair: tuple[str, str] | None
     max_velocity_ratio: float
     max_acceleration_ratio: float
-    min_position_margin_rad: float  # In addition to the configured margin.
+    min_position_margin_rad: float  # Least distance from a position limit, minus the configured margin.
     fallback_ticks: int
     uncertified_ticks: int
     rejected_targets: int

@@ -79,7 +79,7 @@ class Margin:
         return kept
 
     def add(self, other: Margin) -> None:
-        """Add what another run has checked of the same promise. ``tick`` is that of the run with the worst value."""
+        """Add what another run has checked of the same promise. ``tick`` becomes the tick of the worst value."""
         self.checked += other.checked
         self.violations += other.violations
         self._keep_worst(other.worst, other.tick)
