@@ -140,7 +140,7 @@ def test_the_example_format_in_the_docs_exports_a_recording(recordings: Sequence
         np.testing.assert_array_equal(arrays["action"], episode.vectors["action"])
 
 
-def test_an_unknown_name_is_refused_with_the_existing_ones() -> None:
+def test_the_error_for_an_unknown_format_names_the_existing_formats() -> None:
     with pytest.raises(ConfigError, match=r"export zar: allowed: lerobot, .*csv, no_format, npz, zarr"):
         format_named("zar")
     with pytest.raises(ConfigError, match=r"export no_format is .*; allowed: an ExportFormat"):

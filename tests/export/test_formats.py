@@ -119,7 +119,7 @@ def test_each_episode_is_an_hdf5_file_with_the_data_that_act_needs(tmp_path: Pat
             assert (about["sim"], about["action_ahead_frames"], about.get("success")) == (1, 2, episode.success)
 
 
-def test_an_hdf5_file_has_the_subtask_of_each_frame_and_their_names(tmp_path: Path) -> None:
+def test_an_hdf5_file_has_the_subtask_of_each_frame_and_the_names_of_the_subtasks(tmp_path: Path) -> None:
     h5py = pytest.importorskip("h5py", reason="the extra export is not installed")
     told = [
         replace(plain, subtasks=with_them.subtasks, subtask=with_them.subtask)

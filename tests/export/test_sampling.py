@@ -38,7 +38,7 @@ def recording(path: Path, times: list[int], **what: Any) -> Recording:
 
 
 @pytest.mark.parametrize("fps", [1, 24, 30, 60, 200, 1000])
-def test_observations_are_those_of_the_newest_tick_and_commands_those_of_the_first_later_one(
+def test_observations_are_those_of_the_newest_tick_and_commands_those_of_the_next_tick(
     fps: int, tmp_path: Path
 ) -> None:
     # The ticks are about a millisecond apart, and one of them is 70 ms late.
@@ -60,7 +60,7 @@ def test_observations_are_those_of_the_newest_tick_and_commands_those_of_the_fir
     assert {len(values) for values in frames.values()} == {k}
 
 
-def test_targets_are_the_operators_if_there_are_any_and_openings_belong_to_their_arms(tmp_path: Path) -> None:
+def test_the_operators_targets_are_used_where_they_exist_and_openings_belong_to_their_arms(tmp_path: Path) -> None:
     openings = {"wanted": (0.1, 0.4), "commanded": (0.2, 0.5), "opening": (0.3, 0.6)}
     frames = sample(recording(tmp_path, [*range(30)], engaged=range(5, 20), openings=openings), fps=1000)
     assert frames["target"][:, 0, 0].tolist() == [k + 1000 if 5 <= k < 20 else k for k in range(30)]

@@ -1,4 +1,4 @@
-"""Episodes for tests: without a recording, so that every number can be chosen, or recorded from hands that work."""
+"""Episodes for tests. Some have no recording, so that every number can be chosen. Others are recorded from hands."""
 
 from __future__ import annotations
 

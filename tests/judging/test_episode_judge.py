@@ -84,7 +84,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> PatientRun:
     return PatientRun(tmp_path_factory.mktemp("verdicts"))
 
 
-def test_each_verdict_equals_the_one_after_the_run(run: PatientRun) -> None:
+def test_each_verdict_equals_the_verdict_after_the_run(run: PatientRun) -> None:
     after = judge(Recording(run.file))
     assert names_of(after) == [[], ["operator"], ["max_idle_share"]]
     assert run.told == [
@@ -196,7 +196,7 @@ def test_kept_episodes_become_episodes_of_a_dataset_with_their_own_frames(file: 
         assert np.abs(near - state[0]).max(axis=1).min() < 1e-9
 
 
-def test_without_a_recording_a_press_for_an_episode_is_answered_that_nothing_is_recorded() -> None:
+def test_a_press_that_begins_an_episode_without_a_recording_is_reported_once() -> None:
     loop = loop_of(hands(3, inputs=CONTROLS), teleop=EPISODES)
     summary = loop.run(1.5, realtime=False)
     assert [event.kind for event in summary.events].count(TeleopReason.NO_RECORDING) == 1

@@ -125,7 +125,7 @@ class TestDelays:
 
 
 class TestArms:
-    def test_errors_are_those_of_the_engaged_time(self) -> None:
+    def test_errors_are_computed_from_the_engaged_time_only(self) -> None:
         path, target = np.zeros((400, 3)), np.zeros((400, 3))
         target[:100, 2], target[100:200, 2], target[200:, 2] = 0.01, 0.03, 1.0
         found = arm_figures(episode(engaged=engaged_until(1000, 2000), path=path, target_path=target), "left")

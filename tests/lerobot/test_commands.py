@@ -291,7 +291,7 @@ def test_takeovers_of_dagger_make_no_jump_and_every_frame_says_who_acted(seen: P
 
 
 def check_tags(dataset: LeRobotDataset, rows: Rows) -> None:
-    """Check that frames are ticks of the recording in order, and that hands drive only in tagged frames."""
+    """Check that frames are ticks of the recording in order, and that hands move the arms only in tagged frames."""
     tags, states = column(dataset, "intervention").ravel(), column(dataset, "observation.state")
     by_hand = rows["arms"]["intervention"].max(axis=1) > 0.0
     measured = np.hstack((rows["q"], rows["arms"]["opening"])).astype(np.float32)

@@ -1,4 +1,4 @@
-"""The loaders of other trainers read exported files: that of robomimic, and LeRobot's own of v2.1.
+"""Other programs read exported files: robomimic reads HDF5, and LeRobot converts a dataset of v2.1 and reads it.
 
 Run by ``make test-lerobot``, in an environment of its own.
 """

@@ -111,7 +111,7 @@ def test_each_picture_is_stamped_with_its_capture_on_the_loops_clock(run: Record
     assert run.summary.lost_pictures == 0
 
 
-def test_the_tick_of_a_picture_is_the_last_one_before_its_capture(run: RecordedRun) -> None:
+def test_the_tick_of_a_picture_is_the_last_tick_before_its_capture(run: RecordedRun) -> None:
     recording = Recording(file_of(run.summary))
     ticks = np.concatenate([chunk.times for chunk in recording.chunks()])
     before, *pictures = recording.pictures("front")

@@ -1,4 +1,4 @@
-"""Recording never stands in the way of a run, loses nothing silently, and leaves files that other programs open."""
+"""Recording never disturbs a run, loses nothing silently, and leaves files that other programs can open."""
 
 from __future__ import annotations
 

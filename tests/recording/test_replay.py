@@ -186,7 +186,7 @@ class SometimesLate:
         return QpSolution(None, 1.0) if self.count % 7 == 0 else solution
 
 
-def test_late_solutions_are_late_again(tmp_path: Path) -> None:
+def test_solutions_that_came_too_late_come_too_late_in_the_replay(tmp_path: Path) -> None:
     loop = pipeline(control=cell().control.model_copy(update={"solve_time_limit": None}))
     loop.controller._solver = SometimesLate(DaqpSolver(loop.robot.model.nv))
     file = file_of(record(tmp_path, loop, 1.2))
@@ -230,7 +230,7 @@ def _cut(file: Path, target: Path, ticks: int) -> Path:
     return rewrite(file, target, lambda _, message: message if message.number < ticks else None, whole=False)
 
 
-def test_a_recording_that_was_cut_has_the_summary_of_its_ticks(circle: Path, tmp_path: Path) -> None:
+def test_the_replay_of_a_cut_recording_summarises_the_ticks_that_are_left(circle: Path, tmp_path: Path) -> None:
     result = replay(_cut(circle, tmp_path / "cut.mcap", 400))
     assert (result.ticks, result.ended_by) == (400, NO_END)
     assert result.summary is not None

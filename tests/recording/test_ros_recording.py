@@ -184,7 +184,7 @@ def test_a_tick_whose_reference_was_lost_counts_as_lost_but_its_events_are_kept(
     assert len(ticks.states) == 1
 
 
-def test_ticks_count_from_when_joints_and_flags_are_known_and_on_after_a_restart(
+def test_ticks_are_counted_once_joints_and_flags_are_known_and_the_count_goes_on_after_a_restart(
     nodes: NodesOnFile,
 ) -> None:
     nodes.tick(PERIOD, 499, np.array(nodes.robot.home))
@@ -209,7 +209,7 @@ def test_ticks_are_kept_although_the_robot_does_not_measure_some_numbers(nodes: 
     assert np.isnan(ticks.rows["q"]).all(axis=1).tolist() == [False] * 6 + [True]
 
 
-def test_episodes_are_those_of_the_events_of_arms_and_services(nodes: NodesOnFile) -> None:
+def test_episodes_begin_and_end_by_events_of_arms_and_of_services(nodes: NodesOnFile) -> None:
     for at, kind, arm in (
         *(
             (20, TeleopReason.EPISODE_BEGINS, "left"),
