@@ -59,8 +59,8 @@ class PeerSettings:
         self.acceleration = robot.capped_acceleration(control.acceleration_limit)  # (nv,) [rad/s^2]
         self.lower = robot.position_lower + control.position_margin  # (nv,) [rad]
         self.upper = robot.position_upper - control.position_margin  # (nv,) [rad]
-        # The smallest distance that we keep for any pair [m]. Peers have one distance for all pairs. With this distance,
-        # no peer has to avoid postures that our controller may take.
+        # The smallest distance that we keep for any pair [m]. Peers have one distance for all pairs. Therefore no peer
+        # has to avoid postures that our controller may take.
         self.min_distance = float(kept_distances(robot, control).values.min(initial=control.min_distance))
         home = compose(config).home.items()
         # Home positions of joints that move no tool, such as fingers.
