@@ -236,7 +236,7 @@ def nearest_pair(q: Array, robot: Robot) -> tuple[float | None, tuple[str, str] 
 
 @dataclass(frozen=True, slots=True)
 class BenchRow:
-    """The figures of one motion: of our controller in free air, of ours in the cell, and of the peers."""
+    """The figures of one motion: of our controller in free air and in the cell, and of the peers in the cell."""
 
     motion: str
     about: str

@@ -208,7 +208,7 @@ _RIGHT_ASIDE = (0.50, -0.25, 0.38)
 
 
 def _slide(t: float, home: Array) -> Array:
-    """Return the left tool's target that slides sideways over the table, and a right one that stays aside."""
+    """Return a left target that slides sideways over the table, and a right target that stays aside."""
     y = _SLIDE_FROM[1] - _uniform(t, _SLIDE_WAY, _SLIDE_SPEED, _SLIDE_RAMP)
     return np.array([(_SLIDE_FROM[0], y, _SLIDING_HEIGHT), _RIGHT_ASIDE])
 

@@ -123,7 +123,7 @@ def write_hdf5(episode: EpisodeVectors, path: Path) -> None:
 
 def _write_pictures(group: Any, camera: str, pictures: CameraFrames, frames: int) -> Any:
     """Write the pictures of a camera into a group of an HDF5 file, and return the dataset."""
-    # Each picture is compressed by itself, so that one can be read without the others.
+    # Each picture is compressed by itself, so that a reader can decode a single picture.
     packing = {"chunks": (1, *pictures.size), "compression": "gzip", "compression_opts": _COMPRESSION}
     data = group.create_dataset(camera, (frames, *pictures.size), pictures.dtype, **packing)
     for number, pixels in enumerate(pictures):

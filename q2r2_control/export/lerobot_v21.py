@@ -1,4 +1,4 @@
-"""Writes LeRobotDataset v2.1, the layout that openpi and Isaac GR00T train on; the package lerobot writes a newer one.
+"""Writes LeRobotDataset v2.1, the layout on which openpi and Isaac GR00T train. lerobot itself writes a newer layout.
 
 Cameras have the names of openpi. GR00T needs ``meta/modality.json`` and the column of task descriptions.
 """

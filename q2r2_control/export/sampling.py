@@ -221,7 +221,8 @@ def _known(frames: Mapping[str, Array], what: str, arms: tuple[str, ...]) -> lis
 def continuous(poses: Array, first: Array | None = None) -> Array:
     """Return poses (n, arms, 7) whose quaternions do not change sign from frame to frame.
 
-    The first quaternion has the sign of that in ``first`` (arms, 7). Without ``first``, its largest number is positive.
+    The first quaternion has the same sign as the quaternion in ``first`` (arms, 7). Without ``first``, its largest
+    number is positive.
     """
     quaternions = poses[..., 3:]
     if first is None:
@@ -250,7 +251,7 @@ def _to_next(poses: Array) -> Array:
 
 @dataclass(frozen=True)
 class CameraFrames:
-    """The pictures of one camera, one for each frame of an episode: colours, or depth, where 0 is unknown."""
+    """The pictures of one camera, one for each frame of an episode: colours, or depth, where 0 means unknown."""
 
     recording: Recording
     name: str

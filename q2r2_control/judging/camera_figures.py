@@ -47,14 +47,19 @@ _MOSTLY, _HARDLY = 0.5, 0.35
 
 @dataclass(frozen=True, slots=True)
 class CameraFigures:
-    """Figures of one camera, until the run begins to end. None means that a figure cannot be computed."""
+    """Figures of one camera, without the end of the run, while the arms come to rest.
+
+    None means that a figure cannot be computed.
+    """
 
     arm: str | None  # The arm that carries the camera; None if no arm does.
     pictures: int
     missing_pictures: int  # The number of pictures that were due and are missing.
     rate_share: float | None  # The number of pictures divided by the number that was due.
     longest_gap_periods: float | None  # The longest time without a picture, in the camera's periods.
-    frozen_share: float | None  # The share of equal pictures among those between which the arms moved.
+    frozen_share: (
+        float | None
+    )  # How many of the pictures since which the arms moved are equal to the one before (share).
     black_share: float | None  # The share of the pictures that are black or have one colour only.
     bad_pictures: int  # The number of pictures that are damaged, or have another size than the cell says.
     lag_ms: float | None  # The delay of the motion in the pictures behind the motion of the joints.

@@ -20,7 +20,7 @@ _GRASPS = re.compile(
 
 
 def contradictions(figures: EpisodeFigures, settings: JudgeSettings) -> Iterator[Rejection]:
-    """Yield reasons to discard an episode that are not limits of numbers. Their only setting is ``needs_task``."""
+    """Yield the reasons to discard an episode that have no threshold. Their only setting is ``needs_task``."""
     if figures.timing.repeated_stamps:
         count = figures.timing.repeated_stamps
         yield Rejection("repeated_stamps", f"{count} ticks have the time of the tick before")

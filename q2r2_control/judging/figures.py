@@ -115,7 +115,7 @@ class TimingFigures:
     # The number of ticks with the time of the tick before. None for ROS nodes, whose messages may arrive together.
     repeated_stamps: int | None
     clock_step_s: float  # The largest step by which a clock was set; negative if back, 0 if no clock was set.
-    begins_again: bool  # The run goes on after it has begun to end, so two runs are in one file.
+    begins_again: bool  # True if the run goes on after its end has begun, so that two runs are in one file.
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,7 +148,7 @@ class EpisodeFigures:
     file: str
     part: int | None  # The number of the episode in the file, from 1 on; None for the whole file.
     task: str | None  # The task in words; None if it is not known.
-    duration_s: float  # The time until the run begins to end.
+    duration_s: float  # The time until the end of the run begins, in which the arms come to rest.
     engaged_s: float  # The time for which any arm is engaged.
     idle_share: float | None
     hands: dict[str, HandFigures]

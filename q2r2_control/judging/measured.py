@@ -22,7 +22,10 @@ _STEP = 0.005  # The step of lags, and of the times that are compared [s].
 
 @dataclass(frozen=True, slots=True)
 class MeasuredFigures:
-    """Figures of one arm, until the run begins to end. None means that a figure cannot be computed."""
+    """Figures of one arm, without the end of the run, while the arms come to rest.
+
+    None means that a figure cannot be computed.
+    """
 
     unmeasured_ticks: int  # The number of ticks with a position, velocity, opening or reference that is not finite.
     joint_speed_share: float  # Mean speed over 20 ms or 10 frames, divided by the limit; of the worst joint.

@@ -67,7 +67,7 @@ class BagWriter(AbstractContextManager["BagWriter"]):
             raise
 
     def _begin(self) -> dict[int, int]:
-        """Write all that comes before the first message; returns the id in the file of each topic's channel."""
+        """Write all that comes before the first message. Return the id that each topic's channel has in the file."""
         about = self._about
         self._writer.start("ros2", "q2r2_control")
         self._writer.add_metadata(ABOUT, about.texts())
@@ -101,7 +101,7 @@ class BagWriter(AbstractContextManager["BagWriter"]):
             self.flush()
 
     def flush(self) -> None:
-        """Write the messages that were added to the file, as one chunk."""
+        """Write all added messages to the file, as one chunk."""
         self._writer.flush()
         self._stream.flush()
         self._unflushed = 0
@@ -134,7 +134,7 @@ class BagWriter(AbstractContextManager["BagWriter"]):
                 stream.write(end.end() + MCAP0_MAGIC)
 
     def _register(self) -> dict[int, int]:
-        """Declare the topics; returns the id in the file of each topic's channel."""
+        """Declare the topics. Return the id that each topic's channel has in the file."""
         qos = {"offered_qos_profiles": yaml_of([_QOS]).strip()}
         schemas: dict[str, int] = {}
         for kind in dict.fromkeys(topic.type for topic in self._topics):

@@ -1,7 +1,7 @@
 """Reads a recording of the ROS nodes as if one loop had made it.
 
 A tick is a tick of the controller's node, with the newest joint states, flags of the arms and targets that had been
-received by then. Its reference is the one with the same time.
+received by then. Its reference is the reference with the same time.
 """
 
 from __future__ import annotations

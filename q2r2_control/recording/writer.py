@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from q2r2_control.robot.robot import Robot
 
 FLUSH_PERIOD = 0.5  # Time between two flushes of the file [s]. If this process is killed, no more than that is lost.
-READ_AHEAD = 4 << 20  # Size of the data that was read and may wait to be written [bytes].
+READ_AHEAD = 4 << 20  # Largest size of the data that was read and waits to be written [bytes].
 _NICENESS = 10  # The loop has a higher priority if there are not enough processors.
 _ROUNDING = 1e-6  # Share of a period by which rounding may make a message seem to come too early.
 _LAST_TIME = (2**31 - 1) * NANOSECONDS  # The latest time of a stamp [ns].

@@ -107,8 +107,8 @@ class ArmSummary:
     position_error_mm_rms: float | None = None  # None if the arm was never engaged.
     rotation_error_deg_rms: float | None = None
     gripper_changes: int = 0
-    gripper_held_s: float = 0.0  # Time for which something near the fingers held the gripper up.
-    gripper_held_by: tuple[str, str] | None = None  # Names of the last two geometries that were then near each other.
+    gripper_held_s: float = 0.0  # Time for which a body near the fingers prevented the wanted opening of the gripper.
+    gripper_held_by: tuple[str, str] | None = None  # The pair of geometries that prevented it last.
     object_held_s: float | None = None  # Time for which the gripper held its object; None if the arm has no object.
     slip_mm_max: float = 0.0  # Largest slip of the target in one engagement.
     slip_deg_max: float = 0.0
@@ -117,7 +117,7 @@ class ArmSummary:
     policy_s: float = 0.0  # Time for which a policy moved the arm.
     interventions: int = 0  # Number of times that a hand took over from a policy.
     intervention_s: float = 0.0
-    # Distance of the measured tool from the reference's tool at the end; None if it was not measured.
+    # Distance at the end between the measured tool and the tool at the reference; None if it was not measured.
     end_error_mm: float | None = None
 
     @property
@@ -148,7 +148,7 @@ class RunSummary:
     rejected_targets: int
     overruns: int  # Ticks that began more than a period after they were due.
     missed_ticks: int  # Ticks that were due and did not come, because the loop was late.
-    stretched_s: float  # Time by which the motion became late for that reason.
+    stretched_s: float  # Time by which the motion became late because the loop was late.
     at_rest: bool  # Whether the reference was at rest when the run ended.
     torque: TorqueSummary | None  # None in position mode.
     events: list[Event]

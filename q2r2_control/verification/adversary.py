@@ -102,7 +102,7 @@ class Adversary:
         return stream
 
     def _crossing(self) -> Stream:
-        """Return a stream that sends each tool to the place where another tool started."""
+        """Return a stream that sends each tool to the pose that another tool has at home."""
         return self._constant({arm: self._home[self._others[arm]] for arm in self._arms})
 
     def _same_point(self) -> Stream:
@@ -119,7 +119,7 @@ class Adversary:
         return self._constant(self._moved(lambda: np.array([*self._random.uniform(-0.3, 0.3, size=2), -depth])))
 
     def _random_walk(self) -> Stream:
-        """Return a random walk that is faster than an arm can move, and is drawn back towards home."""
+        """Return a random walk that is faster than an arm can move, and that tends back towards home."""
         speed, turn = self._random.uniform(0.001, 0.05), self._random.uniform(0.0, 0.1)
         poses = {arm: pose.copy() for arm, pose in self._home.items()}
 

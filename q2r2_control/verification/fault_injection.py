@@ -86,7 +86,7 @@ def untimed(solver: Solver, nv: int) -> Guard:
 
 
 class FaultySolver:
-    """A real solver that fails as :attr:`fault` says: one of ``FAULTS`` or ``ATTACKS``, or None for a healthy one.
+    """A real solver that fails as :attr:`fault` says: one of ``FAULTS`` or ``ATTACKS``, or None if it does not fail.
 
     Its solve times are invented, so that no result depends on the load of the machine. ``worst`` answers while
     :attr:`fault` is an attack that needs no solver, and uses ``q`` (nv,) [rad] and ``kept`` (p,) [m].
@@ -140,7 +140,7 @@ class Segment:
     ticks: int
     start: Start | None  # None if it continues from the end of the last segment.
     fault: str | None
-    fault_period: int  # The solver fails in every other period [ticks]. An attack lasts for the whole segment.
+    fault_period: int  # The solver fails in every second period of so many ticks. An attack lasts the whole segment.
     stream: Stream
     dt: Callable[[], Any]
 

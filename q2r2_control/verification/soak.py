@@ -81,7 +81,7 @@ class SoakReport:
     margins: list[Margin]
     memory_growth_mb: float | None  # See steady_growth; None if not measured.
     broken: list[Violation]  # The first violation of each promise, in the order of their ticks.
-    seeds: int = 1  # The number of soaks, with the seeds from ``seed`` on. Ticks, times and counts are of all together.
+    seeds: int = 1  # The number of soaks, with the seeds from ``seed`` on. Ticks, times and counts are sums over them.
 
     @property
     def passed(self) -> bool:

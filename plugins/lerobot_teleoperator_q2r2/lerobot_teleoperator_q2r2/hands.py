@@ -1,6 +1,7 @@
 """The hands of a headset, of a page or of a script, for a cell that lerobot runs in the same program.
 
-The hands drive the cell's own loop, with its clutch, leash and vibrations. lerobot gets the targets of the arms.
+The hands drive the cell's own loop, with its clutch, leash and vibrations. lerobot gets the controller's reference as
+the action.
 """
 
 from __future__ import annotations

@@ -54,7 +54,7 @@ class PeerSettings:
         self.robot, self.config, self.dt = robot, config, dt
         self.position_gain = control.position_gain * dt  # Share of the tool's position error that a tick removes.
         self.posture_gain = control.posture_gain * dt  # Share of the posture error that a tick removes.
-        self.posture_cost = float(control.posture_weight**0.5)  # Root of its weight; a tool has 1.
+        self.posture_cost = float(control.posture_weight**0.5)  # Square root of its weight; the cost of a tool is 1.
         self.velocity = robot.velocity_limit * control.velocity_scale  # (nv,) [rad/s]
         self.acceleration = robot.capped_acceleration(control.acceleration_limit)  # (nv,) [rad/s^2]
         self.lower = robot.position_lower + control.position_margin  # (nv,) [rad]
