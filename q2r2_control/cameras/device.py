@@ -17,7 +17,7 @@ from q2r2_control.extras import install_line
 Pixels = npt.NDArray[np.uint8]  # (height, width, 3) b g r, as OpenCV has them.
 _PASSWORD = re.compile(r"(?<=://)[^/@]*@")
 _RIGHT_ANGLE = 90  # [deg]
-_OLDEST_STAMP = 1.0  # A driver's stamp that is older than this is by another clock [s].
+_OLDEST_STAMP = 1.0  # A driver's stamp that is older than this comes from another clock [s].
 _Number = TypeVar("_Number", np.uint8, np.uint16)
 
 

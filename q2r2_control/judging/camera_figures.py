@@ -57,9 +57,8 @@ class CameraFigures:
     missing_pictures: int  # The number of pictures that were due and are missing.
     rate_share: float | None  # The number of pictures divided by the number that was due.
     longest_gap_periods: float | None  # The longest time without a picture, in the camera's periods.
-    frozen_share: (
-        float | None
-    )  # How many of the pictures since which the arms moved are equal to the one before (share).
+    # Of the pairs of successive pictures between which the arms moved, the share whose two pictures are equal.
+    frozen_share: float | None
     black_share: float | None  # The share of the pictures that are black or have one colour only.
     bad_pictures: int  # The number of pictures that are damaged, or have another size than the cell says.
     lag_ms: float | None  # The delay of the motion in the pictures behind the motion of the joints.

@@ -14,7 +14,7 @@ SERIAL, FPS, UNIT = "042", 30, 1e-4  # Unit of depth [m].
 
 
 class SoftwareRealSense:
-    """A camera with a sensor of colour and one of depth."""
+    """A camera with a colour sensor and a depth sensor."""
 
     def __init__(self, size: tuple[int, int] = (WIDTH, HEIGHT)) -> None:
         self._rs: Any = pytest.importorskip("pyrealsense2")

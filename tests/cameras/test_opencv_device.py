@@ -1,4 +1,4 @@
-"""A live camera: when its pictures were captured, and a stream of the network."""
+"""Live cameras: the times at which their pictures were captured, and cameras on the network."""
 
 from __future__ import annotations
 

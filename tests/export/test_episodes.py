@@ -113,7 +113,7 @@ def test_an_interrupted_export_goes_on_with_its_finished_episodes(run: Run, tmp_
     made = keep_episodes(files, FrameSampling(), write_vectors, kept)
     assert made.kept[0] == first
     assert first.stat().st_mtime_ns == made_at
-    # An unfinished episode, or one with other options, is made again.
+    # An unfinished episode is made again, and so is an episode with other options.
     first.rename(first.with_name(f"{first.name}.unfinished"))
     keep_episodes(files, FrameSampling(), write_vectors, kept)
     assert load_vectors(first).frames == load_vectors(made.kept[1]).frames

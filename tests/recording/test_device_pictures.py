@@ -1,4 +1,4 @@
-"""Pictures of a real camera are recorded with the time of their capture, whatever the plant, and beside the loop."""
+"""Pictures of a real camera are recorded with the time of their capture, with any plant, without delaying the loop."""
 
 from __future__ import annotations
 
