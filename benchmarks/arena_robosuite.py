@@ -35,7 +35,7 @@ _JOINT_CONTROL = {
     "interpolation": None,
 }
 _JOINT_CONTROL |= {"input_max": 7, "input_min": -7, "output_max": 7, "output_min": -7, "ramp_ratio": 0.2}
-_MEETING_PLACE = np.array([0.0, -0.15, 1.12])  # Place where the right hand takes the hammer, in the world [m].
+_MEETING_PLACE = np.array([0.0, -0.15, 1.12])  # Position at which the right hand takes the hammer, in the world [m].
 _MIN_GRASP_Y = -0.5  # Least y at which the left hand can grasp while it points down [m].
 _RIGHT_HAND_LEAN = 0.9  # Angle by which the right hand leans towards its own base [rad].
 _CLOSING_SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)  # Shares of the fingers' way from open to closed.
@@ -108,8 +108,8 @@ class RobosuiteCell:
             share = (tick + 1) / _TICKS_PER_PERIOD
             on_the_way = {side: pin.SE3.Interpolate(before[side], targets[side], share) for side in self.arms}
             q = self._follower.step(on_the_way, PERIOD / _TICKS_PER_PERIOD).q
-            # Each action with a sign moves the gripper by one step. One such action in a period moves it as far as
-            # with the other controllers.
+            # An action that is not 0 moves the gripper by one step. With one such action in each period, the gripper
+            # is as fast as with the other controllers.
             action = [
                 np.append(q[self._follower.robot.arms[side].joints], grip[side] * (tick == 0)) for side in self.arms
             ]

@@ -1,8 +1,8 @@
-"""Do ten real cameras cost the loop anything, while they are recorded, and while a policy observes them?
+"""Do ten real cameras slow down the loop, while they are recorded, and while a policy observes them?
 
-Runs in real time, each once without cameras and once with them. The cameras are a video file, which a process for each
-of them reads and compresses on this machine, as it would with pictures of a device. Scripted hands, or a policy, lead
-both arms round circles.
+All runs are in real time. Scripted hands, or a policy, move both arms round circles, once without cameras and once with
+them. All cameras play the same video file. A process for each camera reads and compresses the pictures on this machine,
+as it would with a device.
 """
 
 from __future__ import annotations

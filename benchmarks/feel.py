@@ -110,7 +110,7 @@ class FeelFigures:
     band_at_rest_db: float  # Gain for a tremor in :data:`TREMOR_BAND` of a hand that otherwise rests.
     noise_um: float  # RMS of the tool's motion along the worst axis, for a hand at rest.
     stop_delay_ms: float  # Time from the hand's rest until the tool stays within 2 mm of its own rest.
-    overshoot_mm: float  # Largest distance of the tool beyond its place of rest.
+    overshoot_mm: float  # Largest distance of the tool beyond its position at rest.
     overshoot_percent: float  # Overshoot as a share of the path of the hand that stops.
     pauses_mm: tuple[float, ...]  # Drift of the tool over all pauses, for each of :data:`RESTING_NOISES`.
 
@@ -188,7 +188,7 @@ class _Log:
         self._asked: list[float] = []
 
     def take(self, tick: Tick) -> None:
-        """Keep the hand's and the tool's place of a tick."""
+        """Keep the positions of hand and tool at a tick."""
         way = self.hands.hand_pose(HAND, tick.now).translation - HANDS_AT_REST[HAND].translation
         self._t.append(tick.t - _MOTION_BEGINS_S)
         self._asked.append(float(way[self._axis]))
@@ -238,7 +238,7 @@ class _Log:
     def stop(self) -> tuple[float, float]:
         """Return the delay of the tool's rest behind the hand's [s], and the tool's overshoot [m].
 
-        The tool rests when it stays within 2 mm of its last place.
+        The tool rests when it stays within 2 mm of its last position.
         """
         t, _, tool = self._from(0.0)
         ahead = tool - tool[-1]
@@ -246,7 +246,7 @@ class _Log:
         return float(late[-1]) - (_STOP_BEGINS_S + STOP_TIME), max(float(ahead.max()), 0.0)
 
     def moved(self) -> float:
-        """Return the distance between the tool's first and last place [m]."""
+        """Return the distance between the tool's first and last position [m]."""
         return float(np.linalg.norm(self._tool[-1] - self._tool[0]))
 
     def _from(self, begin: float) -> tuple[Array, Array, Array]:
@@ -289,7 +289,7 @@ def tremor(band: tuple[float, float], rms: float, period: float, seed: int, spee
 
     Its spectrum is flat within ``band`` [Hz] and zero outside. The noise repeats after ``period`` [s], over which its
     RMS is exact. It is the sum of all tones of the band that repeat after the period. They have the same amplitude, and
-    their phases are drawn from ``seed``.
+    random phases that depend on ``seed``.
     """
     low, high = (round(frequency * period) for frequency in band)
     turns = 2.0 * math.pi * np.arange(low, high + 1) / period

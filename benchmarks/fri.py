@@ -36,9 +36,9 @@ from q2r2_control.viewer.tables import figure_table
 _CONFIG = "config/dual_iiwa7_fri.yaml"
 _MAX_DELAY_S = 0.1  # Longest delay of the tools that is looked for [s].
 _WATCH_PRIORITY = 90  # Real-time priority of the watching threads, above all others.
-# A watching thread sleeps for the first of these times. If it wakes up late by more than the second one, its processor
-# stood still. The thread usually sleeps when a halt begins, so each halt of at least their sum is found. The sum is
-# 1 ms, half of the shortest period that is measured [s].
+# A watching thread sleeps for the first of these times. If it wakes up late by more than the second time, its processor
+# stood still. The thread usually sleeps when a standstill begins, so each standstill of at least the sum of both times
+# is found. The sum is 1 ms, half of the shortest period that is measured [s].
 _WATCH_SLEEP_S, _MIN_LATENESS_S = 0.0005, 0.0005
 _CABINET_TIMEOUT_S = 60.0  # Timeout for the cabinets on a busy computer [s].
 _end: Any = None  # Time when the watch of this watching process ends, by the monotonic clock [s].
@@ -86,12 +86,12 @@ def undisturbed(answers: list[tuple[float, float]], stills: list[tuple[float, fl
 
 
 class ToolWay:
-    """The commanded and measured places of the tools in the ticks in which all arms were engaged."""
+    """The commanded and measured positions of the tools in the ticks in which all arms were engaged."""
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
         # Arrays of plain numbers are used here, because the garbage collector would search a list of arrays for more
-        # than 100 ms during the run. The commanded places are computed after the run, because that takes a twentieth
+        # than 100 ms during the run. The commanded positions are computed after the run, because that takes a twentieth
         # of the run's time.
         self._postures, self._tools = array("d"), array("d")
 

@@ -26,7 +26,7 @@ DURATION_S, WARM_UP_STEPS = 20.0, 5  # Default duration for each environment [s]
 STEP_RATE_HZ = 20  # Steps per second of simulated time, which is robosuite's default [Hz].
 ACTION_SHARE = 0.1  # Largest action, as a share of the largest allowed one.
 
-Environment = tuple[str, Any, Callable[[], Any]]  # Name, environment, and a function that draws an action.
+Environment = tuple[str, Any, Callable[[], Any]]  # Name, environment, and a function that returns a random action.
 
 
 def of_ours(loop_rate: float | None) -> Iterator[Environment]:

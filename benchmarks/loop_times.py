@@ -1,4 +1,4 @@
-"""Where does a tick of the whole live loop go, stage by stage, with each plant and mode?
+"""Where does the time of a tick of the whole live loop go, stage by stage, with each plant and mode?
 
 Ticks come at the loop's rate, because a tick that directly follows another one finds warmer caches. Time in the run is
 still simulated, so every round moves the same way whatever the machine does. The cases run in turns. Rounds that time
@@ -58,7 +58,7 @@ class Times:
 
 
 class StageClock:
-    """A clock that charges every moment of a run to the innermost watched method that runs, or else to the rest."""
+    """A clock that adds each moment of a run to the stage of the innermost watched method, or else to the rest."""
 
     def __init__(self, period: float) -> None:
         """A tick begins at the earliest a ``period`` [s] after the last one. If it is 0, no tick waits."""

@@ -1,4 +1,4 @@
-"""How many random mutants of a room do its tests notice?
+"""How many random mutants of a package's folder do its tests notice?
 
     python benchmarks/mutations.py q2r2_control/teleop tests/teleop tests/pipeline
 

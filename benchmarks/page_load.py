@@ -1,8 +1,8 @@
 """Do ten watchers, and a client that sends garbage without a pause, slow down the loop of a run with a page?
 
-The command q2r2 run --web runs twice in real time, while scripted hands lead both arms round circles. In the second run
+The command q2r2 run --web runs twice in real time, while scripted hands move both arms round circles. In the second run
 the watchers read everything that the page sends. A hostile client sends messages that no browser sends, and connects
-again whenever it is disconnected. All these clients share the machine with the run, which remote clients would not.
+again whenever it is disconnected. All these clients use the same machine as the run, which remote clients would not.
 """
 
 from __future__ import annotations

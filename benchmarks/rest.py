@@ -1,6 +1,6 @@
 """Do the arms come to rest, and how smoothly, at constant targets that they cannot reach or that bring them together?
 
-Each tool gets a constant target at random, near the place where both arms work or on the other arm's side. Most targets
+Each tool gets a random constant target, in the space where both arms work or on the other arm's side. Most targets
 cannot be reached with every distance kept. The arms then slide along each other for seconds until they rest.
 """
 

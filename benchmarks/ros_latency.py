@@ -106,7 +106,10 @@ def measure_latency(config: str, duration: float, rate: float) -> LatencyReport:
 
 
 class _Probe:
-    """A node that publishes steps and records commands. Their times are the middleware's, whenever a callback runs."""
+    """A node that publishes steps and records commands.
+
+    The times of commands are the stamps of the middleware, so they do not depend on when a callback runs.
+    """
 
     def __init__(self) -> None:
         self._context = rclpy.Context()

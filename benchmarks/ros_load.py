@@ -111,7 +111,7 @@ def measure_load(config: str, duration: float, rate: float) -> LoadReport:
 
 
 class _Watcher:
-    """A node that listens to the nodes' states and to joint commands, with the middleware's times at the sender."""
+    """A node that listens to the nodes' states, and to joint commands with the middleware's stamps of the sender."""
 
     def __init__(self) -> None:
         self.active = False  # True if the controller is active.

@@ -104,7 +104,7 @@ def measure_presses(config: str, starts: int) -> PressReport:
 class _Hand:
     """A node for the left hand that records what the arm's node and the controller answer.
 
-    Times are the middleware's at the sender.
+    Times are the stamps that the middleware sets at the sender.
     """
 
     def __init__(self) -> None:

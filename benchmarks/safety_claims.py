@@ -1,4 +1,4 @@
-"""The lines of the safety argument, each with a way to break it: see safety_mutations.py.
+"""The lines of the safety argument, each with a change that breaks it: see safety_mutations.py.
 
 Every row names a claim of q2r2_control/control/safety/README.md and one line that keeps it.
 """

@@ -2,7 +2,7 @@
 
 Every row names a claim and one line that keeps it. The file safety_claims.py has the lines of the certificate, and
 guard_claims.py has those beside it. Each line is broken in a copy of the package. For a line of the controller,
-`q2r2 soak` runs there. If it finds nothing, the tests of the line's room run. If nothing finds a broken line, this
+`q2r2 soak` runs there. If it finds nothing, the tests of the line's folder run. If nothing finds a broken line, this
 program exits with 1. For a line of a kernel, all kernels are compiled again, which takes a minute or two.
 """
 

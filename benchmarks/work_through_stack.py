@@ -47,7 +47,7 @@ class StackFigures:
     mode: str
     motion: str
     done: float  # Share of the planned ticks that ran; 1 unless the run was stopped.
-    rms_error_mm: float | None = None  # RMS error of the tool with the larger one, until the hands rest.
+    rms_error_mm: float | None = None  # RMS error of the tool with the larger error, until the hands rest.
     max_error_mm: float | None = None  # Largest error of either tool, until the hands rest.
     path_error_mm: float | None = None  # RMS error from the pose that the hand asked for one filter delay earlier.
     end_error_mm: float | None = None  # Largest error of either tool at the end.
@@ -75,7 +75,7 @@ class StackFigures:
 
 
 class Stack:
-    """A cell in MuJoCo that hands lead through one work motion after another, in one ``mode``.
+    """A cell in MuJoCo whose arms hands move through one work motion after another, in one ``mode``.
 
     If ``free`` is True, no pair is monitored, and all bodies pass through each other.
     """
@@ -93,7 +93,7 @@ class Stack:
         self._kept = kept_distances(self.robot, self._config.control).values
 
     def run(self, motion: WorkMotion, seed: int | None = 0) -> StackFigures:
-        """Run ``motion`` from home. ``seed`` decides what samples add to the hands' poses. If None, they are exact."""
+        """Run ``motion`` from home. ``seed`` decides the noise of the samples; if it is None, the samples are exact."""
         hands = WorkHands(motion, self._start, self._config.teleop, seed)
         pipeline = Pipeline(self._config, self.robot, hands, self._plant, self.mode)
         log = _Log(pipeline, checked=len(self._kept) > 0)
@@ -192,9 +192,9 @@ class _Log:
 
 
 def _errors(log: _Log, hands: WorkHands, delay: float, end: float) -> tuple[Array, Array, Array]:
-    """Return three distances (n, arms) [m] of the measured tools from the places that the hands ask for.
+    """Return three distances (n, arms) [m] of the measured tools from the positions that the hands ask for.
 
-    The hands ask for these places at the tick itself, ``delay`` [s] before it, and at the ``end`` [s].
+    The hands ask for these positions at the tick itself, ``delay`` [s] before it, and at the ``end`` [s].
     """
     tools = np.array(log.tools)
     asked = (
@@ -206,7 +206,7 @@ def _errors(log: _Log, hands: WorkHands, delay: float, end: float) -> tuple[Arra
 
 
 def _rms_mm(errors: Array) -> float:
-    """Return the RMS error of the tool with the larger one [mm], from errors (n, arms) [m]."""
+    """Return the RMS error of the tool with the larger error [mm], from errors (n, arms) [m]."""
     return 1e3 * float(np.sqrt(np.mean(errors**2, axis=0)).max())
 
 

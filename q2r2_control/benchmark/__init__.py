@@ -1,1 +1,1 @@
-"""Comparison of the controller with public ones: times of a tick, and two-armed work motions."""
+"""Comparison of the controller with public controllers: times of a tick, and work motions of two arms."""

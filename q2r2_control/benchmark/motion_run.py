@@ -1,7 +1,8 @@
 """Run one controller in one work motion and compute its figures, and run the bench of our controller and its peers.
 
-All controllers get the same cell, limits, targets and ticks, in one process. Peers run open loop like ours, with
-targets ahead of time by their lag. Our controller also runs in free air. The difference is the cost of the pairs.
+All controllers get the same cell, limits, targets and ticks, in one process. Peers run open loop like our controller,
+and their targets are moved ahead of time by their lag. Our controller also runs in free air. The difference between
+its two runs is the cost of the monitored pairs.
 """
 
 from __future__ import annotations
@@ -28,7 +29,8 @@ PATIENCE = 3.0  # Longest time that a controller may take, as a multiple of the 
 JOLT = 5.0  # A larger change of a joint's acceleration in one tick is a jolt [rad/s^2].
 _TAIL = 0.5  # Duration at the end over which the acceleration at rest is computed [s].
 _SHORTEST_DT = 1e-9  # Duration of a tick that moves nothing [s].
-_DISTANCE_TICKS = 4  # Ticks between postures whose distances are measured. Near the nearest one, all are measured.
+# Distances are measured at one posture in so many ticks. Around the nearest of these postures, all are measured.
+_DISTANCE_TICKS = 4
 
 
 class OwnController:
@@ -98,10 +100,12 @@ class MotionFigures:
     done: float  # Share of the ticks; less than 1 if the controller was too slow.
     ticks: int = 0  # Measured ticks.
     failures: int = 0  # Measured ticks with an exception, no solution, or numbers that are not finite.
-    rms_error_mm: float | None = None  # Until the rest begins, of the tool with the larger error.
-    max_error_mm: float | None = None  # Until the rest begins, of either tool.
-    end_error_mm: float | None = None  # At the end, of either tool.
-    arrival_s: float | None = None  # From the motion's begin until both tools stay within 10 mm of the goal, if any.
+    rms_error_mm: float | None = None  # RMS error of the tool with the larger error, until the rest begins.
+    max_error_mm: float | None = None  # Largest error of either tool until the rest begins.
+    end_error_mm: float | None = None  # Largest error of either tool at the end.
+    # Time from the beginning of the motion until both tools stay within 10 mm of the goal. None if they do not stay
+    # there until the end, or if the motion has no goal.
+    arrival_s: float | None = None
     fallback_percent: float | None = None  # Share of ticks with the certified stop; None for a peer, which has none.
     min_distance_mm: float | None = None  # Least distance of the monitored pairs, by Coal.
     closest_pair: tuple[str, str] | None = None
@@ -196,7 +200,10 @@ def figures_of(
 
 
 def _errors(run: MotionRun, robot: Robot, motion: WorkMotion, began: int) -> tuple[Array, Array]:
-    """Return the distances (n, arms) of tools from their targets and from their last targets, by measured tick [m]."""
+    """Return two distances (n, arms) of the tools in the n measured ticks [m]: from their targets, and from the goal.
+
+    The goal is the last target.
+    """
     start = {arm: robot.tool_pose(robot.home, arm) for arm in robot.arms}
     goal = motion.targets(motion.ends, start)
     tools = np.array([[robot.tool_pose(q, arm).translation for arm in goal] for q in run.q[began:]])
@@ -229,7 +236,7 @@ def nearest_pair(q: Array, robot: Robot) -> tuple[float | None, tuple[str, str] 
 
 @dataclass(frozen=True, slots=True)
 class BenchRow:
-    """The figures of one motion: of our controller in free air, of ours in the cell, and of the peers."""
+    """The figures of one motion: of our controller in free air and in the cell, and of the peers in the cell."""
 
     motion: str
     about: str

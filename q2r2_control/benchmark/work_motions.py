@@ -1,8 +1,8 @@
 """Work motions of two arms near each other, near the table and at the end of their reach.
 
-The motions are made for ``config/dual_iiwa7.yaml``. Targets depend only on time and on the tools' start, so that every
-controller can get the same ones. Each motion begins with an approach from home, and ends with still targets for
-:data:`REST`. Tools keep their rotation, in which they point straight down, unless the motion says otherwise.
+The motions are made for ``config/dual_iiwa7.yaml``. Targets depend only on time and on the tool poses at the start, so
+every controller can get the same targets. Each motion begins with an approach from home, and ends with still targets
+for :data:`REST`. Tools keep their rotation, in which they point straight down, unless the motion says otherwise.
 
 With both tools pointing down at one height, the wrists are 20 mm apart when the tools are 0.18 m apart. A tool that
 points down can get 0.73 m away from its arm's mount (0.38 m above it). In this rotation, no arm reaches the home of the
@@ -24,7 +24,7 @@ from q2r2_control.types import Array
 
 ARMS = ("left", "right")
 REST = 2.0  # Time with still targets at the end, unless a motion has its own [s].
-_LEG = 2.0  # Time of an approach from one place to the next [s].
+_LEG = 2.0  # Time of an approach from one position to the next [s].
 _SETTLE = 0.5  # Time between the approach and the motion [s].
 
 # A function of the time since the motion began [s] and of the tools' positions at home. It returns the positions of
@@ -103,7 +103,7 @@ def _to(
     tilt: tuple[float, float] = (0.0, 0.0),
     reachable: bool = False,
 ) -> WorkMotion:
-    """Return a motion with a goal, straight from stop to stop. Each stop has its time of travel [s]."""
+    """Return a motion with a goal, straight from stop to stop. Each stop has the time of travel to it [s]."""
 
     def path(t: float, home: Array) -> Array:
         here = approach[-1] if approach else home
@@ -119,7 +119,10 @@ def _to(
 
 
 def _uniform(t: float, way: float, speed: float, ramp: float) -> float:
-    """Return the distance at ``t`` along a ``way`` at a ``speed``, with the time ``ramp`` to speed up and to stop."""
+    """Return the distance that was covered at ``t`` [s], on a path of the length ``way``, at the speed ``speed``.
+
+    Speeding up and stopping take the time ``ramp`` [s] each.
+    """
     duration = way / speed + ramp
     if t < ramp:
         return 0.5 * speed * t**2 / ramp
@@ -180,7 +183,7 @@ def _met(home: Array) -> Array:
     return _between_tools(home, 0.12)
 
 
-# Side by side, and past each other, with the left tool behind the right arm and above the path of its elbow.
+# Side by side, and past each other. The left tool is then behind the right arm, above the path of the right elbow.
 _APART = np.array([(0.30, 0.25, 0.40), (0.58, -0.25, 0.26)])
 _PAST = np.array([(0.30, -0.05, 0.40), (0.58, 0.05, 0.26)])
 # At the same x, so that the tools cannot pass each other.
@@ -205,7 +208,7 @@ _RIGHT_ASIDE = (0.50, -0.25, 0.38)
 
 
 def _slide(t: float, home: Array) -> Array:
-    """Return the left tool's target that slides sideways over the table, and a right one that stays aside."""
+    """Return a left target that slides sideways over the table, and a right target that stays aside."""
     y = _SLIDE_FROM[1] - _uniform(t, _SLIDE_WAY, _SLIDE_SPEED, _SLIDE_RAMP)
     return np.array([(_SLIDE_FROM[0], y, _SLIDING_HEIGHT), _RIGHT_ASIDE])
 

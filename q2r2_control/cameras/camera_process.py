@@ -1,4 +1,4 @@
-"""The process that reads one camera. It waits for the camera alone, so a slow camera keeps nobody else waiting."""
+"""The process that reads one camera. Each camera has such a process, so a slow camera delays nothing else."""
 
 from __future__ import annotations
 
@@ -38,18 +38,18 @@ class DepthShot(NamedTuple):
     """A picture of the depth that a camera sees."""
 
     time: float  # Time of its capture, by the monotonic clock [s].
-    png: bytes  # 16 bits for each pixel, in units; 0 where the depth is not known.
+    png: bytes  # A 16-bit number for each pixel: the depth in multiples of ``unit``; 0 where it is not known.
     unit: float  # [m]
 
 
 class CameraLost(NamedTuple):
-    """The camera gives no more pictures. Those that follow come from the camera opened anew."""
+    """The camera gives no more pictures. Pictures that follow are from the camera after it was opened again."""
 
     why: str
 
 
 class Thinning:
-    """Leaves out pictures of a camera that is faster than ``rate`` [Hz], evenly."""
+    """Leaves out pictures, evenly over time, if a camera gives more of them than ``rate`` [Hz]."""
 
     def __init__(self, rate: float) -> None:
         self._period = 1.0 / rate
@@ -68,10 +68,12 @@ Answer = CameraShot | DepthShot | CameraLost
 
 
 def main(requests: Iterator[Any], answer: Callable[[Answer], None]) -> None:
-    """Answer each picture of the camera that is the first request, until the requests end.
+    """Answer with each picture of a camera until the requests end. The first request is the camera.
+
+    If the camera is lost later, this process tries again and again to open it.
 
     Raises:
-        CameraError: If the camera cannot be opened at first. Later it is opened anew again and again.
+        CameraError: If the camera cannot be opened for the first time.
     """
     camera = next(requests, None)
     if not isinstance(camera, CameraConfig):
@@ -92,7 +94,7 @@ def main(requests: Iterator[Any], answer: Callable[[Answer], None]) -> None:
 
 
 def _end_with(requests: Iterator[Any]) -> None:
-    """End this process with the run, even while it waits for a camera."""
+    """End this process when the run ends, even while the process waits for a camera."""
     for _ in requests:
         pass
     os._exit(0)

@@ -1,4 +1,4 @@
-"""The open cameras of a cell: their newest pictures, and those that have come since the last look."""
+"""The open cameras of a cell. Each gives its newest picture, and all pictures since they were last taken."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from q2r2_control.config.recording import CameraConfig
 from q2r2_control.errors import CameraError
 from q2r2_control.process.helper_process import HelperProcess, reason_of
 
-_WAITING = 256  # Pictures of a camera that wait for a look. The oldest of more are lost.
+_WAITING = 256  # So many pictures of a camera may wait until they are taken. If more come, the oldest are lost.
 _READY = 120.0  # Longest time until a camera gives its first picture, on a computer that is busy [s].
 _Item = TypeVar("_Item")
-_LOOKS = 0.02  # Time between two checks for it [s].
+_LOOKS = 0.02  # Time between two checks whether a picture has come [s].
 
 
 class CameraStream:
@@ -41,7 +41,7 @@ class CameraStream:
 
     @property
     def why_lost(self) -> str | None:
-        """Why the camera gives no pictures, if it says so; None while it gives some."""
+        """The reason why the camera gives no pictures, if it has told one; None while it gives pictures."""
         return self.process.fault if self._lost is None or self.process.fault else self._lost.why
 
     def hear(self, hearer: Callable[[CameraShot], None]) -> None:
@@ -53,7 +53,7 @@ class CameraStream:
         return _taken(self._waiting)
 
     def take_depths(self) -> list[DepthShot]:
-        """Return the pictures of depth since the last call. It never waits."""
+        """Return the depth pictures since the last call. It never waits."""
         return _taken(self._depths)
 
     def first_picture(self) -> CameraShot:
@@ -97,7 +97,7 @@ def _taken(waiting: deque[_Item]) -> list[_Item]:
 
 
 class CameraStreams(AbstractContextManager["CameraStreams"]):
-    """All real cameras of a cell, as a context around the runs that use them."""
+    """All real cameras of a cell, as a context manager around the runs that use them."""
 
     def __init__(self, cameras: Mapping[str, CameraConfig]) -> None:
         """Start a process for each camera; raises :class:`CameraError`."""
@@ -110,7 +110,7 @@ class CameraStreams(AbstractContextManager["CameraStreams"]):
             raise
 
     def wait_until_ready(self) -> None:
-        """Wait until each camera has given a picture; raises :class:`CameraError` if one does not."""
+        """Wait until each camera has given a picture. Raises :class:`CameraError` if a camera gives none."""
         for stream in self.streams.values():
             stream.first_picture()
 

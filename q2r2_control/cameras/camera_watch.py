@@ -1,4 +1,7 @@
-"""Notices when a camera stops, slows down, changes the size of its pictures, or comes back; knows no clock."""
+"""Notices when a camera stops, slows down, changes the size of its pictures, or comes back.
+
+It reads no clock: its methods get all times.
+"""
 
 from __future__ import annotations
 
@@ -9,10 +12,14 @@ from q2r2_control.cameras.reasons import CameraReason
 from q2r2_control.config.recording import CameraConfig
 from q2r2_control.events import Reason, ReasonKind
 
-_STOPPED_PERIODS, _STOPPED_AFTER = 5.0, 1.0  # A camera has stopped after both of these times, in periods and [s].
+# A camera has stopped if no picture came for the longer of these two times: a number of its periods, and a time [s].
+_STOPPED_PERIODS, _STOPPED_AFTER = 5.0, 1.0
 _WINDOW = 2.0  # Time over which the rate of a camera is measured [s].
-_NEARLY, _FORGETS = 0.3, 0.9  # A share of a period; what remains of a delay after each picture.
-_SLOW, _FAST_ENOUGH = 0.8, 0.9  # Shares of the rate below which a camera is slow, and from which it no longer is.
+# A picture is missing if the sum of delays is at least a period less the first share of a period. The second number is
+# the share of this sum that still counts at the next picture.
+_NEARLY, _FORGETS = 0.3, 0.9
+# Shares of the rate. A camera becomes slow below the first share, and is no longer slow from the second share on.
+_SLOW, _FAST_ENOUGH = 0.8, 0.9
 
 
 def longest_silence(camera: CameraConfig) -> float:
@@ -23,18 +30,19 @@ def longest_silence(camera: CameraConfig) -> float:
 class MissingPictures:
     """Counts the pictures of a camera that are missing, by the times of those that came.
 
-    Pictures of a real camera come unevenly, and not at exactly its rate. One counts as missing if the time that all
-    pictures together are late by is nearly a period, while small delays are forgotten within some ten pictures.
+    Pictures of a real camera come unevenly, and not at exactly its rate. Therefore the delays of successive pictures
+    are added up, and small delays are forgotten within some ten pictures. A picture counts as missing if the sum is
+    nearly a period.
     """
 
     def __init__(self, begin: float, rate: float) -> None:
         """Count from ``begin`` [s] on, for a camera of ``rate`` [Hz]."""
         self.count = 0
         self._rate, self._newest = rate, begin
-        self._late: float | None = None  # How late the newest picture is, in periods; None before the first one.
+        self._late: float | None = None  # The sum of delays at the newest picture, in periods; None before any picture.
 
     def add(self, time: float) -> int:
-        """Take the time of the next picture [s]; returns how many are missing just before it."""
+        """Take the time of the next picture [s]. Return how many pictures are missing just before it."""
         periods, self._newest = (time - self._newest) * self._rate, time
         # The first picture may come at any time within a period.
         late = periods if self._late is None else max(_FORGETS * self._late, -1.0) + periods - 1.0
@@ -49,7 +57,7 @@ class MissingPictures:
 
 
 class CameraWatch:
-    """Watches one camera from the beginning of a run. Each fault is told once, until it is over."""
+    """Watches one camera from the beginning of a run. Each fault is reported once, and again only if it comes back."""
 
     def __init__(self, name: str, camera: CameraConfig, begin: float) -> None:
         """``begin`` is the time of the run's first tick, by the clock of the pictures [s]."""
@@ -61,7 +69,7 @@ class CameraWatch:
 
     @property
     def stopped(self) -> bool:
-        """True if it was told that the camera has stopped, and no picture has come since."""
+        """True if this watch has reported that the camera stopped, and no picture has come since."""
         return CameraReason.CAMERA_STOPPED in self._told
 
     @property
@@ -70,7 +78,7 @@ class CameraWatch:
         return self._missing.count
 
     def add(self, time: float, received: float, width: int, height: int) -> list[Reason]:
-        """Take a picture that was captured at ``time`` and ``received`` later [s]; returns what is to be told."""
+        """Take a picture that was captured at ``time`` [s] and received at ``received`` [s]. Return what to report."""
         missing = self._missing.add(time)
         silence, self._received = received - self._received, received
         found = []
@@ -84,7 +92,7 @@ class CameraWatch:
         return found + self._rate_at(time)
 
     def look(self, now: float, why: str | None = None) -> list[Reason]:
-        """Return what is to be told if no picture was received for a while up to ``now`` [s].
+        """Return what to report if no picture was received for too long a time before ``now`` [s].
 
         ``why`` is the camera's own reason, if it gives one.
         """
@@ -105,12 +113,12 @@ class CameraWatch:
         rate = (len(self._times) - 1) / span
         self._times.popleft()
         share = rate / self._camera.rate
-        if _SLOW <= share < _FAST_ENOUGH:  # Neither begins nor ends to be slow.
+        if _SLOW <= share < _FAST_ENOUGH:  # The camera stays slow if it was slow, and otherwise is not slow.
             return []
         return self._tell(CameraReason.CAMERA_SLOW, share < _SLOW, rate=rate, due=self._camera.rate)
 
     def _tell(self, kind: ReasonKind, is_so: bool, **detail: Any) -> list[Reason]:
-        """Return the reason if it ``is_so`` for the first time since it last was not."""
+        """Return the reason if it holds (``is_so``) and did not hold at the last call with this ``kind``."""
         was_told = kind in self._told
         (self._told.add if is_so else self._told.discard)(kind)
         return [self._reason(kind, **detail)] if is_so and not was_told else []

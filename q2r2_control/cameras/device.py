@@ -17,7 +17,7 @@ from q2r2_control.extras import install_line
 Pixels = npt.NDArray[np.uint8]  # (height, width, 3) b g r, as OpenCV has them.
 _PASSWORD = re.compile(r"(?<=://)[^/@]*@")
 _RIGHT_ANGLE = 90  # [deg]
-_OLDEST_STAMP = 1.0  # A driver's stamp that is older than this is by another clock [s].
+_OLDEST_STAMP = 1.0  # A driver's stamp that is older than this comes from another clock [s].
 _Number = TypeVar("_Number", np.uint8, np.uint16)
 
 
@@ -28,7 +28,7 @@ class Capture(NamedTuple):
 
 class DepthCapture(NamedTuple):
     time: float  # Time of the capture, by the monotonic clock of this computer [s].
-    pixels: npt.NDArray[np.uint16]  # (height, width) Depth in units; 0 where it is not known.
+    pixels: npt.NDArray[np.uint16]  # (height, width) Depth in multiples of ``unit``; 0 where it is not known.
     unit: float  # [m]
 
 
@@ -36,7 +36,7 @@ class CameraDevice(Protocol):
     """An open camera."""
 
     def read(self) -> Capture | DepthCapture:
-        """Wait for the next picture, or for the next depth of a camera whose depth is recorded.
+        """Wait for the next picture, or for the next depth picture if the camera's depth is recorded.
 
         Raises:
             CameraError: If no more pictures come.
@@ -77,7 +77,7 @@ def capture_time(received: float, stamp_ms: float, delay: float) -> float:
         received: Time of its receipt [s].
         stamp_ms: Stamp of the driver by the same clock [ms]. V4L2 drivers stamp pictures by the monotonic clock;
             others give 0, or the time since their stream began.
-        delay: From the capture to the receipt, where the stamp is not one of the monotonic clock [s].
+        delay: Time from the capture to the receipt [s]. It is used if the stamp is not by the monotonic clock.
     """
     stamp = stamp_ms / 1e3
     return stamp if 0.0 <= received - stamp < _OLDEST_STAMP else received - delay

@@ -1,4 +1,4 @@
-"""Times of the computer's clock, by which cameras stamp their pictures, as times of the loop's clock."""
+"""Converts times of the computer's clock, by which cameras stamp their pictures, into times of the loop's clock."""
 
 from __future__ import annotations
 
@@ -30,7 +30,8 @@ class LoopTimes:
     def at(self, computer: float) -> TickTime:
         """Return the loop's time at a time of the computer's clock, with the number of the last tick up to then.
 
-        Before the first tick, the loop's time passes as the computer's, and the number is that of the first tick.
+        Before the first tick, the loop's clock is assumed to run like the computer's. The number is then that of the
+        first tick.
         """
         ahead = None
         for tick in reversed(self._ticks):

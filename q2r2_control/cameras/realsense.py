@@ -1,4 +1,4 @@
-"""A RealSense camera by its own library: colour, and depth as 16 bit numbers."""
+"""A RealSense camera, read with its own library: colour, and depth as 16-bit numbers."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ class RealSense:
         silent = [stream.name for stream, came in self._came.items() if received - came >= _PATIENCE_MS / 1e3]
         if silent or not has_come:
             raise CameraError(f"no {' and no '.join(silent) or 'frame'} within {_PATIENCE_MS / 1e3:g} s")
-        stamp_ms = 0.0  # A clock of the camera's own says nothing here.
+        stamp_ms = 0.0  # It stays 0 if the stamp is by the camera's own clock, whose offset is not known.
         if frame.get_frame_timestamp_domain() != self._rs.timestamp_domain.hardware_clock:
             stamp_ms = frame.get_timestamp() + 1e3 * _monotonic_less_day()
         captured = capture_time(received, stamp_ms, self._camera.delay)
@@ -144,7 +144,7 @@ class RealSense:
 
 
 def _monotonic_less_day() -> float:
-    """Return the difference of the monotonic clock from the time of day [s].
+    """Return the monotonic time minus the time of day [s].
 
     The clocks are read one after the other. The readings between which the least time has passed are used.
     """

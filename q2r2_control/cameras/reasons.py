@@ -6,7 +6,7 @@ from q2r2_control.events import ReasonKind
 
 
 class CameraReason(ReasonKind):
-    """What a camera lacks. No arm stops for it."""
+    """Faults of a camera, and the end of a fault. No arm stops because of them."""
 
     CAMERA_STOPPED = "camera_stopped", "camera {camera}: no picture for {age:.1f} s{why}"
     CAMERA_SLOW = "camera_slow", "camera {camera}: {rate:.1f} pictures a second instead of {due:g}"

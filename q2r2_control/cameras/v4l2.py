@@ -43,7 +43,7 @@ def device_path(camera: CameraConfig) -> str:
 
 
 def capture_devices() -> dict[str, str]:
-    """Return the names of the devices that give pictures, by their path. Those that may not be opened are included."""
+    """Return the names of the devices that give pictures, by path. Devices that the user may not open are included."""
     found = {}
     folders = Path("/sys/class/video4linux").glob("video*")
     for folder in sorted(folders, key=lambda folder: int(folder.name.removeprefix("video") or 0)):

@@ -1,4 +1,4 @@
-"""A video file in the place of a camera, for tests and rehearsals: it plays in real time."""
+"""A video file that replaces a camera, for tests and rehearsals. It plays in real time."""
 
 from __future__ import annotations
 

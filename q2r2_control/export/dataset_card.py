@@ -38,7 +38,7 @@ def _is_vector(feature: Mapping[str, Any]) -> bool:
 
 
 def _numbers(feature: str, labels: Sequence[str]) -> str:
-    """Return the labels as a text; neighbouring labels with the same unit have it once, after them."""
+    """Return the labels as a text. After neighbouring labels with the same unit, that unit stands once."""
     plain = tuple(label.removesuffix(POSITION) for label in labels)
     units = units_of({feature: plain})[feature]
     runs = groupby(zip(labels, units, strict=True), key=lambda pair: pair[1])

@@ -39,7 +39,7 @@ _FORMAT = 9  # The version of kept episodes. Episodes of another version are mad
 
 @dataclass(frozen=True)
 class FrameSampling:
-    """Settings for the frames that are made of the ticks, and for the data that is exported with them.
+    """Settings for the frames that are made from the ticks, and for the data that is exported with them.
 
     ``fps`` is the number of frames per second, and ``ahead`` the number of frames by which actions come earlier. Raises
     :class:`ConfigError` unless ``fps`` is 1 to 1000 and ``ahead`` is 0 to ``fps``.
@@ -60,7 +60,7 @@ class FrameSampling:
 
 @dataclass(frozen=True)
 class EpisodeVectors:
-    """One episode as vectors, (n, size) float32 by feature."""
+    """One episode with n frames, as vectors: for each feature, an array (n, size) of float32."""
 
     recording: str  # The name of the file.
     cell: str
@@ -70,11 +70,11 @@ class EpisodeVectors:
     notes: dict[str, str]  # The recorded notes, such as program, machine and operator.
     vectors: Vectors
     success: bool | None = None  # None if it is not known.
-    ahead: int = 0  # Row k has the actions that are positions of frame k + ahead.
+    ahead: int = 0  # Actions that are positions come earlier: row k has those of frame k + ahead.
     part: int = 0  # The number of the episode in the file, from 1 on; 0 for the whole file.
     cameras: Mapping[str, CameraFrames] = field(default_factory=dict)  # By camera, one picture for each frame.
-    depths: Mapping[str, CameraFrames] = field(default_factory=dict)  # The same of cameras with recorded depth.
-    subtasks: tuple[str, ...] = ()  # The names of its subtasks, in their order; empty if nobody told of any.
+    depths: Mapping[str, CameraFrames] = field(default_factory=dict)  # The same for each camera with recorded depth.
+    subtasks: tuple[str, ...] = ()  # The names of its subtasks, in their order; empty if it has no subtasks.
     subtask: tuple[int, ...] = ()  # The index in ``subtasks`` of each frame; empty if there are no subtasks.
 
     @property
@@ -114,7 +114,8 @@ def make_episode(file: Path, sampling: FrameSampling, span: EpisodeSpan | None =
         vectors, labels = features(frames, robot)
     except RecordingError as error:
         raise RecordingError(f"{recording.file}: {error}") from error
-    for action in (ActionSpace.JOINTS, ActionSpace.TOOL):  # The action of motions leads to the next frame already.
+    # Actions that are motions already lead to the next frame, so they are not moved.
+    for action in (ActionSpace.JOINTS, ActionSpace.TOOL):
         vectors[action] = _earlier(vectors[action], sampling.ahead)
     notes = dict(recording.about.notes)
     notes = anonymous(notes) if sampling.anonymous else notes
@@ -125,7 +126,7 @@ def make_episode(file: Path, sampling: FrameSampling, span: EpisodeSpan | None =
         shown = names if sampling.pictures else ()
         return {name: CameraFrames(recording, name, cell.cameras[name], stamps, is_depth) for name in shown}
 
-    # The same limits of times as those of the judge, which are since the run began.
+    # These times are since the run began, as those of ``subtask_starts`` are.
     passed = (frames["stamp"] - recording.about.epoch) / NANOSECONDS
     subtasks = subtask_names(cell.recording.subtasks, len(span.subtask_starts))
     number = np.searchsorted(np.array(span.subtask_starts), passed, side="right")
@@ -160,8 +161,10 @@ def spans_to_export(file: Path) -> list[EpisodeSpan]:
         return [WHOLE]  # The error of make_episode tells later why the file cannot be read.
 
 
-Write = Callable[[EpisodeVectors, Path], None]  # Writes an episode as a new file or folder; importable by processes.
-# Returns why episodes of a file are discarded, by their number, judged with pictures or not; importable as well.
+# Writes an episode as a new file or folder. It is a function of a module, so that other processes can import it.
+Write = Callable[[EpisodeVectors, Path], None]
+# Returns why episodes of a file are discarded, by the numbers of these episodes. The flag tells whether the pictures
+# are judged too. It is also a function of a module.
 Verdicts = Callable[[Path, bool], Mapping[int, str]]
 _LONGEST_REASON = 300  # The longest text of a reason [characters].
 
@@ -225,7 +228,8 @@ def keep_episodes(
 def _keep(job: _Job) -> tuple[str | None, str | None]:
     """Write one episode unless it exists; only a complete episode is ever stored under its name.
 
-    Returns the verdict that leaves it out, or None, and the reason why the recording cannot be exported, or None.
+    Returns two texts: the verdict if the episode is discarded, otherwise None; and the reason why the recording cannot
+    be exported, or None if it can.
     """
     target = job.target
     if target.exists():
@@ -237,7 +241,7 @@ def _keep(job: _Job) -> tuple[str | None, str | None]:
         episode = make_episode(job.file, job.sampling, job.span)
     except (RecordingError, *BROKEN) as error:
         return None, _reason(error, job)
-    # A worker that lost its scheduler may still write the episode that another machine was then given.
+    # If a worker loses its scheduler, another machine gets the same episode, and both may write it at the same time.
     unfinished = target.with_name(f"{target.name}.unfinished-{platform.node()}-{os.getpid()}")
     try:
         job.write(episode, unfinished)
@@ -297,7 +301,7 @@ class Output:
             self._partial.rmdir()
 
     def write(self, write: Callable[[Path], None]) -> None:
-        """Let ``write`` make the folder under another name, and then move it to its place."""
+        """Let ``write`` make the folder under another name. When it is complete, rename it to the output."""
         made = self._partial / "output"
         try:
             shutil.rmtree(made, ignore_errors=True)

@@ -25,7 +25,7 @@ from q2r2_control.export.sampling import CameraFrames, units_of
 from q2r2_control.extras import install_line
 from q2r2_control.plugins import EXPORTS, load_class, names_of
 
-# The name in the HDF5 file, and the name of the feature.
+# The names of data in the HDF5 file, and of the features that the data comes from.
 _DATA = (
     ("observations/qpos", "observation.state"),
     ("observations/qvel", "observation.velocity"),
@@ -34,7 +34,7 @@ _DATA = (
 _AXES = ("frame", "row", "column")
 _COMPRESSION = 1  # The fastest level of gzip.
 ROBOMIMIC = "robomimic.h5"  # The name does not end with .hdf5, because some trainers of ACT read all such files.
-UNITS = "units.json"  # The file beside the tables with the unit of each column of numbers.
+UNITS = "units.json"  # The file beside the CSV files, with the unit of each column of numbers.
 # The names that robomimic reads in a demonstration, and the data that they link to, which is stored once.
 _LINKS = {
     **{"actions": "action", "rewards": "rewards", "dones": "dones"},
@@ -63,7 +63,7 @@ def write_table(episode: EpisodeVectors, path: Path) -> None:
 
 
 def gather_tables(files: Sequence[Path], folder: Path) -> None:
-    """Move tables into a new ``folder``, with the names of the recordings, and write the units of their columns.
+    """Move CSV files into a new ``folder``, under the names of their recordings, and write the units of their columns.
 
     Raises :class:`RecordingError` if two recordings have the same name.
     """
@@ -93,8 +93,8 @@ def require_h5py() -> Any:
 def write_hdf5(episode: EpisodeVectors, path: Path) -> None:
     """Write one episode as HDF5."""
     with require_h5py().File(path, "w") as file:
-        file.attrs["sim"] = True  # With this, trainers take the action of the same row.
-        file.attrs["compress"] = False  # Readers get pixels, although the file compresses them.
+        file.attrs["sim"] = True  # With this value, trainers pair an observation with the action of the same row.
+        file.attrs["compress"] = False  # HDF5 compresses the pictures, but readers get plain pixels and no JPEG.
         file.attrs["fps"] = episode.fps
         file.attrs["action_ahead_frames"] = episode.ahead
         for name in ("recording", "cell", "task"):
@@ -123,7 +123,7 @@ def write_hdf5(episode: EpisodeVectors, path: Path) -> None:
 
 def _write_pictures(group: Any, camera: str, pictures: CameraFrames, frames: int) -> Any:
     """Write the pictures of a camera into a group of an HDF5 file, and return the dataset."""
-    # Each picture is compressed by itself, so that one can be read without the others.
+    # Each picture is compressed by itself, so that a reader can decode a single picture.
     packing = {"chunks": (1, *pictures.size), "compression": "gzip", "compression_opts": _COMPRESSION}
     data = group.create_dataset(camera, (frames, *pictures.size), pictures.dtype, **packing)
     for number, pixels in enumerate(pictures):

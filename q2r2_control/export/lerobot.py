@@ -1,6 +1,6 @@
 """Writes a LeRobotDataset with the package https://github.com/huggingface/lerobot, in the format of that package.
 
-Each episode becomes a dataset, and then these are joined.
+Each episode first becomes a dataset of its own. Then these datasets are joined.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ from q2r2_control.extras import install_line
 from q2r2_control.inputs.policy import ActionSpace
 
 _NAME = "q2r2/recordings"  # The package needs a name on the hub, but the datasets are never sent there.
-# The package makes no requests to the hub, and neither the package nor the encoder of videos prints its progress.
+# With these variables, the package makes no requests to the hub. Neither the package nor the video encoder prints its
+# progress.
 _ENVIRONMENT = {"HF_HUB_OFFLINE": "1", "TQDM_DISABLE": "1", "SVT_LOG": "1"}
 _CAP_SYS_NICE, _CAPABILITY_VERSION = 23, 0x20080522  # From linux/capability.h.
 
@@ -94,7 +95,7 @@ def join_shards(shards: Sequence[Path], folder: Path) -> None:
     import datasets
     from lerobot.datasets.aggregate import aggregate_datasets
 
-    # The package datasets keeps copies of tables. They must not stay in the user's cache.
+    # The package ``datasets`` caches copies of the data. They must not stay in the user's cache.
     cache, datasets.config.HF_DATASETS_CACHE = datasets.config.HF_DATASETS_CACHE, folder.with_name("cache")
     try:
         aggregate_datasets([_NAME] * len(shards), _NAME, roots=list(shards), aggr_root=folder)
@@ -107,7 +108,10 @@ def join_shards(shards: Sequence[Path], folder: Path) -> None:
 
 
 def check_alike(infos: Sequence[dict[str, Any]], sources: Sequence[dict[str, Any]]) -> None:
-    """Raises :class:`RecordingError` if episodes, given by their ``info.json``, differ in their cells or features."""
+    """Raises :class:`RecordingError` if episodes differ in their cells or features.
+
+    ``infos`` are the contents of their files ``info.json``, and ``sources`` their entries in :data:`SOURCES`.
+    """
     first, first_recording = infos[0], sources[0]["recording"]
     for info, source in zip(infos, sources, strict=True):
         cell, recording = info["robot_type"], source["recording"]

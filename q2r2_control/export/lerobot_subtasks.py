@@ -1,7 +1,8 @@
-"""Adds the subtasks of episodes to a LeRobotDataset, in all forms that versions of the package lerobot know.
+"""Adds the subtasks of episodes to a LeRobotDataset, in both forms that versions of the package lerobot read.
 
 Up to lerobot 0.5, the column ``subtask_index`` has the index of each frame's subtask in ``meta/subtasks.parquet``. From
-lerobot 0.6 on, the column ``language_persistent`` has, at each frame, all subtasks of the episode with their begin.
+lerobot 0.6 on, the column ``language_persistent`` has, at each frame, all subtasks of the episode and the times at
+which they begin.
 """
 
 from __future__ import annotations
@@ -33,9 +34,10 @@ def read_subtasks(shards: Sequence[Path]) -> list[dict[str, Any]]:
 
 
 def add_subtasks(episodes: Sequence[dict[str, Any]], folder: Path) -> None:
-    """Add the subtasks of all ``episodes`` to the dataset in ``folder``; without any subtask it stays as it is.
+    """Add the subtasks of all ``episodes`` to the dataset in ``folder``.
 
-    In a dataset with subtasks, an episode of which nobody told any is one subtask with an empty name.
+    If no episode has subtasks, the dataset is not changed. Otherwise an episode without subtasks counts as one subtask
+    with an empty name.
     """
     if not any(episode["names"] for episode in episodes):
         return
@@ -70,7 +72,7 @@ def _with_subtasks(table: Any, told: Sequence[dict[str, Any]], names: Sequence[s
     for number, frame in _places(table):
         own = told[number]
         found.append(names.index(own["names"][own["index"][frame] if own["index"] else 0]))
-    # The table's metadata lists its columns for the package datasets, and would lack the new ones.
+    # The table's metadata is removed: it lists the columns for the package ``datasets``, and would lack the new ones.
     return table.replace_schema_metadata(None).append_column(SUBTASK, pa.array(found, pa.int64()))
 
 
@@ -98,5 +100,5 @@ def _with_language(table: Any, told: Sequence[dict[str, Any]]) -> Any:
 
 
 def _places(table: Any) -> list[tuple[int, int]]:
-    """Return the number of the episode, and of the frame in it, of each row."""
+    """Return, for each row, the number of its episode and the number of its frame in that episode."""
     return list(zip(table["episode_index"].to_pylist(), table["frame_index"].to_pylist(), strict=True))

@@ -1,4 +1,4 @@
-"""Writes LeRobotDataset v2.1, the layout that openpi and Isaac GR00T train on; the package lerobot writes a newer one.
+"""Writes LeRobotDataset v2.1, the layout on which openpi and Isaac GR00T train. lerobot itself writes a newer layout.
 
 Cameras have the names of openpi. GR00T needs ``meta/modality.json`` and the column of task descriptions.
 """
@@ -24,7 +24,8 @@ from q2r2_control.export.sampling import CameraFrames, Names
 from q2r2_control.extras import install_line
 
 DESCRIPTION = "annotation.human.action.task_description"  # GR00T's name of the column with the number of the task.
-SUBTASK_DESCRIPTION = "annotation.human.action.subtask_description"  # The same of the subtask, which is a task too.
+# The same for the subtask: subtasks are in the list of tasks too.
+SUBTASK_DESCRIPTION = "annotation.human.action.subtask_description"
 OPENPI_CAMERAS = ("cam_high", "cam_left_wrist", "cam_right_wrist")
 _ANNOTATION = "annotation."
 _CHUNK = 1000  # The number of episodes in a folder.
@@ -46,7 +47,8 @@ def openpi_names(cameras: Mapping[str, CameraFrames]) -> dict[str, str]:
     """Return the name of each camera in the dataset.
 
     One camera on each arm and one other camera get the names of openpi. All others keep their names. A camera is on an
-    arm if the name of its link begins with the arm's name. For a camera of a ROS topic, its own name counts.
+    arm if the name of its link begins with the arm's name. For a camera on a ROS topic, which has no link, its own name
+    counts.
     """
     names = {name: name for name in cameras}
     for name, frames in cameras.items():
@@ -103,7 +105,7 @@ def join_v21(shards: Sequence[Path], folder: Path) -> None:
     about = [json.loads((shard / _ABOUT).read_text(encoding="utf-8")) for shard in shards]
     sources = [one["source"] for one in about]
     check_alike(about, sources)
-    # Subtasks are tasks too, after the others.
+    # Subtasks are tasks too. They come after the tasks of the episodes.
     tasks = list(dict.fromkeys([*(one["task"] for one in about), *(name for one in about for name in one["subtasks"])]))
     counted = (*_COUNTED, SUBTASK_DESCRIPTION) if any(one["subtasks"] for one in about) else _COUNTED
     modality = about[0]["modality"] | {"annotation": {_annotation(name): {} for name in counted if _annotation(name)}}
@@ -113,7 +115,7 @@ def join_v21(shards: Sequence[Path], folder: Path) -> None:
         frames, task, at = np.arange(one["frames"]), tasks.index(one["task"]), np.ones(one["frames"], dtype=np.int64)
         columns: dict[str, npt.NDArray[Any]] = {"timestamp": (frames / one["fps"]).astype(np.float32)}
         columns |= zip(_COUNTED, (frames, number * at, total + frames, task * at, task * at), strict=True)
-        if SUBTASK_DESCRIPTION in counted:  # Without any subtask, the whole episode is one with the task's name.
+        if SUBTASK_DESCRIPTION in counted:  # An episode without subtasks counts as one subtask, named as its task.
             told = [tasks.index(one["subtasks"][index]) for index in one["subtask"]]
             columns[SUBTASK_DESCRIPTION] = np.array(told) if told else task * at
         table = parquet.read_table(shard / _PACKED)
@@ -218,7 +220,7 @@ def _runs(values: Sequence[Any]) -> list[tuple[Any, list[int]]]:
 
 
 def _modality(names: Names, cameras: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Return which part of the robot the numbers of state and action belong to, as GR00T's ``modality.json``."""
+    """Return which numbers of state and action belong to which part of the robot, as in GR00T's ``modality.json``."""
 
     def part(label: str) -> str:
         arm = next((arm for arm in names.get("intervention", ()) if label.startswith(f"{arm}_")), None)

@@ -49,16 +49,17 @@ _OLDEST = 2  # The largest age of a picture in periods of the camera, so that on
 
 
 def sample(recording: Recording, fps: int, trim: bool = False, span: EpisodeSpan = WHOLE) -> dict[str, Array]:
-    """Return the observations and commands at each of n frames of the ``span``, whose first tick gives t_0.
+    """Return the observations and commands at each of n frames of the ``span``. Its first tick is at t_0.
 
     Measured are ``position``, ``velocity``, ``effort`` (n, joints) [rad, rad/s, Nm] and ``opening`` (n, arms), 0 closed
     .. 1 open, or -inf if not measured. Commanded are ``reference`` (n, joints) [rad] and ``gripper`` (n, arms).
     ``reference_tool`` and ``target`` are poses x y z [m] qx qy qz qw in the world (n, arms, 7). Without a target of the
     operator, ``target`` is ``reference_tool``. ``intervention`` (n, arms) is 1 where a hand moves the arm instead of a
     policy. ``time`` (n,) [s] is since t_0, and ``stamp`` (n,) is the time of day [ns]. With ``trim``, frames are from
-    the first to the last tick at which an arm is engaged or the reference moves. Raises :class:`RecordingError` for a
-    damaged file, for one without a usable tick, for one in which ticks were lost for longer than a frame, and for a
-    ``span`` in which a clock was set.
+    the first to the last tick at which an arm is engaged or the reference moves.
+
+    Raises :class:`RecordingError` if the file is damaged, if it has no usable tick, if ticks were lost for longer than
+    a frame, or if a clock was set in the ``span``.
     """
     picked: dict[str, list[npt.NDArray[Any]]] = {name: [] for name in ("stamp", *OBSERVED, *COMMANDED)}
     start, end, count = None, 0, 0
@@ -102,9 +103,9 @@ def _times_until(last: int, start: int, fps: int, first_frame: int) -> npt.NDArr
 
 
 def _ticks(recording: Recording, fps: int, span: EpisodeSpan) -> Iterator[Columns]:
-    """Yield the columns of the ticks in chunks; checks that no ticks are missing for longer than a frame.
+    """Yield the columns of the ticks in chunks.
 
-    It also checks that no clock was set within the ``span``.
+    Check that no ticks are missing for longer than a frame, and that no clock was set within the ``span``.
     """
     numbers = times = np.empty(0, dtype=np.int64)
     dts = np.empty(0)
@@ -220,7 +221,8 @@ def _known(frames: Mapping[str, Array], what: str, arms: tuple[str, ...]) -> lis
 def continuous(poses: Array, first: Array | None = None) -> Array:
     """Return poses (n, arms, 7) whose quaternions do not change sign from frame to frame.
 
-    The first quaternion has the sign of that in ``first`` (arms, 7). Without ``first``, its largest number is positive.
+    The first quaternion has the same sign as the quaternion in ``first`` (arms, 7). Without ``first``, its largest
+    number is positive.
     """
     quaternions = poses[..., 3:]
     if first is None:
@@ -234,7 +236,10 @@ def continuous(poses: Array, first: Array | None = None) -> Array:
 
 
 def _to_next(poses: Array) -> Array:
-    """Return the motion (n, arms, 6) [m, rad] from each pose to the next, in the former's frame; zeros for the last."""
+    """Return the motion (n, arms, 6) [m, rad] from each pose to the next, in the frame of the earlier pose.
+
+    The motion of the last pose is zero.
+    """
     motions = np.zeros((*poses.shape[:2], 6))
     for index in range(poses.shape[1]):
         placements = [pin.XYZQUATToSE3(pose) for pose in poses[:, index]]
@@ -246,7 +251,7 @@ def _to_next(poses: Array) -> Array:
 
 @dataclass(frozen=True)
 class CameraFrames:
-    """The pictures of one camera, one for each frame of an episode: colours, or depth, where 0 is unknown."""
+    """The pictures of one camera, one for each frame of an episode: colours, or depth, where 0 means unknown."""
 
     recording: Recording
     name: str

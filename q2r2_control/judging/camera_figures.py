@@ -23,38 +23,46 @@ _TRAVEL = 0.01  # If the joints of an arm move more than this between two pictur
 # first number, plus the second number times the difference between these two pictures.
 _ODD, _ODD_RATIO = 10.0, 3.0
 _PARTS = (4, 6, 4, 8)  # The parts of a view: rows of parts, rows in each; columns of parts, columns in each.
-# Damaged pictures are looked for in cameras of at least this rate [Hz]. At a lower rate, a body that moves may be in a
-# part of one picture only, as damage is.
+# Damaged parts are looked for in the pictures of cameras with at least this rate [Hz]. At a lower rate, a moving body
+# may be in a part in one picture only, and would look like damage.
 _QUICK = 10.0
 LARGEST_LAG = 0.4  # The largest lag that is searched for [s].
 _LAG_STEP = 0.02  # The step between two lags that are compared [s].
 _IN_TIME = 0.1  # A lag up to this is preferred if it explains the motion nearly as well as the best lag [s].
-_NEARLY = 0.05  # Share of the motion in the pictures by which a larger lag has to explain more.
-_LEFT = 0.65  # A larger lag leaves at most this share of the motion that the small lags leave unexplained.
+# A larger lag is preferred if two conditions hold. It explains more of the pictures' motion by this share of it:
+_NEARLY = 0.05
+# What it leaves unexplained is at most this share of what the small lags leave unexplained:
+_LEFT = 0.65
 _LEAST_FIT = 0.35  # Least share of the pictures' motion that the arms' motion must explain, or else the lag is unknown.
 _FEWEST = 20  # The least number of pictures from which a lag or an arm can be found.
-_LEAST_TRAVEL = 0.5  # The least travel of an arm's joints in an episode from which its camera can be found [rad].
-_CORRELATES = 0.4  # The least correlation of the change of pictures with the motion of the arm that carries the camera.
-_OTHER_ARM = 0.2  # The sum of correlations of two swapped cameras is larger by this with the arm of the other camera.
-_STILL = 3.0  # The brightness of a place that stands still changes by less than this.
-# The share of the view that stands still is above the first for a fixed camera, below the second for one on an arm.
+_LEAST_TRAVEL = 0.5  # A camera on an arm is compared with fixed ones if the arm's joints travel more than this [rad].
+# Two cameras on different arms are swapped if each camera's pictures change with the motion of the other camera's arm.
+_CORRELATES = 0.4  # The least correlation of each of these two.
+_OTHER_ARM = 0.2  # The sum of these two correlations is larger by this than the sum with the cameras' own arms.
+_STILL = 3.0  # A pixel of a view stands still if its brightness changes by less than this.
+# A camera seems to be fixed if the share of its view that stands still is above the first number. It seems to be on an
+# arm if this share is below the second number.
 _MOSTLY, _HARDLY = 0.5, 0.35
 
 
 @dataclass(frozen=True, slots=True)
 class CameraFigures:
-    """Figures of one camera, until the run begins to end. None means that a figure cannot be computed."""
+    """Figures of one camera, without the end of the run, while the arms come to rest.
 
-    arm: str | None  # The arm that carries the camera; None if none does.
+    None means that a figure cannot be computed.
+    """
+
+    arm: str | None  # The arm that carries the camera; None if no arm does.
     pictures: int
     missing_pictures: int  # The number of pictures that were due and are missing.
     rate_share: float | None  # The number of pictures divided by the number that was due.
     longest_gap_periods: float | None  # The longest time without a picture, in the camera's periods.
-    frozen_share: float | None  # The share of equal pictures among those between which the arms moved.
+    # Of the pairs of successive pictures between which the arms moved, the share whose two pictures are equal.
+    frozen_share: float | None
     black_share: float | None  # The share of the pictures that are black or have one colour only.
     bad_pictures: int  # The number of pictures that are damaged, or have another size than the cell says.
     lag_ms: float | None  # The delay of the motion in the pictures behind the motion of the joints.
-    swapped_with: str | None  # The camera with which it was swapped.
+    swapped_with: str | None  # The camera with which it was swapped; None if it was not swapped.
 
 
 def camera_figures(episode: Episode) -> dict[str, CameraFigures]:
@@ -75,7 +83,8 @@ class _CameraLook:
         self._start, self._end = float(t[0]), float(t[-1])
         self._rate = min(camera.rate, episode.config.nominal_rate_hz)  # At most one picture in a tick.
         self._pictures = pictures.between(self._start, self._end, 0.0)
-        self.fixed = camera.is_simulated and camera.link is None  # Of a real camera this is not known.
+        # It is not known whether a real camera without a link is fixed, so it does not count as fixed.
+        self.fixed = camera.is_simulated and camera.link is None
         self.arm = None if camera.link is None else arm_of_link(episode.robot, camera.link)
         measured = np.isfinite(episode.frames.q).all(axis=1)
         self._t, self._q = episode.frame_t[measured], episode.frames.q[measured]
@@ -125,7 +134,10 @@ class _CameraLook:
         return odd
 
     def travel(self, arm: str, lag: float = 0.0) -> Array:
-        """Return how far an arm's joints moved (k - 1,) [rad] between two pictures, ``lag`` [s] before their times."""
+        """Return how far an arm's joints moved (k - 1,) [rad] from each picture to the next.
+
+        A picture is assumed to show the arm ``lag`` [s] before the time of the picture.
+        """
         if not len(self._t):
             return np.zeros(max(len(self._pictures.t) - 1, 0))
         q = np.stack([np.interp(self._pictures.t - lag, self._t, self._q[:, at]) for at in self._joints[arm]], axis=1)
@@ -135,8 +147,9 @@ class _CameraLook:
         """Return the lag [s] at which the arms' speeds s explain the change of the pictures best.
 
         The model is c_1 s_1 + c_2 s_2 + c_0, with all c >= 0. A lag that is not near zero counts only if it explains
-        the change clearly better than the lags near zero. An arm that moves to and fro has the same speed again later.
-        An arm that moves round looks faster when it is nearer to the camera.
+        the change clearly better than the lags near zero, since two motions make a wrong lag fit too: An arm that moves
+        to and fro has the same speed again later. An arm that moves in a circle looks faster when it is near the
+        camera.
         """
         change, lags = self._change, np.arange(-LARGEST_LAG, LARGEST_LAG + _LAG_STEP, _LAG_STEP)
         energy = float(np.sum((change - change.mean()) ** 2)) if len(change) >= _FEWEST else 0.0
@@ -174,11 +187,11 @@ class _CameraLook:
 
 
 def _swapped(looks: dict[str, _CameraLook]) -> dict[str, str]:
-    """Return the cameras that were swapped, by name, each with the other one.
+    """Return the cameras that were swapped, by name, each with the camera with which it was swapped.
 
-    Two cameras on different arms are swapped if the pictures of each change with the arm of the other. For a fixed
-    camera and a camera on an arm there are two conditions: Hardly anything stands still in the view of the fixed one.
-    Most things stand still in the view of the other one.
+    Two cameras on different arms are swapped if each camera's pictures change with the motion of the other camera's
+    arm. For a fixed camera and a camera on an arm there are two conditions: Hardly anything stands still in the view of
+    the fixed camera. Most things stand still in the view of the camera on the arm.
     """
     found: dict[str, str] = {}
     for (one, first), (two, second) in combinations(looks.items(), 2):
@@ -197,12 +210,12 @@ def _swapped(looks: dict[str, _CameraLook]) -> dict[str, str]:
 
 
 def _by_part(change: Array) -> Array:
-    """Return the mean change (k, parts) of the parts of views (k, rows, columns)."""
+    """Return the mean absolute change (k, parts) in each part of a view, from the ``change`` (k, rows, columns)."""
     return np.asarray(np.abs(change).reshape(-1, *_PARTS).mean(axis=(2, 4)).reshape(len(change), -1))
 
 
 def arm_of_link(robot: Robot, link: str) -> str | None:
-    """Return the arm that moves a link; None if none does, or several do."""
+    """Return the arm that moves a link; None if no arm or several arms move it."""
     joints = {frame.parentJoint - 1 for frame in robot.model.frames if frame.name == link}
     arms = [name for name, arm in robot.arms.items() if joints & set(arm.joints.tolist())]
     return arms[0] if len(arms) == 1 else None

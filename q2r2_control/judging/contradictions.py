@@ -1,4 +1,4 @@
-"""Find contradictions between parts of an episode's file, of which one cannot be true."""
+"""Find contradictions in an episode's file: two facts that cannot both be true."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from q2r2_control.judging.figures import EpisodeFigures
 from q2r2_control.judging.thresholds import Rejection
 from q2r2_control.recording.clock_steps import clock_step_text
 
-_CONSTANT = 0.05  # Share of a gripper's stroke: a smaller range is no motion of the gripper.
-_CLOSES = 0.5  # Share of the stroke: a gripper has to move if its commands have a larger range.
+_CONSTANT = 0.05  # A gripper did not move if its opening varied by less than this share of its stroke.
+_CLOSES = 0.5  # A gripper has to move if its commands vary by more than this share of its stroke.
 _GRASPS = re.compile(
     r"\b(grasp|grip(?!per)|pick|place|stack|lift|carr(y|ies)|insert|hand(s|ed|ing)? .*\b(over|to) |handover|"
     r"put (.* )?(in|into|on|onto)\b)",
@@ -20,7 +20,7 @@ _GRASPS = re.compile(
 
 
 def contradictions(figures: EpisodeFigures, settings: JudgeSettings) -> Iterator[Rejection]:
-    """Yield reasons to discard an episode that are not limits of numbers. Their only setting is ``needs_task``."""
+    """Yield the reasons to discard an episode that have no threshold. Their only setting is ``needs_task``."""
     if figures.timing.repeated_stamps:
         count = figures.timing.repeated_stamps
         yield Rejection("repeated_stamps", f"{count} ticks have the time of the tick before")

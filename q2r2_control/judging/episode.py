@@ -21,7 +21,7 @@ from q2r2_control.recording.tick_rows import SAMPLE_FIELDS, Rows, targets_or_too
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import SIDES, Array, Flags
 
-FRAME = 0.01  # The time from one frame to the next [s].
+FRAME = 0.01  # A frame is a tick whose poses are kept. This is the time from one frame to the next [s].
 SPEED_OVER = 0.02  # A measured speed is an average over at least this time, since ticks are not evenly spaced [s].
 
 
@@ -53,10 +53,10 @@ class Ticks:
 class Frames:
     """One row for each of m ticks that are :data:`FRAME` apart. Poses are x y z [m] qx qy qz qw in the world."""
 
-    at: npt.NDArray[np.int64]  # (m,) Rows of the ticks.
+    at: npt.NDArray[np.int64]  # (m,) The rows of these ticks in :class:`Ticks`.
     q: Array  # (m, joints) Measured positions [rad].
-    target: Array  # (m, arms, 7) Targets of the operator, or the tool at the reference where there is no target.
-    reference: Array  # (m, arms, 7) Tools at the controller's reference.
+    target: Array  # (m, arms, 7) The operator's targets, or ``reference`` where there is no target.
+    reference: Array  # (m, arms, 7) Tool poses at the controller's reference.
     v: Array  # (m, joints) Measured velocities [rad/s].
     reference_q: Array  # (m, joints) The controller's reference [rad].
     opening: Array  # (m, arms) Measured openings of grippers, 0 closed .. 1 open; -inf if not measured.
@@ -67,7 +67,7 @@ class Frames:
 class Hand:
     """The k received samples of one hand. Their poses may not be finite."""
 
-    arm: str  # The arm that the hand leads.
+    arm: str  # The arm that follows the hand.
     received: Array  # (k,) Time of the receipt of the pose [s].
     polled: Array  # (k,) Time of the tick that took the sample [s].
     position: Array  # (k, 3) Position in the input's frame [m].
@@ -82,8 +82,8 @@ class Episode:
     robot: Robot
     ticks: Ticks
     frames: Frames
-    tools: Array  # (m, arms, 7) Measured poses of the tools at the frames.
-    hands: dict[str, Hand]  # The hands that lead an arm.
+    tools: Array  # (m, arms, 7) Measured tool poses, with one row for each row of ``frames``.
+    hands: dict[str, Hand]  # The hands that an arm follows, by name.
     events: list[Event]
     damage: str | None  # The reason why the file cannot be read to its end.
     pictures: dict[str, Pictures] = field(default_factory=dict)  # By camera, if its pictures can be read.
@@ -92,7 +92,7 @@ class Episode:
     part: int | None = None  # The number of the episode, from 1 on; None for the whole recording.
     discarded: bool = False  # The operator discarded it.
     ended_by_operator: bool = False  # The operator ended it while the run went on.
-    subtask_starts: tuple[float, ...] = ()  # When the operator began another subtask.
+    subtask_starts: tuple[float, ...] = ()  # Times at which the operator began another subtask.
 
     @property
     def arms(self) -> tuple[str, ...]:
@@ -168,7 +168,7 @@ class _Read:
         self._recording = recording
         self._limits = robot.velocity_limit
         self._joints = [arm.joints for arm in robot.arms.values()]
-        # A joint that can turn a full circle may be measured modulo that circle.
+        # A joint that can make a full turn may be measured modulo one turn.
         self._wraps = robot.position_upper - robot.position_lower >= 2.0 * np.pi
         self._last: tuple[float, Array] | None = None  # Time [s] and measured joints of the newest tick.
         self.ticks: list[Ticks] = []
@@ -181,7 +181,8 @@ class _Read:
         self._origin = 0.0  # Time of the loop's clock at the beginning of the recording [s].
         about = recording.about
         rows, times = np.empty(0, tick_type(len(about.arms), len(about.joints))), np.empty(0, np.int64)
-        self._add(TickChunk(rows, times, np.empty((0, len(SAMPLE_FIELDS))), {}))  # A recording may have no tick.
+        # A recording may have no tick. With this empty chunk, its arrays then have the right shapes.
+        self._add(TickChunk(rows, times, np.empty((0, len(SAMPLE_FIELDS))), {}))
 
     def all_chunks(self) -> str | None:
         """Read all chunks; returns the damage of the file, or None."""

@@ -90,7 +90,7 @@ def written_episode(question: Question) -> Episode | None:
 
 
 class EpisodeJudge:
-    """A listener of a recorded run, as a context around it. It raises nothing: a failure is logged once.
+    """A listener of a recorded run, used as a context manager around it. It raises nothing: a failure is logged once.
 
     A caller that has no ticks calls :meth:`record_event` and :meth:`report_verdicts` itself. A process of low priority
     does the work.

@@ -20,13 +20,14 @@ from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.types import Array, Flags
 from q2r2_control.wording import sentence
 
-_SURELY = 100  # After this number of frames with a target, one second, the topic has a message at any rate.
+# If an arm has a target in more frames than this, for one second, the target's topic has a message at any topic rate.
+_SURELY = 100
 _SHORTEST = 1e-3  # The shortest time for which an arm counts as engaged [s].
 
 
 @dataclass(frozen=True, slots=True)
 class HandFigures:
-    """Figures of one hand while it leads its engaged arm. Rates, shares and times are None if it never does."""
+    """Figures of one hand while an engaged arm follows it. Rates, shares and times are None if no arm ever does."""
 
     arm: str
     pose_rate_hz: float | None  # The number of received poses divided by the time.
@@ -41,8 +42,8 @@ class HandFigures:
 def hand_figures(episode: Episode, hand: str, dropout: float) -> HandFigures:
     """Return the figures of a hand's samples. A time between poses is a dropout if it is longer than ``dropout`` [s].
 
-    Times between poses, and the time from the last pose to the end, count while the hand leads its arm and no tick was
-    lost.
+    Times between poses, and the time from the last pose to the end, count while the arm follows the hand and no tick
+    was lost.
     """
     ticks, samples = episode.ticks, episode.hands[hand]
     engaged = (ticks.engaged & ~ticks.by_policy)[:, episode.arms.index(samples.arm)] & ticks.following
@@ -76,7 +77,10 @@ def hand_figures(episode: Episode, hand: str, dropout: float) -> HandFigures:
 
 
 def _at(t: Array, flags: Flags, when: Array) -> Flags:
-    """Return the newest of ``flags`` (n,), which have times ``t`` (n,), at or before each of the times ``when``."""
+    """Return the newest flag at or before each of the times ``when``; False if there is none.
+
+    The ``flags`` (n,) have the times ``t`` (n,).
+    """
     at = np.searchsorted(t, when, side="right") - 1
     return np.asarray((at >= 0) & flags[np.maximum(at, 0)])
 
@@ -99,9 +103,9 @@ class TimingFigures:
     """Figures of all ticks, the end of the run included. Shares and maxima are None if there are no ticks."""
 
     ticks: int  # The number of ticks that are in the file.
-    lost_ticks: int  # The number of ticks up to the last one that the recording lacks.
+    lost_ticks: int  # The number of ticks that are missing in the file, up to its last tick.
     lost_share: float | None
-    longest_lost_s: float  # The longest time of which no tick is in the file.
+    longest_lost_s: float  # The longest time span that has no tick in the file.
     late_ticks: int  # The number of ticks that come more than 1.5 periods after the one before.
     missed_ticks: int  # The number of whole periods that passed without a tick.
     missed_share: float | None  # The share of missed ticks among those that were due.
@@ -111,12 +115,12 @@ class TimingFigures:
     # The number of ticks with the time of the tick before. None for ROS nodes, whose messages may arrive together.
     repeated_stamps: int | None
     clock_step_s: float  # The largest step by which a clock was set; negative if back, 0 if no clock was set.
-    begins_again: bool  # The run goes on after it has begun to end, so two runs are in one file.
+    begins_again: bool  # True if the run goes on after its end has begun, so that two runs are in one file.
 
 
 @dataclass(frozen=True, slots=True)
 class SubtaskFigures:
-    """One subtask of an episode, from its press to the next one, or to the end of the episode."""
+    """One subtask of an episode. It ends when the operator begins the next subtask, or with the episode."""
 
     name: str
     start_s: float  # Time since the episode began.
@@ -124,7 +128,10 @@ class SubtaskFigures:
 
 
 def subtask_figures(episode: Episode, duration: float) -> list[SubtaskFigures]:
-    """Return the subtasks of an episode of this ``duration`` [s]; no subtask if nobody told of any."""
+    """Return the subtasks of an episode that has this ``duration`` [s].
+
+    The list is empty if the cell names no subtask and the operator marked none.
+    """
     names = subtask_names(episode.config.recording.subtasks, len(episode.subtask_starts))
     ends = (*episode.subtask_starts, duration)
     starts = (0.0, *episode.subtask_starts)
@@ -141,7 +148,7 @@ class EpisodeFigures:
     file: str
     part: int | None  # The number of the episode in the file, from 1 on; None for the whole file.
     task: str | None  # The task in words; None if it is not known.
-    duration_s: float  # The time until the run begins to end.
+    duration_s: float  # The time until the end of the run begins, in which the arms come to rest.
     engaged_s: float  # The time for which any arm is engaged.
     idle_share: float | None
     hands: dict[str, HandFigures]
@@ -161,7 +168,7 @@ class EpisodeFigures:
     ended_by: str | None  # The fault that ended the run.
     discarded: bool  # The operator discarded the episode.
     success: bool | None  # The success by the task's own check or the operator; None if it is not known.
-    subtasks: list[SubtaskFigures]  # In their order; empty if nobody told of subtasks.
+    subtasks: list[SubtaskFigures]  # In the order of time; see :func:`subtask_figures`.
     missing_subtasks: list[str]  # The names of the cell's subtasks that the operator did not begin.
 
     @property
@@ -232,7 +239,7 @@ def _least_mm(distances: Array) -> float | None:
 
 
 def timing_figures(episode: Episode) -> TimingFigures:
-    """Return the figures of all ticks. The missed ticks follow from the time that each tick counts since the last."""
+    """Return the figures of all ticks. The number of missed ticks is computed from the ``dt`` of each tick."""
     ticks, count = episode.ticks, len(episode.ticks.t)
     if not count:
         return TimingFigures(0, 0, None, 0.0, 0, 0, None, None, None, episode.ended, 0, 0.0, False)

@@ -81,7 +81,7 @@ def verdict_of(figures: EpisodeFigures, settings: JudgeSettings) -> Verdict:
     for threshold in THRESHOLDS:
         limit = getattr(settings, threshold.name)
         for whose, found in groups[threshold.of].items():
-            # The first reason about a camera has the number of its missing pictures, and no other one repeats it.
+            # Only the first reason about a camera tells the number of its missing pictures.
             missing = 0 if whose in told else getattr(found, "missing_pictures", 0)
             says = f"{whose}{missing} pictures missing, " if missing else whose
             if (reason := threshold.reason(getattr(found, threshold.figure), limit, says)) is not None:
@@ -161,7 +161,7 @@ def part_of(episode: Episode, span: EpisodeSpan) -> Episode:
 
 @dataclass(frozen=True)
 class Judgement:
-    """The verdict on an episode, and the numbers that it follows from. Machines send it to each other."""
+    """The verdict on an episode, and the numbers from which it follows. It can be sent to another machine."""
 
     figures: EpisodeFigures
     verdict: Verdict
@@ -175,7 +175,7 @@ class Judgement:
 
 @dataclass(frozen=True)
 class Judged(Judgement):
-    """A judgement with the episode itself, of which plots are made, and the thresholds by which it was judged."""
+    """A judgement with the episode itself, which plots show, and with the thresholds of the verdict."""
 
     episode: Episode
     settings: JudgeSettings
@@ -230,7 +230,10 @@ def judge_all(files: Sequence[Path], settings: JudgeSettings | None = None) -> I
 
 
 def judgements_of(settings: JudgeSettings | None, file: Path) -> list[Judgement | Unreadable]:
-    """Judge one recording as :func:`judge_all` does, without its episodes. Other processes and machines call it."""
+    """Judge one recording as :func:`judge_all` does, but return judgements without the episodes.
+
+    Other processes and machines can run it, because its arguments and its result are small.
+    """
     found = judge_all([file], settings)
     return [Judgement(one.figures, one.verdict) if isinstance(one, Judged) else one for one in found]
 
@@ -251,7 +254,8 @@ def discarded_episodes(file: Path, pictures: bool) -> dict[int, str]:
 def _discarded(file: Path, pictures: bool, absolute: Path, changed: int) -> dict[int, str]:
     """Return the result of :func:`discarded_episodes`.
 
-    A worker of a cluster lives on, so ``absolute`` and the time ``changed`` tell apart files with the same name.
+    ``absolute`` and ``changed``, the file's modification time, are only part of the cache's key. A worker process of a
+    cluster lives long, and may see different files with the same name.
     """
     judged = judge(open_recording(file), pictures=pictures)
     return {one.figures.part or 0: one.verdict.line for one in judged if not one.verdict.keep}

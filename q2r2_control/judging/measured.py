@@ -1,4 +1,7 @@
-"""Check whether measurements of an arm are plausible: finite, not faster than its joints, and near its reference."""
+"""Compute from an arm's measurements whether they are plausible.
+
+They have to be finite, not faster than the speed limits of the joints, and near the controller's reference.
+"""
 
 from __future__ import annotations
 
@@ -19,18 +22,21 @@ _STEP = 0.005  # The step of lags, and of the times that are compared [s].
 
 @dataclass(frozen=True, slots=True)
 class MeasuredFigures:
-    """Figures of one arm, until the run begins to end. None means that a figure cannot be computed."""
+    """Figures of one arm, without the end of the run, while the arms come to rest.
+
+    None means that a figure cannot be computed.
+    """
 
     unmeasured_ticks: int  # The number of ticks with a position, velocity, opening or reference that is not finite.
-    joint_speed_share: float  # The largest of the joints: mean speed over 20 ms or 10 frames, divided by the limit.
-    velocity_mismatch: float | None  # The largest of the joints: |k - 1|, where velocity = k * slope of the position.
+    joint_speed_share: float  # Mean speed over 20 ms or 10 frames, divided by the limit; of the worst joint.
+    velocity_mismatch: float | None  # |k - 1|, where velocity = k * slope of the position; of the worst joint.
     reference_lag_ms: float | None  # The lag of the measured joints behind the reference.
     opening_range: float | None  # The range of measured openings; None if they are not measured.
     commanded_range: float | None  # The range of commanded openings; None if the arm has no gripper.
 
 
 def measured_figures(episode: Episode, arm: str) -> MeasuredFigures:
-    """Return the figures of an arm. They leave torques out, since not every plant measures them."""
+    """Return the figures of an arm. Torques are not checked, since not every plant measures them."""
     index, ticks = episode.arms.index(arm), episode.ticks
     joints, at = episode.robot.arms[arm].joints, episode.frames.at
     following = ticks.following[at]
@@ -53,7 +59,8 @@ def _lasting_speed(t: Array, q: Array, limits: Array) -> float:
         return 0.0
     passed = np.maximum(t[_SPEED_FRAMES:] - t[:-_SPEED_FRAMES], 1e-9)
     steps = np.abs(q[_SPEED_FRAMES:] - q[:-_SPEED_FRAMES])
-    steps = np.where(steps > np.pi, 0.0, steps)  # A joint without limits of position starts again after a turn.
+    # The measured angle of a joint without position limits may jump by a turn.
+    steps = np.where(steps > np.pi, 0.0, steps)
     return float(np.nan_to_num(steps / passed[:, None] / limits, posinf=0.0).max())
 
 
@@ -72,7 +79,10 @@ def _velocity_mismatch(t: Array, q: Array, v: Array) -> float | None:
 
 
 def _reference_lag(t: Array, q: Array, reference: Array) -> float | None:
-    """Return the lag [ms] of the measured joints behind the reference, as in :func:`delays`; negative if they lead."""
+    """Return the lag [ms] of the measured joints behind the reference, as in :func:`delays`.
+
+    It is negative if the measured joints are ahead of the reference.
+    """
     usable = np.isfinite(q).all(axis=1) & np.isfinite(reference).all(axis=1)
     t, q, reference = t[usable], q[usable], reference[usable]
     if len(t) < 2 or t[-1] - t[0] < 3.0 * _LARGEST_LAG:

@@ -25,11 +25,12 @@ _SMOOTHING = 0.02
 LONGEST = 0.5  # The longest delay that is searched for [s].
 _STEP = 0.005  # The step of delays, and of the times that are compared [s].
 _DIFFERENCE = 0.025  # A velocity is a difference of positions over this time before and after [s].
-_LEAST_MOTION = 0.01  # A hand that moves more slowly has no delay [m/s], RMS.
+_LEAST_MOTION = 0.01  # No delay is computed for a hand whose RMS speed is lower [m/s].
 _LEAST_FIT = 0.5  # The least share of the tool's motion that the hand's motion has to explain.
-_ALIKE = 0.01  # A delay that is a second longer needs a better fit by this, since a motion may repeat itself.
-_LOOK = 0.5  # The place of a tool is compared with its place this much earlier and later [s].
-_MOVED, _TURNED = 2e-3, 0.02  # The least distance and angle between these places of a tool that moves [m, rad].
+# A motion that repeats itself fits at several delays. So a delay that is a second longer needs a fit better by this.
+_ALIKE = 0.01
+_LOOK = 0.5  # A tool's pose is compared with its poses this much earlier and later [s].
+_MOVED, _TURNED = 2e-3, 0.02  # A tool moves if these poses differ by more than this distance [m] or angle [rad].
 
 
 def smoothness(t: Array, position: Array, engaged: Flags) -> float | None:
@@ -43,9 +44,9 @@ def smoothness(t: Array, position: Array, engaged: Flags) -> float | None:
         moving += _pieces(t[begin:end], position[begin:end])
     if len(moving) < _FEWEST:
         return None
-    # In real time many ticks come a millisecond late, and measure a tool of 0.3 m/s with an error of 0.3 mm. The third
-    # derivative of that error is larger than that of the motion, so positions are smoothed. The smoothing changes the
-    # ends, so they are cut off.
+    # In real time many ticks come a millisecond late. If a tool moves at 0.3 m/s, its position then has an error of
+    # 0.3 mm. The third derivative of that error is larger than that of the motion, so positions are smoothed. The
+    # smoothing falsifies both ends of a piece, so the ends are cut off.
     cut = round(2.0 * _SMOOTHING / FRAME)
     smoothed = [gaussian_filter1d(piece, _SMOOTHING / FRAME, axis=0)[cut:-cut] for piece in moving]
     return float(np.median([ldlj(piece, FRAME) for piece in smoothed]))
@@ -107,8 +108,8 @@ def delays(episode: Episode, hand: str) -> list[float | None]:
     A delay is the tau that maximises the squared correlation of v(t) with M v_hand(t - tau) over all times t at which
     the arm is engaged. Here v is the velocity of the target or tool, and M (3, 3) maps the hand's axes to the world, as
     the teleoperation does. The anchors, the scale and the time for which the hand rests do not matter. A delay is None
-    if the hand moves less than 10 mm/s RMS, only turns, or explains less than half of that motion, or if no maximum is
-    within (0, 0.5) s.
+    in three cases: The hand has an RMS speed below 10 mm/s, for example because it only turns. Its motion explains less
+    than half of the motion of the target or tool. No maximum is within (0, 0.5) s.
     """
     samples = episode.hands[hand]
     arm = episode.arms.index(samples.arm)
@@ -140,14 +141,17 @@ def delays_behind(hand: Track, followers: Sequence[Track], when: Array) -> list[
 
 
 def best_delay(leader: Track, follower: Track, when: Array, lags: Array) -> float | None:
-    """Return by which of ``lags`` [s], 5 ms apart, a motion follows another; None as in :func:`delays`."""
+    """Return the delay [s] of ``follower`` behind ``leader``, at times ``when`` (n,) [s]; None as in :func:`delays`.
+
+    It is searched for among ``lags`` [s], which are 5 ms apart.
+    """
     return _best(lags, [leader.velocity(when - lag) for lag in lags], follower.velocity(when))
 
 
 def _best(lags: Array, by_hand: list[Array], moved: Array) -> float | None:
-    """Return the delay of the highest correlation, also between two steps.
+    """Return the delay with the highest correlation, interpolated between two steps.
 
-    Among delays with nearly the same correlation it is the one nearest to zero.
+    Of several delays with nearly the same correlation, the delay nearest to zero is returned.
     """
     energy = float(np.sum(moved * moved))
     fits = np.zeros(len(lags))
@@ -222,9 +226,10 @@ def tracking_errors(episode: Episode, arm: int) -> tuple[Array, Array]:
 def idle_share(episode: Episode) -> float | None:
     """Return the share of the run, until it begins to end, in which no engaged arm moves.
 
-    An arm moves if its tool, at the controller's reference, is more than 2 mm or 0.02 rad from its place half a second
-    earlier or later. It also moves if its gripper gets another command in that time. Thus a trembling hand is idle, and
-    a short stop between two motions is not. The result is None if no tick is in the file.
+    An arm moves if its tool pose, at the controller's reference, differs by more than 2 mm or 0.02 rad from its pose
+    half a second earlier or later. It also moves if its gripper gets another command in that time. Thus an arm that
+    follows a trembling hand is idle, and a short stop between two motions is not. The result is None if no tick is in
+    the file.
     """
     t, at = episode.frame_t, episode.frames.at
     moving = np.zeros(len(t), dtype=bool)

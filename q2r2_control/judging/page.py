@@ -94,7 +94,7 @@ def page_of(
         rows.append(f'<tr><th><a href="#episode-{number}">{name}</a></th><td>{badge}</td>{cells}</tr>')
         reasons = "".join(f"<li>{escape(reason.text)}</li>" for reason in judged.verdict.reasons)
         about = f"<p>{escape(judged.figures.task or '')}</p><ul>{reasons}</ul>"
-        # Each picture is a separate image, since the same names of elements occur in all of them.
+        # Each SVG file is embedded as an image of its own, because the same ids of elements occur in all of them.
         data = b64encode(draw_episode(judged).encode()).decode()
         size = 'width="1248" height="806"'
         picture = f'<img alt="plots of {plain}" {size} src="data:image/svg+xml;base64,{data}">'
@@ -115,7 +115,7 @@ def page_of(
 
 def draw_episode(judged: Judged) -> str:
     """Return plots over time as the text of an SVG file, whose size does not grow with the episode."""
-    # The import stands here because it takes longer than all other work of a command without plots.
+    # Matplotlib is imported only here, because its import takes longer than all work of a command without plots.
     import matplotlib as mpl
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
@@ -142,7 +142,10 @@ def draw_episode(judged: Judged) -> str:
 
 
 def thinned(t: Array, values: Array, extreme: np.ufunc) -> tuple[Array, Array]:
-    """Return at most 500 points of a line: the ``extreme``, ``np.fmax`` or ``np.fmin``, of pieces of equal length."""
+    """Return at most 500 points of a line. Each point is the extreme value of one of 500 parts of equal length.
+
+    ``extreme`` is ``np.fmax`` or ``np.fmin``.
+    """
     if len(t) <= _POINTS:
         return t, values
     starts = np.unique(np.linspace(0, len(t), _POINTS, endpoint=False).astype(int))
@@ -162,13 +165,14 @@ def _draw_speed(axes: Axes, judged: Judged) -> None:
         axes.axvspan(t[begin], t[min(stop, len(t) - 1)], label=None if number else "no arm engaged", **_SHADE)
     for number, fault in enumerate(judged.figures.faults):
         axes.axvline(fault.t, label=None if number else "fault", **_FAULT)
-    axes.set_ylim(0.0, max(10.0, axes.get_ylim()[1]))  # Arms at rest show no rounding errors.
+    axes.set_ylim(0.0, max(10.0, axes.get_ylim()[1]))  # So the rounding errors of arms at rest are not visible.
 
 
 def _draw_errors(axes: Axes, judged: Judged) -> None:
     for index, arm in enumerate(judged.episode.arms):
         _draw(axes, arm, judged.episode.frame_t, 1e3 * tracking_errors(judged.episode, index)[0])
-    highest = max(1.0, axes.get_ylim()[1])  # The limit may be far above all errors, which would be a flat line then.
+    # The axis must not reach up to the limit: if it is far above all errors, they would look like a flat line.
+    highest = max(1.0, axes.get_ylim()[1])
     if (limit := judged.settings.max_position_error_p99) is not None:
         axes.axhline(1e3 * limit, label=f"p99 at most {1e3 * limit:g}", **_LIMIT)
     axes.set_ylim(0.0, highest)

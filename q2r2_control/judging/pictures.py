@@ -84,7 +84,7 @@ def _look_at(picture: Picture, t: float, camera: CameraConfig) -> _Look:
 
 def _has_foreign_marker(jpeg: bytes) -> bool:
     """Return whether the coded pixels of a JPEG were overwritten: they contain a marker that is not allowed there."""
-    scan = jpeg.rfind(_SCAN)  # The last one, since a preview picture with its own scan may stand before it.
+    scan = jpeg.rfind(_SCAN)  # The last marker, since a preview picture with its own marker may stand before it.
     if scan < 0:
         return False
     begin = scan + len(_SCAN) + int.from_bytes(jpeg[scan + 2 : scan + 4], "big")

@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple
 class Rejection:
     """A reason why an episode is discarded."""
 
-    name: str  # The name of the threshold, or of a reason without one: never_engaged, no_ticks, damaged ...
+    name: str  # The name of the threshold, or of a reason that has no threshold: never_engaged, no_ticks, damaged ...
     text: str
 
 

@@ -24,8 +24,9 @@ if TYPE_CHECKING:  # The process of the writer does not import these modules.
 FORMAT = "4"  # The version of topics and fields. A recording of another version cannot be read.
 LOOP, ROS = "loop", "ros"  # The sources of a recording: the ticks of one loop, or the messages of ROS nodes.
 ABOUT, CONCLUSION = "q2r2_control", "q2r2_control_end"  # Names of metadata records.
-CELL, ROBOT, FIELDS = "cell.yaml", "robot.urdf", "fields.json"
-_PERSONAL = ("operator", "host", "certificate")  # Names of notes. The certificate is a path.
+CELL, ROBOT, FIELDS = "cell.yaml", "robot.urdf", "fields.json"  # Names of attachments.
+# Notes that may name a person or a computer. The note on the certificate is the path of a file.
+_PERSONAL = ("operator", "host", "certificate")
 _GIT_TIME = 2.0  # The longest time that git may take [s].
 
 

@@ -1,8 +1,8 @@
-"""Write a bag of rosbag2: an MCAP file, by the package ``mcap``, and the ``metadata.yaml`` beside it, version 9.
+"""Write a bag of rosbag2: an MCAP file, which the package ``mcap`` writes, and a ``metadata.yaml`` of version 9.
 
 ROS is not needed. The rules are those of metadata_io.cpp in https://github.com/ros2/rosbag2. Message types are from
-rosbags. The writer of rosbags (0.11) is not used: it writes no numbers of messages and no attachments, and may end a
-chunk in the middle of a tick.
+rosbags. The writer of rosbags (0.11) is not used: it writes neither the sequence numbers of messages nor attachments,
+and it may end a chunk in the middle of a tick.
 """
 
 from __future__ import annotations
@@ -42,12 +42,12 @@ _QOS = {
 
 
 class BagWriter(AbstractContextManager["BagWriter"]):
-    """Writes a bag, as a context. :meth:`close` completes the file.
+    """Writes a bag, and is a context manager. :meth:`close` completes the file.
 
-    Without :meth:`close` the file has all that was flushed, and no index. A file of a killed process stops without an
-    end record, which ``mcap recover`` repairs. After an error, for example of a full disk, the end record is written
-    without an index: rosbags then reads all 2,000 of 2,000 messages, and would read none without the record. The file
-    is removed if no message was written before the error.
+    Without :meth:`close` the file has all that was flushed, but no index. If the process is killed, the end record is
+    missing too; ``mcap recover`` repairs such a file. After an error, for example of a full disk, the end record is
+    written without an index. rosbags then reads all of 2,000 messages; without the end record it would read none. The
+    file is removed if no message was written before the error.
     """
 
     def __init__(self, path: Path, topics: Iterable[Topic], about: About) -> None:
@@ -57,7 +57,7 @@ class BagWriter(AbstractContextManager["BagWriter"]):
         self._first = self._last = about.epoch  # Times of the first and the last message [ns].
         self._stream = path.open("xb")
         self._whole = 0  # The number of bytes that were flushed.
-        self._empty = True  # No message was flushed.
+        self._empty = True  # True if no message was flushed.
         # With a smaller limit the writer may end a chunk inside a tick, and a run that is killed would lose that tick.
         self._writer, self._unflushed = Writer(self._stream, chunk_size=sys.maxsize), 0
         try:
@@ -67,7 +67,7 @@ class BagWriter(AbstractContextManager["BagWriter"]):
             raise
 
     def _begin(self) -> dict[int, int]:
-        """Write all that comes before the first message; returns the id in the file of each topic's channel."""
+        """Write all that comes before the first message. Return the id that each topic's channel has in the file."""
         about = self._about
         self._writer.start("ros2", "q2r2_control")
         self._writer.add_metadata(ABOUT, about.texts())
@@ -90,7 +90,7 @@ class BagWriter(AbstractContextManager["BagWriter"]):
             self._path.parent.rmdir()  # The folder was made for this file.
 
     def write(self, messages: Iterable[Message]) -> None:
-        """Write messages of whole ticks, in the order of time; :meth:`flush` writes them to the file."""
+        """Add the messages of whole ticks, in the order of time. :meth:`flush` writes them to the file."""
         for channel, number, time, sent, payload in messages:
             self._writer.add_message(self._channels[channel], time, payload, sent, number)
             self._first = min(self._first, time) if self._counts else time
@@ -101,7 +101,7 @@ class BagWriter(AbstractContextManager["BagWriter"]):
             self.flush()
 
     def flush(self) -> None:
-        """Write the messages that were added to the file, as one chunk."""
+        """Write all added messages to the file, as one chunk."""
         self._writer.flush()
         self._stream.flush()
         self._unflushed = 0
@@ -134,7 +134,7 @@ class BagWriter(AbstractContextManager["BagWriter"]):
                 stream.write(end.end() + MCAP0_MAGIC)
 
     def _register(self) -> dict[int, int]:
-        """Declare the topics; returns the id in the file of each topic's channel."""
+        """Declare the topics. Return the id that each topic's channel has in the file."""
         qos = {"offered_qos_profiles": yaml_of([_QOS]).strip()}
         schemas: dict[str, int] = {}
         for kind in dict.fromkeys(topic.type for topic in self._topics):
@@ -177,7 +177,7 @@ class BagWriter(AbstractContextManager["BagWriter"]):
         }
         target = self._path.with_name(METADATA_FILE)
         part = target.with_suffix(".part")
-        # A copy by JSON shares no objects, so the YAML has no references.
+        # The copy through JSON has a separate dict for each use of _QOS. So the YAML has no anchors and no aliases.
         plain = json.loads(json.dumps({"rosbag2_bagfile_information": information}))
         part.write_text(yaml_of(plain), encoding="utf-8")
         os.replace(part, target)

@@ -22,7 +22,8 @@ from q2r2_control.summary.tick import Tick
 if TYPE_CHECKING:
     from q2r2_control.plants.mujoco import MujocoPlant
 
-# Size of the copies that may wait [bytes]: for the shipped cell, some seconds of a camera at 30 Hz.
+# Total size of the copied positions that may wait for the process [bytes]. For the shipped cell, these are some seconds
+# of a camera at 30 Hz.
 ROOM = 128 << 10
 _NICENESS = 19  # The loop and the writer have a higher priority.
 _QUALITY = 90  # The quality of JPEG.
@@ -32,12 +33,12 @@ _READY = 10.0  # Longest time to wait before the run until the process is ready 
 
 @dataclass(frozen=True)
 class CameraSetup:
-    """The first request: the model to take pictures of, the cameras, and the channels of their messages."""
+    """The first request: the model that the pictures show, the cameras, and the channels of their messages."""
 
     model: bytes  # A pickled mujoco.MjModel.
     cameras: dict[str, CameraConfig]
     channels: dict[str, int]  # By camera, the channel in the file of the recording.
-    waited_for: bool  # The loop waits for the pictures, in simulated time.
+    waited_for: bool  # True if the loop waits for the pictures, as it does in simulated time.
 
 
 class PictureRequest(NamedTuple):
@@ -70,7 +71,7 @@ class CameraRecorder:
     def __init__(self, write: Callable[[Message], None], room: int = ROOM) -> None:
         """Start the process. ``write`` gets the message of each picture, in another thread.
 
-        ``room`` [bytes] is the size of the copies that may wait. Raises :class:`OSError`.
+        ``room`` [bytes] is the total size of the copied positions that may wait. Raises :class:`OSError`.
         """
         self._write, self._ready = write, Event()
         self.process = HelperProcess(
@@ -96,7 +97,9 @@ class CameraRecorder:
     def prepare(
         self, plant: MujocoPlant, cameras: Mapping[str, CameraConfig], topics: Mapping[str, Topic], *, waits: bool
     ) -> None:
-        """Prepare pictures of ``plant`` for messages of ``topics``; waits until the process is ready, at most 10 s.
+        """Prepare to take pictures of ``plant``, and wait until the process is ready, at most 10 s.
+
+        ``topics`` are those of the recording, by name; they tell the channel of each camera's messages.
 
         If ``waits`` is True, the loop will wait for pictures, so their process has the same priority as the loop.
         """

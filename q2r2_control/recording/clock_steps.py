@@ -1,4 +1,4 @@
-"""Finds ticks of a recording between which a clock was set: one rule, for the judge and the export.
+"""Finds ticks of a recording between which a clock was set. The judge and the export use the same rule.
 
 ROS time is the clock of the computer or of a simulation. A person or a time server may set it forward or back while
 arms move. A recording then has some seconds twice, or a gap of some seconds.
@@ -11,14 +11,15 @@ import numpy.typing as npt
 
 from q2r2_control.types import Array
 
-_NOTED = 0.1  # A smaller difference between the clock and the loop is no step, since receipts are uneven [s].
-_SHARE = 0.5  # For lost ticks, whose own dt is not known, this share of their time is added to that tolerance.
+_NOTED = 0.1  # Messages do not arrive evenly, so a smaller difference between the clock and the loop is no step [s].
+_SHARE = 0.5  # This share of the time of lost ticks is added to ``_NOTED``, because their own dt is not known.
 
 
 def clock_steps(numbers: npt.NDArray[np.int64], t: Array, dt: Array) -> Array:
-    """Return the time by which the clock was set before each of n ticks (n,) [s]: negative if back, 0 if not set.
+    """Return by how much the clock was set just before each of n ticks (n,) [s].
 
-    A controller that stood still, and counts less time than passed, looks the same as a clock that was set forward.
+    The number is negative if the clock was set back, and 0 if it was not set. A controller that stood still, and counts
+    less time than passed, looks the same as a clock that was set forward.
 
     Args:
         numbers: Numbers of the ticks (n,).

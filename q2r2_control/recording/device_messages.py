@@ -1,4 +1,4 @@
-"""The pictures of real cameras as messages of a recording of the ROS nodes, and what happens to these cameras."""
+"""Makes messages of real cameras' pictures for a recording of the ROS nodes, and reports if a camera stops."""
 
 from __future__ import annotations
 
@@ -28,9 +28,10 @@ class DeviceMessages:
         self._numbers = dict.fromkeys(streams, 0)
 
     def take(self, now: float) -> tuple[list[Message], list[Reason]]:
-        """Return the pictures since the last call, and what is to be told.
+        """Return the messages of all pictures since the last call, and what has happened to the cameras.
 
-        A message is sent at the capture of its picture. It gets its place in the file by the time of its receipt.
+        The field ``sent`` of a message is the time at which its picture was captured. The field ``time``, by which the
+        file is ordered, is the time at which the picture was received.
         """
         messages, reasons = [], []
         for name, stream in self.streams.streams.items():

@@ -25,9 +25,9 @@ _logger = logging.getLogger(__name__)
 
 
 class DevicePictures(AbstractContextManager["DevicePictures"]):
-    """A listener of one run, as a context around it. It never waits while the run goes on.
+    """A listener of one run, used as a context manager around it. It never waits while the run goes on.
 
-    It tells what happens to the cameras. If the run is recorded, it records their pictures.
+    It reports what happens to the cameras. If the run is recorded, it records their pictures.
     """
 
     def __init__(
@@ -42,7 +42,7 @@ class DevicePictures(AbstractContextManager["DevicePictures"]):
         Args:
             streams: The open cameras.
             realtime: True if the loop's clock is that of the computer.
-            report: It gets what happens to the cameras, for the episode and its operator.
+            report: Called with all that happens to the cameras, for the episode and its operator.
             recording: The recorder of the run and the facts about it; None if the run is not recorded.
         """
         self._streams, self._realtime, self._report = streams.streams, realtime, report
@@ -51,7 +51,7 @@ class DevicePictures(AbstractContextManager["DevicePictures"]):
         self._channels = {name: topic.channel for name, topic in topics.items()}
         self._times = LoopTimes()
         self._watches: dict[str, CameraWatch] = {}
-        self._before: dict[str, CameraShot] = {}  # The newest pictures before the first tick.
+        self._before: dict[str, CameraShot] = {}  # By camera, the newest picture before the first tick.
         self._depth_before: dict[str, DepthShot] = {}
         self._count = 0
         self._begin = 0.0  # Time of the first tick, by the monotonic clock [s].
@@ -80,9 +80,9 @@ class DevicePictures(AbstractContextManager["DevicePictures"]):
             self._recording[0].missing_pictures += sum(watch.missing for watch in self._watches.values())
 
     def _take(self, name: str, until: float = math.inf) -> None:
-        """Record the pictures of a camera since the last call that were captured in the run, ``until`` a time [s].
+        """Take a camera's pictures since the last call, and record those captured in the run up to ``until`` [s].
 
-        The last picture before the run is recorded too, because it is the newest one at the first tick.
+        The last picture before the run is recorded too, because it is the newest picture at the first tick.
         """
         for received, shot in self._streams[name].take():
             if shot.time < self._begin:

@@ -49,8 +49,8 @@ class McapFile:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._types: dict[int, str] = {}  # By schema.
-        self._topics: dict[int, Topic] = {}  # By channel.
+        self._types: dict[int, str] = {}  # By the id of a schema, the message type.
+        self._topics: dict[int, Topic] = {}  # By the id of a channel.
         self._skipped: list[_Place] = []  # Chunks that were not read and may declare channels.
 
     def topics(self) -> dict[int, Topic]:
@@ -87,10 +87,11 @@ class McapFile:
                 return None  # The last bytes of an unfinished file may look like an index at an impossible place.
 
     def messages(self, topics: Collection[str] | None = None, since: int = 0) -> Iterator[list[Message]]:
-        """Yield all messages, or those of some ``topics``, as lists of a chunk or of some hundred messages.
+        """Yield all messages, or those of some ``topics``, in lists.
 
-        They come in the order of the file. ``mcap sort`` changes that order to the order of time. Chunks that end
-        before ``since`` [ns] are left out. Raises the errors of the package ``mcap`` for a damaged file.
+        A list has the messages of one chunk, or about a thousand messages that are in no chunk. They come in the order
+        of the file. ``mcap sort`` changes that order to the order of time. Chunks that end before ``since`` [ns] are
+        left out. Raises the errors of the package ``mcap`` for a damaged file.
         """
         with self._path.open("rb") as stream:
             yield from self._in_file_order(stream, topics, since)

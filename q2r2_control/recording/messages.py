@@ -1,8 +1,8 @@
 """Topics of recordings and their messages: ROS 2 messages in CDR, made by rosbags.
 
-A recording is of the run of one loop or of the ROS nodes. Replay, judge and export read ``tick``, ``hand_samples``,
-``state`` and the pictures of a loop's run. Its other topics repeat this data as standard messages, for tools that plot
-and show them.
+A recording has the run of one loop, or messages of the ROS nodes. Of a loop's run, the replay, the judge and the export
+read the topics ``tick``, ``hand_samples`` and ``state``, and the pictures. The other topics repeat this data as
+standard messages, for tools that plot and show them.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from q2r2_control.types import SIDES, Array
 
 STORE = message_types(Dialect.ROS2)
 ARRAY, TEXT, PICTURE = "std_msgs/msg/Float64MultiArray", "std_msgs/msg/String", "sensor_msgs/msg/CompressedImage"
-JPEG = "jpeg"  # The usual format of its messages.
+JPEG = "jpeg"  # The usual value of the field ``format`` of a CompressedImage.
 POSE, JOINTS = "geometry_msgs/msg/PoseStamped", "sensor_msgs/msg/JointState"
 TRAJECTORY, HAND_INPUTS = "trajectory_msgs/msg/JointTrajectory", "quest2ros/msg/OVR2ROSInputs"
 NANOSECONDS = 1_000_000_000
-_ENCAPSULATION = 4  # The number of bytes before the message.
+_ENCAPSULATION = 4  # The size of the CDR header, which is before the fields of the message [bytes].
 WORLD = "world"  # The frame of targets.
 TICK, SAMPLES, STATE = "/q2r2/tick", "/q2r2/hand_samples", "/q2r2/state"
 JOINT_STATES, EXTERNAL_TORQUE = "/joint_states", "/q2r2/external_torque"
@@ -34,8 +34,8 @@ RECORDER = "/recorder"
 RECORDER_EVENTS = f"{RECORDER}/events"
 _NODES = ("mujoco_robot", "cartesian_controller", "tcp_endpoint", "simulation_input", "hand_input", "recorder")
 
-# `index` counts the ticks that moved the reference, and `dt` is the time since the last of them. Each arm has its own
-# `rejected`.
+# `index` counts the ticks that moved the reference, and `dt` is the time since the last such tick. tick_fields() adds a
+# field `rejected_...` for each arm.
 TICK_FIELDS = (
     *("index", "now", "dt", "step", "compute_time", "solve_time", "status", "certified", "fallback"),
     *("closest_distance", "margin", "slack"),
@@ -78,7 +78,7 @@ def loop_topics(arms: Sequence[str]) -> tuple[str, ...]:
 
 
 def ros_topics(arms: Sequence[str], pictures: Iterable[str] = ()) -> tuple[Topic, ...]:
-    """Return the topics of a recording of the nodes; ``pictures`` are those of the pictures of cameras."""
+    """Return the topics of a recording of the nodes. ``pictures`` are the topics of the cameras' pictures."""
     types: dict[str, str] = {DESCRIPTION: TEXT, JOINT_STATES: JOINTS, "/mujoco_robot/external_torque": JOINTS}
     types |= {"/tf": _TRANSFORMS, "/tf_static": _TRANSFORMS, "/diagnostics": _DIAGNOSTICS}
     for hand in SIDES:
@@ -155,24 +155,24 @@ def depth_topic(camera: str) -> str:
 
 
 def coding_of_depth(unit: float) -> str:
-    """Return the format of a message of depth, whose numbers of 16 bits have this ``unit`` [m]."""
+    """Return the ``format`` of a message with depth. Its 16-bit numbers are multiples of ``unit`` [m]."""
     return f"16UC1; png; unit {unit:.6g} m"
 
 
 def unit_of_depth(payload: bytes) -> float:
-    """Return the unit [m] of a message of depth. Raises :class:`ValueError` if its format has none."""
+    """Return the unit [m] of the depth in a message. Raises :class:`ValueError` if its ``format`` has no unit."""
     coding = str(STORE.deserialize_cdr(payload, PICTURE).format)  # type: ignore[attr-defined]
     return float(coding.removeprefix("16UC1; png; unit ").removesuffix(" m"))
 
 
 def heard_on(topic: str) -> str:
-    """Return the topic that the recorder subscribes to for a recorded topic."""
+    """Return the topic to which the recorder subscribes in order to record ``topic``."""
     arm = topic.removeprefix("/q2r2/").split("/")[0]
     return asked_target(arm) if topic == target(arm) else topic
 
 
 def is_compressed(topic: str) -> bool:
-    """Return whether a camera's topic has messages CompressedImage, by the naming of image_transport."""
+    """Return whether a camera's topic has CompressedImage messages. image_transport gives such topics this ending."""
     return topic.endswith("/compressed")
 
 
@@ -182,13 +182,16 @@ def is_latched(topic: str) -> bool:
 
 
 def is_reliable(topic: Topic) -> bool:
-    """Return whether all messages of a topic shall arrive. Senders of commands and streams must not wait for that."""
+    """Return whether the recorder asks ROS for reliable delivery, so that all messages of a topic arrive.
+
+    It does not ask for that on topics with commands and streams, whose senders must not wait for the recorder.
+    """
     return topic.type in (ARRAY, TEXT) or topic.name == REFERENCE or heard_on(topic.name) != topic.name
 
 
 class Message(NamedTuple):
     channel: int
-    number: int  # The number of its tick, or its number at the sender.
+    number: int  # The number of the message's tick, or the sequence number that the sender gave the message.
     time: int  # The time of day [ns].
     sent: int  # The time of day at which it was sent, by the sender's clock [ns].
     payload: bytes  # The message in CDR.
@@ -199,11 +202,11 @@ class Message(NamedTuple):
 
 
 class CodedPicture(NamedTuple):
-    """A picture of a real camera, of which the writer makes a message."""
+    """A picture of a real camera. The writer makes a message from it."""
 
     channel: int
-    number: int  # The number of the newest tick when it was captured.
-    time: int  # The time of day of its capture [ns].
+    number: int  # The number of the newest tick when the picture was captured.
+    time: int  # The time of day at which the picture was captured [ns].
     camera: str
     data: bytes
     coding: str = JPEG
@@ -220,11 +223,15 @@ class CodedPicture(NamedTuple):
 class MessageTemplate:
     """Makes many messages that differ only in float64 numbers and in the stamp of the header.
 
-    The messages of the poses and joints of one tick of two arms take 3 us. rosbags needs 110 us, 11 % of a processor.
+    For one tick of two arms, it makes the messages with poses and joints in 3 us. rosbags needs 110 us, which is 11 %
+    of a processor at 1 kHz.
     """
 
     def __init__(self, kind: str, example: Any, count: int) -> None:
-        """Find the numbers 1, 2, ... ``count`` in the message ``example``: :meth:`filled` takes them in this order."""
+        """Make a template from the message ``example``, which contains the numbers 1, 2, ... ``count``.
+
+        :meth:`filled` replaces these numbers in this order.
+        """
         payload = serialized(kind, example)
         self._size = len(payload)
         padding = bytes(-(len(payload) - _ENCAPSULATION) % 8)
@@ -304,7 +311,7 @@ def text(data: str) -> bytes:
 
 
 def picture(camera: str, stamp: int, data: bytes, coding: str = JPEG) -> bytes:
-    """Return a sensor_msgs/CompressedImage as CDR, whose frame is the name of the camera; ``stamp`` [ns]."""
+    """Return a sensor_msgs/CompressedImage as CDR. Its ``frame_id`` is the name of the camera; ``stamp`` [ns]."""
     return serialized(PICTURE, make(PICTURE, header(camera, stamp), coding, np.frombuffer(data, dtype=np.uint8)))
 
 

@@ -1,4 +1,7 @@
-"""Reads recordings chunk by chunk, also those of a killed process, and the episodes that an operator marked in them."""
+"""Reads recordings chunk by chunk, and the episodes that an operator marked in them.
+
+A recording whose process was killed can be read too.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +39,7 @@ from q2r2_control.recording.messages import (
 from q2r2_control.recording.tick_chunks import TickAssembly, TickChunk
 from q2r2_control.teleop.reasons import TeleopReason
 
-# Errors that readers raise for a file that is damaged or of another program.
+# Errors that readers raise for a file that is damaged, or that another program wrote.
 BROKEN = (
     *(McapError, ZstdError, SerdeError, ValueError, KeyError, IndexError),
     *(struct.error, TypeError, OverflowError, MemoryError, AssertionError),
@@ -47,14 +50,17 @@ BROKEN = (
 class Picture:
     time: int  # The time of day of the tick that the picture shows [ns].
     tick: int  # The number of that tick.
-    jpeg: bytes  # Of depth: a PNG of 16 bits.
+    jpeg: bytes  # The coded picture. If the picture shows depth, it is a PNG with 16 bits for each pixel.
 
 
 NO_END = "the recording has no end: its process was killed, or the disk was full"
 
 
 class Recording:
-    """A file that ``q2r2 run --record`` wrote. Raises :class:`RecordingError`, of one line, for any other file."""
+    """A file that ``q2r2 run --record`` wrote.
+
+    Raises :class:`RecordingError`, with a message of one line, for any other file.
+    """
 
     def __init__(self, path: Path) -> None:
         """Open ``path``: the file, or a folder in which it is the only recording."""
@@ -86,15 +92,18 @@ class Recording:
         return (picture for _, picture in self.pictures_of((camera,)))
 
     def pictures_of(self, cameras: Iterable[str]) -> Iterator[tuple[str, Picture]]:
-        """Return all pictures of some cameras, with the name of the camera; those of each are in the order of time."""
+        """Return all pictures of some cameras, each with the name of its camera.
+
+        The pictures of each camera are in the order of time.
+        """
         return self._coded({self._topic_of(camera): camera for camera in cameras})
 
     def depths(self, camera: str) -> Iterator[Picture]:
-        """Return all pictures of a camera's depth, in the order of time."""
+        """Return all depth pictures of a camera, in the order of time."""
         return (picture for _, picture in self._coded({depth_topic(camera): camera}))
 
     def depth_unit(self, camera: str) -> float:
-        """Return the unit [m] of a camera's depth; raises :class:`RecordingError` if none was recorded."""
+        """Return the unit [m] of a camera's depth. Raises :class:`RecordingError` if no depth was recorded."""
         for messages in self.messages((depth_topic(camera),)):
             for message in messages:
                 with self._faults():
@@ -102,7 +111,7 @@ class Recording:
         raise RecordingError(f"{self.file}: depth of camera {camera}: no picture was recorded")
 
     def _coded(self, names: Mapping[str, str]) -> Iterator[tuple[str, Picture]]:
-        """Yield all pictures of some topics, with the ``names`` of these."""
+        """Yield all pictures on the topics in ``names``, each with the name that ``names`` gives its topic."""
         for messages in self.messages(names):
             for message in messages:
                 with self._faults():
@@ -113,7 +122,7 @@ class Recording:
         return picture_topic(camera)
 
     def _time_of(self, picture: Message) -> int:
-        """Return the time of day of the capture of a picture [ns]."""
+        """Return the time of day at which a picture was captured [ns]."""
         return picture.time
 
     @cached_property
@@ -144,7 +153,10 @@ class Recording:
 
     @property
     def closed(self) -> bool:
-        """Return whether the file has an index, which is written last: not by a killed process or on a full disk."""
+        """Return whether the file has an index.
+
+        The index is written last. It is missing if the process was killed, or if the disk was full.
+        """
         return self._summary() is not None
 
     @property
@@ -158,7 +170,7 @@ class Recording:
 
     @property
     def conclusion(self) -> Conclusion:
-        """Return the facts of the end of the run; they are empty if the file has no index."""
+        """Return the facts that the run stated at its end; they are empty if the file has no index."""
         if self.closed:
             with self._faults():
                 for record in self._mcap.extras():
@@ -233,10 +245,10 @@ class EpisodeSpan:
 
     start: float = -math.inf
     end: float = math.inf  # inf stands for the end of the run.
-    discarded: bool = False  # The operator discarded it.
+    discarded: bool = False  # True if the operator discarded the episode.
     success: bool | None = None  # None if it is not known.
     number: int = 0  # The number of the episode, from 1 on; 0 is the whole run.
-    # When the operator began another subtask. The first subtask begins with the episode.
+    # Times at which the operator began another subtask [s]. The first subtask begins with the episode.
     subtask_starts: tuple[float, ...] = ()
 
     def with_subtask(self, start: float) -> EpisodeSpan:
@@ -250,8 +262,10 @@ WHOLE = EpisodeSpan()
 def spans_of(events: Iterable[Event], run_succeeded: bool | None = None) -> list[EpisodeSpan]:
     """Return the episodes that an operator has marked, or the whole run if there are none.
 
-    A discard, a success and a failure belong to the episode that goes on, or else to the last one. The last mark
-    counts. The success of the whole run is that of the operator, or else ``run_succeeded``, that of the task's check.
+    A mark that discards an episode, or calls it a success or failure, belongs to the episode that is going on. If none
+    is going on, it belongs to the last episode. If an episode was called both a success and a failure, the last mark
+    counts. The success of the whole run is the operator's mark, or else ``run_succeeded``, the result of the task's own
+    check.
     """
     whole = replace(WHOLE, success=run_succeeded)
     spans: list[EpisodeSpan] = []
@@ -285,7 +299,7 @@ def read_spans(recording: Recording) -> list[EpisodeSpan]:
 
 
 def _events_of(recording: Recording) -> Iterator[Event]:
-    """Yield all events. A loop has them in one topic, so the numbers of its ticks need not be read."""
+    """Yield all events. A loop's recording has them all on one topic, so the rows of its ticks need not be read."""
     if recording.about.source == LOOP:
         states = (str(data_of(one.payload, TEXT)) for messages in recording.messages({STATE}) for one in messages)
         for state in states:

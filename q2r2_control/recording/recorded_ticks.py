@@ -21,7 +21,7 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.tick import RunStart
 from q2r2_control.types import QUEST_CONTROLS, SIDES, ActionChunk, Array, HandInputs, HandSample, RobotState
 
-_SAME_POSE = 1e-6  # Largest difference of equal poses: of positions [m] and of the numbers of a quaternion.
+_SAME_POSE = 1e-6  # Poses are equal if their positions [m] and quaternions differ by at most this in each number.
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +47,7 @@ class RecordedTicks:
         self._arms = recording.about.arms
         self._ticks = self._all(recording)
         self._starts: list[RunStart] = []
-        self.missing = 0  # The number of ticks that were lost after the last one.
+        self.missing = 0  # The number of lost ticks, just after the last tick that can be read.
         self.current: RecordedTick | None = None
         self.next = next(self._ticks, None)
         if self.next is None or not self._starts:
@@ -56,7 +56,7 @@ class RecordedTicks:
         self.start = self._starts[0]
 
     def advance(self) -> RecordedTick:
-        """Go on to the next tick. Raises :class:`NoMoreTicksError` after the last one."""
+        """Go on to the next tick, and return it. Raises :class:`NoMoreTicksError` after the last tick."""
         if self.next is None:
             raise NoMoreTicksError
         self.current, self.next = self.next, next(self._ticks, None)
@@ -157,9 +157,13 @@ def _built(text: str) -> tuple[Config, Robot]:
 
 
 def check_tools(positions: Array, tools: Array, robot: Robot) -> None:
-    """Raises :class:`RecordingError` if recorded ``tools`` (arms, 7) are not those at joint ``positions`` (joints,)."""
+    """Check that recorded tool poses are those of a robot at joint ``positions`` (joints,).
+
+    Raises :class:`RecordingError` if ``robot`` has other tool poses at ``positions`` than ``tools`` (arms, 7).
+    """
     (found,) = tool_poses(positions[None], robot)
-    near = np.minimum(np.abs(found - tools), np.abs(found + tools))[:, 3:].max() < _SAME_POSE  # q and -q are equal.
+    # A quaternion and its negative are the same rotation.
+    near = np.minimum(np.abs(found - tools), np.abs(found + tools))[:, 3:].max() < _SAME_POSE
     if not near or np.abs(found - tools)[:, :3].max() > _SAME_POSE:
         raise RecordingError("the robot that its cell names now is not the recorded one: tools are elsewhere")
 

@@ -1,4 +1,4 @@
-"""Records a run, or messages of ROS nodes, into a new folder, by a process that writes there."""
+"""Records a run, or messages of ROS nodes, into a new folder. A process of its own writes the file."""
 
 from __future__ import annotations
 
@@ -34,12 +34,14 @@ if TYPE_CHECKING:  # The ROS node does not import MuJoCo.
     from q2r2_control.plants.mujoco import MujocoPlant
 
 PATIENCE = 10.0  # Time to wait for a disk that hangs at the end of a run [s].
-# Size of the data that may wait to be sent [bytes]. As much may wait in the writer. A tick of two arms takes 1.6 kB,
-# and the nodes of two arms send some 0.6 MB a second.
+# Size of the data that may wait to be sent [bytes]. The same size may wait in the writer. A tick of two arms takes
+# 1.6 kB, and the nodes of two arms send some 0.6 MB a second.
 ROOM = 4 << 20
-# A warning is logged when the file is behind the run by the first time, and is possible again below the second [s].
+# A warning is logged if the file is behind the run by more than the first time. There is no second warning before the
+# file is behind by less than the second time [s].
 _BEHIND, _CAUGHT_UP = 2.0, 1.0
-ROOM_WITH_PICTURES = 64 << 20  # The same with cameras of nodes: an uncompressed picture takes a megabyte [bytes].
+# ROOM for recordings of nodes with pictures: an uncompressed picture takes a megabyte [bytes].
+ROOM_WITH_PICTURES = 64 << 20
 _LAST_NUMBER = 2**32 - 1
 _BATCH = 16  # The number of ticks that are sent at once.
 _LONGEST_FAULT = 500  # Longest text of the fault that ended a run [characters].
@@ -83,7 +85,10 @@ class BaseRecorder:
         return True
 
     def _send(self, batch: list[PackedTick] | list[Message] | list[CodedPicture], *, wait: bool = False) -> bool:
-        """Send a batch to the writer; returns False if there is no room for it now. With ``wait`` it waits for room."""
+        """Send a batch to the writer, and return whether it was sent: False if there is no room for it now.
+
+        If ``wait`` is True, wait until there is room.
+        """
         if self.writer is None or self.fault is not None:
             return False
         sent = self.writer.send(batch, sum(one.size for one in batch), wait=wait)
@@ -163,11 +168,14 @@ class RecordingSummary:
     pictures: int = 0  # The number of pictures that were written.
     lost_pictures: int = 0  # The number of pictures that were due and are missing.
     pictures_fault: str | None = None  # The reason why the pictures ended before the run.
-    longest_backlog_s: float = 0.0  # The longest time that waited to be written and that a kill of the writer may lose.
+    # The longest time span of the run that was not yet in the file. A kill of the writer would have lost it.
+    longest_backlog_s: float = 0.0
 
 
 class Recorder(BaseRecorder, AbstractContextManager["Recorder"]):
-    """A listener of one run, as a context around it. It raises nothing: a failure is logged once, and the run goes on.
+    """A listener of one run, used as a context manager around it.
+
+    It raises nothing: a failure is logged once, and the run goes on.
 
     The process starts in the constructor. Make the recorder before any long preparation, and call :meth:`begin` just
     before the run begins::
@@ -191,14 +199,14 @@ class Recorder(BaseRecorder, AbstractContextManager["Recorder"]):
             waits: True if ticks wait for room, as they may in simulated time. Otherwise ticks for which there is no
                 room are lost, and counted.
             room: The size of the data that may wait to be written [bytes].
-            pictures: True if one more process takes the pictures of the cameras of :meth:`prepare`.
+            pictures: True to start one more process, which takes the pictures of the cameras of :meth:`prepare`.
         """
         self._waits = waits
         self._count = 0  # The number of ticks.
         self.overflows = 0  # The number of ticks for which there was no room.
         self._packer: TickPacker | None = None  # None before :meth:`begin`.
         self._batch: list[PackedTick] = []
-        # For each batch that is not yet written, the number of ticks up to it and the loop's time [s].
+        # For each batch that is not yet written, the number of ticks up to its end and the loop's time then [s].
         self._sent: deque[tuple[int, float]] = deque()
         self._longest_backlog, self._said_so = 0.0, False
         self._epoch = 0
@@ -216,7 +224,7 @@ class Recorder(BaseRecorder, AbstractContextManager["Recorder"]):
                 self._check_cameras(reason_of(error))
 
     def prepare(self, plant: MujocoPlant, robot: Robot, cameras: Mapping[str, CameraConfig]) -> None:
-        """Prepare pictures of a run of ``plant``, just before :meth:`begin`; this takes at most some seconds.
+        """Prepare to take pictures of ``plant``, just before :meth:`begin`. This takes at most some seconds.
 
         Args:
             plant: The simulation that moves the arms.
@@ -229,7 +237,7 @@ class Recorder(BaseRecorder, AbstractContextManager["Recorder"]):
             self._check_cameras()
 
     def begin(self, about: About, robot: Robot, topic_rate: float | None = TOPIC_RATE) -> None:
-        """Begin the file of a run, which may then be called as a listener of the run's pipeline.
+        """Begin the file of a run. From now on the recorder may be called, as a listener of the run's pipeline.
 
         Args:
             about: The facts that the run states at its beginning.
@@ -266,9 +274,9 @@ class Recorder(BaseRecorder, AbstractContextManager["Recorder"]):
             self._packer.repeat_state()
 
     def _watch_backlog(self, now: float) -> None:
-        """Warn if the file is far behind the run, since a kill of the writer would lose that time.
+        """Warn if the file is far behind the run: a kill of the writer would lose all data of that time.
 
-        A run in simulated time waits for the writer, so nothing is watched.
+        A run in simulated time waits for the writer, so no warning is needed.
         """
         if self._waits:
             return

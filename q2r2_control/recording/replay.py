@@ -45,7 +45,7 @@ from q2r2_control.types import (
 
 @dataclass(frozen=True, slots=True)
 class ArmDifference:
-    """The difference between an arm's measured tool in the replay and in the recording, at the same ticks."""
+    """The differences between an arm's measured tool poses in the replay and in the recording, at the same ticks."""
 
     position_mm_rms: float
     position_mm_max: float
@@ -59,10 +59,10 @@ _REPEATABLE = ("mujoco", "kinematic")  # Plants that can move in a replay.
 class Replay:
     ticks: int
     summary: RunSummary | None  # None if the run ended before its first tick.
-    ended_by: str | None  # That fault, or the reason why the replay ended too early.
-    difference: str | None  # The first difference; None if there is none.
-    notes: list[str]  # The changes since the run was recorded.
-    arms: dict[str, ArmDifference]  # With a plant, the difference of each arm's tool.
+    ended_by: str | None  # The fault that ended the replay, or the reason why it ended too early; None if neither.
+    difference: str | None  # The first difference in words; None if there is none, or if nothing was compared.
+    notes: list[str]  # The changes of program, cell and robot since the run was recorded.
+    arms: dict[str, ArmDifference]  # The differences of each arm's tool poses; empty without a plant.
 
 
 def replay(
@@ -74,7 +74,7 @@ def replay(
     prepare: Callable[[Pipeline], None] = lambda pipeline: None,
     paced: bool = False,
 ) -> Replay:
-    """Run a recording again, with its own cell or another one.
+    """Run a recording again, with its own cell or with another cell.
 
     Without a ``plant``, the loop gets the recorded measurements, whatever it commands. With a ``plant``, that plant
     moves and is measured. Only a plant of the recorded kind can repeat the run to the bit, so ``compare`` is not
@@ -126,10 +126,13 @@ def replay(
 
 
 class ReplayPipeline(Pipeline):
-    """Runs the loop with the clock and input of a recording. Its solver fails in the same substeps as it did then."""
+    """Runs the loop with the clock and input of a recording.
+
+    Its solver fails in the same substeps in which the solver of the recorded run failed.
+    """
 
     def __init__(self, config: Config, robot: Robot, ticks: RecordedTicks, about: About, plant: str | None) -> None:
-        """``plant`` is the name of a plant; None stands for the recorded measurements, which no command changes."""
+        """``plant`` is the name of a plant. If it is None, the loop gets the recorded measurements."""
         recorded = _Recorded(ticks, about.plant_modes, self._ask_again)
         # A recording does not tell which extra buttons the device had.
         buttons = QUEST_CONTROLS.buttons + config.teleop.bindings.of_device
@@ -142,11 +145,14 @@ class ReplayPipeline(Pipeline):
         return _Clock(1.0 / self.config.nominal_rate_hz, self._recorded, self._pace)
 
     def summary_so_far(self) -> RunSummary:
-        """Return the summary of the ticks up to now. A run that has begun is needed."""
+        """Return the summary of the ticks up to now. The run must have begun."""
         return self._recorder.finish(self._clock, self.loop.pacer)
 
     def _ask_again(self, tick: RecordedTick) -> None:
-        """Repeat the requests of a program at this tick: they are events of both arms that change no state."""
+        """Repeat the requests that a program made at this tick.
+
+        Such a request was recorded as an event of each arm that changes no state, so one arm's events are enough.
+        """
         first = next(iter(self.robot.arms))
         asked = (event for event in tick.events if event.arm == first and event.source == event.destination)
         self.requests.extend(event.reason for event in asked if event.kind in REPEATED)
@@ -179,7 +185,7 @@ class _Clock(LoopClock):
 class _Recorded:
     """Gives the samples and measured states of the recorded tick. Implements PolicySource and Plant.
 
-    Commands move nothing.
+    Commands have no effect.
     """
 
     controls = replace(QUEST_CONTROLS, words=replace(QUEST_WORDS, nobody="this is a recording"))
@@ -235,9 +241,9 @@ class _Solver:
 
 
 class _PlantDifference:
-    """A listener of a replay on a plant that measures how far the tools are from their recorded places."""
+    """A listener of a replay with a plant. It measures the differences of the tool poses from the recorded ones."""
 
-    keeps_episodes = True  # The recorder has set this too.
+    keeps_episodes = True  # It is True in the recorder too, so the marks of episodes have the same effect.
 
     def __init__(self, robot: Robot, ticks: RecordedTicks) -> None:
         self._robot, self._ticks = robot, ticks
@@ -268,7 +274,7 @@ class _PlantDifference:
 class _Comparison:
     """A listener of a replay that compares each tick with the recorded one, bit by bit, except computing times."""
 
-    keeps_episodes = True  # The recorder has set this too.
+    keeps_episodes = True  # It is True in the recorder too, so the marks of episodes have the same effect.
 
     def __init__(self, about: About, ticks: RecordedTicks) -> None:
         self._ticks, self._packer = ticks, TickPacker(about.arms, about.joints)
@@ -288,7 +294,10 @@ class _Comparison:
                 self._difference = f"{tick.now - self._ticks.start.now:.6f} s: {found}"
 
     def finish(self) -> str | None:
-        """Return the first difference after the replay, or None. A recorded tick that was not replayed is one too."""
+        """Return the first difference, or None, when the replay has ended.
+
+        A recorded tick that was not replayed is a difference too.
+        """
         if self._difference is None and self._ticks.next is not None:
             return f"{self._ticks.next.now - self._ticks.start.now:.6f} s: a tick was recorded only"
         return self._difference

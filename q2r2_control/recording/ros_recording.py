@@ -1,7 +1,7 @@
 """Reads a recording of the ROS nodes as if one loop had made it.
 
 A tick is a tick of the controller's node, with the newest joint states, flags of the arms and targets that had been
-received by then. Its reference is the one with the same time.
+received by then. Its reference is the reference with the same time.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import SIDES, Array
 
 _CLOCK_SET = 0.5  # The times of a reference and a tick differ by this much only if the clock was set between them [s].
-_SAME = 1e-6  # The times of one tick may differ by their rounding [s].
+_SAME = 1e-6  # Times that differ by at most this belong to the same tick; they may be rounded differently [s].
 
 
 def open_recording(path: Path) -> Recording:
@@ -66,7 +66,7 @@ class RosRecording(Recording):
 
     def _topic_of(self, camera: str) -> str:
         topic = parse_config(self.about.cell, f"{self.file}: its cell").cameras[camera].topic
-        if topic is None:  # A device, which the recorder has read itself.
+        if topic is None:  # The camera is a device that the recorder itself reads.
             return super()._topic_of(camera)
         if not names.is_compressed(topic):
             raise RecordingError(
@@ -76,7 +76,7 @@ class RosRecording(Recording):
         return topic
 
     def _time_of(self, picture: Message) -> int:
-        # The recorder has read devices itself. The clock of another sender may be a different one.
+        # The recorder itself reads devices, so it is their sender. Another sender may have another clock.
         return picture.sent if self.topic(picture) in self._device_topics else picture.time
 
     @cached_property
@@ -90,15 +90,15 @@ class _Tick:
     time: int  # The time of day of its receipt [ns].
     now: float  # The controller's time [s].
     row: Rows  # (1,), filled with the numbers that were known by then.
-    samples: list[Array]  # The numbers of SAMPLE_FIELDS of samples that were received since the last tick.
+    samples: list[Array]  # The samples that were received since the last tick, each with the numbers of SAMPLE_FIELDS.
     events: list[Event]  # The events since the last tick.
 
 
 class RosTicks:
-    """Makes ticks of the messages of a set of nodes."""
+    """Makes ticks from the messages of a set of nodes."""
 
     def __init__(self, epoch: int, robot: Robot) -> None:
-        """``epoch`` [ns] is the time at which times of ticks begin, by the clock of the messages."""
+        """``epoch`` [ns] is the time from which the times of ticks are counted, by the clock of the messages."""
         self._robot, self._epoch, self._joint_names = robot, epoch, robot.joint_names
         self._arms = arms = tuple(robot.arms)
         self._fields, self._type = names.tick_fields(arms), tick_type(len(arms), len(robot.joint_names))
@@ -106,7 +106,7 @@ class RosTicks:
         self.joints = np.full((3, len(robot.joint_names)), np.nan)  # The newest q, v and tau.
         self._known = np.zeros(len(robot.joint_names), dtype=bool)  # True for joints that were measured.
         self._flags = np.full((len(arms), len(names.ARM_FIELDS)), np.nan)
-        self._targets: dict[int, tuple[int, Array]] = {}  # By the arm's place, the time of receipt [ns] and the pose.
+        self._targets: dict[int, tuple[int, Array]] = {}  # By the arm's index, the time of receipt [ns] and the pose.
         self._samples: list[Array] = []
         self._events: list[Event] = []
         self._due: deque[_Tick] = deque()  # Ticks that wait for their references.
@@ -127,7 +127,7 @@ class RosTicks:
 
     @property
     def topics(self) -> frozenset[str]:
-        """Return the topics that ticks are made of."""
+        """Return the topics from which ticks are made."""
         return frozenset(self._handlers)
 
     def add_messages(self, messages: Iterable[tuple[str, Message]]) -> TickChunk:
@@ -200,7 +200,7 @@ class RosTicks:
         self._samples, self._events = [], []
 
     def _whole_ticks(self) -> Iterator[_Tick]:
-        """Yield the ticks whose reference came.
+        """Yield the ticks whose reference has been received.
 
         Samples and events of a tick whose reference was lost go to the next tick.
         """
@@ -226,7 +226,10 @@ class RosTicks:
             yield tick
 
     def _is_older(self, reference: float, tick: float) -> bool:
-        """Return whether the tick of the oldest reference, of time ``reference`` [s], is missing."""
+        """Return whether the oldest waiting reference belongs to no tick: it is older than the oldest waiting tick.
+
+        ``reference`` and ``tick`` are their times [s].
+        """
         if abs(reference - tick) < _CLOCK_SET:
             return reference < tick - _SAME
         # The clock was set between the two, forward or back. Other ticks and references tell which of them is later.

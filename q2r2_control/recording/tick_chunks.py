@@ -14,17 +14,17 @@ from q2r2_control.recording.messages import SAMPLES, STATE, TEXT, TICK, Message,
 from q2r2_control.recording.tick_rows import SAMPLE_FIELDS, Rows, tick_type
 from q2r2_control.types import Array
 
-_FEWEST = 200  # Ticks are read in groups of more than this, since NumPy takes as long for one as for many.
+_FEWEST = 200  # Ticks are read in groups of more than this, since NumPy takes as long for one tick as for many.
 
 
 @dataclass(frozen=True)
 class TickChunk:
     """A group of n ticks that follow each other; n may be 0."""
 
-    rows: Rows  # (n,) of tick_type.
+    rows: Rows  # (n,) Rows with the dtype that tick_type returns.
     times: npt.NDArray[np.int64]  # (n,) The times of day [ns].
-    samples: Array  # (m, numbers of SAMPLE_FIELDS).
-    states: dict[int, str]  # JSON, by the number of the tick.
+    samples: Array  # (m, len(SAMPLE_FIELDS)) The m samples that the n ticks took.
+    states: dict[int, str]  # By the number of a tick, its state as JSON.
 
     @property
     def numbers(self) -> npt.NDArray[np.int64]:
@@ -32,7 +32,10 @@ class TickChunk:
         return np.asarray(self.rows["index"].astype(np.int64))
 
     def events(self) -> dict[int, list[Event]]:
-        """Return the events by number of their tick. Raises ValueError, KeyError and TypeError for other data."""
+        """Return the events by the number of their tick.
+
+        Raises ValueError, KeyError and TypeError if a state is not JSON or has other fields.
+        """
         found = {number: json.loads(text).get("events", ()) for number, text in self.states.items()}
         return {number: [Event.from_json(event) for event in events] for number, events in found.items()}
 
@@ -41,7 +44,7 @@ class TickAssembly:
     """Collects messages, and gives the ticks whose messages are complete.
 
     Messages have the numbers of their ticks and come in the order of time. Therefore a tick is complete when the next
-    one comes. The last one is complete when there are no more messages.
+    tick comes. The last tick is complete when there are no more messages.
     """
 
     topics = (TICK, SAMPLES, STATE)

@@ -1,4 +1,7 @@
-"""Packs a tick: one row of float64, in the order in which a tick computes its numbers, its samples and its state."""
+"""Packs a tick into three parts: one row of float64 numbers, its samples, and its state as JSON.
+
+The numbers of a row are in the order in which a tick computes them.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +26,7 @@ Rows = npt.NDArray[np.void]
 NOT_MEASURED = -math.inf  # Stands for the opening of a gripper that the plant does not measure.
 COMMAND_MODES, STATUSES = tuple(CommandMode), tuple(StepStatus)
 HAND_FAULTS = (None, *HandFault)
-UNSOLVED_MAX = 2**53  # The limit of the bit mask of unsolved substeps: a float64 has bits for no more.
+UNSOLVED_MAX = 2**53  # The bit mask of unsolved substeps is at most this: a float64 has no more bits for integers.
 SAMPLE_FIELDS = (
     *("tick", "hand", "pose_stamp", "inputs_stamp", "x", "y", "z", "qx", "qy", "qz", "qw"),
     *QUEST_CONTROLS.names,
@@ -33,8 +36,9 @@ ARM_FIELDS = (
     *("opening", "engaged", "slip", "slip_angle", "wanted", "commanded", "rejected", "gripper_held", "holding"),
     *("intervention", "policy"),
 )
-ARM_POSES = ("filtered_hand", "target", "tool")  # Zeros stand for no pose. The tool is at the reference.
-NOT_REPLAYED = ("compute_time", "solve_time", "tool")  # The writer computes the tool from the reference.
+ARM_POSES = ("filtered_hand", "target", "tool")  # Zeros stand for no pose. ``tool`` is the tool pose at the reference.
+# A replay does not compare these numbers. The writer, and not the loop, computes ``tool`` from the reference.
+NOT_REPLAYED = ("compute_time", "solve_time", "tool")
 _LOOP = ("index", "now", "dt", "connected", "following", "samples", "state_stamp", "external")
 _MEASURED = ("q", "v", "tau", "tau_external")
 _CONTROLLER = ("step", "unsolved", "status", "certified", "fallback", "closest_distance", "margin", "slack")
@@ -48,7 +52,7 @@ _NO_POSE = (0.0,) * len(POSE_FIELDS)  # Its quaternion has length 0, so it is no
 class PackedTick(NamedTuple):
     """One tick, on its way to the process that writes it."""
 
-    row: bytes  # A row of tick_type.
+    row: bytes  # A row with the dtype that tick_type returns.
     samples: bytes  # The float64 numbers of SAMPLE_FIELDS, sample after sample.
     state: str  # JSON of the state if it changed, or if there are events, chunks or extra controls; otherwise empty.
 
@@ -87,7 +91,7 @@ def numbers_in(rows: Rows) -> Array:
 
 
 def targets_or_tools(rows: Rows) -> Array:
-    """Return the operator's targets (n, arms, 7), or the tools at the reference where there is no target."""
+    """Return the operator's targets (n, arms, 7), or the tool poses at the reference where there is no target."""
     targets, tools = rows["arms"]["target"], rows["arms"]["tool"]
     return np.where(targets.any(axis=2, keepdims=True), targets, tools)
 
@@ -102,7 +106,7 @@ class TickPacker:
         self._state: dict[str, Any] | None = None  # The last state that was packed.
 
     def repeat_state(self) -> None:
-        """Pack the state and the start again with the next tick, since the last one was lost."""
+        """Pack the state and the start of the run again with the next tick, since the last packed tick was lost."""
         self._state = None
 
     def pack(self, number: int, tick: Tick) -> PackedTick:
@@ -138,7 +142,7 @@ class TickPacker:
         )
 
     def _state_text(self, tick: Tick, samples: Sequence[HandSample]) -> str:
-        """Return fields with names, as JSON; the text is empty if nothing changed."""
+        """Return the state of a tick as JSON; the text is empty if nothing changed since the last tick."""
         report = tick.reference.report
         state: dict[str, Any] = {
             "states": tick.states,

@@ -27,8 +27,8 @@ from q2r2_control.types import QUEST_CONTROLS, SIDES, Array
 if TYPE_CHECKING:
     from q2r2_control.robot.robot import Robot
 
-FLUSH_PERIOD = 0.5  # Time between two flushes of the file, which is lost at most if this process is killed [s].
-READ_AHEAD = 4 << 20  # Size of the data that was read and may wait to be written [bytes].
+FLUSH_PERIOD = 0.5  # Time between two flushes of the file [s]. If this process is killed, no more than that is lost.
+READ_AHEAD = 4 << 20  # Largest size of the data that was read and waits to be written [bytes].
 _NICENESS = 10  # The loop has a higher priority if there are not enough processors.
 _ROUNDING = 1e-6  # Share of a period by which rounding may make a message seem to come too early.
 _LAST_TIME = (2**31 - 1) * NANOSECONDS  # The latest time of a stamp [ns].
@@ -39,12 +39,12 @@ _HAND, _POSE_STAMP, _INPUTS_STAMP, _X, _BUTTONS = (
 
 @dataclass(frozen=True)
 class RecordedRobot:
-    """The robot's data for messages; unlike the robot itself it can be sent to another process."""
+    """The robot's data that messages need. Unlike the robot itself, it can be sent to another process."""
 
     model: pin.Model
     joints: tuple[str, ...]
     arms: tuple[str, ...]
-    tools: tuple[int, ...]  # The frame of each arm's tool.
+    tools: tuple[int, ...]  # The id of each arm's tool frame.
     urdf: str
 
     @classmethod
@@ -53,7 +53,7 @@ class RecordedRobot:
         return cls(robot.model, tuple(robot.joint_names), tuple(robot.arms), tools, robot.urdf)
 
     def tool_poses(self, postures: Array) -> Array:
-        """Return the tools' poses (n, arms, 7) x y z [m] qx qy qz qw in the world, at joint positions (n, joints)."""
+        """Return the tool poses (n, arms, 7) x y z [m] qx qy qz qw in the world, at ``postures`` (n, joints)."""
         data = self.model.createData()
         poses = np.empty((len(postures), len(self.tools), len(POSE_FIELDS)))
         for q, row in zip(postures, poses, strict=True):
@@ -64,14 +64,17 @@ class RecordedRobot:
 
 
 class TickEncoder:
-    """Makes messages of ticks, in their order. ``epoch`` [ns] is the time of day at which the run began."""
+    """Makes messages from ticks, in the order of the ticks.
+
+    ``epoch`` [ns] is the time of day at which the run began.
+    """
 
     def __init__(
         self, robot: RecordedRobot, topics: dict[str, Topic], epoch: int, topic_rate: float | None = None
     ) -> None:
-        """``topic_rate`` [Hz] is that of the standard topics, which repeat numbers of ticks; None means every tick."""
+        """``topic_rate`` [Hz] is the rate of the standard topics, which repeat numbers of ticks; None: every tick."""
         self._robot, self._topics, self._epoch, self._topic_rate = robot, topics, epoch, topic_rate
-        self._slot = -1.0  # The number of the period of the newest tick with standard topics.
+        self._slot = -1.0  # The number of the topics' period in which the newest tick was.
         self._type = tick_type(len(robot.arms), len(robot.joints))
         self._start: float | None = None  # The time of the loop's clock at the start of the run [s].
         self._stamps: dict[tuple[float, int], float] = {}  # The last stamps of each hand's poses and inputs.
@@ -123,7 +126,10 @@ class TickEncoder:
         return first + [message for of_tick in made.messages for message in of_tick]
 
     def _due(self, now: Array) -> npt.NDArray[np.int64]:
-        """Return which ticks at ``now`` (n,) [s] have standard topics: the first tick in each period of the topics."""
+        """Return the indices of the ticks that get messages on the standard topics.
+
+        They are the first ticks in each period of the topics. The ticks have the times ``now`` (n,) [s].
+        """
         if self._topic_rate is None:
             return np.arange(len(now))
         assert self._start is not None
@@ -133,13 +139,16 @@ class TickEncoder:
         return np.flatnonzero(np.diff(newest) > 0.0)
 
     def _times(self, seconds: Array) -> npt.NDArray[np.int64]:
-        """Convert times of the loop's clock [s] to times of day [ns]; NaN becomes the start, others are limited."""
+        """Convert times of the loop's clock [s] to times of day [ns].
+
+        NaN becomes the start of the run. Times that do not fit into a stamp become the nearest time that does.
+        """
         assert self._start is not None
         passed = np.clip(np.nan_to_num(seconds - self._start) * NANOSECONDS, -_LAST_TIME, _LAST_TIME)
         return np.clip(np.rint(passed).astype(np.int64) + self._epoch, 0, _LAST_TIME)
 
     def _add_samples(self, made: _Batch, at: int, samples: Array) -> None:
-        """Add the samples of a tick as the loop got them, and new poses and inputs as messages of the nodes."""
+        """Add the samples of a tick as the loop got them. Add each new pose and new inputs as a ROS message too."""
         for sample in samples:
             hand = SIDES[int(sample[_HAND])]
             made.add(messages.SAMPLES, [at], [messages.array(sample)])
@@ -155,7 +164,7 @@ class TickEncoder:
                 made.add(messages.hand_buttons(hand), [at], [messages.serialized(messages.HAND_INPUTS, inputs)])
 
     def _is_new(self, sample: Array, stamp: int) -> bool:
-        """Return whether a sample of a hand has another stamp than the one before."""
+        """Return whether a sample differs in the column ``stamp`` from the hand's sample before."""
         before = self._stamps.get((sample[_HAND], stamp))
         self._stamps[sample[_HAND], stamp] = sample[stamp]
         return bool(before != sample[stamp])
@@ -193,20 +202,21 @@ class RecordingSetup:
     about: About
     topics: tuple[Topic, ...]  # The topics of the file.
     robot: RecordedRobot | None = None  # The robot of packed ticks; None if only messages are sent.
-    topic_rate: float | None = None  # The rate of the standard topics that are made of ticks [Hz]; None: every tick.
+    topic_rate: float | None = None  # The rate of the standard topics that repeat ticks [Hz]; None for every tick.
 
 
 class Written(NamedTuple):
-    """An answer of the process: the numbers of sent ticks and messages that are in the file."""
+    """An answer of the process: how many of the ticks and messages that it got are in the file."""
 
     ticks: int = 0
     messages: int = 0  # Messages that were sent as messages, not as ticks.
 
 
 def read_ahead(requests: Iterator[Any], room: int = READ_AHEAD) -> Iterator[Any]:
-    """Yield the same requests, read by a thread as they come.
+    """Yield the requests, which a thread reads as they come.
 
-    Requests that were read are written even if the run is killed. Requests of ``room`` [bytes] may wait.
+    Requests that were read are written even if the run is killed. The thread reads at most about ``room`` [bytes]
+    ahead.
     """
     waiting: SimpleQueue[tuple[Any, int]] = SimpleQueue()
     free = Condition()
@@ -232,7 +242,11 @@ def read_ahead(requests: Iterator[Any], room: int = READ_AHEAD) -> Iterator[Any]
 
 
 def main(requests: Iterator[Any], answer: Callable[[Written], None]) -> None:
-    """Write one recording, from lists of packed ticks or messages. Raises :class:`OSError`; written data is kept."""
+    """Write one recording.
+
+    The requests are a :class:`RecordingSetup`, lists of packed ticks or of messages, and a :class:`Conclusion`. Raises
+    :class:`OSError`; the file then keeps the data that was written before.
+    """
     requests = read_ahead(requests)
     setup = next((request for request in requests if request is not None), None)
     if not isinstance(setup, RecordingSetup):

@@ -47,7 +47,7 @@ class Histogram:
         self._largest = 0.0
 
     def add(self, duration: float) -> None:
-        """Count one duration [s]. A negative one counts as zero, and one that is not finite does not count."""
+        """Count one duration [s]. A negative duration counts as zero. A duration that is not finite does not count."""
         if math.isfinite(duration):
             self._counts[int(min(max(duration / self._bin, 0.0), _BINS - 1))] += 1
             self._largest = max(self._largest, duration)
@@ -67,7 +67,8 @@ class Histogram:
 class TorqueSummary:
     """Figures of a run in torque mode."""
 
-    off_reference_s: dict[str, float]  # By arm, the time for which it was farther away than the impedance's error clip.
+    # By arm, the time for which its distance from the reference was larger than the impedance's error clip.
+    off_reference_s: dict[str, float]
     min_measured_distance_mm: float | None = None  # None if there is no monitored pair.
     measured_closest_pair: tuple[str, str] | None = None
     pressed_pairs: list[tuple[str, str]] = field(default_factory=list)  # Pairs that the wall has pushed apart.
@@ -78,13 +79,13 @@ class TorqueSummary:
 
     @property
     def met(self) -> bool:
-        """Whether measured links have met that may not touch, so that the measurement breaks the promise."""
+        """Whether two links that must not touch have touched, by the measured joint positions."""
         return (self.min_measured_distance_mm or 0.0) < 0.0
 
     def add(self, dt: float, impedance: ImpedanceReport, wall: WallReport) -> None:
         """Count one tick of ``dt`` [s]."""
         least = math.inf if self.min_measured_distance_mm is None else self.min_measured_distance_mm
-        # The distance is NaN if nothing was measured. It is then not less, and the tick counts as held.
+        # The distance is NaN if nothing was measured. The comparison is then False, and the tick counts as held.
         if 1e3 * wall.closest_distance < least:
             self.min_measured_distance_mm = 1e3 * wall.closest_distance
             self.measured_closest_pair = wall.closest_pair
@@ -106,9 +107,9 @@ class ArmSummary:
     position_error_mm_rms: float | None = None  # None if the arm was never engaged.
     rotation_error_deg_rms: float | None = None
     gripper_changes: int = 0
-    gripper_held_s: float = 0.0  # Time for which something near the fingers held the gripper up.
-    gripper_held_by: tuple[str, str] | None = None  # Names of the geometries of the last pair that did so.
-    object_held_s: float | None = None  # Time for which the gripper held its object; None if it has none.
+    gripper_held_s: float = 0.0  # Time for which a body near the fingers prevented the wanted opening of the gripper.
+    gripper_held_by: tuple[str, str] | None = None  # The pair of geometries that prevented it last.
+    object_held_s: float | None = None  # Time for which the gripper held its object; None if the arm has no object.
     slip_mm_max: float = 0.0  # Largest slip of the target in one engagement.
     slip_deg_max: float = 0.0
     yielded_mm_max: float = 0.0  # Largest displacement of the target by the admittance, in position mode.
@@ -116,7 +117,7 @@ class ArmSummary:
     policy_s: float = 0.0  # Time for which a policy moved the arm.
     interventions: int = 0  # Number of times that a hand took over from a policy.
     intervention_s: float = 0.0
-    # Distance of the measured tool from the reference's tool at the end; None if it was not measured.
+    # Distance at the end between the measured tool and the tool at the reference; None if it was not measured.
     end_error_mm: float | None = None
 
     @property
@@ -133,21 +134,21 @@ class RunSummary:
     duration_s: float
     loop_rate_hz: float
     real_time_factor: float | None  # Simulated seconds per second of the computer's clock; None in real time.
-    tick_us: Percentiles  # From polling the input to the command, without the plant.
-    lateness_us: Percentiles  # From when a tick was due to its beginning; None in simulated time.
-    input_to_command_ms: Percentiles  # From the receipt of a sample to the command to which it led.
+    tick_us: Percentiles  # Time from polling the input to the command, without the plant.
+    lateness_us: Percentiles  # Time by which ticks began after they were due; None in simulated time.
+    input_to_command_ms: Percentiles  # Time from the receipt of a sample to the command that follows from it.
     arms: dict[str, ArmSummary]
     min_distance_mm: float | None  # None if there is no monitored pair.
     closest_pair: tuple[str, str] | None
     max_velocity_ratio: float
     max_acceleration_ratio: float
-    min_position_margin_rad: float  # In addition to the configured margin.
+    min_position_margin_rad: float  # Least distance from a position limit, minus the configured margin.
     fallback_ticks: int
     uncertified_ticks: int
     rejected_targets: int
     overruns: int  # Ticks that began more than a period after they were due.
     missed_ticks: int  # Ticks that were due and did not come, because the loop was late.
-    stretched_s: float  # Time by which the motion became late for that reason.
+    stretched_s: float  # Time by which the motion became late because the loop was late.
     at_rest: bool  # Whether the reference was at rest when the run ended.
     torque: TorqueSummary | None  # None in position mode.
     events: list[Event]
@@ -167,7 +168,7 @@ class RunSummary:
             broken.append(f"measured {met} met: {self.torque.min_measured_distance_mm:.1f} mm")
         if self.uncertified_ticks:
             broken.append(f"{self.uncertified_ticks} ticks without a certificate")
-        # Both arms report one error of a policy, which is named once.
+        # Both arms report the same error of a policy. It is named only once.
         roots = (event.reason.root for event in self.events)
         broken += dict.fromkeys(sentence(root) for root in roots if root.kind is CommonReason.POLICY_UNUSABLE)
         if not self.at_rest:

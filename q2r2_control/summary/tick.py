@@ -26,7 +26,7 @@ class RunStart:
 
 @dataclass(slots=True)
 class Tick:
-    """All data of one tick, for the listeners. Nobody changes it."""
+    """All data of one tick, for the listeners. They must not change it."""
 
     t: float  # Time since the start of the run [s].
     start: RunStart
@@ -62,11 +62,14 @@ class Tick:
         return self.states[arm] == ArmState.POLICY
 
     def tracking_error(self, arm: str) -> tuple[float, float]:
-        """Return the distance [m] and the angle [rad] of an arm's tool from its target; NaN if it has none."""
+        """Return the distance [m] and the angle [rad] of an arm's tool from its target.
+
+        Both are NaN if the arm has no target.
+        """
         target = self.targets[arm].pose
         if target is None:
             return math.nan, math.nan
         tool, asked = pin.SE3ToXYZQUATtuple(self.tools[arm]), pin.SE3ToXYZQUATtuple(target)
         apart = min(math.dist(tool[3:], asked[3:]), math.dist(tool[3:], [-value for value in asked[3:]]))
-        # q and -q are the same rotation.
+        # A quaternion and its negative are the same rotation, so ``apart`` is the smaller of both distances.
         return math.dist(tool[:3], asked[:3]), 4.0 * math.asin(min(0.5 * apart, 1.0))

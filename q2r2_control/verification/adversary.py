@@ -1,4 +1,4 @@
-"""Hostile streams of targets, drawn at random from a seed."""
+"""Hostile streams of targets, which are random but the same for the same seed."""
 
 from __future__ import annotations
 
@@ -26,7 +26,8 @@ class Request(NamedTuple):
 Stream = Callable[[int, Array], Request]
 _TABLE = 0.2  # Height of the table's top, on which tools press, as in the shipped cells [m].
 _TICK = 0.001  # Tick at which work motions are played [s].
-# Factors on the first settings to which gains change. Arms that separation slows long before contact test little.
+# A gain changes to its first value times one of these factors. A small separation gain slows the arms long before
+# contact, which tests little.
 _GAIN_SHARES = {
     **dict.fromkeys(("position_gain", "rotation_gain", "posture_gain", "max_linear_speed"), (0.1, 1.0, 2.0)),
     **{"separation_gain": (0.5, 1.0, 4.0), "stretch_gain": (0.1, 1.0, 10.0), "posture_weight": (0.1, 1.0, 100.0)},
@@ -35,7 +36,7 @@ _WORKSPACE = np.array([[-0.6, -1.1, -0.1], [1.1, 1.1, 1.4]])  # Lower and upper 
 
 
 class Adversary:
-    """Draws streams for the arms of one robot. Every name in :attr:`names` is a method that makes one."""
+    """Makes random streams of targets for the arms of one robot. There is a method for each name in :attr:`names`."""
 
     names = (
         *("hold", "stay_home", "teleport", "crossing", "same_point", "unreachable", "into_the_table", "random_walk"),
@@ -55,7 +56,7 @@ class Adversary:
         return made
 
     def pose(self) -> pin.SE3:
-        """Draw a pose of a tool anywhere around the cell."""
+        """Return a random tool pose anywhere around the cell."""
         return pin.SE3(pin.exp3(self._random.normal(size=3) * 1.5), self._random.uniform(*_WORKSPACE))
 
     def _constant(self, targets: dict[str, Any]) -> Stream:
@@ -79,7 +80,7 @@ class Adversary:
         return self._renewed(int(self._random.integers(5, 800)), self._poses)
 
     def _postures(self) -> Stream:
-        """Return a stream of the tools' poses in random postures, many of them at joint limits."""
+        """Return a stream of tool poses that belong to random postures with many joints at their limits."""
 
         def poses() -> dict[str, Any]:
             q = self._random.uniform(self._robot.position_lower, self._robot.position_upper)
@@ -101,7 +102,7 @@ class Adversary:
         return stream
 
     def _crossing(self) -> Stream:
-        """Return a stream that sends each tool to the place where another tool started."""
+        """Return a stream that sends each tool to the pose that another tool has at home."""
         return self._constant({arm: self._home[self._others[arm]] for arm in self._arms})
 
     def _same_point(self) -> Stream:
@@ -118,7 +119,7 @@ class Adversary:
         return self._constant(self._moved(lambda: np.array([*self._random.uniform(-0.3, 0.3, size=2), -depth])))
 
     def _random_walk(self) -> Stream:
-        """Return a random walk that is faster than an arm can move, and is drawn back towards home."""
+        """Return a random walk that is faster than an arm can move, and that tends back towards home."""
         speed, turn = self._random.uniform(0.001, 0.05), self._random.uniform(0.0, 0.1)
         poses = {arm: pose.copy() for arm, pose in self._home.items()}
 
@@ -230,7 +231,7 @@ class Adversary:
 
 
 class HostileChanges:
-    """Draws changes during motion: openings of grippers, grasps, and settings. A draw may be None, for no change."""
+    """Makes random changes during motion: openings of grippers, grasps, and settings. None means no change."""
 
     def __init__(self, controller: CartesianController, seed: int) -> None:
         self._settings = controller.settings
@@ -238,7 +239,7 @@ class HostileChanges:
         self._openings, self._grasps, self._changes = (np.random.default_rng([seed, stream]) for stream in (3, 4, 5))
 
     def opening(self) -> tuple[str, Interval] | None:
-        """Draw an arm and an interval of its opening. Most of them are near the last one, so that many have to grow."""
+        """Return a random arm and a random interval of its gripper's opening, or None for no change."""
         random = self._openings
         if random.random() > 0.05:
             return None
@@ -247,13 +248,16 @@ class HostileChanges:
         return arm, (ALL_OF_THE_WAY, (0.0, 0.0), (first, second), (0.0, second))[kind]
 
     def grasp(self) -> tuple[str, bool] | None:
-        """Draw an arm and whether it holds its object from this tick on, at any speed, for a short or a long time."""
+        """Return a random arm, and whether it holds its object from this tick on, or None for no change.
+
+        The arms may move at any speed at this tick, and the next change may come soon or late.
+        """
         if not self._with_object or self._grasps.random() > 0.02:
             return None
         return str(self._grasps.choice(self._with_object)), bool(self._grasps.random() < 0.7)
 
     def settings(self) -> dict[str, float] | None:
-        """Draw new settings by name: greater or smaller distances, and other gains."""
+        """Return a new value of one setting by its name, or None for no change: another distance or another gain."""
         random = self._changes
         if random.random() > 0.01:
             return None

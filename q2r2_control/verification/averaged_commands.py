@@ -1,4 +1,4 @@
-"""The promises about commands that are means of the references, for a cell with a limit of jerk."""
+"""Checks the promises about averaged commands. A cell with a jerk limit commands moving averages of its references."""
 
 from __future__ import annotations
 
@@ -13,15 +13,16 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 from q2r2_control.verification.promises import MeasuredDistances
 
-_PERIOD = 0.001  # Period of the checked commands [s]. Other ticks are not regular.
+_PERIOD = 0.001  # Only ticks of exactly this duration, which are called regular, are checked [s].
 _EXACT = 1e-12  # Differences of times below this are rounding [s].
 
 
 class AveragedCommands:
     """Averages one reference after another, as a drive does, and measures the commands.
 
-    Jerk and acceleration are differences of commands in ticks of exactly one period. Distances are those of commands
-    whose whole window had the same bodies: fingers and objects that have just changed count for the newest reference.
+    Jerk and acceleration are differences of commands in ticks of exactly one period. Distances are checked only if the
+    bodies did not change in the command's whole window. After a change of fingers or objects, the new bodies are those
+    of the newest reference, and not those of the command.
     """
 
     def __init__(self, robot: Robot, settings: ControllerSettings, measured: MeasuredDistances) -> None:
@@ -48,7 +49,7 @@ class AveragedCommands:
         self._kept.clear()
 
     def update(self, q: Array, v: Array, h: float) -> dict[str, float]:
-        """Average a reference ``h`` [s] after the last one; returns values of promises by key."""
+        """Average a reference ``h`` [s] after the last one. Return the values to check, by the key of their promise."""
         if abs(h - _PERIOD) > _EXACT:
             self._regular = 0
             self._kept.clear()
@@ -67,7 +68,7 @@ class AveragedCommands:
     def least_margin(self) -> float | None:
         """Return the least distance of a pair at the newest command, minus its kept distance [m].
 
-        None if something has changed within its window.
+        None if a body has changed, or if a tick was not regular, within the command's window.
         """
         if len(self._kept) < self._window:
             return None

@@ -24,9 +24,11 @@ from q2r2_control.verification.tool_speeds import MeasuredToolSpeeds
 
 _NEWEST = 5000  # Number of ticks whose accelerations are kept.
 _ROUNDING = 4.0 * np.finfo(np.float64).eps  # Rounding error of a difference, relative to the numbers.
-_BETWEEN_SHARE, _BETWEEN_SAMPLES = 0.02, 4  # Share of sampled ticks, and postures between this tick and the last one.
-_STOP_SHARE, _STOP_SAMPLES = 0.005, 41  # Share of sampled ticks, and postures during a full stop.
-_NEAR, _NEAR_SHARE = 1e-3, 10.0  # Below this margin [m], so many times as many ticks are sampled.
+# In a random share of the ticks, this number of postures between the last tick and this one is measured.
+_BETWEEN_SHARE, _BETWEEN_SAMPLES = 0.02, 4
+# In a random share of the ticks, this number of postures during a full stop is measured.
+_STOP_SHARE, _STOP_SAMPLES = 0.005, 41
+_NEAR, _NEAR_SHARE = 1e-3, 10.0  # If the margin is below the first number [m], both shares are larger by this factor.
 
 
 def time_of(dt: Any) -> float:
@@ -39,8 +41,8 @@ class Contract:
 
     A start outside the limits, too fast or in penetration is allowed. For the limits that it breaks, the promise is to
     recover, and separate margins check that. Coal measures distances between ticks and during full stops, in ticks that
-    ``random`` draws, or in all ticks with ``sample_all``. A tick longer than one substep moves along several parabolas.
-    The reference does not show these, so only its end is checked.
+    ``random`` chooses, or in all ticks if ``sample_all`` is True. In a tick longer than one substep, the joints move
+    along several parabolas. The reference does not show them, so only its end is checked.
     """
 
     def __init__(
@@ -116,7 +118,10 @@ class Contract:
         self._measured.kept = kept  # This tick has to prove these distances.
 
     def _note_objects(self) -> None:
-        """Take over the kept distances of objects. While a pair counts, its distance may fall only to the settings'."""
+        """Take the kept distances of held objects from the controller.
+
+        While a pair counts, check that its kept distance does not fall below the distance in the settings.
+        """
         held = self._controller.object_distances
         counted = np.isfinite(self._measured.held) & np.isfinite(held)
         if counted.any():
@@ -211,7 +216,7 @@ class Contract:
             self._note("parabola", 0.0 if self._parabola else self._off_the_stop(q, v, h))
 
     def _off_the_stop(self, q: Array, v: Array, h: float) -> float:
-        """Return the deviation of a tick of ``h`` [s] from the stop that was known before it."""
+        """Return the deviation of a tick of ``h`` [s] from the certified stop that was known before the tick."""
         stop_q, stop_v = self._braked(self._q, self._v, self._stop, h)
         return max(float(np.abs(stop_q - q).max()), float(np.abs(stop_v - v).max()))
 
@@ -262,7 +267,10 @@ class Contract:
         self._least = least
 
     def _check_tools(self, q: Array, v: Array) -> None:
-        """Check the tools' speeds at ``q`` [rad] and ``v`` [rad/s], which are (nv,) or have a row for each instant."""
+        """Check the speeds of the tools at ``q`` [rad] and ``v`` [rad/s].
+
+        Both are (nv,), or have one such row for each instant.
+        """
         if self._tool_limit is not None and self._certain:
             self._note("tool_speed", self._tools.fastest(q, v) / self._tool_limit)
 

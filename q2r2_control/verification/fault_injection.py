@@ -24,12 +24,12 @@ from q2r2_control.verification.adversary import Adversary, Stream
 # "corner" is a random vertex for some ticks. "again" is the last answer, even if the box has changed since.
 # "no_rows" is the QP's solution without separation rows, which goes straight to the targets.
 ATTACKS = ("towards_nearest", "corner", "again", "no_rows")
-_PATIENCE = 200  # Most ticks for which one pair or one corner is pursued.
-_CANDIDATES = 4  # Number of pairs with the least margins, of which one is pursued.
+_PATIENCE = 200  # Largest number of ticks for which an attack goes on with the same pair or the same corner.
+_CANDIDATES = 4  # An attack chooses one of so many pairs with the least margins.
 
 
 class WorstSolver:
-    """Makes the answers of attacks. Coal measures the distances, and Pinocchio their gradients."""
+    """Makes the answers of a solver that attacks. Coal measures the distances, and Pinocchio their gradients."""
 
     def __init__(self, robot: Robot, random: np.random.Generator) -> None:
         self._random = random
@@ -56,7 +56,7 @@ class WorstSolver:
         return self._last
 
     def _gradient(self, q: Array, kept: Array) -> Array:
-        """Return the gradient (nv,) of the distance of a pair with one of the least margins [m/rad]."""
+        """Return the gradient (nv,) of the distance of one pair, which has one of the least margins [m/rad]."""
         model, geometries = self._distances.model, self._distances.geometry
         data, geometry_data = self._distances.data, self._distances.geometry_data
         pin.computeJointJacobians(model, data, q)
@@ -86,7 +86,7 @@ def untimed(solver: Solver, nv: int) -> Guard:
 
 
 class FaultySolver:
-    """A real solver that fails as :attr:`fault` says: one of ``FAULTS`` or ``ATTACKS``, or None for a healthy one.
+    """A real solver that fails as :attr:`fault` says: one of ``FAULTS`` or ``ATTACKS``, or None if it does not fail.
 
     Its solve times are invented, so that no result depends on the load of the machine. ``worst`` answers while
     :attr:`fault` is an attack that needs no solver, and uses ``q`` (nv,) [rad] and ``kept`` (p,) [m].
@@ -140,7 +140,7 @@ class Segment:
     ticks: int
     start: Start | None  # None if it continues from the end of the last segment.
     fault: str | None
-    fault_period: int  # The solver fails in every other period [ticks]. An attack lasts for the whole segment.
+    fault_period: int  # The solver fails in every second period of so many ticks. An attack lasts the whole segment.
     stream: Stream
     dt: Callable[[], Any]
 
@@ -197,13 +197,16 @@ def _ticks(timing: str, random: np.random.Generator) -> Callable[[], Any]:
 
 
 class Starts:
-    """Draws states to which a controller is reset."""
+    """Chooses random states to which a controller is reset."""
 
     def __init__(self, robot: Robot, kept: Array, random: np.random.Generator) -> None:
         self._robot, self._kept, self._random = robot, kept, random
 
     def draw(self, name: str) -> Start:
-        """Draw a start of the kind ``name``. The arms are at rest, except for the kinds "moving" and "too fast"."""
+        """Return a random start of the kind ``name``.
+
+        The arms are at rest, except for the kinds "moving" and "too fast".
+        """
         robot, random, nv = self._robot, self._random, self._robot.model.nv
         kinds = {"home": robot.home.copy, "anywhere": self._posture, "in penetration": self._in_penetration}
         q, v = kinds.get(name, self._apart)(), np.zeros(nv)
@@ -231,7 +234,10 @@ class Starts:
         return self._robot.home.copy()
 
     def _in_penetration(self) -> Array:
-        """Return a posture on the way from home to a random one in penetration, where a distance is just too small."""
+        """Return a posture in which a distance is just too small.
+
+        It lies on the straight line from home to a random posture in penetration.
+        """
         far = self._posture()
         for _ in range(50):
             if (self._robot.distance_values(far) < 0.0).any():

@@ -32,7 +32,7 @@ COUNTED = {
     "fallbacks": "certified stops executed",
 }
 STREAMS = ("walk", "limits", "other_arm", "oscillate", "random", "broken", "late", "stall")
-_MOST, _LONGEST = 8, 0.4  # Most actions in a chunk, and the longest duration of a chunk [s].
+_MOST, _LONGEST = 8, 0.4  # Largest number of actions in a chunk, and longest duration of a chunk [s].
 _STOPS = 1.0  # Time from the last action that counts until all arms are at rest [s].
 _PERIODS = (0.02, 0.1)  # Range of the time between two actions [s].
 _TOOLS = np.array([[-0.6, -1.1, -0.1], [1.1, 1.1, 1.4]])  # Coordinates of far targets for tools [m].
@@ -50,7 +50,10 @@ class _Segment(NamedTuple):
 
 
 class HostilePolicy:
-    """Draws actions at random. Most begin where the arms are, because others would be refused and move nothing."""
+    """Makes random actions.
+
+    Most of them begin where the arms are, because other actions would be refused and move nothing.
+    """
 
     def __init__(self, robot: Robot, random: np.random.Generator) -> None:
         self._robot, self._random = robot, random
@@ -72,7 +75,7 @@ class HostilePolicy:
         return found
 
     def draw(self, segment: _Segment, tick: Tick) -> tuple[Any, Any]:
-        """Draw actions and their times."""
+        """Return random actions and their times [s]. Streams of some kinds have invalid ones."""
         random, names = self._random, action_names(self._robot, segment.space)
         count = int(random.integers(1, _MOST + 1))
         period = random.uniform(*_PERIODS)
@@ -100,7 +103,7 @@ class HostilePolicy:
         return np.zeros(6 * len(self._robot.arms))
 
     def goal(self, stream: str, space: ActionSpace, step: float) -> Array:
-        """Draw the goal of a stream. In the space of tool motions, this is the motion of each action."""
+        """Return a random goal of a stream. In the space of tool motions, the goal is the motion of each action."""
         random, robot = self._random, self._robot
         q = self._posture()
         if stream == "limits":
@@ -217,7 +220,7 @@ class PolicySoak:
             self._send(tick)
 
     def _keep(self, key: str, margin: Margin, error: str) -> None:
-        """Keep the first break of a promise, with the tick before."""
+        """Keep the first violation of a promise, with the tick before it."""
         q, v = (
             (self._pipeline.robot.home,) * 2 if self._last is None else (self._last.reference.q, self._last.reference.v)
         )

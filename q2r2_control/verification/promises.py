@@ -79,7 +79,7 @@ class Margin:
         return kept
 
     def add(self, other: Margin) -> None:
-        """Add what another run has checked of the same promise. ``tick`` is that of the run with the worst value."""
+        """Add what another run has checked of the same promise. ``tick`` becomes the tick of the worst value."""
         self.checked += other.checked
         self.violations += other.violations
         self._keep_worst(other.worst, other.tick)
@@ -107,15 +107,15 @@ class MeasuredDistances:
         self.kept = kept
         self._robot = robot
         self._at_corners = deeper_at_corners(collision_model_of(robot), kept)
-        self._fingers: CoalDistances | None = None  # None if fingers may be anywhere on their way.
+        self._fingers: CoalDistances | None = None  # None if fingers may be anywhere between open and closed.
         objects = robot.objects.geometry.copy()
-        for pair in robot.collision_model.collisionPairs:  # These pairs come before those of objects.
+        for pair in robot.collision_model.collisionPairs:  # Only the pairs of objects remain.
             objects.removeCollisionPair(pair)
         self._of_objects = CoalDistances(robot.model, objects)
         self.forget()
 
     def forget(self) -> None:
-        """Forget openings and grasps: fingers may be anywhere on their way, and no object counts."""
+        """Forget openings and grasps. Fingers may then be anywhere between open and closed, and no object counts."""
         self._fingers = None
         self.held = np.full(len(self._robot.objects.pair_names()), -np.inf)
 
@@ -136,7 +136,7 @@ class MeasuredDistances:
         return np.asarray(self._values(q) - self.kept + self._at_corners)
 
     def reported_margin(self, report: StepReport) -> float:
-        """Return the least margin in a report [m]. For its nearest pair, the kept distance of this object counts."""
+        """Return the least margin in a report [m]. The report's nearest pair has to keep its distance in ``kept``."""
         closest = frozenset(report.closest_pair)
         if closest in self._objects:
             return report.margin
@@ -159,11 +159,12 @@ class MeasuredDistances:
         return margins, wrong
 
     def _object_margins(self, q: Array) -> Array:
-        """Return the margins of pairs of held objects that are apart, or have to be [m]."""
+        """Return the margins [m] of the pairs of held objects that are apart, or that have to be apart."""
         if not np.isfinite(self.held).any():
             return np.zeros(0)
         values = self._of_objects.at(q)
-        seen = np.isfinite(self.held) & ((values > 0.0) | (self.held >= 0.0))  # Coal's depth is different.
+        # Coal defines the depth of a penetration differently, so pairs that may touch count only while they are apart.
+        seen = np.isfinite(self.held) & ((values > 0.0) | (self.held >= 0.0))
         return (values - self.held)[seen]
 
     def _values(self, q: Array) -> Array:

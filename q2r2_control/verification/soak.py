@@ -54,7 +54,7 @@ MEMORY_ALLOWED = 5.0  # Allowed growth of the memory [MB].
 
 @dataclass(frozen=True, slots=True)
 class Violation:
-    """The first break of a promise, with the request at that tick."""
+    """The first violation of a promise, with the request at that tick."""
 
     promise: str
     seed: int
@@ -81,7 +81,7 @@ class SoakReport:
     margins: list[Margin]
     memory_growth_mb: float | None  # See steady_growth; None if not measured.
     broken: list[Violation]  # The first violation of each promise, in the order of their ticks.
-    seeds: int = 1  # The number of soaks, with the seeds from ``seed`` on. Ticks, times and counts are of all together.
+    seeds: int = 1  # The number of soaks, with the seeds from ``seed`` on. Ticks, times and counts are sums over them.
 
     @property
     def passed(self) -> bool:
@@ -111,7 +111,7 @@ def run_soak(
     name = config.control.solver if solver is None else type(solver).__name__
     worst = WorstSolver(robot, np.random.default_rng([seed, 6]))
     faulty = FaultySolver(inner, np.random.default_rng([seed, 1]), worst)
-    # Targets jump as they are given, which is harder on the controller than targets with a bridge between them.
+    # Targets are not interpolated from tick to tick (bridge_held): targets that jump are harder for the controller.
     controller = CartesianController(robot, settings, solver=untimed(faulty, robot.model.nv), bridge_held=False)
     return Soak(config.name, controller, faulty, seed, name).run(ticks, progress)
 
@@ -228,7 +228,7 @@ def steady_growth(memory: Sequence[float | None]) -> float | None:
     """Return the growth of ``memory`` that a leak may have caused from the first measurement to the last [MB].
 
     A leak adds the same amount in each of the equal spans between measurements. The heap also grows until it can hold
-    the largest tick, but only in some spans. Therefore the least growth of a span counts, multiplied by the spans.
+    the largest tick, but only in some spans. Therefore the least growth of a span counts, times the number of spans.
 
     Args:
         memory: Two or more measurements [MB]; None if the system gave no value.

@@ -25,9 +25,10 @@ def run_soaks(
     policy: bool = False,
     progress: Callable[[str], None] = lambda what: None,
 ) -> SoakReport:
-    """Run a soak of ``ticks`` ticks with each of one or more ``seeds``, of a policy's actions if ``policy``.
+    """Run a soak of ``ticks`` ticks with each of one or more ``seeds``.
 
-    But for the growth of memory, which is measured, the report is the same at any ``place``.
+    If ``policy`` is True, a hostile policy moves the arms through the whole pipeline. Except for the growth of memory,
+    which is measured, the report is the same at any ``place``.
     """
     reports = []
     with closing(place.results(partial(soak_with, config, ticks, policy), seeds)) as results:
@@ -38,7 +39,7 @@ def run_soaks(
 
 
 def soak_with(config: Config, ticks: int, policy: bool, seed: int) -> SoakReport:
-    """Run one soak. Other processes and machines call it."""
+    """Run one soak. This is a function of a module, so that other processes and machines can call it."""
     return PolicySoak(config, seed).run(ticks) if policy else run_soak(config, ticks, seed)
 
 

@@ -1,7 +1,4 @@
-"""Figures of a work motion describe the motion, our controller and peers
-
-the bench gives all of them the same motion.
-"""
+"""The figures of a work motion are right, and the bench gives our controller and its peers the same motion."""
 
 from __future__ import annotations
 
@@ -71,7 +68,7 @@ def test_figures_of_a_controller_that_stands_still_are_those_of_the_targets(robo
     assert figures.end_error_mm == pytest.approx(10.0)
     assert figures.arrival_s is None
     assert figures.max_acceleration == pytest.approx(2.0)
-    # There and back in two of the last 500 ticks.
+    # In two of the last 500 ticks, one joint accelerates: first up to the speed of the jerk, then back to rest.
     assert figures.rest_acceleration == pytest.approx(np.sqrt(2.0 * 2.0**2 / 500.0))
     assert (figures.done, figures.failures, figures.fallback_percent) == (1.0, 1, None)
     nearest = min(robot.distances(robot.home), key=lambda pair: pair.distance)
@@ -117,7 +114,7 @@ def test_the_report_says_how_far_a_too_slow_controller_got(robot: Robot) -> None
 
 
 @pytest.mark.slow
-def test_a_row_has_our_controller_in_free_air_and_near_the_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_bench_runs_our_controller_in_free_air_and_in_the_cell(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(PEERS, "missing", "no_such_package_anywhere")
     monkeypatch.setitem(PEERS, "broken", "json")
     said: list[str] = []
@@ -129,7 +126,7 @@ def test_a_row_has_our_controller_in_free_air_and_near_the_pairs(monkeypatch: py
     assert report.notes[0] == f"missing: not installed; {INSTALL}"
     assert report.notes[1].startswith("broken: cannot be built for this cell: ModuleNotFoundError")
     assert ours.min_distance_mm is not None
-    assert ours.min_distance_mm >= 1.0  # The nearest pair is one of fingers and obstacles.
+    assert ours.min_distance_mm >= 1.0  # The nearest pair is a finger and an obstacle.
     assert row.free_air.rms_error_mm is not None
     assert ours.rms_error_mm is not None
     # The target is 10 mm lower than the table allows.

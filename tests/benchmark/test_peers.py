@@ -69,7 +69,7 @@ def test_a_peer_with_an_acceleration_limit_starts_as_slowly_as_we_do(peer: Bench
 @pytest.mark.slow
 def test_a_peer_follows_in_free_motion_as_well_as_its_gain_allows(peer: BenchController) -> None:
     figures = run_motion(Leading(peer, CONFIG.control.position_gain), ROBOT, WORK_MOTIONS["reach-under"])
-    # Without the lead, the tool would be 35 mm late at the target's 0.28 m/s.
+    # Without Leading, the tool would be 35 mm behind its target, which moves at 0.28 m/s.
     assert figures.max_error_mm is not None
     assert figures.max_error_mm < 5.0
     assert figures.arrival_s is not None

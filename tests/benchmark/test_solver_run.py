@@ -16,7 +16,7 @@ CONFIG = load_config("config/dual_iiwa7.yaml")
 SHORT = replace(CONTACT, duration=0.3)
 
 
-def test_each_solver_runs_the_motion_of_daqp_and_a_missing_one_is_named() -> None:
+def test_each_solver_runs_the_motion_of_daqp_and_a_missing_solver_is_named() -> None:
     report = run_solvers(CONFIG, ("osqp", "no_such_solver"), motion=SHORT)
     daqp, osqp = report.figures
     assert (daqp.solver, daqp.off_daqp_mm, daqp.unsolved_percent) == ("daqp", 0.0, 0.0)

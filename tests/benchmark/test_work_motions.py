@@ -54,12 +54,12 @@ def test_a_carry_keeps_its_gap_and_has_the_speed_of_its_name(
     motion = WORK_MOTIONS[f"carry-{gap:.2f}-{speed:.2f}"]
     carried = ways(motion, start)[round(motion.begins / DT) :]
     np.testing.assert_allclose(carried[:, 0] - carried[:, 1], np.tile([0.0, gap, 0.0], (len(carried), 1)), atol=1e-12)
-    # The sideways motion has the whole speed, and the motion up and down half of it.
+    # The motion along x has the whole speed, and the motion up and down has half of it.
     assert np.abs(np.diff(carried[:, 0, 0])).max() / DT == pytest.approx(speed, rel=1e-3)
     np.testing.assert_allclose(carried[-1], carried[0], atol=1e-9)
 
 
-def test_motions_are_found_by_their_names_and_by_the_first_letters_of_these() -> None:
+def test_motions_are_found_by_their_names_and_by_the_beginnings_of_their_names() -> None:
     assert [motion.name for motion in motions_named(["swap", "pass", "pass"])] == ["pass", "pass-back", "swap"]
     assert {motion.name for motion in motions_named(["carry-0.16"])} == {
         f"carry-0.16-{speed}" for speed in ("0.04", "0.15", "0.30", "0.50")

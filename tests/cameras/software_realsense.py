@@ -14,7 +14,7 @@ SERIAL, FPS, UNIT = "042", 30, 1e-4  # Unit of depth [m].
 
 
 class SoftwareRealSense:
-    """A camera with a sensor of colour and one of depth."""
+    """A camera with a colour sensor and a depth sensor."""
 
     def __init__(self, size: tuple[int, int] = (WIDTH, HEIGHT)) -> None:
         self._rs: Any = pytest.importorskip("pyrealsense2")
@@ -39,7 +39,7 @@ class SoftwareRealSense:
         self._give(self._colour, self._of_colour, numbered(number, self._size), time_of_day)
 
     def show_depth(self, depth: npt.NDArray[np.uint16], time_of_day: float) -> None:
-        """Give a frame of depth (height, width) in units, captured at a time [s]."""
+        """Give a frame of depth (height, width), in multiples of :data:`UNIT`, captured at a time [s]."""
         self._give(self._depth, self._of_depth, depth, time_of_day)
 
     def _give(self, sensor: Any, profile: Any, pixels: npt.NDArray[Any], time_of_day: float) -> None:
@@ -55,7 +55,7 @@ class SoftwareRealSense:
 
 
 class StoppedClock:
-    """The clocks of the computer in the place of the module ``time``. They pass only as a test says."""
+    """Replaces the module ``time``. Its clocks go on only if a test changes :attr:`passed`."""
 
     def __init__(self) -> None:
         self.passed = 0.0  # [s]

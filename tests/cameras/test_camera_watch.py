@@ -1,4 +1,4 @@
-"""A camera that stops, slows, changes its size or comes back is told of once."""
+"""A camera that stops, slows down, changes the size of its pictures, or comes back is reported once."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def watch() -> CameraWatch:
 
 
 def told(watched: CameraWatch, times: list[float], width: int = 64) -> list[str]:
-    """Give pictures of these times since the begin [s], and return all that was told in words."""
+    """Add pictures that were captured at these times since the beginning [s]. Return all reports in words."""
     found = []
     for time in times:
         found += watched.add(100.0 + time, 100.0 + time + LATENCY, width, 48)
@@ -30,7 +30,7 @@ def every(step: float, begin: float, end: float) -> list[float]:
     return [begin + step * k for k in range(round((end - begin) / step))]
 
 
-def test_an_even_camera_is_not_told_of_and_misses_nothing() -> None:
+def test_a_camera_with_small_jitter_is_not_reported_and_misses_no_picture() -> None:
     watched = watch()
     uneven = [time + (0.015 if at % 3 else -0.015) for at, time in enumerate(every(0.05, 0.03, 10.0))]
     assert told(watched, uneven) == []
@@ -38,7 +38,7 @@ def test_an_even_camera_is_not_told_of_and_misses_nothing() -> None:
     assert watched.missing == 0
 
 
-def test_a_camera_that_stops_is_told_of_once_with_its_reason_and_again_when_it_is_back() -> None:
+def test_a_camera_that_stops_is_reported_once_with_its_reason_and_again_when_it_is_back() -> None:
     watched = watch()
     told(watched, every(0.05, 0.0, 1.0))
     assert watched.look(100.95 + LATENCY + 0.99) == []
@@ -56,7 +56,7 @@ def test_a_camera_that_gives_no_picture_at_all_misses_all_of_them() -> None:
     assert watched.missing == 40
 
 
-def test_a_slow_camera_is_told_of_once_until_it_is_fast_enough() -> None:
+def test_a_slow_camera_is_reported_once_until_it_is_fast_enough() -> None:
     watched = watch()
     assert told(watched, every(0.05, 0.0, 3.0)) == []
     assert told(watched, every(0.1, 3.0, 8.0)) == ["camera front: 15.7 pictures a second instead of 20"]
@@ -65,7 +65,7 @@ def test_a_slow_camera_is_told_of_once_until_it_is_fast_enough() -> None:
     assert len(told(watched, every(0.1, 12.0, 16.0))) == 1
 
 
-def test_pictures_of_another_size_are_told_of_once() -> None:
+def test_pictures_of_another_size_are_reported_once() -> None:
     watched = watch()
     told(watched, every(0.05, 0.0, 1.0))
     assert told(watched, every(0.05, 1.0, 2.0), width=32) == ["camera front: pictures of 32x48; allowed: 64x48"]

@@ -1,4 +1,4 @@
-"""A live camera: when its pictures were captured, and a stream of the network."""
+"""Live cameras: the times at which their pictures were captured, and cameras on the network."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ pytest.importorskip("cv2")
         pytest.param(100_500.0, 99.9, id="a stamp of the future does not count"),
     ],
 )
-def test_a_picture_was_captured_when_its_driver_says_if_that_can_be(stamp_ms: float, captured: float) -> None:
+def test_the_time_of_a_picture_is_that_of_its_driver_if_this_time_is_possible(stamp_ms: float, captured: float) -> None:
     from q2r2_control.cameras.device import capture_time
 
     assert capture_time(100.0, stamp_ms, 0.1) == pytest.approx(captured)
@@ -41,14 +41,14 @@ class Stream(BaseHTTPRequestHandler):
     """A network camera whose pictures show numbers, in Motion JPEG by HTTP."""
 
     sent: dict[int, float]  # By number, the time just before it was sent [s].
-    paths: list[str]  # Of the requests.
+    paths: list[str]  # The paths of all requests.
 
     def do_GET(self) -> None:
         self.paths.append(self.path)
         self.send_response(200)
         self.send_header("Content-Type", "multipart/x-mixed-replace;boundary=picture")
         self.end_headers()
-        with suppress(OSError):  # The client has enough.
+        with suppress(OSError):  # The client has closed the connection.
             for number in range(200):
                 packed = io.BytesIO()
                 Image.fromarray(numbered(number)).save(packed, "JPEG", quality=90)
@@ -73,7 +73,7 @@ def address() -> Iterator[str]:
     server.server_close()
 
 
-def test_pictures_of_the_network_were_captured_a_delay_before_their_receipt(address: str) -> None:
+def test_pictures_of_a_network_camera_were_captured_the_delay_before_their_receipt(address: str) -> None:
     delay = 1.5
     device = open_device(CameraConfig(device=address, width=WIDTH, height=HEIGHT, delay=delay))
     shots = [device.read() for _ in range(5)]

@@ -66,7 +66,7 @@ def test_without_depth_only_colour_is_read_and_turned(clock: StoppedClock) -> No
     device.close()
 
 
-def test_a_stream_that_falls_silent_beside_the_other_is_a_fault(clock: StoppedClock) -> None:
+def test_it_is_a_fault_if_only_one_of_two_streams_falls_silent(clock: StoppedClock) -> None:
     source = SoftwareRealSense()
     device = RealSense(camera(depth=True), source.device)
     clock.passed = 2.5
@@ -76,12 +76,12 @@ def test_a_stream_that_falls_silent_beside_the_other_is_a_fault(clock: StoppedCl
     device.close()
 
 
-def test_a_size_that_the_camera_does_not_give_is_named_with_the_nearest() -> None:
+def test_the_error_for_a_size_that_the_camera_does_not_give_names_the_nearest_size() -> None:
     with pytest.raises(CameraError, match=f"gives no 32x48; .* allowed: width: {WIDTH}, height: {HEIGHT}"):
         RealSense(camera(width=32), SoftwareRealSense().device)
 
 
-def test_a_camera_that_is_not_connected_is_named_with_those_that_are() -> None:
+def test_the_error_for_a_camera_that_is_not_connected_says_what_is_allowed() -> None:
     with pytest.raises(CameraError, match="realsense:042: no such camera; allowed: "):
         open_device(camera())
 

@@ -1,7 +1,7 @@
 """Formats of V4L2 devices, by the structures of the kernel's <linux/videodev2.h>.
 
-No computer of the tests has a camera, so a function answers in the place of a driver. It packs the same structures by
-the names of ctypes, so that a wrong place of a number is found.
+The computers that run the tests have no camera, so a function answers instead of a driver. It builds the same
+structures with ctypes, whose fields have names. The test therefore finds a number at a wrong offset.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class FrameSize(ctypes.Structure):
         ("type", ctypes.c_uint32),
         ("width", ctypes.c_uint32),
         ("height", ctypes.c_uint32),
-        ("others", ctypes.c_uint32 * 4),  # Of a range of sizes.
+        ("others", ctypes.c_uint32 * 4),  # The other numbers of a range of sizes.
         ("reserved", ctypes.c_uint32 * 2),
     )
 

@@ -63,7 +63,7 @@ def test_pictures_are_turned_clockwise(tmp_path: Path) -> None:
         ({"rotation": 90}, "gives no 64x48; the nearest that it gives is 48x64; allowed: width: 48, height: 64"),
     ],
 )
-def test_a_file_of_another_size_is_refused_with_its_own_size(
+def test_the_error_for_a_file_of_another_size_names_its_size(
     tmp_path: Path, changes: dict[str, object], says: str
 ) -> None:
     with pytest.raises(CameraError, match=says):

@@ -13,7 +13,7 @@ from PIL import Image
 
 WIDTH, HEIGHT = 64, 48  # [pixels]
 FPS = 25.0  # [pictures/s]
-_BITS = 8  # Of a picture's number, each a bright or dark column of blocks.
+_BITS = 8  # The number of bits of a picture's number. Each bit is a bright or dark column of pixels.
 _MIDDLE = 128
 
 

@@ -53,11 +53,13 @@ def write_recording(
     cameras: Mapping[str, CameraConfig] | None = None,
     pictures: Mapping[str, Sequence[int]] | None = None,
 ) -> Path:
-    """A recording with ticks at ``times`` [ns] since its start.
+    """Write a recording with ticks at ``times`` [ns] since its start, and return its path.
 
-    Measured joints are at minus the tick's place, the reference is at its place, and so are the x of tools at it. While
-    engaged (places of ticks) the target of the left arm is at 1000 plus its place. ``openings``: by name, (arms,).
-    ``pictures``: of ``cameras``, when they were taken [ns], each brighter than the last.
+    In tick k, every measured joint is at -k [rad], every joint of the reference is at k [rad], and the x of each tool
+    at the reference is k [m]. ``numbers`` has the ticks' numbers if some ticks were lost. In the ticks ``engaged``, the
+    left arm is engaged, and the x of its target is 1000 + k [m]. In the ticks ``moving``, the reference moves.
+    ``openings`` has the values (arms,) of a field by the field's name. ``pictures`` has, by camera, the times [ns] at
+    which pictures were taken; each picture is brighter than the last.
     """
     config = cell().model_copy(update={"cameras": dict(cameras or {})})
     how, cameras_of, notes = ("position", ("position",), EPOCH, False), tuple(config.cameras), {"task": "to count"}
@@ -100,7 +102,7 @@ class Run:
 
 
 def step_of_the_hand(hand: str, t: float) -> pin.SE3:
-    """Return a motion that rests, and is 1 cm to the left from :data:`STEP_AT` on."""
+    """Return the pose of a hand that rests, but is 1 cm farther left from :data:`STEP_AT` on."""
     return pin.SE3(np.eye(3), np.array([0.0, 0.01 if t >= STEP_AT else 0.0, 0.0]))
 
 
@@ -111,7 +113,7 @@ def press(hand: str, t: float) -> HandInputs:
 def record_step(folder: Path, duration: float = DURATION) -> Run:
     """Record a run with both arms engaged and a step of the hands.
 
-    The plant is where the reference was a tick before.
+    The plant's joints are always where the reference was one tick earlier.
     """
     loop = pipeline(source=PlayedInput(step_of_the_hand, press, {side: EvenSampling(100.0) for side in SIDES}))
     watch = Watch(loop)
@@ -119,7 +121,7 @@ def record_step(folder: Path, duration: float = DURATION) -> Run:
 
 
 def record_two(folder: Path) -> Sequence[Path]:
-    """Return the files of two such runs of different lengths."""
+    """Record two runs of different lengths as :func:`record_step` does, and return their files."""
     return [record_step(folder, duration).file for duration in (DURATION, 0.6)]
 
 
@@ -161,13 +163,16 @@ class Waves:
 
 
 def with_subtasks(plain: EpisodeVectors, *lengths: tuple[str, int]) -> EpisodeVectors:
-    """An episode that has subtasks with these names and numbers of frames; the last one goes on to its end."""
+    """Return an episode that has subtasks with these names and numbers of frames.
+
+    The last subtask goes on to the end of the episode.
+    """
     index = [number for number, (_, frames) in enumerate(lengths) for _ in range(frames)]
     index += [len(lengths) - 1] * (plain.frames - len(index))
     return replace(plain, subtasks=tuple(name for name, _ in lengths), subtask=tuple(index))
 
 
-# Two episodes with a subtask in common, and one of which nobody told any.
+# Two episodes that have a subtask in common, and an episode without subtasks.
 TOLD = (
     with_subtasks(EPISODES[0], ("reach", 15), ("grasp the cube", 25)),
     with_subtasks(EPISODES[1], ("grasp the cube", 10), ("place", 15)),
@@ -181,7 +186,7 @@ def with_pictures(plain: EpisodeVectors, seed: int) -> EpisodeVectors:
 
 
 def write_vectors(episode: EpisodeVectors, path: Path) -> None:
-    """Keep an episode, like the formats do."""
+    """Write an episode into a file, as the formats of the export do."""
     path.write_bytes(pickle.dumps(replace(episode, cameras={}, depths={})))
 
 

@@ -1,4 +1,4 @@
-"""A recorded run becomes an equal episode, which any number of processes make once."""
+"""A recorded run becomes the same episode with any number of processes, and each episode is made only once."""
 
 from __future__ import annotations
 
@@ -61,8 +61,8 @@ def test_a_step_of_the_hand_is_in_action_and_observation_at_the_stated_frames_of
     assert (whole.task, whole.cell, whole.recording) == ("a test", "dual_iiwa7", run.file.name)
     assert "version" in whole.notes
     assert np.flatnonzero(whole.outcome()["next.done"]).tolist() == [whole.frames - 1]
-    # Ticks are 2 ms apart: frame k is that of command i where i - 1 < k / fps / 2 ms <= i, of state i where it is in
-    # i <= ... < i + 1.
+    # Ticks are 2 ms apart, so frame k is at the time of tick x = k / fps / 2 ms, which may lie between two ticks. The
+    # frame has the command of tick i with i - 1 < x <= i, and the state of tick i with i <= x < i + 1.
     slow = make_episode(run.file, FrameSampling(fps=30))
     assert first_moved(slow.vectors["action"][:, joints]) == (command - 1) * 60 // 1000 + 1
     assert first_moved(slow.vectors["observation.state"][:, joints]) == -(-(command + 1) * 60 // 1000)
@@ -113,7 +113,7 @@ def test_an_interrupted_export_goes_on_with_its_finished_episodes(run: Run, tmp_
     made = keep_episodes(files, FrameSampling(), write_vectors, kept)
     assert made.kept[0] == first
     assert first.stat().st_mtime_ns == made_at
-    # An unfinished episode, or one with other options, is made again.
+    # An unfinished episode is made again, and so is an episode with other options.
     first.rename(first.with_name(f"{first.name}.unfinished"))
     keep_episodes(files, FrameSampling(), write_vectors, kept)
     assert load_vectors(first).frames == load_vectors(made.kept[1]).frames
@@ -122,7 +122,7 @@ def test_an_interrupted_export_goes_on_with_its_finished_episodes(run: Run, tmp_
 
 
 def write_at_open_gate(episode: EpisodeVectors, path: Path) -> None:
-    """Wait for a reader of the pipe that may be beside the folder, and keep the episode."""
+    """Write an episode. If a pipe named ``gate`` is beside the folder, first wait until a process reads the pipe."""
     if (gate := path.parent.with_name("gate")).exists():
         gate.write_bytes(b"")
     write_vectors(episode, path)
@@ -164,7 +164,7 @@ def by_name(file: Path, pictures: bool) -> dict[int, str]:
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_a_bad_recording_and_a_discarded_one_are_named_and_the_others_are_kept(
+def test_bad_recordings_and_discarded_recordings_are_named_and_the_others_are_kept(
     workers: int, run: Run, tmp_path: Path
 ) -> None:
     damaged, copy = tmp_path / "damaged.mcap", Path(shutil.copy(run.file, tmp_path / "copy.mcap"))

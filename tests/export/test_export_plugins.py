@@ -27,7 +27,10 @@ PLUGIN = ROOT / "plugins/q2r2_zarr"
 
 @pytest.fixture(autouse=True)
 def plugin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Install the package of plugins/, the one of the page, and one that declares an object that is not a format."""
+    """Install two packages: plugins/q2r2_zarr, and the example in docs/extending.md.
+
+    The first package also declares a Python object that is not a format.
+    """
     group = tomllib.loads((PLUGIN / "pyproject.toml").read_text())["project"]["entry-points"]["q2r2_control.exports"]
     (declared,) = (block for block in blocks_of("docs/extending.md", "toml") if "q2r2_control.exports" in block)
     page = tomllib.loads(declared)["project"]["entry-points"]["q2r2_control.exports"]
@@ -127,7 +130,7 @@ def test_episodes_with_different_numbers_are_not_joined_to_a_store(
         store.join(files, tmp_path / "store")
 
 
-def test_the_format_of_the_page_exports_unchanged(recordings: Sequence[Path], tmp_path: Path) -> None:
+def test_the_example_format_in_the_docs_exports_a_recording(recordings: Sequence[Path], tmp_path: Path) -> None:
     out = tmp_path / "arrays"
     result = q2r2("export", "npz", str(recordings[0]), "--output", str(out), "--workers", "1")
     assert result.exit_code == 0, result.output
@@ -137,7 +140,7 @@ def test_the_format_of_the_page_exports_unchanged(recordings: Sequence[Path], tm
         np.testing.assert_array_equal(arrays["action"], episode.vectors["action"])
 
 
-def test_an_unknown_name_is_refused_with_the_existing_ones() -> None:
+def test_the_error_for_an_unknown_format_names_the_existing_formats() -> None:
     with pytest.raises(ConfigError, match=r"export zar: allowed: lerobot, .*csv, no_format, npz, zarr"):
         format_named("zar")
     with pytest.raises(ConfigError, match=r"export no_format is .*; allowed: an ExportFormat"):

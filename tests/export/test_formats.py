@@ -1,4 +1,4 @@
-"""A table and an HDF5 file have the numbers of the dataset."""
+"""The CSV files and HDF5 files of an export have the numbers of its episodes."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_a_table_has_the_subtask_of_each_line(tmp_path: Path) -> None:
     assert list(rows[0]) == [*HEAD, "subtask_index", "subtask"]
     found = [(int(row["subtask_index"]), row["subtask"]) for row in rows]
     assert found == [(0, "grasp the cube")] * 10 + [(1, "place")] * 15
-    assert len(read(made / "run-3.csv")) == TOLD[2].frames  # As it was without subtasks.
+    assert len(read(made / "run-3.csv")) == TOLD[2].frames  # ``read`` checks that it has no columns for subtasks.
 
 
 POSITIONS = ("left_A1", "left_gripper")
@@ -119,7 +119,7 @@ def test_each_episode_is_an_hdf5_file_with_the_data_that_act_needs(tmp_path: Pat
             assert (about["sim"], about["action_ahead_frames"], about.get("success")) == (1, 2, episode.success)
 
 
-def test_an_hdf5_file_has_the_subtask_of_each_frame_and_their_names(tmp_path: Path) -> None:
+def test_an_hdf5_file_has_the_subtask_of_each_frame_and_the_names_of_the_subtasks(tmp_path: Path) -> None:
     h5py = pytest.importorskip("h5py", reason="the extra export is not installed")
     told = [
         replace(plain, subtasks=with_them.subtasks, subtask=with_them.subtask)

@@ -56,7 +56,7 @@ def lines(file: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in file.read_text().splitlines()]
 
 
-def test_every_episode_has_a_table_of_its_numbers_and_tasks_are_numbered_over_all(dataset: Path) -> None:
+def test_every_episode_has_a_table_of_its_numbers_and_tasks_are_numbered_over_all_episodes(dataset: Path) -> None:
     tasks = {line["task_index"]: line["task"] for line in lines(dataset / "meta/tasks.jsonl")}
     stats = lines(dataset / "meta/episodes_stats.jsonl")
     before = 0
@@ -76,7 +76,7 @@ def test_every_episode_has_a_table_of_its_numbers_and_tasks_are_numbered_over_al
     assert set(table) == {name for name, feature in info["features"].items() if feature["dtype"] != "video"}
 
 
-def test_subtasks_are_an_annotation_of_gr00t_and_tasks_by_number(tmp_path: Path) -> None:
+def test_subtasks_are_an_annotation_of_gr00t_and_are_listed_as_tasks(tmp_path: Path) -> None:
     told = [
         replace(seen, cameras={}, subtasks=of.subtasks, subtask=of.subtask) for seen, of in zip(SEEN, TOLD, strict=True)
     ]
@@ -106,7 +106,7 @@ def test_the_readme_names_the_unit_of_every_number(dataset: Path) -> None:
     assert "timestamp" not in card
 
 
-def test_the_readme_knows_lerobots_names_and_actions_of_later_frames(tmp_path: Path) -> None:
+def test_the_readme_has_lerobots_names_and_tells_that_actions_are_of_later_frames(tmp_path: Path) -> None:
     features = {
         "action": {"dtype": "float32", "names": ["left_A1.pos", "left_gripper.pos"]},
         "action.tool": {"dtype": "float32", "names": ["left_x", "left_qw"]},

@@ -38,7 +38,7 @@ def recording(path: Path, times: list[int], **what: Any) -> Recording:
 
 
 @pytest.mark.parametrize("fps", [1, 24, 30, 60, 200, 1000])
-def test_observations_are_those_of_the_newest_tick_and_commands_those_of_the_first_later_one(
+def test_observations_are_those_of_the_newest_tick_and_commands_those_of_the_next_tick(
     fps: int, tmp_path: Path
 ) -> None:
     # The ticks are about a millisecond apart, and one of them is 70 ms late.
@@ -60,7 +60,7 @@ def test_observations_are_those_of_the_newest_tick_and_commands_those_of_the_fir
     assert {len(values) for values in frames.values()} == {k}
 
 
-def test_targets_are_the_operators_if_there_are_any_and_openings_belong_to_their_arms(tmp_path: Path) -> None:
+def test_the_operators_targets_are_used_where_they_exist_and_openings_belong_to_their_arms(tmp_path: Path) -> None:
     openings = {"wanted": (0.1, 0.4), "commanded": (0.2, 0.5), "opening": (0.3, 0.6)}
     frames = sample(recording(tmp_path, [*range(30)], engaged=range(5, 20), openings=openings), fps=1000)
     assert frames["target"][:, 0, 0].tolist() == [k + 1000 if 5 <= k < 20 else k for k in range(30)]
@@ -121,7 +121,7 @@ def poses(q: Array) -> list[Array]:
 
 
 def frames(seed: int = 0) -> dict[str, Array]:
-    """Return frames with joints that move through much of their range, and targets elsewhere than the tools."""
+    """Return frames whose joints move through much of their range. The targets differ from the tool poses."""
     random = np.random.default_rng(seed)
 
     def motion() -> Array:
@@ -196,7 +196,7 @@ def test_quaternions_do_not_jump_and_targets_have_the_signs_of_the_tools() -> No
                 assert (np.sum(quaternions[1:] * quaternions[:-1], axis=1) > 0.0).all()
             assert np.dot(tools[0], targets[0]) >= 0.0
             assert tools[0][np.abs(tools[0]).argmax()] > 0.0
-    assert flipped  # Without this, the test would show nothing.
+    assert flipped  # Otherwise no quaternion was recorded with a changed sign, and the test would show nothing.
 
 
 def test_grippers_that_are_never_measured_are_left_out() -> None:

@@ -1,4 +1,4 @@
-"""Episodes in which every number is chosen, without a recording."""
+"""Episodes for tests. Some have no recording, so that every number can be chosen. Others are recorded from hands."""
 
 from __future__ import annotations
 
@@ -44,8 +44,9 @@ def episode(
 ) -> Episode:
     """Return an episode with both arms engaged at rest and a pose every 10 ms, unless said otherwise.
 
-    ``path`` (m, 3) is that of the tools at the frames, ``hand_path`` (k, 3) of the hands at the times ``received``
-    (k,), which ticks get ``delay`` [s] later. ``ticks`` replaces columns of :class:`Ticks`.
+    ``path`` (m, 3) has the tool positions at the frames. ``hand_path`` (k, 3) has the positions of both hands at the
+    times ``received`` (k,); a tick takes each of them ``delay`` [s] later. ``ticks`` replaces columns of
+    :class:`Ticks`.
     """
     count = round(seconds / DT)
     t: Array = DT * np.arange(1, count + 1, dtype=np.float64)
@@ -99,7 +100,7 @@ def frame_times(seconds: float = 4.0) -> Array:
     return np.asarray(DT * np.arange(1, round(seconds / DT) + 1)[::EVERY])
 
 
-RATE = 250.0  # Rate with longer substeps than by default, because ticks take most of a test's time [Hz].
+RATE = 250.0  # A low rate, with longer substeps than by default, because ticks take most of a test's time [Hz].
 DURATION = 4.0  # [s]
 PRESS, START = 0.2, 0.5  # [s]
 _PRESSED = 0.1  # [s]
@@ -120,7 +121,7 @@ def eased(t: float, begin: float = START, over: float = 1.0) -> float:
 
 
 class Work:
-    """Hands that reach to and fro between random points, each on its own, and stop at each."""
+    """Hands that reach from one random point to the next, and stop at each point. Each hand has points of its own."""
 
     def __init__(self, seed: int, begin: float = START, reaches: int = 20) -> None:
         random = np.random.default_rng(seed)
@@ -149,7 +150,10 @@ def press(hand: str, t: float) -> HandInputs:
 def operator(
     toggled: Sequence[float], discarded: float, marked: float | None = None, succeeded: float | None = None
 ) -> Callable[[str, float], HandInputs]:
-    """Return controls of an operator whose left hand rates episodes at these times [s], by :data:`EPISODES`."""
+    """Return the controls of an operator whose left hand begins, ends and rates episodes at these times [s].
+
+    The bindings are :data:`EPISODES`. At each time in ``toggled``, an episode begins or ends.
+    """
 
     def held(hand: str, t: float, *begin: float | None) -> float:
         return float(hand == "left" and any(at <= t < at + _PRESSED for at in begin if at is not None))
@@ -171,7 +175,7 @@ class WithDropouts(HeadsetSampling):
 
 
 class Late(PlayedInput):
-    """A loop that gets samples 80 ms after they were received."""
+    """An input whose samples reach the loop 80 ms after they were received."""
 
     _waiting: Sequence[HandSample] = ()
 

@@ -18,7 +18,7 @@ from q2r2_control.recording.messages import NANOSECONDS, Message, array, data_of
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.tick_rows import Rows, numbers_in, tick_type
 
-LATE = 0.2  # [s]
+LATE = 0.2  # Delay of data that is late [s].
 
 
 @dataclass
@@ -43,7 +43,7 @@ class Contents:
         return cls(recording, about, found, numbers.reshape(-1).view(kind).copy())
 
     def write(self, target: Path) -> Path:
-        """Write the contents as a recording that was ended."""
+        """Write the contents as a recording that was closed properly."""
         rows = zip(self.messages[names.TICK], numbers_in(self.rows), strict=True)
         self.messages[names.TICK] = [message._replace(payload=array(numbers)) for message, numbers in rows]
         every = sorted((one for found in self.messages.values() for one in found), key=lambda one: one.time)
@@ -56,7 +56,7 @@ class Contents:
 
     @property
     def middle(self) -> slice:
-        """Return the ticks of the middle of the episode, in which the arms move."""
+        """Return the rows of 100 ticks in the middle of the episode, while the arms move."""
         return slice(len(self.rows) // 2, len(self.rows) // 2 + 100)
 
     @property

@@ -33,7 +33,7 @@ pytestmark = pytest.mark.slow
 
 # There is one episode with work, one that its operator discards, and one in which nothing moves.
 TOGGLED, GIVEN_UP = (1.0, 2.5, 3.0, 4.0, 6.0), 3.7
-VERDICTS_BY = {2.8: 1, 3.9: 1, 6.3: 2}  # [s]
+VERDICTS_BY = {2.8: 1, 3.9: 1, 6.3: 2}  # At each of these times [s], the run waits until there are so many verdicts.
 DURATION = 7.0
 FIRST = EpisodeSpan(1.0, 2.5, number=1)
 BEGINS, ENDS, DISCARDED = TeleopReason.EPISODE_BEGINS, TeleopReason.EPISODE_ENDS, TeleopReason.EPISODE_DISCARDED
@@ -84,13 +84,13 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> PatientRun:
     return PatientRun(tmp_path_factory.mktemp("verdicts"))
 
 
-def test_each_verdict_equals_the_one_after_the_run(run: PatientRun) -> None:
+def test_each_verdict_equals_the_verdict_after_the_run(run: PatientRun) -> None:
     after = judge(Recording(run.file))
     assert names_of(after) == [[], ["operator"], ["max_idle_share"]]
     assert run.told == [
         Reason.of(TeleopReason.VERDICT, episode=number, keep=keep, line=after[number - 1].verdict.line)
         for number, keep in ((1, True), (3, False))
-    ]  # The operator knows the other verdict.
+    ]  # Episode 2 gets no verdict, since the operator has discarded it.
 
 
 def test_both_hands_feel_a_verdict_and_the_run_is_replayed_with_it(run: PatientRun) -> None:
@@ -168,7 +168,7 @@ def test_each_episode_is_judged_only_by_its_own_content(judged: list[Judged]) ->
     assert [one.figures.arms["left"].gripper_changes for one in judged] == [1, 0, 0]
 
 
-def test_events_of_an_episode_have_its_own_time_and_name_on_the_page(file: Path, judged: list[Judged]) -> None:
+def test_times_of_events_are_since_their_episode_began_and_the_page_names_it(file: Path, judged: list[Judged]) -> None:
     marks = [(event.t, event.kind) for event in judged[0].episode.events]
     assert marks == [
         (pytest.approx(0.0, abs=0.02), "episode_begins"),
@@ -196,7 +196,7 @@ def test_kept_episodes_become_episodes_of_a_dataset_with_their_own_frames(file: 
         assert np.abs(near - state[0]).max(axis=1).min() < 1e-9
 
 
-def test_without_a_recording_the_controls_say_so() -> None:
+def test_a_press_that_begins_an_episode_without_a_recording_is_reported_once() -> None:
     loop = loop_of(hands(3, inputs=CONTROLS), teleop=EPISODES)
     summary = loop.run(1.5, realtime=False)
     assert [event.kind for event in summary.events].count(TeleopReason.NO_RECORDING) == 1

@@ -36,7 +36,7 @@ def without(begin: float, end: float) -> Array:
 
 
 def engaged_until(first: int, again: int) -> Flags:
-    """Return all of 2000 ticks except those from ``first`` to ``again``."""
+    """Return flags (2000,) of an arm that is engaged except in the ticks from ``first`` to ``again``."""
     at = np.arange(2000)
     return (at < first) | (at >= again)
 
@@ -50,7 +50,7 @@ class TestHands:
         assert found.dropout_share == pytest.approx(0.2 / 4.0, abs=2e-3)
         assert found.pose_rate_hz == pytest.approx(0.95 * 100.0, abs=1.0)
 
-    def test_the_end_of_poses_is_a_gap_until_the_end(self) -> None:
+    def test_after_the_last_pose_there_is_a_gap_until_the_end_of_the_episode(self) -> None:
         assert hand(received=np.arange(0.0, 3.0, 0.01)).longest_gap_s == pytest.approx(1.0, abs=0.02)
         found = hand(received=())
         assert (found.pose_rate_hz, found.dropouts, found.sample_age_ms_p99) == (0.0, 1, None)
@@ -84,7 +84,7 @@ class TestHands:
         keep = {name: values[number] for name, values in vars(of.ticks).items()}
         lossy = replace(of, ticks=replace(of.ticks, **keep), frames=replace(of.frames, at=of.frames.at[:1]))
         assert hand_figures(of, "left", DROPOUT).dropouts == 2
-        assert hand_figures(lossy, "left", DROPOUT).dropouts == 1  # The dropout is the one at the end.
+        assert hand_figures(lossy, "left", DROPOUT).dropouts == 1  # The time after the last pose is a dropout.
 
     def test_a_hand_whose_arm_is_never_engaged_has_no_shares(self) -> None:
         found = hand(engaged=NEVER)
@@ -125,7 +125,7 @@ class TestDelays:
 
 
 class TestArms:
-    def test_errors_are_those_of_the_engaged_time(self) -> None:
+    def test_errors_are_computed_from_the_engaged_time_only(self) -> None:
         path, target = np.zeros((400, 3)), np.zeros((400, 3))
         target[:100, 2], target[100:200, 2], target[200:, 2] = 0.01, 0.03, 1.0
         found = arm_figures(episode(engaged=engaged_until(1000, 2000), path=path, target_path=target), "left")
@@ -193,7 +193,7 @@ class TestTiming:
         assert not timing_figures(episode(following=~NEVER)).ended
 
 
-def test_faults_are_pauses_that_no_operator_asked_for_each_once() -> None:
+def test_each_pause_that_no_operator_asked_for_is_one_fault() -> None:
     jumped = Reason.of(TeleopReason.HAND_JUMPED, distance=0.3)
     pressed, refused = Reason.of(TeleopReason.PRESSED, control="lower button"), Reason(TeleopReason.NOT_ENGAGED)
     events = [

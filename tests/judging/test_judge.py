@@ -59,7 +59,7 @@ def test_clean_work_is_kept(clean: Path) -> None:
     found = judged(clean)
     assert found.verdict.line == "keep"
     for arm in found.figures.arms.values():
-        # Filters of 35 ms, and a controller that lags at the start of a motion.
+        # The filters delay by 35 ms, and the controller lags at the start of a motion.
         assert arm.hand_to_target_ms == pytest.approx(33.0, abs=6.0)
         assert arm.hand_to_tool_ms == pytest.approx(49.0, abs=8.0)
         assert arm.gripper_changes == 1
@@ -216,7 +216,8 @@ def changed(of: str = "episode", **changes: Any) -> EpisodeFigures:
     return replace(FIGURES, **changes)
 
 
-# The columns are threshold and its value, a figure at it and one beyond it, and the text of the reason.
+# The columns are: the name and the value of the threshold, the group and the name of the figure that it limits, a value
+# of the figure at the limit, a value beyond the limit, and the end of the text of the reason.
 CASES: list[tuple[str, float, str, str, Any, Any, str]] = [
     ("min_pose_rate", 30.0, "hand", "pose_rate_hz", 30.0, 29.0, "right hand: poses at 29.0 Hz (at least 30)"),
     ("max_dropout_share", 0.1, "hand", "dropout_share", 0.1, 0.2, "dropouts 20.0 % of the time (at most 10)"),
@@ -316,7 +317,7 @@ def test_a_failure_is_discarded_unless_failures_are_kept_but_a_run_that_ended_by
     assert [reason.name for reason in verdict_of(ended, JudgeSettings()).reasons] == ["ended_by"]
 
 
-def test_a_missing_number_is_not_judged_and_one_that_is_not_finite_is_discarded() -> None:
+def test_a_missing_number_is_not_judged_and_a_number_that_is_not_finite_discards_the_episode() -> None:
     assert verdict_of(changed("arm", ldlj=None, hand_to_tool_ms=None), JudgeSettings()).keep
     assert not verdict_of(changed("arm", ldlj=float("nan")), JudgeSettings()).keep
     assert not verdict_of(changed("arm", position_error_mm_rms=float("nan")), JudgeSettings()).keep

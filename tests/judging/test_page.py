@@ -80,7 +80,7 @@ def test_the_page_fetches_nothing_and_each_episode_has_a_row_with_its_verdict_an
         pytest.param(episode(path=np.full((400, 3), np.nan)), id="tools that are no numbers"),
     ],
 )
-def test_any_episode_can_be_judged_and_drawn(of: Episode) -> None:
+def test_any_episode_can_be_judged_and_plotted(of: Episode) -> None:
     found = judged(of)
     assert not found.verdict.keep
     (picture,) = Page(page_of([found], "recordings")).pictures

@@ -50,7 +50,7 @@ def test_an_unspoiled_episode_is_kept(clean: Path, tmp_path: Path) -> None:
     assert reasons(spoiled(clean, tmp_path / "same.mcap")) == set()
 
 
-def test_an_unspoiled_episode_with_pictures_is_kept_and_its_cameras_are_in_time(filmed: Path) -> None:
+def test_an_unspoiled_episode_with_pictures_is_kept_and_its_pictures_come_on_time(filmed: Path) -> None:
     (found,) = judge(Recording(filmed))
     assert found.verdict.line == "keep"
     assert {name: camera.arm for name, camera in found.figures.cameras.items()} == {

@@ -9,11 +9,12 @@ from q2r2_control.types import SIDES, HandInputs, HandSample
 from tests.support.hands_input import PRESSED, RELEASED, HandsInput
 
 NAME, READY = "taking_over", "hands: have taken over"
-_ASKED_ANEW, _LATER = 0.05, 0.3  # Times without a poll, and after the first one [s].
+# After the first time without a poll, the next poll asks the hands anew. READY is printed after the second time [s].
+_ASKED_ANEW, _LATER = 0.05, 0.3
 
 
 class TakingOver(HandsInput):
-    """Hands that press as soon as they are asked, and then draw a wave. After a while, a printed line says so."""
+    """Hands that press as soon as they are asked, and then move forwards. A printed line tells when they do."""
 
     def __init__(self) -> None:
         super().__init__()

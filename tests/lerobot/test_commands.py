@@ -37,7 +37,7 @@ FPS = 25  # A frame has a whole number of ticks.
 TAKEOVERS = 100
 SPACE, TAB, ESCAPE = b" ", b"\t", b"\x1b"
 PACED = f"--fps={FPS}"
-# Without it, lerobot-record is used, which has no takeovers.
+# True if lerobot-rollout is installed. Otherwise lerobot-record is used, which has no takeovers.
 ROLLS_OUT = Path(sys.executable).with_name("lerobot-rollout").exists()
 
 
@@ -116,7 +116,7 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def trained(exported: Path) -> Path:
-    """Return a small policy that lerobot-train has trained on it for 100 steps."""
+    """Return a small policy that lerobot-train has trained for 100 steps on the dataset of :func:`exported`."""
     given = {"dataset.repo_id": "q2r2/circle", "dataset.root": exported, "output_dir": exported.with_name("act")}
     given |= {"policy.type": "act", "policy.device": "cpu", "policy.push_to_hub": "false", "steps": 100}
     given |= {"policy.chunk_size": 10, "policy.n_action_steps": 10, "policy.dim_model": 32, "policy.n_heads": 2}
@@ -223,7 +223,7 @@ def test_replay_repeats_the_motion_of_a_dataset(folder: Path, exported: Path) ->
     dataset = LeRobotDataset("q2r2/circle", root=exported)
     robot = cell_and_robot_of(recording_of(folder))[1]
     asked, rows = column(dataset, "action"), rows_of(folder)
-    # A single action is reached a frame after the tick in which it arrived. This is the tick after it was sent.
+    # An action arrives in the tick after it was sent, and the reference reaches it one frame after that tick.
     led = rows["reference_q"][rate // FPS + 1 :: rate // FPS]
     for arm in robot.arms:
         ways = [
@@ -247,7 +247,7 @@ def test_rollout_lets_a_policy_act_that_was_trained_on_an_export(seen: Path, tra
 
 
 @pytest.mark.skipif(not ROLLS_OUT, reason="lerobot has lerobot-rollout since 0.6")
-def test_the_commands_of_the_page_train_a_policy_and_let_it_act(tmp_path: Path) -> None:
+def test_the_commands_in_the_docs_train_a_policy_and_let_it_act(tmp_path: Path) -> None:
     (block,) = (block for block in blocks_of("docs/policies.md", "sh") if "cell.yaml --input scripted" in block)
     (tmp_path / "config").symlink_to(ROOT / "config")
     (tmp_path / ".venv-lerobot").symlink_to(sys.prefix)
@@ -291,7 +291,7 @@ def test_takeovers_of_dagger_make_no_jump_and_every_frame_says_who_acted(seen: P
 
 
 def check_tags(dataset: LeRobotDataset, rows: Rows) -> None:
-    """Check that frames are ticks of the recording in order, and that hands drive only in tagged frames."""
+    """Check that frames are ticks of the recording in order, and that hands move the arms only in tagged frames."""
     tags, states = column(dataset, "intervention").ravel(), column(dataset, "observation.state")
     by_hand = rows["arms"]["intervention"].max(axis=1) > 0.0
     measured = np.hstack((rows["q"], rows["arms"]["opening"])).astype(np.float32)

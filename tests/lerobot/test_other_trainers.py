@@ -1,4 +1,4 @@
-"""The loaders of other trainers read exported files: that of robomimic, and LeRobot's own of v2.1.
+"""Other programs read exported files: robomimic reads HDF5, and LeRobot converts a dataset of v2.1 and reads it.
 
 Run by ``make test-lerobot``, in an environment of its own.
 """
@@ -18,7 +18,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 try:
     from lerobot.scripts.convert_dataset_v21_to_v30 import convert_dataset
 
-    OF_ALL = False  # True if the loader needs the folder of all datasets.
+    OF_ALL = False  # True if the converter needs the folder that contains all datasets.
 except ImportError:  # This is the import of lerobot 0.4.
     from lerobot.datasets.v30.convert_dataset_v21_to_v30 import convert_dataset
 

@@ -29,7 +29,8 @@ from tests.support.processes import pipeline_of
 ROOT = Path(__file__).resolve().parents[2]
 ARMS = ("left", "right")
 JOINTS = tuple(f"{arm}_A{number}" for arm in ARMS for number in range(1, 8))
-RATE = 500.0  # This is the lowest rate with one substep per tick, because ticks take most of a test's time [Hz].
+# The lowest rate at which a tick has only one substep [Hz]. It is low because ticks take most of a test's time.
+RATE = 500.0
 
 
 # The program reads a bag with rosbags alone, in a process without this package.
@@ -71,7 +72,7 @@ def pipeline(
     source: Input | None = None,
     **changes: object,
 ) -> Pipeline:
-    """Return a pipeline at :data:`RATE`. It has cameras only if they are given, because drawing takes long."""
+    """Return a pipeline at :data:`RATE`. It has cameras only if ``changes`` has some, because pictures take long."""
     hands = source or ScriptedInput(trajectory, human=human, seed=3, frequency_hz=0.5)
     return pipeline_of({"loop_rate_hz": RATE, "cameras": {}, **changes}, hands, plant, mode)
 
@@ -86,7 +87,7 @@ def record(
     waits: bool = True,
     during: Callable[[Recorder], None] = lambda recorder: None,
 ) -> RecordingSummary:
-    """Record a run, with its cameras if it has some; ``during`` gets the recorder at the beginning."""
+    """Record a run, with its cameras if it has some. ``during`` is called with the recorder just before the run."""
     cameras = loop.config.cameras
     with Recorder(folder, "test", waits=waits and not realtime, room=room, pictures=bool(cameras)) as recorder:
         if cameras:
@@ -114,9 +115,10 @@ def file_of(summary: RecordingSummary) -> Path:
 
 
 def rewrite(file: Path, target: Path, change: Callable[[str, Message], Message | None], *, whole: bool = True) -> Path:
-    """Write a copy in chunks of 200 ticks. ``change`` replaces each message, by its topic, or leaves it out.
+    """Write a copy of ``file`` to ``target``, in chunks of 200 ticks.
 
-    Not ``whole``: it ends as where its writer was killed.
+    ``change`` gets the topic of each message and the message. It returns the message to write, or None to leave it out.
+    If ``whole`` is False, the copy ends like the file of a writer that was killed.
     """
     recording = Recording(file)
     topics = recording.declared_topics

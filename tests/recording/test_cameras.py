@@ -1,6 +1,7 @@
-"""Pictures are recorded beside the loop.
+"""A process beside the loop takes and records pictures.
 
-They are exact in simulated time, never delay the loop, and losses are counted.
+In simulated time, each picture is exactly on time. In real time, pictures never delay the loop, and lost ones are
+counted.
 """
 
 from __future__ import annotations
@@ -61,7 +62,7 @@ def test_in_simulated_time_there_is_a_picture_at_each_multiple_of_a_cameras_peri
     places = [plant.model.joint(name).qposadr[0] for name in loop.robot.joint_names]
 
     def observe(tick: Tick) -> None:
-        """Keep times, and check that copies for pictures are those of the tick's own state."""
+        """Keep the tick's time, and check that the joint positions for pictures are those of the tick's state."""
         np.testing.assert_array_equal(plant.observed_qpos[places], tick.state.q)
         times.append(tick.t)
 

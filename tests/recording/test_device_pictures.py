@@ -1,4 +1,4 @@
-"""Pictures of a real camera are recorded with the time of their capture, whatever the plant, and beside the loop."""
+"""Pictures of a real camera are recorded with the time of their capture, with any plant, without delaying the loop."""
 
 from __future__ import annotations
 
@@ -55,10 +55,10 @@ class RecordedRun:
         during: Callable[[RecordedRun], bool] | None = None,
         in_cell: CameraConfig | None = None,
     ) -> None:
-        """Play ``camera``, in the place of another one that the cell has if ``in_cell`` is given."""
+        """Play the video of ``camera``. If ``in_cell`` is given, the cell has that camera instead."""
         self.loop = pipeline("circle", "kinematic", cameras={"front": in_cell or camera})
         self.shots: list[tuple[float, int]] = []  # The time of each capture [s], and the number in the picture.
-        self.start = 0.0  # Of the loop's clock [s].
+        self.start = 0.0  # The time of the loop's clock at the start of the run [s].
         self.reports: list[ReasonKind] = []
         during = during or (lambda run: run.recorder.device_pictures >= ENOUGH)
 
@@ -111,7 +111,7 @@ def test_each_picture_is_stamped_with_its_capture_on_the_loops_clock(run: Record
     assert run.summary.lost_pictures == 0
 
 
-def test_the_tick_of_a_picture_is_the_last_one_before_its_capture(run: RecordedRun) -> None:
+def test_the_tick_of_a_picture_is_the_last_tick_before_its_capture(run: RecordedRun) -> None:
     recording = Recording(file_of(run.summary))
     ticks = np.concatenate([chunk.times for chunk in recording.chunks()])
     before, *pictures = recording.pictures("front")
@@ -130,7 +130,7 @@ def test_the_judge_reads_the_pictures_as_those_of_simulated_cameras(run: Recorde
     assert not episode.pictures["front"].other_size.any()
 
 
-def test_a_camera_that_ends_is_told_of_once_and_marks_the_episode_and_the_run_goes_on(
+def test_a_camera_that_stops_is_reported_once_and_in_the_episode_and_the_run_goes_on(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     after: list[int] = []

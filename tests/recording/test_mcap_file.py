@@ -21,7 +21,7 @@ from q2r2_control.recording.tick_rows import SAMPLE_FIELDS, tick_type
 from tests.recording.runs import ARMS, JOINTS, file_of, pipeline, record
 
 _One = tuple[Schema | None, Channel, McapMessage]
-DURATION = 0.7  # The number of ticks is larger than that of a packet [s].
+DURATION = 0.7  # A run of this duration has more ticks than a TickAssembly keeps back [s].
 
 
 class Read(NamedTuple):
@@ -45,7 +45,7 @@ def ours(file: Path) -> Read:
 
 def read_of(path: Path) -> Read:
     chunks = list(Recording(path).chunks())
-    for chunk in chunks:  # Ticks come with their samples and states.
+    for chunk in chunks:  # Each chunk has all samples and states of its ticks, and no others.
         numbers = chunk.numbers.tolist()
         assert chunk.samples[:, 0].tolist() == np.repeat(numbers, chunk.rows["samples"].astype(int)).tolist()
         assert chunk.states.keys() <= set(numbers)
@@ -118,7 +118,7 @@ WRITERS: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("settings", WRITERS.values(), ids=WRITERS)
-def test_a_file_reads_the_same_when_it_was_written_again_by_one(
+def test_a_file_reads_the_same_after_it_was_rewritten_by_a_writer(
     file: Path, ours: Read, tmp_path: Path, settings: dict[str, Any]
 ) -> None:
     again = written_again(file, tmp_path / "again.mcap", in_order(file), **settings)
@@ -129,14 +129,14 @@ def test_a_file_reads_the_same_when_it_was_written_again_by_one(
 
 
 def test_ticks_without_the_samples_that_they_took_are_refused(file: Path, tmp_path: Path) -> None:
-    """Each chunk has messages of one topic only, so that a replay would be another run."""
+    """Each chunk has messages of one topic only. A replay without the samples of a tick would be another run."""
     again = written_again(file, tmp_path / "again.mcap", by_topic(file), chunk_size=10_000)
     with pytest.raises(RecordingError, match="mcap sort puts them in order"):
         read_of(again)
 
 
 def test_a_file_of_another_writer_reads_up_to_where_it_is_cut(file: Path, ours: Read, tmp_path: Path) -> None:
-    """Only the tick in whose messages the last chunk ends is left out."""
+    """Only one tick is left out: the tick of which the last whole chunk has some messages, but not all."""
     again = written_again(file, tmp_path / "again.mcap", in_order(file), chunk_size=3_000)
     data, cut, lengths = again.read_bytes(), tmp_path / "cut.mcap", []
     for size in np.linspace(0.3, 0.95, 25) * len(data):

@@ -1,4 +1,4 @@
-"""Paths that a user gives as files of recordings, and the episodes in them that an operator rates."""
+"""Finds recordings by the paths that a user gives, and reads their messages and episodes, also from cut files."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_for_a_whole_run_the_operators_rating_replaces_the_check_of_its_task() -
         assert [span.success for span in spans_of(events(*told), run_succeeded=True)] == [success]
 
 
-def test_folders_are_searched_by_name_and_no_file_is_taken_twice(tmp_path: Path) -> None:
+def test_files_in_folders_are_in_the_order_of_their_names_and_no_file_is_taken_twice(tmp_path: Path) -> None:
     for name in ("b", "a"):
         (tmp_path / name).mkdir()
         (tmp_path / name / f"{name}.mcap").touch()
@@ -87,7 +87,7 @@ def test_folders_are_searched_by_name_and_no_file_is_taken_twice(tmp_path: Path)
 
 
 def test_a_reader_that_is_slower_than_the_writer_ends(tmp_path: Path) -> None:
-    """A verdict is computed from a file that goes on growing. Later data are for the next reading."""
+    """A verdict is computed from a file that goes on growing. Data that comes later is left for the next reading."""
     about = About.of(pipeline(), realtime=True, notes={}, cameras=())
     topic = messages.Topic(1, messages.STATE, messages.TEXT)
     with BagWriter(tmp_path / "growing.mcap", [topic], about) as bag:
@@ -133,7 +133,7 @@ def test_a_file_that_ends_anywhere_is_read_as_far_as_it_goes_and_is_not_damaged(
         recording = Recording(cut)
         found = [message.number for several in recording.messages() for message in several]
         assert not recording.closed
-        # An index of its messages follows a chunk. A reader does not need it.
+        # After each chunk comes an index of the chunk's messages, which a reader does not need.
         assert found == [0, 1, 2][: len(found)]
         assert len(found) >= sum(end <= size for end in ends)
 
@@ -146,7 +146,7 @@ def messages_or_fault(file: Path) -> list[messages.Message] | str | None:
         return None if found is None else found.group(0)
 
 
-def test_a_length_that_leads_out_of_a_completed_file_is_damage(tmp_path: Path) -> None:
+def test_a_completed_file_with_a_record_beyond_its_end_is_damaged(tmp_path: Path) -> None:
     about = About.of(pipeline(), realtime=True, notes={}, cameras=())
     file = tmp_path / "file.mcap"
     with BagWriter(file, [messages.Topic(1, messages.STATE, messages.TEXT)], about) as bag:
@@ -155,7 +155,7 @@ def test_a_length_that_leads_out_of_a_completed_file_is_damage(tmp_path: Path) -
     data, place = bytearray(file.read_bytes()), len(MCAP0_MAGIC)
     while data[place] != Opcode.CHUNK:
         place += 9 + int.from_bytes(data[place + 1 : place + 9], "little")
-    data[place + 4] = 0x7F  # The byte is a part of its length.
+    data[place + 4] = 0x7F  # The byte is a part of the chunk's length.
     file.write_bytes(data)
     with pytest.raises(RecordingError, match="damaged"):
         list(Recording(file).messages())
@@ -207,7 +207,7 @@ def test_every_number_of_a_tick_has_its_own_name_and_place() -> None:
         assert number == labels.index(label)
 
 
-def test_only_arrays_and_texts_in_the_written_form_are_read() -> None:
+def test_arrays_and_texts_are_read_as_written_and_an_array_of_another_length_is_refused() -> None:
     numbers = np.array([[0.5, np.nan, -0.0], [1.0, np.inf, 2.0]])
     payloads = [messages.array(row) for row in numbers]
     assert messages.numbers_of(payloads, 3).tobytes() == numbers.tobytes()

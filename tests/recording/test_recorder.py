@@ -1,4 +1,4 @@
-"""Recording never stands in the way of a run, loses nothing silently, and leaves files that other programs open."""
+"""Recording never disturbs a run, loses nothing silently, and leaves files that other programs can open."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Tick]
     return file_of(record(tmp_path_factory.mktemp("recordings"), loop, 2.0)), ticks
 
 
-def test_every_topic_opens_with_rosbags_in_another_process_and_has_what_was_told(
+def test_rosbags_in_another_process_reads_every_topic_with_the_data_of_the_run(
     tmp_path: Path, recorded: tuple[Path, list[Tick]]
 ) -> None:
     file, ticks = recorded
@@ -73,7 +73,7 @@ def test_every_topic_opens_with_rosbags_in_another_process_and_has_what_was_told
     poses, targets = arms["filtered_hand"][asked, :3], arms["target"][asked, :3]
     hands = [tick.targets["left"].hand for tick in led]
     np.testing.assert_array_equal(poses, [hand.translation for hand in hands if hand is not None])
-    # Side by side and unscaled, a tool moves as its hand does: by the same from the first target on.
+    # In Side-by-Side mode and with scale 1, the target moves from its first position exactly as the hand does.
     assert np.ptp(poses, axis=0).max() > 0.005
     np.testing.assert_allclose(targets - targets[0], poses - poses[0], atol=1e-9)
 
@@ -98,7 +98,7 @@ def test_standard_topics_may_come_with_every_tick(tmp_path: Path) -> None:
 def test_a_clock_that_is_set_back_during_a_run_changes_no_time_in_the_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # Each look at the time of day finds an hour less than the one before.
+    # Each call returns a time of day that is an hour before the time of the last call.
     hours = count(1_700_000_000_000_000_000, -3_600_000_000_000)
     monkeypatch.setattr(time, "time_ns", lambda: next(hours))
     file = file_of(record(tmp_path, pipeline(), 0.5))
@@ -150,7 +150,7 @@ def test_a_recorder_that_wrote_nothing_leaves_no_file(tmp_path: Path, caplog: py
     assert list((tmp_path / "full").iterdir()) == []
 
 
-def test_a_file_that_fails_before_its_first_message_is_whole_is_removed_with_its_folder(tmp_path: Path) -> None:
+def test_a_file_whose_writer_fails_before_the_first_message_is_whole_is_removed_with_its_folder(tmp_path: Path) -> None:
     loop = pipeline()
     about, topic = About.of(loop, False, {}), Topic(1, STATE, TEXT)
     folder = tmp_path / "run"
@@ -244,5 +244,5 @@ def test_memory_is_flat_however_long_a_run_is(tmp_path: Path, recorded: tuple[Pa
         tracemalloc.stop()
     assert recorder.summary.lost_ticks == 0
     for now, then in zip(held[-1], held[0], strict=True):
-        # At most 8 MB wait at any time; the ticks in between are 18 as they are packed.
+        # At most 8 MB wait at any time. The ticks between the first and the last measurement have 18 MB when packed.
         assert now - then < 14e6

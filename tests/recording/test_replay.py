@@ -36,7 +36,7 @@ BOX = {"x": [0.3, 0.8], "y": [0.0, 0.6], "z": [0.1, 0.7]}
 
 @pytest.fixture(scope="module")
 def circle(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return hands that engage both arms, and from 1.2 s on move in circles for half a second."""
+    """Return a recording. Its hands engage both arms, and from 1.2 s on move in circles for half a second."""
     return file_of(record(tmp_path_factory.mktemp("recordings"), pipeline(), 1.8))
 
 
@@ -61,7 +61,7 @@ def test_a_replay_of_a_run_in_simulated_time_is_identical(
     assert result.summary.at_rest
 
 
-def test_requests_of_a_program_are_repeated(tmp_path: Path) -> None:
+def test_requests_that_a_program_made_are_repeated_in_the_replay(tmp_path: Path) -> None:
     loop = pipeline("circle", "kinematic", control=cell().control.model_copy(update={"moving_obstacles": ("hand",)}))
     tool = loop.robot.tool_pose(loop.robot.home, "left").translation
     place = tuple((tool + np.array([0.0, 0.6, 0.0])).tolist())  # The place is so near that the arms slow down.
@@ -96,11 +96,11 @@ def test_requests_of_a_program_are_repeated(tmp_path: Path) -> None:
     assert (result.difference, result.ended_by, result.notes) == (None, None, [])
 
 
-def test_a_replay_of_a_run_by_the_computers_clock_is_identical(tmp_path: Path) -> None:
+def test_a_replay_of_a_run_in_real_time_is_identical(tmp_path: Path) -> None:
     loop = pipeline("circle", "mujoco", "torque", human=True)
     file = file_of(record(tmp_path, loop, 1.2, realtime=True))
     result = replay(file)
-    # The machine decides whether the arms were engaged, because a loop that stalls pauses them.
+    # Whether the arms were engaged depends on this computer, because a loop that stalls pauses them.
     assert (result.difference, result.ended_by) == (None, None)
     assert result.ticks > 10
     recording = Recording(file)
@@ -108,7 +108,7 @@ def test_a_replay_of_a_run_by_the_computers_clock_is_identical(tmp_path: Path) -
     assert 0 <= first - recording.about.epoch < 1_000_000_000, "times of day, whatever the loop's clock is"
 
 
-def test_the_holding_of_a_gripper_is_replayed(tmp_path: Path) -> None:
+def test_a_gripper_that_held_an_object_holds_it_in_the_replay(tmp_path: Path) -> None:
     flat = {"box": (0.06, 0.04, 0.015), "at": (0.0, 0.0, 0.0085), "mass": 0.1}
     config = object_cell(None, flat)
     loop = pipeline("grasp", "mujoco", source=ScriptedInput("grasp"), arms=config.arms, mujoco=config.mujoco)
@@ -186,7 +186,7 @@ class SometimesLate:
         return QpSolution(None, 1.0) if self.count % 7 == 0 else solution
 
 
-def test_late_solutions_are_late_again(tmp_path: Path) -> None:
+def test_solutions_that_came_too_late_come_too_late_in_the_replay(tmp_path: Path) -> None:
     loop = pipeline(control=cell().control.model_copy(update={"solve_time_limit": None}))
     loop.controller._solver = SometimesLate(DaqpSolver(loop.robot.model.nv))
     file = file_of(record(tmp_path, loop, 1.2))
@@ -201,7 +201,7 @@ def test_late_solutions_are_late_again(tmp_path: Path) -> None:
     [
         (SAMPLES, SAMPLE_FIELDS.index("x"), 1.0, "left.filtered_hand.x: recorded "),
         (TICK, number_of("dt"), 1.002, "step: recorded 0.002, replayed 0.00199"),
-        (STATE, 1, 1.4, "states: recorded {'left': 'dngaged', "),  # The bit is in its first letter.
+        (STATE, 1, 1.4, "states: recorded {'left': 'dngaged', "),  # The flipped bit is in the letter e of "engaged".
     ],
     ids=["a sample", "the time of a tick", "the state in words"],
 )
@@ -230,7 +230,7 @@ def _cut(file: Path, target: Path, ticks: int) -> Path:
     return rewrite(file, target, lambda _, message: message if message.number < ticks else None, whole=False)
 
 
-def test_a_recording_that_was_cut_has_the_summary_of_its_ticks(circle: Path, tmp_path: Path) -> None:
+def test_the_replay_of_a_cut_recording_summarises_the_ticks_that_are_left(circle: Path, tmp_path: Path) -> None:
     result = replay(_cut(circle, tmp_path / "cut.mcap", 400))
     assert (result.ticks, result.ended_by) == (400, NO_END)
     assert result.summary is not None

@@ -40,7 +40,7 @@ LATENCY = 100_000  # Time from a tick to the receipt of its messages [ns].
 
 
 class NodesOnFile:
-    """Messages of nodes at times since the begin of the recording [ns]."""
+    """Records messages as nodes send them. All times ``at`` are since the beginning of the recording [ns]."""
 
     def __init__(self, folder: Path, config: Config | None = None, room: int = ROOM) -> None:
         self.config = (config or cell()).model_copy(update={"loop_rate_hz": 250.0})
@@ -71,14 +71,14 @@ class NodesOnFile:
         self.recorder.record([names.Message(self.topics[topic].channel, self._number, time, time, payload)])
 
     def joint_states(self, at: int, q: Array) -> None:
-        """Return joints in another order than the robot's, and one that is not its own."""
+        """Record joint states in another order than the robot's, with a joint that the robot does not have."""
         order = [*reversed(self.joints), "left_finger_joint_1"]
         values = dict(zip(self.joints, q, strict=True))
         position = np.array([values.get(name, 0.5) for name in order])
         self.put(names.JOINT_STATES, at, names.joint_state(order, position, 0 * position, 0 * position))
 
     def tick(self, at: int, index: int, q: Array, v: Array | None = None, **values: float) -> None:
-        """Return a tick of the controller with its reference and its report."""
+        """Record a tick of the controller: its reference and its numbers."""
         now = (self.epoch + at) * 1e-9
         zero = np.zeros(len(self.joints))
         reference = names.joint_trajectory(list(self.joints), q, zero if v is None else v, zero, round(now * 1e9))
@@ -107,7 +107,11 @@ SECOND = 1_000_000_000  # [ns]
 
 
 def play(nodes: NodesOnFile, count: int = 250, first: int = 5, index: int = 1, engaged: range = range(0)) -> None:
-    """Play ticks ``first`` .. of 4 ms. Joint i of the reference is at home + 1 mrad a tick, measured a tick late."""
+    """Record ``count`` ticks of 4 ms. Tick ``first`` is due ``first`` periods after the beginning.
+
+    The reference of each joint moves away from home by 1 mrad a tick. The measured joints follow one tick later. The
+    arms are engaged in the ticks ``engaged``. The controller's own index of tick ``first`` is ``index``.
+    """
     home = np.array(nodes.robot.home)
     for place in range(first, first + count):
         at = place * PERIOD
@@ -180,7 +184,7 @@ def test_a_tick_whose_reference_was_lost_counts_as_lost_but_its_events_are_kept(
     assert len(ticks.states) == 1
 
 
-def test_a_restarted_controller_continues_the_numbers_after_joints_and_flags_are_known(
+def test_ticks_are_counted_once_joints_and_flags_are_known_and_the_count_goes_on_after_a_restart(
     nodes: NodesOnFile,
 ) -> None:
     nodes.tick(PERIOD, 499, np.array(nodes.robot.home))
@@ -190,7 +194,7 @@ def test_a_restarted_controller_continues_the_numbers_after_joints_and_flags_are
     assert ticks.numbers.tolist() == list(range(20))
 
 
-def test_no_tick_is_dropped_for_numbers_that_the_robot_does_not_measure(nodes: NodesOnFile) -> None:
+def test_ticks_are_kept_although_the_robot_does_not_measure_some_numbers(nodes: NodesOnFile) -> None:
     """A position that is not finite is in its tick too, so that the judge finds it."""
     play(nodes, 5)
     nothing, q = np.full(len(nodes.joints), np.nan), np.array(nodes.robot.home)
@@ -205,7 +209,7 @@ def test_no_tick_is_dropped_for_numbers_that_the_robot_does_not_measure(nodes: N
     assert np.isnan(ticks.rows["q"]).all(axis=1).tolist() == [False] * 6 + [True]
 
 
-def test_episodes_are_those_of_the_events_of_arms_and_services(nodes: NodesOnFile) -> None:
+def test_episodes_begin_and_end_by_events_of_arms_and_of_services(nodes: NodesOnFile) -> None:
     for at, kind, arm in (
         *(
             (20, TeleopReason.EPISODE_BEGINS, "left"),
@@ -233,7 +237,7 @@ def test_episodes_are_found_even_if_no_controller_was_active(nodes: NodesOnFile)
     assert (span.start, span.end) == (pytest.approx(0.004), pytest.approx(0.02))
 
 
-def test_an_episode_is_judged_by_its_messages_and_not_replayed(nodes: NodesOnFile) -> None:
+def test_an_episode_is_judged_from_its_messages_and_cannot_be_replayed(nodes: NodesOnFile) -> None:
     engaged = range(50, 240)
     play(nodes, 250, engaged=engaged)
     file = nodes.close()
@@ -246,7 +250,7 @@ def test_an_episode_is_judged_by_its_messages_and_not_replayed(nodes: NodesOnFil
         replay(file)
 
 
-def test_a_known_step_is_in_action_and_observation_at_the_frames_of_its_times(nodes: NodesOnFile) -> None:
+def test_a_step_of_the_joints_is_exported_in_the_frames_of_its_time(nodes: NodesOnFile) -> None:
     home = np.array(nodes.robot.home)
     for place in range(1, 101):
         at, step = place * PERIOD, 0.1 * (place >= 50)
@@ -264,7 +268,7 @@ def test_a_known_step_is_in_action_and_observation_at_the_frames_of_its_times(no
 
 
 @pytest.mark.parametrize("step", [5 * SECOND, -SECOND // 4], ids=["forward", "back"])
-def test_an_episode_with_a_changed_clock_is_discarded_and_not_exported_but_others_are(
+def test_an_episode_in_which_the_clock_was_set_is_discarded_and_only_the_other_is_exported(
     nodes: NodesOnFile, tmp_path: Path, step: int
 ) -> None:
     nodes.event(1, TeleopReason.EPISODE_BEGINS)
@@ -289,7 +293,7 @@ def test_an_episode_with_a_changed_clock_is_discarded_and_not_exported_but_other
     assert make_episode(recording.file, FrameSampling(fps=50), second).frames == 20
 
 
-def test_ticks_keep_their_references_if_the_clock_is_changed_and_one_of_a_pair_is_lost(nodes: NodesOnFile) -> None:
+def test_ticks_keep_their_references_if_the_clock_is_set_and_a_tick_or_a_reference_is_lost(nodes: NodesOnFile) -> None:
     put = nodes.put
     for step, lost in ((5, names.REFERENCE), (-5, names.CONTROLLER_TICK), (5, names.CONTROLLER_TICK)):
         play(nodes, 20)
@@ -302,7 +306,7 @@ def test_ticks_keep_their_references_if_the_clock_is_changed_and_one_of_a_pair_i
     assert sum(len(chunk.rows) for chunk in chunks) == 3 * (20 + 20)
 
 
-def test_messages_beyond_the_memory_are_lost_and_counted(tmp_path: Path) -> None:
+def test_messages_for_which_there_is_no_room_are_lost_and_counted(tmp_path: Path) -> None:
     nodes = NodesOnFile(tmp_path, room=1 << 16)
     assert nodes.recorder.writer is not None
     os.kill(nodes.recorder.writer.pid, signal.SIGSTOP)
@@ -320,7 +324,7 @@ def test_a_recording_of_another_controller_is_refused_in_one_line(tmp_path: Path
         ticks_in(nodes.close())
 
 
-def test_uncompressed_pictures_cannot_be_exported_and_are_named(tmp_path: Path) -> None:
+def test_uncompressed_pictures_cannot_be_exported_and_the_error_names_their_camera(tmp_path: Path) -> None:
     nodes = NodesOnFile(
         tmp_path, cell().model_copy(update={"cameras": {"front": CameraConfig(topic="/front/image_raw")}})
     )

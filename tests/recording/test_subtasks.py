@@ -25,8 +25,9 @@ from tests.export.files import step_of_the_hand
 from tests.recording.runs import file_of, pipeline, record
 
 NAMES = ("reach", "grasp the cube", "place")
-TOGGLED, NEXT = (0.4, 1.4, 1.8), (0.2, 0.7, 1.1, 1.6, 2.1)  # [s]
-PRESSED, DURATION = 0.08, 2.4  # [s]
+# Times at which the operator begins or ends an episode, and at which another subtask begins [s].
+TOGGLED, NEXT = (0.4, 1.4, 1.8), (0.2, 0.7, 1.1, 1.6, 2.1)
+PRESSED, DURATION = 0.08, 2.4  # Duration of a press, and of the run [s].
 
 
 def operator(toggled: tuple[float, ...], following: tuple[float, ...]) -> Callable[[str, float], HandInputs]:
@@ -75,7 +76,7 @@ def test_number_and_name_of_each_subtask_are_in_the_file(file: Path) -> None:
         (
             TeleopReason.SUBTASK_BEGINS,
             {"number": 2, "name": "grasp the cube"},
-        ),  # The run may be one episode until here.
+        ),  # No episode has begun yet, so the whole run may be one episode.
         (TeleopReason.EPISODE_BEGINS, {}),
         (TeleopReason.SUBTASK_BEGINS, {"number": 2, "name": "grasp the cube"}),
         (TeleopReason.SUBTASK_BEGINS, {"number": 3, "name": "place"}),

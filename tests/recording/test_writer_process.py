@@ -34,7 +34,10 @@ WRITTEN_LATER = 60.0  # Simulated duration; a listener ends the run earlier [s].
 
 
 def script(loop: Pipeline, steps: Callable[[Recorder], Iterator[None]]) -> Callable[[Recorder], None]:
-    """Run the steps of a recorded run. Each step lasts until it yields, and is resumed at the next tick."""
+    """Return a function that runs ``steps`` during a run of ``loop``, when it is called with the recorder.
+
+    At each tick the steps go on until they yield. The run ends when they return.
+    """
 
     def begin(recorder: Recorder) -> None:
         left = steps(recorder)

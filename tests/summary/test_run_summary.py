@@ -45,7 +45,7 @@ def add(
 ) -> None:
     """Add a tick of 1 ms at home. Both arms are engaged if the tool has an ``error`` relative to its target.
 
-    ``changes``: of the tick's record, or of its reference.
+    ``changes`` replaces fields of the tick, or ``q``, ``v``, ``a`` and ``report`` of its reference.
     """
     tick, arms = tick_at(statistics.robot, 0.0), statistics.robot.arms
     motion = {name: changes.pop(name) for name in ("q", "v", "a") if name in changes}
@@ -214,7 +214,7 @@ def test_percentiles_equal_those_of_numpy_to_a_thousandth_of_the_unit(size: int)
     assert found.max == pytest.approx(1e6 * values.max(), rel=1e-12)
 
 
-def test_any_number_can_be_added_and_one_beyond_the_range_counts_as_the_largest() -> None:
+def test_any_number_can_be_added_and_a_number_beyond_the_range_counts_as_the_largest() -> None:
     histogram = Histogram(1e-3)
     for value in (float("nan"), float("inf"), float("-inf")):
         histogram.add(value)

@@ -49,7 +49,7 @@ def one(value: float) -> Array:
 
 
 def moved(q: Array, v: Array, change: float, report: StepReport) -> Reference:
-    """Return the tick after ``q`` and ``v``, in which the velocity of one joint changes."""
+    """Return the reference one tick after ``q`` and ``v``. The velocity of one joint changes by ``change`` [rad/s]."""
     after = v + one(change)
     return Reference(q + 0.5 * DT * (v + after), after, one(change / DT), report)
 

@@ -1,4 +1,4 @@
-"""A hostile policy breaks no promise, and a missing check is found."""
+"""A hostile policy breaks no promise. The soak finds a check of actions that is missing."""
 
 from __future__ import annotations
 

@@ -44,7 +44,7 @@ def controller_and_solver() -> tuple[CartesianController, FaultySolver]:
 
 
 class Sabotaged:
-    """The real controller with a changed result at one tick and after."""
+    """The real controller, but its results are changed from one tick on."""
 
     def __init__(self, change: Callable[[Reference], Reference], first: int, settings: ControllerSettings) -> None:
         self.settings, self.kept_distances = settings, kept_distances(robot(), settings).values
@@ -87,7 +87,7 @@ GRASPING = {"grasps": 40, "held objects: kept distance falls by": 1000}
         pytest.param(WITH_OBJECTS, 1, GRASPING, id="objects gripped and let go at any moment"),
     ],
 )
-def test_three_thousand_hostile_ticks_break_no_promise(config: Config, seed: int, least: dict[str, int]) -> None:
+def test_hostile_input_never_breaks_the_contract(config: Config, seed: int, least: dict[str, int]) -> None:
     report = run_soak(config, 3000, seed)
     assert [found.promise for found in report.broken] == []
     assert report.passed
@@ -96,7 +96,7 @@ def test_three_thousand_hostile_ticks_break_no_promise(config: Config, seed: int
 
 
 @pytest.mark.parametrize("name", ["osqp", "quadprog"])
-def test_hostile_ticks_with_another_solver_break_no_promise(name: str) -> None:
+def test_hostile_input_with_another_solver_never_breaks_the_contract(name: str) -> None:
     if name not in ("osqp", *qpsolvers.available_solvers):
         pytest.skip(f"{name} is not installed")
     config = CONFIG.model_copy(update={"control": SETTINGS.with_solver(name)})
@@ -106,7 +106,7 @@ def test_hostile_ticks_with_another_solver_break_no_promise(name: str) -> None:
     assert report.counts["unsolved"] < 0.01 * report.ticks
 
 
-def test_hostile_ticks_move_no_tool_faster_than_its_limit() -> None:
+def test_hostile_input_moves_no_tool_faster_than_its_limit() -> None:
     limited = CONFIG.model_copy(update={"control": SETTINGS.model_copy(update={"tool_speed_limit": 0.25})})
     report = run_soak(limited, 2000, 9)
     assert report.passed, report.broken
@@ -116,7 +116,7 @@ def test_hostile_ticks_move_no_tool_faster_than_its_limit() -> None:
 
 
 @pytest.mark.parametrize("jerk", [1000.0, 5000.0])
-def test_commands_of_hostile_ticks_keep_the_limit_of_jerk_and_all_distances(jerk: float) -> None:
+def test_commands_under_hostile_input_keep_the_jerk_limit_and_all_distances(jerk: float) -> None:
     limited = CONFIG.model_copy(update={"control": SETTINGS.model_copy(update={"jerk_limit": jerk})})
     report = run_soak(limited, 3000, 3)
     assert report.passed, report.broken
@@ -126,7 +126,7 @@ def test_commands_of_hostile_ticks_keep_the_limit_of_jerk_and_all_distances(jerk
 
 
 class Garbage:
-    """A solver whose answers are invalid in turns: no answer, wrong types, and numbers that resemble an answer."""
+    """A solver with random invalid answers: no answer, wrong types, or numbers that only resemble an answer."""
 
     def __init__(self) -> None:
         self.random, self.asked = np.random.default_rng(1), 0
@@ -157,7 +157,7 @@ class Garbage:
         return QpSolution(problem.upper, 0.002)
 
 
-def test_hostile_ticks_with_a_solver_that_returns_garbage_break_no_promise() -> None:
+def test_hostile_input_with_a_solver_that_returns_garbage_never_breaks_the_contract() -> None:
     solver = Garbage()
     report = run_soak(CONFIG, 2000, 8, solver=solver)
     assert report.passed, report.broken
@@ -176,7 +176,7 @@ class Impossible:
 
 
 class Flipping:
-    """A task that reverses its request at each tick: the first joint is to turn in one direction, then in the other."""
+    """A constraint that reverses its rows at each tick: three joints have to turn one way, and then the other way."""
 
     hard = True
 
@@ -198,7 +198,7 @@ class Moody:
 
     def rows(self, q: Array, v: Array) -> Any:
         self.asked += 1
-        usual = (-np.sign(v + 1e-300)[None, :], np.array([-3.0]))  # The joints may not all be fast.
+        usual = (-np.sign(v + 1e-300)[None, :], np.array([-3.0]))  # The sum of the joints' speeds is at most 3 rad/s.
         if self.asked < 50 or self.random.random() < 0.7:
             return usual
         kind = int(self.random.integers(5))
@@ -214,7 +214,7 @@ class Moody:
 
 
 @pytest.mark.parametrize("constraint", [Impossible(), Flipping(), Moody()], ids=lambda one: type(one).__name__)
-def test_hostile_ticks_with_a_hostile_hard_constraint_break_no_promise(constraint: Any) -> None:
+def test_hostile_input_with_a_hostile_hard_constraint_never_breaks_the_contract(constraint: Any) -> None:
     solver = FaultySolver(
         DaqpSolver(robot().model.nv), np.random.default_rng(1), WorstSolver(robot(), np.random.default_rng(2))
     )
@@ -292,7 +292,7 @@ def test_a_wrong_reported_distance_is_found_by_coal() -> None:
 
 
 def test_arms_that_come_too_close_are_found_at_ticks_between_them_and_in_stops() -> None:
-    """The controller keeps 20 mm, but 150 mm are asked for."""
+    """The controller keeps 20 mm, but the contract is checked with 150 mm."""
     report = soak(lambda reference: reference, 0, 1000, settings=SETTINGS.model_copy(update={"min_distance": 0.15}))
     promises = {found.promise for found in report.broken}
     assert {f"distance - kept distance, {when}" for when in ("at ticks", "between ticks", "full stops")} <= promises
@@ -310,7 +310,10 @@ def test_a_stop_that_is_due_and_not_executed_is_found() -> None:
 
 
 def test_leaving_penetration_the_separation_never_decreases() -> None:
-    """The soak found this: the wrist, 16 mm in the table, opens to 0.5 mm, and the stop takes 0.3 mm back."""
+    """A soak found this case. The wrist is 16 mm inside the table, and its distance grows to 0.5 mm.
+
+    The stop then reduced the distance by 0.3 mm.
+    """
     left = [-0.21607004362824325, 1.5400883486752313, 1.949636558861823, 0.6047422668811306]
     left += [0.8080053095448911, 1.4352829330812347, 1.9429994776891732]
     right = [-2.159257201510056, -1.1332045586738233, -0.5307167749313296, -1.634581274414817]

@@ -1,4 +1,4 @@
-"""Soaks with several seeds have one report, whose parts are those of the single soaks."""
+"""Soaks with several seeds have one report, which joins the reports of the single soaks."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def violation(promise: str, seed: int) -> Violation:
     return Violation(promise, seed, 3, "walk", 1, np.zeros(2), np.zeros(2), {}, "0.001", "")
 
 
-def test_two_soaks_of_one_process_are_the_sums_and_the_worst_of_both() -> None:
+def test_the_report_on_two_soaks_has_the_sums_of_their_counts_and_the_worst_of_their_margins() -> None:
     lines: list[str] = []
     both = run_soaks(cell(), TICKS, range(3, 5), HERE, progress=lines.append)
     first, second = (run_soak(cell(), TICKS, seed) for seed in (3, 4))
@@ -43,13 +43,13 @@ def test_two_soaks_of_one_process_are_the_sums_and_the_worst_of_both() -> None:
     assert lines == ["seed 3: passed", "seed 4: passed"]
 
 
-def test_the_first_break_of_each_promise_is_kept_with_its_seed() -> None:
+def test_the_first_violation_of_each_promise_is_kept_with_its_seed() -> None:
     broken = [violation("room", 1)], [violation("speed", 2), violation("room", 2)]
     found = joined([report(0), *(report(seed, broken=its) for seed, its in enumerate(broken, start=1))])
     assert [(one.promise, one.seed) for one in found.broken] == [("room", 1), ("speed", 2)]
 
 
-def test_a_value_that_is_not_a_number_stays_the_worst_and_growth_of_memory_is_the_largest() -> None:
+def test_a_value_that_is_not_a_number_stays_the_worst_and_the_largest_growth_of_memory_is_kept() -> None:
     values = [margin(0.9, 1), margin(math.nan, 2, 1), margin(0.99, 3)]
     growths = (0.5, 2.5, 1.0)
     reports = [report(seed, margins=[values[seed]], memory_growth_mb=growths[seed]) for seed in range(3)]

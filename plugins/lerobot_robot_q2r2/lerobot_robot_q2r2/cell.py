@@ -1,4 +1,4 @@
-"""A cell that lerobot records from and sends actions to, by the door of policies.
+"""A cell as a robot of lerobot, which records its observations and sends it actions as a policy does.
 
 Its features have the names and order of ``q2r2 export lerobot``, so a policy that was trained on such a dataset fits.
 """
@@ -35,29 +35,31 @@ from q2r2_control.recording import About, DevicePictures, Recorder
 
 _logger = logging.getLogger(__name__)
 _ROOM = 64 << 20  # Size of pictures and ticks that may wait to be written [bytes].
-_BEGINS = 60.0  # how long the kernels of a new version take to compile at most, and more [s]
+# Longest time to wait for the first tick [s]. Compiling the kernels of a new version takes less.
+_BEGINS = 60.0
 
 
 @RobotConfig.register_subclass("q2r2_cell")
 @dataclass(kw_only=True)
 class Q2R2CellConfig(RobotConfig):
-    cell: str = "config/dual_iiwa7.yaml"  # a cell's YAML, here or shipped; its cameras are the robot's
-    plant: str | None = None  # an installed plant, such as fri; by default the cell's
-    rate: float = 30.0  # of the actions [Hz]
-    simulated_time: bool = False  # an action takes 1 / rate of simulated time, however long lerobot takes for it
-    full_speed: bool = False  # of real cabinets; otherwise joints go at a tenth of their speed
-    record: str | None = None  # folder for recordings of q2r2
+    cell: str = "config/dual_iiwa7.yaml"  # Path of a cell's YAML, or of a shipped one. The robot has its cameras.
+    plant: str | None = None  # Name of an installed plant, such as fri; None for the cell's own plant.
+    rate: float = 30.0  # Rate of the actions [Hz].
+    simulated_time: bool = False  # If true, each action takes 1 / rate of simulated time, however slow lerobot is.
+    full_speed: bool = False  # If false, real arms move at a tenth of the speed that the cell says.
+    record: str | None = None  # Folder for recordings of q2r2; None to record nothing.
 
 
 class Q2R2Cell(Robot):
-    """Joint positions [rad] and openings, 0 closed .. 1 open. A loop of q2r2 runs from ``connect`` to ``disconnect``.
+    """A robot whose numbers are joint positions [rad], and openings of grippers from 0 closed to 1 open.
 
-    Actions that are refused move nothing, and the log says why; the arms rest when none comes for half a second.
+    A loop of q2r2 runs from ``connect`` to ``disconnect``. An action that is refused moves nothing, and the log says
+    why. If no action comes for half a second, the arms come to rest.
     """
 
     config_class = Q2R2CellConfig
     name = "q2r2_cell"
-    newest: ClassVar[Q2R2Cell | None] = None  # the one that a teleoperator's hands drive
+    newest: ClassVar[Q2R2Cell | None] = None  # The cell that was created last. The hands of a teleoperator drive it.
 
     def __init__(self, config: Q2R2CellConfig) -> None:
         super().__init__(config)
@@ -77,13 +79,13 @@ class Q2R2Cell(Robot):
         joints = action_names(self._robot, ActionSpace.JOINTS)
         self._measured = tuple(arm for arm in self._robot.arms if arm in self._plant.gripper_openings())
         self._seen = (*joints, *(f"{arm}_gripper" for arm in self._measured))
-        self._names = (*joints, *(f"{arm}_gripper" for arm in self._robot.arms))  # of an action
+        self._names = (*joints, *(f"{arm}_gripper" for arm in self._robot.arms))  # Names of the numbers of an action.
         self.pipeline.listeners.append(self._see)
-        self._tick: Tick | None = None  # the newest one
+        self._tick: Tick | None = None  # The newest tick.
         self._begun = Event()
         self._thread: Thread | None = None
         self._fault: Q2R2Error | None = None
-        self._steps, self._start = 0, 0.0  # of simulated time
+        self._steps, self._start = 0, 0.0  # Number of actions since the start, and time of the start [s], if simulated.
         self._pictures: CellPictures | None = None
         self._open = ExitStack()  # The open cameras and the recording.
         Q2R2Cell.newest = self
@@ -169,7 +171,7 @@ class Q2R2Cell(Robot):
 
     def get_observation(self) -> dict[str, Any]:
         tick = self._check()
-        # A gripper that was not heard of for a while is taken to be where it was sent.
+        # If a gripper's opening is not measured at present, the commanded opening is used.
         openings = [tick.openings.get(arm, tick.command.grippers[arm]) for arm in self._measured]
         seen = _named(self._seen, (*tick.state.q, *openings))
         if self._drawn:
@@ -186,7 +188,7 @@ class Q2R2Cell(Robot):
         return seen
 
     def send_action(self, action: dict[str, Any]) -> dict[str, Any]:
-        """An action that is not the hands' own is the policy's, which takes the arms from them."""
+        """Send an action. If it does not come from the hands, the policy sent it, and takes the arms from the hands."""
         self._check()
         before, self._by_policy = self._by_policy, not self._asked
         if self._by_policy and self.hands.open:
@@ -206,11 +208,11 @@ class Q2R2Cell(Robot):
             _logger.info("the policy has the arms")
         return action
 
-    _asked = False  # whether the next action is the hands'
-    _by_policy = False  # whether the last one was not
+    _asked = False  # True if the next action comes from the hands, because lerobot has just asked them for it.
+    _by_policy = False  # True if the last action came from the policy.
 
     def hands_action(self) -> dict[str, Any]:
-        """The reference, which the hands drive until an action comes that is not theirs."""
+        """Return the reference as an action. The hands drive it from now on, until the policy sends an action."""
         tick = self._check()
         self._asked = self.hands.open = True
         return _named(self._names, (*tick.reference.q, *map(tick.command.grippers.__getitem__, self._robot.arms)))

@@ -1,4 +1,7 @@
-"""Hands of a teleoperator at the door of a cell that lerobot runs: they count while lerobot asks for their actions."""
+"""The hands of a teleoperator as an input of a cell that lerobot runs.
+
+The hands move the arms only while lerobot asks for the hands' actions.
+"""
 
 from __future__ import annotations
 
@@ -7,14 +10,14 @@ from q2r2_control.inputs import WebInput
 
 
 class HandsDoor:
-    """The operator of a cell's policy: the hands of whichever device is attached. Implements :class:`Input`."""
+    """The operator of a cell's policy: the hands of the device that is attached. Implements :class:`Input`."""
 
-    # Of all devices: which one it is going to be is not known when the cell is made.
+    # The controls of all devices, because the device is not known yet when the cell is created.
     controls = DeviceControls(QUEST_CONTROLS.buttons + WebInput.controls.buttons, QUEST_CONTROLS.axes)
 
     def __init__(self) -> None:
-        self.operator: Input | None = None  # whose hands they are, by who attaches them
-        self.open = False  # whether the hands may drive
+        self.operator: Input | None = None  # The attached device; None if no device is attached.
+        self.open = False  # True while the hands may move the arms.
         self._was_open = False
 
     @property
@@ -22,14 +25,14 @@ class HandsDoor:
         return not self.open or (self.operator is not None and self.operator.connected)
 
     def start(self) -> None:
-        """Nothing to do: the hands have begun when they were attached, and stay attached from run to run."""
+        """Do nothing. The device has started when it was attached, and stays attached from run to run."""
 
     def poll(self, now: float) -> list[HandSample]:
         open, was_open, self._was_open = self.open, self._was_open, self.open
         if self.operator is None or not open:
             return []
         samples = self.operator.poll(now)
-        return samples if was_open else []  # those that came while nobody asked for them say nothing
+        return samples if was_open else []  # Samples that came before the hands were asked are dropped.
 
     def send_haptic(self, feedback: HapticFeedback) -> None:
         if self.operator is not None and self.open:

@@ -1,6 +1,7 @@
 """The hands of a headset, of a page or of a script, for a cell that lerobot runs in the same program.
 
-The hands drive the cell's own loop, with its clutch, leash and vibrations. lerobot gets the targets of the arms.
+The hands drive the cell's own loop, with its clutch, leash and vibrations. lerobot gets the controller's reference as
+the action.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ class Q2R2HandsConfig(TeleoperatorConfig):
 
 
 class Q2R2Hands(Teleoperator):
-    """Hands that engage an arm where it is by a press, as in ``q2r2 run``. The program has one cell of lerobot.
+    """Hands that engage the arms by a press, as in ``q2r2 run``. They move the cell that was created last.
 
     The hands have a clutch, so ``lerobot-rollout`` needs ``--strategy.smooth_handover=false``.
     """

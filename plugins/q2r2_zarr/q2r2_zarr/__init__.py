@@ -58,7 +58,10 @@ def _append_pictures(data: Any, name: str, pictures: Any) -> Any:
 
 
 def join_episodes(files: Sequence[Path], folder: Path) -> None:
-    """Join stores of single episodes, at least one, in a new one. Raises :class:`RecordingError` if arrays differ."""
+    """Join the stores of one or more episodes in a new store ``folder``.
+
+    Raises :class:`RecordingError` if the arrays of the stores differ.
+    """
     root = zarr.open_group(str(folder), mode="w-", zarr_format=_ZARR_FORMAT)
     data, ends, about, first = root.create_group("data"), list[int](), list[dict[str, Any]](), ""
     for file in files:

@@ -26,7 +26,7 @@ PEERS = {
 }
 WITHOUT_ACCELERATION_LIMIT = ("mink",)
 INSTALL = install_line("bench")
-NEAREST_ROWS = 10  # Separation rows of a peer that gets only the nearest pairs.
+NEAREST_ROWS = 10  # Number of separation rows of a peer that gets only the nearest pairs.
 DETECTION_DISTANCE = 0.25  # Pairs farther apart than this need no exact distance [m].
 
 
@@ -54,13 +54,13 @@ class PeerSettings:
         self.robot, self.config, self.dt = robot, config, dt
         self.position_gain = control.position_gain * dt  # Share of the tool's position error that a tick removes.
         self.posture_gain = control.posture_gain * dt  # Share of the posture error that a tick removes.
-        self.posture_cost = float(control.posture_weight**0.5)  # Root of its weight; a tool has 1.
+        self.posture_cost = float(control.posture_weight**0.5)  # Square root of its weight; the cost of a tool is 1.
         self.velocity = robot.velocity_limit * control.velocity_scale  # (nv,) [rad/s]
         self.acceleration = robot.capped_acceleration(control.acceleration_limit)  # (nv,) [rad/s^2]
         self.lower = robot.position_lower + control.position_margin  # (nv,) [rad]
         self.upper = robot.position_upper - control.position_margin  # (nv,) [rad]
-        # The smallest distance that we keep for any pair [m]. Peers have one distance for all pairs, and with this one
-        # no peer has to avoid postures that ours may take.
+        # The smallest distance that we keep for any pair [m]. Peers have one distance for all pairs. Therefore no peer
+        # has to avoid postures that our controller may take.
         self.min_distance = float(kept_distances(robot, control).values.min(initial=control.min_distance))
         home = compose(config).home.items()
         # Home positions of joints that move no tool, such as fingers.
@@ -95,7 +95,7 @@ def build_peers(names: Sequence[str], setup: PeerSettings) -> tuple[list[BenchCo
 
 
 class Leading:
-    """A peer whose targets are moved ahead of time along their paths, to make up for its lag."""
+    """A peer whose targets are moved ahead of time along their paths, to compensate for the peer's lag."""
 
     def __init__(self, peer: BenchController, gain: float) -> None:
         """Wrap ``peer``, whose tools have the ``gain`` [1/s]."""

@@ -1,13 +1,14 @@
 """roboplan: OInK, differential inverse kinematics as one QP in C++, on Pinocchio, Coal and ProxQP.
 
-roboplan has position, velocity and acceleration limits and a barrier on the nearest pairs. All are hard, so that they
-can contradict each other, and then it raises. By default its solver looks for the nearest feasible problem instead.
-That follows some targets more closely, but took up to a minute in one tick, and is off. The iterations are limited to a
-tenth of the default, because single ticks still took minutes. The barrier does not consider braking distances. roboplan
-gets the same URDF with our margins in its position limits, and our bodies in place of its collision shapes. It has the
-same pairs, the smallest distance that we keep, and rows for every pair or for the ten nearest. The tolerance of its
-solver is the default (1e-6 rad per tick), because smaller ones took up to two minutes in one tick. The damping towards
-a safe displacement, with the default gain 1, is off, because with it the tools hardly follow at ticks of 1 ms.
+roboplan has position, velocity and acceleration limits and a barrier on the nearest pairs. All of them are hard
+constraints that can contradict each other. roboplan then raises an exception. By default its solver looks for the
+nearest feasible problem instead. This follows some targets more closely, but took up to a minute in one tick, so it is
+switched off. The iterations are limited to a tenth of the default, because single ticks still took minutes. The barrier
+does not consider braking distances. roboplan gets the same URDF, with our margins in its position limits, and with our
+bodies instead of its collision shapes. It has the same pairs, the smallest distance that we keep, and rows for every
+pair or for the ten nearest pairs. The tolerance of its solver is the default (1e-6 rad per tick), because smaller
+tolerances took up to two minutes in one tick. The damping towards a safe displacement, with the default gain 1, is off,
+because with it the tools hardly follow at ticks of 1 ms.
 """
 
 from __future__ import annotations
