@@ -106,7 +106,7 @@ def certify_bodies(model: SafetyModel, data: SafetyData, grown: IntArray) -> int
     for p in range(pairs.first.shape[0]):
         if grown[pairs.first[p]] == 1 or grown[pairs.second[p]] == 1:
             any_grown = True
-            if data.distance[p] < model.min_distance[p]:  # Without a tolerance for rounding: the body need not grow.
+            if data.distance[p] < model.min_distance[p]:  # No rounding is allowed, because the body need not grow.
                 return p
     stay_with_stop(data)
     if not any_grown or certify(model, data, 0.0):
