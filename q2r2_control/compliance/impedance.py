@@ -107,7 +107,7 @@ class ImpedanceController:
     def reset(self, state: RobotState) -> None:
         """Start again at rest at the measured posture. The first torque is the gravity torque there.
 
-        Changes of stiffness, damping or payload that are under way are completed at once.
+        Changes of stiffness, damping or payload that have not ended yet are completed at once.
 
         Raises:
             RobotError: If the posture is not nv finite numbers.

@@ -102,7 +102,7 @@ class ImpedanceModel(NamedTuple):
     """Data that do not change between ticks."""
 
     chain: Chain
-    tools: Tools  # Tools of k arms.
+    tools: Tools  # The tools of all k arms.
     limits: PositionLimits
     torque_limit: Array  # (nv,) [Nm]
     largest_error: Array  # (2,) [m, rad]
@@ -113,8 +113,8 @@ class ImpedanceData(NamedTuple):
 
     inputs: Array  # (6, nv) Measured q and v; q, v and a of the newest reference; torque that is added [Nm].
     due: Array  # (2, nv) q and v of the reference that is due now.
-    springs: Array  # (k, 5) Values of ``LIVE_IMPEDANCE``.
-    M: Array  # (nv, nv) Inertia.
+    springs: Array  # (k, 5) The values of ``LIVE_IMPEDANCE`` for each arm.
+    M: Array  # (nv, nv) Joint-space inertia matrix.
     torque: Array  # (nv,) Input: torque of gravity and velocity. Output: torque of the law [Nm].
     commanded: Array  # (nv,) The last torque, within all bounds [Nm].
     saturated: BoolArray  # (nv,) Joints that would need more than their torque limit.

@@ -148,7 +148,7 @@ class LiveSettings:
         # Crowded means that some pair is within its buffer. The last number is the time until distances grow again [s].
         self._growing, self._crowded, self._due = False, False, 0.0
         self.settings = settings
-        self.kept = self._goal  # Distance that every monitored pair keeps (p,) [m]; another array after a change.
+        self.kept = self._goal  # Distance that every monitored pair keeps (p,) [m]. Each change makes a new array.
 
     @property
     def narrow(self) -> int:

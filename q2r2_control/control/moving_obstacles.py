@@ -54,7 +54,7 @@ class MovingObstacles:
             stop_time=np.zeros(1),
         )
         self.there: dict[str, MovingObstacle] = {}
-        self.still: dict[str, MovingObstacle] = {}  # The obstacles that do not move. Each report makes another mapping.
+        self.still: dict[str, MovingObstacle] = {}  # The obstacles whose speed is 0. Each report makes a new mapping.
         self._holding: frozenset[str] = frozenset()
         if count:
             pointers = *pointers, pointer_to(self.data)

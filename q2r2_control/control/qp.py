@@ -110,7 +110,8 @@ def find_minimum(data_pointer: KernelPointer) -> bool:
 def _find_minimum(data: KernelData) -> bool:
     """Do the work of :func:`find_minimum`, also for :func:`assemble`.
 
-    Python calls both of them. This kernel is compiled as a part of each, and is optimised only together with them.
+    Python calls both :func:`find_minimum` and :func:`assemble`. This kernel is compiled as a part of them, because only
+    kernels that Python calls are optimised (kernel_compiler.py).
     """
     tasks, box, rows, minimum = data.tasks, data.safety.box, data.safety.rows, data.tasks.minimum
     nv = minimum.shape[0]

@@ -23,7 +23,7 @@ from q2r2_control.types import Array
 _FARTHEST = 100.0  # [m]
 _ORTHONORMAL = 1e-3  # Largest error of R R' of a target's rotation R.
 _AT_REST = 1e-2  # An arm whose joints are all slower than this counts as resting [rad/s].
-_NONE, _POSE, _NO_POSE = 0, 1, 2  # Kinds of offers to an arm.
+_NONE, _POSE, _NO_POSE = 0, 1, 2  # What is offered to an arm as its target: nothing, a pose, or something else.
 # A target faster than this multiple of the tool's own limit has jumped.
 _TELEPORT = 3.0
 
@@ -47,13 +47,13 @@ class TaskTargets(NamedTuple):
     translation: Array  # (n, 3) [m]
     feed_forward: Array  # (n, 6) Smoothed twist of the target [m/s, rad/s].
     hold: Array  # (nv,) Joint positions to hold [rad].
-    posture: Array  # (nv,) Joint positions for the joints that the tools leave free [rad].
+    posture: Array  # (nv,) Posture to which joints move as far as the tools leave them free [rad].
     latched: IntArray  # (n,) 1 if the arm has come to rest where it holds.
-    offered: IntArray  # (n,) The kind of offer in this tick: nothing, a pose, or something else.
-    pose: Array  # (n, 4, 4) Homogeneous pose, as offered.
+    offered: IntArray  # (n,) What is offered in this tick: _NONE, _POSE or _NO_POSE.
+    pose: Array  # (n, 4, 4) The offered pose as a homogeneous matrix, before it is checked.
     feed_forward_time: float  # Time constant that smooths the feed-forward [s].
     teleport_speed: float  # A faster target has jumped [m/s].
-    teleport_turn: float  # [rad/s]
+    teleport_turn: float  # A target that turns faster has jumped [rad/s].
     scratch: PoseScratch
 
     @classmethod

@@ -55,7 +55,7 @@ class WatchedPairs:
 
     @property
     def kept_distances(self) -> Array:
-        """Distance that every monitored pair keeps now (p,) [m]. After a change this is another array."""
+        """Distance that every monitored pair keeps now (p,) [m]. Each change makes a new array."""
         return self._live.kept
 
     @property
@@ -110,7 +110,7 @@ class WatchedPairs:
         """
         if not self._objects.set_holding(arm, holds):
             return
-        self._active.used[0] = 0  # The pair that it names may not be monitored any more.
+        self._active.used[0] = 0  # The last active pairs may no longer be monitored.
         self._obstacles.hold(self._objects.holding)
         self._observe_again(self._unchanged)
         self._objects.begin()
@@ -144,7 +144,7 @@ class WatchedPairs:
             ConfigError: If there is no such name.
         """
         changed = self._obstacles.put(name, obstacle)
-        self._active.used[0] = 0  # The pair that it names may not be monitored any more.
+        self._active.used[0] = 0  # The last active pairs may no longer be monitored.
         blocked = self._observe_again(changed) if self._state.v.any() else -1
         self._certified &= blocked < 0
         self._obstacles.keep_clear(0.0)
@@ -214,7 +214,7 @@ class WatchedPairs:
 
     @property
     def still_obstacles(self) -> Mapping[str, MovingObstacle]:
-        """The :attr:`moving_obstacles` that do not move. After a change this is another mapping."""
+        """The :attr:`moving_obstacles` whose reported speed is 0. Each change makes a new mapping."""
         return self._obstacles.still
 
     @property

@@ -224,7 +224,7 @@ class TorqueDrive(Drive):
         self.wall = MeasuredSeparation(robot, config.control, config.impedance.wall)
         self.report = DriveReport()
         self._has_servos = has_servos
-        self._believed = self._reference = robot.home  # The last posture and the last reference (nv,) [rad].
+        self._believed = self._reference = robot.home  # Last usable measured posture, and last reference (nv,) [rad].
 
     def reset(self, state: RobotState) -> None:
         self.report = DriveReport()

@@ -86,7 +86,7 @@ def test_the_margin_of_a_report_refers_to_the_distances_kept_at_that_tick(
         reference = run.drive(DT, {"left": at(GRIP + 0.02)})
         distances = object_distances(controller, reference.q)
         spare = distances - controller.object_distances
-        if distances[spare.argmin()] > 0.0:  # The depth of Coal is another quantity.
+        if distances[spare.argmin()] > 0.0:  # In penetration, Coal measures another quantity.
             assert reference.report.margin == pytest.approx(spare.min(), abs=2e-6)
             grown += int(counting(controller).min() > kept)
         kept = counting(controller).min()
@@ -125,7 +125,7 @@ def test_an_object_gripped_in_motion_keeps_its_new_distances_during_the_known_st
         moving = np.minimum(time, np.abs(reference.v) / stop)
         q = reference.q + reference.v * moving - 0.5 * np.sign(reference.v) * stop * moving**2
         values = object_distances(controller, q)
-        seen = counts & (values > 0.0)  # The depth of Coal is another quantity.
+        seen = counts & (values > 0.0)  # In penetration, Coal measures another quantity.
         assert (values - kept)[seen].min() > -2e-6
         assert (kept[counts & (values <= 0.0)] < 0.0).all()
     for _ in range(500):
@@ -210,7 +210,7 @@ def test_an_undone_step_undoes_the_greater_distances_that_its_substeps_gave_the_
         grown += bool((counting(controller) > before[np.isfinite(before)]).any())
         controller.withdraw(late)
         np.testing.assert_array_equal(controller.object_distances, before)
-        apart = distances > 0.0  # The depth of Coal is another quantity.
+        apart = distances > 0.0  # In penetration, Coal measures another quantity.
         assert (distances[apart] >= controller.object_distances[apart] - 1e-6).all()
         assert controller.step(lifted, DT).report.certified
     assert grown > 10

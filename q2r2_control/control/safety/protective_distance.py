@@ -33,7 +33,7 @@ from q2r2_control.control.kernel_pointers import KernelPointer, pointee
 from q2r2_control.control.safety.safety_data import SafetyData, SafetyModel
 from q2r2_control.types import Array
 
-# R [s]. Reports that are newer count as this old. If reports come more often, the kept distance then does not jump.
+# R [s]. A newer report counts as this old, so that the kept distance does not jump if reports come more often.
 REPORT_AGE = 0.1
 _LEAST_STOP = 0.05  # Least value of T_0, which it has if arms are close to an obstacle [s].
 _SHARE = 0.5  # Share of the free distance to an obstacle that the obstacle's reach may take.

@@ -32,7 +32,7 @@ from q2r2_control.control.safety.stop_rollout import begin_rollout, sample_of, w
 # Tolerances for a pair that is too close. The first is for its distance [m], and a relative one for times.
 _CLOSER = 1e-12
 _STILL = 1e-9  # Tolerance for its approach speed [m/s].
-_NOISE = 1e-15  # Difference between two measurements of the same distance [m].
+_NOISE = 1e-15  # By rounding, two measurements of the same distance may differ by this [m].
 # Accuracy of the closest points of a box and a segment. The gap along the plane between both may be smaller than their
 # distance by this. Without the tolerance, a pair exactly at its distance could never be proven to move apart again.
 _LAST_DIGITS = 1e-11  # [m]

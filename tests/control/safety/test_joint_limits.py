@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from q2r2_control.control.safety.joint_limits import JointLimits, VelocityBox, fastest_towards, next_velocity_box
 from q2r2_control.types import Array
 
-JOINTS = 60  # Joints that are stepped side by side.
+JOINTS = 60  # Number of joints that are tested at the same time.
 STEPS = 800
 RETURN_SPEED = 0.2
 # Tolerance for the accumulated rounding of positions.

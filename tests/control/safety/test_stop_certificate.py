@@ -60,7 +60,7 @@ def _motions_from(
 
 
 def _starts_apart(name: str, random: np.random.Generator, near: bool, count: int) -> Iterator[Array]:
-    """Yield postures in which every pair is apart. With ``near``, they lie on a path, just before it collides."""
+    """Yield postures in which every pair is apart. With ``near``, each is just before a collision on a random path."""
     arrays, found = cell(name), 0
     while found < count:
         q, other = random_posture(arrays.robot, random), random_posture(arrays.robot, random)
