@@ -249,7 +249,7 @@ def measure_pairs(model: SafetyModel, data: SafetyData) -> int:
     fastest = 2.0 * fastest_body(data.velocities)
     for p in range(pairs.first.shape[0]):
         data.near[p] = 0
-        if model.min_distance[p] == -np.inf:  # The pair belongs to an object that is not held.
+        if model.min_distance[p] == -np.inf:  # Its object is not held, or its obstacle is not present.
             distance[p] = np.inf
             continue
         distance[p] = at_least(collision, data.collision, p)
