@@ -1,6 +1,6 @@
-"""Let arms yield to a push, after the QP in torque mode and before the QP in position mode.
+"""Let arms yield to a push: in torque mode by terms after the QP, in position mode by targets before the QP.
 
-``impedance`` turns the QP's reference into torques that make each tool a damped spring, by the equations of
-``impedance_law``. ``repulsion`` adds a wall between measured links. ``admittance`` displaces targets by the measured
-wrench, for arms that take positions.
+``impedance`` turns the QP's reference into torques with which each tool acts as a damped spring; ``impedance_law`` has
+the equations. ``repulsion`` adds a repulsive force between measured links. For arms that take positions, ``admittance``
+displaces the targets according to the measured wrench.
 """

@@ -1,11 +1,13 @@
 """Compliance in position mode: the measured wrench displaces the target that the QP follows.
 
-The QP keeps every limit and distance for any target. The bounds of the displacement are therefore only for the
-operator. Only the QP sees the displaced target: recordings and the teleop layer use the operator's own target.
+The QP keeps every limit and distance for any target. The displacement is therefore bounded only for the operator's
+sake, and not for safety. Only the QP sees the displaced target: recordings and the teleop layer use the operator's own
+target.
 
-The tool shows the admittance in series with the servos below it. Against a stiff body the loop closes through QP and
-servos with their delay. With the defaults a simulated arm leans quietly on 10 kN/m. On 30 kN/m it does so with twice
-the damping ratio or four times the mass. A load that the model does not know counts as a push downwards.
+At the tool, the admittance acts in series with the servos of the joints. In contact with a stiff body, the feedback
+loop contains the QP and the servos with their delay. With the default settings, a simulated arm rests quietly against a
+body of 10 kN/m. Against 30 kN/m it does so with twice the damping ratio or four times the mass. A load that the model
+does not know counts as a push downwards.
 """
 
 from __future__ import annotations
@@ -22,17 +24,17 @@ from q2r2_control.control.tasks.frame import ROTATION_LENGTH
 from q2r2_control.robot.robot import Arm, Robot
 from q2r2_control.types import Array, RobotState
 
-_METRES = np.array([1.0, 1.0, 1.0, *[ROTATION_LENGTH] * 3])
-# Singular value of J, all in metres, below which a direction counts as singular [m]. A torque error of 0.1 Nm is an
-# error of 2 N there.
+_METRES = np.array([1.0, 1.0, 1.0, *[ROTATION_LENGTH] * 3])  # Factors that convert the rows of J to metres.
+# A direction counts as singular if its singular value of J, with all rows in metres, is below this [m]. At this value,
+# a torque error of 0.1 Nm causes a force error of 2 N.
 _SINGULAR = 0.05
-_NOTHING = 1e-9  # A smaller displacement or speed counts as zero [m], [rad], [1/s].
+_NOTHING = 1e-9  # Smaller displacements [m], [rad] and velocities [m/s], [rad/s] count as zero.
 
 
 def estimate_wrench(J: Array, tau: Array) -> Array:
     """Return the least-squares wrench (6,) for the torques ``tau`` (n,) [Nm] of an arm with the Jacobian J (6, n).
 
-    By J J' = V s^2 V', F = V f(s) V' J tau.
+    With J J' = V s^2 V', the wrench is F = V f(s) V' J tau, where f(s) is 1 / s^2, and smaller for singular directions.
     """
     scaled = _METRES[:, None] * J
     values, directions = np.linalg.eigh(scaled @ scaled.T)
@@ -52,7 +54,7 @@ def rest_displacement(force: Array, dead_band: float, stiffness: float, limit: f
 
 
 def stop_at_limit(x: Array, v: Array, limit: float) -> tuple[Array, Array]:
-    """Return a displacement (3,) of at most ``limit`` and its speed (3,), which does not point outwards there."""
+    """Return ``x`` (3,) shortened to ``limit``, and ``v`` (3,) without its outward part if ``x`` was too long."""
     length = math.hypot(*x)
     if length <= limit:
         return x, v
@@ -64,7 +66,8 @@ def oscillate(x: Array, v: Array, frequency: float, damping_ratio: float, dt: fl
     """Return the exact x and v after ``dt`` [s] of x'' + 2 xi w x' + w^2 x = 0, with the ``frequency`` w [rad/s]."""
     fall = damping_ratio * frequency
     spread = frequency * math.sqrt(abs(damping_ratio**2 - 1.0))
-    # The products of e^(-fall t) with cos or cosh, and with sin or sinh over spread, in a form without overflow.
+    # ``cosine`` is e^(-fall t) times cos or cosh, and ``sine`` is e^(-fall t) times sin or sinh, divided by ``spread``.
+    # They are computed in a form without overflow.
     if spread * dt < 1e-6:
         cosine = math.exp(-fall * dt)
         sine = cosine * dt
@@ -82,7 +85,7 @@ def oscillate(x: Array, v: Array, frequency: float, damping_ratio: float, dt: fl
 class ArmCompliance:
     """The wrench and the displacement of one arm, in world axes at the origin of the tool frame."""
 
-    wrench: Array  # (6,) On the tool, after the low-pass and before the dead band: force [N], torque [Nm].
+    wrench: Array  # (6,) Wrench on the tool after the low-pass filter, before the dead band: force [N], torque [Nm].
     displacement: Array  # (6,) Translation [m], rotation vector [rad].
 
 
@@ -95,7 +98,7 @@ class AdmittanceReport:
 
 
 class Admittance:
-    """Displaces the targets of all arms, so that each tool yields as M x'' + D x' + K x = F does."""
+    """Displaces the target of each arm by the x that solves M x'' + D x' + K x = F, so that the tool yields to F."""
 
     def __init__(self, robot: Robot, settings: AdmittanceSettings | None = None) -> None:
         self.settings = settings or AdmittanceSettings()
@@ -105,7 +108,7 @@ class Admittance:
 
     def reset(self) -> None:
         """Forget wrenches and displacements."""
-        self._wrench = {arm: np.zeros(6) for arm in self._arms}  # After the low-pass [N], [Nm].
+        self._wrench = {arm: np.zeros(6) for arm in self._arms}  # After the low-pass filter [N], [Nm].
         self._x = {arm: np.zeros(6) for arm in self._arms}  # Displacement [m], [rad].
         self._v = {arm: np.zeros(6) for arm in self._arms}  # [m/s], [rad/s]
         self._rejected = False
@@ -113,9 +116,10 @@ class Admittance:
     def update(self, targets: Mapping[str, pin.SE3 | None], state: RobotState, dt: float) -> dict[str, pin.SE3 | None]:
         """Return the displaced targets.
 
-        If an arm has no target, its displacement ends at once, because a new target starts at the tool. If a torque or
-        the posture is not finite, the last wrench is used. If dt is not positive and finite, nothing moves. The report
-        says so in both cases. A target that is not finite is passed on, and the controller refuses it.
+        If an arm has no target, its displacement becomes zero at once, because a new target starts at the tool's pose.
+        If a torque or the posture is not finite, the last wrench is used. If dt is not positive and finite, no
+        displacement changes. In both cases the report has ``rejected``. A target that is not finite is passed on, and
+        the controller refuses it.
 
         Args:
             targets: Targets of the tools, in the world frame.
@@ -141,7 +145,7 @@ class Admittance:
         return AdmittanceReport(arms, self._rejected)
 
     def _filter_wrenches(self, state: RobotState, dt: float) -> None:
-        """Let the wrench of every arm approach the measured one, or zero if nothing is measured."""
+        """Let the filtered wrench of every arm approach the measured wrench, or zero if no torque is measured."""
         tau, q = state.tau_external, state.q
         if tau is not None:
             self._rejected = not (math.isfinite(tau.sum()) and math.isfinite(q.sum()))
@@ -158,7 +162,7 @@ class Admittance:
             self._wrench[name] += share * (estimate - self._wrench[name])
 
     def _displace(self, arm: str, follows: bool, dt: float) -> None:
-        """Advance the displacement of one arm by ``dt`` [s]. It ends at once if the arm follows no target."""
+        """Compute the displacement of one arm ``dt`` [s] later. It is zero if the arm follows no target."""
         law, wrench, x, v, pushed = self.settings, self._wrench[arm], self._x[arm], self._v[arm], False
         linear = (slice(0, 3), law.stiffness, law.mass, law.force_dead_band, law.max_displacement)
         angular = (slice(3, 6), law.rotation_stiffness, law.inertia, law.torque_dead_band, law.max_rotation)

@@ -1,22 +1,25 @@
-"""Cartesian impedance control: turn the QP's reference into joint torques that make each tool a damped spring.
+"""Cartesian impedance control: turn the QP's reference into joint torques with which each tool is a damped spring.
 
     tau = J' (K e + D e') + N (K_n (q_r - q) + D_n (v_r - v)) + M(q) a_r + C(q, v) v + g(q) + joint-limit repulsion
 
-e is the way from the measured tool to that of the reference, e' the difference of their twists, D and D_n the damping
-of :func:`inertia_and_damping`, N a nullspace projector. Hogan 1985, Albu-Schaeffer et al. 2003.
+e is the displacement from the measured tool pose to the tool pose of the reference, and e' the difference of the two
+twists. D is the damping of :func:`inertia_and_damping`, D_n the damping of each joint, and N a nullspace projector.
+Hogan 1985, Albu-Schaeffer et al. 2003.
 
 **Feed-forward M a_r.** The inertia of an arm at its tool is mainly that of the rotors times the squared gear ratio: 20
-to 140 kg for a robot of 22 kg. Without feed-forward the spring would have to yield for every acceleration, by 30 mm at
-1 m/s^2. With it the spring bears only the errors of the model, and may be soft. A push at rest is not affected.
+to 140 kg for a robot of 22 kg. Without the feed-forward, every acceleration would stretch the spring, by 30 mm at
+1 m/s^2. With the feed-forward, the spring bears only the errors of the model, and may be soft. How a resting arm yields
+to a push does not change.
 
 **Torque rate.** A full stop at 10 rad/s^2 needs 70 Nm more in a joint that moves the whole arm. While the torque rises
-to that, the tool leaves the reference, and with it the distances that the reference keeps.
+by this amount, the tool deviates from the reference. The arm may then leave the distances that the reference keeps.
 
-**Payload.** A held object is part of M, C and g. Its mass is added and removed on a straight line over 0.3 s, so that
-no torque jumps.
+**Payload.** A held object is part of M, C and g. Its mass is added and removed linearly over 0.3 s, so that no torque
+jumps.
 
-**Time.** A reference is due at the end of its tick, and the state is measured at the start. The spring therefore acts
-about the reference of the tick before, which is due now. The acceleration is the one that leads to the newest one.
+**Time.** A reference is due at the end of its tick, and the state is measured at the start of the tick. The spring
+therefore acts about the reference of the previous tick, which is due now. The acceleration a_r is the one that leads
+from this reference to the newest reference.
 """
 
 from __future__ import annotations
@@ -53,10 +56,10 @@ _PAYLOAD_TIME = 0.3  # Time over which the mass of a payload is added or removed
 class ImpedanceReport:
     """The result of one tick. Joints and arms are given by name."""
 
-    errors: dict[str, Array]  # By arm (6,): clipped way to the reference, in world axes [m], [rad].
+    errors: dict[str, Array]  # By arm (6,): clipped displacement from tool to reference, in world axes [m], [rad].
     clipped: tuple[str, ...]  # Arms whose deviation from their reference is clipped.
     saturated: tuple[str, ...]  # Joints that would need more than their torque limit.
-    rate_limited: tuple[str, ...]  # Joints whose torque could not change as fast as it should.
+    rate_limited: tuple[str, ...]  # Joints whose torque would have to change faster than ``torque_rate_limit`` allows.
     repelled: tuple[str, ...]  # Joints that are pushed away from a position limit.
     held: bool  # Whether the measured state was not usable, so that the last gravity torque is held.
 
@@ -73,8 +76,8 @@ class ImpedanceController:
     """Turns the reference and the measured state of each tick into joint torques, for all arms of a cell.
 
     For any input the torques are finite, within ``torque_scale`` times the robot's limits, and change between two ticks
-    by no more than ``torque_rate_limit`` allows. Each arm is computed alone, with its own blocks of the inertia matrix
-    and its inverse. Joints that carry several arms get the sum.
+    by no more than ``torque_rate_limit`` allows. Torques are computed for each arm alone, with its own blocks of the
+    inertia matrix and of the inverse of this matrix. Joints that carry several arms get the sum of their torques.
     """
 
     def __init__(self, robot: Robot, settings: ImpedanceSettings | None = None) -> None:
@@ -102,9 +105,9 @@ class ImpedanceController:
         self._begin(robot.home)
 
     def reset(self, state: RobotState) -> None:
-        """Start again at rest at the measured posture. The first torque is that of gravity there, without a jump.
+        """Start again at rest at the measured posture. The first torque is the gravity torque there.
 
-        Changes of stiffness, damping or payload that are under way are completed at once.
+        Changes of stiffness, damping or payload that have not ended yet are completed at once.
 
         Raises:
             RobotError: If the posture is not nv finite numbers.
@@ -125,16 +128,16 @@ class ImpedanceController:
         data.commanded[:] = np.minimum(np.maximum(self.gravity(q), -self._limit), self._limit)
 
     def gravity(self, q: Array) -> Array:
-        """Return the torque (nv,) [Nm] that bears the arms and what they hold at a posture ``q`` (nv,) [rad]."""
+        """Return the torque (nv,) [Nm] that bears the weight of arms and payloads at a posture ``q`` (nv,) [rad]."""
         return np.array(pin.computeGeneralizedGravity(self._model, self._pinocchio_data, q))
 
     def set_holding(self, holding: Mapping[str, bool]) -> None:
-        """Take whether each gripper that has an object holds it, so that the arm has to bear its mass."""
+        """Set for each arm that has an object whether its gripper holds it. The arm bears the mass of a held object."""
         for arm in self._payloads:
             self._wanted_borne[arm] = float(holding.get(arm, False))
 
     def _bear(self, change: float) -> None:
-        """Move the borne share of each payload towards the wanted one by ``change``."""
+        """Move the share of each payload's mass that is borne towards the wanted share, by at most ``change``."""
         inertias = {held.joint: self.robot.model.inertias[held.joint] for held in self._payloads.values()}
         for arm, held in self._payloads.items():
             way = self._wanted_borne[arm] - self._borne[arm]
@@ -145,13 +148,13 @@ class ImpedanceController:
             self._model.inertias[joint] = inertia
 
     def change(self, values: Mapping[str, float], arm: str | None = None) -> None:
-        """Change stiffness and damping of one arm or of all arms, by the names in ``LIVE_IMPEDANCE``.
+        """Change stiffness and damping of one arm, or of all arms if ``arm`` is None.
 
-        The values change on a straight line over ``ramp_time``, because a stiffer spring that is stretched stores more
-        energy.
+        The keys of ``values`` are names in ``LIVE_IMPEDANCE``. The values change linearly over ``ramp_time``, because
+        the energy of a stretched spring rises with its stiffness.
 
         Raises:
-            ConfigError: If there is no such name or arm, or a value is out of range. Nothing is changed then.
+            ConfigError: If there is no such name or arm, or a value is out of range. Then nothing is changed.
         """
         if arm is not None and arm not in self._arms:
             raise ConfigError(f"impedance: no arm {arm!r:.40}; arms: {', '.join(self._arms)}")
@@ -172,11 +175,12 @@ class ImpedanceController:
         """Return the torques for one tick.
 
         Args:
-            reference: The reference, which is due at the end of the tick. One that is not finite is not used, and the
-                last one is held.
-            state: The state that was measured at the start of the tick. If it, or a result of it, is not finite, the
-                last gravity torque is held, because a spring about an unknown posture could push anywhere.
-            dt: Duration of the tick [s]. One that is not in (0, 0.1] counts as 0 or as 0.1.
+            reference: The reference, which is due at the end of the tick. If it is not finite, it is not used, and the
+                arms are held at the last reference.
+            state: The state that was measured at the start of the tick. If the state, or a torque that is computed from
+                it, is not finite, the command is the gravity torque at the last usable posture. At an unknown posture,
+                a spring could push in any direction.
+            dt: Duration of the tick [s]. A duration outside (0, 0.1] counts as 0 or as 0.1.
             extra: Torque that is added before saturation (nv,) [Nm].
         """
         time = min(float(dt), LONGEST_DT) if dt > 0.0 else 0.0
@@ -211,7 +215,7 @@ class ImpedanceController:
 
 
 def check_springs(values: Mapping[str, float]) -> None:
-    """Raise :class:`ConfigError` for a name that is not in ``LIVE_IMPEDANCE``, and for a value out of range."""
+    """Raise :class:`ConfigError` if a name is not in ``LIVE_IMPEDANCE``, or if a value is out of range."""
     for name in values.keys() - set(LIVE_IMPEDANCE):
         allowed = ", ".join(LIVE_IMPEDANCE)
         raise ConfigError(f"impedance: {name} = {values[name]!r:.40}: while a controller runs: {allowed}")

@@ -1,7 +1,8 @@
-"""Terms of Cartesian impedance control: task inertia, damping design, nullspaces, torque bounds.
+"""The terms of Cartesian impedance control: task inertia, damping design, nullspaces, torque bounds.
 
-Task vectors (6,) are linear, then angular, in world axes at the tool's origin; J (6, n) is that Jacobian of an arm's n
-joints, M (n, n) their inertia. Stiffness [N/m, Nm/rad], damping [Ns/m, Nms/rad], task inertia [kg, kg m^2].
+Vectors of the task (6,) have a linear part, then an angular part, in world axes at the tool's origin. J (6, n) is the
+Jacobian of an arm's tool with n joints, and M (n, n) is the inertia of these joints. Units: stiffness [N/m, Nm/rad],
+damping [Ns/m, Nms/rad], task inertia [kg, kg m^2].
 """
 
 from __future__ import annotations
@@ -20,8 +21,9 @@ from q2r2_control.types import Array
 
 BoolArray = npt.NDArray[np.bool_]
 
-ABSURD = 1e9  # A robot or a controller sends no number as large as this. The squares of smaller ones are finite.
-# The greatest inertia that a direction of a tool may have [kg]. An arm in a working posture stays below a fifth of it.
+# No number from a real robot or controller is as large as this. The squares of smaller numbers are finite.
+ABSURD = 1e9
+# The greatest inertia that a tool may have in any direction [kg]. In a working posture it is below a fifth of this.
 _HEAVIEST = 1000.0
 
 
@@ -43,7 +45,7 @@ def plausible(numbers: Array) -> bool:
 
 @numpy_kernel
 def clip_errors(errors: Array, position: float, rotation: float) -> BoolArray:
-    """Shorten each part of ``errors`` (k, 6) to ``position`` [m] and ``rotation`` [rad]; returns which were longer."""
+    """Shorten ``errors`` (k, 6) to at most ``position`` [m] and ``rotation`` [rad]; return which were longer (k,)."""
     clipped = np.zeros(len(errors), dtype=np.bool_)
     for i in range(len(errors)):
         nearer = position / max(size_of(errors[i, :3]), position)
@@ -57,7 +59,7 @@ def clip_errors(errors: Array, position: float, rotation: float) -> BoolArray:
 
 @numpy_kernel
 def inertia_and_damping(mobility: Array, stiffness: Array) -> tuple[Array, Array]:
-    """Return the inertia Lambda (6, 6) at the tool, and the damping (6, 6) of ratio 1 for a ``stiffness`` (6,).
+    """Return the inertia Lambda (6, 6) at the tool, and the damping (6, 6) with the ratio 1 for a ``stiffness`` (6,).
 
     ``mobility`` is J M^-1 J' (6, 6), whose inverse is Lambda (Khatib 1987, eq. 18). The damping gives every mode of
     Lambda x'' + D x' + K x = 0 the same ratio, by double diagonalisation (Albu-Schaeffer, Ott, Frese, Hirzinger:
@@ -65,9 +67,10 @@ def inertia_and_damping(mobility: Array, stiffness: Array) -> tuple[Array, Array
     K v = lambda Lambda v, V' Lambda V = I, Q = V^-1, D = 2 Q' diag(xi sqrt(lambda)) Q. K being diagonal,
     K^1/2 J M^-1 J' K^1/2 = U diag(lambda) U' gives Q' = K^1/2 U diag(lambda)^-1/2, and with it Lambda = Q' Q.
 
-    Near a singular posture a lambda vanishes, and Lambda and the damping force would grow without bound. For that
-    reason lambda, the square of a mode's frequency, is not below the one of 1000 kg. All other modes stay exact. A
-    damping term on the diagonal would instead make the projector with Lambda inexact everywhere.
+    Near a singular posture some lambda vanishes, and Lambda and the damping force would grow without bound. A lambda is
+    the square of a mode's frequency. It is therefore raised to at least the value that belongs to a mass of 1000 kg.
+    All other modes stay exact. A damping term on the diagonal would instead make the projector with Lambda inexact in
+    every posture.
     """
     root = np.sqrt(stiffness)
     scaled = np.zeros((6, 6))
@@ -88,9 +91,9 @@ def inertia_and_damping(mobility: Array, stiffness: Array) -> tuple[Array, Array
 
 @numpy_kernel
 def consistent_force(inertia: Array, J: Array, M_inverse: Array, torque: Array) -> Array:
-    """Return the force F (6,) for which ``torque`` - J' F does not accelerate the tool, which is N torque.
+    """Return the force F (6,) with which the joint torque ``torque`` - J' F does not accelerate the tool.
 
-    N = I - J' Lambda J M^-1 (Khatib 1987, eq. 51).
+    This difference is N ``torque`` with N = I - J' Lambda J M^-1 (Khatib 1987, eq. 51).
     """
     return inertia @ (J @ (M_inverse @ torque))
 
@@ -99,34 +102,34 @@ class ImpedanceModel(NamedTuple):
     """Data that do not change between ticks."""
 
     chain: Chain
-    tools: Tools  # Tools of k arms.
+    tools: Tools  # The tools of all k arms.
     limits: PositionLimits
     torque_limit: Array  # (nv,) [Nm]
     largest_error: Array  # (2,) [m, rad]
 
 
 class ImpedanceData(NamedTuple):
-    """The measurement of one tick, and the arrays that are written in it."""
+    """The measurement of one tick, and the arrays that are written in this tick."""
 
     inputs: Array  # (6, nv) Measured q and v; q, v and a of the newest reference; torque that is added [Nm].
     due: Array  # (2, nv) q and v of the reference that is due now.
-    springs: Array  # (k, 5) Values of ``LIVE_IMPEDANCE``.
-    M: Array  # (nv, nv) Inertia.
+    springs: Array  # (k, 5) The values of ``LIVE_IMPEDANCE`` for each arm.
+    M: Array  # (nv, nv) Joint-space inertia matrix.
     torque: Array  # (nv,) Input: torque of gravity and velocity. Output: torque of the law [Nm].
     commanded: Array  # (nv,) The last torque, within all bounds [Nm].
     saturated: BoolArray  # (nv,) Joints that would need more than their torque limit.
-    late: BoolArray  # (nv,) Joints whose torque could not change as fast as it should.
+    late: BoolArray  # (nv,) Joints whose torque would have to change faster than its rate limit allows.
     J: Array  # (k, 6, nv) Jacobians at the measured posture.
-    error: Array  # (k, 6) Clipped way to the wanted pose [m], [rad].
-    clipped: BoolArray  # (k,) Arms whose way was longer.
+    error: Array  # (k, 6) Clipped displacement from the measured to the wanted tool pose [m], [rad].
+    clipped: BoolArray  # (k,) Arms whose displacement was longer before it was clipped.
     repulsion: Array  # (nv,) Torque from position limits [Nm].
-    wanted_twist: Array  # (k, 6)
+    wanted_twist: Array  # (k, 6) Twists of the tools at the reference that is due now [m/s], [rad/s].
     wanted_rotation: Array  # (k, 3, 3) Wanted rotations of the tools.
     wanted_translation: Array  # (k, 3) [m]
-    rotation: Array  # (3, 3) Scratch: rotation of a measured tool.
-    translation: Array  # (3,) [m]
-    turn: Array  # (3, 3) Scratch: rotation from the measured to the wanted orientation.
-    placements: Placements  # Scratch.
+    rotation: Array  # (3, 3) Buffer for the measured rotation of one tool.
+    translation: Array  # (3,) Buffer for the measured position of one tool [m].
+    turn: Array  # (3, 3) Buffer for the rotation from the measured to the wanted orientation.
+    placements: Placements  # Buffer for the poses of the joint frames.
 
     @classmethod
     def empty(cls, model: ImpedanceModel, springs: Array) -> ImpedanceData:
@@ -159,14 +162,14 @@ class ImpedanceData(NamedTuple):
 def impedance_torque(
     model_pointer: KernelPointer, data_pointer: KernelPointer, change: float
 ) -> tuple[bool, bool, bool, bool]:
-    """Write the torque of one tick into ``data.commanded``, at most ``change`` [Nm] from the last one.
+    """Write the torque of one tick into ``data.commanded``, at most ``change`` [Nm] from the last torque.
 
-    A reference that is not finite is not used, and the last one is held. All is one kernel, because every call from
-    Python takes time.
+    If the reference is not finite, the arms are held at the last reference. One kernel does all of this, because every
+    call from Python takes time.
 
     Returns:
-        Whether there is a torque, whether an error was clipped, whether a limit repels, and whether a bound held the
-        torque back. There is no torque if the measured state, or a result of it, is not finite.
+        Whether there is a torque, whether an error was clipped, whether a position limit repels a joint, and whether a
+        torque bound was active. There is no torque if the measured state, or a torque computed from it, is not finite.
     """
     model, data = pointee(model_pointer), pointee(data_pointer)
     measured, reference, added = data.inputs[:2], data.inputs[2:5], data.inputs[5]
@@ -205,7 +208,7 @@ def _add_springs(model: ImpedanceModel, data: ImpedanceData, q: Array, v: Array)
         inertia, damping = inertia_and_damping(J @ M_inverse @ J.T, stiffness)
         force = stiffness * data.error[i] + values[2] * (damping @ (data.wanted_twist[i] - J @ v))
         for j in range(len(q)):
-            # The damping of each joint has its ratio for the inertia that this joint moves alone.
+            # The damping of each joint has the set damping ratio for the inertia that this joint moves alone.
             joint_damping = 2.0 * values[4] * np.sqrt(values[3] * data.M[j, j])
             posture[j] = (values[3] * (data.due[0, j] - q[j]) + joint_damping * (data.due[1, j] - v[j])) * member[j]
         force -= consistent_force(inertia, J, M_inverse, posture)
@@ -215,7 +218,7 @@ def _add_springs(model: ImpedanceModel, data: ImpedanceData, q: Array, v: Array)
 
 @kernel
 def _update_tools(model: ImpedanceModel, data: ImpedanceData, q: Array) -> None:
-    """Write the Jacobians at ``q``, the wanted twists, and the ways from measured to wanted poses."""
+    """Write the Jacobians at ``q``, the wanted twists, and the displacements from measured to wanted tool poses."""
     place(model.chain, data.due[0], data.placements)
     for i in range(len(data.J)):
         tool_pose(data.placements, model.tools, i, data.wanted_rotation[i], data.wanted_translation[i])
@@ -241,11 +244,12 @@ def copy(values: Array, out: Array) -> None:
 
 @numpy_kernel
 def limit_repulsion(limits: PositionLimits, q: Array, v: Array, wanted: Array) -> Array:
-    """Return the torque (nv,) [Nm] away from position limits, of a spring that begins at a distance before each.
+    """Return the torque (nv,) [Nm] with which a spring before each position limit pushes its joint back.
 
-    If the reference ``wanted`` (nv,) is nearer to the limit, the spring begins at the reference. The reference keeps
-    the limits by itself, and a spring that keeps a joint from its reference would keep the tool from its target. The
-    damping grows from 0 along this way, so that the torque does not jump. It brakes, and never pulls.
+    The spring begins at ``limits.distance`` before the limit. If the reference ``wanted`` (nv,) is nearer to the limit,
+    the spring begins at the reference: the reference keeps the limits by itself, and a spring that keeps a joint from
+    its reference would keep the tool from its target. The damping grows from 0 over the same distance, so that the
+    torque does not jump. The damping may reduce the torque to 0, but it never pulls a joint towards its limit.
     """
     reach, share = limits.distance, limits.damping / limits.distance
     below = np.maximum(np.minimum(limits.lower + reach, wanted) - q, 0.0)
@@ -260,8 +264,8 @@ def bound_torque(tau: Array, last: Array, limit: Array, change: float) -> tuple[
     """Return ``tau`` (nv,) within +-``limit`` (nv,) and at most ``change`` from ``last`` (nv,), all in Nm.
 
     If ``last`` is within the limit, both bounds hold: the result lies between ``last`` and the saturated torque, and is
-    therefore within the limit as well. The other two results (nv,) tell which joints were saturated, and which could
-    not change fast enough.
+    therefore within the limit as well. The other two results (nv,) tell which joints were saturated, and which torques
+    would have to change by more than ``change``.
     """
     within = np.minimum(np.maximum(tau, -limit), limit)
     bounded = np.minimum(np.maximum(within, last - change), last + change)

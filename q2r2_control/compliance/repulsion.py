@@ -1,40 +1,46 @@
-"""A repulsive, damped wall between the measured links, for torque mode, where they may leave the QP's reference.
+"""A repulsive, damped force between measured links, called the wall. It is for torque mode only.
 
-In the tick it comes after the QP, beside the impedance:  tau = impedance + gravity and Coriolis + wall,  from the
-measured q and v of the same tick and before torques are saturated. The reference keeps its distances by itself; an arm
-that is pushed away from it meets this wall.
+In torque mode, the measured links may deviate from the QP's reference. The reference keeps its distances by itself. If
+an arm is pushed away from its reference, the wall pushes it away from other bodies. The command of a tick is
 
-**The law.** Each monitored pair closer by the depth x than the distance that it keeps presses itself apart with
+    tau = impedance + gravity and Coriolis + wall
 
-    F = min(k x, F_max) - c(x) d',    clipped to [0, F_max],    tau += (dd/dq)' F,
+from the q and v that were measured in this tick. The wall is added before torques are saturated.
 
-d' the rate of distance, c the damping of ratio xi at the pair's effective mass m = 1 / (g' M^-1 g), g = dd/dq (Khatib,
-IJRR 1987), rising from 0 to its value in the first two millimetres. The torque is continuous in q and v and never pulls
-two bodies together. Its elastic part is the gradient of  U = sum k x^2 / 2:  the wall gives back at most what was put
-in. Distances are those of pair_distance.py, so that bodies that lie along each other do not make the torque switch from
-end to end.
+**The law.** If a monitored pair is closer than its kept distance by the depth x, the wall pushes its bodies apart with
+
+    F = min(k x, F_max) - c(x) d',    clipped to [0, F_max],    tau += (dd/dq)' F.
+
+d is the distance and d' its rate. c is the damping of ratio xi at the pair's effective mass m = 1 / (g' M^-1 g) with
+g = dd/dq (Khatib, IJRR 1987); over the first two millimetres of x, it rises from 0 to this value. The torque is
+continuous in q and v, and never pulls two bodies together. Its elastic part is the negative gradient of
+U = sum k x^2 / 2:  the wall gives back at most the energy that was put in. Distances are the smooth ones of
+pair_distance.py. If bodies lie along each other, the torque therefore does not switch from end to end.
 
 **Why many pairs do not add up to an unstable stiffness.** All pairs act through the same joints. With K = sum k g g'
-and D = sum c g g' the fastest mode of M^-1 K is no faster than the trace, sum k / m, and that of M^-1 D no faster than
-sum c / m. Held over a period h, a mode with stiffness w^2 and damping 2 z is stable exactly when h w^2 / 2 < 2 z < 2 /
-h  (Colgate and Schenkel, 1997, for the lower bound). With T = 2 ms, the longest period, the stiffness of all pairs is
-scaled down together where sum k / m would exceed 0.25 / T^2. The damping is too where sum c / m would exceed 0.5 / T.
-These are a quarter of the stable bounds, enough for one period of delay and for masses wrong by a factor of two. Then c
-> h k / 2 for every pair while no more than 16 are scaled down together, but for the first hundredths of a millimetre,
-where c is still rising. A pair's share in the sums fades in over two millimetres outside the shell, so that the scale
-does not jump. It only makes the wall softer. Where it acts (never for two iiwa 7 with the default stiffness) the torque
-is the gradient of U but for the scale's own slope.
+and D = sum c g g', the largest eigenvalue of M^-1 K is at most its trace, sum k / m, and that of M^-1 D at most sum c /
+m. If the torque is held over a period h, a mode with stiffness w^2 and damping 2 z is stable exactly when h w^2 / 2 <
+2 z < 2 / h  (Colgate and Schenkel, 1997, for the lower bound). T = 2 ms is the longest period. The stiffness of all
+pairs is scaled down together if sum k / m would exceed 0.25 / T^2, and the damping if sum c / m would exceed 0.5 / T.
+These values are a quarter of the stable bounds. That suffices for one period of delay, and for masses that are wrong by
+a factor of two. Then c > h k / 2 for every pair, as long as no more than 16 pairs are scaled down together. The only
+exception is the first hundredths of a millimetre, in which c is still rising. A pair begins to count in the sums two
+millimetres outside its kept distance, with a share that rises from 0 to 1, so that the scale does not jump. The scale
+only makes the wall softer. If it is below 1 (never for two iiwa 7 with the default stiffness), the elastic torque also
+lacks the part of the gradient of U that comes from the scale.
 
-**The greatest load.** d_min is the distance that a pair keeps. At rest a force of k d_min or F_max, whichever is less.
-In motion it takes up at most the energy F_max d_min for each pair, beside the joints' share. Bodies that meet with more
-than that are slowed down, but touch. Fingers that may come within a millimetre therefore touch at a push of 10 N.
+**The greatest load.** d_min is the distance that a pair keeps. At rest, the wall withstands a force of k d_min or
+F_max, whichever is less. In motion, it takes up at most the energy F_max d_min for each pair, besides the share of the
+joints. Bodies that meet with more energy are slowed down, but touch. Fingers that may come within a millimetre
+therefore touch at a push of 10 N.
 
-**Fingers** are the same bodies as in the controller, at the openings that it has accepted. A wall around all of their
-way would push the arms out of postures that the reference may take. A body that has grown meets no pair at the
-reference; elsewhere its push comes at the rate of torques that the impedance allows.
+**Fingers** have the same bodies as in the controller, for the openings that the controller has accepted. With bodies
+that cover all openings, the wall would push the arms out of postures that the reference may take. If a body has grown,
+it touches no wall at the reference. At other postures, the torque of the wall rises no faster than the impedance's rate
+limit allows.
 
-**Moving obstacles** count that stay where they are. A report of one that moves would put energy into the wall,
-k x^2 / 2 for each jump of x, and push an arm that rests.
+**Moving obstacles** count only while they stay where they are. If a moving obstacle counted, each report would let x
+jump, put the energy k x^2 / 2 into the wall, and push an arm that rests.
 """
 
 from __future__ import annotations
@@ -66,14 +72,16 @@ from q2r2_control.types import Array, Interval
 _LONGEST_PERIOD = 0.002  # T [s]
 _STIFFEST = 0.25 / _LONGEST_PERIOD**2  # Largest sum k / m [1/s^2].
 _MOST_DAMPED = 0.5 / _LONGEST_PERIOD  # Largest sum c / m [1/s].
-# Band inside the shell in which damping fades in, and outside it in which a pair's share in the sums does [m].
+# The shell of a pair is its kept distance. Inside the shell, the damping rises from 0 to its value over this distance.
+# Outside the shell, the share of the pair in the sums rises from 0 to 1 over the same distance [m].
 _BAND = 0.002
-_IMMOBILE = 1e-9  # [1/kg]
-# Smoothing length of distances, relative to the radii and the kept distance. The error is at most 0.3 mm.
+_IMMOBILE = 1e-9  # A pair with a smaller mobility 1 / m cannot be moved by the joints [1/kg].
+# Smoothing length of distances, relative to the sum of the radii and the kept distance. The error is at most 0.3 mm.
 _SMOOTHING = 0.07
-# Cores that are closer than this part of the radii are measured exactly, because smoothing would weaken the force.
+# If two cores are closer than this share of the sum of the radii, their distance is measured exactly, because smoothing
+# would weaken the force.
 _DEEP = 0.25
-# Depth of two bodies that may touch from which the wall pushes, relative to the radii.
+# The wall pushes bodies that may touch only at a greater depth than this, relative to the sum of the radii.
 _SOFT = 0.5
 _OUT_OF_REACH = MovingObstacle(shape="sphere", size=(0.1,), position=(0.0, 0.0, -20.0), speed=0.0)
 
@@ -83,7 +91,7 @@ class RepulsionModel(NamedTuple):
 
     collision: CollisionModel
     smoothing: Array  # (p,) [m^2]
-    deep: Array  # (p,) Distance below which it is measured exactly [m].
+    deep: Array  # (p,) Smaller distances than this are measured exactly [m].
     shell: Array  # (p,) Distance that the pair keeps [m].
     stiffness: float  # [N/m]
     damping_ratio: float
@@ -91,12 +99,12 @@ class RepulsionModel(NamedTuple):
 
 
 class RepulsionData(NamedTuple):
-    """The measurement of one tick, and arrays that are written in it."""
+    """The measurement of one tick, and arrays that are written in this tick."""
 
-    measured: Array  # (2, nv) q and v
-    M: Array  # (nv, nv) mass matrix, read from its upper triangle; overwritten
+    measured: Array  # (2, nv) The measured q and v.
+    M: Array  # (nv, nv) Mass matrix, of which the upper triangle is read. It is overwritten with its Cholesky factor.
     collision: CollisionData  # Collision data at q.
-    near: IntArray  # (p,) Pairs in the shell or just outside.
+    near: IntArray  # (p,) Indices of the near pairs, which are inside the shell or just outside.
     depth: Array  # (p,) Their depths [m].
     rows: Array  # (p, nv) Gradients of their distances.
     mobility: Array  # (p,) 1 / m [1/kg]
@@ -123,9 +131,10 @@ class RepulsionData(NamedTuple):
 
 @kernel
 def find_near(model_pointer: KernelPointer, data_pointer: KernelPointer) -> tuple[int, int, float]:
-    """Write depths and gradients of the pairs in the shell or just outside.
+    """Write depths and gradients of the near pairs, which are inside the shell or just outside.
 
-    Returns how many these are, the closest pair of all and its distance; -1 where q or v is not finite.
+    Returns the number of near pairs, the closest of all pairs and its distance [m]. If q or v is not finite, the number
+    is -1.
     """
     model, data = pointee(model_pointer), pointee(data_pointer)
     if not np.isfinite(data.measured.sum()):
@@ -136,11 +145,11 @@ def find_near(model_pointer: KernelPointer, data_pointer: KernelPointer) -> tupl
         if at_least(model.collision, data.collision, p) >= max(least, model.shell[p] + _BAND):
             continue
         distance = measure(model.collision, data.collision, p)
-        # A pair that may touch must not hide a pair that must not.
+        # Penetration of a pair that may touch counts as 0, so that it does not hide a pair that must not touch.
         apart = max(distance, 0.0) if model.shell[p] < 0.0 else distance
         if apart < least:
             least, closest = apart, p
-        # The smooth distance is at least as large.
+        # The smooth distance is never smaller than this distance.
         if distance >= model.shell[p] + _BAND:
             continue
         if distance > model.deep[p]:
@@ -165,7 +174,7 @@ def repulsion_torque(model_pointer: KernelPointer, data_pointer: KernelPointer, 
     stiffness = model.stiffness * min(1.0, _STIFFEST / max(total, _IMMOBILE))
     total = 0.0
     for i in range(count):
-        # c = 2 xi sqrt(k m), thus c / m = 2 xi sqrt(k / m)
+        # c = 2 xi sqrt(k m), thus c / m = 2 xi sqrt(k / m).
         share = clamp(depth[i] / _BAND, 0.0, 1.0)
         total += share * 2.0 * model.damping_ratio * np.sqrt(stiffness * mobility[i])
     damping = 2.0 * model.damping_ratio * min(1.0, _MOST_DAMPED / max(total, _IMMOBILE))
@@ -206,21 +215,23 @@ def _mobility(factor: Array, row: Array, out: Array) -> float:
 class WallReport:
     """The wall's action in one tick."""
 
-    tau: Array  # (nv,) Torque that is added to the commanded one [Nm].
+    tau: Array  # (nv,) Torque of the wall, which is added to the other torques [Nm].
     pressing: tuple[tuple[str, str], ...]  # Names of the bodies that the wall pushes apart.
     force: float  # The largest force of a pair [N].
     energy: float  # Energy stored in the wall [J].
     closest_pair: tuple[str, str]  # The closest pair of measured bodies.
-    closest_distance: float  # Its distance [m]; 0 if pairs touch that may, NaN if q or v is not finite.
+    # The distance of this pair [m]; 0 if it may touch and penetrates; NaN if q or v is not finite.
+    closest_distance: float
 
 
 class MeasuredSeparation:
-    """Keeps the measured links apart in torque mode. It keeps no state between ticks."""
+    """Pushes measured links apart in torque mode. The torque depends only on the measurement of the present tick."""
 
     def __init__(self, robot: Robot, settings: ControllerSettings, wall_settings: WallSettings | None = None) -> None:
-        """Make a wall with the distances that pairs keep by ``settings``.
+        """Make a wall that begins at the distances that pairs keep according to ``settings``.
 
-        Raises :class:`RobotError` for a shape that no kernel measures, :class:`ConfigError` as the controller does.
+        Raises :class:`RobotError` if no kernel measures a shape, and :class:`ConfigError` if the settings do not fit
+        the robot.
         """
         law, self._model, self._data = wall_settings or WallSettings(), robot.model, robot.model.createData()
         geometry = with_obstacle_bodies(robot, settings.moving_obstacles, held=False)
@@ -256,24 +267,24 @@ class MeasuredSeparation:
             self.set_kept_distances(self._kept)
 
     def set_obstacles(self, obstacles: Mapping[str, MovingObstacle]) -> None:
-        """Set the moving obstacles that stay where they are, by name. All others are put out of reach."""
+        """Set the moving obstacles that stay where they are, by name. All others have no effect on the arms."""
         for name, number in self._obstacles.items():
             write_body(self._bodies, number, obstacles.get(name, _OUT_OF_REACH))
         self.set_kept_distances(self._kept)
 
     def set_kept_distances(self, kept: Array) -> None:
-        """Set the distance (p,) [m] that every pair keeps, which is where its wall begins."""
+        """Set the distance (p,) [m] that every pair keeps. The wall of a pair begins at this distance."""
         self._kept, radius = kept, self._bodies.radius
         radii = radius[self._pairs.first] + radius[self._pairs.second]
         self._deep[:] = (_DEEP - 1.0) * radii
-        # Pairs that may touch meet the wall only at depths that a touch does not reach.
+        # For pairs that may touch, the wall begins at a depth that an ordinary touch does not reach.
         self._shell[:] = np.maximum(np.append(kept, self._kept_by_obstacles), -_SOFT * radii)
         self._smoothing[:] = (_SMOOTHING * (radii + self._shell)) ** 2
 
     def update(self, q: Array, v: Array) -> WallReport:
         """Return the wall's torque at the measured ``q`` [rad] and ``v`` [rad/s], (nv,) each.
 
-        Never raises because of a number: where one is not finite nothing can be known, and no torque is given.
+        If a number is not finite, no exception is raised: the torque is then zero, because the posture is unknown.
         """
         np.concatenate((q, v), out=self._measured)
         count, closest, distance = self._find_near(self._model_pointer, self._data_pointer)

@@ -20,13 +20,13 @@ def answer_of(ask: Callable[[Array, Array], object], q: Array, v: Array, shapes:
     """Ask for a matrix and a vector at a state.
 
     Args:
-        ask: Gets copies of ``q`` and ``v``, and may do anything.
+        ask: The user's function. It gets copies of ``q`` and ``v``, and may raise or return anything.
         q: Joint positions (nv,) [rad].
         v: Joint velocities (nv,) [rad/s].
-        shapes: The allowed shapes for a person; "" if they are (k, nv) and (k,).
+        shapes: Text for the message that names the allowed shapes; "" if they are (k, nv) and (k,).
 
     Returns:
-        A finite matrix (k, nv) and vector (k,), or one line that says why there are none.
+        A finite matrix (k, nv) and vector (k,), or one line that says why the answer cannot be used.
     """
     try:
         answer = ask(q.copy(), v.copy())

@@ -1,8 +1,9 @@
 """A user's own linear constraints on the next joint velocities: rows of the QP in addition to those of separation.
 
-A soft constraint has a slack, as the rows of separation have. A hard constraint has none, and is checked again before a
-step is taken: if the velocities break it, the certified stop is executed instead. The certificate does not read these
-rows. For that reason no constraint can break a limit or a distance, and the stop is not proven to keep a constraint.
+A soft constraint has a slack, as the rows of separation have. A hard constraint has no slack, and is checked again
+before a step is taken: if the velocities break it, the certified stop is executed instead. The certificate does not
+read these rows. For that reason, no constraint can make the arms break a limit or a distance. For the same reason, it
+is not proven that the stop keeps a constraint.
 """
 
 from __future__ import annotations
@@ -34,8 +35,9 @@ class Constraint(Protocol):
     and does not know the constraint, so that the arms may break it until they rest. This takes 0.3 s from full speed in
     the shipped cells. At rest the constraint holds if no ``lower`` is above 0.
 
-    The constraint is about velocities and not about positions. A plane is kept as well as ``rows`` turns distances into
-    velocities, and the stop may lead beyond it. Arms that can never satisfy the constraint stay where they are.
+    The constraint is about velocities and not about positions. How well the arms stay on one side of a plane depends on
+    how well ``rows`` turns distances into velocities, and the stop may lead beyond the plane. Arms that can never
+    satisfy the constraint stay where they are.
     """
 
     def rows(self, q: Array, v: Array) -> tuple[Array, Array]:
@@ -51,8 +53,8 @@ class Constraint(Protocol):
 
         Returns:
             A (k, nv) and lower (k,), finite, with any k and rows of any norm. An exception or another answer is
-            reported in ``faults`` of the step's report. A soft constraint then has no effect, and with a hard one the
-            arms brake.
+            reported in ``faults`` of the step's report. If the constraint is soft, it then has no effect. If it is
+            hard, the arms brake.
         """
 
 
@@ -84,7 +86,7 @@ class OwnConstraints:
         return bool(self._soft or self._hard)
 
     def write(self, q: Array, v: Array) -> tuple[str, ...]:
-        """Ask every constraint for its rows at ``q`` and ``v``; returns the reasons for answers that are not used."""
+        """Ask every constraint for its rows at ``q`` and ``v``; return a reason for each answer that is not used."""
         faults: list[str] = []
         found = [self._rows_of(kind, q, v, faults) for kind in (self._soft, self._hard)]
         rows = [answer for kind in found for _, answer in kind]
@@ -116,7 +118,7 @@ class OwnConstraints:
         return not self._unknown and bool((self.matrix[first:] @ v >= self.lower[first:] - HARD_TOLERANCE).all())
 
     def active(self, v: Array) -> tuple[tuple[ActiveLimit, ...], float]:
-        """Return the constraints that ``v`` (nv,) just satisfies or breaks, and the largest violation [rad/s]."""
+        """Return the constraints that are active at ``v`` (nv,) or broken by it, and the largest violation [rad/s]."""
         slack = self.lower - self.matrix @ v
         names = dict.fromkeys(name for name, lacks in zip(self._names, slack, strict=True) if lacks >= -_ACTIVE)
         limits = tuple(ActiveLimit(LimitKind.CONSTRAINT, (name.partition(" ")[2],)) for name in names)

@@ -58,7 +58,7 @@ class CartesianController(WatchedPairs):
             (guard.py), so that nothing that it answers, raises or writes can break the contract.
         tasks: Your own costs, in addition to those of ``settings.tasks``.
         constraints: Your own rows, soft or hard.
-        bridge_held: Whether targets that come less often than steps are bridged, see
+        bridge_held: Whether targets that come less often than steps are interpolated, see
             :mod:`q2r2_control.control.held_targets`. False for a loop whose targets are new at every step anyway.
 
     Raises:
@@ -103,14 +103,15 @@ class CartesianController(WatchedPairs):
 
     @property
     def settings(self) -> ControllerSettings:
-        """The settings of the last :meth:`change`, or the first ones."""
+        """The settings of the last :meth:`change`, or those of the constructor."""
         return self._live.settings
 
     def change(self, values: Mapping[str, Any]) -> str | None:
-        """Change settings by the names in ``LIVE`` from the next step on; returns why that is not possible, or None.
+        """Change settings whose names are in ``LIVE``, from the next step on.
 
-        Gains change within half a second. A smaller ``min_distance`` counts at once. A greater one counts for each pair
-        as soon as it is certified (:attr:`kept_distances`). It is refused if the home posture does not keep it.
+        Returns None, or the reason why the change is not possible. Gains change within half a second. A smaller
+        ``min_distance`` counts at once. A greater ``min_distance`` counts for each pair as soon as it is certified
+        (:attr:`kept_distances`). It is refused if the home posture does not keep it.
         """
         try:
             refused = self._live.change(self.settings.changed(values))
@@ -161,12 +162,14 @@ class CartesianController(WatchedPairs):
         """Move the reference by one step towards the targets.
 
         Args:
-            targets: Poses of the tools by arm, in the world frame. An arm that is missing or None holds. If a target is
-                not a finite pose, the arm keeps its last target, and the report names the arm. A target that replaces
-                one which was held for several steps, up to 110 ms, is reached within 1.25 times that time.
-            dt: Duration of the step [s]. Above 0.1 s the reference moves by 0.1 s; if it is not above 0, by nothing.
-            posture: Where the joints go that the tools leave free (nv,) [rad]; None for home. A posture that is not
-                finite is not used.
+            targets: Poses of the tools by arm, in the world frame. An arm without a target, or with None, holds. If a
+                target is not a finite pose, the arm keeps its last target, and the report names the arm. If the last
+                target was held for several steps, up to 110 ms, the next target is interpolated over 1.25 times that
+                time.
+            dt: Duration of the step [s]. Above 0.1 s the reference moves by 0.1 s. If it is not above 0, the reference
+                does not move.
+            posture: The posture to which the joints move as far as the tools leave them free (nv,) [rad]; None for
+                home. A posture that is not finite is not used.
 
         Returns:
             The new reference, in arrays of its own.
@@ -227,7 +230,7 @@ class CartesianController(WatchedPairs):
         Args:
             x: Next joint velocities (nv,) [rad/s]. The slacks may follow them, as in a solution of the whole problem.
                 All parts of a dt above ``max_substep`` use the same velocities.
-            targets: As in :meth:`step`. These are the targets with which the problem was made.
+            targets: The same targets as in the call of :meth:`problem`.
             dt: As in :meth:`step` [s].
             posture: As in :meth:`step`.
 
@@ -262,7 +265,7 @@ class CartesianController(WatchedPairs):
             for index in range(parts):
                 if not self._take_part(time / parts, 1.0 / parts, -1.0 if index else time, summary, solve):
                     summary.unsolved |= 1 << index
-        else:  # The targets are taken, and nothing moves.
+        else:  # The targets are stored, and the reference does not move.
             self._qp.take_targets(summary)
         rejected = () if known and summary.targets_usable else self._targets.rejected(targets)
         if rejected:
@@ -296,9 +299,9 @@ class CartesianController(WatchedPairs):
         return Reference(state.q.copy(), state.v.copy(), state.a.copy(), report)
 
     def brake(self, dt: float) -> Reference:
-        """Move the reference by ``dt`` [s] along its certified stop. The rest of the stop stays certified.
+        """Move the reference by ``dt`` [s] along its certified stop. The remaining part of the stop stays certified.
 
-        When the stop ends, the reference is at rest. A dt that is not above 0 moves nothing.
+        When the stop ends, the reference is at rest. With a dt that is not above 0, the reference does not move.
         """
         self._remember()
         self._state.a[:] = 0.0
@@ -317,9 +320,10 @@ class CartesianController(WatchedPairs):
             kept[:] = array
 
     def withdraw(self, reference: Reference) -> None:
-        """Undo the last step, because its ``reference`` came too late for the plant, which has begun to brake.
+        """Undo the last step, because its ``reference`` came too late for the plant, and the plant has begun to brake.
 
-        State and certified stop become those before the step, and ``reference`` becomes that state.
+        The controller gets back the state and the certified stop from before the step. Positions and velocities of this
+        state are also written into ``reference``.
 
         Raises:
             RobotError: If ``reference`` is not a reference.
@@ -328,7 +332,7 @@ class CartesianController(WatchedPairs):
         for array, kept in zip(self._restored, self._before, strict=True):
             array[:] = kept
         reference.q[:], reference.v[:] = self._state.q, self._state.v
-        # Later parts of the step may have certified greater distances than the arms keep where they are now.
+        # A later substep may have certified greater distances than the arms keep at their present posture.
         pairs_kept, objects_kept = self._kept_before
         self._live.keep_no_more_than(pairs_kept)
         self._objects.keep_no_more_than(objects_kept)
@@ -337,7 +341,8 @@ class CartesianController(WatchedPairs):
     def hold_at(self, q: Array | None) -> None:
         """Let arms without a target go to the posture ``q`` and hold there. The contract holds as always.
 
-        Their speed is 4 /s times the remaining way. ``q`` should therefore move as the arms should.
+        The speed of a joint is 4 /s times its remaining distance. For slower motion, change ``q`` slowly from call to
+        call.
 
         Args:
             q: The posture (nv,) [rad]; None lets arms hold where they come to rest.
@@ -348,7 +353,7 @@ class CartesianController(WatchedPairs):
         self._targets.hold_at(None if q is None else self.robot.checked("q", q))
 
     def tool_pose(self, arm: str) -> pin.SE3:
-        """Return the pose of an arm's tool in the reference, in the world frame.
+        """Return the pose of an arm's tool at the reference, in the world frame.
 
         Raises:
             RobotError: If there is no such arm.
@@ -358,7 +363,7 @@ class CartesianController(WatchedPairs):
 
     @property
     def solver_failure(self) -> str | None:
-        """Why the solver's last answer was not a solution; None if it was one. DAQP gives no reasons."""
+        """The reason why the solver's last answer was no solution; None if it was a solution. DAQP gives no reasons."""
         return getattr(self._solver, "failure", None)
 
     @property
@@ -375,9 +380,9 @@ class CartesianController(WatchedPairs):
     def _take_part(
         self, h: float, share: float, tick: float, summary: StepSummary, solve: Callable[[QpProblem], QpSolution]
     ) -> bool:
-        """Build and solve the QP of one step, certify the solution and move; returns whether it was solved.
+        """Build and solve the QP of one substep, certify the solution and move; return whether the QP was solved.
 
-        ``share`` is the part of the tick that this step is, and ``h`` its duration [s].
+        ``h`` is the duration of the substep [s], and ``share`` is this duration divided by that of the tick.
         """
         self._write_problem(h, tick, summary)
         solution = solve(self._qp.problem)
@@ -395,17 +400,17 @@ class CartesianController(WatchedPairs):
         summary.slack = max(summary.slack, slack)
         summary.solve_time += solution.solve_time
         was_apart, self._apart = self._apart, self._observed[-1] >= -ROUNDING
-        # The rest of a certified stop is certified. Any other step was certified just now; the proof is complete if all
-        # pairs kept their distance before.
+        # What remains of a certified stop is certified. Any other step was certified just now. This proof is complete
+        # if all pairs kept their distance before the step.
         self._certified = self._apart and (self._certified if outcome == STOPPED else was_apart)
         return solved
 
     def _move_as_permitted(self, solved: bool, h: float, share: float, summary: StepSummary) -> tuple[int, float]:
-        """Move by the solution if the hard constraints permit it, and else along the certified stop.
+        """Move by the solution if the hard constraints permit it, or otherwise along the certified stop.
 
-        The certificate may mix the solution with the stop. The result is checked against the constraints again, and
-        undone if it breaks one. Posture, velocity and the known stop are then those before the step. The stop depends
-        on nothing else, and is therefore the one that was certified before.
+        The safety filter may mix the solution with the stop. The mixture is checked against the constraints again. If
+        it breaks a constraint, the move is undone: posture, velocity and the known stop get their values from before
+        the step. The stop depends on nothing else, so it is the same stop that was certified before.
         """
         own, problem, state = self._qp.constraints, self._qp.problem, self._state
         usable = solved and own.permit(np.clip(self._solution, problem.lower, problem.upper))

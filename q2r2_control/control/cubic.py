@@ -1,4 +1,4 @@
-"""The cubic through two references, for positions and velocities between ticks."""
+"""The cubic polynomial through two references, which gives positions and velocities between ticks."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from q2r2_control.types import Array
 
 
 def cubic(x: float, h: float, q: tuple[Array, Array], v: tuple[Array, Array]) -> tuple[Array, Array]:
-    """Return position and velocity of the cubic at the share ``x`` of a time ``h`` [s].
+    """Return position [rad] and velocity [rad/s] on the cubic when the share ``x`` of a time ``h`` [s] has passed.
 
-    It is a parabola, as the reference is, if the acceleration between both ends is constant.
+    If the acceleration between both ends is constant, the cubic is the parabola on which the reference moves.
 
     Args:
         x: Share of the time that has passed, from 0 to 1.

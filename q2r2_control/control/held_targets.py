@@ -1,9 +1,10 @@
-"""Bridge the time between targets that come less often than the controller's steps, such as the targets of a tracker.
+"""Interpolate targets that come less often than the controller's steps, such as the targets of a tracker.
 
-A target that is held until the next one stands still in most steps, and jumps in one of them. The controller would
-follow each jump with a joint at its acceleration limit. Here, a target that replaces one which was held for some steps
-is reached in 1.25 times as long. It moves along a straight line with a constant rotation, and arrives later by that
-time. A target that changes at every step, or after more than :data:`LONGEST_HOLD`, is passed on at once.
+If a target is held until the next target comes, it stands still in most steps, and jumps in one of them. At each jump,
+the controller would move some joint at its acceleration limit. Here, the poses between both targets are interpolated:
+on a straight line, with a constant angular velocity. This takes 1.25 times as long as the earlier target was held. The
+newest target is reached later by this time. A target that changes at every step, or after more than
+:data:`LONGEST_HOLD`, is passed on at once.
 """
 
 from __future__ import annotations
@@ -16,15 +17,17 @@ import numpy as np
 import pinocchio as pin
 
 LONGEST_HOLD = 0.11  # A target that was held for longer did not belong to a stream [s].
-_SPARE = 1.25  # A target is reached in this many times the last hold, so that the next one may come late by a quarter.
-_FARTHEST = 1e3  # No arm could reach a target that is farther away [m].
-_ORTHONORMAL = 5e-4  # Largest error of R R' of a target's rotation R. A target is refused at twice this error.
+# Duration of an interpolation, divided by the time for which the earlier target was held. With 1.25, the next target
+# may be late by a quarter of this time.
+_SPARE = 1.25
+_FARTHEST = 1e3  # Largest coordinate of a target that is interpolated. No arm could reach farther [m].
+_ORTHONORMAL = 5e-4  # Largest error of R R' of a target's rotation R. The controller refuses a target at twice this.
 _STEPS = 1.5  # A target that changes after fewer steps than this is new at every step, or nearly so.
 
 
 @dataclass(slots=True)
 class _Way:
-    """The way of one arm's target from an earlier pose to the newest one."""
+    """The path of one arm's target from an earlier pose to the newest target."""
 
     start: pin.SE3
     goal: pin.SE3
@@ -32,7 +35,10 @@ class _Way:
     held: float = 0.0  # Time for which the goal has been given [s].
 
     def begin(self, goal: pin.SE3, dt: float) -> None:
-        """Begin a way to a new ``goal``, with steps of ``dt`` [s]. It has no length if the goals are no samples."""
+        """Begin a path to a new ``goal``, with steps of ``dt`` [s].
+
+        The duration is 0 unless the last goal was held for some steps, and both goals can be interpolated.
+        """
         if _STEPS * dt < self.held <= LONGEST_HOLD and _is_ordinary(self.goal) and _is_ordinary(goal):
             self.start, self.duration = self.now(), _SPARE * self.held
         else:
@@ -48,7 +54,7 @@ class _Way:
 
 
 class HeldTargets:
-    """The targets of all arms, with poses between two of them while the newest one is held."""
+    """The targets of all arms. While the newest target is held, poses between it and an earlier pose are returned."""
 
     def __init__(self) -> None:
         self._ways: dict[str, _Way] = {}
@@ -58,7 +64,10 @@ class HeldTargets:
         self._ways.clear()
 
     def between(self, targets: Mapping[str, pin.SE3 | None], dt: float) -> dict[str, pin.SE3 | None]:
-        """Return the targets of a step of ``dt`` [s] for the ``targets`` that were given for it."""
+        """Return the targets to follow in a step of ``dt`` [s].
+
+        While the caller holds a pose of ``targets``, they are interpolated from the pose before to this pose.
+        """
         found: dict[str, pin.SE3 | None] = {}
         for arm, pose in targets.items():
             way = self._ways.get(arm)
@@ -77,7 +86,7 @@ class HeldTargets:
         return found
 
     def peek(self, targets: Mapping[str, pin.SE3 | None], dt: float) -> dict[str, pin.SE3 | None]:
-        """Return the result of :meth:`between` without a change of this object."""
+        """Return what :meth:`between` would return, and leave this instance as it is."""
         kept = self._ways
         try:
             self._ways = {arm: copy.copy(way) for arm, way in kept.items()}

@@ -1,4 +1,4 @@
-"""Compile the hot path with Numba."""
+"""Compile the functions that run at every tick with Numba."""
 
 from __future__ import annotations
 
@@ -16,18 +16,21 @@ from q2r2_control.control.kernel_compiler import Kernel
 def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile ``function`` at its first call: strict IEEE arithmetic, no Python objects, a division by 0 gives inf.
 
-    The function may not allocate memory. References to the arrays of its arguments are therefore not counted.
+    The function must not allocate memory. It therefore need not count references to the arrays of its arguments.
     """
     return _compiled(function, _nrt=False)
 
 
 def inlined_kernel(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile a small function that is called for each pair as a :func:`kernel` that becomes part of its callers."""
+    """Compile a small function like :func:`kernel`, and inline it into its callers.
+
+    This saves the time of a call for functions that are called for each pair.
+    """
     return _compiled(function, _nrt=False, forceinline=True)
 
 
 def numpy_kernel(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile a function of NumPy that may allocate memory, for the few large steps of a tick in BLAS and LAPACK."""
+    """Compile a function that uses NumPy, may allocate memory, and spends its time in BLAS and LAPACK."""
     return _compiled(function)
 
 
@@ -37,7 +40,7 @@ _kernels: list[Any] = []  # All dispatchers of this process.
 def _compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
     if numba.config.DISABLE_JIT:
         return function
-    # Nothing calls a kernel through its C wrapper, which would be compiled in addition to the one for Python.
+    # Nothing calls a kernel through a C wrapper. Without this option, it would be compiled besides the Python wrapper.
     options |= {"nopython": True, "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
     compiled: Any = Kernel(function, options)
     compiled._cache = KernelCache(function)
@@ -47,7 +50,7 @@ def _compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any
 
 
 class _Progress(Listener):
-    """Reports how many kernels have been compiled, without Numba's own helpers."""
+    """Reports how many kernels have been compiled. Numba's own helpers do not count."""
 
     def __init__(self, progress: Callable[[int, int], None]) -> None:
         self._progress = progress
@@ -70,9 +73,10 @@ class _Progress(Listener):
 
 @contextmanager
 def compiling(progress: Callable[[int, int], None]) -> Iterator[None]:
-    """Report to ``progress`` the number of compiled kernels, and of those that this process may need.
+    """Call ``progress`` with the number of compiled kernels, and the number of kernels that this process may need.
 
-    It is called before the first kernel is compiled and after each. It is not called if all come from the cache.
+    ``progress`` is called before the first kernel is compiled, and after each kernel. It is not called if all kernels
+    come from the cache.
     """
     with install_listener("numba:compile", _Progress(progress)):
         yield

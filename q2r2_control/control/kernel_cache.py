@@ -2,8 +2,8 @@
 
 Numba's own cache looks only at the path and the time of the compiled function's file. After an edit, a kernel that
 calls another module's kernel would go on running that module's old code. A second checkout would compile everything
-again. The cache folder is therefore named by a hash of all source files from which machine code is made. Each kernel in
-it is found by its module's name and its file's content.
+again. The name of the cache folder is therefore a hash of all source files from which machine code is made. In this
+folder, the machine code of a kernel is found by its module's name and its file's content.
 """
 
 from __future__ import annotations
@@ -21,23 +21,26 @@ from typing import Any
 
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, _CacheLocator
 
-_ROOMS = ("control", "compliance")
+_SUBPACKAGES = ("control", "compliance")
 _COMPILED = re.compile(r"^@(inlined_|numpy_)?kernel|\bNamedTuple\b|^(from|import) numba\b", re.MULTILINE)
 _VERSION = re.compile("[0-9a-f]{16}")
 
 
 def compiled_sources() -> list[Path]:
-    """Return the files of kernels, of their argument types, and of their compilation. Kernels use no other file."""
+    """Return the files that define kernels, their argument types, or how they are compiled.
+
+    The machine code depends on no other file of this package.
+    """
     package = Path(__file__).parents[1]
-    sources = sorted(source for room in _ROOMS for source in (package / room).rglob("*.py"))
+    sources = sorted(source for name in _SUBPACKAGES for source in (package / name).rglob("*.py"))
     return [source for source in sources if _COMPILED.search(source.read_text(encoding="utf-8"))]
 
 
 def _cache_folder() -> Path:
     """Return the folder of this version's machine code. It becomes the newest, and all but the two newest are deleted.
 
-    A folder from which another process has loaded may be deleted. The machine code of that process is in memory, and
-    the code that it still compiles is written again. If the cache cannot be written, its content is still used.
+    The folder of another running process may be deleted too. That process has its machine code in memory, and the code
+    that it still compiles is written to a new folder. If the cache cannot be written, its content is still used.
     """
     digest = hashlib.sha256(b"".join(source.read_bytes() for source in compiled_sources())).hexdigest()[:16]
     try:
@@ -55,7 +58,7 @@ def _cache_folder() -> Path:
         _delete_old_versions(root)
         return folder
     except (OSError, RuntimeError) as error:
-        # Numba runs the content as code. A folder that others could have made is therefore refused.
+        # Numba runs the content as code. A folder that other users could have made is therefore not used instead.
         warnings.warn(
             f"compiled kernels cannot be kept: {error}. Every start compiles them anew; set XDG_CACHE_HOME to a folder "
             "that can be written",
@@ -109,7 +112,7 @@ class _KernelCacheImpl(CompileResultCacheImpl):
 
 
 class KernelCache(FunctionCache):
-    """Numba's cache with another way to find a file. It is only read if it cannot be written."""
+    """Numba's cache with our rule for finding a file. If the folder cannot be written, the cache is only read."""
 
     _impl_class = _KernelCacheImpl
 

@@ -1,9 +1,9 @@
 """Compile each kernel once, however many other kernels call it.
 
-Numba optimises a function together with all functions that it calls, and translates it to machine code. It does so
-again each time that one of its callers is compiled. A chain of eleven calls would therefore be optimised eleven times.
-Here, a kernel that is compiled for another kernel is not optimised. Only a kernel that Python calls is linked with all
-its parts, optimised and translated as one.
+Numba optimises a function together with all functions that it calls, and translates it to machine code. It repeats this
+work each time that a caller of the function is compiled. In a chain of eleven calls, the innermost function would
+therefore be optimised eleven times. Here, a kernel that is compiled for another kernel is not optimised. Only a kernel
+that Python calls is linked with all its parts. The result is optimised and translated as a whole.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from numba.core.sigutils import normalize_signature
 
 
 class _PartLibrary(JITCodeLibrary):
-    """The code of a kernel that is compiled as a part of another one.
+    """The code of a kernel that is compiled as a part of another kernel.
 
-    It is only linked into the other one, and does not run alone.
+    It is only linked into the other kernel, and never runs on its own.
     """
 
     def finalize(self) -> None:
@@ -42,7 +42,7 @@ class _PartLibrary(JITCodeLibrary):
 
     @property
     def codegen(self) -> Any:
-        """This library itself. Numba passes the function's Python objects to it, but kernels have none."""
+        """This library itself, so that Numba passes the kernel's Python objects to :meth:`set_env`. It has none."""
         return self
 
     def set_env(self, name: str, environment: Any) -> None:
@@ -68,7 +68,8 @@ class _WholeLibrary(JITCodeLibrary):
         super().finalize()
 
     def _optimize_final_module(self) -> None:
-        # Numba itself optimises twice, because it finds some superfluous code that counts references only afterwards.
+        # Numba itself optimises twice, because only after the first time does it find some superfluous code that counts
+        # references.
         manager, builder = self._codegen._module_pass_manager()
         manager.run(self._final_module, builder)
 
@@ -91,7 +92,7 @@ class _PartCompiler(_WholeCompiler):
 class Kernel(CPUDispatcher):
     """A function that is compiled for each combination of argument types with which it is called."""
 
-    _being_compiled = 0  # Number of kernels in compilation, each as a part of the one before.
+    _being_compiled = 0  # Number of kernels in compilation. Each of them is a part of the kernel before it.
 
     def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
         super().__init__(function, targetoptions=options, pipeline_class=_WholeCompiler)
@@ -102,7 +103,7 @@ class Kernel(CPUDispatcher):
         self._part_compiler = numba_compiler(function, self.targetdescr, part_options, {}, _PartCompiler)
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
-        """Return a caller's template during its compilation. Another kernel needs this one only as a part."""
+        """Return the template with which Numba types a call of this kernel. A calling kernel needs only the part."""
         with global_compiler_lock:
             self._wanted_as_part = Kernel._being_compiled > 0
             return super().get_call_template(args, kws)
@@ -113,7 +114,7 @@ class Kernel(CPUDispatcher):
         return [compiled.signature for compiled in (self.overloads | self.parts).values()]
 
     def get_overload(self, sig: Any) -> Any:
-        """Return the part for ``sig`` while a kernel that calls it is compiled, else the whole."""
+        """Return the part for ``sig`` while a calling kernel is compiled, otherwise the whole kernel."""
         with global_compiler_lock:
             part = self.parts.get(normalize_signature(sig)[0]) if Kernel._being_compiled else None
             return super().get_overload(sig) if part is None else part.entry_point
@@ -132,7 +133,10 @@ class Kernel(CPUDispatcher):
                 Kernel._being_compiled -= 1
 
     def _part(self, arguments: Any, result: Any) -> Any:
-        """Return a separate part even if Python calls the kernel. The rest of an optimised whole may lack pieces."""
+        """Return the kernel's code as a part. It is compiled separately even if Python calls the kernel too.
+
+        The optimised code of a whole kernel cannot serve as a part, because some of its functions may be gone.
+        """
         known = self.parts.get(tuple(arguments))
         if known is None:
             details = {"dispatcher": self, "args": arguments, "return_type": result}

@@ -1,4 +1,4 @@
-"""The data of a robot and its settings for the compiled kernels, gathered once."""
+"""The arrays of a robot and its settings that compiled kernels read. They are computed once."""
 
 from __future__ import annotations
 
@@ -21,16 +21,17 @@ from q2r2_control.robot.pairs import pair_names
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
-# Least buffer of pairs that may touch. Rows that aim exactly at the distance would leave the certificate no room [m].
+# Least buffer of a pair [m]. Without a buffer, rows would lead a pair exactly to its distance, which the certificate
+# could then not prove.
 LEAST_BUFFER = 0.00025
-# Pairs that may touch are slowed down from this distance on, because bodies are larger than their contents [m].
+# Pairs that may touch are slowed down below this distance [m], because bodies are larger than the parts in them.
 _CONTACT_ZONE = 0.002
-# Largest depth, relative to the depth at which the cores of two bodies meet.
+# Largest permitted depth, as a share of the depth at which the cores of two bodies meet.
 _DEEPEST = 0.8
 
 
 class KernelModel(NamedTuple):
-    """Data that do not change in a tick, by the packages that read them."""
+    """Data that do not change within a tick. Each field is named after the package that reads it."""
 
     safety: SafetyModel
     tasks: TaskModel
@@ -80,13 +81,16 @@ def kernel_model_of(robot: Robot, settings: ControllerSettings) -> KernelModel:
 
 
 def _of_two_arms(pairs: Pairs) -> IntArray:
-    """Return which pairs (p,) have two bodies that are moved by different joints."""
+    """Return 1 for each pair whose two bodies both move, and are moved by different joints, else 0 (p,)."""
     own = (pairs.carried == 0) & (pairs.sign > 0).any(axis=1) & (pairs.sign < 0).any(axis=1)
     return own.astype(np.int64)
 
 
 def _check_depths(robot: Robot, collision: CollisionModel, kept: KeptDistances) -> None:
-    """Raise :class:`ConfigError` if two bodies may penetrate so deeply that no direction leads out."""
+    """Raise :class:`ConfigError` if two bodies may penetrate so deeply that their cores may meet.
+
+    If the cores met, the direction in which the bodies separate would be unknown.
+    """
     radius = collision.bodies.radius.copy()  # The least radius that each body ever has [m].
     for number, finger in turning_bodies(robot):
         radius[number] = finger.radius
@@ -100,12 +104,12 @@ def _check_depths(robot: Robot, collision: CollisionModel, kept: KeptDistances) 
 
 
 def stop_buffer(min_distance: Array, settings: ControllerSettings) -> Array:
-    """Return the additional distance at which the QP stops each pair (p,) [m]."""
+    """Return the buffer of each pair (p,) [m]: the QP stops the pair at ``min_distance`` plus this buffer."""
     return np.minimum(settings.distance_buffer, np.maximum(0.5 * min_distance, LEAST_BUFFER))
 
 
 class KernelData(NamedTuple):
-    """Data that change from tick to tick, by the packages that write them."""
+    """Data that change from tick to tick. Each field is named after the package that writes it."""
 
     safety: SafetyData
     tasks: TaskData

@@ -1,8 +1,8 @@
-"""Pass a model or its data to kernels by one address.
+"""Pass a model or its data to kernels by one address, so that there is less code to compile.
 
 A named tuple of arrays is written to memory once, in the layout of Numba's own struct. Kernels pass its address to each
-other, and read each attribute where they use it. Otherwise they would pass the hundreds of numbers of which a model's
-arrays consist. This makes less code to compile.
+other, and read each attribute where they use it. Without such an address, they would pass all the numbers with which
+Numba represents a model's arrays, which are hundreds.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ extending: Any = numba.extending
 
 
 class _Address(types.Type):
-    """The type of an address in a kernel. Two such types are equal if the values at the addresses have one type."""
+    """The type of an address in a kernel. Two such types are equal if the values at the addresses have equal types."""
 
     def __init__(self, pointee: Any) -> None:
         self.pointee = pointee
@@ -98,10 +98,10 @@ def _unbox(kind: _Pointer, boxed: Any, context: Any) -> Any:
 
 @extending.intrinsic
 def pointee(typing_context: Any, pointer: Any) -> Any:
-    """Return, in a kernel, the tuple to which ``pointer`` points. No reference is counted, so the caller keeps it.
+    """Return, in a kernel, the value to which ``pointer`` points.
 
-    A named tuple stays in memory, and each attribute is read where it is used. Kernels pass one address to each other
-    instead of the hundreds of numbers of which a model's arrays consist. This makes less code to compile.
+    A named tuple stays in memory, and each of its attributes is read where it is used. No reference is counted, so the
+    caller of the kernel has to keep the value.
     """
     if isinstance(pointer.pointee, types.BaseNamedTuple):
         return pointer(pointer), lambda context, builder, signature, arguments: arguments[0]
@@ -147,7 +147,7 @@ class _PointerAttribute(AttributeTemplate):
 
 @lower_getattr_generic(_Pointer)
 def _read_attribute(context: Any, builder: Any, pointer: Any, value: Any, name: str) -> Any:
-    """Read an array or a number to which a pointer leads. Of a nested named tuple, only the address is read."""
+    """Read an attribute of the named tuple to which a pointer points. For a nested named tuple, return its address."""
     index = pointer.pointee.fields.index(name)
     kind = pointer.pointee.types[index]
     whole = builder.bitcast(value, context.get_data_type(pointer.pointee).as_pointer())
@@ -162,7 +162,7 @@ def _words(value: Any) -> list[int]:
     if isinstance(value, tuple):
         return [word for part in value for word in _words(part)]
     if isinstance(value, np.ndarray):
-        # The owner of the pointer keeps the array. No reference is counted, and both of Numba's owners are left out.
+        # The owner of the pointer keeps the array. No reference is counted, and Numba's two pointers to owners are 0.
         owners = [0, 0]
         return [*owners, value.size, value.itemsize, value.ctypes.data, *value.shape, *value.strides]
     if isinstance(value, KernelPointer | KernelPointers):
@@ -177,7 +177,7 @@ def _words(value: Any) -> list[int]:
 
 
 def _form(value: Any) -> Any:
-    """Return a key with everything on which Numba's type of ``value`` depends. It is found faster than the type."""
+    """Return a key with everything on which Numba's type of ``value`` depends. It takes less time than the type."""
     if isinstance(value, tuple):
         return type(value), *[_form(part) for part in value]
     if isinstance(value, np.ndarray):

@@ -1,27 +1,28 @@
 """Change distances, held objects and gains while a controller runs.
 
-**Distances.** A greater distance can make a certified state uncertified. The distance that a pair keeps therefore grows
-only as far as the known stop is certified with it. This bound is  d - S - buffer,  where d is the distance of the pair
-at the reference, and S bounds by how much the stop brings it closer (stop_certificate.py). The kept distance of a pair
+**Distances.** If the required distance of a pair became greater at once, the known stop could lose its certificate. The
+distance that a pair keeps therefore grows only as far as the known stop is certified with it. This bound is
+d - S - buffer,  where d is the distance of the pair at the reference, and S bounds by how much the stop brings the pair
+closer (stop_certificate.py). The kept distance of a pair
 
-- falls at once if less is asked for, since the known stop stays certified;
-- grows at ``GROWTH`` towards the distance asked for, up to the bound, before a step is decided on. The step is then
+- falls at once if the requested distance is smaller, since the known stop stays certified;
+- grows at ``GROWTH`` towards the requested distance, up to the bound, before a step is decided on. The step is then
   certified with the greater distance, and the invariant of safety/README.md holds at every tick;
-- never falls while it grows. A pair that is nearer than asked for is not pushed apart.
+- never falls while it grows. A pair that is nearer than the requested distance is not pushed apart.
 
 After a reset every pair keeps the distances of the controller's first settings, and at once as much of the present
-settings as the posture allows. The controller recovers from a start that is nearer, up to the whole buffer. Pairs that
-start within the buffer stop where they are, with ``LEAST_BUFFER`` at least. This buffer grows with d - S as above. Arms
-that rest within it are not pushed apart.
+settings as the posture allows. If a pair starts closer than its kept distance, the controller recovers until the pair
+has its whole buffer. If a pair starts within the buffer, the QP stops it where it is, with ``LEAST_BUFFER`` at least.
+The buffer of this pair then grows with d - S as above. Arms that rest within the buffer are not pushed apart.
 
-**Held objects.** A pair that does not count keeps minus infinity. The pair of an object that is gripped keeps
-d - S - buffer, or its own distance if that is less. The known stop is then certified with the object too, so that the
-object never has to be refused. The kept distance grows with later values of d and S, and never falls. If two objects
-overlap when the second one is gripped, both hands hold one object. It is not kept apart from itself until one hand lets
-go.
+**Held objects.** The kept distance is minus infinity for pairs that do not count. When an object is gripped, each of
+its pairs keeps d - S - buffer, or the distance of its class if that is less. The known stop is then certified with the
+object too, so that the object never has to be refused. The kept distance grows with later values of d and S, and never
+falls. If two objects overlap when the second object is gripped, it is assumed that both hands hold one and the same
+object. Its two bodies are not kept apart until one hand lets go.
 
-**Gains** and weights go to their new values on straight lines. These are all arrays of the tasks that differ between
-the settings. The certificate reads none of them.
+**Gains** and weights change linearly to their new values. They are all arrays of the tasks that differ between the two
+settings. The certificate reads none of them.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ _RAMP_TIME = 0.5  # Time in which gains change [s].
 
 
 class ObjectPairs:
-    """The objects that are held, and the distances that their pairs keep. All arrays are of the objects' pairs only."""
+    """The objects that are held, and the distances that their pairs keep. Arrays contain only the objects' pairs."""
 
     def __init__(self, robot: Robot, settings: ControllerSettings, model: KernelModel, data: KernelData) -> None:
         self._robot, self._safety, self._data = robot, model.safety, data.safety
@@ -72,9 +73,10 @@ class ObjectPairs:
         self._write(np.full(len(self._holders), -np.inf))
 
     def set_holding(self, arm: str, holds: bool) -> bool:
-        """Let an arm's gripper hold its object, or not; returns whether this is a change.
+        """Note whether an arm's gripper holds its object; return whether this is a change.
 
-        Pairs that begin to count keep their own distance until they are measured. The caller calls :meth:`begin` then.
+        Pairs that begin to count keep the distance of their class until they are measured. The caller then calls
+        :meth:`begin`.
 
         Raises:
             RobotError: If the arm has no object.
@@ -93,7 +95,7 @@ class ObjectPairs:
         return True
 
     def begin(self) -> None:
-        """Let the pairs that have begun to count, and were measured, keep as much as is certified."""
+        """Let the pairs that have begun to count keep as much as is certified. They have to be measured before."""
         kept = np.where(self._new, np.minimum(self._goal, self._within_reach()), self.kept)
         overlap = self._data.distance[self._range] < np.minimum(self._goal, 0.0)
         if (overlap & self._shared & self._new).any():  # Both hands hold one object.
@@ -110,16 +112,16 @@ class ObjectPairs:
             self._write(np.where(np.isfinite(self.kept), more, -np.inf))
 
     def change(self, settings: ControllerSettings) -> None:
-        """Let pairs keep the distances of ``settings``: a smaller one at once, a greater one by :meth:`step`."""
+        """Let pairs keep the distances of ``settings``: smaller distances at once, greater ones after :meth:`step`."""
         self._aim(settings)
         self._write(np.minimum(self.kept, self._goal))
 
     def keep_no_more_than(self, kept: Array) -> None:
-        """Keep no more than ``kept`` [m] again, because the step since then was undone."""
+        """Let pairs keep no more than the earlier distances ``kept`` [m], because the step since was undone."""
         self._write(np.where(np.isfinite(kept), np.minimum(self.kept, kept), self.kept))
 
     def _within_reach(self) -> Array:
-        """Return d - S - buffer [m]."""
+        """Return d - S - buffer of the objects' pairs [m]."""
         return np.asarray(provable_distances(self._safety, self._data)[self._range] - self._buffer)
 
     def _write(self, kept: Array) -> None:
@@ -131,7 +133,7 @@ class ObjectPairs:
 
 
 class LiveSettings:
-    """The present settings of one controller, on their way to the settings that were asked for."""
+    """The present settings of one controller, which change gradually to the requested settings."""
 
     def __init__(
         self, robot: Robot, settings: ControllerSettings, model: KernelModel, data: KernelData, objects: ObjectPairs
@@ -140,19 +142,21 @@ class LiveSettings:
         self._model, self._safety, self._data = model, model.safety, data.safety
         self._gains, self._ramp = self._gains_of(settings), 0.0  # The gains to reach, and the time until then [s].
         self._changing: list[tuple[Array, Array]] = []  # Arrays that kernels read, and their new values.
-        self._goal = self._least = kept_distances(robot, settings).values  # The least is that of the first settings.
+        # Distances that pairs have to keep by the requested settings, and by the first settings (p,) [m].
+        self._goal = self._least = kept_distances(robot, settings).values
         self._stops = model.safety.approach.stop_distance[: len(self._goal)]  # Distances at which the QP stops pairs.
-        self._growing, self._crowded, self._due = False, False, 0.0  # Crowded means that a pair is within its buffer.
+        # Crowded means that some pair is within its buffer. The last number is the time until distances grow again [s].
+        self._growing, self._crowded, self._due = False, False, 0.0
         self.settings = settings
-        self.kept = self._goal  # Distance that every monitored pair keeps (p,) [m]; another array after a change.
+        self.kept = self._goal  # Distance that every monitored pair keeps (p,) [m]. Each change makes a new array.
 
     @property
     def narrow(self) -> int:
-        """The pair whose kept distance is farthest from the one asked for; -1 if all pairs keep all of it."""
+        """The pair whose kept distance is farthest below the requested one; -1 if all pairs keep what is requested."""
         return int(np.argmax(self._goal - self.kept)) if self._growing else -1
 
     def change(self, settings: ControllerSettings) -> str | None:
-        """Go to ``settings``, which may differ in ``LIVE`` only; returns None, or why nothing was changed."""
+        """Change to ``settings``, which may differ in ``LIVE`` only; return None, or why nothing was changed."""
         before, goal = self.settings.min_distance, kept_distances(self._robot, settings)
         if settings.min_distance > before:
             if settings.min_distance > CLEARANCE:
@@ -160,7 +164,7 @@ class LiveSettings:
                     f"min_distance = {settings.min_distance:g} m: allowed while a controller runs: up to "
                     f"{CLEARANCE:g}, since pairs that always stay farther apart are not watched"
                 )
-            # With this room, arms at home keep the whole distance and rest.
+            # If home has this much distance, arms that rest there keep the whole distance with its buffer.
             room = replace(goal, values=goal.values + stop_buffer(goal.values, settings))
             if faults := too_close_at_home(self._robot, room):
                 return f"min_distance = {settings.min_distance:g} m: {faults[0]} with distance_buffer"
@@ -176,21 +180,21 @@ class LiveSettings:
         return None
 
     def restart(self) -> None:
-        """Begin again before a reset, with the distances that do not depend on the posture."""
+        """Before a reset, return to the distances that do not depend on the posture, and finish the change of gains."""
         self._due = 0.0
         self._write(np.minimum(self._goal, self._least))
         self._stops[:] = self.kept + stop_buffer(self.kept, self.settings)
         self._approach_gains(self._ramp)
 
     def begin(self) -> None:
-        """After the reset, keep as much as the posture allows, and let the QP stop pairs no farther away than that."""
+        """After the reset, let pairs keep as much as the posture allows, and reduce the buffer of pairs within it."""
         self._grow(np.inf)
         distance = self._data.distance[: len(self.kept)]
         is_within = (distance >= self.kept - ROUNDING) & (distance < self._stops)
         self._stop_from(np.where(is_within, self.kept, self._stops))
 
     def step(self, h: float) -> None:
-        """Let kept distances and gains change, before a step of ``h`` [s] from a reference that was observed."""
+        """Change kept distances and gains before a step of ``h`` [s]. The reference has to be observed before."""
         if self._objects.growing:
             self._objects.step(h)
         if self._ramp:
@@ -203,7 +207,7 @@ class LiveSettings:
                 self._stop_from(self._stops)
 
     def keep_no_more_than(self, kept: Array) -> None:
-        """Keep no more than ``kept`` (p,) [m] again, because the step since then was undone."""
+        """Let pairs keep no more than the earlier distances ``kept`` (p,) [m], because the step since was undone."""
         self._write(np.minimum(self.kept, kept))
 
     def _grow(self, most: float) -> None:
@@ -220,9 +224,9 @@ class LiveSettings:
             self._stop_from(self._stops)
 
     def _stop_from(self, before: Array) -> None:
-        """Let the QP stop pairs at their buffer, or within it where they are already.
+        """Let the QP stop pairs at their buffer, or where they are if they are within it already.
 
-        ``before`` (p,) are the distances at which the QP stopped them so far [m]. They do not fall.
+        ``before`` (p,) are the distances at which the QP has stopped the pairs so far [m]. These distances do not fall.
         """
         wanted = self.kept + stop_buffer(self.kept, self.settings)
         least = np.maximum(before, self.kept + LEAST_BUFFER)

@@ -22,7 +22,7 @@ from q2r2_control.types import Array
 
 
 class MovingObstacles:
-    """The obstacles that are there, by name. Pairs with an obstacle that is not there keep minus infinity."""
+    """The obstacles that are present, by name. The kept distance is minus infinity for pairs with other obstacles."""
 
     def __init__(
         self,
@@ -31,7 +31,7 @@ class MovingObstacles:
         pointers: tuple[KernelPointer, ...],
         geometry: pin.GeometryModel,
     ) -> None:
-        """``pointers`` lead to the kernels' model and data, which were made with ``geometry``."""
+        """Take the pointers to the kernels' model and data, whose bodies and pairs are those of ``geometry``."""
         model: KernelModel = pointers[0].value
         self._robot, self._bodies, limits = robot, model.safety.collision.bodies, model.safety.limits
         names, last = [item.name for item in geometry.geometryObjects], len(geometry.collisionPairs)
@@ -54,7 +54,7 @@ class MovingObstacles:
             stop_time=np.zeros(1),
         )
         self.there: dict[str, MovingObstacle] = {}
-        self.still: dict[str, MovingObstacle] = {}  # The obstacles that do not move. Each report makes another mapping.
+        self.still: dict[str, MovingObstacle] = {}  # The obstacles whose speed is 0. Each report makes a new mapping.
         self._holding: frozenset[str] = frozenset()
         if count:
             pointers = *pointers, pointer_to(self.data)
@@ -64,15 +64,15 @@ class MovingObstacles:
 
     @property
     def reports(self) -> dict[str, ObstacleReport]:
-        """The last reports of the obstacles that are there."""
+        """The last reports of the obstacles that are present."""
         ages = zip(self._number, self.data.age.tolist(), strict=True)
         return {name: ObstacleReport(self.there[name], age) for name, age in ages if name in self.there}
 
     def put(self, name: str, obstacle: MovingObstacle | None) -> IntArray:
         """Take a report of an obstacle; None if it has gone. Returns an array (g,) with a 1 for the body that changed.
 
-        Until :meth:`keep_clear`, all pairs with obstacles keep the distances that they need while the arms stop. Raises
-        as :func:`check_obstacle` does.
+        Until :meth:`keep_clear` is called, all pairs with obstacles keep the distances that they need while the arms
+        stop. Raises the same exceptions as :func:`check_obstacle`.
         """
         check_obstacle(name, obstacle, self._number)
         number, index = self._number[name], list(self._number).index(name)
@@ -91,7 +91,7 @@ class MovingObstacles:
         return changed
 
     def hold(self, holding: frozenset[str]) -> None:
-        """Let the grippers of these arms hold their objects."""
+        """Note that the grippers of exactly these arms hold their objects."""
         self._holding = holding
         self._count()
 
@@ -102,22 +102,25 @@ class MovingObstacles:
         self._count()
 
     def kept_from(self, stop: float) -> Array:
-        """Return the distances that pairs keep from the reported places, if the arms stop in ``stop`` [s] (n,) [m]."""
+        """Return the distances (n,) [m] that pairs keep from the reported poses, if the arms stop in ``stop`` [s].
+
+        Only pairs with obstacles that are present are included.
+        """
         kept = self.data.kept.reshape(len(self._number), -1) if self._number else np.zeros((0, 0))
         way = self.data.speed * (np.maximum(self.data.age, REPORT_AGE) + stop)
         return np.ravel((kept + way[:, None])[[name in self.there for name in self._number]])
 
     def keep_clear(self, h: float) -> None:
-        """Write kept distances and joint speeds for the kernels, before a step of ``h`` [s]."""
+        """Write kept distances and velocity limits for the kernels, before a step of ``h`` [s]."""
         if self.there:
             self._keep_clear(h)
 
     def pass_time(self, time: float) -> None:
-        """Let reports age by ``time`` [s], for which no step is taken."""
+        """Let reports age by ``time`` [s] in which no step is taken."""
         self.data.age[:] += time
 
     def _count(self) -> None:
-        """Let those pairs count whose obstacle is there and whose object is held."""
+        """Let those pairs count whose obstacle is present and whose object, if any, is held."""
         if not self._number:
             return
         there = np.repeat([name in self.there for name in self._number], len(self._goal) // len(self._number))

@@ -1,12 +1,12 @@
-"""The QP of a step. Compiled kernels build it from tasks, box and separation rows. It is solved if a bound matters.
+"""The QP of a step. Compiled kernels build it from the tasks, the velocity box and the separation rows.
 
     minimise    1/2 v' H v + g' v + 1/2 sum_i s_i^2 / rho_i,    rho_i = SOFTNESS a_i' H^-1 a_i,  a_i the i-th row
     subject to  lower <= v <= upper,    rows v + s >= rows_lower,    s >= 0
 
 The box is never empty (joint_limits.py) and the rows are soft. A solution therefore always exists. Rows have unit norm,
-so that a slack is a joint speed. H^-1 along a row is the compliance of the cost to it. A single row gives way by the
-share SOFTNESS of its correction, however strong the cost is. If the minimum of the cost alone keeps box and rows, it is
-the solution, and no solver is called.
+so that a slack is a joint speed. a_i' H^-1 a_i is the compliance of the cost along row i. With this factor in rho_i, a
+row that is violated alone gives way by the share SOFTNESS of its correction, however large the weights of the cost are.
+If the minimum of the cost alone keeps the box and the rows, it is the solution, and no solver is called.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from q2r2_control.control.targets import update_targets
 from q2r2_control.control.tasks.built_in import write_task_cost
 from q2r2_control.types import Array
 
-SOFTNESS = 1e-5  # Share of its correction by which a row yields.
+SOFTNESS = 1e-5  # Share of its correction by which a row gives way.
 
 
 @dataclass(slots=True)  # A frozen class would cost a microsecond a tick.
@@ -47,7 +47,8 @@ class QpProblem:
         upper: Greatest next velocities (nv,) [rad/s].
         rows: Left-hand sides (m, nv), of unit norm: separation first, then soft constraints, then hard ones.
         rows_lower: Right-hand sides (m,) [rad/s].
-        minimum: Minimum of the cost alone (nv,) [rad/s] if it keeps box and rows, and is the solution; else None.
+        minimum: Minimum of the cost alone (nv,) [rad/s] if it keeps box and rows, so that it is the solution; None if
+            it does not.
         hard: Number of hard rows, which are the last ones.
     """
 
@@ -66,7 +67,7 @@ class QpSolution:
     """The answer of a solver.
 
     Attributes:
-        v: Next joint velocities (nv,) [rad/s]; None if the solver found none.
+        v: Next joint velocities (nv,) [rad/s]; None if the solver found no solution.
         solve_time: Time that the solver reports [s]; 0 if it was not called.
     """
 
@@ -88,7 +89,7 @@ class Solver(Protocol):
             problem: The problem of this step.
 
         Returns:
-            The solution. Its ``v`` is None if none was found.
+            The solution. Its ``v`` is None if no solution was found.
         """
         ...
 
@@ -107,7 +108,11 @@ def find_minimum(data_pointer: KernelPointer) -> bool:
 
 @kernel
 def _find_minimum(data: KernelData) -> bool:
-    """Find the minimum, for :func:`find_minimum` and :func:`assemble`. Only kernels that Python calls are optimised."""
+    """Do the work of :func:`find_minimum`, also for :func:`assemble`.
+
+    Python calls both :func:`find_minimum` and :func:`assemble`. This kernel is compiled as a part of them, because only
+    kernels that Python calls are optimised (kernel_compiler.py).
+    """
     tasks, box, rows, minimum = data.tasks, data.safety.box, data.safety.rows, data.tasks.minimum
     nv = minimum.shape[0]
     for i in range(nv):
@@ -131,11 +136,11 @@ def _find_minimum(data: KernelData) -> bool:
 def assemble(
     model_pointer: KernelPointer, targets_pointer: KernelPointer, data_pointer: KernelPointer, h: float, tick: float
 ) -> tuple[bool, bool, bool]:
-    """Write cost, rows and box of a step of ``h`` [s] from an observed reference.
+    """Write cost, rows and box of a step of ``h`` [s]. The reference has to be observed before.
 
-    If the step is the first one of a tick, ``tick`` is the duration of this tick [s], and the offered targets are
-    taken. In other steps it is below 0. Returns whether all targets were usable, whether all joints are within their
-    limits, and the result of :func:`find_minimum`.
+    In the first step of a tick, ``tick`` is the duration of the tick [s], and the offered poses become the targets. In
+    later steps of the tick, ``tick`` is below 0. Returns whether all targets were usable, whether all joints are within
+    their limits, and the result of :func:`find_minimum`.
     """
     model, targets, data = pointee(model_pointer), pointee(targets_pointer), pointee(data_pointer)
     state, usable = data.safety.state, True

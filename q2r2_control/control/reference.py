@@ -1,4 +1,4 @@
-"""Observe the reference, and move it as far as the safety filter allows (compiled)."""
+"""Compute poses and distances at the reference, and move it as far as the safety filter allows (compiled)."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Observed = tuple[int, float, int, float]
 
 @kernel
 def start_reference(model_pointer: KernelPointer, data_pointer: KernelPointer) -> bool:
-    """Observe the reference after a reset. Return whether a stop is known that keeps all pairs apart."""
+    """Observe the reference after a reset. Return whether some stop is proven to keep all pairs apart."""
     model, data = pointee(model_pointer), pointee(data_pointer)
     rest_always(data.safety.history, data.safety.state.q)
     _observe(model, data)
@@ -34,7 +34,7 @@ def start_reference(model_pointer: KernelPointer, data_pointer: KernelPointer) -
 def observe_bodies(model_pointer: KernelPointer, data_pointer: KernelPointer, grown: IntArray) -> tuple[Observed, int]:
     """Observe the reference after bodies or kept distances have changed. ``grown`` (g,) marks bodies that have grown.
 
-    Also returns the pair in the way, see :func:`certify_bodies`; -1 if the bodies are allowed.
+    Also returns the first pair that does not allow the bodies (:func:`certify_bodies`); -1 if they are allowed.
     """
     model, data = pointee(model_pointer), pointee(data_pointer)
     return _observe(model, data), certify_bodies(model.safety, data.safety, grown)
@@ -55,7 +55,7 @@ def move_reference(
 
 @kernel
 def spare_distance(model_pointer: KernelPointer, data_pointer: KernelPointer, pairs: IntArray) -> float:
-    """Return the least margin of some ``pairs`` (p,) at the reference [m]: their distance minus the kept distance."""
+    """Return the least margin of some ``pairs`` (p,) at the reference [m]: its distance minus its kept distance."""
     model, data = pointee(model_pointer).safety, pointee(data_pointer).safety
     least = np.inf
     for p in pairs:

@@ -30,7 +30,7 @@ class StepProblem:
         self.constraints = OwnConstraints(robot, constraints)
 
     def connect(self, model: KernelPointer, targets: KernelPointer, data: KernelPointer) -> None:
-        """Compile the kernels for these pointers, after a reset has written what they lead to."""
+        """Compile the kernels for these pointers. A reset has to write the values at the pointers before."""
         self._pointers = model, targets, data
         arrays: KernelData = data.value
         self._rows, self._tasks, self._state = arrays.safety.rows, arrays.tasks, arrays.safety.state
@@ -47,7 +47,7 @@ class StepProblem:
             self._find_minimum = bound(find_minimum, data)
 
     def take_targets(self, summary: StepSummary) -> None:
-        """Take the offered targets in a tick that moves nothing."""
+        """Make the offered poses the targets, in a tick in which the reference does not move."""
         summary.targets_usable, _, _ = self._assemble(*self._pointers, self._longest, 0.0)
 
     def write(self, h: float, tick: float, summary: StepSummary) -> None:
@@ -75,7 +75,7 @@ class GivenSolution:
     """A solver that always gives the same answer, which a program has found elsewhere."""
 
     def __init__(self, x: object, nv: int) -> None:
-        """``x`` begins with the velocities (nv,) [rad/s]. Anything else counts as no solution."""
+        """Take the answer ``x``. Its first nv numbers are the velocities [rad/s]; anything else is no solution."""
         self._v: Array | None = None
         try:
             given = np.asarray(x)

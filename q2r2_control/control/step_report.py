@@ -17,14 +17,14 @@ _KINDS = {POSITION: LimitKind.POSITION, VELOCITY: LimitKind.VELOCITY, ACCELERATI
 
 
 class LimitNames:
-    """Names of limits and pairs by their numbers in the kernels."""
+    """The names of limits and pairs, which kernels know by their indices."""
 
     def __init__(self, robot: Robot, geometry: pin.GeometryModel) -> None:
         """``geometry`` begins with the robot's own bodies and pairs, as the kernels' arrays do."""
         names = [item.name for item in geometry.geometryObjects]
         pairs = collision_model_of(
             robot, geometry
-        ).pairs  # In the kernels, boxes that may be touched have other numbers.
+        ).pairs  # The kernels' own pairs are not used here, because boxes that may be touched have other indices there.
         both = zip(pairs.first.tolist(), pairs.second.tolist(), strict=True)
         self.pairs = [
             (names[first], names[second]) for first, second in both
@@ -38,7 +38,7 @@ class LimitNames:
         self._by_kind[TOOL_SPEED] = [ActiveLimit(LimitKind.TOOL_SPEED, (arm,)) for arm in robot.arms]
 
     def pair(self, number: int) -> tuple[str, str]:
-        """Return the names of both bodies of a pair; empty names in a cell without pairs."""
+        """Return the names of both bodies of the pair with index ``number``; empty names in a cell without pairs."""
         return self.pairs[number] if self.pairs else ("", "")
 
     def of(self, active: ActiveBounds) -> tuple[ActiveLimit, ...]:
@@ -61,7 +61,7 @@ class StepSummary:
     fallback: bool = False
     targets_usable: bool = True  # Whether all targets were usable.
     inside: bool = True  # Whether all joints are within their limits.
-    unsolved: int = 0  # One bit for each substep without a solution.
+    unsolved: int = 0  # Bit i is 1 if substep i had no solution.
     slack: float = 0.0
     solve_time: float = 0.0
     faults: tuple[str, ...] = ()  # As in StepReport.

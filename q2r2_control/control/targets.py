@@ -21,15 +21,15 @@ from q2r2_control.types import Array
 
 # Greatest coordinate of a target. It is larger than any cell, and squares of such numbers stay finite.
 _FARTHEST = 100.0  # [m]
-_ORTHONORMAL = 1e-3
-_AT_REST = 1e-2  # [rad/s]
-_NONE, _POSE, _NO_POSE = 0, 1, 2  # Kinds of offers to an arm.
+_ORTHONORMAL = 1e-3  # Largest error of R R' of a target's rotation R.
+_AT_REST = 1e-2  # An arm whose joints are all slower than this counts as resting [rad/s].
+_NONE, _POSE, _NO_POSE = 0, 1, 2  # What is offered to an arm as its target: nothing, a pose, or something else.
 # A target faster than this multiple of the tool's own limit has jumped.
 _TELEPORT = 3.0
 
 
 class PoseScratch(NamedTuple):
-    """Scratch for checking an offered pose."""
+    """Buffers for the check of a pose that is offered as a target."""
 
     rotation: Array  # (3, 3)
     gram: Array  # (3, 3)
@@ -39,21 +39,21 @@ class PoseScratch(NamedTuple):
 
 
 class TaskTargets(NamedTuple):
-    """Targets of the arms in one tick."""
+    """The targets of all arms in one tick."""
 
     member: Array  # (n, nv) 1 if a joint belongs to the arm.
     follows: IntArray  # (n,) 1 if the tool follows its target, 0 if the arm's joints hold.
     rotation: Array  # (n, 3, 3)
     translation: Array  # (n, 3) [m]
-    feed_forward: Array  # (n, 6) Twist of the target itself [m/s, rad/s].
+    feed_forward: Array  # (n, 6) Smoothed twist of the target [m/s, rad/s].
     hold: Array  # (nv,) Joint positions to hold [rad].
-    posture: Array  # (nv,) Joint positions for the joints that the tools leave free [rad].
+    posture: Array  # (nv,) Posture to which joints move as far as the tools leave them free [rad].
     latched: IntArray  # (n,) 1 if the arm has come to rest where it holds.
-    offered: IntArray  # (n,) The kind of offer in this tick: nothing, a pose, or something else.
-    pose: Array  # (n, 4, 4) Homogeneous pose, as offered.
+    offered: IntArray  # (n,) What is offered in this tick: _NONE, _POSE or _NO_POSE.
+    pose: Array  # (n, 4, 4) The offered pose as a homogeneous matrix, before it is checked.
     feed_forward_time: float  # Time constant that smooths the feed-forward [s].
     teleport_speed: float  # A faster target has jumped [m/s].
-    teleport_turn: float  # [rad/s]
+    teleport_turn: float  # A target that turns faster has jumped [rad/s].
     scratch: PoseScratch
 
     @classmethod
@@ -94,7 +94,7 @@ class TargetTracker:
         self._targets.posture[:] = self._home
 
     def hold_at(self, q: Array | None) -> None:
-        """Let arms without a target move to ``q`` (nv,) [rad] and hold there. With None they hold where they rest."""
+        """Let arms without a target move to ``q`` (nv,) [rad] and hold there; None lets them hold where they rest."""
         if q is None:
             self._targets.latched[:] = 0
         else:
@@ -102,7 +102,7 @@ class TargetTracker:
             self._targets.latched[:] = 1
 
     def aim_posture(self, posture: npt.ArrayLike | None) -> None:
-        """Let the free joints move to ``posture`` (nv,) [rad], or home without one.
+        """Let the joints that the tools leave free move to ``posture`` (nv,) [rad], or to home if it is None.
 
         An invalid posture changes nothing.
         """
@@ -150,9 +150,10 @@ class TargetTracker:
 
 @kernel
 def update_targets(targets: TaskTargets, q: Array, v: Array, dt: float) -> bool:
-    """Make each offered pose the arm's target, or hold the last one. Return False if an offer was not usable.
+    """Make each offered pose the arm's target. Return False if some offered pose was not usable.
 
-    A target that is not a pose is marked in ``targets.offered``.
+    An arm keeps its last target if the offered pose is not usable, which is marked in ``targets.offered``. An arm to
+    which nothing is offered holds.
     """
     all_usable = True
     for i in range(targets.offered.shape[0]):
@@ -173,7 +174,7 @@ def update_targets(targets: TaskTargets, q: Array, v: Array, dt: float) -> bool:
 
 @kernel
 def _hold(targets: TaskTargets, i: int, q: Array, v: Array) -> None:
-    """Brake a moving arm first, and hold it where it comes to rest, so that it need not come back."""
+    """Let a moving arm brake first, and hold it where it comes to rest, so that it need not move back."""
     speed = 0.0
     for j in range(q.shape[0]):
         if targets.member[i, j] == 1.0:
@@ -187,7 +188,8 @@ def _hold(targets: TaskTargets, i: int, q: Array, v: Array) -> None:
 def _update_pose(targets: TaskTargets, i: int, dt: float) -> bool:
     """Make the offered homogeneous pose the target of arm ``i``. Return False if it is not a finite pose.
 
-    The twist of a target that moves is smoothed over a time. A target that jumped, faster than any tool, has no twist.
+    The twist of the target is smoothed with a time constant. If the target has jumped, faster than any tool can move,
+    its twist counts as zero.
     """
     scratch = targets.scratch
     if not _checked_pose(targets.pose[i], scratch):
@@ -237,7 +239,7 @@ def _checked_pose(pose: Array, scratch: PoseScratch) -> bool:
     for i in range(3):
         j, k = (i + 1) % 3, (i + 2) % 3
         determinant += rotation[0, i] * (rotation[1, j] * rotation[2, k] - rotation[1, k] * rotation[2, j])
-    # A maximum may ignore NaN, and infinities may cancel. In the sum, such numbers show.
+    # A maximum may ignore NaN, but the sum is not finite if a number is NaN or infinite.
     if not (np.isfinite(total) and error < _ORTHONORMAL and determinant > 0.0):
         return False
     if largest > _FARTHEST:

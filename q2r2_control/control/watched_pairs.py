@@ -26,7 +26,7 @@ from q2r2_control.robot.pairs import pairs_with_others
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Interval
 
-# Measures the pairs at a posture (nv,), and returns their distances and the distances that they have to keep (p,) [m].
+# A function that measures the pairs' distances (p,) [m] at a posture (nv,), and the distances (p,) [m] that they keep.
 PairsAhead = tuple[Callable[[Array], Array], Array]
 
 
@@ -55,21 +55,21 @@ class WatchedPairs:
 
     @property
     def kept_distances(self) -> Array:
-        """Distance that every monitored pair keeps now (p,) [m]. After a change this is another array."""
+        """Distance that every monitored pair keeps now (p,) [m]. Each change makes a new array."""
         return self._live.kept
 
     @property
     def narrow_pair(self) -> tuple[str, str] | None:
-        """The pair whose kept distance is farthest from the one asked for; None if all pairs keep all of it."""
+        """The pair whose kept distance is farthest below the requested one; None if no kept distance is below it."""
         return None if self._live.narrow < 0 else self._names.pair(self._live.narrow)
 
     def set_opening(self, arm: str, least: float, greatest: float) -> tuple[str, str] | None:
         """Declare that the gripper of an arm is, and stays, between two openings.
 
-        From the next step on its fingers count as the volume that they sweep between the openings. At first, and after
-        :meth:`reset`, this is their whole way. A part of the present volume is always accepted. Another volume is
-        accepted if every pair keeps its distance with it, at the reference and during a certified stop from there. The
-        caller may send the gripper only to openings that were accepted.
+        From the next step on, the bodies of its fingers are the volume that the fingers sweep between the openings. At
+        first, and after :meth:`reset`, this volume belongs to all openings. A part of the present volume is always
+        accepted. Another volume is accepted if every pair keeps its distance with it, at the reference and during the
+        certified stop from there. The caller may send the gripper only to openings that were accepted.
 
         Args:
             arm: The arm.
@@ -77,7 +77,7 @@ class WatchedPairs:
             greatest: The greatest opening.
 
         Returns:
-            None if the openings were accepted; else the pair in the way, and nothing has changed.
+            None if the openings were accepted; otherwise a pair that does not allow them, and nothing has changed.
 
         Raises:
             RobotError: If there is no such arm, or the numbers are not an interval within 0 .. 1.
@@ -99,18 +99,18 @@ class WatchedPairs:
         return dict(self._fingers.intervals)
 
     def set_holding(self, arm: str, holds: bool) -> None:
-        """Declare that the gripper of an arm holds its object from the next step on, or holds it no more.
+        """Declare that the gripper of an arm holds its object from the next step on, or no longer holds it.
 
-        A held object is part of the tool. Each of its pairs begins with the distance that it has. It keeps more as the
-        distance grows, until it keeps its own (:attr:`object_distances`). For that reason the object is always
-        accepted, and no arm moves for it. After :meth:`reset` no object is held.
+        A held object is part of the tool. At first, each of its pairs keeps at most its present distance. The kept
+        distance (:attr:`object_distances`) grows with the distance, up to the one of the pair's class. The object is
+        therefore always accepted, and no arm has to move because of it. After :meth:`reset` no object is held.
 
         Raises:
             RobotError: If the arm has no object.
         """
         if not self._objects.set_holding(arm, holds):
             return
-        self._active.used[0] = 0  # The pair that it names may not be monitored any more.
+        self._active.used[0] = 0  # The last active pairs may no longer be monitored.
         self._obstacles.hold(self._objects.holding)
         self._observe_again(self._unchanged)
         self._objects.begin()
@@ -118,7 +118,7 @@ class WatchedPairs:
 
     @property
     def holding(self) -> dict[str, bool]:
-        """For each arm that has an object, whether its gripper holds it, as :meth:`set_holding` was told."""
+        """For each arm that has an object, whether its gripper holds it by the last :meth:`set_holding`."""
         return {arm: arm in self._objects.holding for arm in self.robot.objects.by_arm}
 
     @property
@@ -127,10 +127,10 @@ class WatchedPairs:
         return self._objects.kept.copy()
 
     def move_obstacle(self, name: str, obstacle: MovingObstacle | None) -> tuple[str, str] | None:
-        """Report where a moving obstacle is and how fast it may move, from the next step on.
+        """Report where a moving obstacle is and how fast it may move. The report counts from the next step on.
 
-        The arms keep away from all places that the obstacle can reach until they rest, and slow down as it comes
-        nearer. The report always counts.
+        The arms keep away from all positions that the obstacle can reach before they rest, and slow down as it comes
+        nearer. No report is refused.
 
         Args:
             name: One of ``ControllerSettings.moving_obstacles``.
@@ -144,7 +144,7 @@ class WatchedPairs:
             ConfigError: If there is no such name.
         """
         changed = self._obstacles.put(name, obstacle)
-        self._active.used[0] = 0  # The pair that it names may not be monitored any more.
+        self._active.used[0] = 0  # The last active pairs may no longer be monitored.
         blocked = self._observe_again(changed) if self._state.v.any() else -1
         self._certified &= blocked < 0
         self._obstacles.keep_clear(0.0)
@@ -152,7 +152,7 @@ class WatchedPairs:
         return None if blocked < 0 else self._names.pair(blocked)
 
     def pass_time(self, time: float) -> None:
-        """Let reports of moving obstacles age by ``time`` [s], for which no step is taken.
+        """Let reports of moving obstacles age by ``time`` [s] in which no step is taken.
 
         Raises:
             RobotError: If ``time`` is not a number of seconds, 0 or more.
@@ -163,15 +163,15 @@ class WatchedPairs:
 
     @property
     def skew(self) -> float:
-        """Greatest difference between the lags of two arms behind the reference [s]; 0 if they move as one body."""
+        """Greatest difference between the delays of two arms behind the reference [s]; 0 if they follow alike."""
         return float(self._data_pointer.value.safety.history.window[0])
 
     def allow_skew(self, time: float) -> None:
-        """Let the lags of the arms differ by up to ``time`` [s] from the next step on, and each arm stop on its own.
+        """Let the delays of the arms behind the reference differ by up to ``time`` [s], and each arm stop on its own.
 
-        Bodies of two arms then keep their distance wherever on its own way each arm is. Its way begins where the
-        reference was a ``time`` ago, and ends where the certified stop does. A greater time takes effect as time
-        passes, and a smaller one at once. After :meth:`reset` all of it counts.
+        From the next step on, bodies of two arms keep their distance wherever on its own path each arm is. The path
+        begins where the reference was ``time`` [s] ago, and ends where the certified stop ends. A greater time takes
+        effect as time passes, and a smaller time at once. After :meth:`reset` the whole time counts at once.
 
         Args:
             time: The difference, from 0 to 0.1 [s].
@@ -184,24 +184,24 @@ class WatchedPairs:
         self._data_pointer.value.safety.history.window[1] = time
 
     def pairs_ahead(self, stop: float) -> PairsAhead:
-        """Return a function that measures all pairs at a posture, to check a way before the arms take it.
+        """Return what is needed to check a path before the arms follow it, see :data:`PairsAhead`.
 
         Held objects count, and moving obstacles count where they were reported last.
 
         Args:
-            stop: Time in which the arms stop on that way [s].
+            stop: Time in which the arms stop on that path [s].
         """
         kept = self.kept_distances, self._objects.kept, self._obstacles.kept_from(stop)
         return distances_with(self.robot, self.moving_obstacles), np.concatenate(kept)
 
     @property
     def moving_obstacles(self) -> dict[str, MovingObstacle]:
-        """The moving obstacles that are there, by name, from the last calls of :meth:`move_obstacle`."""
+        """The moving obstacles that are present, by name, from the last calls of :meth:`move_obstacle`."""
         return dict(self._obstacles.there)
 
     @property
     def obstacle_reports(self) -> dict[str, ObstacleReport]:
-        """The moving obstacles that are there, with the present age of their reports."""
+        """The moving obstacles that are present, by name, with the present age of their reports."""
         return self._obstacles.reports
 
     def spare_distance(self, arm: str) -> float:
@@ -214,7 +214,7 @@ class WatchedPairs:
 
     @property
     def still_obstacles(self) -> Mapping[str, MovingObstacle]:
-        """The :attr:`moving_obstacles` that do not move. After a change this is another mapping."""
+        """The :attr:`moving_obstacles` whose reported speed is 0. Each change makes a new mapping."""
         return self._obstacles.still
 
     @property
@@ -223,7 +223,7 @@ class WatchedPairs:
         return self._model_pointer.value, self._data_pointer.value, self._obstacles.data
 
     def _observe_again(self, grown: IntArray) -> int:
-        """Update the distances after a change; returns the pair in the way of bodies that have ``grown``, or -1."""
+        """Update the distances after a change; return the pair that does not allow the ``grown`` bodies, or -1."""
         self._observed, blocked = self._observe_bodies(self._model_pointer, self._data_pointer, grown)
         self._apart = self._observed[-1] >= -ROUNDING
         return int(blocked)

@@ -1,4 +1,4 @@
-"""Drive a plant by position, velocity or torque: from targets and a reference to a command."""
+"""Turn a reference into a command for a plant: positions, velocities or torques."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ Openings = dict[str, float]
 
 @dataclass(slots=True)
 class DriveReport:
-    """The results of one tick: of the impedance and the wall in torque mode, of the admittance in position mode.
+    """The reports of one tick: of impedance and wall in torque mode, or of the admittance in the other modes.
 
-    A result is None if it belongs to another mode, or is not enabled.
+    A report is None if it belongs to another mode, or if its part is not enabled.
     """
 
     impedance: ImpedanceReport | None = None
@@ -39,12 +39,12 @@ class DriveReport:
 
 
 class Drive(ABC):
-    """One mode of driving a plant."""
+    """Turns references into commands of one mode: positions, velocities or torques."""
 
     mode: CommandMode
-    report: DriveReport  # The results of the last tick.
+    report: DriveReport  # The reports of the last tick.
     yields = False  # Whether a person may push the arms away from the reference.
-    coasts = False  # Whether a plant goes on moving by the last command while no new one comes.
+    coasts = False  # Whether a plant continues to move by the last command while no new command comes.
 
     @abstractmethod
     def reset(self, state: RobotState) -> None:
@@ -54,41 +54,42 @@ class Drive(ABC):
     def command(
         self, reference: Reference, state: RobotState, grippers: Openings, dt: float, trusted: bool = True
     ) -> Command:
-        """Return the command for the plant. No number makes it raise.
+        """Return the command for the plant. No number in the arguments raises an exception.
 
         Args:
             reference: The controller's reference.
             state: The measured state.
             grippers: The openings of the grippers.
             dt: Duration of the tick [s].
-            trusted: False if ``state`` is too old or implausible, and for the last command of a run. Terms that push
-                according to the state must not push then.
+            trusted: False if ``state`` is too old or implausible, and for the last command of a run. The command must
+                then contain no force or feedback that depends on ``state``.
         """
 
     def average(self, period: float) -> None:  # noqa: B027
-        """Keep the limit of jerk by means of the newest references, in ticks of a ``period`` [s].
+        """From now on, command averages of the newest references, which keep the limit of jerk.
 
-        It is not called for a plant that is told the certified stop and averages by itself.
+        The ticks have the ``period`` [s]. The method is not called for a plant that knows the certified stop and
+        averages by itself.
         """
 
     def set_openings(self, openings: Mapping[str, Interval]) -> None:  # noqa: B027
-        """Take the interval of openings of each arm's gripper that the controller has accepted."""
+        """Set the interval of openings that the controller has accepted, for each arm's gripper."""
 
     def set_holding(self, holding: Mapping[str, bool]) -> None:  # noqa: B027
-        """Take whether each gripper that has an object holds it."""
+        """Set for each arm that has an object whether its gripper holds it."""
 
     def set_kept_distances(self, kept: Array) -> None:  # noqa: B027
-        """Take the distance that every pair keeps from now on (p,) [m]."""
+        """Set the distance that every pair keeps from now on (p,) [m]."""
 
     def set_obstacles(self, obstacles: Mapping[str, MovingObstacle]) -> None:  # noqa: B027
-        """Take the reported obstacles that do not move, by name."""
+        """Set the reported moving obstacles that stay where they are, by name."""
 
     def displaced(self, targets: ToolTargets, state: RobotState, dt: float) -> ToolTargets:
-        """Return the targets for the controller in a tick of ``dt`` [s]; an admittance displaces them."""
+        """Return the targets for the controller in a tick of ``dt`` [s]. With an admittance, they are displaced."""
         return targets
 
     def at_rest(self, state: RobotState) -> bool:
-        """Return whether the arms stand still, if the reference does."""
+        """Return whether the arms are at rest too, after the reference has come to rest."""
         return True
 
     def last_command(self, state: RobotState, grippers: Openings) -> Command | None:
@@ -99,7 +100,7 @@ class Drive(ABC):
 def permitted(settings: ControllerSettings, drive: Drive) -> ControllerSettings:
     """Return the controller's settings that a drive permits.
 
-    Bodies may touch only if the arms are compliant. A limit of jerk counts for commanded positions and velocities only.
+    Bodies may touch only in torque mode, in which the arms yield. A limit of jerk counts only in the other modes.
     """
     return settings.without_jerk_limit() if drive.yields else settings.without_contact()
 
@@ -115,9 +116,9 @@ def holding_command(q: Array, grippers: Openings) -> Command:
     return Command(CommandMode.POSITION, q, zero, zero, grippers)
 
 
-# Gain of the position feedback [1/s]. With a plant of the delay T, here 100 ms, gains below about 1 / T are stable.
+# Gain of the position feedback [1/s]. If the plant has a delay T, gains below about 1 / T are stable; here T is 100 ms.
 FEEDBACK_GAIN = 10.0
-_FRESH_TICKS = 3  # A measurement that has not changed for more ticks is old, because the arm has moved since.
+_FRESH_TICKS = 3  # After more ticks than this, a measurement is too old for feedback: the arm has moved since.
 _STILL = 1e-2  # An arm on its spring stands still if its joints are slower than this [rad/s].
 
 
@@ -174,7 +175,7 @@ class PositionDrive(Drive):
 class VelocityDrive(PositionDrive):
     """Commands v = v_ref + k (q_ref - q) within the limits: the reference's velocity, and feedback of the position.
 
-    There is no feedback without a trusted state, or with a state that is some ticks old.
+    If the state is not trusted or some ticks old, v is v_ref, without feedback.
     """
 
     mode = CommandMode.VELOCITY
@@ -201,7 +202,7 @@ class VelocityDrive(PositionDrive):
         return Command(self.mode, q, bounded, np.zeros_like(q), grippers)
 
     def last_command(self, state: RobotState, grippers: Openings) -> Command | None:
-        # Many plants go on at the last velocity after its sender has ended.
+        # Many plants continue at the last velocity after the program that sent it has ended.
         zero = np.zeros_like(self._limit)
         return Command(self.mode, np.nan_to_num(state.q), zero, zero, grippers)
 
@@ -209,10 +210,10 @@ class VelocityDrive(PositionDrive):
 class TorqueDrive(Drive):
     """Commands torques that follow the reference. Targets are not displaced, because the spring is the compliance.
 
-    **Without a trusted state** a spring about an old posture could push anywhere. If the plant has position servos
-    (``has_servos``), which measure by themselves, they follow the reference. If not, the command is the torque of
-    gravity at the newest measured posture, with a flag that says so, because many drivers repeat the last command for
-    ever.
+    **Without a trusted state**, the torque of a spring could push the arms anywhere. If the plant has position servos
+    of its own (``has_servos``), the command then contains positions, and the servos follow the reference. Otherwise the
+    command is the gravity torque at the newest measured posture, because many drivers repeat the last command for ever.
+    Its flag ``gravity_only`` is then set.
     """
 
     mode = CommandMode.TORQUE
@@ -223,7 +224,7 @@ class TorqueDrive(Drive):
         self.wall = MeasuredSeparation(robot, config.control, config.impedance.wall)
         self.report = DriveReport()
         self._has_servos = has_servos
-        self._believed = self._reference = robot.home  # The last posture and the last reference (nv,) [rad].
+        self._believed = self._reference = robot.home  # Last usable measured posture, and last reference (nv,) [rad].
 
     def reset(self, state: RobotState) -> None:
         self.report = DriveReport()
@@ -260,12 +261,12 @@ class TorqueDrive(Drive):
         return Command(self.mode, reference.q, reference.v, torque.tau, grippers)
 
     def at_rest(self, state: RobotState) -> bool:
-        # Without a measurement there is nothing to wait for.
+        # Without a measurement, waiting for rest would never end.
         seen = np.isfinite(state.q).all() and np.isfinite(state.v).all()
         return not seen or float(np.abs(state.v).max()) <= _STILL
 
     def last_command(self, state: RobotState, grippers: Openings) -> Command | None:
-        # Position servos hold the arms. A torque that nobody updates does not.
+        # Position servos can hold the arms. A torque that is no longer updated cannot hold them.
         if self._has_servos:
             return holding_command(state.q if np.isfinite(state.q).all() else self._reference, grippers)
         q = self._posture(state)

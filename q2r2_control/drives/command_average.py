@@ -15,16 +15,16 @@ _LATE = 1.5  # A tick that lasts longer, in periods, is not averaged.
 
 
 class CommandAverage:
-    """The mean of the references of a window, which commands follow instead of the newest one.
+    """The mean of the references in a window of time. It is commanded instead of the newest reference.
 
-    ``robot/command_average.py`` proves what the mean keeps: with regular ticks the limit of jerk, and always the other
-    limits and the distances. Ticks may be irregular: between two of them the reference is a cubic. The reference during
-    a tick of more than 1.5 periods is not known well enough. The mean then begins again at its end, as the reference
-    itself would be commanded.
+    ``robot/command_average.py`` proves that the mean keeps the limit of jerk if ticks are regular, and that it always
+    keeps the other limits and the distances. Ticks may be irregular: the reference between two ticks is computed as a
+    cubic. During a tick of more than 1.5 periods, the reference is not known well enough. At the end of such a tick,
+    the reference itself is commanded, and the mean begins again from there.
     """
 
     def __init__(self, window: float, period: float) -> None:
-        """Make the average over a ``window`` [s], see ``average_window``, of ticks of a ``period`` [s]."""
+        """Make the average over a ``window`` [s] (see ``average_window``), for ticks of a ``period`` [s]."""
         count = max(math.ceil((window - _ROUNDING) / period), 1)
         self._ages, self._longest = period * np.arange(count), _LATE * period
         self._times: list[float] = []  # Times of the last ticks [s], with the reference of each.
@@ -33,7 +33,7 @@ class CommandAverage:
 
     @property
     def delay(self) -> float:
-        """How much older than the newest reference its mean is [s]."""
+        """How far the mean is behind the newest reference [s]."""
         return 0.5 * float(self._ages[-1])
 
     def reset(self, q: Array) -> None:
@@ -51,12 +51,12 @@ class CommandAverage:
         now = self._times[-1]
         samples = [self._at(now - age) for age in self._ages]
         oldest = bisect_right(self._times, now - self._ages[-1] - _ROUNDING) - 1
-        if oldest > 0:  # Older references are not used again. Times restart at 0, since rounding grows with them.
+        if oldest > 0:  # Older references are not used again. Times restart at 0, since rounding grows with the time.
             self._times = [time - self._times[oldest] for time in self._times[oldest:]]
             del self._path[:oldest]
         self.settled = all((sample[0] == q).all() for sample in samples)
         if self.settled:
-            return q, v  # The mean of equal numbers may be another number, by rounding.
+            return q, v  # By rounding, the mean of equal numbers may differ from them.
         mean_q, mean_v = (np.mean([sample[i] for sample in samples], axis=0) for i in (0, 1))
         return mean_q, mean_v
 

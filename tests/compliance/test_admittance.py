@@ -1,4 +1,4 @@
-"""Compliance in position mode: its displacement, its estimate of the wrench, and both in the closed loop."""
+"""Compliance in position mode: the displacement of targets, the estimate of the wrench, and both in a closed loop."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def _away(pose: pin.SE3 | None, goal: pin.SE3 | None) -> Array:
 
 
 def _displaced(admittance: Admittance, state: RobotState, ticks: int, dt: float = DT) -> list[Array]:
-    """Return the displacements of the left target."""
+    """Return the displacement (6,) of the left target [m], [rad] at each of the next ``ticks``."""
     return [_away(admittance.update(GOALS, state, dt)["left"], GOALS["left"]) for _ in range(ticks)]
 
 
@@ -81,7 +81,7 @@ AXES = pytest.mark.parametrize("axis", [0, 2, 4], ids=["along x", "along z", "ab
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("axis", "ratio", "dt"), [(0, 0.2, 0.001), (5, 0.6, 0.01)], ids=["moved", "turned"])
-def test_released_it_returns_with_the_damping_ratio_asked_for(axis: int, ratio: float, dt: float) -> None:
+def test_after_a_push_the_target_returns_with_the_set_damping_ratio(axis: int, ratio: float, dt: float) -> None:
     admittance = Admittance(ROBOT, AdmittanceSettings(damping_ratio=ratio))
     _displaced(admittance, _touch(_wrench(axis, 20.0 if axis < 3 else 5.0)), round(4.0 / dt), dt)
     back = np.array(_displaced(admittance, UNTOUCHED, round(1.5 / dt), dt))[:, axis]
@@ -89,11 +89,11 @@ def test_released_it_returns_with_the_damping_ratio_asked_for(axis: int, ratio: 
 
 
 @pytest.mark.slow
-def test_critically_damped_it_returns_without_overshoot_and_leaves_the_target_unchanged_at_the_end() -> None:
+def test_with_critical_damping_the_target_returns_without_overshoot_and_exactly() -> None:
     admittance = Admittance(ROBOT)
     _displaced(admittance, _touch(_wrench(2, -20.0)), 2000)
     back = np.array(_displaced(admittance, UNTOUCHED, 4000))[:, 2]
-    # Below the dead band, the low-pass filter still decays. After its time constant, nothing pushes.
+    # After the release, the filtered wrench decays and is soon below the dead band.
     assert (np.diff(back) >= 0.0).all()
     assert back[0] < -0.019
     assert admittance.update(GOALS, UNTOUCHED, DT)["left"] is GOALS["left"]
@@ -110,7 +110,7 @@ def test_a_force_below_the_dead_band_never_moves_the_tool(axis: int) -> None:
 
 
 @pytest.mark.slow
-def test_the_dead_band_ends_without_a_step_and_soon_lets_the_whole_force_through() -> None:
+def test_beyond_the_dead_band_the_displacement_rises_without_a_step_to_that_of_the_whole_force() -> None:
     forces = np.linspace(1.5, 30.0, 115)
     ends = np.array([_displaced(Admittance(ROBOT), _touch(_wrench(0, force)), 100, 0.1)[-1][0] for force in forces])
     slopes = np.diff(ends) / np.diff(forces)
@@ -136,7 +136,7 @@ def test_any_wrench_at_any_tick_keeps_the_displacement_inside_its_limits() -> No
     np.testing.assert_allclose(farthest, [DEFAULT.max_displacement, DEFAULT.max_rotation], rtol=1e-6)
 
 
-def test_motion_stops_where_the_displacement_meets_its_limit() -> None:
+def test_the_velocity_of_the_displacement_ends_when_the_displacement_reaches_its_limit() -> None:
     admittance = Admittance(ROBOT, AdmittanceSettings(damping_ratio=0.1, filter_time=0.0))
     push, x = _touch(_wrench(0, 95.0)), 0.0
     while x < DEFAULT.max_displacement - 1e-9:
@@ -145,7 +145,7 @@ def test_motion_stops_where_the_displacement_meets_its_limit() -> None:
     assert (np.diff([x, *back]) < 0.0).all()
 
 
-def test_an_arm_yields_only_to_its_own_push() -> None:
+def test_an_arm_yields_only_to_a_push_at_its_own_tool() -> None:
     admittance = Admittance(ROBOT)
     for _ in range(500):
         targets = admittance.update(GOALS, _touch(_wrench(2, 20.0), "right"), DT)
@@ -160,12 +160,12 @@ def test_an_arm_that_holds_is_not_displaced_and_starts_again_from_its_new_target
         assert admittance.update(holding, push, DT) == holding
         assert not admittance.report().arms["left"].displacement.any()
         assert admittance.report().arms["left"].wrench[0] == pytest.approx(20.0, rel=1e-3)
-    # The push is still there, so that the tool starts from rest with the acceleration of the virtual mass.
+    # The push continues, so the displacement starts from rest with the acceleration of the virtual mass.
     first = _displaced(admittance, push, 1)[0]
     assert 0.0 < first[0] <= 0.5 * 20.0 / DEFAULT.mass * DT**2 * 1.001
 
 
-def test_a_sensor_that_falls_silent_lets_the_target_return_without_a_jump() -> None:
+def test_if_torques_are_no_longer_measured_the_target_returns_without_a_jump() -> None:
     admittance = Admittance(ROBOT)
     pushed = _displaced(admittance, _touch(_wrench(0, 20.0)), 1000)
     after = _displaced(admittance, _state(ROBOT.home, None), 2000)
@@ -196,7 +196,7 @@ def test_a_measurement_that_is_not_finite_holds_the_last_wrench_and_is_reported(
 
 
 @pytest.mark.parametrize("dt", [0.0, np.nan])
-def test_an_impossible_dt_moves_nothing_and_is_reported(dt: float) -> None:
+def test_an_invalid_dt_changes_no_displacement_and_is_reported(dt: float) -> None:
     admittance, push = Admittance(ROBOT), _touch(_wrench(1, 20.0))
     before = _displaced(admittance, push, 100)[-1]
     np.testing.assert_array_equal(_displaced(admittance, push, 1, dt)[0], before)
@@ -228,9 +228,9 @@ def _plant() -> MujocoPlant:
 
 
 def _loop(goals: dict[str, pin.SE3 | None], dt: float, ticks: int) -> Iterator[Array]:
-    """Return the displacement of the left tool from its goal in the reference at every tick.
+    """Yield at every tick the displacement (6,) of the left tool from its goal at the reference [m], [rad].
 
-    Each tick keeps the contract.
+    The contract is checked at every tick.
     """
     controller, admittance, plant = CartesianController(ROBOT), Admittance(ROBOT), _plant()
     plant.reset()
@@ -245,7 +245,7 @@ def _loop(goals: dict[str, pin.SE3 | None], dt: float, ticks: int) -> Iterator[A
 
 @pytest.mark.slow
 @AXES
-def test_when_pushed_in_mujoco_the_tool_moves_by_the_wrench_over_the_stiffness_plus_the_give_of_the_servos(
+def test_a_push_in_mujoco_moves_the_tool_by_the_give_of_the_admittance_and_of_the_servos(
     axis: int,
 ) -> None:
     push = _wrench(axis, 20.0 if axis < 3 else 5.0)
@@ -265,7 +265,7 @@ def test_when_pushed_in_mujoco_the_tool_moves_by_the_wrench_over_the_stiffness_p
 
 
 @pytest.mark.slow
-def test_a_tool_that_leans_on_a_body_of_ten_kilonewtons_per_metre_comes_to_rest() -> None:
+def test_a_tool_that_presses_on_a_body_of_10_kilonewtons_per_metre_comes_to_rest() -> None:
     body = 10000.0
     surface = ROBOT.tool_pose(ROBOT.home, "left").translation[2] - 0.02
     below = {arm: pin.SE3(goal.rotation, goal.translation - [0.0, 0.0, 0.06]) for arm, goal in GOALS.items() if goal}
@@ -294,7 +294,7 @@ def regular() -> list[Array]:
     return [ROBOT.home, *(q for q in postures if _least_singular(q) > 0.05)]
 
 
-def test_a_wrench_at_the_tool_is_found_again_in_every_posture_that_is_not_singular(regular: list[Array]) -> None:
+def test_a_wrench_at_the_tool_is_estimated_exactly_in_every_posture_that_is_not_singular(regular: list[Array]) -> None:
     random = np.random.default_rng(42)
     assert len(regular) > 50
     for q in regular:
@@ -309,7 +309,7 @@ def test_torques_that_no_wrench_explains_give_the_least_squares_wrench(regular: 
         np.testing.assert_allclose(estimate_wrench(_jacobian(q), tau), np.linalg.pinv(_jacobian(q).T) @ tau, atol=1e-7)
 
 
-def test_stretched_out_the_estimate_stays_bounded_and_knows_nothing_of_the_force_along_the_arm() -> None:
+def test_for_a_stretched_arm_the_estimate_is_bounded_and_has_no_force_along_the_arm() -> None:
     random, upright = np.random.default_rng(45), np.zeros(len(ROBOT.home))
     assert _least_singular(upright) < 1e-9
     along = np.array([0.0, 0.0, 30.0, 0.0, 0.0, 0.0])
@@ -323,10 +323,10 @@ def test_stretched_out_the_estimate_stays_bounded_and_knows_nothing_of_the_force
 
 
 @pytest.mark.parametrize("ratio", [0.1, 1.0 - 1e-9, 1.0, 1.3])
-def test_one_step_of_the_oscillator_equals_a_thousand_small_ones(ratio: float) -> None:
+def test_one_step_of_the_oscillator_equals_a_thousand_small_steps(ratio: float) -> None:
     start, many = np.array([0.03]), np.array([0.03])
     x, v = oscillate(start, np.array([-0.2]), 12.0, ratio, 0.1)
-    # The slope of each small step is that of the differential equation.
+    # The small steps use the derivatives from the differential equation.
     speed, h = np.array([-0.2]), 1e-4
     for _ in range(1000):
         acceleration = -2 * ratio * 12.0 * speed - 144.0 * many

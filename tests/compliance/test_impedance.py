@@ -1,4 +1,4 @@
-"""The impedance controller without a simulator: its torques, its bounds, and what bad numbers do to it."""
+"""The impedance controller without a simulator: its torques, its bounds, and its response to invalid numbers."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ KEYS = (*LIVE_IMPEDANCE, "limit_stiffness", "limit_damping", "torque_scale", "to
 
 @pytest.mark.parametrize("key", KEYS)
 @pytest.mark.parametrize("value", [0.0, np.nan])
-def test_settings_that_would_not_hold_the_arm_are_refused(key: str, value: float) -> None:
+def test_impedance_settings_that_would_not_hold_the_arm_are_refused(key: str, value: float) -> None:
     with pytest.raises(ConfigError, match=key):
         ImpedanceSettings.model_validate({key: value})
 
@@ -119,7 +119,7 @@ class TestController:
                 last = tau
 
     @pytest.mark.parametrize("value", [np.nan, np.inf])
-    def test_an_unusable_reference_is_not_used_and_the_last_one_is_held(self, robot: Robot, value: float) -> None:
+    def test_an_unusable_reference_is_not_used_and_the_last_reference_is_held(self, robot: Robot, value: float) -> None:
         controller = started(robot)
         moved = at(robot.home + 0.01)
         for _ in range(50):
@@ -146,7 +146,7 @@ class TestController:
 
 
 class TestAnImpedanceThatChanges:
-    def test_a_setting_changes_on_a_straight_line_over_the_ramp_time(self, robot: Robot) -> None:
+    def test_a_setting_changes_linearly_over_the_ramp_time(self, robot: Robot) -> None:
         controller = started(robot, ImpedanceSettings(ramp_time=0.1))
         before = controller.in_force("right")
         asked = {
@@ -175,7 +175,7 @@ class TestAnImpedanceThatChanges:
             assert [values["damping_ratio"] for values in in_force] == pytest.approx(damping)
             assert [values["nullspace_stiffness"] for values in in_force] == pytest.approx([10.0, 10.0])
 
-    def test_after_a_change_the_controller_is_as_if_made_with_the_new_settings(self, robot: Robot) -> None:
+    def test_after_a_change_torques_are_those_of_a_controller_made_with_the_new_settings(self, robot: Robot) -> None:
         soft = {"translational_stiffness": 300.0, "damping_ratio": 0.4, "nullspace_stiffness": 20.0}
         made, changed = started(robot, ImpedanceSettings(**soft)), ImpedanceController(robot)
         changed.change(soft)
@@ -198,7 +198,7 @@ class TestAnImpedanceThatChanges:
             ({"translational_stiffness": 100.0}, "middle", "no arm 'middle'; arms: left, right"),
         ],
     )
-    def test_an_impossible_setting_is_refused_and_nothing_changes(
+    def test_a_setting_that_is_not_allowed_is_refused_and_nothing_changes(
         self, robot: Robot, values: dict, arm: str | None, message: str
     ) -> None:
         controller = ImpedanceController(robot)
@@ -211,7 +211,7 @@ class TestAnImpedanceThatChanges:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("model", "tool", "joints"), [("panda", "panda_hand", 7), ("ur5", "tool0", 6)])
-def test_robots_with_unknown_rotors_have_usual_ones(model: str, tool: str, joints: int) -> None:
+def test_robots_with_unknown_rotor_inertias_get_usual_rotor_inertias(model: str, tool: str, joints: int) -> None:
     import example_robot_data
 
     robot = Robot.from_urdf(example_robot_data.load(model).urdf, {"left": tool})

@@ -1,4 +1,4 @@
-"""The formulas of the impedance, each on its own: damping, inertia, projectors, and the bounds of its torque."""
+"""The formulas of the impedance, each tested alone: damping, inertia, projectors and the bounds of the torque."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ def tool_inertia(J: Array, M: Array) -> Array:
 
 
 def projector_of(J: Array, M: Array) -> Array:
-    """Return the matrix that torques are multiplied by."""
+    """Return the nullspace projector N (n, n), column by column."""
     J, inertia, M_inverse = np.ascontiguousarray(J), tool_inertia(J, M), np.linalg.inv(M)
     consistent = [torque - J.T @ consistent_force(inertia, J, M_inverse, torque) for torque in np.eye(len(M))]
     return np.column_stack(consistent)
 
 
-def test_each_part_of_an_error_is_clipped_by_its_length_and_keeps_its_direction() -> None:
+def test_translation_and_rotation_of_an_error_are_each_clipped_in_length_and_keep_their_direction() -> None:
     errors = np.array(
         [[0.03, 0.0, 0.04, 0.0, 0.3, 0.4], [0.3, 0.0, 0.4, 0.0, 0.3, 0.0], [0.0, 0.0, 0.01, 3.0, 0.0, 0.0]]
     )
@@ -81,7 +81,7 @@ class TestLimitRepulsion:
         assert [self.torque(q, wanted=0.97) for q in (0.97, 0.98)] == pytest.approx([0.0, -3.0])
         assert self.torque(-0.98, wanted=-0.97) == pytest.approx(3.0)
 
-    def test_the_limit_torque_brakes_approach_and_never_holds_retreat(self) -> None:
+    def test_the_limit_torque_brakes_motion_towards_the_limit_and_not_motion_away_from_it(self) -> None:
         assert [self.torque(0.95, v=v) for v in (1.0, -1.0, -3.0)] == pytest.approx([-25.0, -5.0, 0.0])
         assert self.torque(-0.95, v=3.0) == 0.0
 
@@ -118,7 +118,7 @@ def damping(stiffness: Array, inertia: Array, ratio: float) -> Array:
 def arm_torque(
     arm: str, settings: ImpedanceSettings, wanted: tuple[Array, Array], measured: tuple[Array, Array]
 ) -> Array:
-    """Return the torque (7,) of one arm's spring and posture."""
+    """Return the torque (7,) [Nm] of one arm's spring and posture, computed from the formulas of the papers."""
     model, joints, frame = ROBOT.model, ROBOT.arms[arm].joints, ROBOT.arms[arm].frame_id
     (q_wanted, v_wanted), (q, v) = wanted, measured
     jacobians = []
@@ -142,7 +142,7 @@ def arm_torque(
 
 
 @pytest.mark.parametrize("spread", [0.02, 0.5], ids=["near", "further than the clip"])
-def test_the_torque_is_that_of_the_formulas(spread: float) -> None:
+def test_the_torque_of_the_controller_is_that_of_the_written_formulas(spread: float) -> None:
     random = np.random.default_rng(7)
     settings = ImpedanceSettings(damping_ratio=0.7, limit_distance=1e-3, torque_rate_limit=1e5)
     controller = ImpedanceController(ROBOT, settings)
@@ -153,7 +153,7 @@ def test_the_torque_is_that_of_the_formulas(spread: float) -> None:
         q_wanted = q + random.uniform(-spread, spread, 14)
         state = RobotState(q, v, np.zeros(14), None, 0.0)
         controller.reset(state)
-        # The spring acts about the reference of the tick before.
+        # The spring acts about the reference of the previous tick.
         controller.step(reference(q_wanted, v_wanted), state, 0.001)
         command = controller.step(reference(q_wanted, v_wanted, a), state, 0.1)
         expected = pin.rnea(ROBOT.model, ROBOT.model.createData(), q, v, a)

@@ -1,4 +1,4 @@
-"""The wall between measured links: its energy, its stability, and arms that are pushed at it in MuJoCo."""
+"""The wall, which pushes measured links apart: its energy, its stability, and pushed arms in MuJoCo."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def wall(**settings: float) -> MeasuredSeparation:
 
 @cache
 def _postures() -> list[tuple[Array, WallReport]]:
-    """Return postures in which the wall presses and nothing touches."""
+    """Return postures in which the wall pushes some pair apart and no pair touches, each with the wall's report."""
     random, found = np.random.default_rng(31), []
     for _ in range(12000):
         q = random_posture(ROBOT, random)
@@ -63,7 +63,9 @@ def _mass_matrix(q: Array) -> Array:
 
 
 @pytest.mark.parametrize("kind", [_of_two_arms, _with_the_table], ids=["two arms", "an arm and the table"])
-def test_the_torque_at_rest_is_the_gradient_of_the_wall_energy(kind: Callable[[tuple[str, str]], bool]) -> None:
+def test_the_torque_at_rest_is_the_negative_gradient_of_the_energy_of_the_wall(
+    kind: Callable[[tuple[str, str]], bool],
+) -> None:
     chosen = [(q, report) for q, report in _postures() if any(map(kind, report.pressing))][:40]
     assert len(chosen) >= 20
     assert max(len(report.pressing) for _, report in chosen) >= 3
@@ -76,7 +78,7 @@ def test_the_torque_at_rest_is_the_gradient_of_the_wall_energy(kind: Callable[[t
         assert np.abs(report.tau).max() > 0.0
 
 
-def test_the_energy_is_that_of_a_spring_over_each_pairs_depth_as_coal_measures_it() -> None:
+def test_the_energy_is_that_of_springs_compressed_by_the_depths_that_coal_measures() -> None:
     stiffness = WallSettings().stiffness
     for q, report in _postures()[:100]:
         depth = np.array([max(SHELL - pair.distance, 0.0) for pair in ROBOT.distances(q)])
@@ -86,7 +88,7 @@ def test_the_energy_is_that_of_a_spring_over_each_pairs_depth_as_coal_measures_i
         assert least - 1e-9 <= report.energy <= spring + 1e-4
 
 
-def test_the_report_names_the_pairs_that_press_and_the_closest_pair() -> None:
+def test_the_report_names_the_pairs_that_the_wall_pushes_apart_and_the_closest_pair() -> None:
     for q, report in _postures()[:50]:
         distances = {frozenset((pair.name_a, pair.name_b)): pair.distance for pair in ROBOT.distances(q)}
         assert distances[frozenset(report.closest_pair)] == pytest.approx(report.closest_distance, abs=1e-4)
@@ -96,7 +98,7 @@ def test_the_report_names_the_pairs_that_press_and_the_closest_pair() -> None:
         assert all(pair in pressing for pair, distance in distances.items() if distance < SHELL - 4e-4)
 
 
-def test_a_pair_that_may_touch_hides_no_pair_that_must_not() -> None:
+def test_a_pair_that_may_touch_does_not_hide_a_pair_that_must_not_touch() -> None:
     q = ROBOT.home.copy()
     q[1] = 0.7  # The left fingers are 10 mm inside the table.
     contact = {"pair": ("*_finger_*", "table"), "depth": 0.015, "speed": 0.03}
@@ -110,7 +112,7 @@ def test_a_pair_that_may_touch_hides_no_pair_that_must_not() -> None:
     assert not any("finger" in name for name in report.closest_pair)
 
 
-def test_fingers_press_with_the_openings_that_were_set() -> None:
+def test_the_wall_uses_the_bodies_of_fingers_for_the_openings_that_were_set() -> None:
     random, separation = np.random.default_rng(4), MeasuredSeparation(ROBOT, ControllerSettings(), WallSettings())
     closed = collision_model_at(ROBOT.collision_model, ROBOT.finger_bodies, {"left": (0.0, 0.1)})
     farther = 0
@@ -124,7 +126,7 @@ def test_fingers_press_with_the_openings_that_were_set() -> None:
     assert farther > 2
 
 
-def test_there_is_no_torque_outside_the_shell_at_any_speed() -> None:
+def test_there_is_no_torque_at_any_speed_if_all_pairs_keep_their_distance() -> None:
     random, seen = np.random.default_rng(32), 0
     for _ in range(400):
         q, v = random_posture(ROBOT, random), random.normal(0.0, 2.0, len(REST))
@@ -153,7 +155,7 @@ def test_the_wall_never_pulls_a_pair_together_at_any_speed() -> None:
         assert weaker >= 1, "fast enough out, it lets go"
 
 
-def test_the_damping_takes_energy_at_every_velocity() -> None:
+def test_the_damping_never_adds_energy() -> None:
     random = np.random.default_rng(33)
     for q, report in _postures()[:200]:
         v = random.normal(0.0, 0.3, len(REST))
@@ -161,10 +163,10 @@ def test_the_damping_takes_energy_at_every_velocity() -> None:
 
 
 @pytest.mark.slow
-def test_the_torque_grows_gradually_into_the_shell_while_closing() -> None:
+def test_the_torque_of_the_wall_rises_gradually_while_a_pair_closes_in() -> None:
     crossed = 0
     for q, report in _postures()[:12]:
-        # The approach begins outside and goes along the torque at constant speed, in steps of a few micrometres.
+        # The approach begins outside the wall, and moves against the torque at constant speed in very small steps.
         direction = report.tau / np.linalg.norm(report.tau)
         way = np.linspace(0.1, 0.0, 8001)
         torques = np.array([wall().update(q + s * direction, -0.3 * direction).tau for s in way])
@@ -173,7 +175,7 @@ def test_the_torque_grows_gradually_into_the_shell_while_closing() -> None:
     assert crossed >= 3
 
 
-def test_default_stiffness_is_never_scaled_down_but_a_hard_wall_scales_down_that_of_stacked_pairs() -> None:
+def test_the_stiffness_of_many_pairs_is_scaled_down_for_a_hard_wall_but_never_for_the_default() -> None:
     firm = {"maximum_force": 2000.0}
     stiffest = max(_postures(), key=lambda posture: len(posture[1].pressing))[0]
     for q, _ in _postures():
@@ -184,7 +186,7 @@ def test_default_stiffness_is_never_scaled_down_but_a_hard_wall_scales_down_that
 
 
 @pytest.mark.parametrize("stiffness", [1e4, 1e5])
-def test_damping_of_all_pairs_together_stays_below_a_quarter_of_the_stable_maximum_at_two_milliseconds(
+def test_the_damping_of_all_pairs_together_stays_below_a_quarter_of_the_stable_maximum(
     stiffness: float,
 ) -> None:
     separation, bound = wall(stiffness=stiffness, damping_ratio=2.0, maximum_force=2000.0), 0.5 / 0.002
@@ -211,7 +213,7 @@ def test_numbers_that_are_not_finite_give_neither_torque_nor_distance(bad: float
 
 
 @pytest.mark.parametrize("key", ["stiffness", "damping_ratio", "maximum_force"])
-def test_settings_that_would_not_push_apart_or_would_add_energy_are_refused(key: str) -> None:
+def test_wall_settings_that_would_not_push_bodies_apart_or_would_add_energy_are_refused(key: str) -> None:
     with pytest.raises(ConfigError, match=key):
         WallSettings(**{key: 0.0})
 
@@ -234,10 +236,10 @@ HOLD, HOLD_DAMPING = 2000.0, 60.0  # Stiffness [Nm/rad] and damping [Nm s/rad] t
 def _pushed(
     force: float, friction: float, dt: float, separation: MeasuredSeparation
 ) -> Iterator[tuple[WallReport, float, float, float]]:
-    """The left hand, 60 mm from the right one, is pushed at it for 1.5 s and released for 1.5 s.
+    """Push the left hand for 1.5 s at the right hand, which is 60 mm away, and then release it for 1.5 s.
 
-    Yields the report, the energy of motion, of the wall and of the right arm's hold, the push's work [J], and the
-    distance of the closest pair by Coal [m].
+    Yield at each tick the report, the sum of the energies of motion, of the wall and of the springs that hold the right
+    arm [J], the work of the push [J], and the distance of the closest pair, measured by Coal [m].
     """
     q = ROBOT.home.copy()
     while min(pair.distance for pair in ROBOT.distances(q) if _of_two_arms((pair.name_a, pair.name_b))) > 0.06:
@@ -270,7 +272,7 @@ def _pushed(
         pytest.param(10.0, 0.002, 1e5, 0.01, id="braked, slow loop, ten times the stiffness"),
     ],
 )
-def test_an_arm_pushed_at_the_other_with_40_newtons_never_touches_it_and_gets_no_energy_from_the_wall(
+def test_an_arm_pushed_at_the_other_arm_with_40_newtons_never_touches_it_nor_gains_energy(
     friction: float, dt: float, stiffness: float, least: float
 ) -> None:
     pressed, released = 0, []
@@ -287,7 +289,7 @@ def test_an_arm_pushed_at_the_other_with_40_newtons_never_touches_it_and_gets_no
     assert released[-1] < 0.7 * released[0]
 
 
-def test_a_wall_with_distances_that_changed_later_equals_a_wall_made_with_them() -> None:
+def test_a_wall_whose_distances_changed_pushes_like_a_wall_made_with_these_distances() -> None:
     wider = ControllerSettings(min_distance=0.04)
     made, told = MeasuredSeparation(ROBOT, wider), MeasuredSeparation(ROBOT, ControllerSettings())
     q = _postures()[0][0]
@@ -296,7 +298,7 @@ def test_a_wall_with_distances_that_changed_later_equals_a_wall_made_with_them()
     np.testing.assert_array_equal(told.update(q, REST).tau, made.update(q, REST).tau)
 
 
-def test_an_arm_pushed_at_a_new_box_never_touches_it_and_is_free_when_the_box_is_removed() -> None:
+def test_an_arm_pushed_at_a_new_box_never_touches_it_until_the_box_is_removed() -> None:
     controller = CartesianController(ROBOT, ControllerSettings(moving_obstacles=("hand", "box")))
     separation, size = MeasuredSeparation(ROBOT, controller.settings), (0.2, 0.05, 0.3)
     at = ROBOT.tool_pose(ROBOT.home, "left").translation + np.array([0.0, 0.14, 0.0])
@@ -325,7 +327,7 @@ def test_an_arm_pushed_at_a_new_box_never_touches_it_and_is_free_when_the_box_is
 
 
 @pytest.mark.parametrize("with_object", [False, True], ids=["empty hands", "an object in one hand's reach"])
-def test_a_moving_hand_has_no_wall_because_its_reports_would_push_the_arms(with_object: bool) -> None:
+def test_an_obstacle_that_may_move_has_no_wall(with_object: bool) -> None:
     robot = Robot.from_config(object_cell(BLOCK)) if with_object else ROBOT
     controller = CartesianController(robot, ControllerSettings(moving_obstacles=("hand", "box")))
     separation = MeasuredSeparation(robot, controller.settings)

@@ -1,4 +1,4 @@
-"""Cells for tests of the controller's parts, as the arrays that the kernels take, and distances along motions."""
+"""Two cells as arrays for the kernels, and functions that measure distances along motions of their robots."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ NAMES = ("dual_iiwa7", "dual_panda")
 
 
 class _Behind(KernelPointer):
-    """A pointer whose named tuple can also be read in Python."""
+    """A pointer to a named tuple, through which Python can read the attributes of the tuple too."""
 
     def __getattr__(self, name: str) -> Any:
         found = getattr(self.value, name)
@@ -43,9 +43,10 @@ class _Behind(KernelPointer):
 
 
 def behind(value: _Tuple) -> _Tuple:
-    """Return a named tuple as kernels get it in the product: by its address.
+    """Return an object that kernels take as a pointer to ``value``, and that Python can use like ``value``.
 
-    By value, compiling would take a minute.
+    The controller passes its data in the same way. If kernels took the named tuple itself, compiling would take a
+    minute.
     """
     pointer = pointer_to(value)
     return cast("_Tuple", _Behind(pointer.value, pointer.memory, pointer.numba_type))
@@ -68,7 +69,7 @@ class CellArrays(NamedTuple):
 
 @cache
 def cell(name: str) -> CellArrays:
-    """Return one of ``NAMES``, which is loaded once."""
+    """Return the cell called ``name``, one of ``NAMES``. Each cell is loaded once."""
     robot = Robot.from_config(pandas() if name == "dual_panda" else load_config(f"config/{name}.yaml"))
     return arrays_of(robot)
 
@@ -79,12 +80,12 @@ def arrays_of(robot: Robot) -> CellArrays:
 
 @cache
 def kernel_model(name: str) -> KernelModel:
-    """Return the data of the controller's kernels about one of ``NAMES``, with the default settings."""
+    """Return the kernels' model of the cell called ``name``, with the default settings."""
     return behind(kernel_model_of(cell(name).robot, ControllerSettings()))
 
 
 def kernel_data(name: str, q: Array, v: Array | None = None) -> KernelData:
-    """Return the controller's data with bodies and joints at ``q`` (nv,) and velocity ``v``.
+    """Return kernel data with bodies and joint frames placed at the posture ``q`` (nv,), with the velocity ``v`` (nv,).
 
     Nothing else is computed.
     """
@@ -94,7 +95,7 @@ def kernel_data(name: str, q: Array, v: Array | None = None) -> KernelData:
 
 
 def move_data(name: str, data: KernelData, q: Array, v: Array | None = None) -> None:
-    """Move bodies and joints of ``data`` to ``q`` (nv,) with velocity ``v``. Making new data would take 20 ms."""
+    """Place bodies and joint frames of ``data`` at ``q`` (nv,) and velocity ``v``. Making new data would take 20 ms."""
     model, safety = kernel_model(name).safety, data.safety
     safety.state.q[:] = q
     safety.state.v[:] = 0.0 if v is None else v
@@ -103,7 +104,7 @@ def move_data(name: str, data: KernelData, q: Array, v: Array | None = None) -> 
 
 
 def pandas() -> Config:
-    """Return two pandas with a table in front of them."""
+    """Return the configuration of a cell with two Panda arms and a table in front of them."""
     arms = {
         side: {
             "model": "example-robot-data:panda",
@@ -122,7 +123,7 @@ def random_posture(robot: Robot, random: np.random.Generator) -> Array:
 
 
 def placed(cell: CellArrays, q: Array) -> CollisionData:
-    """Return joint frames and geometries in the world at ``q`` (nv,)."""
+    """Return the poses of joint frames and geometries in the world frame at ``q`` (nv,)."""
     data = behind(CollisionData.empty(cell.collision))
     update_placements(cell.collision, data, q)
     return data

@@ -1,4 +1,4 @@
-"""Arms beside a moving hand, with checks of their distances by Coal alone."""
+"""Arms that are chased by a moving hand. Their distances from the hand are measured by Coal, not by our kernels."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ BOX = (0.1, 0.3, 0.2)  # Lengths of the sides [m].
 
 
 class Coal:
-    """Distances of all moving bodies from a ball or a box, by Coal."""
+    """Measures the distances of all moving bodies from a ball or a box with Coal."""
 
     def __init__(self, controller: CartesianController, shape: coal.CollisionGeometry | None = None) -> None:
         self.model = controller.robot.model
@@ -73,7 +73,7 @@ class Coal:
         self._data, self._geometry = self.model.createData(), self.collision_model.createData()
 
     def distances(self, q: Array, at: Array) -> Array:
-        """Return the distances (bodies,) [m]."""
+        """Return the distances (bodies,) [m] at the posture ``q`` (nv,), with the ball or box ``at`` (3,) [m]."""
         return np.array([result.min_distance for result in self._results(q, at)])
 
     def towards_nearest(self, q: Array, at: Array) -> Array:
@@ -92,14 +92,15 @@ class Coal:
 class Hunt:
     """A hand that chases the nearest body at full speed for a while, and then moves at random for a while.
 
-    At every tick and in its middle: a body that moves is as far from it as it has to be, or comes no closer to where
-    it was reported. A solver works against the arms; other pairs and joints keep their promises too.
+    At the end and in the middle of every tick, each body that moves is checked: it keeps its distance from the hand, or
+    comes no closer to the reported position of the hand. A solver works against the arms. All other pairs keep their
+    distances too.
     """
 
     def __init__(
         self, controller: CartesianController, solver: FaultySolver, seed: int, lie: float = 1.0, box: bool = False
     ) -> None:
-        """``lie`` is the true speed of the hand, or of a ``box``, divided by the reported speed."""
+        """Take a hand, or a ``box``, whose true speed is ``lie`` times the reported speed."""
         shape = coal.Box(*BOX) if box else coal.Sphere(RADIUS)
         self.controller, self.solver, self.coal, self.box = controller, solver, Coal(controller, shape), box
         self.random, self.lie = np.random.default_rng(seed), lie
@@ -109,7 +110,7 @@ class Hunt:
         solver.kept = self.coal.kept
         self.at = robot.tool_pose(robot.home, "left").translation + np.array([0.0, 0.9, 0.0])
         self.velocity, self.way = np.zeros(3), np.zeros(3)
-        self.broken: list[float] = []  # The distances by which a moving body was too near [m].
+        self.broken: list[float] = []  # By how much a moving body was too close to the hand, for each violation [m].
         self.nearest_moving, self.touched, self.moved, self.retreats = np.inf, 0, 0, 0
 
     def run(self, seconds: float, speed: float, period: float, acceleration: float | None = None) -> None:
@@ -140,7 +141,7 @@ class Hunt:
             q, v, t = reference.q, reference.v, t + dt
 
     def _move(self, q: Array, dt: float, speed: float, acceleration: float | None) -> tuple[Array, Array]:
-        """Return the hand after half of a tick and after all of it."""
+        """Move the hand in one tick. Return its position (3,) [m] in the middle and at the end of the tick."""
         way = self.way if self.way.any() else self.coal.towards_nearest(q, self.at)
         wanted = speed * way / np.linalg.norm(way)
         change = wanted - self.velocity

@@ -1,4 +1,7 @@
-"""Named hostile motions of the targets: each makes targets at time t from the controller's tools at the start."""
+"""Named hostile motions of the targets. Each function returns the targets at the time t [s].
+
+Its second argument has the tool poses at the start, by arm.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +28,7 @@ def _moved(pose: pin.SE3, by: tuple[float, float, float]) -> pin.SE3:
 
 
 def crossing(t: float, start: Mapping[str, pin.SE3]) -> Targets:
-    """Each tool is asked to be where the other one started."""
+    """The target of each tool is at the start position of the other tool."""
     return {
         "left": pin.SE3(start["left"].rotation, start["right"].translation),
         "right": pin.SE3(start["right"].rotation, start["left"].translation),
@@ -33,7 +36,7 @@ def crossing(t: float, start: Mapping[str, pin.SE3]) -> Targets:
 
 
 def same_point(t: float, start: Mapping[str, pin.SE3]) -> Targets:
-    """Both tools are asked to be at the same place."""
+    """Both targets are at the same position."""
     middle = 0.5 * (start["left"].translation + start["right"].translation)
     return {side: pin.SE3(pose.rotation, middle) for side, pose in start.items()}
 
@@ -59,12 +62,12 @@ def into_the_table(t: float, start: Mapping[str, pin.SE3]) -> Targets:
 
 
 def one_arm_frozen(t: float, start: Mapping[str, pin.SE3]) -> Targets:
-    """The left arm holds, and the right arm is asked to be where the left one is."""
+    """The left arm holds, and the target of the right arm is at the start position of the left tool."""
     return {"left": None, "right": pin.SE3(start["right"].rotation, start["left"].translation)}
 
 
 def not_a_number(t: float, start: Mapping[str, pin.SE3]) -> Targets:
-    """A moving target, with invalid ones in between."""
+    """Valid targets that move, with invalid targets in between."""
     good = {side: _moved(pose, (0.0, 0.0, 0.1 * np.sin(6.0 * t))) for side, pose in start.items()}
     step = int(t / 0.05) % 4
     if step == 1:

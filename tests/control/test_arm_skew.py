@@ -1,4 +1,4 @@
-"""Two arms with different lags, which stop one by one: each may be at any place of its recent motion."""
+"""Two arms that follow the reference with different delays: each may be anywhere on its recent path."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from q2r2_control.types import SIDES, Array, Reference
 from tests.control.hunted_arms import controller_and_solver
 
 DT = 0.002  # Duration of a control tick [s].
-WINDOW = 0.03  # Largest lag of one arm behind the other [s].
+WINDOW = 0.03  # Largest delay of one arm behind the other arm [s].
 
 
 class Ways:
-    """Recent postures of the reference, and the least margin of pairs of two arms between all of them."""
+    """Keeps recent postures of the reference, and computes margins with each arm at any of these postures."""
 
     def __init__(self, controller: CartesianController) -> None:
         self.controller, self.robot = controller, controller.robot
@@ -33,7 +33,7 @@ class Ways:
         self.between = np.array([bool(one and other and one != other) for one, other in pairs])
 
     def least_margin(self, reference: Reference) -> float:
-        """Return the least margin of pairs of two arms, over all places on each arm's recent motion [m]."""
+        """Return the least margin of pairs between both arms [m], with each arm anywhere on its own path."""
         stop = self.controller.stop_deceleration
         lasts = np.abs(reference.v) / stop
         places = list(self.past[-round(WINDOW / DT) - 1 :: 7])
@@ -49,7 +49,7 @@ class Ways:
 
 
 def beside_each_other(controller: CartesianController, window: float) -> dict[str, pin.SE3]:
-    """Put both tools 0.15 m apart, start from rest there, and return where they are."""
+    """Move both tools until they are 0.15 m apart, start again from rest there, and return their poses."""
     targets: dict[str, pin.SE3 | None] = {}
     for arm, y in zip(SIDES, (0.075, -0.075), strict=True):
         targets[arm] = pin.SE3(controller.tool_pose(arm).rotation, np.array([0.55, y, 0.45]))
@@ -61,12 +61,12 @@ def beside_each_other(controller: CartesianController, window: float) -> dict[st
 
 
 def swung(start: dict[str, pin.SE3], t: float, speed: float) -> dict[str, pin.SE3 | None]:
-    """Return targets that swing both tools sideways by 0.12 m."""
+    """Return targets at the time ``t`` [s] that swing both tools sideways by 0.12 m, at up to ``speed`` [m/s]."""
     way = 0.12 * min(t, 1.0) * np.sin(speed * t / 0.12)
     return {arm: pin.SE3(pose.rotation, pose.translation + np.array([0.0, way, 0.0])) for arm, pose in start.items()}
 
 
-def test_two_arms_that_swing_alike_keep_apart_at_all_places_of_their_recent_motion(robot: Robot) -> None:
+def test_two_arms_that_swing_alike_keep_their_distance_wherever_each_arm_is_on_its_path(robot: Robot) -> None:
     controller = CartesianController(robot)
     start, ways, margins, fallbacks, errors = beside_each_other(controller, WINDOW), Ways(controller), [], 0, []
     for k in range(900):
@@ -86,7 +86,7 @@ def test_two_arms_that_swing_alike_keep_apart_at_all_places_of_their_recent_moti
 
 @pytest.mark.slow
 @pytest.mark.parametrize("window", [0.0, WINDOW])
-def test_only_arms_that_may_have_different_lags_are_kept_apart_so_against_hostile_solvers(window: float) -> None:
+def test_hostile_solvers_bring_arms_with_different_delays_too_close_only_without_allowed_skew(window: float) -> None:
     controller, solver = controller_and_solver()
     solver.fault = None
     controller.move_obstacle("hand", None)
@@ -101,7 +101,7 @@ def test_only_arms_that_may_have_different_lags_are_kept_apart_so_against_hostil
     assert (min(margins) >= -1e-9) == (window > 0.0)
 
 
-def test_an_undone_step_leaves_the_past_unchanged(robot: Robot) -> None:
+def test_an_undone_step_leaves_the_history_unchanged(robot: Robot) -> None:
     controller = CartesianController(robot)
     start = beside_each_other(controller, WINDOW)
     for k in range(150):
@@ -115,7 +115,7 @@ def test_an_undone_step_leaves_the_past_unchanged(robot: Robot) -> None:
         np.testing.assert_array_equal(array, kept)
 
 
-def test_a_longer_window_grows_with_time_and_a_shorter_one_applies_at_once(robot: Robot) -> None:
+def test_a_longer_window_takes_effect_as_time_passes_and_a_shorter_window_at_once(robot: Robot) -> None:
     controller = CartesianController(robot)
     controller.allow_skew(0.02)
     assert controller.skew == 0.0

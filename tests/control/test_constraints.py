@@ -1,4 +1,7 @@
-"""A program's own constraints are rows of the QP or a condition of each step. No promise depends on them."""
+"""A program's own constraints are rows of the QP, or a condition that each step has to satisfy.
+
+The contract holds whatever they return.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +22,7 @@ from tests.control.test_problem import DT, crossing, solved_by
 
 
 class StillJoint:
-    """A constraint that keeps the joint's next velocity 0."""
+    """A constraint that keeps the next velocity of a joint at 0."""
 
     def __init__(self, joint: int, hard: bool = False) -> None:
         self.joint, self.hard = joint, hard
@@ -31,7 +34,7 @@ class StillJoint:
 
 
 class Answers:
-    """A constraint that returns whatever ``answer`` returns, after it is switched on."""
+    """A constraint that returns whatever ``answer`` returns once ``asked`` is True. Before, it returns no rows."""
 
     def __init__(self, answer: Callable[[int], Any], hard: bool = False) -> None:
         self.answer, self.hard, self.asked = answer, hard, False
@@ -68,7 +71,7 @@ NONSENSE: dict[str, Callable[[int], Any]] = {
 
 
 def driven(controller: CartesianController, ticks: int) -> tuple[Array, Array]:
-    """Return velocities and postures of a run towards crossing targets, with the contract at every tick."""
+    """Return velocities and postures of a run to crossing targets. The contract is checked at every tick."""
     contract = Contract(controller, controller.robot.home)
     v, q = [], []
     for tick in range(ticks):
@@ -80,7 +83,7 @@ def driven(controller: CartesianController, ticks: int) -> tuple[Array, Array]:
 
 
 @pytest.mark.parametrize(("hard", "most"), [(False, 1e-3), (True, 1e-6)], ids=["soft", "hard"])
-def test_a_joint_that_must_not_turn_rests_while_the_others_move(robot: Robot, hard: bool, most: float) -> None:
+def test_a_joint_that_must_not_turn_rests_while_the_other_joints_move(robot: Robot, hard: bool, most: float) -> None:
     free, _ = driven(CartesianController(robot), 400)
     held, _ = driven(CartesianController(robot, constraints=[StillJoint(3, hard)]), 400)
     assert np.abs(free[:, 3]).max() > 0.1
@@ -89,7 +92,7 @@ def test_a_joint_that_must_not_turn_rests_while_the_others_move(robot: Robot, ha
 
 
 class Plane:
-    """A plane that keeps the left elbow above a height [m]: J v+ >= -gain (z - height)."""
+    """A hard constraint that keeps the left elbow above a height [m]: J v+ >= -gain (z - height)."""
 
     hard = True
 
@@ -106,7 +109,7 @@ class Plane:
         return J, np.array([-5.0 * room])
 
 
-def test_an_elbow_does_not_cross_a_plane_that_it_would_otherwise_cross(robot: Robot) -> None:
+def test_a_hard_constraint_keeps_an_elbow_above_a_plane_that_it_would_otherwise_cross(robot: Robot) -> None:
     _, q = driven(CartesianController(robot), 600)
     plane = Plane(robot, 0.0)
     heights = [plane.elbow(at) for at in q]
@@ -116,7 +119,7 @@ def test_an_elbow_does_not_cross_a_plane_that_it_would_otherwise_cross(robot: Ro
     assert min(plane.elbow(at) for at in q) > plane.height - 1e-4
 
 
-def test_a_hard_row_that_no_step_satisfies_brakes_the_arms_and_is_named(robot: Robot) -> None:
+def test_a_hard_row_that_no_step_satisfies_brakes_the_arms_and_the_report_names_it(robot: Robot) -> None:
     fast = Answers(lambda nv: (np.eye(nv)[:1], np.full(1, 100.0)), hard=True)
     controller = CartesianController(robot, constraints=[fast])
     moving, _ = driven(controller, 100)
@@ -143,7 +146,7 @@ def test_a_given_solution_that_breaks_a_hard_row_is_not_executed(robot: Robot) -
 
 
 class NoLess:
-    """A constraint that keeps the next velocities at least as fast along ``along`` as the last given value."""
+    """A constraint that the next velocities are at least as fast as ``along`` in the direction of ``along``."""
 
     hard = True
     along: Array | None = None
@@ -154,10 +157,10 @@ class NoLess:
         return self.along[None, :], np.array([self.along @ self.along])
 
 
-def test_a_certified_part_of_a_solution_that_breaks_a_hard_row_gives_way_to_the_stop_to_the_bit(robot: Robot) -> None:
-    """The given solutions consider no pair.
+def test_if_the_certified_part_of_a_solution_breaks_a_hard_row_exactly_the_stop_is_executed(robot: Robot) -> None:
+    """The given solutions ignore all pairs, so that often only a part of a solution can be certified.
 
-    The certificate allows a part of each, which is slower than the row allows.
+    This part is slower than the row allows. The arms then have to do exactly what they do without a solution.
     """
     constraints = NoLess(), NoLess()
     one, other = (CartesianController(robot, constraints=[constraint]) for constraint in constraints)
@@ -203,7 +206,7 @@ def test_other_solvers_keep_a_hard_row_too(robot: Robot, name: str) -> None:
     assert abs(reference.v[3]) < 1e-4
 
 
-def test_osqp_keeps_a_hard_row_in_the_loop_too(robot: Robot) -> None:
+def test_osqp_keeps_a_hard_row_in_a_closed_loop_too(robot: Robot) -> None:
     controller = CartesianController(robot, solver="osqp", constraints=[StillJoint(3, hard=True)])
     reports = [controller.step(crossing(robot, tick), DT).report for tick in range(200)]
     assert sum(report.fallback for report in reports) < 2
@@ -212,7 +215,9 @@ def test_osqp_keeps_a_hard_row_in_the_loop_too(robot: Robot) -> None:
 
 @pytest.mark.parametrize("hard", [False, True], ids=["soft", "hard"])
 @pytest.mark.parametrize("name", NONSENSE)
-def test_a_constraint_with_an_invalid_answer_raises_nothing_and_is_named(robot: Robot, name: str, hard: bool) -> None:
+def test_a_constraint_with_an_invalid_answer_raises_nothing_and_the_report_names_it(
+    robot: Robot, name: str, hard: bool
+) -> None:
     broken = Answers(NONSENSE[name], hard)
     controller = CartesianController(robot, constraints=[broken])
     driven(controller, 50)
@@ -233,7 +238,7 @@ class BrokenTask:
         return np.zeros((len(q), len(q))), np.zeros(len(q))
 
 
-def test_a_task_that_raises_in_a_step_changes_nothing_and_is_named(robot: Robot) -> None:
+def test_a_task_that_raises_in_a_step_changes_nothing_and_the_report_names_it(robot: Robot) -> None:
     task = BrokenTask()
     controllers = CartesianController(robot, tasks=[task]), CartesianController(robot)
     task.asked = True
@@ -243,7 +248,7 @@ def test_a_task_that_raises_in_a_step_changes_nothing_and_is_named(robot: Robot)
 
 
 class Heavy:
-    """A task whose matrix is changed after it was accepted at home."""
+    """A task whose matrix changes after the task was accepted at home."""
 
     def __init__(self, matrix: Callable[[int], Array]) -> None:
         self.matrix, self.asked = matrix, False
@@ -261,7 +266,7 @@ class Heavy:
     ],
     ids=["negative", "not symmetric"],
 )
-def test_a_task_whose_cost_has_no_minimum_is_not_used_and_named(
+def test_a_task_with_an_unusable_matrix_is_not_used_and_the_report_names_it(
     robot: Robot, matrix: Callable[[int], Array], told: str
 ) -> None:
     task = Heavy(matrix)

@@ -1,4 +1,4 @@
-"""Pairs that may touch: the depth and speed of the reference, and the distances of all other pairs."""
+"""Pairs that may touch: how deep and how fast the reference enters, and that other pairs keep their distances."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ def settings(*allowed: dict[str, Any]) -> ControllerSettings:
 
 
 def towards_the_table(controller: CartesianController, speed: float, seconds: float = 4.0) -> tuple[Array, Array]:
-    """Return distances of the left fingers from the table [m] and closing speeds [m/s].
+    """Move the left target downwards at ``speed`` [m/s], until it is 0.3 m inside the table.
 
-    The target ends 0.3 m inside.
+    Return the distance of the left fingers from the table [m] and their closing speed [m/s], both at every tick.
     """
     pairs = np.array([set(pair) > {"table_0"} and "left_hand_e_finger" in str(pair) for pair in PAIRS])
     run, heights = Driven(controller, dt=DT), []
@@ -50,7 +50,7 @@ def towards_the_table(controller: CartesianController, speed: float, seconds: fl
 
 @pytest.mark.slow
 @pytest.mark.parametrize("speed", [0.2, 5.0])
-def test_a_finger_that_may_touch_enters_by_the_depth_and_no_faster_than_allowed(speed: float) -> None:
+def test_a_finger_that_may_touch_enters_up_to_its_depth_and_no_faster_than_allowed(speed: float) -> None:
     allowed = settings({"pair": ["left_*finger*", "table"], "depth": DEPTH, "speed": SPEED})
     heights, speeds = towards_the_table(CartesianController(ROBOT, allowed), speed)
     assert heights.min() == pytest.approx(-DEPTH, abs=5e-4)
@@ -59,8 +59,8 @@ def test_a_finger_that_may_touch_enters_by_the_depth_and_no_faster_than_allowed(
     assert speeds[heights > 0.05].max() > 2.0 * SPEED, "nothing is slowed that is far from contact"
 
 
-def test_a_body_that_is_not_named_keeps_its_distance_from_the_same_table() -> None:
-    """The right fingers get the same targets as the left ones. The contract knows the distance of every pair."""
+def test_a_body_that_must_not_touch_keeps_its_distance_from_the_same_table() -> None:
+    """The right fingers have targets at the same height, but are not allowed to touch the table."""
     controller = CartesianController(ROBOT, settings({"pair": ["left_*finger*", "table"], "depth": DEPTH}))
     goal = {arm: pin.SE3(DOWN, np.array([0.5, y, 0.1])) for arm, y in (("left", 0.25), ("right", -0.25))}
     Driven(controller, dt=DT).drive(3.0, goal)
@@ -71,12 +71,12 @@ def test_a_body_that_is_not_named_keeps_its_distance_from_the_same_table() -> No
 
 @pytest.mark.slow
 def test_fingers_of_both_hands_may_touch_each_other() -> None:
-    """The hands face each other. Their tools are asked to change sides, and their fingers enter by the depth."""
+    """The hands face each other, and their targets cross over. The fingers enter each other up to the depth."""
     depth = 0.005
     controller = CartesianController(ROBOT, settings({"pair": ["*finger*", "*finger*"], "depth": depth}))
 
     def across(t: float, start: Mapping[str, pin.SE3]) -> dict[str, pin.SE3]:
-        """Return targets that are turned about x, so that the tools point at each other."""
+        """Return targets that are turned about x so that the tools point at each other, and that come closer."""
         gap = max(0.25 - 0.1 * t, -0.01)
         return {
             arm: pin.SE3(pin.rpy.rpyToMatrix(-sign, 0.0, 0.0) @ DOWN, np.array([0.5, sign * gap, 0.45]))

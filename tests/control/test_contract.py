@@ -1,4 +1,4 @@
-"""Details of the controller's contract: rest, recovery, faults, the report, and the worst of all solvers."""
+"""Details of the controller's contract: rest, recovery, faults, the report, and solvers that attack the arms."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def controller() -> CartesianController:
 
 
 def run(controller: CartesianController, scenario: Any, duration: float, dt: float, **start: Array) -> Contract:
-    """Run a scenario from a ``start`` q and v, and assert the contract at every tick."""
+    """Run a scenario for ``duration`` [s] from the state ``start`` (q, v), and check the contract at every tick."""
     driven = Driven(controller, dt=dt, **start)
     driven.drive(duration, scenario)
     return driven.contract
@@ -82,7 +82,9 @@ def test_an_invalid_dt_moves_nothing_and_is_reported(controller: CartesianContro
     assert np.abs(before.a).max() > 1.0
 
 
-def test_a_dt_above_a_tenth_of_a_second_moves_no_further_than_a_tenth(controller: CartesianController) -> None:
+def test_a_dt_above_a_tenth_of_a_second_moves_the_arms_as_a_tenth_of_a_second_does(
+    controller: CartesianController,
+) -> None:
     results = []
     for dt in (0.1, 5.0):
         driven = Driven(controller)
@@ -106,7 +108,7 @@ def test_a_joint_that_starts_outside_a_position_limit_returns_without_a_jump(
     assert robot.position_lower[joint] + margin <= reference.q[joint] <= robot.position_upper[joint] - margin
 
 
-def test_leaving_a_stretched_posture_takes_little_more_time_than_the_acceleration_limit_needs(
+def test_arms_leave_a_stretched_posture_nearly_as_fast_as_the_acceleration_limit_allows(
     controller: CartesianController,
 ) -> None:
     robot, q = controller.robot, controller.robot.home.copy()
@@ -115,7 +117,7 @@ def test_leaving_a_stretched_posture_takes_little_more_time_than_the_acceleratio
         q[arm.joints] = [0.0, 0.9, 0.0, 0.0, 0.0, 0.0, 0.0]
     driven = Driven(controller, q, dt=0.001)
     for pose, y in zip(driven.start.values(), (0.4, -0.4), strict=True):
-        inwards = np.array([0.0, y, 0.34]) - pose.translation  # The direction leads to the shoulder.
+        inwards = np.array([0.0, y, 0.34]) - pose.translation  # The vector from the tool to the shoulder.
         pose.translation = pose.translation + 0.15 * inwards / np.linalg.norm(inwards)
     error = 1.0
     while error > 0.01 and driven.ticks < 4000:
@@ -124,13 +126,13 @@ def test_leaving_a_stretched_posture_takes_little_more_time_than_the_acceleratio
             float(np.linalg.norm(controller.tool_pose(arm).translation - pose.translation))
             for arm, pose in driven.start.items()
         )
-    # The joint with the longest way accelerates fully for half of it, and decelerates fully for the other half.
+    # At best, the joint with the longest path accelerates fully for half of it, and then decelerates fully.
     limit = robot.capped_acceleration(controller.settings.acceleration_limit)
     fastest = 2.0 * np.sqrt((np.abs(reference.q - q) / limit).max())
     assert 0.001 * driven.ticks < 1.2 * fastest
 
 
-def test_every_joint_keeps_and_uses_the_smaller_of_its_own_acceleration_limit_and_the_setting() -> None:
+def test_every_joint_uses_the_smaller_of_its_own_acceleration_limit_and_the_setting() -> None:
     limits = {"A2": 1.5, "A3": 12.0, "A4": 4.0}
     cell = load_config("config/dual_iiwa7.yaml")
     arms = {side: arm.model_copy(update={"acceleration_limit": limits}) for side, arm in cell.arms.items()}
@@ -167,7 +169,7 @@ def test_the_report_names_the_limits_that_hold_the_arms_back(controller: Cartesi
 
 
 def least_margin(robot: Robot, settings: ControllerSettings, ticks: int, attack: str, seed: int) -> float:
-    """Return the least margin of a pair at any tick by Coal [m]. All ticks have a certificate."""
+    """Return the least margin of a pair at any tick, measured by Coal [m]. Check that every tick is certified."""
     solver = FaultySolver(DaqpSolver(robot.model.nv), worst=WorstSolver(robot, np.random.default_rng(seed)))
     controller = CartesianController(robot, settings, solver=untimed(solver, robot.model.nv))
     solver.kept, solver.q = controller.kept_distances, robot.home
@@ -177,7 +179,7 @@ def least_margin(robot: Robot, settings: ControllerSettings, ticks: int, attack:
     least = np.inf
     for tick in range(ticks):
         dt = (0.001, 0.004, 0.0005, 0.01, 0.03)[tick // 150 % 5]
-        # There has to be an earlier answer to repeat.
+        # The attack "again" needs an earlier answer to repeat.
         solver.fault = "towards_nearest" if attack == "again" and tick % 5 == 0 else attack
         reference = controller.step(targets, dt)
         contract.check(reference, dt)
@@ -188,12 +190,12 @@ def least_margin(robot: Robot, settings: ControllerSettings, ticks: int, attack:
 
 
 @pytest.mark.parametrize("attack", ATTACKS)
-def test_the_worst_solver_brings_no_pair_closer_than_its_distance(attack: str) -> None:
+def test_no_attacking_solver_brings_a_pair_closer_than_its_kept_distance(attack: str) -> None:
     least = least_margin(robot_of("iiwa7"), load_config("config/dual_iiwa7.yaml").control, 1500, attack, seed=1)
     assert -ROUNDING <= least < 1e-4, "it has to get there, and no further"
 
 
-def test_a_pair_that_is_too_close_by_a_rounding_error_keeps_its_certificate_and_its_distance() -> None:
+def test_a_pair_too_close_by_a_rounding_error_keeps_its_certificate_and_opens_to_its_buffer() -> None:
     robot = robot_of("iiwa7")
     nearest = float(robot.distance_values(robot.home).min())
     settings = ControllerSettings(min_distance=nearest + 1e-15)
@@ -206,7 +208,7 @@ def test_a_pair_that_is_too_close_by_a_rounding_error_keeps_its_certificate_and_
     assert -ROUNDING <= least_margin(robot, settings, 600, "towards_nearest", seed=2) < 0.0
 
 
-def test_a_start_with_an_unproven_stop_has_no_certificate_until_a_step_has_one_whatever_room_there_is() -> None:
+def test_a_start_with_an_unproven_stop_has_no_certificate_until_a_step_is_certified() -> None:
     controller, solver = controller_of("iiwa7")
     q, turn = controller.robot.home.copy(), np.zeros(controller.robot.model.nv)
     turn[[arm.joints[0] for arm in controller.robot.arms.values()]] = [-1.0, 1.0]  # The arms turn towards each other.
@@ -223,7 +225,7 @@ def test_a_start_with_an_unproven_stop_has_no_certificate_until_a_step_has_one_w
     assert all(report.certified and report.margin >= 0.0 for report in reports)
 
 
-def test_the_first_step_of_a_pair_that_is_too_close_has_no_certificate_and_the_next_one_has_one() -> None:
+def test_the_step_in_which_a_pair_stops_being_too_close_is_the_last_without_a_certificate() -> None:
     robot = robot_of("iiwa7")
     settings = ControllerSettings(min_distance=float(robot.distance_values(robot.home).min()) + 1e-5)
     controller = CartesianController(robot, settings)

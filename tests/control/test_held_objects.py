@@ -1,4 +1,4 @@
-"""A held object is monitored. It keeps the distance that it has, then more and more, and moves no arm."""
+"""A held object is monitored: its pairs first keep their present distance, later more, and no arm moves for it."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def controller(robot: Robot) -> CartesianController:
 
 @pytest.fixture(scope="module")
 def at_grip(controller: CartesianController) -> Array:
-    """Return a posture (nv,) [rad] in which the left tool is at rest and grips a block on the table."""
+    """Return a posture (nv,) [rad] in which the left tool rests where it can grip a block on the table."""
     return Driven(controller).drive(2.5, {"left": at(GRIP)}).q
 
 
@@ -43,7 +43,7 @@ def counting(controller: CartesianController) -> Array:
 
 
 def object_distances(controller: CartesianController, q: Array) -> Array:
-    """Return the distances of every pair of objects, by Coal [m]."""
+    """Return the distances of all pairs that contain an object (pairs,) [m], measured by Coal."""
     objects = controller.robot.objects
     return coal_distances(controller.robot, objects.geometry, q)[-len(objects.holders) :]
 
@@ -58,7 +58,7 @@ def test_a_block_on_the_table_is_gripped_and_released_without_a_motion(
         assert np.abs(reference.q - at_grip).max() < 1e-9
 
 
-def test_a_block_is_lifted_at_once_and_put_down_with_a_quarter_of_a_millimetre_of_error(
+def test_a_gripped_block_is_lifted_at_once_and_put_down_to_a_quarter_of_a_millimetre(
     controller: CartesianController, at_grip: Array
 ) -> None:
     run = Driven(controller, at_grip)
@@ -86,7 +86,7 @@ def test_the_margin_of_a_report_refers_to_the_distances_kept_at_that_tick(
         reference = run.drive(DT, {"left": at(GRIP + 0.02)})
         distances = object_distances(controller, reference.q)
         spare = distances - controller.object_distances
-        if distances[spare.argmin()] > 0.0:  # The depth of Coal is another quantity.
+        if distances[spare.argmin()] > 0.0:  # In penetration, Coal measures another quantity.
             assert reference.report.margin == pytest.approx(spare.min(), abs=2e-6)
             grown += int(counting(controller).min() > kept)
         kept = counting(controller).min()
@@ -94,7 +94,7 @@ def test_the_margin_of_a_report_refers_to_the_distances_kept_at_that_tick(
 
 
 @pytest.mark.slow
-def test_an_object_that_is_too_large_may_overlap_the_table_only_as_much_as_when_it_was_gripped(robot: Robot) -> None:
+def test_an_object_that_overlaps_the_table_when_gripped_never_overlaps_it_more(robot: Robot) -> None:
     large = cell({"box": (0.04, 0.04, 0.08), "at": (0.0, 0.0, 0.013)})
     controller = CartesianController(Robot.from_config(large), large.control)
     run = Driven(controller)
@@ -108,10 +108,10 @@ def test_an_object_that_is_too_large_may_overlap_the_table_only_as_much_as_when_
     assert counting(controller).min() == 0.0
 
 
-def test_gripped_in_mid_motion_the_stop_that_is_known_keeps_what_it_then_keeps(
+def test_an_object_gripped_in_motion_keeps_its_new_distances_during_the_known_stop(
     controller: CartesianController,
 ) -> None:
-    """The tool moves down towards the table at speed. Coal measures along the known stop."""
+    """The tool moves down towards the table at 0.4 m/s. Coal measures the distances along the known stop."""
     controller.reset(controller.robot.home)
     z = height(controller)
     while height(controller) > GRIP + 0.003:
@@ -125,7 +125,7 @@ def test_gripped_in_mid_motion_the_stop_that_is_known_keeps_what_it_then_keeps(
         moving = np.minimum(time, np.abs(reference.v) / stop)
         q = reference.q + reference.v * moving - 0.5 * np.sign(reference.v) * stop * moving**2
         values = object_distances(controller, q)
-        seen = counts & (values > 0.0)  # The depth of Coal is another quantity.
+        seen = counts & (values > 0.0)  # In penetration, Coal measures another quantity.
         assert (values - kept)[seen].min() > -2e-6
         assert (kept[counts & (values <= 0.0)] < 0.0).all()
     for _ in range(500):
@@ -136,7 +136,7 @@ def test_gripped_in_mid_motion_the_stop_that_is_known_keeps_what_it_then_keeps(
 
 
 @pytest.mark.slow
-def test_a_hand_that_drives_a_held_bar_into_the_other_arm_stops_at_its_distance() -> None:
+def test_a_hand_that_moves_a_held_bar_into_the_other_arm_stops_at_the_kept_distance() -> None:
     long = cell({"box": (0.03, 0.25, 0.03)})
     controller = CartesianController(Robot.from_config(long), long.control)
     others = np.array([any("right_" in name for name in pair) for pair in controller.robot.objects.pair_names()])
@@ -151,7 +151,7 @@ def test_a_hand_that_drives_a_held_bar_into_the_other_arm_stops_at_its_distance(
 
 
 @pytest.mark.slow
-def test_two_held_blocks_are_kept_apart_and_one_that_both_hands_hold_lets_them_touch(
+def test_two_held_blocks_are_kept_apart_unless_they_overlap_when_the_second_is_gripped(
     controller: CartesianController,
 ) -> None:
     run = Driven(controller)
@@ -197,7 +197,7 @@ def test_after_a_release_no_report_names_a_pair_of_the_object_even_if_no_time_pa
     assert not counting(controller).size
 
 
-def test_an_undone_step_takes_back_the_distances_that_its_later_parts_allowed_the_block(
+def test_an_undone_step_undoes_the_greater_distances_that_its_substeps_gave_the_block(
     controller: CartesianController, at_grip: Array
 ) -> None:
     controller.reset(at_grip)
@@ -210,7 +210,7 @@ def test_an_undone_step_takes_back_the_distances_that_its_later_parts_allowed_th
         grown += bool((counting(controller) > before[np.isfinite(before)]).any())
         controller.withdraw(late)
         np.testing.assert_array_equal(controller.object_distances, before)
-        apart = distances > 0.0  # The depth of Coal is another quantity.
+        apart = distances > 0.0  # In penetration, Coal measures another quantity.
         assert (distances[apart] >= controller.object_distances[apart] - 1e-6).all()
         assert controller.step(lifted, DT).report.certified
     assert grown > 10

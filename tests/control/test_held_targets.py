@@ -1,4 +1,4 @@
-"""Targets that come less often than steps: what lies between two of them is followed, and nothing else changes."""
+"""Targets that come less often than steps are interpolated. Other targets are passed on as they are."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def followed(held: HeldTargets, given: pin.SE3) -> pin.SE3:
 
 
 @pytest.mark.parametrize("rate", [20.0, 90.0, 300.0])
-def test_a_stream_is_followed_on_a_straight_line_at_its_own_speed(rate: float) -> None:
+def test_a_stream_of_targets_is_followed_on_a_straight_line_at_the_speed_of_the_stream(rate: float) -> None:
     held, way = HeldTargets(), list[float]()
     for step in range(1000):
         sample = math.floor(step * DT * rate) / rate
@@ -42,7 +42,7 @@ def test_a_stream_is_followed_on_a_straight_line_at_its_own_speed(rate: float) -
     assert late.max() < 2.3 / rate
 
 
-def test_a_target_that_is_new_at_every_step_or_after_a_rest_is_passed_on_at_once() -> None:
+def test_a_target_that_is_new_at_every_step_or_after_a_long_hold_is_passed_on_at_once() -> None:
     held = HeldTargets()
     for step in range(20):
         assert followed(held, new := pose(0.001 * step)) == new
@@ -76,7 +76,7 @@ SCALED, MIRRORED = (pin.SE3(factor * np.eye(3), np.zeros(3)) for factor in (1.01
     [None, "no pose", pose(math.nan), pose(1e200), SCALED, MIRRORED],
     ids=["None", "a text", "not finite", "far away", "scaled", "mirrored"],
 )
-def test_an_invalid_target_is_passed_on_and_the_next_one_starts_a_new_line(other: object) -> None:
+def test_an_invalid_target_is_passed_on_and_so_is_the_target_after_it(other: object) -> None:
     held = HeldTargets()
     given: Any
     for given in (pose(0.0), pose(0.1), other):
@@ -87,7 +87,7 @@ def test_an_invalid_target_is_passed_on_and_the_next_one_starts_a_new_line(other
     assert list(held.between({"left": new}, DT)) == ["left"]
 
 
-def test_an_arm_without_a_target_begins_anew() -> None:
+def test_after_a_step_without_a_target_the_next_target_is_passed_on_at_once() -> None:
     held = HeldTargets()
     for _ in range(10):
         followed(held, pose(0.0))
@@ -101,7 +101,7 @@ def robot() -> Robot:
 
 
 def velocities(controller: CartesianController, steps: int, ask: bool = False) -> list[Array]:
-    """The joints' velocities while a tool is led along a sine of up to 0.2 m/s, 90 times a second."""
+    """Return the joint velocities while a target moves along a sine at up to 0.2 m/s, with 90 samples a second."""
     controller.reset(controller.robot.home)
     start, found = controller.tool_pose("left"), []
     for step in range(steps):
@@ -114,7 +114,7 @@ def velocities(controller: CartesianController, steps: int, ask: bool = False) -
 
 
 @pytest.mark.parametrize("bridged", [True, False])
-def test_a_joint_is_hardly_ever_at_its_limit_of_acceleration_where_held_targets_are_bridged(
+def test_joints_are_hardly_ever_at_their_acceleration_limit_if_held_targets_are_interpolated(
     robot: Robot, bridged: bool
 ) -> None:
     settings = ControllerSettings(acceleration_limit=LIMIT)
@@ -124,6 +124,6 @@ def test_a_joint_is_hardly_ever_at_its_limit_of_acceleration_where_held_targets_
     assert share < 0.05 if bridged else share > 0.5
 
 
-def test_the_problem_is_that_of_the_bridged_target_and_reading_it_changes_nothing(robot: Robot) -> None:
+def test_reading_the_problem_between_steps_does_not_change_the_interpolation_of_targets(robot: Robot) -> None:
     controller = CartesianController(robot, ControllerSettings(acceleration_limit=LIMIT))
     np.testing.assert_array_equal(velocities(controller, 40), velocities(controller, 40, ask=True))

@@ -1,4 +1,4 @@
-"""No argument of a caller makes a tick raise, or makes a reset raise any exception other than the documented one."""
+"""No argument makes a tick raise an exception. Other calls, such as a reset, raise only the documented exceptions."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def controller(robot: Robot) -> CartesianController:
 
 @pytest.fixture
 def contract(robot: Robot, controller: CartesianController) -> Iterator[Contract]:
-    """Return a controller with moving arms. After the block, it goes on in the same way."""
+    """Let the arms move before and after the test, and check the contract. Return the contract."""
     controller.reset(robot.home)
     contract = Contract(controller)
     going_on(contract, controller)
@@ -97,7 +97,7 @@ def test_targets_that_are_not_a_mapping_are_refused_and_nothing_moves(
     ids=["reset q", "reset v", "hold_at", "withdraw", "change distance", "change gain", "tool_pose", "opening arm",
          "opening from", "opening to", "holding arm", "obstacle name", "obstacle"],
 )  # fmt: skip
-def test_other_calls_raise_our_errors_and_the_next_tick_keeps_every_promise(
+def test_other_calls_raise_only_our_errors_and_the_next_tick_keeps_the_contract(
     robot: Robot, controller: CartesianController, hostile: Any, call: Any
 ) -> None:
     controller.reset(robot.home)

@@ -48,7 +48,7 @@ def test_bound_machine_code_belongs_to_the_kernel_and_has_run_once() -> None:
 PAGE = Path(__file__).parents[2] / "docs" / "kernels.md"
 
 
-def test_the_template_compiles_and_sees_changes_in_the_model(tmp_path: Path) -> None:
+def test_the_example_of_the_kernels_page_compiles_and_sees_changes_in_the_model(tmp_path: Path) -> None:
     (template,) = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
     source = tmp_path / "spring.py"
     source.write_text(template)
@@ -61,8 +61,8 @@ def test_the_template_compiles_and_sees_changes_in_the_model(tmp_path: Path) -> 
     assert not found["torque"](found["pointer"], found["q"], found["tau"])
 
 
-def test_numba_still_has_the_inner_modules_that_kernels_stand_on() -> None:
-    """The test fails with one clear sentence if a newer Numba has changed the modules that kernels need."""
+def test_numba_still_has_the_inner_modules_that_kernels_need() -> None:
+    """If a newer Numba has changed the modules that kernels need, this test fails with one clear sentence."""
     version = (
         f"control/kernel_compiler.py does not work with numba {numba.__version__}: keep to the bound in pyproject.toml"
     )

@@ -66,9 +66,7 @@ def test_the_name_of_the_cache_covers_everything_that_a_kernel_uses(source: Path
     assert imported <= covered | harmless
 
 
-def test_a_cache_that_cannot_be_written_is_put_into_another_folder(
-    sources: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_if_the_cache_cannot_be_written_another_folder_is_used(sources: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     occupied = sources.parent / "a_file"
     occupied.write_text("")
     monkeypatch.setenv("XDG_CACHE_HOME", str(occupied))
@@ -126,7 +124,7 @@ def test_a_second_checkout_compiles_nothing(own_cache: Path) -> None:
     assert doubled_by(own_cache / "elsewhere" / "doubling.py") == []
 
 
-def test_a_touched_source_is_not_compiled_again(own_cache: Path) -> None:
+def test_a_source_that_was_written_again_unchanged_is_not_compiled_again(own_cache: Path) -> None:
     doubled_by(own_cache / "doubling.py")
     source = own_cache / "doubling.py"
     source.write_text(_DOUBLING)
@@ -136,7 +134,7 @@ def test_a_touched_source_is_not_compiled_again(own_cache: Path) -> None:
     assert sum(double.stats.cache_misses.values()) == 0
 
 
-def test_each_compiled_kernel_is_reported_with_their_number_but_machine_code_from_the_cache_is_not(
+def test_progress_counts_compiled_kernels_and_does_not_count_machine_code_from_the_cache(
     own_cache: Path,
 ) -> None:
     assert doubled_by(own_cache / "doubling.py") == [(0, 2), (1, 2), (2, 2)]

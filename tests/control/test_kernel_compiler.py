@@ -13,7 +13,7 @@ from q2r2_control.control.kernel_compiler import _PartLibrary
 
 @pytest.fixture
 def chain() -> tuple[Any, Any, Any]:
-    """Return three new kernels. Each of them except the first calls the one before."""
+    """Return three new kernels. The second kernel calls the first, and the third calls both."""
 
     @kernel
     def third(x: float) -> float:
@@ -31,7 +31,7 @@ def chain() -> tuple[Any, Any, Any]:
 
 
 def compiled(kinds: dict[Any, Any]) -> Any:
-    """Return the only compiled version of a kernel, among its wholes or its parts."""
+    """Return the only compiled version of a kernel in ``kinds``, which are its wholes or its parts."""
     (found,) = kinds.values()
     return found
 
@@ -54,12 +54,12 @@ def test_a_part_that_python_calls_is_compiled_as_a_whole_and_gives_the_same_resu
     assert not isinstance(compiled(third.overloads).library, _PartLibrary)
 
 
-def test_a_kernel_that_was_called_first_becomes_part_of_another_one(chain: tuple[Any, Any, Any]) -> None:
+def test_a_kernel_that_python_has_called_can_become_part_of_another_kernel(chain: tuple[Any, Any, Any]) -> None:
     third, _, difference = chain
     assert (third(6.0), difference(6.0)) == (2.0, 1.0)
 
 
-def test_a_kernel_with_a_builtin_that_was_called_first_becomes_part_of_two_others() -> None:
+def test_a_kernel_with_a_builtin_that_python_has_called_can_become_part_of_two_kernels() -> None:
     @kernel
     def at_least_one(x: float) -> float:
         return max(x, 1.0) + max(int(x), 3)
@@ -75,7 +75,9 @@ def test_a_kernel_with_a_builtin_that_was_called_first_becomes_part_of_two_other
     assert (at_least_one(5.0), halved(5.0), doubled(5.0)) == (10.0, 5.0, 30.0)
 
 
-def test_a_part_that_cannot_be_compiled_raises_and_the_next_kernel_is_a_whole(chain: tuple[Any, Any, Any]) -> None:
+def test_a_part_that_cannot_be_compiled_raises_and_the_next_kernel_is_compiled_as_a_whole(
+    chain: tuple[Any, Any, Any],
+) -> None:
     @kernel
     def wrong(x: float) -> float:
         return x.no_such_attribute  # type: ignore[attr-defined]
@@ -91,7 +93,9 @@ def test_a_part_that_cannot_be_compiled_raises_and_the_next_kernel_is_a_whole(ch
     assert typeof(1.0) in next(iter(third.overloads))
 
 
-def test_a_kernel_that_python_calls_while_another_one_is_compiled_is_a_whole(chain: tuple[Any, Any, Any]) -> None:
+def test_a_kernel_that_python_calls_while_another_kernel_is_compiled_gives_the_right_result(
+    chain: tuple[Any, Any, Any],
+) -> None:
     third, _, difference = chain
 
     def while_compiled(event: Any) -> None:

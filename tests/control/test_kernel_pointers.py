@@ -22,8 +22,8 @@ def test_a_copy_has_its_own_memory() -> None:
     np.testing.assert_array_equal(held.value[0], 1.0)
 
 
-def test_tuples_with_one_name_and_other_fields_are_not_mixed_up() -> None:
-    # The test uses only types. Compiled code of types that are not the package's would be cached beside the package's.
+def test_named_tuples_with_the_same_name_and_different_fields_have_different_types() -> None:
+    # The test compares only types. If it compiled code for these types, the code would be cached with the package's.
     one = namedtuple("Bodies", "first second")  # type: ignore[name-match]
     other = namedtuple("Bodies", "second first")  # type: ignore[name-match]
     values = np.ones(1), np.zeros(1)
@@ -41,7 +41,7 @@ def test_every_pointer_has_the_type_that_numba_gives_its_value() -> None:
         assert pointer_to((part, (array, part))).numba_type.pointee == numba.typeof((part, (array, part)))
 
 
-def test_an_unknown_address_is_an_error_and_no_crash() -> None:
+def test_an_argument_without_an_address_raises_an_error_and_does_not_crash() -> None:
     double = bound(_double_held, pointer_to((np.ones(3),)))
     with pytest.raises(AttributeError, match="address"):
         double(None)
@@ -57,7 +57,7 @@ def _double_held(held: KernelPointer) -> None:
 @pytest.mark.parametrize(
     "value", [(True,), ("a word",), (np.ones(2), None), ([1.0],)], ids=["bool", "text", "none", "list"]
 )
-def test_a_value_that_has_no_place_behind_a_pointer_is_refused(value: tuple[object, ...]) -> None:
+def test_a_pointer_to_an_unsupported_value_is_refused(value: tuple[object, ...]) -> None:
     with pytest.raises(TypeError, match="cannot be behind a kernel's pointer"):
         pointer_to(value)
 
@@ -76,7 +76,7 @@ def _read_all(pointer: KernelPointer, out: npt.NDArray[np.float64]) -> None:
     out[2], out[3] = value.part[0][1], value.turned[1, 0]
 
 
-def test_a_kernel_reads_what_python_wrote_behind_a_pointer() -> None:
+def test_a_kernel_reads_through_a_pointer_what_python_wrote() -> None:
     out = np.zeros(4)
     _read_all(pointer_to(_All(-0.5, 7, (np.array([3, 4]),), np.arange(6.0).reshape(2, 3).T)), out)
     np.testing.assert_array_equal(out, [-0.5, 7.0, 4.0, 1.0])

@@ -1,4 +1,4 @@
-"""Distances and gains change while the arms move: every promise holds at every tick, and nothing jumps."""
+"""Distances and gains change while the arms move: the contract holds at every tick, and no motion jumps."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def controller() -> CartesianController:
 
 
 def margins(run: Driven) -> np.ndarray:
-    """Return the margin of every pair to the common distance that is asked for [m]."""
+    """Return by how much the distance of every pair exceeds the requested distance (p,) [m]."""
     return run.robot.distance_values(run.q) - kept_distances(run.robot, run.controller.settings).values
 
 
@@ -42,9 +42,9 @@ def test_a_greater_distance_pushes_no_pair_apart_and_is_kept_when_the_pair_has_o
     assert controller.change({"min_distance": FAR}) is None
     run.drive(1.5)
     assert np.abs(run.q - before).max() < 1e-4
-    assert margins(run).min() < -0.02  # The pair is nearer than asked for, and is left so.
+    assert margins(run).min() < -0.02  # The pair is nearer than requested, and is not pushed apart.
     assert len(controller.narrow_pair or ()) == 2
-    assert controller.kept_distances.min() > 0.6 * pair.min()  # The pair comes no nearer than it is.
+    assert controller.kept_distances.min() > 0.6 * pair.min()  # The pair keeps most of its present distance.
     run.drive(3.0, run.start)
     assert controller.narrow_pair is None
     assert controller.kept_distances.min() == FAR
@@ -68,7 +68,7 @@ def test_a_distance_grows_no_faster_than_allowed_and_falls_at_once(controller: C
 
 
 @pytest.mark.slow
-def test_random_changes_during_motion_break_no_promise(controller: CartesianController) -> None:
+def test_random_changes_of_settings_during_motion_never_break_the_contract(controller: CartesianController) -> None:
     random, run = np.random.default_rng(3), Driven(controller)
     scenarios = [SCENARIOS[name] for name in ("crossing", "same point", "teleport", "into the table")] + [circle]
     for _ in range(30):
@@ -100,8 +100,8 @@ def test_a_smaller_separation_gain_slows_approaching_arms_without_a_jerk(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in LIVE if name != "min_distance"])
-def test_a_changed_controller_equals_one_that_was_made_with_the_new_value(name: str) -> None:
-    """The comparison is exact to the bit. One arm gives way, out of reach and near the other arm."""
+def test_a_changed_controller_moves_as_one_that_was_made_with_the_new_value(name: str) -> None:
+    """Both motions are equal to the bit. The right arm gives way, near the left arm and out of its reach."""
     usual = ControllerSettings(priority="left")
     value = 0.4 * getattr(usual, name)
     made = [CartesianController(robot_of("iiwa7"), usual.model_copy(update=update)) for update in ({name: value}, {})]
@@ -125,7 +125,7 @@ def test_a_setting_is_live_if_the_model_of_a_task_keeps_it_in_an_array() -> None
 
 
 @pytest.mark.slow
-def test_after_a_reset_near_a_body_pairs_keep_the_distance_that_the_posture_leaves_them(
+def test_after_a_reset_near_a_body_pairs_keep_as_much_distance_as_the_posture_allows(
     controller: CartesianController,
 ) -> None:
     run = Driven(controller)
@@ -145,7 +145,7 @@ def test_after_a_reset_near_a_body_pairs_keep_the_distance_that_the_posture_leav
 
 
 @pytest.mark.slow
-def test_a_distance_that_has_grown_falls_back_at_a_reset(controller: CartesianController) -> None:
+def test_a_kept_distance_that_has_grown_falls_to_its_first_value_at_a_reset(controller: CartesianController) -> None:
     run = Driven(controller)
     run.drive(4.0, SCENARIOS["crossing"])
     near = run.q
@@ -161,7 +161,7 @@ def test_a_distance_that_has_grown_falls_back_at_a_reset(controller: CartesianCo
 
 
 @pytest.mark.slow
-def test_arms_within_their_buffer_rest_after_a_reset_and_the_buffer_grows_as_they_part(
+def test_arms_within_their_buffer_rest_after_a_reset_and_the_buffer_grows_as_they_move_apart(
     controller: CartesianController,
 ) -> None:
     run = Driven(controller)
@@ -178,10 +178,10 @@ def test_arms_within_their_buffer_rest_after_a_reset_and_the_buffer_grows_as_the
     assert left.contract.uncertified == 0
 
 
-def test_an_approaching_pair_keeps_no_more_distance_than_its_stop_leaves(controller: CartesianController) -> None:
+def test_an_approaching_pair_keeps_no_more_distance_than_its_stop_keeps(controller: CartesianController) -> None:
     run, robot = Driven(controller), controller.robot
     lost = np.zeros(0)
-    # The loop ends when a stop would bring a pair nearer than it was asked to keep.
+    # The loop ends when a stop would take more than 4 mm from the distance of a pair, and end clearly below FAR.
     while run.ticks < 800 and not (lost > 0.004).any():
         run.drive(0.01, SCENARIOS["crossing"])
         stop = controller.stop_deceleration
@@ -207,7 +207,7 @@ def test_an_approaching_pair_keeps_no_more_distance_than_its_stop_leaves(control
     ],
     ids=["pairs are not watched", "not a live one", "out of range", "as a whole"],
 )
-def test_an_impossible_change_is_refused_with_the_reason_and_changes_nothing(
+def test_a_change_that_is_not_allowed_is_refused_with_the_reason_and_changes_nothing(
     controller: CartesianController, values: dict[str, float], reason: str
 ) -> None:
     before = controller.settings
@@ -217,16 +217,18 @@ def test_an_impossible_change_is_refused_with_the_reason_and_changes_nothing(
     assert controller.settings is before
 
 
-def test_a_distance_that_home_does_not_have_is_refused_and_names_the_pair(controller: CartesianController) -> None:
+def test_a_distance_that_home_does_not_keep_is_refused_with_the_name_of_the_pair(
+    controller: CartesianController,
+) -> None:
     nearest = min(controller.robot.distances(controller.robot.home), key=lambda pair: pair.distance)
-    # No room would be left for distance_buffer.
+    # Home would keep this distance, but not together with distance_buffer.
     refusal = controller.change({"min_distance": nearest.distance - 0.001})
     assert refusal is not None
     assert nearest.name_a in refusal
 
 
 def _way(controller: CartesianController) -> np.ndarray:
-    """Return positions while both arms reach across each other, and then upwards."""
+    """Return the postures (ticks, nv) [rad] while both tools move across each other, and then upwards."""
     start = {arm: controller.tool_pose(arm) for arm in controller.robot.arms}
     goals = [SCENARIOS[name](0.0, start) for name in ("crossing", "overhead") for _ in range(400)]
     return np.array([controller.step(goal, DT).q for goal in goals])

@@ -1,4 +1,4 @@
-"""Obstacles that move on their own: arms rest before they can be touched, and can work beside them."""
+"""Obstacles that move on their own. Arms come to rest before an obstacle can touch them, and can work beside it."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def circle(t: float, start: dict[str, pin.SE3], radius: float = 0.05, turns: flo
 
 
 def worst_error(controller: CartesianController, obstacle: MovingObstacle | None, seconds: float = 3.0) -> float:
-    """Return the worst error of the left tool on a circle that both hands lead [m], after the first second."""
+    """Return the greatest position error of the left tool after the first second [m]. Both targets move in circles."""
     start, worst = {arm: controller.tool_pose(arm) for arm in controller.robot.arms}, 0.0
     for tick in range(round(seconds / 0.002)):
         if obstacle is not None and tick % 16 == 0:
@@ -93,7 +93,9 @@ def test_arms_beside_a_slow_hand_follow_as_in_free_air(controller: CartesianCont
     assert beside < 1.5 * free + 1e-3
 
 
-def test_the_end_of_reports_brings_arms_to_rest_and_the_report_names_the_pair(controller: CartesianController) -> None:
+def test_if_reports_of_an_obstacle_end_the_arms_come_to_rest_and_the_step_names_the_pair(
+    controller: CartesianController,
+) -> None:
     start = {arm: controller.tool_pose(arm) for arm in controller.robot.arms}
     far = start["left"].translation + np.array([0.0, 0.8, 0.0])
     controller.move_obstacle("hand", hand(far))
@@ -169,7 +171,7 @@ def test_a_new_box_is_an_obstacle_like_any_other_until_it_is_removed(
     assert np.linalg.norm(controller.tool_pose("left").translation - goal) < 2e-3
 
 
-def test_arms_beside_a_hand_that_comes_too_near_may_leave_it_and_the_other_arm_moves(
+def test_an_arm_that_a_hand_is_too_near_to_can_leave_and_meanwhile_the_other_arm_moves(
     controller: CartesianController,
 ) -> None:
     start = {arm: controller.tool_pose(arm) for arm in controller.robot.arms}
@@ -199,7 +201,7 @@ def test_the_reach_of_an_obstacle_is_that_of_a_point_that_gains_speed() -> None:
     assert hand(np.zeros(3), 1.0, speed_now=0.2).slower == 0.0
 
 
-def test_without_names_no_array_of_the_kernels_changes_its_size() -> None:
+def test_without_moving_obstacles_the_arrays_of_kernels_have_no_entries_for_them() -> None:
     robot = robot_of_cell()
     without, one = (
         kernel_model_of(robot, ControllerSettings(moving_obstacles=names)).safety for names in ((), ("hand",))

@@ -1,4 +1,4 @@
-"""The distances of arms from table, floor, obstacles, each other and themselves, with the contract at every tick."""
+"""How close arms come to table, floor, obstacles, each other and themselves. The contract holds at every tick."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def controller() -> CartesianController:
 
 
 def driven(controller: CartesianController, goal: Mapping[str, pin.SE3], seconds: float) -> Reference:
-    """Drive from home towards ``goal`` until the arms rest."""
+    """Drive from home to ``goal`` for a time in which the arms come to rest. Return the last reference."""
     run = Driven(controller, dt=0.004, random=np.random.default_rng(1))
     reference, contract = run.drive(seconds, goal), run.contract
     assert contract.tail_acceleration() < 0.1
@@ -42,7 +42,7 @@ def driven(controller: CartesianController, goal: Mapping[str, pin.SE3], seconds
 
 
 def down_to(z: float, y: float = 0.25, x: float = 0.5) -> dict[str, pin.SE3]:
-    """Return targets at which both tools point down at a height [m]."""
+    """Return targets at the height ``z`` [m] at which both tools point down."""
     return {arm: pin.SE3(DOWN, np.array([x, side * y, z])) for arm, side in SIDES}
 
 
@@ -64,7 +64,7 @@ def test_tools_driven_down_onto_the_table_end_with_their_tips_between_1_and_2_mm
 
 @pytest.mark.slow
 def test_hands_driven_at_each_other_end_at_the_distance_that_fingers_keep(controller: CartesianController) -> None:
-    """The tools point at each other, and their tips are asked to overlap by 50 mm."""
+    """The tools point at each other, and with their targets the tips would overlap by 50 mm."""
     goal = {
         arm: pin.SE3(
             pin.rpy.rpyToMatrix(side * np.pi / 2, 0.0, 0.0), np.array([0.55, side * (FRAME_TO_TIPS - 0.025), 0.5])
@@ -88,7 +88,7 @@ def test_the_nearest_pair_and_the_tightest_pair_are_reported_separately(controll
     assert report.margin < SETTINGS.distance_buffer + 1e-4
 
 
-def test_pairs_that_may_touch_come_to_rest_apart() -> None:
+def test_pairs_with_the_distance_0_come_to_rest_without_touching() -> None:
     data = CONFIG.model_dump(mode="json")
     data["control"] |= {"pairs": [{"pair": ["*_finger_*", "table"], "distance": 0.0}], "solve_time_limit": None}
     config = CONFIG.model_validate(data)
@@ -98,7 +98,7 @@ def test_pairs_that_may_touch_come_to_rest_apart() -> None:
 
 Target = tuple[tuple[float, float, float], tuple[float, float, float]]
 
-# Position that each tool is asked to reach [m], and its angle from home about an axis [rad].
+# For each arm, the position of the target [m], and the rotation vector from home to the target [rad].
 SLIDES: dict[str, tuple[Target, Target]] = {
     "while a joint is at its limit": (
         ((0.294, 0.219, 0.473), (-0.609, -0.206, 0.149)),
@@ -112,8 +112,10 @@ SLIDES: dict[str, tuple[Target, Target]] = {
 
 
 @pytest.mark.parametrize("slide", SLIDES)
-def test_joints_hardly_jolt_while_arms_slide_along_each_other(controller: CartesianController, slide: str) -> None:
-    dt, started = 0.001, 2000  # Number of ticks until the slide has begun and the targets' jump is over.
+def test_joint_accelerations_hardly_jump_while_arms_slide_along_each_other(
+    controller: CartesianController, slide: str
+) -> None:
+    dt, started = 0.001, 2000  # Number of ticks after which the arms slide, and no longer react to the targets' jump.
     run = Driven(controller, dt=dt)
     targets = {
         arm: pin.SE3(pin.exp3(np.array(turn)) @ run.start[arm].rotation, np.array(place))
@@ -121,7 +123,7 @@ def test_joints_hardly_jolt_while_arms_slide_along_each_other(controller: Cartes
     }
     v = np.array([controller.step(targets, dt).v for _ in range(4000)])
     assert np.linalg.norm(v[started:], axis=1).min() > 0.05, "they slide all the time"
-    # A pair that begins to hold the arms may still cause a jolt.
+    # When a pair begins to hold the arms back, an acceleration may still jump.
     assert count_jolts(v, dt, started * dt) <= 0.01 * 2000, f"changes of more than {JOLT:g} rad/s^2"
 
 
@@ -139,7 +141,7 @@ def test_arms_with_targets_below_the_floor_beside_the_table_come_to_rest_above_i
 
 
 def hands_in_the_table(depth: float) -> Array:
-    """Return a posture in which both tools point down ``depth`` [m] below the table's surface, with their links."""
+    """Return a posture in which both tools are ``depth`` [m] below the table's top, together with their hands."""
     ghost = Robot.from_config(CONFIG)
     ghost.collision_model.removeAllCollisionPairs()
     controller = CartesianController(ghost, SETTINGS)
@@ -151,8 +153,8 @@ def hands_in_the_table(depth: float) -> Array:
     return reference.q
 
 
-def test_hands_and_wrists_deep_in_the_table_come_out_through_its_top() -> None:
-    """The shortest way out for a hand alone would be the underside, near the floor, and for the wrists the top."""
+def test_hands_and_wrists_that_start_deep_in_the_table_come_out_of_it() -> None:
+    """Alone, a hand would leave the table through its underside, near the floor, and a wrist through its top."""
     controller = with_floor(0.0)
     home = {arm: controller.tool_pose(arm) for arm in controller.robot.arms}
     controller.reset(hands_in_the_table(0.18))
@@ -163,8 +165,8 @@ def test_hands_and_wrists_deep_in_the_table_come_out_through_its_top() -> None:
     assert np.diff([report.closest_distance for report in reports]).min() >= -1e-9, "it never comes closer"
 
 
-def test_where_nothing_can_be_certified_the_report_names_the_pairs_that_hold_the_arms() -> None:
-    """Without a floor, the underside is a way out, and hand and wrist hold each other in the table."""
+def test_if_nothing_can_be_certified_the_report_names_the_pairs_that_hold_the_arms() -> None:
+    """Without a floor, a hand would leave through the underside and a wrist through the top, so neither can move."""
     controller = with_floor(None)
     home = {arm: controller.tool_pose(arm) for arm in controller.robot.arms}
     controller.reset(hands_in_the_table(0.12))
@@ -195,7 +197,7 @@ def test_a_tool_pushed_into_an_obstacle_stops_before_it_and_rests(shape: str) ->
     assert reference.report.closest_distance < 0.03, "it goes as near as it may"
 
 
-def test_a_target_that_bends_the_hand_to_the_forearm_is_followed_up_to_the_kept_distance(
+def test_a_target_that_bends_the_hand_towards_the_forearm_is_followed_up_to_the_kept_distance(
     controller: CartesianController,
 ) -> None:
     inwards = pin.SE3(pin.rpy.rpyToMatrix(0.0, 1.2, 0.0), np.zeros(3))
@@ -207,10 +209,10 @@ def test_a_target_that_bends_the_hand_to_the_forearm_is_followed_up_to_the_kept_
 
 
 @pytest.mark.slow
-def test_a_circle_is_followed_no_worse_because_the_hand_is_near_its_own_forearm(
+def test_a_circle_is_followed_well_although_the_hand_is_near_its_own_forearm(
     controller: CartesianController,
 ) -> None:
-    """The circle is half a metre in the air. Its speed is 0.3 m/s, and 6 mm of distance are free at its top."""
+    """The circle is half a metre in the air. The target moves at 0.3 m/s, and 6 mm of distance are free at its top."""
     run, errors, nearest = Driven(controller, dt=0.001), [], np.inf
     for tick in range(4000):
         nearest = min(nearest, run.drive(0.001, circle).report.closest_distance)
@@ -221,8 +223,8 @@ def test_a_circle_is_followed_no_worse_because_the_hand_is_near_its_own_forearm(
     assert np.sqrt(np.mean(np.square(errors[1000:]))) < 0.004
 
 
-def test_the_margin_of_an_arm_is_the_least_margin_of_its_pairs_with_other_bodies() -> None:
-    """Links are named after their arm. The table and the floor belong to no arm."""
+def test_the_spare_distance_of_an_arm_is_the_least_margin_of_its_pairs_with_other_bodies() -> None:
+    """The names of links begin with the name of their arm. The table and the floor belong to no arm."""
     robot, random, kept = cell("dual_iiwa7").robot, np.random.default_rng(5), 0.03
     controller = CartesianController(robot, ControllerSettings(min_distance=kept))
     for _ in range(60):

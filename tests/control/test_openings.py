@@ -1,6 +1,6 @@
 """Fingers that slide or turn are monitored at all openings that they may have.
 
-A change is proven first; Coal checks it.
+A change of these openings is accepted only if it is proven to be safe. Coal measures whether it is.
 """
 
 from __future__ import annotations
@@ -46,7 +46,9 @@ def height(controller: CartesianController) -> float:
     return float(controller.tool_pose("left").translation[2])
 
 
-def test_a_closed_gripper_gets_beside_a_block_where_one_that_may_open_does_not(controller: CartesianController) -> None:
+def test_a_closed_gripper_reaches_a_pose_beside_a_block_that_a_gripper_that_may_open_does_not(
+    controller: CartesianController,
+) -> None:
     run = Driven(controller)
     run.drive(2.0, {"left": BESIDE})
     assert height(controller) > BESIDE.translation[2] + 0.01
@@ -76,10 +78,12 @@ def test_beside_the_block_the_gripper_opens_as_far_as_the_block_allows_and_above
     run.drive(0.1, {"left": ABOVE})
 
 
-def test_an_arm_at_speed_may_not_open_where_there_is_room_but_none_to_stop(controller: CartesianController) -> None:
-    """The closed gripper moves towards the block and asks at every tick.
+def test_a_moving_gripper_must_not_open_if_its_stop_would_bring_open_fingers_too_close(
+    controller: CartesianController,
+) -> None:
+    """The closed gripper moves towards the block, and asks at every tick whether it may open.
 
-    Coal measures along stops from accepted openings.
+    If it may, Coal measures the distances of the open fingers along the stop.
     """
     robot = controller.robot
     kept = kept_distances(robot, SETTINGS).values
@@ -137,7 +141,7 @@ def test_an_invalid_opening_is_refused_by_name(
 
 
 @pytest.mark.parametrize("below", [0.0, 5e-10])
-def test_fingers_at_their_exact_distance_can_part_again(robot: Robot, below: float) -> None:
+def test_fingers_exactly_at_their_distance_can_move_away_again(robot: Robot, below: float) -> None:
     run = Driven(CartesianController(robot, SETTINGS))
     run.set_opening("left", 0.0, 0.0)
     report = run.drive(2.0, {"left": BESIDE}).report
@@ -154,7 +158,7 @@ COAL = 2e-6  # Largest difference between our distances and those of Coal [m].
 
 
 class Cell(Driven):
-    """A run with its contract and the real positions of the fingers."""
+    """A run that checks the contract, and measures with the real positions of the fingers."""
 
     def __init__(self, config: Config) -> None:
         # No result depends on the clock.
@@ -163,11 +167,11 @@ class Cell(Driven):
         super().__init__(CartesianController(robot, settings), dt=DT)
 
     def spare(self, openings: dict[str, float]) -> float:
-        """Return the margin of the nearest pair of drawn shapes [m]."""
+        """Return the least margin of a pair, measured with the real shapes of the fingers at ``openings`` [m]."""
         return float((self.real.distances(self.q, openings) - self.kept).min())
 
     def spare_of_bodies(self) -> float:
-        """Return the same margin of the fingers' bodies."""
+        """Return the least margin of a pair, measured with the fingers' bodies for the accepted openings [m]."""
         model = collision_model_at(self.robot.collision_model, self.robot.finger_bodies, self.controller.openings)
         return float((coal_distances(self.robot, model, self.q) - self.kept).min())
 
@@ -177,7 +181,7 @@ def cell(tmp_path: Path) -> Cell:
     return Cell(turning_cell(tmp_path))
 
 
-def test_an_open_gripper_does_not_close_into_the_table_and_closes_where_there_is_room(cell: Cell) -> None:
+def test_an_open_gripper_does_not_close_into_the_table_and_closes_higher_above_it(cell: Cell) -> None:
     assert cell.set_opening("left", 1.0, 1.0) is None
     cell.drive(1.8, {"left": above_table(0.006)})
     # The tips of the closed fingers would be 8 mm inside the table.
@@ -194,8 +198,8 @@ def test_an_open_gripper_does_not_close_into_the_table_and_closes_where_there_is
     cell.drive(0.02, {"left": above_table(0.06)})
 
 
-def test_less_that_reaches_nearer_is_refused_like_more_and_the_wider_body_stays(cell: Cell) -> None:
-    """The gripper moves onto the table in a direction in which a smaller interval has capsules that reach farther."""
+def test_a_narrower_interval_whose_capsule_reaches_the_table_is_refused_and_the_wider_one_stays(cell: Cell) -> None:
+    """The gripper points at the table with a side on which a narrower interval has capsules that reach farther."""
     wide, narrow, direction = (0.0, 0.7), (0.175, 0.7), np.array([-0.1135, 0.3231, 0.9395])
     fingers = [body for body in cell.robot.finger_bodies if isinstance(body, TurningBody) and body.arm == "left"]
     reach = {}
@@ -224,7 +228,7 @@ def test_less_that_reaches_nearer_is_refused_like_more_and_the_wider_body_stays(
 
 
 @pytest.mark.slow
-def test_with_hostile_targets_and_openings_no_finger_is_too_near_at_its_real_position(cell: Cell) -> None:
+def test_with_hostile_targets_and_openings_no_finger_is_too_close_at_its_real_position(cell: Cell) -> None:
     random, refused = np.random.default_rng(5), 0
     goals: dict[str, pin.SE3] = {}
     for tick in range(1500):

@@ -1,4 +1,4 @@
-"""The QP of a step can be read without side effects and solved by any program, and the arms keep every promise."""
+"""The QP of a step can be read without side effects, and any program may solve it. The contract holds anyway."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ KEPT = ControllerSettings(moving_obstacles=("hand",))
 
 
 def crossing(robot: Robot, tick: int = 0) -> dict[str, pin.SE3]:
-    """Each tool is sent to where the other one is, and swings."""
+    """Return targets of which each is at the home position of the other tool. The left target swings up and down."""
     left, right = (robot.tool_pose(robot.home, arm) for arm in ("left", "right"))
     swing = np.array([0.0, 0.0, 0.05 * math.sin(0.02 * tick)])
     return {
@@ -46,7 +46,7 @@ def solved_by(name: str, problem: qpsolvers.Problem) -> Array | None:
 
 
 def busy(controller: CartesianController, tick: int) -> None:
-    """Make changes between steps that start clocks and ramps of a controller."""
+    """Change settings and move an obstacle between steps, so that some of the controller's values change with time."""
     if tick == 100:
         assert controller.change({"position_gain": 4.0, "min_distance": 0.025}) is None
     if tick % 50 == 10:
@@ -86,7 +86,7 @@ def test_the_problem_is_the_one_that_the_step_solves(robot: Robot) -> None:
     assert with_rows > 100
 
 
-def test_the_velocities_of_the_step_lead_to_the_same_reference_to_the_bit(robot: Robot) -> None:
+def test_the_velocities_of_a_step_given_to_advance_lead_to_exactly_the_same_reference(robot: Robot) -> None:
     controllers = [CartesianController(robot) for _ in range(2)]
     for tick in range(200):
         targets = crossing(robot, tick)
@@ -114,7 +114,7 @@ def test_an_invalid_solution_brakes_along_the_certified_stop_like_an_unsolved_st
     assert not reference.v.any()
 
 
-def test_velocities_far_beyond_the_box_break_no_promise(robot: Robot) -> None:
+def test_given_velocities_far_beyond_the_box_never_break_the_contract(robot: Robot) -> None:
     controller, random = CartesianController(robot), np.random.default_rng(3)
     contract = Contract(controller, robot.home)
     for tick in range(400):
@@ -123,6 +123,6 @@ def test_velocities_far_beyond_the_box_break_no_promise(robot: Robot) -> None:
 
 
 @pytest.mark.parametrize("dt", [0.0, -1.0, 0.11, math.nan, None, "a"])
-def test_an_impossible_step_has_no_problem(robot: Robot, dt: Any) -> None:
+def test_the_problem_of_a_step_with_an_invalid_dt_is_refused(robot: Robot, dt: Any) -> None:
     with pytest.raises(RobotError, match=r"dt = .*: allowed: a number above 0, up to 0\.1 s"):
         CartesianController(robot).problem({}, dt)

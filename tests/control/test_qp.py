@@ -36,7 +36,8 @@ def _problem(random: np.random.Generator, rows: int, conflicting: bool = False) 
 def _assert_minimum(problem: QpProblem, v: Array) -> None:
     """Assert that ``v`` is the minimum. Without slack variables, the soft problem is a convex function in a box.
 
-    ``v`` is its minimum if no Newton-like step, the gradient scaled by the curvature, leads on within the box.
+    ``v`` is its minimum if a step along the negative gradient, scaled by the curvature and clipped to the box, leads
+    back to ``v``.
     """
     softness = SOFTNESS * np.sum(problem.rows * np.linalg.solve(problem.H, problem.rows.T).T, axis=1)
     slack = np.maximum(problem.rows_lower - problem.rows @ v, 0.0)
@@ -63,7 +64,7 @@ def test_the_minimum_is_found_for_any_number_of_rows_in_successive_ticks_also_wi
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1e3], ids="cost times {:g}".format)
-def test_a_single_row_yields_by_the_same_part_for_any_strength_of_the_cost(scale: float) -> None:
+def test_a_single_row_gives_way_by_the_same_share_for_any_weight_of_the_cost(scale: float) -> None:
     row = np.zeros((1, NV))
     row[0, :2] = 0.6, 0.8
     wide = np.full(NV, 10.0)
@@ -72,7 +73,7 @@ def test_a_single_row_yields_by_the_same_part_for_any_strength_of_the_cost(scale
 
 
 @pytest.mark.parametrize("what", ["g", "H", "rows"])
-def test_numbers_that_are_not_finite_raise_nothing_and_leave_no_trace(what: str) -> None:
+def test_numbers_that_are_not_finite_raise_nothing_and_do_not_change_later_solutions(what: str) -> None:
     problem, solver = _problem(np.random.default_rng(32), 3), DaqpSolver(NV)
     before = _solved(solver, problem)
     broken = getattr(problem, what).copy()
@@ -83,7 +84,7 @@ def test_numbers_that_are_not_finite_raise_nothing_and_leave_no_trace(what: str)
 
 @pytest.fixture
 def data() -> KernelData:
-    """Return data of a cost whose minimum is 0.1 rad/s for every joint. It keeps the box of 1 rad/s and the row."""
+    """Return data with a cost whose minimum is 0.1 rad/s for every joint, within the box of 1 rad/s and the row."""
     data = kernel_data("dual_iiwa7", np.zeros(NV))
     root = np.random.default_rng(5).normal(size=(NV, NV))
     data.tasks.H[:] = root @ root.T + np.eye(NV)
@@ -133,7 +134,7 @@ class BothWays:
     def __init__(self) -> None:
         self._solver = DaqpSolver(NV)
         self.deviations: list[float] = []
-        # For each problem without a direct minimum: True if a bound holds the solution back.
+        # For each problem without a direct minimum: True if the solution differs from the minimum of the cost alone.
         self.held_back: list[bool] = []
 
     def solve(self, problem: QpProblem) -> QpSolution:
@@ -149,7 +150,7 @@ class BothWays:
 
 
 def circling(home: pin.SE3, t: float, side: float) -> pin.SE3:
-    """Return targets of a tool that moves in circles and, farther on, into the other arm and out again."""
+    """Return a target at the time ``t`` [s] that moves in small circles, slowly into the other arm and out again."""
     by = np.array([0.08 * np.sin(4.0 * t), -side * 0.25 * (1.0 - np.cos(t)), 0.04 * np.sin(3.0 * t)])
     return pin.SE3(home.rotation, home.translation + by)
 
@@ -174,7 +175,7 @@ RANDOM = np.random.default_rng(4)
 
 
 @pytest.mark.parametrize("n", [1, 6, 14])
-def test_the_factor_is_read_from_the_upper_triangle_and_solves_the_equations(n: int) -> None:
+def test_a_matrix_given_by_its_upper_triangle_is_factorised_and_solves_equations(n: int) -> None:
     vectors, _ = np.linalg.qr(RANDOM.normal(size=(n, n)))
     A, b = (vectors * np.geomspace(1.0, 1e4, n)) @ vectors.T, RANDOM.normal(size=n)
     factor, x = np.triu(A), b.copy()

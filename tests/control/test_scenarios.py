@@ -1,6 +1,6 @@
-"""The suite that checks a robot: named hostile motions, with the contract at every tick.
+"""Named hostile motions for each robot. The contract is checked at every tick.
 
-Another robot joins by a line in ``ROBOTS`` and in the parameters of the test.
+To add a robot, add a line to ``ROBOTS`` and a line to the parameters of the test.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ from tests.control.cells import pandas
 from tests.control.scenarios import SCENARIOS, Scenario, circle, crossing
 
 DURATION = 2.0  # [s]
-FAULT_PERIOD, FAULT_SHARE = 0.2, 0.2  # A faulty solver fails at the end of every period [s].
+# A faulty solver fails in the last part of every period. These are the period [s] and the share of this part.
+FAULT_PERIOD, FAULT_SHARE = 0.2, 0.2
 AGAINST_US = "against us"  # All attacks in turn, each for one period.
 Start = Callable[[Robot], tuple[Array, Array]]
 
@@ -43,9 +44,9 @@ def robot_of(name: str) -> Robot:
 
 @cache
 def controller_of(name: str) -> tuple[CartesianController, FaultySolver]:
-    """Return the controller of a robot.
+    """Return the controller of a robot, and its solver.
 
-    It is made once, and a reset starts it again. The solver's times are simulated.
+    The controller is made once, and a reset starts it again. The solver's times are simulated.
     """
     settings = ControllerSettings(solve_time_limit=0.05)
     solver = FaultySolver(DaqpSolver(robot_of(name).model.nv))
@@ -86,7 +87,10 @@ def in_penetration(robot: Robot) -> tuple[Array, Array]:
 
 
 def too_fast(robot: Robot) -> tuple[Array, Array]:
-    """Return velocities in which every joint is 1.2 times too fast, upwards and apart, far from its position limits."""
+    """Return home, and velocities at which the first and last joint of each arm exceed their limits by a fifth.
+
+    The arms turn in opposite directions.
+    """
     q, v = at_home(robot)
     for arm, sign in zip(robot.arms.values(), (1.0, -1.0), strict=True):
         v[arm.joints[0]] = 1.2 * sign * robot.velocity_limit[arm.joints[0]]
@@ -128,9 +132,9 @@ CASES = {
 
 
 def ticks_of(dt: float, jitter: bool) -> Iterator[float]:
-    """Return the lengths of the ticks of one run.
+    """Yield the durations of the ticks of one run [s].
 
-    With jitter, they are between a fifth of the tick and five times as long.
+    With jitter, a duration is between a fifth of ``dt`` and five times ``dt``.
     """
     random, t = np.random.default_rng(5), 0.0
     while t < DURATION:
@@ -139,7 +143,7 @@ def ticks_of(dt: float, jitter: bool) -> Iterator[float]:
         yield length
 
 
-# One tick is shorter than a substep, and one has five substeps.
+# With the first dt, a tick is shorter than a substep. With the second dt, it has five substeps.
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.parametrize(
     ("robot", "dt"), [("iiwa7", 0.001), ("iiwa7", 0.01), pytest.param("panda", 0.01, marks=pytest.mark.slow)]
@@ -166,7 +170,7 @@ def test_the_contract_holds_at_every_tick(name: str, robot: str, dt: float) -> N
     # Only a start in penetration has no certificate at first.
     assert (contract.uncertified > 0) == (case.start is in_penetration)
     assert failed == 0 or case.fault in STOPPING_FAULTS
-    # After an absurd solution, which was followed as far as it was certified, rows may be late by a part of a stop.
+    # An absurd solution is followed as far as it is certified. After it, rows may be too late to prevent a fallback.
     assert unfounded <= (0.02 if case.fault == "absurd" else 0.001) * contract.ticks
     if case.recovers:
         assert StepStatus.RECOVERING in statuses

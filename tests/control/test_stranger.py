@@ -46,7 +46,7 @@ class NotBackwards:
 
 
 class OwnSolver:
-    """A solver of the soft problem without rows, by projected gradients. The certificate needs no better one."""
+    """A solver that ignores all rows and uses projected gradients. The certificate needs no better solver."""
 
     def solve(self, problem: QpProblem) -> QpSolution:
         v = np.clip(np.zeros_like(problem.g), problem.lower, problem.upper)

@@ -25,7 +25,7 @@ def tracker() -> TargetTracker:
 
 
 def _taken(tracker: TargetTracker) -> TaskTargets:
-    return tracker._targets  # Kernels read the targets through ``pointer``. Python code need not read them.
+    return tracker._targets  # The public attribute ``pointer`` is for kernels only.
 
 
 def _update(tracker: TargetTracker, targets: dict[str, Any], dt: float, q: Array, v: Array) -> tuple[str, ...]:
@@ -61,7 +61,7 @@ UNUSABLE: dict[str, Callable[[], Any]] = {
 
 
 @pytest.mark.parametrize("bad", UNUSABLE.values(), ids=UNUSABLE.keys())
-def test_a_target_that_is_not_a_pose_is_named_and_the_last_one_stays(
+def test_a_target_that_is_not_a_pose_is_named_and_the_last_target_stays(
     tracker: TargetTracker, bad: Callable[[], Any]
 ) -> None:
     good = _pose(pin.exp3(np.array([0.1, 0.2, 0.3])))
@@ -84,7 +84,7 @@ def test_a_target_beyond_any_cell_keeps_its_direction_but_not_its_distance(track
     np.testing.assert_allclose(_taken(tracker).translation[0], [100.0, -50.0, 25.0])
 
 
-def test_a_slightly_skewed_rotation_is_straightened(tracker: TargetTracker) -> None:
+def test_a_slightly_skewed_rotation_matrix_is_made_orthonormal(tracker: TargetTracker) -> None:
     random = np.random.default_rng(36)
     for _ in range(20):
         R = pin.exp3(random.normal(size=3))

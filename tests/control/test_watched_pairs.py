@@ -1,4 +1,4 @@
-"""The pairs that a prediction examines, and the distances that they keep."""
+"""The pairs that are measured to predict collisions, and the distances that these pairs keep."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def least_ahead(controller: CartesianController) -> float:
     return float((distances(controller.step({}, 0.0).q) - kept).min())
 
 
-def test_a_prediction_finds_the_distances_of_slow_arms_beside_a_hand() -> None:
+def test_a_prediction_finds_the_margin_of_the_report_beside_a_moving_hand() -> None:
     controller = controller_at_home()
     side = controller.tool_pose("left").translation + np.array([0.0, RADIUS + 0.12, 0.0])
     controller.move_obstacle("hand", hand(side))
@@ -32,7 +32,7 @@ def test_a_prediction_finds_the_distances_of_slow_arms_beside_a_hand() -> None:
     np.testing.assert_allclose(distances(reference.q), controller.robot.distance_values(reference.q), atol=2e-6)
 
 
-def test_a_held_box_keeps_its_distance_too() -> None:
+def test_a_prediction_includes_the_distances_of_a_held_box() -> None:
     config = cell(BLOCK)
     robot = Robot.from_config(config)
     settings = config.control.model_copy(update={"moving_obstacles": ("hand",)})

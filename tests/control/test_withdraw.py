@@ -1,4 +1,4 @@
-"""A step that came too late for the plant is undone, and the arms go on braking from where they were."""
+"""A step that came too late for the plant is undone, and the arms brake from the state before this step."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ DT = 0.002
 
 
 def crossing(controller: CartesianController) -> dict[str, pin.SE3 | None]:
-    """Each tool is sent to where the other one is."""
+    """Return targets of which each is at the present position of the other tool."""
     left, right = (controller.tool_pose(arm) for arm in SIDES)
     return {"left": pin.SE3(left.rotation, right.translation), "right": pin.SE3(right.rotation, left.translation)}
 
 
 def moving(robot: Robot) -> tuple[CartesianController, Reference]:
-    """Return a controller whose arms move into each other, and its last reference."""
+    """Return a controller whose arms move towards each other, and its last reference."""
     controller = CartesianController(robot)
     targets = crossing(controller)
     return controller, [controller.step(targets, DT) for _ in range(100)][-1]
@@ -39,7 +39,7 @@ def test_an_undone_step_leaves_state_and_stop_unchanged(robot: Robot) -> None:
 
 
 @pytest.mark.slow
-def test_arms_that_move_into_each_other_keep_every_promise_with_late_steps(robot: Robot) -> None:
+def test_arms_that_move_towards_each_other_keep_limits_and_distances_with_late_steps(robot: Robot) -> None:
     controller, random = CartesianController(robot), np.random.default_rng(0)
     cap = robot.capped_acceleration(controller.settings.acceleration_limit)
     targets, before = crossing(controller), Reference(robot.home, np.zeros_like(robot.home), robot.home, None)  # type: ignore[arg-type]
@@ -59,7 +59,7 @@ def test_arms_that_move_into_each_other_keep_every_promise_with_late_steps(robot
     assert -1e-9 <= nearest < 0.01
 
 
-def test_a_braking_reference_says_so_and_can_be_undone_too(robot: Robot) -> None:
+def test_a_braking_step_follows_the_certified_stop_and_can_be_undone_too(robot: Robot) -> None:
     controller, before = moving(robot)
     deceleration = controller.stop_deceleration
     braked = controller.brake(DT)

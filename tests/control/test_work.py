@@ -15,7 +15,7 @@ pytestmark = pytest.mark.slow
 
 CONFIG = load_config("config/dual_iiwa7.yaml")
 SETTINGS = CONFIG.control.model_copy(update={"solve_time_limit": None})  # No result depends on the clock.
-# Time at rest [s], which is longer than that of the motions, because arms that block each other slide for a while.
+# Time after the motion in which the arms come to rest [s]. Arms that block each other slide for a while before.
 STILL = 3.0
 
 
@@ -26,7 +26,7 @@ def robot_of(free: bool) -> Robot:
 
 @cache
 def figures_of(name: str, free: bool = False) -> MotionFigures:
-    """Return our figures in a work motion, or in free air on the same path."""
+    """Return our figures in a work motion. With ``free``, no pair is monitored."""
     robot = robot_of(free)
     return run_motion(OwnController(robot, CONFIG), robot, WORK_MOTIONS[name])
 
@@ -38,7 +38,7 @@ def rms(name: str, free: bool = False) -> float:
     return error
 
 
-# These are the nearest carries at the highest speed.
+# Of the motions that carry something, only the one with the nearest arms and the highest speed is checked.
 CHECKED = [name for name in WORK_MOTIONS if not name.startswith("carry")] + ["carry-0.16-0.50"]
 
 
@@ -59,7 +59,7 @@ def test_arms_that_carry_something_close_together_follow_as_in_free_air() -> Non
 
 
 @pytest.mark.parametrize(("name", "time"), [("pass", 2.0), ("pass-back", 2.0), ("cross", 4.5), ("reach-under", 2.0)])
-def test_arms_get_past_each_other_if_there_is_a_way(name: str, time: float) -> None:
+def test_arms_get_past_each_other_if_there_is_a_path(name: str, time: float) -> None:
     arrival = figures_of(name).arrival_s
     assert arrival is not None
     assert arrival < time

@@ -1,4 +1,4 @@
-"""Velocity commands lead to the reference within limits, and never use a measurement that is not trusted."""
+"""Velocity commands let the arms follow the reference within limits. No command uses a state that is not trusted."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def at(q: np.ndarray, v: np.ndarray) -> Reference:
     return Reference(q, v, 0.0 * q, StepReport(StepStatus.OK, (), (), ("", ""), 1.0, True, False, 0.0, 0.0))
 
 
-def test_the_feedback_is_bounded_and_left_out_where_the_state_is_not_trusted() -> None:
+def test_the_velocity_command_is_bounded_and_has_no_feedback_if_the_state_is_not_trusted() -> None:
     loop = pipeline(mode="velocity")
     drive, robot = loop.drive, loop.robot
     assert isinstance(drive, VelocityDrive)
@@ -59,8 +59,8 @@ DT = 0.004
 
 
 def pulled(robot: Robot, has_servos: bool) -> tuple[TorqueDrive, Reference, RobotState]:
-    """Return a drive whose reference has left the resting arms, so that the spring pulls."""
-    # The machine would decide whether a solution is late.
+    """Return a torque drive whose reference has moved away from the resting arms, so that the spring pulls."""
+    # With a time limit, the speed of the computer would decide whether a solution is late.
     controller = CartesianController(robot, cell().control.model_copy(update={"solve_time_limit": None}))
     drive = TorqueDrive(robot, cell(), has_servos)
     zero = np.zeros_like(robot.home)
@@ -75,7 +75,7 @@ def pulled(robot: Robot, has_servos: bool) -> tuple[TorqueDrive, Reference, Robo
     return drive, reference, state
 
 
-def test_without_a_trusted_state_the_torque_is_that_of_gravity(robot: Robot) -> None:
+def test_without_a_trusted_state_the_command_is_the_gravity_torque(robot: Robot) -> None:
     drive, reference, state = pulled(robot, has_servos=False)
     gravity = pin.computeGeneralizedGravity(robot.model, robot.model.createData(), robot.home)
     command = drive.command(reference, state, {}, DT, trusted=False)
@@ -96,9 +96,9 @@ def test_without_a_trusted_state_a_plant_with_servos_follows_the_reference(robot
     np.testing.assert_array_equal(command.q, reference.q)
 
 
-def test_the_wall_between_measured_links_is_part_of_the_command(robot: Robot) -> None:
+def test_the_wall_presses_if_a_measured_pair_is_too_close(robot: Robot) -> None:
     drive, reference, state = pulled(robot, has_servos=False)
-    # The left arm folds inwards until a measured pair is closer than allowed.
+    # Random postures are tried until a measured pair is closer than its kept distance, and no pair touches.
     q = state.q.copy()
     rng = np.random.default_rng(3)
     kept = kept_distances(robot, cell().control).values

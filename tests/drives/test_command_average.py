@@ -1,4 +1,4 @@
-"""Commands that are means of the references keep the limit of jerk, and the other limits, and end at the reference."""
+"""Commands that are means of references keep the limit of jerk and the other limits, and end at the last reference."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ A, H = 10.0, 0.001  # Acceleration limit [rad/s^2] and period [s].
 
 
 def limited(jerk: object, mode: str = "position", **control: Any) -> Config:
-    """Return the shipped cell with a limit of jerk."""
+    """Return the shipped cell with the limit of jerk ``jerk`` [rad/s^3] and a loop of 1000 Hz."""
     settings = cell().control.model_copy(update={"jerk_limit": jerk, **control})
     return cell().model_copy(update={"control": settings, "loop_rate_hz": 1000.0})
 
@@ -42,7 +42,7 @@ def hasty_reference(ticks: int, dt: Array, seed: int = 1) -> list[tuple[Array, A
 
 
 @pytest.mark.parametrize("jerk", [700.0, 5000.0, 6000.0, 19_000.0])
-def test_commands_of_regular_ticks_reach_the_limit_of_jerk_and_never_exceed_it(jerk: float) -> None:
+def test_with_regular_ticks_commands_reach_the_limit_of_jerk_and_never_exceed_it(jerk: float) -> None:
     average = CommandAverage(2.0 * A / jerk, H)
     average.reset(np.zeros(2))
     commands = [average.update(q, v, H)[0] for q, v in hasty_reference(3000, np.full(3000, H))]
@@ -82,7 +82,7 @@ def test_a_tick_without_time_changes_no_command() -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_commands_of_irregular_ticks_stay_as_near_to_the_way_of_the_reference_as_is_allowed_for(seed: int) -> None:
+def test_with_irregular_ticks_commands_stay_within_the_allowed_distance_of_the_references_path(seed: int) -> None:
     window = 0.004
     dt = np.random.default_rng(seed).uniform(0.3 * H, 1.5 * H, 2000)
     average = CommandAverage(window, H)
@@ -100,7 +100,7 @@ def test_commands_of_irregular_ticks_stay_as_near_to_the_way_of_the_reference_as
         assert np.abs(command - there).max() <= 0.25 * A * window**2
 
 
-def test_a_late_tick_is_commanded_as_it_is_and_the_average_begins_again() -> None:
+def test_after_a_late_tick_the_reference_itself_is_commanded_and_the_average_begins_again() -> None:
     average = CommandAverage(0.004, H)
     average.reset(np.zeros(2))
     for q, v in hasty_reference(20, np.full(20, H)):
@@ -133,7 +133,7 @@ def test_a_drive_is_at_rest_only_when_its_last_command_is_the_reference(mode: Co
 
 
 def hasty(t: float) -> Array:
-    """Return the pose of a hand that shakes, so that the reference uses all of its acceleration (6,)."""
+    """Return the pose (6,) of a hand that shakes so fast that the reference needs its whole acceleration limit."""
     return np.array([0.0, 0.0, 0.1 * math.sin(12.0 * max(t - ENGAGED, 0.0)), 0.0, 0.0, 0.0])
 
 
@@ -150,13 +150,13 @@ def test_a_whole_run_keeps_the_limit_of_jerk_in_every_tick(mode: CommandMode) ->
     assert np.abs(np.diff(q, n=3, axis=0) / H**3).max() > 0.5 * jerk
 
 
-def test_torques_are_commanded_without_a_limit_of_jerk_and_its_distances() -> None:
+def test_in_torque_mode_pairs_keep_no_additional_distance_for_the_limit_of_jerk() -> None:
     loop = Pipeline.from_config(limited(5000.0), input=HandsInput(), plant="mujoco", mode="torque")
     plain = Pipeline.from_config(limited(None), input=HandsInput(), plant="mujoco", mode="torque")
     assert (loop.controller.kept_distances == plain.controller.kept_distances).all()
 
 
-def test_a_plant_that_executes_stops_by_itself_and_does_not_average_refuses_the_limit() -> None:
+def test_a_limit_of_jerk_is_refused_for_a_plant_that_executes_stops_itself_but_does_not_average() -> None:
     config = load_config("config/dual_iiwa7_fri.yaml")
     config = config.model_copy(update={"control": config.control.model_copy(update={"jerk_limit": 5000.0})})
     with pytest.raises(ConfigError, match=r"control.jerk_limit: allowed: null, since FriPlant does not keep it"):

@@ -1,4 +1,4 @@
-"""Both modes of a drive in whole runs in MuJoCo: pushed arms, yielding targets, lost measurements."""
+"""Torque mode, and position mode with an admittance, in whole runs in MuJoCo: pushed arms and lost measurements."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ ENGAGED = 0.3  # After this time, hands that stay where they are have engaged bo
 
 
 def configured(**sections: dict[str, object]) -> Config:
-    """Return the shipped cell at 500 Hz with changed keys in its sections."""
+    """Return the shipped cell at 500 Hz. ``sections`` has the changed keys of each section of the configuration."""
     changed = {name: getattr(cell(), name).model_copy(update=keys) for name, keys in sections.items()}
     return cell().model_copy(update={"loop_rate_hz": 500.0, **changed})
 
 
 def at(t: float, action: Callable[[], object]) -> Callable[[Tick], None]:
-    """Return a listener that acts once, at time ``t`` [s]."""
+    """Return a listener that calls ``action`` once, at the first tick from ``t`` [s] on."""
     done: list[Tick] = []
 
     def listener(tick: Tick) -> None:
@@ -54,15 +54,15 @@ def pushed(config: Config, mode: str, push: Array, start: float, duration: float
 
 
 def way(watch: Watch, arm: str) -> Array:
-    """Return the distances (n,) [m] of the arm's measured tool from its place at the begin of the push."""
+    """Return at each tick (n,) the distance [m] of the arm's measured tool from its position at the time ENGAGED."""
     start = next(tick for tick in watch.ticks if tick.t >= ENGAGED)
     return np.array(
         [np.linalg.norm(tick.tools[arm].translation - start.tools[arm].translation) for tick in watch.ticks]
     )
 
 
-def test_in_torque_mode_an_arm_pushed_into_the_other_presses_the_wall_without_a_touch_and_comes_back() -> None:
-    # The spring is soft, so that the push overcomes it and the wall holds the rest.
+def test_in_torque_mode_an_arm_pushed_at_the_other_arm_never_touches_it_and_comes_back() -> None:
+    # The spring is so soft that the push overcomes it. The wall bears the rest of the push.
     config = configured(impedance={"translational_stiffness": 300.0, "rotational_stiffness": 100.0})
     loop, watch = pushed(config, "torque", np.array([0.0, -100.0, 0.0, 0.0, 0.0, 0.0]), ENGAGED, 1.5)
     summary = loop.run(6.5, realtime=False)
@@ -154,7 +154,7 @@ def blinded(what: str, value: float, start: float, duration: float) -> tuple[Pip
 
 
 @pytest.mark.parametrize(("what", "value"), [("q", np.nan), ("v", np.inf)])
-def test_a_short_loss_of_measurements_is_bridged_and_counted(what: str, value: float) -> None:
+def test_after_a_short_loss_of_measurements_the_run_goes_on_and_counts_the_lost_ticks(what: str, value: float) -> None:
     loop, watch, _ = blinded(what, value, 0.9, 0.8 * BLIND)
     summary = loop.run(1.6, realtime=False)
     assert summary.torque is not None

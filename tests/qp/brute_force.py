@@ -1,12 +1,12 @@
-"""The solution of a small QP without a solver: every set of active bounds and rows is tried.
+"""Find the solution of a small QP without a solver, by trying every set of active bounds and rows.
 
-The cost with the slacks put in, s_i = max(0, lower_i - a_i v), is
+With the best slacks, s_i = max(0, lower_i - a_i v), the cost is
 
     f(v) = 1/2 v' H v + g' v + 1/2 sum_i max(0, lower_i - a_i v)^2 / rho_i.
 
-At the solution each joint is at its lower bound, at its upper one or between them, and each row is satisfied or gives
-way. For each of these cases f is a parabola, whose least point is found by one linear system. The best of all such
-points that satisfy the box and the hard rows is the solution, since f is strictly convex.
+At the solution each joint is at its lower bound, at its upper bound or between them, and each row is satisfied or gives
+way. For each of these combinations f is a quadratic function, whose minimum is found by one linear system. Of all these
+minima that satisfy the box and the hard rows, the one with the least cost is the solution, since f is strictly convex.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _ROUNDING = 1e-9
 
 
 def cost_of(problem: QpProblem, v: Array) -> float:
-    """Return f at velocities ``v`` (nv,) [rad/s], in which a hard row has no cost."""
+    """Return f at velocities ``v`` (nv,) [rad/s]. Hard rows have no cost in it."""
     soft = len(problem.rows_lower) - problem.hard
     slack = np.maximum(problem.rows_lower - problem.rows @ v, 0.0)[:soft]
     softness = row_softness(problem.H, problem.rows)[:soft]
@@ -51,7 +51,11 @@ def solve_by_brute_force(problem: QpProblem) -> Array:
 
 
 def _least_point(problem: QpProblem, sides: npt.NDArray[np.int64], active: npt.NDArray[np.bool_]) -> Array | None:
-    """Return the least point of f with joints at the bounds in ``sides``, and with these rows violated or met."""
+    """Return the minimum (nv,) [rad/s] of f for one combination; None if it does not exist.
+
+    ``sides`` (nv,) is -1 for a joint at its lower bound, 1 at its upper bound, and 0 between them. Rows with ``active``
+    (m,) give way if they are soft, and are met exactly if they are hard.
+    """
     soft = np.arange(len(active)) < len(active) - problem.hard
     giving, met = problem.rows[active & soft], problem.rows[active & ~soft]
     stiffness = 1.0 / row_softness(problem.H, problem.rows)[active & soft]

@@ -13,10 +13,10 @@ from q2r2_control.control.solvers.registry import OURS
 from tests.control.cells import cell
 
 ROBOT = cell("dual_iiwa7").robot
-# DAQP, to which the others are compared, comes first. The names are sorted, so that all test processes agree.
+# DAQP, with which the other solvers are compared, comes first. Names are sorted so that all test processes agree.
 NAMES = (*OURS, *sorted(set(qpsolvers.available_solvers) - set(OURS)))
 
-# By default, these two stop at a residual. Where an arm is nearly stretched, the flat cost makes this inaccurate.
+# By default, these two solvers stop at a residual. For a nearly stretched arm, whose cost is flat, this is inaccurate.
 EXACTLY: dict[str, dict[str, float]] = {
     "proxqp": {"eps_abs": 1e-9, "eps_rel": 0.0},
     "scs": {"eps_abs": 1e-9, "eps_rel": 1e-9},
@@ -30,7 +30,7 @@ def accuracy_of(name: str) -> float:
 
 
 def each_solver() -> list[pytest.ParameterSet]:
-    """Return all names. Solvers other than the package's own are slow, and run with ``pytest tests/qp``."""
+    """Return all names as parameters of a test. Tests with other solvers than DAQP and OSQP are marked as slow."""
     return [pytest.param(name, marks=() if name in OURS else pytest.mark.slow) for name in NAMES]
 
 

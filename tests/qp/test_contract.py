@@ -1,4 +1,4 @@
-"""Shorter motions of the contract: every solver keeps each limit and each distance at every tick."""
+"""Short motions with every solver: each limit and each distance is kept at every tick."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from tests.qp.solvers import NAMES, ROBOT, controller_with, each_solver
 from tests.support.driven import Driven
 
 DT, MOVING, RESTING = 0.002, 0.16, 2.5  # [s]
-SLOWLY_OUT = "start in penetration"  # Arms part at 50 mm/s, and a tick has up to 80 rows.
-REST, RESTED = 1e-3, 0.02  # A speed of every joint [rad/s], and the time for which it has to last [s].
-TRACKING = 1.05  # Largest error of another solver, as a multiple of DAQP's.
+SLOWLY_OUT = "start in penetration"  # In this motion arms move apart at 50 mm/s, and a tick has up to 80 rows.
+REST, RESTED = 1e-3, 0.02  # Arms rest if all joints are slower than this [rad/s] for this time [s].
+TRACKING = 1.05  # Largest tracking error with another solver, as a multiple of the error with DAQP.
 ROUNDING = 1e-9
 MOTIONS = {name: case for name, case in CASES.items() if case.fault is None}
 SHORTEST = ("crossing", "circle", SLOWLY_OUT)  # These motions run with the other short tests.
@@ -29,9 +29,9 @@ SHORTEST = ("crossing", "circle", SLOWLY_OUT)  # These motions run with the othe
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """One run, in which the tools follow their targets and then hold."""
+    """One run, in which the tools first follow their targets and the arms then hold."""
 
-    references: list[Reference]  # References of the time with targets.
+    references: list[Reference]  # The references while the arms have targets.
     error: float  # RMS error of the tool that is farther from its target [m].
     unsolved: int  # Number of ticks without a solution.
     rested: bool | None  # None if the test does not wait for rest.
@@ -65,7 +65,7 @@ def motion(solver: str, name: str) -> Motion:
 
 
 def _comes_to_rest(driven: Driven) -> bool:
-    """Return whether the arms rest in time after their targets ended. The contract is checked meanwhile too."""
+    """Let the arms hold, and return whether they come to rest within ``RESTING``. The contract is checked too."""
     driven.dt, slow = DT, 0.0
     for _ in range(round(RESTING / DT)):
         slow = slow + DT if np.abs(driven.drive(DT, {}).v).max() < REST else 0.0
@@ -80,7 +80,7 @@ def _every(solver: str, name: str) -> pytest.ParameterSet:
 
 
 @pytest.mark.parametrize(("solver", "name"), [_every(solver, name) for solver in NAMES for name in MOTIONS])
-def test_arms_keep_the_contract_and_come_to_rest(solver: str, name: str) -> None:
+def test_arms_keep_the_contract_come_to_rest_and_follow_as_well_as_with_daqp(solver: str, name: str) -> None:
     run = motion(solver, name)
     assert run.rested is not False
     assert run.unsolved <= 0.01 * len(run.references)
@@ -89,13 +89,13 @@ def test_arms_keep_the_contract_and_come_to_rest(solver: str, name: str) -> None
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Limits of a run from the robot and the settings, without the controller's own data."""
+    """The limits of a run, computed from the robot and the settings and not from the controller's own data."""
 
     lower: Array  # (nv,) [rad]
     upper: Array  # (nv,) [rad]
     velocity: Array  # (nv,) [rad/s]
     acceleration: Array  # (nv,) [rad/s^2]
-    distances: Array  # Distances of each pair (p,) [m].
+    distances: Array  # (p,) Distance that each pair keeps [m].
 
 
 def limits_of(controller: CartesianController) -> Limits:
@@ -114,7 +114,10 @@ def from_rest(case: Case) -> bool:
 
 
 def assert_within(limits: Limits, references: list[Reference]) -> None:
-    """Check ticks of ``DT`` from rest on. A tick follows a parabola, so that positions determine the velocities."""
+    """Check that ``references``, which are ``DT`` [s] apart and begin at rest, keep the limits and the distances.
+
+    Within a tick the motion is a parabola, so positions and velocities have to agree.
+    """
     q = np.array([reference.q for reference in references])
     v = np.array([reference.v for reference in references])
     assert (q >= limits.lower - ROUNDING).all()
@@ -130,7 +133,9 @@ def assert_within(limits: Limits, references: list[Reference]) -> None:
 @pytest.mark.parametrize(
     ("solver", "name"), [_every(solver, name) for solver in NAMES for name in MOTIONS if from_rest(MOTIONS[name])]
 )
-def test_limits_and_distances_hold_at_every_tick_by_simple_arithmetic_and_coal(solver: str, name: str) -> None:
+def test_limits_and_distances_hold_at_every_tick_as_checked_with_simple_arithmetic_and_coal(
+    solver: str, name: str
+) -> None:
     assert_within(limits_of(controller_with(solver)), motion(solver, name).references)
 
 
@@ -157,8 +162,8 @@ def test_a_reachable_motion_is_followed_within_millimetres() -> None:
     assert 1e-3 < motion("daqp", "circle").error < 5e-3
 
 
-def test_targets_that_meet_bring_the_arms_within_millimetres_of_the_distance_they_keep() -> None:
-    """The motions of this file really press pairs against their distances, so that a solver needs the rows."""
+def test_crossing_targets_bring_pairs_within_millimetres_of_their_kept_distances() -> None:
+    """Motions of this file bring pairs to their kept distances. A solver therefore has to use the separation rows."""
     controller = controller_with("daqp")
     controller.reset(ROBOT.home)
     left, right = controller.tool_pose("left"), controller.tool_pose("right")

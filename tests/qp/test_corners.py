@@ -1,4 +1,4 @@
-"""Where limits leave hardly any room, the QP still has a solution, and every solver's answer keeps the contract."""
+"""In extreme states, which limits hardly allow, the QP still has a solution, and every solver keeps the contract."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ CORNERS: dict[str, Callable[[Robot], Corner]] = {
 
 
 def moved(controller: CartesianController, way: pin.Motion) -> dict[str, pin.SE3]:
-    """Return targets that are ``way`` (3,) [m] away from the tools' poses."""
+    """Return the tool poses, displaced by the translation and rotation vector in ``way`` [m], [rad]."""
     poses = {arm: controller.tool_pose(arm) for arm in ROBOT.arms}
     turn = pin.exp3(way.angular)
     return {arm: pin.SE3(turn @ pose.rotation, pose.translation + way.linear) for arm, pose in poses.items()}
@@ -99,7 +99,7 @@ def test_the_box_is_never_empty_and_all_numbers_are_finite(name: str) -> None:
 
 @pytest.mark.parametrize("name", CORNERS)
 @pytest.mark.parametrize("solver", each_solver())
-def test_every_tick_from_a_corner_is_solved_and_keeps_the_contract(solver: str, name: str) -> None:
+def test_every_tick_from_an_extreme_state_is_solved_and_keeps_the_contract(solver: str, name: str) -> None:
     q, v, way = CORNERS[name](ROBOT)
     driven = Driven(controller_with(solver), q, v, DT)
     targets = moved(driven.controller, way)
@@ -127,13 +127,13 @@ def test_a_joint_at_its_limit_that_still_moves_towards_it_brakes_as_hard_as_poss
             reference = driven.drive(DT, driven.start)
             unsolved += reference.report.unsolved
         assert sign * reference.v[joint] == pytest.approx(abs(v[joint]) - TICKS * braking[joint] * DT, abs=1e-6)
-    # OSQP finds no solution in some ticks in which an elbow is folded into its own arm and 48 rows contradict each
-    # other. The arm then brakes, as with a solution.
+    # In some ticks an elbow is folded into its own arm, and 48 rows contradict each other. OSQP finds no solution then.
+    # The arm brakes, as it does with a solution.
     assert unsolved <= (0.15 if solver == "osqp" else 0.0) * TICKS * len(joints)
 
 
 @pytest.mark.parametrize("solver", each_solver())
-def test_arms_in_penetration_part_at_the_permitted_speed(solver: str) -> None:
+def test_arms_in_penetration_move_apart_at_the_permitted_speed(solver: str) -> None:
     q, v = in_penetration(ROBOT)
     driven = Driven(controller_with(solver), q, v, DT)
     before = driven.drive(0.05, {}).report.margin

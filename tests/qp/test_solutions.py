@@ -1,4 +1,4 @@
-"""The QP has one solution. Every solver finds that of brute force for small problems, and that of DAQP in motions."""
+"""The QP has one solution. Every solver finds the solution of brute force in small problems, and of DAQP in motions."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def solver_of(name: str, nv: int) -> Solver:
 
 
 def small(random: np.random.Generator, rows: list[list[float]], lower: list[float], hard: int = 0) -> QpProblem:
-    """Return a problem of four joints, some of which meet the box, with these rows."""
+    """Return a problem of four joints with the given ``rows``. Without rows, its box is active for some joints."""
     J = random.normal(size=(3, NV))
     matrix = np.array(rows, dtype=float).reshape(-1, NV)
     matrix /= np.linalg.norm(matrix, axis=1, keepdims=True)
@@ -52,7 +52,7 @@ def _at_hardly_any_cost(random: np.random.Generator) -> QpProblem:
 
 
 def corners() -> dict[str, QpProblem]:
-    """Return problems in which a usual part is missing, is contradictory, or leaves no choice."""
+    """Return problems in which a usual part is missing, contradicts another part, or leaves no choice."""
     random = np.random.default_rng(11)
     return {
         "no rows": small(random, [], []),
@@ -89,7 +89,7 @@ def _assert_solved(solution: QpSolution, problem: QpProblem, expected: Array, ac
 
 
 @pytest.mark.parametrize("corner", CORNERS)
-def test_no_other_point_of_the_box_costs_less_than_that_of_brute_force(corner: str) -> None:
+def test_no_other_feasible_point_costs_less_than_the_solution_of_brute_force(corner: str) -> None:
     problem, best = CORNERS[corner], brute_force(corner)
     random, least = np.random.default_rng(2), cost_of(problem, best)
     for size in (1e-3, 1e-2, 0.1, 1.0):
@@ -122,14 +122,14 @@ def test_a_solver_finds_the_brute_force_solutions_of_random_problems(name: str) 
 
 
 class Noting:
-    """DAQP that keeps a copy of every problem that needs a solver."""
+    """A solver that calls DAQP, and keeps every problem whose solution is not the minimum of its cost alone."""
 
     def __init__(self) -> None:
         self._solver, self.problems = DaqpSolver(ROBOT.model.nv), list[QpProblem]()
 
     def solve(self, problem: QpProblem) -> QpSolution:
         if problem.minimum is None:
-            self.problems.append(problem)  # The problem is a copy already, because it shares no data with a solver.
+            self.problems.append(problem)  # The problem is a copy already, because every solver but ours gets copies.
         return self._solver.solve(problem)
 
 
@@ -146,7 +146,7 @@ MOTIONS = {
 
 @cache
 def problems_of(motion: str) -> list[QpProblem]:
-    """Return ten problems of 0.6 s, evenly spread among those that need a solver."""
+    """Return ten problems from 0.6 s of a motion, evenly spread among the problems that need a solver."""
     scenario, start = MOTIONS[motion]
     noting = Noting()
     controller = CartesianController(ROBOT, ControllerSettings(), solver=noting)
@@ -169,13 +169,13 @@ def test_a_solver_finds_daqps_solution_of_each_problem_of_a_motion(name: str, mo
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_solver_finds_a_solution_where_the_box_hardly_allows_similar_rows(name: str) -> None:
+def test_a_solver_finds_a_solution_if_the_box_hardly_allows_three_similar_rows(name: str) -> None:
     nv, up, unsolved = 7, np.full(7, 0.1), 0
     for seed in range(20):
         random = np.random.default_rng(seed)
         rows = random.normal(size=nv) + 0.1 * random.normal(size=(3, nv))
         rows /= np.linalg.norm(rows, axis=1)[:, None]
-        # The rows demand about what the box allows.
+        # The rows demand about as much as the box allows.
         lower = 0.1 * np.abs(rows).sum(axis=1) * random.uniform(0.95, 1.05, 3)
         problem = QpProblem(300.0 * np.eye(nv), np.zeros(nv), -up, up, rows, lower)
         v = solver_of(name, nv).solve(problem).v
@@ -194,8 +194,8 @@ def test_daqp_through_qpsolvers_equals_daqp_called_directly() -> None:
             _assert_solved(through.solve(problem), problem, expected, 1e-8)
 
 
-def test_slacks_of_the_public_problem_are_what_the_rows_give_way_by_and_cost_what_they_should() -> None:
-    """At its solution, x = [v; s] of ``CartesianController.problem`` has the same cost as f at v."""
+def test_slacks_of_the_public_problem_equal_the_violations_of_rows_and_have_the_same_cost() -> None:
+    """The solution x = [v; s] of the problem that ``CartesianController.problem`` returns costs the same as f at v."""
     for motion in ("targets that cross", "recovery from penetration"):
         for problem in problems_of(motion):
             nv, public = len(problem.g), slack_problem(problem)
@@ -207,8 +207,8 @@ def test_slacks_of_the_public_problem_are_what_the_rows_give_way_by_and_cost_wha
             assert public_cost == pytest.approx(cost_of(problem, x[:nv]), rel=1e-6, abs=1e-9)
 
 
-def test_motions_press_many_rows_at_once_and_some_give_way() -> None:
-    """Otherwise, the agreement of solvers would be only about boxes."""
+def test_in_the_motions_many_rows_are_active_at_once_and_some_are_violated() -> None:
+    """If no row were active, the comparison of solvers would only cover the box."""
     pressed, gave_way = 0, 0
     for motion in ("targets that cross", "recovery from penetration"):
         for problem in problems_of(motion):

@@ -1,5 +1,6 @@
-"""Places of joints, bodies and tools, and distances of bodies: kernels over a robot's joint tree and its shapes.
+"""Kernels that compute the poses of joints and bodies, and the distances of bodies.
 
-``kinematics`` places joint frames; ``collision`` holds the bodies and monitored pairs and places them;
-``closest_points`` knows segments and boxes; ``pair_distance`` measures pairs and gives their gradients.
+``kinematics`` computes the poses of joint frames. ``collision`` holds the bodies and monitored pairs, and computes the
+poses of the bodies. ``closest_points`` computes the closest points of segments and boxes. ``pair_distance`` computes
+the distances of pairs and their gradients.
 """

@@ -1,8 +1,9 @@
 """Compute the closest points and the signed distances of segments and boxes (compiled).
 
 A capsule is the set of points within ``radius`` of a segment. The distance of two capsules is therefore the distance of
-their segments minus both radii. A sphere is a capsule whose segment is a point. Because the radius only shifts the
-distance, it stays exact, and its gradient smooth, well into penetration, until the segments themselves meet.
+their segments minus both radii. A sphere is a capsule whose segment is a point. The radii only shift the distance.
+The distance therefore stays exact when capsules penetrate each other, and its gradient stays smooth, until the segments
+themselves meet.
 """
 
 from __future__ import annotations
@@ -49,17 +50,17 @@ def clamp(value: float, lower: float, upper: float) -> float:
 def segment_segment(a0: Array, a1: Array, b0: Array, b1: Array, on_a: Array, on_b: Array) -> float:
     """Return the distance [m] of segments a0-a1 and b0-b1, each (3,). The closest points are written too.
 
-    The kernel minimises the convex quadratic |a(s) - b(t)|^2 over the unit square. It takes the free minimum of s, then
-    t for it, then s again for the clamped t (Ericson, Real-Time Collision Detection, 2005, section 5.1.9). The closest
-    points are written into ``on_a`` and ``on_b`` (3,).
+    The kernel minimises the convex quadratic |a(s) - b(t)|^2 over the unit square. It takes s at the unconstrained
+    minimum, then the best t for this s, then the best s again if t was clamped (Ericson, Real-Time Collision Detection,
+    2005, section 5.1.9). The closest points are written into ``on_a`` and ``on_b`` (3,).
     """
     aa, bb, ab, ar, br = products(a0, a1, b0, b1)
     s, t = 0.0, 0.0
     if aa > _TINY and bb > _TINY:
         determinant = aa * bb - ab * ab
-        # Parallel segments have many pairs of closest points. The middle of the overlap changes least if they tilt. Its
-        # distance is too large by at most half the overlap times the angle. Therefore only segments with an angle below
-        # 1e-7 count as parallel.
+        # Parallel segments have many pairs of closest points. The middle of the overlap changes least if the segments
+        # tilt. The distance there is too large by at most half the overlap times the angle. Therefore only segments
+        # with an angle below 1e-7 rad count as parallel.
         if determinant > 1e-14 * aa * bb:
             s = clamp((ab * br - ar * bb) / determinant, 0.0, 1.0)
         else:
@@ -97,19 +98,19 @@ def products(a0: Array, a1: Array, b0: Array, b1: Array) -> tuple[float, float, 
 
 @kernel
 def _middle_of_overlap(aa: float, ab: float, ar: float) -> float:
-    """Return, for parallel segments, the parameter on a of the middle of the part that b covers."""
-    start, end = -ar / aa, (ab - ar) / aa  # Parameters of b on a.
+    """Return the parameter on segment a of the middle of the part that the parallel segment b covers."""
+    start, end = -ar / aa, (ab - ar) / aa  # Parameters on a of both ends of b.
     return 0.5 * (clamp(start, 0.0, 1.0) + clamp(end, 0.0, 1.0))
 
 
 @kernel
 def segment_box(a0: Array, a1: Array, half: Array, on_a: Array, on_box: Array, normal: Array) -> float:
-    """Return the signed distance [m] of a segment and a box of half sides ``half``, all in the box frame, (3,).
+    """Return the signed distance [m] of a segment and a box of half sides ``half`` (3,), in the frame of the box.
 
     The closest points and the unit normal from the segment to the box are written. The squared distance along the
     segment is convex and piecewise quadratic. Its pieces meet at the parameters, six at most, at which the segment
-    crosses the plane of a face. Between two of them, the zero of the slope is found exactly. A segment that enters the
-    box is pushed out on the shortest way.
+    crosses the plane of a face. Between two such parameters, the zero of the slope is found exactly. If the segment
+    enters the box, the distance is minus the length of the shortest translation that takes it out.
     """
     s = _minimum_along(a0, a1, half)
     for k in range(3):
@@ -136,10 +137,11 @@ def _slope_along(a0: Array, a1: Array, half: Array, s: float) -> float:
 
 @kernel
 def _minimum_along(a0: Array, a1: Array, half: Array) -> float:
-    """Return the parameter of the minimum. If many share it (a segment along a face), it is the middle of them.
+    """Return the parameter s at which the distance is least; the middle if it is least on an interval.
 
-    The slope never falls. The largest break with a negative slope and the smallest break with a positive slope
-    therefore enclose all minima. Between them there are only breaks at which the slope is zero.
+    It is least on an interval if the segment runs along a face. A break is a parameter at which the segment crosses the
+    plane of a face. The slope never falls with s. The largest break with a negative slope and the smallest break with a
+    positive slope therefore enclose all minima. Between them, the slope is zero at every break.
     """
     low, low_slope = 0.0, _slope_along(a0, a1, half, 0.0)
     high, high_slope = 1.0, _slope_along(a0, a1, half, 1.0)
@@ -178,11 +180,12 @@ def _minimum_along(a0: Array, a1: Array, half: Array) -> float:
 
 @kernel
 def _push_out(a0: Array, a1: Array, half: Array, on_a: Array, on_box: Array, normal: Array) -> float:
-    """Return the shortest way out of the box for a segment that enters it.
+    """Return minus the depth of a segment that enters the box [m]; the closest points and the normal are written.
 
-    It leads to the nearest face of their Minkowski difference (Cameron, ICRA 1997). These faces belong to the faces of
-    the box, and to each of its edges with the segment. Without the latter, the depth would jump when a segment begins
-    to cut an edge.
+    The depth is the length of the shortest translation that takes the segment out of the box. The translation leads to
+    the nearest face of the Minkowski difference of both (Cameron, ICRA 1997). Such a face comes from a face of the box,
+    or from an edge of the box together with the segment. Without the faces from edges, the depth would jump when a
+    segment begins to cut an edge.
     """
     best, axis, sign, edge = np.inf, 0, 1.0, -1
     least = 1e-6 * way_between(a0, a1)
@@ -205,18 +208,19 @@ def _push_out(a0: Array, a1: Array, half: Array, on_a: Array, on_box: Array, nor
         normal[k] = 0.0
         on_box[k] = on_a[k]
     on_box[axis] = sign * half[axis]
-    normal[axis] = -sign  # The normal leads from the segment into the box, against the way out.
+    normal[axis] = -sign  # The normal points from the segment into the box, against the translation.
     return -best
 
 
 @kernel
 def _depth_across(a0: Array, a1: Array, half: Array, k: int, least: float, normal: Array) -> float:
-    """Return the way out of the box across its edges along the axis ``k`` [m].
+    """Return how far the segment has to move to leave the box across an edge that is parallel to the axis ``k`` [m].
 
-    ``normal`` is written. It leads from the segment into the box.
+    Infinite if the segment itself is parallel to this axis. ``normal`` is written. It points from the segment into the
+    box.
     """
     i, j = (k + 1) % 3, (k + 2) % 3
-    # The way out is along the cross product e_k x (a1 - a0).
+    # The translation is along the cross product e_k x (a1 - a0).
     x, y = a0[j] - a1[j], a1[i] - a0[i]
     size = np.sqrt(x * x + y * y)
     if size <= least:
@@ -230,7 +234,10 @@ def _depth_across(a0: Array, a1: Array, half: Array, k: int, least: float, norma
 
 @kernel
 def _across_edge(a0: Array, a1: Array, half: Array, k: int, on_a: Array, on_box: Array, normal: Array) -> None:
-    """Write where the segment crosses the box's edge along axis ``k`` when it leaves against ``normal``."""
+    """Write the closest points of the segment and the edge across which it leaves the box, against ``normal``.
+
+    The edge is parallel to the axis ``k``.
+    """
     i, j = (k + 1) % 3, (k + 2) % 3
     for axis in (i, j):
         on_box[axis] = -half[axis] if normal[axis] > 0.0 else half[axis]

@@ -1,4 +1,4 @@
-"""A robot's collision geometries and monitored pairs as arrays, and their places at a posture (compiled).
+"""A robot's collision geometries and monitored pairs as arrays, and the geometries' poses at a posture (compiled).
 
 Every geometry is a segment with a radius (capsule, sphere) or a box. A pair lists only the joints that move one of its
 bodies relative to the other.
@@ -23,10 +23,11 @@ from q2r2_control.types import Array
 class CollisionBodies(NamedTuple):
     """The collision geometries, each in the frame of its joint.
 
-    Start and end of fingers change. Radius and size of fingers that turn change too, see :mod:`finger_openings`.
+    For a sliding finger, ``start`` and ``end`` change with its opening. For a turning finger, ``radius`` and ``size``
+    change too, see :mod:`finger_openings`.
     """
 
-    joint: IntArray  # (g,) Number of the joint; 0 is the world.
+    joint: IntArray  # (g,) Number of the joint that carries the geometry; 0 is the world.
     box: IntArray  # (g,) 1 for a box, 0 for a segment.
     start: Array  # (g, 3) Start of the segment, or centre of the box [m].
     end: Array  # (g, 3) End of the segment [m].
@@ -58,7 +59,7 @@ class CollisionModel(NamedTuple):
 
 
 class BodyPlacements(NamedTuple):
-    """Geometries in the world, written by :func:`update_placements`."""
+    """Poses of the geometries in the world frame, written by :func:`update_placements`."""
 
     start: Array  # (g, 3) [m]
     end: Array  # (g, 3) [m]
@@ -66,13 +67,13 @@ class BodyPlacements(NamedTuple):
 
 
 class Contact(NamedTuple):
-    """The pair that was measured last, in the world."""
+    """The closest points of the pair that was measured last, in the world frame."""
 
     first: Array  # (3,) The closest point of the first body [m].
     second: Array  # (3,) The closest point of the second body [m].
     normal: Array  # (3,) Unit vector from the first to the second body.
-    local: Array  # (3, 3) Scratch.
-    kept: Array  # (2, 3) Scratch: closest points that are needed after another part has been measured.
+    local: Array  # (3, 3) Buffer for vectors in the frame of a box.
+    kept: Array  # (2, 3) Buffer for closest points that are needed after another part has been measured.
 
     @classmethod
     def empty(cls) -> Contact:
@@ -80,7 +81,7 @@ class Contact(NamedTuple):
 
 
 class CollisionData(NamedTuple):
-    """A posture, written by :func:`update_placements`, and scratch to measure a pair there."""
+    """Poses of joints and bodies at a posture, written by :func:`update_placements`, and the last measurement there."""
 
     placements: Placements
     posed: BodyPlacements
@@ -103,7 +104,8 @@ def collision_model_of(robot: Robot, geometry: pin.GeometryModel | None = None) 
     chain, bodies = chain_of(robot.model), bodies_of(geometry)
     travel = np.maximum(np.abs(robot.position_lower), np.abs(robot.position_upper))
     extent = farthest_of(bodies)
-    # Capsules of other intervals may reach beyond the capsule of the whole interval.
+    # A turning finger has one capsule for each interval of openings. The capsule of a part of the whole interval may
+    # reach beyond the capsule of the whole interval.
     for number, finger in turning_bodies(robot):
         extent[number] = max(extent[number], finger.extent)
     return CollisionModel(chain, bodies, pairs_of(geometry, chain, bodies, travel, extent))
@@ -145,7 +147,7 @@ def turning_bodies(robot: Robot) -> list[tuple[int, TurningBody]]:
 
 
 def farthest_of(bodies: CollisionBodies) -> Array:
-    """Return the farthest distance of segments and boxes from the origins of their joints' frames (g,) [m]."""
+    """Return the greatest distance of each segment or box from the origin of its joint's frame (g,) [m]."""
     ends = np.maximum(np.linalg.norm(bodies.start, axis=1), np.linalg.norm(bodies.end, axis=1))
     return np.asarray(np.linalg.norm(bodies.half, axis=1) + ends)
 
@@ -158,7 +160,8 @@ def pairs_of(model: pin.GeometryModel, chain: Chain, bodies: CollisionBodies, tr
         chain: The joints.
         bodies: The bodies of ``model``.
         travel: Greatest distance of each joint from zero (nv,) [rad or m].
-        extent: A bound (g,) on :func:`farthest_of` the bodies, which holds for all their later changes [m].
+        extent: For each body, a bound (g,) on the distance of its segment or box from its joint's origin [m]. The bound
+            still holds after bodies of fingers change.
 
     Raises:
         RobotError: If both bodies of a pair are boxes, because no kernel measures such a pair.
@@ -175,7 +178,7 @@ def pairs_of(model: pin.GeometryModel, chain: Chain, bodies: CollisionBodies, tr
         for body, sign in ((first, -1.0), (second, 1.0)):
             farthest = extent[body]
             joint = int(bodies.joint[body])
-            # On the way to the base, the bound grows by the offset of each link, and by the travel of each slide.
+            # Towards the base, the bound grows by the offset of each link, and by the travel of each sliding joint.
             while joint != 0:
                 if chain.prismatic[joint]:
                     farthest += travel[joint - 1]
@@ -199,7 +202,7 @@ def pairs_of(model: pin.GeometryModel, chain: Chain, bodies: CollisionBodies, tr
 
 @kernel
 def update_placements(model: CollisionModel, data: CollisionData, q: Array) -> None:
-    """Write the joint frames and the geometries in the world at ``q`` (nv,)."""
+    """Write the poses of the joint frames and the geometries in the world frame, at the posture ``q`` (nv,)."""
     bodies, placements, posed = model.bodies, data.placements, data.posed
     place(model.chain, q, placements)
     for g in range(bodies.joint.shape[0]):

@@ -1,10 +1,11 @@
-"""The bodies of the fingers in one collision model, for the known openings of their grippers.
+"""Fit the bodies of fingers in a collision model to the known openings of their grippers.
 
-They are changed in place, where the kernels read them. Let a sliding finger count as a part of its way. This part is
-nowhere farther from a joint's axis than the whole way (``Pairs.reach``, ``leverage``). It also fits into a ball of the
-same size about its own middle (``CollisionBodies.size``). Every bound that uses these numbers therefore stays valid. A
-finger that turns has another capsule, radius and size for each interval. Its ``reach`` and ``leverage`` come from the
-farthest one (``collision_model_of``).
+The arrays of the bodies are changed in place, where the kernels read them. The body of a sliding finger is the part of
+its path that belongs to the known openings. This part is nowhere farther from a joint's axis than the whole path
+(``Pairs.reach``, ``leverage``). It also fits into a ball of the same size about its own middle
+(``CollisionBodies.size``). Every bound that uses these numbers therefore stays valid. A turning finger has a separate
+capsule, radius and size for each interval of openings. Its ``reach`` and ``leverage`` come from the capsule that
+reaches farthest (``collision_model_of``).
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.robot.turning_fingers import Capsules, TurningBody, TurningSweeps, sticks_out
 from q2r2_control.types import ALL_OF_THE_WAY, Interval
 
-# Number of intervals whose capsules are kept. A gripper that is held asks again and again for the same intervals.
+# Number of intervals whose capsules are kept. A gripper that does not move needs the same intervals again and again.
 _REMEMBERED = 16
 
 
@@ -31,7 +32,7 @@ class FingerOpenings:
     """The interval of openings of each arm's gripper. At first, it is the whole interval."""
 
     def __init__(self, robot: Robot, bodies: CollisionBodies) -> None:
-        """Begin with the ``bodies`` of ``robot``, in which fingers sweep their whole way."""
+        """Begin with the ``bodies`` of ``robot``, in which fingers sweep their whole path."""
         self.intervals: dict[str, Interval] = dict.fromkeys(robot.arms, ALL_OF_THE_WAY)
         self._bodies = bodies
         names = [geometry.name for geometry in robot.collision_model.geometryObjects]
@@ -47,7 +48,7 @@ class FingerOpenings:
         self._parts: dict[int, tuple[float, float]] = {}
 
     def checked(self, arm: str, least: float, greatest: float) -> Interval:
-        """Return the interval in a form that can be set; raises :class:`RobotError` if it is not an interval."""
+        """Return the interval, clamped to [0, 1], for :meth:`set`; raises :class:`RobotError` if it is no interval."""
         usable = all(isinstance(value, int | float | np.floating) for value in (least, greatest))
         if not (usable and -math.inf < least <= greatest < math.inf):
             raise RobotError(
@@ -56,10 +57,10 @@ class FingerOpenings:
         return float(min(max(least, 0.0), 1.0)), float(min(max(greatest, 0.0), 1.0))
 
     def set(self, arm: str, interval: Interval) -> IntArray:
-        """Let an arm's fingers sweep ``interval``. Return 1 for each body that has grown, else 0 (g,).
+        """Let the bodies of an arm's fingers cover ``interval``. Return 1 for each body that has grown, else 0 (g,).
 
-        A body has grown if it is not within its former volume. A sliding finger grows only with a wider interval. A
-        turning finger may also grow with a narrower one.
+        A body has grown if it is not within its former volume. A sliding finger grows only if the interval gets wider.
+        A turning finger may also grow if the interval gets narrower.
         """
         grown: IntArray = np.zeros(len(self._bodies.joint), dtype=np.int64)
         self.intervals[arm] = interval
@@ -95,7 +96,7 @@ class _Turning:
         self._capsules = lru_cache(maxsize=_REMEMBERED)(TurningSweeps([body for _, body in found]).capsules)
 
     def set(self, interval: Interval, grown: IntArray) -> None:
-        """Set the volume of ``interval``, and mark in ``grown`` (g,) the bodies that exceed their last volume."""
+        """Set the capsules for ``interval``, and mark in ``grown`` (g,) the bodies that exceed their last volume."""
         bodies, at = self._bodies, self._indices
         capsules = self._all if interval == ALL_OF_THE_WAY else self._capsules(interval)
         changed = sticks_out(capsules, self._now())

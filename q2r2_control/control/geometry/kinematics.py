@@ -18,7 +18,7 @@ from q2r2_control.types import Array
 
 IntArray = npt.NDArray[np.int64]
 
-_ANY_MOTION = 1e-9  # Least length of a unit axis that is more than rounding.
+_ANY_MOTION = 1e-9  # A column of the Jacobian that is longer than this is a motion, and not only rounding.
 
 
 class Chain(NamedTuple):
@@ -26,13 +26,13 @@ class Chain(NamedTuple):
 
     parent: IntArray  # (n,) Number of the parent joint.
     rotation: Array  # (n, 3, 3) Rotation of the joint's frame in the frame of the parent joint, at zero.
-    translation: Array  # (n, 3) Position of the same frame [m].
+    translation: Array  # (n, 3) Position of the joint's frame in the frame of the parent joint, at zero [m].
     axis: Array  # (n, 3) Unit axis in the joint's frame.
     prismatic: IntArray  # (n,) 1 if the joint slides.
 
 
 class Placements(NamedTuple):
-    """Joint frames in the world, written by :func:`place`."""
+    """Poses of the joint frames in the world frame, written by :func:`place`."""
 
     rotation: Array  # (n, 3, 3)
     translation: Array  # (n, 3) [m]
@@ -76,7 +76,7 @@ def chain_of(model: pin.Model) -> Chain:
 
 @kernel
 def place(chain: Chain, q: Array, placements: Placements) -> None:
-    """Write the world placement of every joint frame at ``q`` (nv,)."""
+    """Write the pose of every joint frame in the world frame at the posture ``q`` (nv,)."""
     for i in range(1, chain.parent.shape[0]):
         parent = chain.parent[i]
         x, y, z = chain.axis[i, 0], chain.axis[i, 1], chain.axis[i, 2]

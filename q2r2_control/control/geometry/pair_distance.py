@@ -5,13 +5,13 @@ For the closest points p1, p2 and the unit normal n from the first body to the s
 
 **Smooth distances** have a gradient that never jumps. Forces that follow the gradient need this. The closest points of
 two parallel segments, or of a segment along a box's face, jump from end to end as the bodies tilt. Here a small cost
-draws their parameters s, t in [0, 1] to the middles of the segments,
+pulls the parameters s, t in [0, 1] of the closest points to the middles of the segments,
 
     D^2 = min |a(s) - b(t)|^2 + e ((s - 1/2)^2 + (t - 1/2)^2).
 
-This makes them unique, and continuous in the posture. By the envelope theorem dD = (b - a)' d(b - a) / D at these
-points. The row of the pair with the normal (b - a) / D, which is slightly shorter than one, is exactly the gradient of
-D. D is larger than the distance d of the cores, by e / (4 d) at most.
+This makes the closest points unique, and continuous in the posture. By the envelope theorem dD = (b - a)' d(b - a) / D
+at these points. The row of the pair with the vector (b - a) / D as its normal is therefore exactly the gradient of D.
+This vector is slightly shorter than one. D is larger than the distance d of the cores, by e / (4 d) at most.
 """
 
 from __future__ import annotations
@@ -32,7 +32,10 @@ from q2r2_control.types import Array
 
 @inlined_kernel
 def at_least(model: CollisionModel, data: CollisionData, p: int) -> float:
-    """Return a cheap lower bound on the distance of pair ``p`` [m], from balls around its bodies, or ball and box."""
+    """Return a cheap lower bound on the distance of pair ``p`` [m].
+
+    It is the distance of two balls around both bodies, or of a ball around the first body and the second body's box.
+    """
     bodies, posed, first, second = model.bodies, data.posed, model.pairs.first[p], model.pairs.second[p]
     square = 0.0
     if bodies.box[second] == 1:
@@ -56,8 +59,8 @@ def at_least(model: CollisionModel, data: CollisionData, p: int) -> float:
 def measure(model: CollisionModel, data: CollisionData, p: int) -> float:
     """Return the signed distance [m] of pair ``p``, and fill ``data.contact``.
 
-    The points lie on the core segments, and not on the surfaces of the capsules. Both differ by a multiple of the
-    normal, which does not change the rate of the distance.
+    The closest points in ``data.contact`` lie on the core segments, and not on the surfaces of the capsules. Points on
+    the core and on the surface differ by a multiple of the normal, which does not change the rate of the distance.
     """
     first = model.pairs.first[p]
     return measure_part(model, data, p, data.posed.start[first], data.posed.end[first])
@@ -90,7 +93,7 @@ def _to_box(start: Array, end: Array, centre: Array, axes: Array, half: Array, c
 
 @kernel
 def _into_box_frame(start: Array, end: Array, centre: Array, axes: Array, local: Array) -> None:
-    """Write two points (3,) of the world, in the frame of the box, into the first rows of ``local``."""
+    """Transform two points (3,) of the world frame into the frame of the box, and write them into ``local``."""
     for k in range(3):
         local[0, k], local[1, k] = 0.0, 0.0
         for row in range(3):
@@ -120,7 +123,10 @@ def _to_segment(start: Array, end: Array, other_start: Array, other_end: Array, 
 
 @kernel
 def _any_normal(a0: Array, a1: Array, b0: Array, b1: Array, normal: Array) -> None:
-    """Write a unit normal of segments that touch. It is normal to both, or between the middles of parallel ones."""
+    """Write a unit normal for two segments that touch.
+
+    It is perpendicular to both segments. If they are parallel, it is the direction from one middle to the other.
+    """
     between = 0.0
     for k in range(3):
         i, j = (k + 1) % 3, (k + 2) % 3
@@ -154,7 +160,7 @@ def distance_row(model: CollisionModel, data: CollisionData, p: int, row: Array)
         row[joint - 1] = sign * (nx * (ay * z - az * y) + ny * (az * x - ax * z) + nz * (ax * y - ay * x))
 
 
-# Greatest share of half the thickness of a box by which its edges are rounded.
+# Largest radius of a box's rounded edges, as a share of half the thickness of the box.
 _THICKEST_SKIN = 0.9
 
 
@@ -166,7 +172,7 @@ def with_rounded_boxes(model: CollisionModel, depth: Array) -> CollisionModel:
     """
     bodies, pairs = model.bodies, model.pairs
     second = pairs.second.copy()
-    number: dict[tuple[int, float], int] = {}  # Numbers of rounded boxes, by their source and skin.
+    number: dict[tuple[int, float], int] = {}  # Index of each rounded box, by its original box and its radius.
     for p in np.flatnonzero((depth > 0.0) & (bodies.box[second] == 1)):
         box = int(second[p])
         skin = min(float(depth[p]), _THICKEST_SKIN * float(bodies.half[box].min()))
@@ -183,15 +189,15 @@ def with_rounded_boxes(model: CollisionModel, depth: Array) -> CollisionModel:
 
 
 def deeper_at_corners(model: CollisionModel, kept: Array) -> Array:
-    """Return by how much more than -``kept`` (p,) [m] pairs that may touch can get into a real corner (p,) [m].
+    """Return by how much deeper than -``kept`` (p,) [m] a body can enter a box at a real, sharp corner (p,) [m].
 
-    It is 0 for all other pairs.
+    Only pairs that may touch (``kept`` below 0) can do so. The result is 0 for all other pairs.
     """
     boxed = (kept < 0.0) & (model.bodies.box[model.pairs.second] == 1)
     return np.where(boxed, (1.0 - 1.0 / np.sqrt(3.0)) * model.bodies.radius[model.pairs.first], 0.0)
 
 
-_HALVINGS = 40
+_HALVINGS = 40  # Number of steps of the bisection.
 
 
 @kernel
@@ -214,7 +220,7 @@ def measure_smooth(model: CollisionModel, data: CollisionData, p: int, smoothing
 
 @kernel
 def _segment_segment(a0: Array, a1: Array, b0: Array, b1: Array, smoothing: float, contact: Contact) -> float:
-    """Return D of two segments [m]. The quadratic is strictly convex, and so no case is degenerate."""
+    """Return D of two segments [m]. The quadratic is strictly convex, so no case is degenerate."""
     aa, bb, ab, ar, br = products(a0, a1, b0, b1)
     aa, bb, ar, br = aa + smoothing, bb + smoothing, ar - 0.5 * smoothing, br + 0.5 * smoothing
     s = clamp((ab * br - ar * bb) / (aa * bb - ab * ab), 0.0, 1.0)
@@ -234,7 +240,7 @@ def _segment_segment(a0: Array, a1: Array, b0: Array, b1: Array, smoothing: floa
 def _segment_box(
     a0: Array, a1: Array, posed: BodyPlacements, half: Array, box: int, smoothing: float, contact: Contact
 ) -> float:
-    """Return D of a segment and a box [m]. The slope of D^2 rises strictly with s, and so bisection finds its zero."""
+    """Return D of a segment and a box [m]. The slope of D^2 rises strictly with s, so bisection finds its zero."""
     axes, centre, start, along = posed.rotation[box], posed.start[box], contact.local[0], contact.local[1]
     _into_box_frame(a0, a1, centre, axes, contact.local)
     along -= start

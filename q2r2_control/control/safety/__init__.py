@@ -1,7 +1,8 @@
-"""The functions that keep every limit and every distance, whatever targets and solver do; the argument is in README.md.
+"""The functions that keep every limit and every distance, whatever targets and solver do. README.md has the argument.
 
-``joint_limits`` bounds the next velocities. ``stop_certificate`` proves a step and the stop after it, by
-``speed_bound`` or, where distances leave no room for that, ``separating_plane``. ``safety_filter`` takes the part of a
-solution that can be certified. ``separation_rows`` are for comfort: they make the solver ask for little else. Each
-takes a ``SafetyModel`` (fixed) and ``SafetyData`` (the reference's state, and what is rewritten at each tick).
+``joint_limits`` bounds the next velocities. ``stop_certificate`` proves that a step and the stop after it are safe. The
+proof uses the bound of ``speed_bound``, or ``separating_plane`` if distances are too small for that bound.
+``safety_filter`` executes as much of the solver's solution as can be certified. ``separation_rows`` are for comfort
+only: with them, the solver seldom asks for motion that cannot be certified. Each function takes a ``SafetyModel``
+(constant within a tick) and ``SafetyData`` (the reference's state, and results that are written at each tick).
 """

@@ -1,31 +1,32 @@
-"""Prove that two arms stay apart if one of them is late, or stands still while the other one stops (compiled).
+"""Prove that two arms stay apart even if one of them is late, or if one of them stops alone (compiled).
 
-One reference moves all arms. Each real arm follows it on its own: the answers of one may come later, and one may stop
-alone. Let a real arm be nowhere but on its own way, which is where the reference had it in the last ``window`` [s], and
-from there to the end of the certified stop.
+One reference moves all arms, but each real arm follows it on its own: one arm may be delayed, and one arm may stop
+alone. The path of an arm has two parts: the postures that the reference had in the last ``window`` [s], and the
+postures from there to the end of the certified stop. It is assumed that each real arm is somewhere on its own path.
 
-**Claim.** Let n be a unit vector and c the distance that two bodies of different arms keep. Of the corners e of both
-bodies (the ends of a segment, the corners of a box) let
+**Claim.** Let n be a unit vector, and c the distance that two bodies of different arms have to keep. The corners e of a
+body are the two ends of a segment, or the eight corners of a box. Let
 
-    min over arm 2's way of n'e_2   -   max over arm 1's way of n'e_1   -   radii   >=   c.
+    min over arm 2's path of n'e_2   -   max over arm 1's path of n'e_1   -   radii   >=   c.
 
-Then the bodies are c apart wherever on its way each arm is, whatever the other one does. *Proof.* The plane between
-them lies beyond all places of either body. []
+Then the distance of the bodies is at least c, wherever on its path each arm is, and whatever the other arm does.
+*Proof.* A plane with the normal n separates all positions of one body from all positions of the other body. []
 
-The ways are examined from instant to instant. Let two of them be a time l apart. Between them, a corner is off the
-straight line between its places by at most l^2/8 of its greatest acceleration. That is at most
+The paths are examined at single instants. Let two neighbouring instants be a time l apart. Between them, a corner
+leaves the straight line between its two positions by at most l^2/8 times its greatest acceleration, which is at most
 
     sum_k reach_k (|a_k| + |v_k| (|v_k| + 2 sum_(i before k) |v_i|))
 
-for speeds v and accelerations a of the joints that move it (separating_plane.py has why).
+for the speeds v and accelerations a of the joints that move the corner (separating_plane.py says why).
 
-**Induction.** A step is taken only if that is proven for the way that ends with its own stop. If it is proven for no
-step, the arms go on along the stop before. That way was proven then, and the window leaves more and more of it behind.
-A window that grows no faster than time passes begins where it began before, and so it needs no proof.
+**Induction.** A step is taken only if the condition of the claim is proven for the path that ends with the step's own
+stop. If it is proven for no step, the arms continue along the previous stop. The path of that stop was proven before,
+and the arms have only a part of it left. A window that grows no faster than time passes begins at the same posture as
+before, so a growing window needs no proof.
 
-Most pairs need no plane. Compared with v t, a joint is off by e_j at most in the window, which is known, and by rho_j
-in the step and the stop (speed_bound.py). Neither body then comes closer to the other by more than its own speed times
-the longer of both times, and what the joints are off.
+Most pairs need no plane. Compare each joint with a motion v t at its present velocity. In the window it deviates from
+this motion by at most e_j, which is known; in the step and the stop it deviates by at most rho_j (speed_bound.py). A
+body therefore comes closer by at most its own speed times the longer of both times, plus the effect of the deviations.
 """
 
 from __future__ import annotations
@@ -45,9 +46,10 @@ _STOP_SPACING = 0.015  # Longest time between two examined instants of a stop [s
 
 @kernel
 def write_way(model: SafetyModel, data: SafetyData, h: float, duration: float) -> None:
-    """Write bounds on all joints along their whole way, with a step of ``h`` and a stop of ``duration`` [s].
+    """Write bounds on the motion of all joints along the whole path: window, step and stop.
 
-    It needs :func:`look_back`, and the data that the other proofs write about the step and the stop.
+    Call :func:`look_back` before, and the functions of the other proofs that write the data of the step and the stop.
+    The step takes ``h`` [s], and the stop takes ``duration`` [s].
     """
     history, v, v_next, candidate = data.history, data.state.v, data.candidate.v, data.candidate
     last = data.rollout.q.shape[0] - 1
@@ -57,7 +59,7 @@ def write_way(model: SafetyModel, data: SafetyData, h: float, duration: float) -
         history.speed[j] = max(abs(v[j]), abs(v_next[j]))
     for j in range(v.shape[0]):
         turned = turning(model.collision, history.speed, j)
-        # The acceleration times h^2 is the change of speed times h, also where h is 0.
+        # The acceleration times h^2 is computed as the change of velocity times h, because h may be 0.
         bent = max(history.bend[0, j], 0.125 * (abs(v_next[j] - v[j]) * h + h * h * turned))
         acceleration = (candidate.deceleration[j] if v_next[j] != 0.0 else 0.0) + turned
         history.bend[1, j] = max(bent, 0.125 * coarse * coarse * acceleration)
@@ -66,7 +68,10 @@ def write_way(model: SafetyModel, data: SafetyData, h: float, duration: float) -
 
 @inlined_kernel
 def _stride(data: SafetyData, duration: float, finely: bool) -> int:
-    """Return the number of samples from one examined instant of a stop to the next, for ``duration`` [s]."""
+    """Return how many samples a stop that takes ``duration`` [s] has from one examined instant to the next.
+
+    With ``finely``, four times as many instants are examined.
+    """
     stride = data.rollout.q.shape[0] - 1
     while stride > 1 and duration * stride / (data.rollout.q.shape[0] - 1) > _STOP_SPACING:
         stride //= 2
@@ -75,9 +80,10 @@ def _stride(data: SafetyData, duration: float, finely: bool) -> int:
 
 @inlined_kernel
 def is_far(model: SafetyModel, data: SafetyData, p: int, time: float) -> bool:
-    """Return whether pair ``p`` of two arms is too far apart to meet on their own ways; see the claim's end.
+    """Return whether pair ``p`` is so far apart that it keeps its distance wherever on its path each arm is.
 
-    ``time`` is the time of the step and the stop, h + T / 2 [s]. It needs :func:`write_way`.
+    The last paragraph of this module's docstring has the proof. ``time`` is h + T / 2 [s], the time that counts for the
+    step and the stop. Call :func:`write_way` before.
     """
     pairs = model.collision.pairs
     speed = speed_of(data.velocities, pairs.first[p]) + speed_of(data.velocities, pairs.second[p])
@@ -87,7 +93,10 @@ def is_far(model: SafetyModel, data: SafetyData, p: int, time: float) -> bool:
 
 @kernel
 def keeps_apart_at_any_time(model: SafetyModel, data: SafetyData, p: int, duration: float, threshold: float) -> bool:
-    """Return whether a plane proves pair ``p`` beyond ``threshold`` [m] at all places of both arms' ways."""
+    """Return whether a separating plane proves that the bodies of pair ``p`` are at least ``threshold`` [m] apart.
+
+    The proof covers every position of both arms on their paths. The stop takes ``duration`` [s].
+    """
     measure(model.collision, data.collision, p)
     pairs, bodies = model.collision.pairs, model.collision.bodies
     first, second = pairs.first[p], pairs.second[p]
@@ -97,7 +106,7 @@ def keeps_apart_at_any_time(model: SafetyModel, data: SafetyData, p: int, durati
     if gap - needed >= way(model, p, data.history.bend[1]):
         return True
     if gap - needed < way(model, p, data.history.bend[2]):
-        return False  # More instants would find no more room.
+        return False  # With more instants the gap only gets smaller, so the finer proof would fail too.
     gap = _lowest_on_way(model, data, second, 1.0, duration, True)
     gap += _lowest_on_way(model, data, first, -1.0, duration, True)
     return gap - needed >= way(model, p, data.history.bend[2])
@@ -107,7 +116,7 @@ def keeps_apart_at_any_time(model: SafetyModel, data: SafetyData, p: int, durati
 def _lowest_on_way(
     model: SafetyModel, data: SafetyData, body: int, side: float, duration: float, finely: bool
 ) -> float:
-    """Return the least place of a ``body``'s core along the normal times ``side``, at all examined instants [m]."""
+    """Return the least coordinate of a ``body``'s core along ``side`` times the normal, over all instants [m]."""
     collision, bodies, history = model.collision, model.collision.bodies, data.history
     normal = data.collision.contact.normal
     lowest = _lowest(bodies, data.collision.posed, body, side, normal)
@@ -127,7 +136,7 @@ def _lowest_on_way(
 
 @inlined_kernel
 def _lowest(bodies: CollisionBodies, posed: BodyPlacements, body: int, side: float, normal: Array) -> float:
-    """Return the least place of a body's core along ``normal`` (3,) times ``side`` [m]."""
+    """Return the least coordinate of a body's core along ``side`` times ``normal`` (3,) [m]."""
     start, end, beside = 0.0, 0.0, 0.0
     for k in range(3):
         start += side * normal[k] * posed.start[body, k]

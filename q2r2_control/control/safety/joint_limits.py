@@ -4,7 +4,7 @@ The reference moves with constant acceleration during a step h <= H (H is the lo
 
     v+ = v + a h,    q+ = q + (v + v+) h / 2.
 
-**Claim.** Let r be the room to the upper limit. If a state satisfies
+**Claim.** Let r be the distance to the upper limit. If a state satisfies
 
     P:  v <= 0 and r >= 0,  or  v^2 / (2 a) + H v <= r,
 
@@ -18,8 +18,8 @@ intervals of the velocity and acceleration limits contain full braking too, and 
 lower limit. Between two steps q stays inside as well, because a velocity that changes its sign within a step travels at
 most |v| h / 2 <= H |v|. []
 
-For a state outside P (beyond a limit, too fast to stop, above the velocity limit) no interval keeps every limit. The
-acceleration limit is kept then, and the joint brakes and returns inward at bounded speed.
+For a state outside P (beyond a limit, too fast to stop, above the velocity limit), no interval keeps every limit. Only
+the acceleration limit is then kept. The joint brakes, and returns inward at bounded speed.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class VelocityBox(NamedTuple):
 def fastest_towards(room: float, v: float, a: float, h: float, longest: float, return_speed: float) -> float:
     """Return the largest next velocity towards a limit that keeps P [rad/s]; see the proof above.
 
-    It solves w^2/(2a) + (H + h/2) w = room - v h / 2 for w. Outside the limit it is a motion inward.
+    It is the solution w of w^2/(2a) + (H + h/2) w = room - v h / 2. Outside the limit it is negative, a motion inward.
 
     Args:
         room: Distance to the limit [rad].
@@ -104,7 +104,7 @@ def next_velocity_box(limits: JointLimits, q: Array, v: Array, h: float, box: Ve
         up = min(up, limits.velocity[j])
         down = max(down, -limits.velocity[j])
         if up < slowest or down > fastest or up < down:
-            # A joint that is outside by rounding does not recover.
+            # A joint that is outside P only by rounding does not count as recovering.
             scale = 1e-9 * (1.0 + abs(v[j]))
             if up < slowest - scale or down > fastest + scale or up < down - scale:
                 inside = False

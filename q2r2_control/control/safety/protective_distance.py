@@ -1,25 +1,27 @@
 """Compute how far arms keep away from obstacles that move on their own (compiled).
 
-**Reach.** No point of an obstacle is farther than reach(s) from where it was s seconds before. From its speed at that
-time, a point gains speed no faster than the obstacle's acceleration, up to its greatest speed.
+**Reach.** reach(s) bounds how far any point of an obstacle moves in the s seconds after a report. The point starts with
+its speed at the report. It gains speed no faster than the obstacle's acceleration, up to the obstacle's greatest speed.
 
 **Claim.** Let a step of h and a stop after it be proven to keep the distance
 
     c + reach(max(A + h, R) + T),    T = max(T_0, max |v_j| / a_j - h),
 
-from the reported pose, of age A, as from a fixed body. R is the age of a usual report, and the joints' velocities are
-limited to a_j T_0. If the obstacle keeps its bounds, the body keeps the distance c from the obstacle itself until it
-rests, whatever is reported later.
+from the obstacle at its reported pose, as if the obstacle were fixed. A is the age of the report, and R the age of a
+usual report. The velocity of each joint j is limited to a_j T_0. If the obstacle keeps its bounds, the arm's body keeps
+the distance c from the moving obstacle until the body rests, whatever is reported later.
 
-*Proof.* A stop of any shape takes max |v+_j| / a_j (stop_rollout.py). The box keeps |v+_j| at or below a_j T_0, or
-brakes fully. The known stop, towards which a solution may be moved, takes no longer. The stop therefore takes at most
-T. Until its end the obstacle is within reach(A + h + T) of the pose. []
+*Proof.* A stop of any shape takes max |v+_j| / a_j (stop_rollout.py). The velocity box keeps |v+_j| at or below a_j
+T_0, or lets joint j only brake fully. The known stop, towards which a solution may be moved, takes no longer. The stop
+therefore takes at most T. Until its end the obstacle is within reach(A + h + T) of the reported pose. []
 
 T_0 falls as an obstacle comes nearer, but no faster than the joints can brake, so that the velocity box is never empty.
-The joints slow down early, and then need less distance. Half of the room to the obstacle is left for the arms' own way.
+The joints slow down early, and then need less distance. The obstacle's reach may take half of the free distance; the
+other half is left for the motion of the arms.
 
-Arms that an obstacle has come too near to may leave its reported place. If the report is old, this may lead to where
-the obstacle is now. T_0 then falls to 0 with the room, and the arms rest until the next report.
+If an obstacle has come too close, the arms may still move away from its reported pose. An old report does not tell
+whether this motion leads to the obstacle. T_0 then falls to 0 with the free distance, and the arms rest until the next
+report.
 """
 
 from __future__ import annotations
@@ -35,31 +37,33 @@ from q2r2_control.control.kernel_pointers import KernelPointer, pointee
 from q2r2_control.control.safety.safety_data import SafetyData, SafetyModel
 from q2r2_control.types import Array
 
-REPORT_AGE = 0.1  # R. If reports come more often, the kept distance does not jump with each of them [s].
-_LEAST_STOP = 0.05  # T_0 of arms close to an obstacle [s].
-_LOST = 0.5  # Age from which a report does not tell any more which motion leads away from the obstacle [s].
-_SHARE = 0.5  # Share of the room to an obstacle that its reach may take.
-# A row asks a pair that is too close to open by this at most [m]. The arms are then not pushed, and can still leave.
+# R [s]. A newer report counts as this old, so that the kept distance does not jump if reports come more often.
+REPORT_AGE = 0.1
+# Least value of T_0 if all reports are new, which it has if arms are close to an obstacle [s].
+_LEAST_STOP = 0.05
+_LOST = 0.5  # If a report is older than this, it does not tell which motion leads away from the obstacle [s].
+_SHARE = 0.5  # Share of the free distance to an obstacle that the obstacle's reach may take.
+# A row asks a pair that is too close to open by at most this [m]. The arms are then not pushed, and can still leave.
 _OPENING = 1e-4
 
 
 class ObstacleData(NamedTuple):
     """The moving obstacles o, and their pairs, which are the last n of all pairs."""
 
-    first: IntArray  # (o + 1,) Index of the first pair of each obstacle among the n pairs, and n.
+    first: IntArray  # (o + 1,) Index of each obstacle's first pair among the n pairs; the last entry is n.
     speed: Array  # (o,) Greatest speed of any point [m/s].
-    slower: Array  # (o,) By how much all points were slower at the report [m/s].
-    rise: Array  # (o,) Least time in which they reach the greatest speed, above 0 [s].
+    slower: Array  # (o,) At the report, all points were slower than ``speed`` by at least this [m/s].
+    rise: Array  # (o,) Least time in which points reach ``speed``; above 0 [s].
     age: Array  # (o,) Age of the report [s].
     kept: Array  # (n,) Distance that each pair keeps [m]; minus infinity if the pair does not count now.
-    buffer: Array  # (n,) By how much earlier the QP stops the pair [m].
+    buffer: Array  # (n,) The QP stops the pair at the kept distance plus this [m].
     velocity: Array  # (nv,) Velocity limits without an obstacle nearby [rad/s].
     stop_time: Array  # (1,) T_0 [s].
 
 
 @kernel
 def reach(obstacles: ObstacleData, o: int, t: float) -> float:
-    """Return how far a point of obstacle ``o`` is at most from its place at the report, ``t`` [s] later [m]."""
+    """Return a bound on how far a point of obstacle ``o`` has moved ``t`` [s] after the report [m]."""
     rising = min(t, obstacles.rise[o])
     lost = obstacles.slower[o] * (rising - 0.5 * rising * rising / obstacles.rise[o])
     return obstacles.speed[o] * t - lost
@@ -107,7 +111,7 @@ def keep_clear(
 def keep_while_stopping(
     model_pointer: KernelPointer, data_pointer: KernelPointer, obstacles_pointer: KernelPointer
 ) -> None:
-    """Write the distances that pairs with obstacles keep during the known stop, before they are measured."""
+    """Write the distances that pairs with obstacles keep during the known stop. Call it before pairs are measured."""
     model, data, obstacles = pointee(model_pointer).safety, pointee(data_pointer).safety, pointee(obstacles_pointer)
     time = 0.0
     for j in range(data.certified.shape[0]):
@@ -122,7 +126,7 @@ def keep_while_stopping(
 
 @inlined_kernel
 def _pair(data: SafetyData, obstacles: ObstacleData, p: int) -> int:
-    """Return the number among all pairs of pair ``p`` of the obstacles."""
+    """Return the index of the obstacles' pair ``p`` among all pairs."""
     return data.distance.shape[0] - obstacles.kept.shape[0] + p
 
 
@@ -134,7 +138,11 @@ def _measure(model: SafetyModel, data: SafetyData, obstacles: ObstacleData, p: i
 
 @inlined_kernel
 def _stop_time(data: SafetyData, obstacles: ObstacleData, o: int, p: int) -> float:
-    """Return the T_0 for which a pair leaves room [s]; infinite for a pair that does not count or does not move."""
+    """Return the largest T_0 with which the reach of obstacle ``o`` takes only its share of the free distance [s].
+
+    The free distance is that of the obstacles' pair ``p``. Infinite if this pair does not count now, or if the obstacle
+    does not move.
+    """
     if obstacles.kept[p] == -np.inf or obstacles.speed[o] == 0.0:
         return np.inf
     room = data.distance[_pair(data, obstacles, p)] - obstacles.kept[p] - obstacles.buffer[p]

@@ -1,4 +1,4 @@
-"""Keep recent postures of the reference, at which lagging arms may still be, for arm_skew.py (compiled)."""
+"""Keep recent postures of the reference, at which delayed arms may still be, for arm_skew.py (compiled)."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from q2r2_control.types import Array
 
 LONGEST_WINDOW = 0.1  # The longest time for which past postures are kept [s].
 _POSTURES = 21
-_SPACING = LONGEST_WINDOW / (_POSTURES - 1)  # Time between two of them, if steps are not longer [s].
-_LONG_AGO = 1e3  # The age of the posture of arms that have rested [s].
+_SPACING = LONGEST_WINDOW / (_POSTURES - 1)  # Time between two postures, if steps are not longer [s].
+_LONG_AGO = 1e3  # The age of the postures of arms that have always rested [s].
 
 
 class ReferenceHistory(NamedTuple):
     """Recent postures of the reference, sorted from the newest to the oldest."""
 
-    window: Array  # (2,) The present window, and the one asked for [s]; 0 if all arms move as one body.
+    window: Array  # (2,) The present window, and the requested window [s]; 0 if all arms move at the same time.
     q: Array  # (m, nv) [rad]
     v: Array  # (m, nv) [rad/s]
     a: Array  # (m, nv) Greatest acceleration from each posture to the next newer one [rad/s^2].
@@ -29,18 +29,19 @@ class ReferenceHistory(NamedTuple):
     known: Array  # (m,) 1 if the bodies of a posture are placed.
     samples: KernelPointers  # (m,) CollisionData at each posture.
     counted: IntArray  # (1,) Number of postures in the window.
-    time: Array  # (1,) Age of the oldest of them [s].
+    time: Array  # (1,) Age of the oldest posture in the window [s].
     travel: Array  # (nv,) Greatest distance of a joint in the window from its present position [rad or m].
     off: Array  # (nv,) Greatest deviation of a joint from v t in the window, plus the effect of turning [rad or m].
     speed: Array  # (nv,) Greatest speed of a joint in the window [rad/s].
-    # How much each joint makes a body's corner leave a straight line (3, nv). The first row is for the window. The two
-    # others are for the whole way, with instants that are far apart, and with instants that are close together.
+    # (3, nv) How much each joint makes a body's corner leave a straight line between two instants [rad or m]. The first
+    # row is for the window. The second row is for the whole path with instants that are far apart, and the third row is
+    # for the whole path with instants that are close together.
     bend: Array
-    deviation: Array  # (nv,) Greatest deviation from v t on the whole way, plus the effect of turning [rad or m].
+    deviation: Array  # (nv,) Greatest deviation from v t on the whole path, plus the effect of turning [rad or m].
 
     @classmethod
     def empty(cls, model: CollisionModel, shared: CollisionData) -> ReferenceHistory:
-        """Return a history of arms at rest at zero. The samples share their scratch with ``shared``."""
+        """Return a history of arms at rest at zero. The samples use the rotations and the contact of ``shared``."""
         nv = len(model.chain.parent) - 1
         samples = []
         for _ in range(_POSTURES):
@@ -108,9 +109,9 @@ def remember(history: ReferenceHistory, q: Array, v: Array, v_next: Array, h: fl
 
 @kernel
 def look_back(model: CollisionModel, history: ReferenceHistory, q: Array, v: Array) -> None:
-    """Compute how far the joints were in the window from the reference ``q``, ``v`` (nv,)."""
+    """Compute how far from the present reference ``q``, ``v`` (nv,) the joints were in the window."""
     if history.window[0] == 0.0 and history.counted[0] == 0:
-        return  # All arms move as one body, and all results are 0 already.
+        return  # All arms move at the same time, and all results are 0 already.
     history.counted[0], history.time[0] = 0, 0.0
     history.travel[:], history.off[:], history.speed[:], history.bend[0, :] = 0.0, 0.0, 0.0, 0.0
     longest, newer, window = 0.0, 0.0, history.window[0]
@@ -149,7 +150,10 @@ def look_back(model: CollisionModel, history: ReferenceHistory, q: Array, v: Arr
 
 @inlined_kernel
 def turning(model: CollisionModel, way: Array, j: int) -> float:
-    """Return w_j (w_j + 2 sum_(i before j) w_i) for ``way`` (nv,): the effect of joint j's motion and turning."""
+    """Return w_j (w_j + 2 sum_(i before j) w_i) for the motions w = ``way`` (nv,) of all joints.
+
+    Times reach_j, it bounds how much joint ``j`` bends the path of a corner, see separating_plane.py.
+    """
     before = 0.0
     joint = model.chain.parent[j + 1]
     while joint != 0:

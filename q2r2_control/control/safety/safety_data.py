@@ -15,22 +15,25 @@ from q2r2_control.control.safety.speed_bound import BodyVelocities
 from q2r2_control.control.safety.tool_speed import ToolLimits, ToolSpeeds
 from q2r2_control.types import Array
 
-# A pair counts as too close if it lacks more than this of its distance, see stop_certificate.py.
+# A pair counts as too close if its distance is smaller than required by more than this, see stop_certificate.py.
 ROUNDING = 1e-9  # [m]
 
 
 class Approach(NamedTuple):
     """The rules by which pairs may approach each other in the QP."""
 
-    stop_distance: Array  # (p,) min_distance plus buffer [m].
-    gain: Array  # (1,) It may change between ticks, see separation_rows.py [1/s].
+    stop_distance: Array  # (p,) Distance at which the QP stops a pair: min_distance plus buffer [m].
+    gain: Array  # (1,) The gain of the rows, see separation_rows.py. It may change between ticks [1/s].
     contact_speed: Array  # (p,) Greatest speed in the contact zone of pairs that may touch; infinite for others [m/s].
-    contact_zone: Array  # (p,) Free distance at which the contact zone begins; 0 for other pairs [m].
-    recovery_speed: float  # [m/s]
+    contact_zone: Array  # (p,) Free distance at which the contact zone begins; 0 for pairs that must not touch [m].
+    recovery_speed: float  # Greatest speed at which a row asks a pair to open [m/s].
 
 
 class SafetyModel(NamedTuple):
-    """Data that do not change in a tick. Between ticks bodies of fingers, kept distances and the gain may change."""
+    """Data that do not change within a tick.
+
+    Three things may change between ticks: the bodies of fingers, the kept distances and the gain.
+    """
 
     collision: CollisionModel
     limits: JointLimits
@@ -42,13 +45,14 @@ class SafetyModel(NamedTuple):
 
 
 _SAMPLES = 65  # Number of samples of a stop, with both ends.
-INSTANTS = (0, 20, 64)  # Samples at which a row looks at the stop: its start, half of its way, and its end.
-# The closest points and four segment ends at each instant, and one row for an arm that follows another one.
+# The samples of a stop for which the QP has rows: its start, about the middle of its path, and its end.
+INSTANTS = (0, 20, 64)
+# At each instant, a row for the closest points and four for segment ends. One more if an arm follows another arm.
 _ROWS_PER_PAIR = 5 * len(INSTANTS) + 1
 
 
 class ReferenceState(NamedTuple):
-    """The reference."""
+    """The state of the reference."""
 
     q: Array  # (nv,) [rad]
     v: Array  # (nv,) [rad/s]
@@ -62,11 +66,11 @@ class SeparationRows(NamedTuple):
     lower: Array  # (m,) [rad/s]
     pair: IntArray  # (m,) The pair of each row.
     used: IntArray  # (1,) Number of valid rows.
-    ahead: Array  # (instants,) Scratch: the distance of a pair at each instant [m].
+    ahead: Array  # (instants,) Buffer for the distance of one pair at each instant [m].
 
 
 class Candidate(NamedTuple):
-    """A state after the step that may be taken, and a stop from there."""
+    """A state that the reference may take after the step, and a stop from there."""
 
     q: Array  # (nv,) [rad]
     v: Array  # (nv,) [rad/s]
@@ -74,10 +78,10 @@ class Candidate(NamedTuple):
 
 
 class QuadraticPiece(NamedTuple):
-    """The motion of the joints in a piece of time.
+    """The motion of the joints in an interval of time.
 
-    Joint j moves by D_j(t) = rate t + change t^2 / 2. If it comes to rest in the piece, all that is known is that D_j
-    is between 0 and ``loose``.
+    Joint j moves by D_j(t) = rate t + change t^2 / 2. If the joint comes to rest in the interval, it is only known that
+    D_j is between 0 and ``loose``.
     """
 
     rate: Array  # (nv,) [rad/s]
@@ -87,16 +91,16 @@ class QuadraticPiece(NamedTuple):
 
 
 class Rollout(NamedTuple):
-    """Samples of a stop, which the stop certificate writes."""
+    """Samples of the candidate's stop, written by stop_rollout.py."""
 
     q: Array  # (s, nv)
     v: Array  # (s, nv)
-    samples: KernelPointers  # (s,) CollisionData at each sample. Frame rotations and contact are shared scratch.
+    samples: KernelPointers  # (s,) CollisionData at each sample. They share the arrays of frame rotations and contact.
     known: Array  # (s,) 1 if the bodies of the sample are placed.
     step: QuadraticPiece  # The step from the reference to the candidate.
-    stop: QuadraticPiece  # The whole stop of the candidate.
+    stop: QuadraticPiece  # The motion of the joints from the candidate to rest.
     piece: QuadraticPiece  # A part of the stop.
-    deviation: Array  # (nv,) Greatest deviation of each joint from motion at its speed, see speed_bound.py [rad or m].
+    deviation: Array  # (nv,) rho + kappa of each joint, see speed_bound.py [rad or m].
 
     @classmethod
     def empty(cls, model: CollisionModel) -> Rollout:
@@ -180,8 +184,9 @@ class SafetyData(NamedTuple):
 def provable_distances(model: SafetyModel, data: SafetyData) -> Array:
     """Return d - S of every pair (p,) [m]: the known stop brings no pair closer than that (stop_certificate.py).
 
-    This also holds for the places where lagging arms may still be, see arm_skew.py. It needs the distances at the
-    present reference. A pair may be asked to keep this distance from now on, since the known stop is certified with it.
+    This also holds for the postures at which delayed arms may still be, see arm_skew.py. ``data`` has to contain the
+    distances at the present reference. From now on, a pair may be required to keep the returned distance: the known
+    stop keeps it.
     """
     pairs, travel = model.collision.pairs, np.maximum(0.5 * data.state.v**2 / data.certified, data.history.travel)
     way = (pairs.reach * travel[pairs.joint - 1]).sum(axis=1)  # The reach is 0 for entries without a joint.

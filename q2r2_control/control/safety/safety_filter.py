@@ -1,7 +1,8 @@
 """Move the reference by the part of the solver's velocities that can be certified (compiled).
 
-The certified stop of the last tick is always known. If nothing better can be certified, its next piece is executed, and
-the rest of it stays certified (stop_certificate.py).
+The data always contain the stop that was certified last; it is called the known stop. If nothing better can be
+certified in a step, the next part of the known stop is executed. The remaining part of it stays certified
+(stop_certificate.py).
 """
 
 from __future__ import annotations
@@ -38,9 +39,10 @@ def apply_safety_filter(
         model: The model.
         data: The data.
         solution: The solver's next velocities (nv,) [rad/s].
-        usable: Whether there is a solution. If not, the certified stop is executed.
+        usable: Whether there is a solution. If not, the known stop is executed.
         h: Duration of the step [s].
-        share: The step's part of the tick, to whose mean acceleration it adds.
+        share: Duration of the step divided by that of the tick: the weight of the step's acceleration in the tick's
+            mean acceleration.
 
     Returns:
         FOLLOWED, REDUCED towards the stop, or STOPPED; and the largest violation of a row [rad/s].
@@ -51,7 +53,7 @@ def apply_safety_filter(
     if usable:
         total = 0.0
         for j in range(q.shape[0]):
-            # A solver's tolerance is larger than the contract's. NaN may pass through clamps, but the sum shows it.
+            # The solution may leave the box by the solver's tolerance. NaN may pass a clamp, but the sum is then NaN.
             total += solution[j]
             data.wanted[j] = clamp(solution[j], data.box.lower[j], data.box.upper[j])
             total += data.wanted[j]
@@ -61,7 +63,7 @@ def apply_safety_filter(
         brake(q, v, data.certified, h, candidate.q, candidate.v)
     remember(data.history, q, v, candidate.v, h)
     for j in range(q.shape[0]):
-        # The velocities keep the acceleration limit. Their difference over a tiny h may exceed it by rounding.
+        # The velocities keep the acceleration limit. Their difference divided by a tiny h may exceed it by rounding.
         limit = model.limits.acceleration[j]
         data.state.a[j] += share * clamp((candidate.v[j] - v[j]) / h, -limit, limit)
         q[j] = candidate.q[j]
@@ -74,9 +76,9 @@ def apply_safety_filter(
 
 @kernel
 def certify_start(model: SafetyModel, data: SafetyData) -> bool:
-    """Find a full stop from the reference that keeps all pairs apart; returns whether there is one.
+    """Find a full stop from the reference that keeps all pairs apart; return whether there is such a stop.
 
-    It becomes the known stop. If no shape of stop can be certified, the joints stop together.
+    The stop that is found becomes the known stop. If no shape of stop can be certified, the joints stop together.
     """
     stay_with_stop(data)
     proven = _some_stop_certified(model, data, 0.0, SHAPES)
@@ -88,11 +90,12 @@ def certify_start(model: SafetyModel, data: SafetyData) -> bool:
 
 @kernel
 def certify_bodies(model: SafetyModel, data: SafetyData, grown: IntArray) -> int:
-    """Return the pair that forbids bodies which have grown since the reference was certified; -1 if there is none.
+    """Return the first pair that does not allow the grown bodies; -1 if all pairs allow them.
 
-    The grown bodies are allowed if each of their pairs keeps its distance at the reference, and the known stop keeps
-    all pairs apart. The invariant then holds as if the bodies had always been so. No other stop is tried, because the
-    arms may already be braking along the known one. A pair that is too close must not be made closer.
+    The bodies have grown since the reference was certified. They are allowed if each of their pairs keeps its distance
+    at the reference, and the known stop keeps all pairs apart. The invariant then holds as if the bodies had always had
+    this size. No other stop is tried, because the arms may already be braking along the known stop. A pair that is too
+    close must not be made closer.
 
     Args:
         model: The model, with the grown bodies.
@@ -103,7 +106,7 @@ def certify_bodies(model: SafetyModel, data: SafetyData, grown: IntArray) -> int
     for p in range(pairs.first.shape[0]):
         if grown[pairs.first[p]] == 1 or grown[pairs.second[p]] == 1:
             any_grown = True
-            if data.distance[p] < model.min_distance[p]:  # No rounding is allowed: the body could have grown less.
+            if data.distance[p] < model.min_distance[p]:  # No rounding is allowed, because the body need not grow.
                 return p
     stay_with_stop(data)
     if not any_grown or certify(model, data, 0.0):
@@ -120,10 +123,10 @@ def _keep_stop(data: SafetyData) -> None:
 
 @kernel
 def _largest_certified(model: SafetyModel, data: SafetyData, h: float) -> int:
-    """Make the wanted velocities the candidate if they can be certified, else the largest share of them that can.
+    """Make the wanted velocities the candidate, or else the largest certified mixture of them and the known stop.
 
-    The certified stop and the wanted velocities both lie in the box. The box is convex, and so every mixture of them
-    lies in it.
+    Returns FOLLOWED, REDUCED or STOPPED. The velocities of the known stop and the wanted velocities both lie in the
+    box. Since the box is convex, every mixture of them lies in it too.
     """
     too_close = False
     for p in range(data.distance.shape[0]):
@@ -134,7 +137,7 @@ def _largest_certified(model: SafetyModel, data: SafetyData, h: float) -> int:
         return FOLLOWED
     unproven = data.unproven[0]
     if unproven >= 0 and is_too_close(model, data, unproven) and not data.state.v.any():
-        return STOPPED  # From rest a smaller motion would also come closer, and trying it takes long with many pairs.
+        return STOPPED  # From rest, a smaller motion would bring the pair closer too. Attempts take long.
     low, high = 0.0, 1.0
     for _ in range(_BISECTIONS):
         share = 0.5 * (low + high)
@@ -151,15 +154,15 @@ def _largest_certified(model: SafetyModel, data: SafetyData, h: float) -> int:
 
 @kernel
 def _certify_mixture(model: SafetyModel, data: SafetyData, share: float, h: float, together: bool) -> bool:
-    """Make a mixture the candidate; returns whether it can be certified with some shape of stop.
+    """Make a mixture the candidate; return whether it can be certified with some shape of stop.
 
     Args:
         model: The model.
         data: The data.
-        share: Share of the wanted velocities, from 0 for the certified stop to 1.
+        share: Share of the wanted velocities in the mixture, from 0 for the known stop to 1.
         h: Duration of the step [s].
-        together: Whether only a stop of all joints together is tried. This is so if a pair is too close: a pair that
-            opens then goes on opening.
+        together: True if a pair is too close. Only a stop of all joints together is then tried: with it, a pair that
+            opens continues to open.
     """
     _mix(data, share, h)
     return _some_stop_certified(model, data, h, 1 if together else SHAPES)
@@ -167,7 +170,10 @@ def _certify_mixture(model: SafetyModel, data: SafetyData, share: float, h: floa
 
 @kernel
 def _some_stop_certified(model: SafetyModel, data: SafetyData, h: float, shapes: int) -> bool:
-    """Try the first ``shapes`` of stops; returns whether one of them certifies the candidate, which keeps it."""
+    """Try the first ``shapes`` shapes of a stop; return whether the candidate is certified with one of them.
+
+    The candidate keeps the stop with which it is certified.
+    """
     data.unproven[0] = -1
     for shape in range(shapes):
         write_stop(model, data.candidate.q, data.candidate.v, shape, data.candidate.deceleration)
@@ -178,7 +184,7 @@ def _some_stop_certified(model: SafetyModel, data: SafetyData, h: float, shapes:
 
 @kernel
 def _mix(data: SafetyData, share: float, h: float) -> None:
-    """Write the candidate as a mixture of the certified stop and a ``share`` of the wanted velocities."""
+    """Write the candidate as a mixture of the known stop and a ``share`` of the wanted velocities."""
     state, candidate = data.state, data.candidate
     for j in range(state.q.shape[0]):
         braked, wanted = data.braked[j], data.wanted[j]
@@ -188,7 +194,7 @@ def _mix(data: SafetyData, share: float, h: float) -> None:
 
 @kernel
 def _note_active(data: SafetyData) -> float:
-    """List the limits and pairs that hold the new velocities back; returns the largest violation of a row [rad/s]."""
+    """List the limits, pairs and tools that hold the new velocities back; return a row's largest violation [rad/s]."""
     v, box, rows, active = data.state.v, data.box, data.rows, data.active
     count = 0
     for j in range(v.shape[0]):
@@ -227,10 +233,11 @@ def _note_too_close(model: SafetyModel, data: SafetyData) -> None:
 
 @kernel
 def measure_pairs(model: SafetyModel, data: SafetyData) -> int:
-    """Measure every pair at the reference; returns the closest one.
+    """Measure the pairs at the reference; return the closest pair.
 
-    It needs the placements and velocities there. ``data.distance`` gets the exact distance of the closest pair and of
-    pairs whose row may bind, and a lower bound for others. ``data.near`` marks the pairs whose row may bind.
+    ``data`` has to contain the placements and velocities of the bodies at the reference. ``data.distance`` gets the
+    exact distance of the closest pair and of pairs whose rows may bind, and a lower bound for other pairs.
+    ``data.near`` marks the pairs whose rows may bind.
     """
     collision, approach, distance, v = model.collision, model.approach, data.distance, data.state.v
     pairs = collision.pairs
@@ -242,16 +249,17 @@ def measure_pairs(model: SafetyModel, data: SafetyData) -> int:
     fastest = 2.0 * fastest_body(data.velocities)
     for p in range(pairs.first.shape[0]):
         data.near[p] = 0
-        if model.min_distance[p] == -np.inf:  # The pair belongs to an object that is not held.
+        if model.min_distance[p] == -np.inf:  # Its object is not held, or its obstacle is not present.
             distance[p] = np.inf
             continue
         distance[p] = at_least(collision, data.collision, p)
-        # The greatest speed at which the pair can close in after this step. A pair that is farther away than the way of
-        # the stop, and twice what the gain needs at that speed, gets no row. Safety needs no row.
+        # Let s be the greatest speed at which the pair can close in after this step. A stop of T uses up s T / 2 of the
+        # free distance. At the speed s a row binds below s / gain. A pair with more than s T / 2 + 2 s / gain gets no
+        # row. Rows are not needed for safety.
         always = approach.stop_distance[p] + approach.contact_zone[p] + horizon * pairs.leverage[p] * surge
         far = distance[p] >= least
         if far and distance[p] > always + horizon * fastest:
-            continue  # This holds for all bodies, so that these need not be measured.
+            continue  # ``fastest`` bounds the approach speed of any two bodies, so this pair needs no measurement.
         first, second = pairs.first[p], pairs.second[p]
         if data.history.window[0] > 0.0 and model.of_two_arms[p] == 1:  # Either arm may stop alone.
             approach_speed = speed_of(data.velocities, first) + speed_of(data.velocities, second)

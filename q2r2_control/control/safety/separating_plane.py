@@ -1,7 +1,8 @@
-"""Prove by a plane between two bodies that they stay apart, if their distance alone leaves no room (compiled).
+"""Prove with a plane between two bodies that they stay apart, if a bound from their distance is too weak (compiled).
 
-The bound by reach (stop_certificate.py) treats every joint as if it moved straight towards the other body. A pair that
-rests at min_distance to the micrometre could then never be proven to part again. Here the direction of motion counts.
+The bound S with the reach of joints (stop_certificate.py) treats every joint as if it moved one body straight towards
+the other body. A pair that rests at its min_distance could then never be proven to move apart again. Here the direction
+of motion counts.
 
 **Claim.** Let n be the unit normal of two convex cores that do not meet, and e_1 and e_2 their corners (the ends of a
 segment, the corners of a box). Let J_e be the Jacobian of a corner at the start, and r the joints' reach. If the joints
@@ -12,14 +13,15 @@ move by D(t) with |D_j(t)| <= w_j, then at every t the distance is at least
     K = 1/2 sum_k r_k w_k (w_k + 2 sum_(i before k) w_i)   over the joints that move one body relative to the other.
 
 *Proof.* The distance of convex sets is the largest gap between them over all directions, hence at least the gap along
-n. That gap is the least over their corners. Joints that carry both bodies change no distance and count as fixed; each
-of the others moves one corner. A corner moves by J_e D and a remainder. Its second derivative with respect to joint i
-and a later joint k of the same chain is a product of rotations about both axes with the lever of the outer one, at most
-r_k. Taylor's remainder is then at most 1/2 sum_ik r_(the outer one) w_i w_k = K. (A slide has reach 1, and turns
-nothing: its second derivative with an inner joint is at most that, with an outer one nothing.) []
+n. That gap is the least over their corners. Joints that carry both bodies change no distance and count as fixed. Each
+of the other joints moves one of the two bodies. A corner moves by J_e D and a remainder. The second derivative of its
+position with respect to joint i and a later joint k of the same chain is a product of rotations about both axes with
+the lever about joint k, which is at most r_k. Taylor's remainder is then at most 1/2 sum_ik r_max(i,k) w_i w_k = K. (A
+sliding joint has reach 1 and turns nothing: its second derivative with an earlier joint is at most 1, and with a later
+joint it is 0.) []
 
-In a step, and between two instants of a stop, D_j(t) is a parabola. A joint that comes to rest meanwhile counts as
-anywhere between its ends. The bound is therefore on a parabola for each two corners.
+In a step, and between two instants of a stop, D_j(t) is a parabola. A joint that comes to rest in between counts as
+anywhere between its start and its end. For each pair of corners, the bound is therefore the minimum of a parabola.
 """
 
 from __future__ import annotations
@@ -39,12 +41,15 @@ from q2r2_control.types import Array
 
 
 class Gap(NamedTuple):
-    """The share of a corner in the gap between the bodies along the normal, in a piece and in the one after it."""
+    """The share of a corner in the gap along the normal between the bodies, in a piece of motion and in the next piece.
+
+    From its start, a piece changes the share by rate t + change t^2 / 2, and by ``loose`` or more.
+    """
 
     now: float  # Share at the start of the piece [m].
     rate: float  # [m/s]
     change: float  # [m/s^2]
-    loose: float  # The least that joints which come to rest add [m].
+    loose: float  # Least change by joints that come to rest in the piece; 0 or negative [m].
     then_rate: float
     then_change: float
     then_loose: float
@@ -63,8 +68,9 @@ def stays_beyond(
 ) -> bool:
     """Return whether the plane between the bodies of pair ``p`` proves that they stay farther apart than ``threshold``.
 
-    This holds in a ``piece`` of motion and in the piece ``then`` after it. Their lengths are in seconds, and the length
-    of ``then`` may be 0. The pair was measured in ``data``, at the start of the piece. ``threshold`` is in metres.
+    The proof covers a ``piece`` of motion, which takes ``length`` [s], and the piece ``then`` after it, which takes
+    ``then_length`` [s], possibly 0. The pair was measured in ``data``, at the start of ``piece``. ``threshold`` is in
+    metres.
     """
     pairs, bodies, posed = model.pairs, model.bodies, data.posed
     first, second = pairs.first[p], pairs.second[p]
@@ -85,7 +91,7 @@ def stays_beyond(
 
 @kernel
 def curvature(pairs: Pairs, p: int, travel: Array, then: Array, share: float) -> float:
-    """Return K_1 + K_2 [m] for ways ``travel`` (nv,) plus a ``share`` of the ways ``then`` (nv,).
+    """Return K_1 + K_2 [m] for joints that travel ``travel`` (nv,) plus a ``share`` of ``then`` (nv,) [rad or m].
 
     The joints of a pair are listed from the base outwards.
     """
@@ -125,7 +131,7 @@ def _gap(
     piece: QuadraticPiece,
     then: QuadraticPiece,
 ) -> Gap:
-    """Return the share of a ``corner`` (3,) in the gap. ``side`` is -1 for the pair's first body, 1 for the second."""
+    """Return the share of a ``corner`` (3,) in the gap. ``side`` is -1 if it is the first body's, 1 if the second's."""
     chain, pairs, placements, normal = model.chain, model.pairs, data.placements, data.contact.normal
     nx, ny, nz = side * normal[0], side * normal[1], side * normal[2]
     x, y, z = corner[0], corner[1], corner[2]
@@ -156,7 +162,7 @@ def _gap(
 
 @inlined_kernel
 def _opens(corner: Gap, other: Gap, needed: float, length: float, then_length: float) -> bool:
-    """Return whether the gap between two corners stays above ``needed`` [m] in a piece and in the one after it."""
+    """Return whether the gap between two corners stays above ``needed`` [m] in a piece and in the next piece."""
     gap = corner.now + other.now - needed
     rate, change, loose = corner.rate + other.rate, corner.change + other.change, corner.loose + other.loose
     if _least_on_the_way(gap, rate, change, length) + loose < 0.0:

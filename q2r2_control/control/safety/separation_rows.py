@@ -1,26 +1,28 @@
 """Write the rows of the QP that keep monitored pairs apart.
 
-The rows tell the QP what the certified stop can do. Let B be the least free distance of a pair on this stop,
+The rows tell the QP what the certified stop can do. Let B be the least free distance of a pair during this stop,
 
     B = min over the stop of  d - min_distance - buffer.
 
-A step may use up only a share of it: B(q+, v+) >= (1 - gain h) B(q, v). This is a control barrier function made of a
-backup manoeuvre (Gurriet, Mote, Ames, Feron, CDC 2018). Motion that keeps its distance uses up nothing and is not
-slowed. Motion that closes in is slowed in time for the stop. B is linearised at the instants of the stop at which it is
-least, or may soon be, so that rows do not come and go from tick to tick. The free distance beyond B may be used up at
-50 /s. If a stop takes T, joints that stop together have travelled v s at its time t, with s = t - t^2 / 2T. With the
-same T after the step,
+A step may use up only a share of B: B(q+, v+) >= (1 - gain h) B(q, v). This is a control barrier function that is built
+from a backup manoeuvre (Gurriet, Mote, Ames, Feron, CDC 2018). Motion that keeps its distance uses up nothing and is
+not slowed. Motion that closes in is slowed in time for the stop. The rows are linearised at those instants of the stop
+at which the free distance is least, or may soon be least, so that rows do not come and go from tick to tick. An instant
+with more free distance than B may use up the difference at 50 /s.
+
+A stop takes the time T. At its time t, joints that stop together have travelled v s, with s = t - t^2 / 2T. If the stop
+after the step takes T too, the step changes the posture at the time t by D q, and the row is
 
     D q = h (v + v+) / 2 + s (v+ - v),    n'(J_2 - J_1) D q >= -gain h B.
 
-For a pair at rest this is the usual row, n'(J_2 - J_1) v+ >= -gain B. The change of speed has the same lever for all
-joints and shapes of stop, so that the row is along the normal of the pair. With a lever for each joint its direction
-would change from tick to tick with the shape.
+For a pair at rest this is the usual row, n'(J_2 - J_1) v+ >= -gain B. The factor of v+ is called the lever. It is the
+same for all joints and all shapes of a stop, so that the row has the direction of the pair's normal. With a separate
+lever for each joint, the direction of the row would change from tick to tick with the shape.
 
 If a pair is closer than its buffer, the row asks it to open, as fast as a part of the acceleration limits allows. Pairs
-that may touch have a distance below zero. Around contact they have a zone in which B is used up no faster than at their
-own speed. The rows are for comfort only. They are soft, so that the QP always has a solution, and the certificate alone
-keeps the arms safe.
+that may touch have a ``min_distance`` below zero. Around contact they have a zone in which they use up B no faster than
+at their contact speed. The rows are for comfort only. They are soft, so that the QP always has a solution, and the
+certificate alone keeps the arms safe.
 
 **The gain may change between any two ticks.** The certificate reads no row and no gain. It reads distances, and a lower
 bound of a distance proves less, never more. The executed part of a solution is therefore certified for every gain.
@@ -44,32 +46,34 @@ from q2r2_control.types import Array
 
 
 class StopTime(NamedTuple):
-    """The moment of the stop at which a row looks at its pair."""
+    """The instant of the stop for which a row is written."""
 
-    along: bool  # True if the pair is measured at the start of the stop, and the row follows the tangent to its end.
+    # True if the pair is measured at the start of the stop, and its motion until the end is computed along the tangent.
+    along: bool
     h: float  # Duration of the step [s].
-    lever: float  # Way until the moment per next speed [s].
-    least: float  # B, the least free distance of the pair on the stop [m].
+    lever: float  # How far a joint moves until the instant, per unit of its next velocity [s].
+    least: float  # B, the least free distance of the pair during the stop [m].
     ahead: float  # Time that the row looks ahead: half of the stop, and 1 / gain [s].
 
 
-_SHARE = 0.25
+_SHARE = 0.25  # Share of the acceleration limits that a row may use to open a pair.
 # An end of a near-parallel capsule gets a row of its own if it is farther than this from the closest point.
 _SAME_POINT = 0.005  # [m]
-# An instant gets a row already if its distance is greater than the least one by less than this. Otherwise rows would
-# switch from tick to tick.
+# An instant gets a row if its distance exceeds the least distance by no more than this. Without this tolerance, rows
+# would switch between instants from tick to tick.
 _SAME_DISTANCE = 0.002  # [m]
-# If a stop bends the ways of a pair's points by less than this, the row looks along the tangent at its start.
+# If a stop bends the paths of a pair's points by less than this, its rows use the tangent at the start of the stop.
 _STRAIGHT = 1e-5  # [m]
-# Rate at which instants other than the nearest one may use up their additional free distance [1/s].
+# Rate at which an instant may use up the free distance that it has beyond B [1/s].
 _CATCH_UP = 50.0
 
 
 @kernel
 def write_separation_rows(model: SafetyModel, data: SafetyData, h: float) -> None:
-    """Write the rows of pairs that can bind in a step of ``h`` [s] from the measured reference, with unit norm.
+    """Write the rows that can bind in a step of ``h`` [s]. Each row has unit norm.
 
-    The candidate and its rollout are used for the certified stop.
+    The pairs have to be measured at the reference before. The candidate and its rollout are overwritten with the
+    certified stop.
     """
     stay_with_stop(data)
     duration = begin_rollout(data)
@@ -83,7 +87,7 @@ def write_separation_rows(model: SafetyModel, data: SafetyData, h: float) -> Non
         for i in range(len(INSTANTS)):
             t = duration * INSTANTS[i] / INSTANTS[-1]
             s = t - 0.5 * t * t / duration if duration > 0.0 else 0.0
-            # At rest a faster step lengthens the stop by as much as the step itself.
+            # From rest, a step to v+ moves a joint by h v+ / 2, and the stop after it by as much again at most.
             lever = max(s, 0.5 * h) + 0.5 * h
             if data.rows.ahead[i] > least + _SAME_DISTANCE or (i > 0 and lever <= h):
                 continue
@@ -104,9 +108,10 @@ def write_separation_rows(model: SafetyModel, data: SafetyData, h: float) -> Non
 
 @kernel
 def _distances_ahead(model: SafetyModel, data: SafetyData, p: int, duration: float, straight: bool) -> float:
-    """Write the distance of pair ``p`` at each instant, infinite for instants that are skipped; returns the least [m].
+    """Write the distance of pair ``p`` at each instant, infinite if the instant is skipped; return the least one [m].
 
-    On a straight way the pair is nearest at one of both ends. A pair that is too close has to open from where it is.
+    If the paths are ``straight``, the pair is nearest at the start or at the end of the stop. If the pair is too close,
+    only the start counts, because the pair has to open from its present position.
     """
     ahead, last = data.rows.ahead, len(INSTANTS) - 1
     ahead[:] = np.inf
@@ -114,7 +119,7 @@ def _distances_ahead(model: SafetyModel, data: SafetyData, p: int, duration: flo
     if ahead[0] < model.min_distance[p]:
         return ahead[0]
     if straight:
-        row = data.rows.matrix[-1]  # The last row is never in use, and serves as scratch.
+        row = data.rows.matrix[-1]  # The last row is never in use, and serves as a buffer.
         distance_row(model.collision, data.collision, p, row)
         ahead[last] = ahead[0] + _tangent(data, row)
         return min(ahead[0], ahead[last])
@@ -127,7 +132,7 @@ def _distances_ahead(model: SafetyModel, data: SafetyData, p: int, duration: flo
 
 @inlined_kernel
 def _tangent(data: SafetyData, row: Array) -> float:
-    """Return by how much the certified stop opens a pair with the given ``row`` along the tangent [m]."""
+    """Return by how much the certified stop opens the pair whose gradient is ``row`` (nv,), along the tangent [m]."""
     v, change = data.state.v, 0.0
     for j in range(row.shape[0]):
         change += row[j] * 0.5 * v[j] * abs(v[j]) / data.certified[j]
@@ -140,8 +145,9 @@ def _append_row(
 ) -> int:
     """Add a row if some velocity that the acceleration limit allows (v +- a h) breaks it; other rows cannot bind.
 
-    Pair ``p`` was measured in ``at``, the posture at the ``moment``, or at the start of a straight stop whose end the
-    row sees along the tangent. The row gets unit norm, so that its violation is a joint speed.
+    Pair ``p`` was measured in ``at``, which is the posture at the ``moment``. If ``moment.along``, it is the posture at
+    the start of the stop, from which the row computes the end of the stop along the tangent. The row gets unit norm, so
+    that its violation is a joint speed.
     """
     h = moment.h
     a, v, row, lever = model.limits.acceleration, data.state.v, data.rows.matrix[count], moment.lever
@@ -150,7 +156,7 @@ def _append_row(
     if moment.along:
         free += _tangent(data, row)
     rate = dot(row, v)  # Change of the distance, and of B, per second at constant v [m/s].
-    change = 0.0  # By how much the acceleration can change this in the step [m].
+    change = 0.0  # Largest change of the distance at the moment that accelerations in the step can cause [m].
     for j in range(row.shape[0]):
         change += abs(row[j]) * a[j]
     change *= h * lever
@@ -161,8 +167,8 @@ def _append_row(
     if slow < np.inf:
         allowed = max(allowed, -h * max(slow, gain * (free - model.approach.contact_zone[p])))
     if free < 0.0:
-        # Rows that ask for more than the joints can do would be weighed against each other. A deep pair would then open
-        # at the cost of closing another one.
+        # If rows asked for more than the joints can do, the QP would weigh them against each other. A pair that is much
+        # too close would then open at the cost of closing another pair.
         allowed = min(allowed, model.approach.recovery_speed * h, max(h * rate, 0.0) + _SHARE * change)
     if h * rate - change >= allowed or change <= 0.0:
         return count
@@ -177,11 +183,11 @@ def _append_row(
 def _append_end_rows(
     model: SafetyModel, data: SafetyData, at: CollisionData, p: int, distance: float, moment: StopTime, count: int
 ) -> int:
-    """Add rows at those ends of both bodies of a pair that may soon be as close as its ``distance``.
+    """Add rows for those ends of both bodies that may soon be as close to the other body as ``distance`` [m].
 
-    The closest points of near-parallel bodies jump from end to end. With rows at the ends, no row jumps. An end gets no
-    row if the bodies cannot turn it as close as that within the time that the row looks ahead. The pair was measured in
-    ``at``.
+    The closest points of near-parallel bodies jump from one end to the other end. With rows for the ends, no row jumps.
+    An end gets no row if the bodies turn too slowly to bring it that close within ``moment.ahead``. Pair ``p`` was
+    measured in ``at``.
     """
     bodies, posed, contact, angular = model.collision.bodies, at.posed, at.contact, data.velocities.angular
     first, second = model.collision.pairs.first[p], model.collision.pairs.second[p]

@@ -1,32 +1,32 @@
-"""Bound how much closer two bodies come in a step and the stop after it, by their present speeds (compiled).
+"""Bound from their present speeds how much closer two bodies come in a step and the stop after it (compiled).
 
-The bound by reach (stop_certificate.py) treats every joint as if it moved straight towards the other body. For most
-pairs of two moving arms the speeds of the bodies suffice. Joints that stop together keep the direction of their motion,
-and arms that move alike do not close in at all.
+The bound S with the reach of joints (stop_certificate.py) treats every joint as if it moved one body straight towards
+the other body. For most pairs of two moving arms, a bound from the speeds of the bodies suffices. Joints that stop
+together keep the direction of their motion, and arms that move alike do not close in at all.
 
 **Speed.** A geometry lies in the ball of radius s around its middle. With the middle moving at u and the link turning
 at w, no point of it is faster than |u| + |w| s. The distance of two geometries therefore falls no faster than |u_2 -
 u_1| + |w_1| s_1 + |w_2| s_2.
 
-**Claim.** Let d be the distance of two bodies at the reference that share no joint. Let V be the most that they can
-close in by per second there, |u_2 - u_1| + |w_1| s_1 + |w_2| s_2, where the joints have the velocities v. Let a step of
-h lead to v+, and a stop with the decelerations d_j and the duration T = max |v+_j| / d_j follow. Then their distance is
-always at least
+**Claim.** Let two bodies share no joint, and let d be their distance at the reference. Let V = |u_2 - u_1| + |w_1| s_1
++ |w_2| s_2 be the bound on their approach speed there, where the joints have the velocities v. Let a step of h lead to
+v+, and a stop with the decelerations d_j and the duration T = max |v+_j| / d_j follow. Then their distance is always at
+least
 
     d  -  V (h + T / 2)  -  sum_j reach_j (rho_j + kappa_j),
 
     rho_j = |v+_j - v_j| (h + T) / 2  +  |v+_j| T / 2 - v+_j^2 / 2 d_j,
     kappa_j = w_j (w_j / 2 + sum_(i before j) w_i),
 
-where w_j is the way of joint j in the step and the stop.
+where w_j is the travel of joint j in the step and the stop.
 
 *Proof.* Let D_j(t) be how far joint j has moved. Compare it with v_j sigma(t), where sigma = t in the step and sigma =
 h + s - s^2 / 2T at the time s of the stop, so at most h + T / 2. In the step, |D_j - v_j t| = |v+_j - v_j| t^2 / 2h is
-at most |v+_j - v_j| h / 2, and no more is left of it in the stop. There, v+_j takes the place of v_j, which changes v_j
+at most |v+_j - v_j| h / 2, and this difference stays during the stop. In the stop, v+_j replaces v_j, which changes v_j
 (s - s^2 / 2T) by at most |v+_j - v_j| T / 2. The joint itself travels B_j(s) from the step's end. Since d_j >= |v+_j| /
 T, the difference |v+_j| (s - s^2 / 2T) - |B_j(s)| is never negative and never falls. At T it is |v+_j| T / 2 - v+_j^2 /
 2 d_j. Together |D_j - v_j sigma| <= rho_j. A point of a body moves by J D + R, with |R| <= sum reach_j kappa_j over the
-joints that move it (separating_plane.py has why). Two points, one of each body's core, therefore get closer by at most
+joints that move it (separating_plane.py says why). Two points, one of each body's core, therefore get closer by at most
 |(J_2 - J_1) v| sigma + sum reach_j (rho_j + kappa_j), and |(J_2 - J_1) v| <= V. The radii cancel. []
 
 The velocity of a joint that carries both bodies is part of V, but this joint is not in the sum. V could then be less
@@ -121,7 +121,7 @@ def fastest_approach(velocities: BodyVelocities, first: int, second: int) -> flo
 def write_deviations(model: SafetyModel, data: SafetyData, h: float, duration: float) -> float:
     """Write rho + kappa of every joint [rad or m], for a step of ``h`` [s] and a stop of ``duration`` [s].
 
-    It needs the ways of the step and the stop. Returns h + T / 2 [s].
+    The travel of the joints in the step and the stop has to be written before. Returns h + T / 2 [s].
     """
     parent, v, v_next, rollout = model.collision.chain.parent, data.state.v, data.candidate.v, data.rollout
     step, stop = rollout.step.travel, rollout.stop.travel
@@ -139,10 +139,10 @@ def write_deviations(model: SafetyModel, data: SafetyData, h: float, duration: f
 
 @inlined_kernel
 def least_distance(model: SafetyModel, data: SafetyData, p: int, time: float) -> float:
-    """Return the least distance of pair ``p``, which shares no joint, in the step and the stop [m].
+    """Return a lower bound on the distance of pair ``p``, which shares no joint, in the step and the stop [m].
 
-    It needs :func:`write_deviations`, the velocities of the bodies, and distances at the reference or lower bounds of
-    them. ``time`` is h + T / 2 [s].
+    Call :func:`write_deviations` before. ``data`` has to contain the velocities of the bodies, and the distances at the
+    reference or lower bounds of them. ``time`` is h + T / 2 [s].
     """
     pairs = model.collision.pairs
     approach = fastest_approach(data.velocities, pairs.first[p], pairs.second[p])
@@ -151,7 +151,10 @@ def least_distance(model: SafetyModel, data: SafetyData, p: int, time: float) ->
 
 @inlined_kernel
 def way(model: SafetyModel, p: int, travel: Array) -> float:
-    """Return how far the bodies of pair ``p`` can move relative to each other while joints ``travel`` (nv,) [m]."""
+    """Return how far the bodies of pair ``p`` can move relative to each other [m].
+
+    Each joint travels ``travel`` (nv,) [rad or m].
+    """
     pairs = model.collision.pairs
     total = 0.0
     for k in range(pairs.joint.shape[1]):

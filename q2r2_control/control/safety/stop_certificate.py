@@ -2,18 +2,19 @@
 
 **Certificate.** A tick moves the reference along a parabola to (q+, v+). Two motions must keep every pair at its
 distance: this parabola, and a stop from (q+, v+) of one of the shapes in stop_rollout.py. The robot is then always safe
-by induction, because the certified stop of the last tick can be executed now, and its rest needs no new check.
+by induction: the certified stop of the last tick can be executed now, and what remains of it needs no new check.
 
-**Between samples.** A point of a body is never farther than reach_j from the axis of joint j. While the joints travel
-ways w_j (total variation), the distance of a pair changes by at most S = sum_j reach_j w_j over the joints that move
-one body relative to the other. One sample with the distance d therefore proves d - S. For pairs that share no joint,
-the speeds of their bodies at the reference prove more (speed_bound.py), which suffices for most. If it does not, the
-plane between the bodies proves a piece of the motion by its direction (separating_plane.py). The stop is checked in
-pieces that are as long as can be proven, each from a sample of its own.
+**Between samples.** A point of a body is never farther than reach_j from the axis of joint j. Let joint j travel w_j
+(total variation). The distance of a pair then changes by at most S = sum_j reach_j w_j over the joints that move one
+body relative to the other. One sample with the distance d therefore proves that the distance stays at least d - S. For
+pairs that share no joint, the speeds of their bodies at the reference give a better bound (speed_bound.py), which
+suffices for most pairs. If it does not suffice, the plane between the bodies is used, which takes the direction of
+motion into account (separating_plane.py). The stop is then checked in parts. Each part begins at a sample, and is as
+long as can be proven from there.
 
-**Rounding.** A motion that is proven to end exactly at the distance of a pair may end 1e-16 m below it. If a pair lacks
-less than ROUNDING of its distance, the full proof goes on with the distance that the pair has now. Rounding therefore
-never leads to recovery, in which a pair is only checked at samples.
+**Rounding.** A motion that is proven to end exactly at the required distance of a pair may end 1e-16 m below it. If a
+pair is below its required distance by less than ROUNDING, the full proof uses the present distance of the pair instead.
+Rounding therefore never leads to recovery, in which a pair is only checked at samples.
 """
 
 from __future__ import annotations
@@ -28,18 +29,18 @@ from q2r2_control.control.safety.separating_plane import stays_beyond
 from q2r2_control.control.safety.speed_bound import least_distance, way, write_deviations
 from q2r2_control.control.safety.stop_rollout import begin_rollout, sample_of, write_piece
 
-# Tolerances for a pair that is too close: of its distance, absolute [m] and relative, and of its speed.
+# Tolerances for a pair that is too close. The first is for its distance [m], and a relative one for times.
 _CLOSER = 1e-12
-_STILL = 1e-9  # [m/s]
-_NOISE = 1e-15  # Difference between two measurements of the same distance [m].
-# The closest points of a box and a segment are exact to this. The gap along their plane is smaller than the distance by
-# up to this much. Without the tolerance a pair exactly at its distance could never be proven to part again.
+_STILL = 1e-9  # Tolerance for its approach speed [m/s].
+_NOISE = 1e-15  # By rounding, two measurements of the same distance may differ by this [m].
+# Accuracy of the closest points of a box and a segment. The gap along the plane between both may be smaller than their
+# distance by this. Without the tolerance, a pair exactly at its distance could never be proven to move apart again.
 _LAST_DIGITS = 1e-11  # [m]
 
 
 @kernel
 def step_travel(v: float, v_next: float, h: float) -> float:
-    """Return the way that a joint travels in a step of constant acceleration; there and back both count."""
+    """Return the distance that a joint travels in a step with constant acceleration; there and back both count."""
     if v * v_next >= 0.0:
         return 0.5 * abs(v + v_next) * h
     return 0.5 * (v * v + v_next * v_next) / (abs(v) + abs(v_next)) * h
@@ -65,8 +66,8 @@ def certify(model: SafetyModel, data: SafetyData, h: float) -> bool:
         farthest = max(farthest, data.rollout.step.travel[j] + data.rollout.stop.travel[j], history.travel[j])
     for p in range(data.distance.shape[0]):
         if data.distance[p] - model.collision.pairs.leverage[p] * farthest >= model.min_distance[p]:
-            continue  # No joint travels farther, and so the bodies' way is not longer.
-        alone = apart and model.of_two_arms[p] == 1  # Each of the two arms may be anywhere on its way.
+            continue  # No joint travels farther than this, so the bodies cannot come closer by more.
+        alone = apart and model.of_two_arms[p] == 1  # Each of the two arms may be anywhere on its path.
         if is_far(model, data, p, time) if alone else _has_room(model, data, p, time):
             continue
         data.unproven[0] = p
@@ -80,13 +81,13 @@ def certify(model: SafetyModel, data: SafetyData, h: float) -> bool:
 
 @inlined_kernel
 def is_too_close(model: SafetyModel, data: SafetyData, p: int) -> bool:
-    """Return whether pair ``p`` is closer than it has to keep at the reference, where near distances are exact."""
+    """Return whether pair ``p`` is closer at the reference than its required distance. Near distances are exact."""
     return data.distance[p] < model.min_distance[p] - ROUNDING
 
 
 @kernel
 def _keeps_apart(model: SafetyModel, data: SafetyData, p: int, h: float, duration: float, alone: bool) -> bool:
-    """Return whether pair ``p`` is proven apart in the step and in the stop, by one plane or else piece by piece.
+    """Return whether pair ``p`` is proven apart in the step and in the stop, with one plane or else part by part.
 
     With ``alone`` the proof also holds for arms that move and stop at different times.
     """
@@ -117,9 +118,9 @@ def write_step(data: SafetyData, h: float) -> None:
 
 @inlined_kernel
 def _has_room(model: SafetyModel, data: SafetyData, p: int, time: float) -> bool:
-    """Return whether pair ``p`` is farther apart than it can come closer.
+    """Return whether pair ``p`` keeps its distance, by a simple bound on how much closer it can come.
 
-    This is bounded by the speed of its bodies, or by the ways of the joints if the bodies share a joint.
+    The bound is computed from the speeds of its bodies, or from the travel of the joints if the bodies share a joint.
     """
     if model.collision.pairs.carried[p] == 0:
         return least_distance(model, data, p, time) >= model.min_distance[p]
@@ -131,7 +132,10 @@ def _has_room(model: SafetyModel, data: SafetyData, p: int, time: float) -> bool
 def _step_keeps_apart(
     model: SafetyModel, data: SafetyData, p: int, h: float, duration: float, threshold: float
 ) -> bool:
-    """Return whether pair ``p`` is proven apart in the step: from both ends by the way, or from one by a plane."""
+    """Return whether pair ``p`` is proven apart in the step.
+
+    The proof uses the distances at both ends and the travel of the joints, or else a plane at the start.
+    """
     after = measure(model.collision, sample_of(model, data, 0, duration), p)
     if after < threshold:
         return False
@@ -144,7 +148,7 @@ def _step_keeps_apart(
 
 @kernel
 def _stop_keeps_apart(model: SafetyModel, data: SafetyData, p: int, duration: float, threshold: float) -> bool:
-    """Return whether pair ``p`` is proven apart along the whole stop, piece by piece."""
+    """Return whether pair ``p`` is proven apart along the whole stop, part by part."""
     rollout = data.rollout
     i, last = 0, rollout.q.shape[0] - 1
     stride = last
@@ -179,10 +183,11 @@ def _stop_keeps_apart(model: SafetyModel, data: SafetyData, p: int, duration: fl
 
 @kernel
 def _comes_no_closer(model: SafetyModel, data: SafetyData, p: int, duration: float, closer: float) -> bool:
-    """Return whether a pair that is too close comes no closer: no sample of the stop is closer, or closing in.
+    """Return whether a pair that is too close comes no closer during the stop.
 
-    Distances alone would miss a pair that opens and closes again between two samples. At the last sample all joints
-    rest, and the way of the joint that came to rest last counts.
+    At no sample may its distance be smaller than at the sample before, or be falling. Distances alone would miss a pair
+    that opens and closes again between two samples. At the last sample all joints rest. The joints that came to rest
+    last are then taken with their velocities one sample earlier.
     """
     candidate, row = data.candidate, data.rollout.piece.rate
     before = data.distance[p]

@@ -1,6 +1,6 @@
-"""Compute the postures of a stop at instants. Each is computed when it is first asked for (compiled).
+"""Compute samples of a stop: its postures at instants that are evenly spaced in time (compiled).
 
-The instants are evenly spaced in time, so that all pairs share the samples.
+All pairs share the samples. A sample is computed when it is first needed.
 """
 
 from __future__ import annotations
@@ -12,13 +12,17 @@ from q2r2_control.control.safety.joint_limits import JointLimits
 from q2r2_control.control.safety.safety_data import QuadraticPiece, SafetyData, SafetyModel
 from q2r2_control.types import Array
 
+# The shapes of a stop: all joints rest at the same time, the joints of each arm do, or each joint brakes fully.
 TOGETHER, ARM_BY_ARM, OWN = 0, 1, 2
 SHAPES = 3
 
 
 @kernel
 def write_stop(model: SafetyModel, q: Array, v: Array, shape: int, deceleration: Array) -> None:
-    """Write the ``deceleration`` (nv,) [rad/s^2] of a stop of a shape from ``q`` [rad] and ``v`` [rad/s] (nv,)."""
+    """Write the ``deceleration`` (nv,) [rad/s^2] of each joint in a stop from ``q`` [rad] and ``v`` [rad/s] (nv,).
+
+    ``shape`` is TOGETHER, ARM_BY_ARM or OWN.
+    """
     a = model.limits.acceleration
     for j in range(v.shape[0]):
         deceleration[j] = a[j]
@@ -36,7 +40,10 @@ def write_stop(model: SafetyModel, q: Array, v: Array, shape: int, deceleration:
 
 @kernel
 def _least_deceleration(limits: JointLimits, j: int, q: float, v: float) -> float:
-    """Return the least constant deceleration of joint ``j`` that keeps P until it rests; its limit if none does."""
+    """Return the least constant deceleration of joint ``j`` that keeps P (joint_limits.py) until the joint rests.
+
+    If no deceleration keeps P, return the joint's acceleration limit.
+    """
     room = (limits.upper[j] - q if v > 0.0 else q - limits.lower[j]) - limits.longest_step * abs(v)
     if room <= 0.0:
         return limits.acceleration[j]
@@ -57,14 +64,14 @@ def brake(q: Array, v: Array, deceleration: Array, t: float, q_out: Array, v_out
             v_out[j] = v[j] - sign * deceleration[j] * t
 
 
-# A joint that comes to rest by less than this before the end of a piece of time counts as moving until the end [s].
-# This is far more than rounding. The error of its way is d t^2 / 2, which is 1e-17 rad.
+# A joint that comes to rest less than this before the end of an interval counts as moving until the end [s]. This is
+# far more than the rounding of times. The error of the joint's travel is d t^2 / 2, about 1e-17 rad.
 _SAME_TIME = 1e-9
 
 
 @kernel
 def begin_rollout(data: SafetyData) -> float:
-    """Forget the samples of the last stop, and write the candidate's stop as one piece; returns its duration [s]."""
+    """Forget the samples of the last stop, and write ``rollout.stop`` of the candidate; return its duration [s]."""
     candidate, rollout = data.candidate, data.rollout
     rollout.known[:] = 0.0
     duration = 0.0
@@ -76,7 +83,7 @@ def begin_rollout(data: SafetyData) -> float:
 
 @kernel
 def stay_with_stop(data: SafetyData) -> None:
-    """Make the present reference the candidate, with the known stop."""
+    """Copy the present reference and the known stop into the candidate."""
     for j in range(data.state.v.shape[0]):
         data.candidate.q[j] = data.state.q[j]
         data.candidate.v[j] = data.state.v[j]

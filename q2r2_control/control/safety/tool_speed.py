@@ -1,29 +1,32 @@
 """Prove that no tool is faster than allowed in a step and in the full stop after it (compiled).
 
-The speed of a tool's origin is |J(q) v|, with the linear part J of its Jacobian. J_j is what joint j adds, and reach_j
-bounds how far the tool ever is from that joint's axis.
+The speed of a tool's origin is |J(q) v|, with the linear part J of its Jacobian. J_j is the column of joint j, and
+reach_j bounds how far the tool ever is from that joint's axis.
 
-**Drift.** While the speeds of the joints stay below m_j, no sum of J_j v_j over any of them changes faster than
+**Drift.** Take any subset of the joints, and fixed v_j with |v_j| <= m_j. While the speeds of the joints stay below
+m_j, the sum of J_j v_j over this subset changes no faster than
 
     c(m) = sum_j reach_j m_j (m_j + 2 sum_(i before j) m_i)    [m/s^2],
 
-since an axis turns with the joints before it, and the tool moves about it with those behind (separating_plane.py).
+because the joints before j turn its axis, and the joints behind j move the tool about this axis (separating_plane.py).
 
 **Claim.** Let a step of h lead from (q, v) to (q+, v+) along a parabola, and a stop with decelerations d_j follow.
-Joint j rests after T_j = |v+_j| / d_j, the last one after T. Let P_k be the sum of J_j(q) v+_j over the joints that
+Joint j rests after T_j = |v+_j| / d_j, the last joint after T. Let P_k be the sum of J_j(q) v+_j over the joints that
 rest no sooner than joint k, and with C = c(max(|v|, |v+|)) and c = c(|v+|) let
 
     M = max_k |P_k| + C h,
     B = M  if  c T <= M,  and else  (M + c T)^2 / (4 c T).
 
 Then the tool is never faster than the greater of |J(q) v| and B. *Proof.* In the step v(t) lies between v and v+. Its
-speed is at most (1 - t/h) |J v| + (t/h) (|J v+| + C h), and |J v+| is one of the |P_k|. In the stop joint j has the
-share s_j = 1 - t/T_j of its speed, or none. The longer T_j, the greater the share. Sorted by it, sum J_j s_j v+_j is a
-sum of the P_k with weights s_k - s_(k+1), none of them negative, which add up to 1 - t/T. Each P_k has changed by C h +
-c t at most. The speed is therefore at most (1 - t/T) (M + c t), whose maximum is B. []
+speed is at most (1 - t/h) |J v| + (t/h) (|J v+| + C h), and |J v+| is one of the |P_k|. In the stop, joint j has the
+share s_j = 1 - t/T_j of its speed v+_j, and 0 after T_j. The longer T_j, the greater the share. With the joints sorted
+by their shares, sum J_j s_j v+_j is a sum of the P_k with weights s_k - s_(k+1), none of them negative, which add up to
+1 - t/T. Each P_k has changed by C h + c t at most. The speed is therefore at most (1 - t/T) (M + c t), whose maximum is
+B. []
 
-**Induction.** A step is taken only if B is within the limit. Then |J(q) v| is within it at the next step, and so is all
-of the stop at hand. A tool that starts too fast is braked until it is not: no step that goes on can be proven before.
+**Induction.** A step is taken only if B is within the limit. Then |J(q) v| is within the limit at the next step, and
+during the whole known stop. If a tool is too fast at the start, it is braked until it is slow enough: until then, no
+other motion can be proven.
 """
 
 from __future__ import annotations
@@ -75,10 +78,10 @@ def tool_limits_of(robot: Robot, chain: Chain, speed: float | None) -> ToolLimit
 class ToolSpeeds(NamedTuple):
     """Data that are written when a step is decided on."""
 
-    held: IntArray  # (n,) 1 if the limit of a tool held a step back.
-    origin: Array  # (3,) Scratch [m].
-    columns: Array  # (nv, 3) Scratch: J_j v+_j of each joint [m/s].
-    total: Array  # (3,) Scratch [m/s].
+    held: IntArray  # (n,) 1 if the tool's speed limit held the step back.
+    origin: Array  # (3,) Buffer for the tool's origin in the world [m].
+    columns: Array  # (nv, 3) Buffer for J_j v+_j of each joint [m/s].
+    total: Array  # (3,) Buffer for a sum P_k [m/s].
 
     @classmethod
     def empty(cls, limits: ToolLimits) -> ToolSpeeds:
@@ -90,7 +93,8 @@ class ToolSpeeds(NamedTuple):
 def keeps_tool_speed(model: SafetyModel, data: SafetyData, h: float) -> bool:
     """Return whether no tool is too fast in the step to ``data.candidate`` in ``h`` [s] and the full stop after it.
 
-    It needs the placements at the reference. The tools are not too fast there, or the known stop is being executed.
+    ``data`` has to contain the placements at the reference. The proof assumes that no tool is too fast there; otherwise
+    the known stop is being executed.
     """
     limits = model.tools
     if limits.speed == np.inf:
@@ -105,7 +109,7 @@ def keeps_tool_speed(model: SafetyModel, data: SafetyData, h: float) -> bool:
 
 @kernel
 def fastest_tool(model: SafetyModel, data: SafetyData, i: int, h: float) -> float:
-    """Return B of tool ``i``; see the claim [m/s]."""
+    """Return B of tool ``i``, see the module's claim [m/s]."""
     parent, v_next, deceleration = model.collision.chain.parent, data.candidate.v, data.candidate.deceleration
     _write_columns(model, data, i)
     fastest, longest = 0.0, 0.0

@@ -1,4 +1,4 @@
-"""Call DAQP directly. It is the default solver and the fastest way."""
+"""Call DAQP directly. It is the default solver and the fastest one."""
 
 from __future__ import annotations
 
@@ -10,14 +10,15 @@ import numpy as np
 from q2r2_control.control.qp import SOFTNESS, QpProblem, QpSolution
 
 _UNBOUNDED = 1e30
-_HARD, _SOFT = 0, 8  # Marks of a row in DAQP.
+_HARD, _SOFT = 0, 8  # Flags of a hard and of a soft row in DAQP.
 
 
 class DaqpSolver:
     """DAQP (Arnstrom, Bemporad, Axehill, IEEE TAC 2022), a dual active-set method with soft rows.
 
-    It starts cold at each tick. A start from the last multipliers would save 16 of 17 iterations in contact. It would
-    save no time, because most of it goes into the set-up of the problem. The solution would also depend on the past.
+    It starts cold at each tick. With a warm start from the last multipliers, 16 of 17 iterations in contact would be
+    saved, but no time, because most of the time goes into the set-up of the problem. Moreover, the solution would then
+    depend on the past.
 
     Args:
         nv: Number of joints.

@@ -1,10 +1,10 @@
-"""Keep a foreign solver away from the controller's arrays, and its failures out of a step.
+"""Protect the controller's arrays from other solvers, and a step from their failures.
 
-The safety filter clamps the answer to the same box that a solver gets. If a solver wrote into this box, it would move
-the limits, and the certificate would be about the moved limits. A solver therefore gets copies.
+The safety filter clamps the answer to the same box that a solver gets. If a solver wrote into this box, it would change
+the limits, and the certificate would use the changed limits. A solver therefore gets copies.
 
-The user's own costs and rows may be of any size, and the sum of costs need not be convex. Libraries print a line or
-loop for ever at such a problem. No solver gets one.
+The user's own costs and rows may be of any size, and the sum of costs need not be convex. With such a problem, some
+libraries print a line, and some loop for ever. No solver gets such a problem.
 """
 
 from __future__ import annotations
@@ -20,13 +20,14 @@ from q2r2_control.control.qp import QpProblem, QpSolution, Solver
 from q2r2_control.errors import raised, shown
 
 _REAL = "fiu"  # Kinds of dtype that are real numbers.
-# Largest number of a problem that may be solved, and least diagonal of its cost's Cholesky factor. Ours are near 1.
+# A problem may be solved if no number in it is larger than the first value, and no diagonal entry of the Cholesky
+# factor of its H is smaller than the second value. Without costs and rows of the user, these numbers are near 1.
 _LARGEST, _FLATTEST = 1e12, 1e-8
 _FAILED = QpSolution(None, 0.0)
 
 
 class Guard:
-    """Calls a ``solver``, and returns a solution in arrays of its own, or none. It raises nothing.
+    """Calls a ``solver``. Returns its solution in a new array, or a failed solve, and never raises an exception.
 
     Args:
         solver: An object with ``solve``, from any source.
@@ -34,7 +35,7 @@ class Guard:
         clock: The clock that measures the time of a solve [s].
 
     Attributes:
-        failure: The reason why the last answer was not a solution; None if it was one.
+        failure: The reason why the last answer was not a solution; None if it was a solution.
     """
 
     def __init__(self, solver: Solver, nv: int, clock: Callable[[], float] = time.perf_counter) -> None:
@@ -59,9 +60,9 @@ class Guard:
             self.failure = "no solution" if v is None else self._fault(v, solve_time)
             if self.failure is None:
                 return QpSolution(np.array(v, dtype=float), max(float(solve_time), measured))
-        except (KeyboardInterrupt, SystemExit):  # The handler of a signal ends the program.
+        except (KeyboardInterrupt, SystemExit):  # A signal's handler raises these to end the program.
             raise
-        except BaseException as error:  # This includes a panic in Rust. Each means a tick without a solution.
+        except BaseException as error:  # Any other exception, such as a panic in Rust, counts as a failed solve.
             self.failure = raised(error)
         return _FAILED
 
@@ -76,7 +77,7 @@ class Guard:
 
 
 def _fault_of(problem: QpProblem) -> str | None:
-    """Return why no solver can solve the ``problem``; None if one may."""
+    """Return why the ``problem`` must not be given to a solver; None if it may be given."""
     for part in (problem.H, problem.g, problem.rows, problem.rows_lower):
         if not np.abs(part).max(initial=0.0) <= _LARGEST:  # The comparison is written so that NaN is too large as well.
             return f"the problem has numbers that are not finite, or above {_LARGEST:g}"

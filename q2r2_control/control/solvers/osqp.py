@@ -6,9 +6,10 @@ cost is w' w / 2. With rows a_i L^-T of unit norm, the slacks of all rows have t
     minimise    1/2 w' w + (L^-1 g)' w + 1/2 sum_i t_i^2
     subject to  D lower <= D L^-T w <= D upper,    a_i L^-T w / n_i + sqrt(SOFTNESS) t_i >= lower_i / n_i
 
-Here n_i = |L^-1 a_i|, and D makes the rows of the box unit rows as well. A slack below 0 costs as much as a slack above
-0, and so the problem does not need t >= 0. The pattern is dense and fixed for 16, 32, 48, ... rows. Unused rows bound
-nothing. Each size is set up once, at the first tick that needs it, and warm-started from then on.
+Here n_i = |L^-1 a_i|, and D scales the rows of the box to unit norm as well. A slack below 0 costs as much as a slack
+above 0, so the problem does not need t >= 0. There is a problem of a fixed, dense pattern for 16, 32, 48, ... rows. Its
+unused rows have infinite bounds. Each of these problems is set up at the first tick that needs it. Later ticks start it
+from its last solution.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from q2r2_control.control.qp import SOFTNESS, QpProblem, QpSolution
 from q2r2_control.types import Array
 
 _ROWS_STEP = 16  # Step between the numbers of rows for which OSQP is set up.
-# adaptive_rho_interval counts iterations. With the clock, which is the alternative, a run would not be repeatable.
+# adaptive_rho_interval counts iterations. If the interval depended on the clock instead, runs would not be repeatable.
 _DEFAULTS: dict[str, Any] = {
     "eps_abs": 1e-5,
     "eps_rel": 1e-5,
@@ -92,7 +93,7 @@ class _SizedOsqp:
         answer = self._solver.solve(raise_error=False)
         time = answer.info.update_time + answer.info.solve_time
         if answer.info.status_val != osqp.SolverStatus.OSQP_SOLVED:
-            self._solver.warm_start(x=self._cold, y=self._cold)  # The last solution may be anywhere.
+            self._solver.warm_start(x=self._cold, y=self._cold)  # The last iterate may be far from any solution.
             return QpSolution(None, time)
         v: Array = answer.x[: self._nv] @ inverse
         return QpSolution(v, time)
@@ -115,7 +116,7 @@ class _SizedOsqp:
 
 
 def _inverse_factor(H: Array) -> Array:
-    """Return L^-1 of H = L L' (nv, nv). Other BLAS routines start threads even for so small a matrix."""
+    """Return L^-1 of H = L L' (nv, nv). LAPACK is called directly: other routines start threads for a small matrix."""
     factor, failed = scipy.linalg.lapack.dpotrf(H, lower=True)
     if failed:
         raise np.linalg.LinAlgError("H is not positive definite")

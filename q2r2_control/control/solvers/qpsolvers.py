@@ -1,4 +1,4 @@
-"""Call any solver of the package qpsolvers, which contains some twenty by name.
+"""Call any solver of the package qpsolvers, which has about twenty solvers, each with a name.
 
 Such a solver has no soft rows. Every row therefore gets a slack of its own, and the variables are x = [v; s],
 
@@ -19,7 +19,9 @@ import scipy.sparse
 
 from q2r2_control.control.qp import QpProblem, QpSolution, row_softness
 
-_WIDE = 1.0  # Width of bounds that an equation makes needless, but which some solvers need as finite numbers [rad/s].
+# Distance of the bounds of a variable from the value to which an equation fixes it [rad/s]. These bounds are not
+# needed, but some solvers need finite numbers.
+_WIDE = 1.0
 
 
 def slack_problem(problem: QpProblem, sparse: bool = False, scaled: bool = False) -> qpsolvers.Problem:
@@ -28,9 +30,9 @@ def slack_problem(problem: QpProblem, sparse: bool = False, scaled: bool = False
     Args:
         problem: The problem, with nv joints and m rows.
         sparse: True for matrices of the type ``scipy.sparse.csc_matrix``, which some solvers need.
-        scaled: True for the slacks s_i / sqrt(rho_i), which all have the same cost. If costs differ by orders of
-            magnitude, quadprog takes some problems for contradictions. Other solvers stop at residuals, which are
-            larger in these units.
+        scaled: True if the variables are the scaled slacks s_i / sqrt(rho_i), which all have the same cost. Without
+            this scaling, quadprog finds some problems infeasible. Other solvers stop at a residual, and are less exact
+            with this scaling.
 
     Returns:
         A ``qpsolvers.Problem`` in x = [v; s], (nv + m,) [rad/s], which shares no memory with ``problem``.
@@ -54,7 +56,7 @@ def slack_problem(problem: QpProblem, sparse: bool = False, scaled: bool = False
     )
 
 
-# A solver is useless in a loop without these options.
+# Without these options, the solver cannot be used in a loop.
 _DEFAULTS: dict[str, dict[str, Any]] = {
     "highs": {"output_flag": False, "qp_iteration_limit": 1000},  # Its active set may cycle for ever.
     "scs": {"max_iters": 10000},  # With the default, which is ten times as many, a solve takes a second.
@@ -73,7 +75,7 @@ class QpSolversSolver:
     def __init__(self, name: str, **options: Any) -> None:
         self._name, self._options = name, _DEFAULTS.get(name, {}) | options
         self._sparse = name not in qpsolvers.dense_solvers
-        # The wrappers warn at each problem that is not solved. The report of the step already says so.
+        # The wrappers of qpsolvers warn if a problem is not solved. The report of the step already says so.
         warnings.filterwarnings("ignore", module=r"qpsolvers\.solvers\.")
 
     def solve(self, problem: QpProblem) -> QpSolution:
@@ -85,8 +87,8 @@ class QpSolversSolver:
             return QpSolution(problem.minimum, 0.0)
         made = slack_problem(problem, self._sparse, scaled=self._name == "quadprog")
         if made.h is not None:
-            # Solvers print a warning at a number that they take as infinite. A row that the box keeps is kept as well
-            # with a bound just beyond what the box allows.
+            # Some solvers print a warning if a bound is so large that they take it as infinite. The box alone keeps a
+            # row with such a bound. The bound is therefore reduced to just beyond what the box allows.
             fastest = np.maximum(np.abs(problem.lower), np.abs(problem.upper))
             made.h = np.minimum(made.h, np.abs(problem.rows) @ fastest + 1.0)
         _state_equations(made, self._sparse)
@@ -98,7 +100,7 @@ class QpSolversSolver:
 
 
 def _state_equations(problem: qpsolvers.Problem, sparse: bool) -> None:
-    """Turn pairs of equal bounds into equations, because quadprog finds no solution between such bounds."""
+    """Turn each pair of equal bounds into an equation, because quadprog finds no solution with such bounds."""
     lower, upper = np.asarray(problem.lb), np.asarray(problem.ub)
     fixed = lower == upper
     if not fixed.any():

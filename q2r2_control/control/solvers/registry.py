@@ -42,7 +42,7 @@ def make_solver(
     try:
         with printing_to_stderr():
             solver = _made(name, nv, time_limit, given)
-            solver.solve(_smallest_problem(nv))  # An unknown option raises here, and not during motion.
+            solver.solve(_smallest_problem(nv))  # An unknown option raises an exception here, and not during motion.
     except Exception as error:
         reason = " ".join(str(error).split())
         raise ConfigError(f"control.solver_options = {shown(given)}: {name} refuses: {reason:.120}") from error
@@ -50,7 +50,7 @@ def make_solver(
 
 
 def solver_of(settings: ControllerSettings, nv: int) -> Solver:
-    """Return the solver that ``settings`` ask for; see :func:`make_solver`."""
+    """Return the solver that ``settings`` name; see :func:`make_solver`."""
     return make_solver(settings.solver, nv, settings.solve_time_limit, settings.solver_options)
 
 
@@ -69,7 +69,7 @@ def _made(name: str, nv: int, time_limit: float | None, options: dict[str, Any])
 
 @contextmanager
 def printing_to_stderr() -> Iterator[None]:
-    """Send output to stderr, also that of compiled libraries, because stdout carries the result as JSON."""
+    """Send output to stderr, also the output of compiled libraries: on stdout, a command may print JSON."""
     try:
         sys.stdout.flush()
         stdout = os.dup(1)
@@ -85,7 +85,7 @@ def printing_to_stderr() -> Iterator[None]:
 
 
 def check_installed(name: str) -> None:
-    """Raise :class:`ConfigError` with the installed solvers, unless a solver called ``name`` is installed."""
+    """Raise :class:`ConfigError` unless a solver called ``name`` is installed. The error lists the installed ones."""
     if name in OURS:
         return
     import qpsolvers  # See _made.
@@ -99,7 +99,7 @@ def check_installed(name: str) -> None:
 
 
 def _smallest_problem(nv: int) -> QpProblem:
-    """Return a problem in which a row and the box hold the cost's minimum back."""
+    """Return a problem whose solution is not the minimum of the cost, because a row and the box are active."""
     row = np.zeros((1, nv))
     row[0, 0] = 1.0
     one = np.ones(nv)

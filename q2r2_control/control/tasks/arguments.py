@@ -20,7 +20,7 @@ def check_robot(robot: Robot) -> None:
 
 
 def chosen_arms(robot: Robot, arms: Sequence[str] | None) -> list[str]:
-    """Return the names in ``arms``, or all arms if it is None.
+    """Return the names in ``arms``, or the names of all arms if ``arms`` is None.
 
     Raises :class:`ConfigError` if a name is not the name of an arm.
     """

@@ -1,4 +1,4 @@
-"""The list of the built-in tasks: the model of each, its data, and the call that adds its cost."""
+"""The list of the built-in tasks: for each task its model, its data, and the call that adds its cost."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 class TaskModel(NamedTuple):
-    """Data that are constant in a tick. Arrays of live settings may change between ticks (live_settings.py)."""
+    """Data that are constant within a tick. Arrays of live settings may change between ticks (live_settings.py)."""
 
     chain: Chain
     tools: Tools
@@ -38,11 +38,11 @@ def task_model_of(robot: Robot, settings: ControllerSettings, chain: Chain) -> T
 
 
 class TaskData(NamedTuple):
-    """Tools at the reference, the data of all tasks, and their total cost."""
+    """The poses of the tools at the reference, the data of all tasks, and the total cost of the tasks."""
 
     placements: Placements  # Placements of the joint frames at the reference.
     rotation: Array  # (n, 3, 3) Rotations of the tools.
-    translation: Array  # (n, 3) [m]
+    translation: Array  # (n, 3) Positions of the tools [m].
     J: Array  # (6 n, nv) Jacobians of the tools, one below the other; zero for an arm that follows no target.
     frame: FrameData
     posture: PostureData

@@ -1,7 +1,8 @@
 """Control the swivel of an arm's elbow about the line from shoulder to wrist: the task that YAML names ``swivel``.
 
-With shoulder S, elbow E, wrist W, w = (W - S) / |W - S|, e = E - S and V pointing up, the elbow's offset from the line
-is p = e - (w'e) w and that of V is l = V - (w'V) w. The swivel angle is the angle from l to p about w,
+Let S, E and W be the positions of shoulder, elbow and wrist, w = (W - S) / |W - S|, e = E - S, and V the unit vector
+that points up. The part of e that is perpendicular to the line is p = e - (w'e) w, and that of V is l = V - (w'V) w.
+The swivel angle is the angle from l to p about w,
 
     psi = atan2(w'(V x p), V'p)
 
@@ -9,8 +10,8 @@ is p = e - (w'e) w and that of V is l = V - (w'V) w. The swivel angle is the ang
 
     dpsi = t_p'de / |p| + ((w'V) / |l| t_l - (w'e) / |p| t_p)' dw',    dw' = d(W - S) / |W - S|.
 
-It is not defined for a stretched arm (p = 0) nor for a wrist straight above or below the shoulder (l = 0). The cost
-fades out towards both.
+The angle is not defined for a stretched arm (p = 0), nor for a wrist straight above or below the shoulder (l = 0). Near
+both cases the cost decreases to 0.
 """
 
 from __future__ import annotations
@@ -27,21 +28,22 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
 _UP = np.array([0.0, 0.0, 1.0])
-# Below these values the cost fades out: |p| [m], and |l|, which is the sine of the angle between the line and V.
+# Below these values the cost decreases to 0: |p| [m], and |l|, which is the sine of the angle between the line and V.
 _FULL_RADIUS, _FULL_SINE = 0.05, 0.2
 _TINY = 1e-6
 _DAMPING = 1e-6  # Damping of the projection into the nullspace of the tool's motion.
 
 
 class ElbowSwivel:
-    """Turns elbows towards their angles in the nullspace of the tools. A tool pays nothing for its elbow.
+    """Turns elbows to wanted swivel angles, in the nullspace of the tools. The motion of a tool does not suffer.
 
-    The cost of each arm is  s w (n' v - k (psi* - psi))^2.  psi is the swivel angle above, n its gradient projected
-    into the nullspace of the tool's motion, and s falls from 1 to 0 where psi ceases to be defined. A YAML names the
-    task ``swivel``. Source: Kreutz-Delgado, Long, Seraji, Int. J. Robotics Research 11(5), 1992.
+    The cost of each arm is  s w (n' v - k (psi* - psi))^2.  Here psi is the swivel angle, as in the module's docstring,
+    and n is its gradient, projected into the nullspace of the tool's motion. The factor s falls from 1 to 0 near the
+    postures at which psi is not defined. A YAML names the task ``swivel``. Source: Kreutz-Delgado, Long, Seraji,
+    Int. J. Robotics Research 11(5), 1992.
 
     Args:
-        robot: The robot with these arms.
+        robot: The robot that has the arms.
         angles: Wanted angle psi* of each arm that has the task; 0 for elbow up, None for the angle at home [rad].
         joints: Names of the joints at shoulder, elbow and wrist, without the arm's prefix.
         gain: The swivel speed per angle k [1/s].
@@ -98,7 +100,7 @@ class ElbowSwivel:
         return H, g
 
     def _swivel(self, arm: str) -> tuple[float, float, Array]:
-        """Return the angle [rad], the share from 0 to 1 to which it is defined, and its gradient (nv,)."""
+        """Return the angle [rad], the factor s from 0 to 1, and the gradient of the angle (nv,)."""
         model, data = self._robot.model, self._data
         joints, axes = self._joints[arm], pin.LOCAL_WORLD_ALIGNED
         S, E, W = (data.oMi[joint].translation for joint in joints)
@@ -119,7 +121,7 @@ class ElbowSwivel:
 
 
 def _joint(robot: Robot, arm: str, name: str) -> int:
-    """Return the number of an arm's joint in the model; raises :class:`ConfigError` if there is none."""
+    """Return the index of an arm's joint in Pinocchio's model; raises :class:`ConfigError` if there is no joint."""
     if arm not in robot.arms:
         raise ConfigError(f"angles: no arm {arm!r:.40}; allowed: {', '.join(robot.arms)}")
     own = {robot.joint_names[j].removeprefix(f"{arm}_"): int(j) + 1 for j in robot.arms[arm].joints}

@@ -1,9 +1,9 @@
 """Tasks of the user's program and of other packages: costs on the next joint velocities, written in NumPy.
 
 A program passes its tasks to the controller as objects. A package names its task as an entry point of the group
-``q2r2_control.tasks``. A cell's YAML asks for it, with its settings, under ``control.tasks``. The costs are added to
+``q2r2_control.tasks``. A cell's YAML lists the task, with its settings, under ``control.tasks``. The costs are added to
 the costs of the built-in tasks before the QP is solved. Limits, separation and the certificate do not depend on costs,
-and so no task can break them.
+so no task can break them.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ class Task(Protocol):
 
         A task that wants J v+ = u with a weight w returns H = w J'J and g = -w J'u. The error of a tool has the weight
         1 for metres and 0.09 for radians, and the posture has 1e-3. The method is called at every substep and by
-        :meth:`CartesianController.problem`. Its answer may therefore depend on q and v alone. It should take less than
-        20 us.
+        :meth:`CartesianController.problem`. Its answer must therefore depend on q and v alone. A call should take less
+        than 20 us.
 
         Args:
             q: Joint positions of the reference (nv,) [rad].
@@ -51,7 +51,7 @@ class Task(Protocol):
 
 
 def load_tasks(robot: Robot, wanted: Mapping[str, Mapping[str, Any]]) -> dict[str, Task]:
-    """Return the tasks that the settings ask for, by key.
+    """Return the tasks that the settings ``wanted`` name, by their key in the settings.
 
     Raises :class:`ConfigError` if a task is unknown, or if its settings are not allowed.
     """
@@ -85,7 +85,7 @@ def _fault(made: Any, settings: Mapping[str, Any], error: Exception) -> str:
 
 
 class ExternalTasks:
-    """The tasks of one controller that are called at every substep. Those of its settings come first."""
+    """The tasks of one controller that are called at every substep. The tasks of its settings come first."""
 
     def __init__(self, robot: Robot, settings: Mapping[str, Mapping[str, Any]], own: Sequence[Task]) -> None:
         """Raise :class:`ConfigError` if an object is not a task, or if its cost at home is not usable."""
@@ -105,7 +105,10 @@ class ExternalTasks:
         return bool(self._tasks)
 
     def add_costs(self, H: Array, g: Array, q: Array, v: Array) -> tuple[str, ...]:
-        """Add the cost of each task at ``q`` and ``v`` to H (nv, nv) and g (nv,). Return why some were not used."""
+        """Add the cost of each task at ``q`` and ``v`` to H (nv, nv) and g (nv,).
+
+        Return a reason for each cost that was not used.
+        """
         faults = []
         for key, task in self._tasks.items():
             cost = _cost_of(task, q, v)

@@ -1,17 +1,18 @@
 """Write the cost of a tool that follows its target, as H and g of  1/2 v' H v + g' v (compiled).
 
-The cost of each following arm is  |J v - u|^2_W + v' M v  with the wanted twist u of the tool. The weights are
-W = diag(1, 1, 1, l^2, l^2, l^2), where the length l makes a radian comparable to a metre, times the weights of the
-settings. The latter are along the world's axes, and about the tool's own. The posture may use an axis as far as its
-weight leaves it free.
+The cost of each arm that follows a target is  |J v - u|^2_W + v' M v  with the wanted twist u of the tool. The weights
+are W = diag(1, 1, 1, l^2, l^2, l^2), where the length l makes a radian comparable to a metre, times the weights of the
+settings. The settings have weights along the world's axes, and about the tool's own axes. If the weight of an axis is
+small, the posture may move the tool along or about this axis.
 
 **Damping M.** If an arm is stretched out towards an unreachable target, the gradient of the reach with respect to the
-elbow angle vanishes like L theta. Under a wanted speed s the loop near that posture therefore has the gain L s / mu.
-Without damping mu this gain is unbounded, and with bounded accelerations it ends in a limit cycle. In general the
-wanted velocity s adds the geometric stiffness E_ij = s' d2x / dq_i dq_j. Only its negative part, the pull outwards,
-needs damping. The pull inwards drives the arm away from the singular posture, as it should. Joint i gets mu_i = d_i +
-sum_j min(|E_ij|, d_i) over k, with d_i = max(0, -E_ii). If an arm is pulled straight, |E_ij| <= d_i. By Gershgorin's
-theorem the gain is then at most k. M vanishes at the target.
+elbow angle theta vanishes like L theta, with the arm's length L. Under a wanted speed s and a damping mu, the loop near
+that posture therefore has the gain L s / mu. Without damping this gain is unbounded. Together with bounded
+accelerations, it causes a limit cycle. In general the wanted velocity s adds the geometric stiffness
+E_ij = s' d2x / dq_i dq_j. Only the negative part of E, the pull outwards, needs damping. The pull inwards drives the
+arm away from the singular posture, as it should. The damping of joint i is mu_i = (d_i + sum_j min(|E_ij|, d_i)) / k
+with d_i = max(0, -E_ii) and the setting k. If an arm is pulled straight, |E_ij| <= d_i. By Gershgorin's theorem the
+gain is then at most k. M vanishes at the target.
 """
 
 from __future__ import annotations
@@ -55,22 +56,22 @@ def tools_of(robot: Robot) -> Tools:
 
 
 ROTATION_LENGTH = 0.3  # The length l that makes a radian comparable to a metre [m/rad].
-# Share of a tool's speed limit for which its task asks. The certificate needs the rest.
+# Greatest speed that the task wants, as a share of the tool's speed limit. The certificate needs the remaining share.
 _SHARE_OF_LIMIT = 0.9
 
 
 class Motion(NamedTuple):
-    """The approach of a tool to its target, linear then angular. All values may change between ticks."""
+    """How a tool approaches its target: each array has a linear and an angular value. All may change between ticks."""
 
     gain: Array  # (2,) [1/s]
     deceleration: Array  # (2,) [m/s^2, rad/s^2]
     full_speed: Array  # (2,) [m/s, rad/s]
-    stretch_gain: Array  # (1,) k [1/s]
-    weight: Array  # (6,) Weights of the error along the world's axes and about the tool's, 0 .. 1.
+    stretch_gain: Array  # (1,) The gain k of the damping M [1/s].
+    weight: Array  # (6,) Weights of the error along the world's axes and about the tool's axes, 0 .. 1.
 
 
 def motion_of(settings: ControllerSettings) -> Motion:
-    """Return gains and speeds as the kernels read them."""
+    """Return the gains, speeds and weights of ``settings`` as arrays for the kernels."""
     limit = np.inf if settings.tool_speed_limit is None else settings.tool_speed_limit
     return Motion(
         gain=np.array([settings.position_gain, settings.rotation_gain]),
@@ -86,7 +87,7 @@ class FrameData(NamedTuple):
 
     twist: Array  # (n, 6) Wanted twist [m/s, rad/s].
     feedback: Array  # (n, 6) Part of the twist that comes from the error.
-    turn: Array  # (3, 3) Scratch: rotation from tool to target.
+    turn: Array  # (3, 3) Buffer for the rotation from a tool to its target.
 
     @classmethod
     def empty(cls, n: int) -> FrameData:
@@ -196,11 +197,11 @@ def times_transposed(A: Array, B: Array, product: Array) -> None:
 
 @kernel
 def approach_speed(error: float, gain: float, deceleration: float) -> float:
-    """Return the speed towards a target at distance ``error``: proportional when near, constant deceleration when far.
+    """Return the wanted speed towards a target at the distance ``error`` (e): proportional to e near the target.
 
-    It is v = gain e up to e0 = deceleration / gain^2, and then v = sqrt(2 deceleration e - (deceleration / gain)^2),
-    which continues it smoothly. A purely proportional law asks for the deceleration gain v. At speed the joints cannot
-    decelerate so strongly.
+    Up to e0 = deceleration / gain^2 the speed is v = gain e. Farther away it is the speed from which a tool stops with
+    constant deceleration, v = sqrt(2 deceleration e - (deceleration / gain)^2); both agree smoothly at e0. A purely
+    proportional law would need the deceleration gain v, which the joints cannot reach at high speed.
     """
     if error * gain * gain <= deceleration:
         return gain * error
@@ -209,7 +210,7 @@ def approach_speed(error: float, gain: float, deceleration: float) -> float:
 
 @kernel
 def wanted_twist(motion: Motion, data: TaskData, targets: TaskTargets, i: int) -> None:
-    """Write the twist of tool ``i`` towards its target into ``data.frame.twist``, and its part from the error."""
+    """Write the wanted twist of tool ``i`` into ``data.frame``, with the part of it that is due to the pose error."""
     twist, feedback, feed_forward = data.frame.twist[i], data.frame.feedback[i], targets.feed_forward[i]
     times_transposed(targets.rotation[i], data.rotation[i], data.frame.turn)
     for k in range(3):
@@ -231,11 +232,11 @@ def wanted_twist(motion: Motion, data: TaskData, targets: TaskTargets, i: int) -
 
 @kernel
 def accumulate_tool_cost(J: Array, twist: Array, weight: Array, priority: float, H: Array, g: Array) -> None:
-    """Add ``priority`` |J v - twist|^2_W of one arm to H (nv, nv) and g (nv,). ``weight`` (6,) is that of each row."""
+    """Add ``priority`` |J v - twist|^2_W of one arm to H (nv, nv) and g (nv,). ``weight`` (6,) has one for each row."""
     nv = g.shape[0]
     square = priority * ROTATION_LENGTH * ROTATION_LENGTH
     for i in range(nv):
-        # Joints of other arms do not move this tool. A revolute joint that moves it turns it, and a slide shifts it.
+        # Joints of other arms do not move this tool. The other joints all have an entry other than 0.
         if J[0, i] == J[1, i] == J[2, i] == J[3, i] == J[4, i] == J[5, i] == 0.0:
             continue
         for k in range(6):
@@ -253,8 +254,9 @@ def accumulate_tool_cost(J: Array, twist: Array, weight: Array, priority: float,
 def accumulate_stretch_damping(model: TaskModel, data: TaskData, i: int) -> None:
     """Add the damping M of tool ``i``, with the arm's weight, to ``data.H``.
 
-    For joint k between the base and joint j, d2x / dq_k dq_j = z_k x J_j (linear part). The second derivative of the
-    angular part is no Hessian. The same bound in magnitude replaces it: J_j turns with joint k by at most |z_k|.
+    For a joint k between the base and joint j, d2x / dq_k dq_j = z_k x J_j is the second derivative of the tool's
+    position. The angular part has no such symmetric second derivative. It is replaced by a bound on its magnitude,
+    because joint k turns J_j no faster than |z_k|.
     """
     chain, placements, H = model.chain, data.placements, data.H
     J, feedback = data.J[6 * i : 6 * i + 6], data.frame.feedback[i]
@@ -278,7 +280,7 @@ def accumulate_stretch_damping(model: TaskModel, data: TaskData, i: int) -> None
 
 @kernel
 def _stiffness(chain: Chain, placements: Placements, near: int, far: int, J: Array, s: Array) -> float:
-    """Return s' d2x / dq_near dq_far for the tool's linear motion: z_near x J_far, 0 for a sliding joint."""
+    """Return s' d2x / dq_near dq_far for the tool's position x: s' (z_near x J_far), or 0 if joint ``near`` slides."""
     if chain.prismatic[near] == 1:
         return 0.0
     x, y, z = placements.axis[near, 0], placements.axis[near, 1], placements.axis[near, 2]

@@ -1,4 +1,4 @@
-"""Write the cost of arms without a target, w |v - k (hold - q)|^2. Their joints return to the latched positions."""
+"""Write the cost of arms without a target, w |v - k (hold - q)|^2. It keeps their joints at the positions ``hold``."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from q2r2_control.control.targets import TaskTargets
     from q2r2_control.control.tasks.built_in import TaskData
 
-# With this weight, the task of the other arm does not move a held arm. It may give way to recover separation.
+# With this weight, the task of the other arm does not move an arm that holds. Only to recover separation may it move.
 _WEIGHT = 300.0
 _GAIN = 4.0  # [1/s]
 

@@ -1,8 +1,8 @@
-"""Tasks in addition to the tools' targets, by their names in a cell's YAML: joints, look_at, upright, relative.
+"""Tasks that a cell's YAML adds to the tools' targets by name: joints, look_at, upright, relative.
 
-Each task adds  weight |J v - u|^2  with the velocity u that reduces its error at a gain. Tasks with different goals
-reach a compromise according to their weights. The weights of a tool are 1 for a metre and 0.09 for a radian. The
-settings ``position_weights`` and ``rotation_weights`` leave a tool the freedom that such a task needs.
+Each task adds the cost  weight |J v - u|^2,  where the velocity u is a gain times the task's error. Tasks with
+different goals reach a compromise according to their weights. A tool's target has the weight 1 for metres and 0.09 for
+radians. The settings ``position_weights`` and ``rotation_weights`` give a tool the freedom that such a task needs.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
 _TINY = 1e-9
-_SOFT_EDGE = 0.05  # Angle beyond the cone over which the weight of ``upright`` grows [rad].
+_SOFT_EDGE = 0.05  # Angle beyond the cone at which the weight of ``upright`` has its full value [rad].
 
 
 class _Cost:
@@ -42,9 +42,9 @@ class _Tools:
     """Poses and Jacobians of some tools, in world axes."""
 
     def __init__(self, robot: Robot, arms: Sequence[str] | None) -> None:
-        """Take the tools of ``arms``, or all tools if it is None.
+        """Take the tools of ``arms``, or all tools if ``arms`` is None.
 
-        Raises :class:`ConfigError` as :func:`chosen_arms` and :func:`check_robot` do.
+        Raises :class:`ConfigError` if ``robot`` is not a Robot, or if a name is not the name of an arm.
         """
         check_robot(robot)
         names = chosen_arms(robot, arms)
@@ -64,18 +64,19 @@ class _Tools:
 
 
 class JointTarget:
-    """Moves joints to wanted positions within their limits. Each has the cost w |v_j - k (q*_j - q_j)|^2.
+    """Moves joints to wanted positions within their limits. Each joint has the cost w |v_j - k (q*_j - q_j)|^2.
 
     A YAML names the task ``joints``.
 
     Args:
         robot: The robot with these joints.
         positions: Wanted position q* by the joint's name, such as ``{"left_A3": 0.3}`` [rad, or m of a sliding joint].
-        gain: The speed per distance k [1/s].
+        gain: The gain k: speed per distance [1/s].
         weight: The weight w, compared with 1 for a tool's error in metres.
 
     Raises:
-        ConfigError: If a joint does not exist, if a position is outside its limits, or if a number is not above 0.
+        ConfigError: If a joint does not exist, if a position is outside the joint's limits, or if ``gain`` or
+            ``weight`` is not above 0.
     """
 
     def __init__(self, robot: Robot, positions: Mapping[str, float], gain: float = 2.0, weight: float = 0.1) -> None:
@@ -103,17 +104,17 @@ class JointTarget:
 class LookAt:
     """Lets an axis of the tool point at a point of the world. The rotation about that axis is free.
 
-    Let a be the axis, d the unit vector from the tool to the point, and r their distance. Let t be the angle between a
-    and d about the unit vector n = a x d / sin t. The cost is  w |(I - a a') (omega - dd) - k t n|^2.  Here omega is
-    the angular velocity of the tool, and  dd = -d x v / r  is that of d, while the tool moves with the velocity v. A
-    YAML names the task ``look_at``.
+    Let a be the axis, d the unit vector from the tool to the point, and r the distance of tool and point. Let t be the
+    angle from a to d about the unit vector n = a x d / sin t. The cost is  w |(I - a a') (omega - dd) - k t n|^2.  Here
+    omega is the angular velocity of the tool. The angular velocity of d is  dd = -d x v / r  while the tool moves with
+    the velocity v. A YAML names the task ``look_at``.
 
     Args:
         robot: The robot with the tools.
         point: The point in the world (3,) [m].
         arms: Names of the arms that have the task; None for all.
         axis: The axis a in the tool's frame (3,), of any length.
-        gain: The angular speed per angle k [1/s].
+        gain: The gain k: angular speed per angle [1/s].
         weight: The weight w, compared with 0.09 for a tool's own rotation.
 
     Raises:
@@ -139,7 +140,7 @@ class LookAt:
             pointing, way = pose.rotation @ self._axis, self._point - pose.translation
             distance = max(float(np.linalg.norm(way)), _TINY)
             towards = way / distance
-            # The direction to the point turns as well, if the tool moves across it. Its angular velocity is
+            # The direction to the point turns too if the tool moves across this direction. Its angular velocity is
             # towards x d(towards)/dt.
             across = pin.skew(towards) @ J[:3] / -distance
             free = np.eye(3) - np.outer(pointing, pointing)
@@ -150,17 +151,17 @@ class LookAt:
 class Upright:
     """Keeps an axis of the tool within a cone about a direction of the world.
 
-    Within the cone the task costs nothing. At an angle t beyond its edge the cost is  w(t) (n' omega - k t)^2.  Here n
-    is the axis of the shortest rotation back, and omega is the angular velocity of the tool. The weight grows to w over
-    the first 0.05 rad. A YAML names the task ``upright``.
+    Within the cone the cost is 0. At an angle t beyond its edge the cost is  w(t) (n' omega - k t)^2.  Here n is the
+    axis of the shortest rotation back into the cone, and omega is the angular velocity of the tool. The weight w(t)
+    grows from 0 to w over the first 0.05 rad. A YAML names the task ``upright``.
 
     Args:
         robot: The robot with the tools.
         angle: Angle from the middle of the cone to its edge, up to pi [rad].
         arms: Names of the arms that have the task; None for all.
         axis: The axis in the tool's frame (3,), of any length.
-        up: The middle of the cone in the world (3,), of any length.
-        gain: The angular speed per angle k [1/s].
+        up: The direction of the cone's middle in the world frame (3,), of any length.
+        gain: The gain k: angular speed per angle [1/s].
         weight: The weight w, compared with 0.09 for a tool's own rotation.
 
     Raises:
@@ -198,14 +199,14 @@ class RelativePose:
     """Lets the right tool keep its pose in the left tool's frame.
 
     The cost is  w |J_r v - J_c v - k e|^2  with the pose error e of the right tool (6,) and the Jacobian J_r of that
-    tool. J_c is the Jacobian of a body that the left tool would carry at the wanted pose. Rotations count 0.09 times as
-    much as metres. A YAML names the task ``relative``.
+    tool. J_c is the Jacobian of a body that the left tool would carry at the wanted pose. A radian counts 0.09 times as
+    much as a metre. A YAML names the task ``relative``.
 
     Args:
         robot: A robot with the arms ``left`` and ``right``.
         position: Position of the right tool in the left tool's frame (3,) [m]; None for the position at home.
         rpy: Its roll, pitch and yaw there (3,) [rad]; None for the rotation at home.
-        gain: The speed per distance k [1/s].
+        gain: The gain k: speed per distance [1/s].
         weight: The weight w, compared with 1 for a tool's error in metres.
 
     Raises:
@@ -242,7 +243,10 @@ class RelativePose:
 
 
 def _turn(of: Array, to: Array) -> Array:
-    """Return the shortest rotation vector (3,) [rad] between unit vectors. If they are opposite, the axis is any."""
+    """Return the shortest rotation vector (3,) [rad] that turns the unit vector ``of`` into the unit vector ``to``.
+
+    If they are opposite, one of the possible axes is taken.
+    """
     across = np.cross(of, to)
     sine = float(np.linalg.norm(across))
     if sine < _TINY:

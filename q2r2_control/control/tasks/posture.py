@@ -1,7 +1,7 @@
-"""Write the cost of the joints that no tool needs. They are pulled towards a posture.
+"""Write the cost that moves the joints towards a posture, as far as the tools leave the joints free.
 
 The cost of all joints is w |v - v_p|^2. The posture velocity v_p is projected into the nullspace of the tools, so that
-it leaves no error of a tool at rest. Joints of an arm without a target are not pulled.
+it causes no error of a tool at rest. Joints of an arm without a target have v_p = 0.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _PROJECTION_DAMPING = 1e-3
 
 
 class Posture(NamedTuple):
-    """The posture of the joints that the tools leave free. Gain and weight may change between ticks."""
+    """How joints move to the posture as far as the tools leave them free. Gain and weight may change between ticks."""
 
     home: Array  # (nv,) [rad]
     gain: Array  # (1,) [1/s]
@@ -34,7 +34,7 @@ class Posture(NamedTuple):
 
 
 def posture_of(robot: Robot, settings: ControllerSettings) -> Posture:
-    """Return home, and the strength of the pull towards it."""
+    """Return the home posture, and the gain, weight and speed of the motion towards a posture."""
     gain, weight = np.array([settings.posture_gain]), np.array([settings.posture_weight])
     return Posture(np.array(robot.home), gain, weight, settings.posture_speed)
 
@@ -42,9 +42,9 @@ def posture_of(robot: Robot, settings: ControllerSettings) -> Posture:
 class PostureData(NamedTuple):
     """Data that are written at each tick."""
 
-    v: Array  # (nv,) Wanted velocities where the tools leave joints free [rad/s].
+    v: Array  # (nv,) The posture velocity v_p [rad/s].
     factor: Array  # (6 n, 6 n) Cholesky factor of the damped J J'.
-    moved: Array  # (6 n,) Scratch.
+    moved: Array  # (6 n,) Buffer for J v and for the solution of J J' x = J v.
 
     @classmethod
     def empty(cls, n: int, nv: int) -> PostureData:
@@ -53,7 +53,7 @@ class PostureData(NamedTuple):
 
 @kernel
 def accumulate_posture_cost(model: TaskModel, data: TaskData, targets: TaskTargets, q: Array) -> None:
-    """Add the cost of all joints' distance from the posture velocity. It needs the Jacobians of the tools."""
+    """Add the cost w |v - v_p|^2 of all joints. The Jacobians of the tools have to be written before."""
     gain, speed, v = model.posture.gain[0], model.posture.speed, data.posture.v
     for j in range(q.shape[0]):
         v[j] = clamp(gain * (targets.posture[j] - q[j]), -speed, speed)
@@ -73,14 +73,14 @@ def accumulate_posture_cost(model: TaskModel, data: TaskData, targets: TaskTarge
 def project_to_nullspace(J: Array, factor: Array, moved: Array, v: Array) -> None:
     """Remove from ``v`` (nv,) the part that moves the tools with Jacobians J (6n, nv): v -= J' (J J' + d I)^-1 J v.
 
-    ``factor`` (6n, 6n) and ``moved`` (6n,) are scratch.
+    ``factor`` (6n, 6n) and ``moved`` (6n,) are buffers.
     """
     for i in range(J.shape[0]):
         for j in range(i, J.shape[0]):
             factor[i, j] = dot(J[i], J[j])
         factor[i, i] += _PROJECTION_DAMPING * _PROJECTION_DAMPING
         moved[i] = dot(J[i], v)
-    factorise(factor)  # The matrix is positive definite for any finite J. With another J, J v is not finite either.
+    factorise(factor)  # The matrix is positive definite for any finite J. If J is not finite, nor is the result.
     substitute(factor, moved)
     for j in range(J.shape[1]):
         for i in range(J.shape[0]):

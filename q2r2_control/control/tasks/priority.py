@@ -1,4 +1,4 @@
-"""The arm that gives way if two arms are in each other's way, as weights of the other tasks' costs."""
+"""Decide which arm gives way if one arm blocks the other, by weights of the arms' costs."""
 
 from __future__ import annotations
 
@@ -12,11 +12,12 @@ from q2r2_control.types import Array
 
 
 class Priority(NamedTuple):
-    """The arm that gives way if two arms are in each other's way. The weights may change between ticks.
+    """Weights that decide which arm gives way if one arm blocks the other. The weights may change between ticks.
 
     In the QP the arms influence each other only through separation rows, which couple their joints. All costs of an arm
-    that gives way, also posture and damping, are multiplied by a small weight. Its motion then pays for a row that both
-    arms need. If no row is active, nothing changes. An arm without a target holds its joints, and does not give way.
+    that gives way, also posture and damping, are multiplied by a small weight. If a row couples both arms, the QP then
+    changes the motion of this arm and not that of the other arm. If no row is active, the weights change nothing. An
+    arm without a target holds its joints, and does not give way.
     """
 
     arm: Array  # (n,) Weight of an arm's costs while it follows a target: 1, or less if it gives way.

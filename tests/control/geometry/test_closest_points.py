@@ -51,9 +51,10 @@ def _to_segment(point: Array, start: Array, end: Array) -> float:
 
 
 def _least_distance(segments: Segments) -> float:
-    """The function is a convex quadratic.
+    """Return the least distance of two segments, computed in another way than by the kernel.
 
-    On a square, it is least at its free minimum if that is inside, else on a side.
+    The squared distance is a convex quadratic function of (s, t). On the unit square, it is least at its unconstrained
+    minimum if this minimum lies inside, otherwise on a side.
     """
     a0, a1, b0, b1 = segments
     candidates = [_to_segment(a0, b0, b1), _to_segment(a1, b0, b1), _to_segment(b0, a0, a1), _to_segment(b1, a0, a1)]
@@ -65,7 +66,7 @@ def _least_distance(segments: Segments) -> float:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_segments_are_as_far_apart_as_their_closest_points(kind: str) -> None:
+def test_the_distance_of_two_segments_is_that_of_their_closest_points(kind: str) -> None:
     random = np.random.default_rng(1)
     on_a, on_b = np.zeros(3), np.zeros(3)
     # Segments that are parallel except for rounding are measured in the middle of the overlap, not at its nearer end.
@@ -100,7 +101,7 @@ def _outside(points: Array, half: Array) -> Array:
 
 
 def _nearest_along(a0: Array, a1: Array, half: Array) -> float:
-    """The squared distance is convex along the segment. Bisection finds where its slope changes sign."""
+    """Return the distance of a segment from a box. It is convex along the segment, so bisection finds its minimum."""
     low, high = 0.0, 1.0
     for _ in range(100):
         middle = 0.5 * (low + high)
@@ -154,7 +155,9 @@ SPECIAL = {
 
 
 @pytest.mark.parametrize(("a0", "a1", "expected"), SPECIAL.values(), ids=SPECIAL.keys())
-def test_special_positions_of_a_segment_and_a_box(a0: list[float], a1: list[float], expected: float) -> None:
+def test_the_distance_of_a_segment_and_a_box_is_right_in_special_positions(
+    a0: list[float], a1: list[float], expected: float
+) -> None:
     half = np.array([0.4, 0.2, 0.3])
     for start, end in ((a0, a1), (a1, a0)):
         answer = _to_box(np.array(start), np.array(end), half)
@@ -162,7 +165,7 @@ def test_special_positions_of_a_segment_and_a_box(a0: list[float], a1: list[floa
         _assert_witnesses(answer, np.array(start), np.array(end), half)
 
 
-def test_the_shortest_way_of_a_segment_out_of_a_box_is_found_among_all_directions() -> None:
+def test_no_direction_takes_a_segment_out_of_a_box_by_a_shorter_translation() -> None:
     directions = np.random.default_rng(8).normal(size=(400, 3))
     directions = np.vstack([directions / np.linalg.norm(directions, axis=1, keepdims=True), np.eye(3), -np.eye(3)])
     entered = across = 0

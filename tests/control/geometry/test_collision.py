@@ -24,12 +24,12 @@ def _coal_distances(robot: Robot, q: Array) -> Array:
 
 
 def _core_distance(cell: CellArrays) -> Array:
-    """Return the distance (p,) below which the closed forms are not smooth, because the segment itself touches."""
+    """Return the distance (p,) at which the cores meet [m]. The closed forms are not smooth below this distance."""
     return np.asarray(-cell.bodies.radius[cell.pairs.first] - cell.bodies.radius[cell.pairs.second])
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_distances_of_all_pairs_equal_coals_on_both_sides_of_contact(name: str) -> None:
+def test_distances_of_all_pairs_equal_coals_distances_outside_and_in_penetration(name: str) -> None:
     arrays, random = cell(name), np.random.default_rng(8)
     postures = np.array([arrays.robot.home, *(random_posture(arrays.robot, random) for _ in range(60))])
     ours = distances(arrays, postures)
@@ -44,7 +44,7 @@ def test_distances_of_all_pairs_equal_coals_on_both_sides_of_contact(name: str) 
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_cheap_bound_is_never_more_than_the_distance(name: str) -> None:
+def test_the_cheap_bound_is_never_greater_than_the_distance(name: str) -> None:
     arrays, random = cell(name), np.random.default_rng(9)
     for _ in range(20):
         q = random_posture(arrays.robot, random)
@@ -67,7 +67,7 @@ def _differences(arrays: CellArrays, q: Array, step: float) -> Array:
 
 
 def _assert_rows_are_gradients(arrays: CellArrays, q: Array) -> tuple[int, int]:
-    """Return the numbers of compared pairs outside and in penetration."""
+    """Compare rows with finite differences. Return how many pairs were compared outside and in penetration."""
     here = distances(arrays, q[None])[0]
     slopes, coarse = _differences(arrays, q, STEP), _differences(arrays, q, 10 * STEP)
     outside = penetrating = 0
@@ -91,19 +91,21 @@ def test_rows_are_the_gradients_of_the_distances(seed: int, name: str) -> None:
 
 
 def _way_bound(arrays: CellArrays, way: Array) -> Array:
-    """Return S (p,) of stop_certificate.py for joint ways (nv,)."""
+    """Return S (p,) of stop_certificate.py [m] for joints that travel ``way`` (nv,) [rad or m]."""
     padded = np.concatenate([[0.0], way])
     return np.asarray((arrays.pairs.reach * padded[arrays.pairs.joint]).sum(axis=1))
 
 
 @given(seed=st.integers(0, 2**32 - 1), name=st.sampled_from(NAMES), size=st.floats(1e-4, 3.0))
 @settings(derandomize=True, max_examples=150, deadline=None)
-def test_no_distance_changes_by_more_than_the_reach_times_the_joints_ways(seed: int, name: str, size: float) -> None:
+def test_no_distance_changes_by_more_than_the_travel_of_joints_times_their_reach(
+    seed: int, name: str, size: float
+) -> None:
     arrays, random = cell(name), np.random.default_rng(seed)
     q = random_posture(arrays.robot, random)
     other = np.clip(q + random.uniform(-size, size, len(q)), arrays.robot.position_lower, arrays.robot.position_upper)
     here, there = distances(arrays, np.array([q, other]))
-    # Where a segment enters a box over an edge, its shortest way out is not continuous.
+    # If a segment enters a box over an edge, the direction of the shortest translation out of the box jumps.
     comparable = np.minimum(here, there) > _core_distance(arrays) + 1e-9
     excess = np.abs(here - there) - _way_bound(arrays, np.abs(other - q))
     assert excess[comparable].max() <= 1e-12
@@ -121,7 +123,7 @@ SLIDING = """<robot name="slide"><link name="base"><collision><origin xyz="0.9 0
 <limit lower="-0.3" upper="0.3" velocity="1" effort="1"/></joint></robot>"""
 
 
-def test_prismatic_joints_have_rows_and_reaches_too() -> None:
+def test_rows_and_reaches_are_right_for_prismatic_joints_too() -> None:
     arrays, random = (
         arrays_of(Robot.from_urdf(SLIDING, {"left": "tip"}, unchecked_links=["carriage", "turned"])),
         np.random.default_rng(13),
@@ -141,7 +143,7 @@ def test_a_shape_that_no_kernel_measures_is_refused_by_name() -> None:
         bodies_of(model)
 
 
-def test_two_boxes_are_refused() -> None:
+def test_a_pair_of_two_boxes_is_refused() -> None:
     arrays = cell("dual_iiwa7")
     model = pin.GeometryModel()
     for name in ("crate", "table"):

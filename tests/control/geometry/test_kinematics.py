@@ -34,7 +34,7 @@ def test_every_joint_frame_is_where_pinocchio_puts_it(name: str) -> None:
 
 
 def _model(*joints: object) -> pin.Model:
-    """Return a chain of joints, each with an offset and a rotation relative to the one before."""
+    """Return a chain of joints, each with an offset and a rotation relative to the joint before."""
     model, parent = pin.Model(), 0
     for number, joint in enumerate(joints):
         offset = pin.SE3(pin.rpy.rpyToMatrix(0.3, -0.4, 0.5), np.array([0.1, 0.2, -0.3]))

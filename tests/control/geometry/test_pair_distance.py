@@ -24,7 +24,7 @@ ROUNDED = with_rounded_boxes(MODEL, np.where(TOUCHING, DEPTH, -0.02))
 
 
 def measured(model: CollisionModel, q: Array) -> tuple[Array, Array]:
-    """Return every pair's distance and lower bound at a posture."""
+    """Return every pair's distance (p,) and the lower bound on it (p,) at a posture [m]."""
     data = CollisionData.empty(model)
     update_placements(model, data, q)
     count = len(NAMES)
@@ -33,24 +33,25 @@ def measured(model: CollisionModel, q: Array) -> tuple[Array, Array]:
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_only_pairs_with_a_depth_see_a_rounded_box_and_never_a_larger_one(seed: int) -> None:
+def test_only_pairs_with_a_depth_get_rounded_boxes_and_no_rounded_box_is_larger(seed: int) -> None:
     q = random_posture(ROBOT, np.random.default_rng(seed))
     (distance, _), (rounded, bound) = measured(MODEL, q), measured(ROUNDED, q)
     np.testing.assert_array_equal(rounded[~TOUCHING], distance[~TOUCHING])
     more = (rounded - distance)[TOUCHING]
-    # Corners lose sqrt(3) - 1 of the radius. A point deep inside is nearer to other sides of the smaller core.
+    # At a corner, rounding removes (sqrt(3) - 1) times the radius. Inside the box, distances may differ by more, since
+    # a point deep inside may be nearer to another side of the smaller core.
     assert (more > -1e-9).all()
     outside = distance[TOUCHING] > 0.0
     assert (more[outside] <= (np.sqrt(3.0) - 1.0) * DEPTH + 1e-9).all()
     assert (bound <= rounded + 1e-9).all()
 
 
-def test_above_the_face_of_a_box_nothing_changes() -> None:
+def test_rounded_boxes_do_not_change_distances_above_the_face_of_a_box() -> None:
     (distance, _), (rounded, _) = measured(MODEL, ROBOT.home), measured(ROUNDED, ROBOT.home)
     np.testing.assert_allclose(rounded[TOUCHING], distance[TOUCHING], atol=1e-12)
 
 
-def test_a_depth_increases_the_distance_of_cores_by_the_same_amount() -> None:
+def test_a_rounded_box_has_the_depth_of_its_pair_as_its_radius() -> None:
     first, second = ((model.bodies.radius[model.pairs.second])[TOUCHING] for model in (MODEL, ROUNDED))
     np.testing.assert_allclose(second - first, DEPTH)
 
@@ -60,7 +61,7 @@ CORES_APART = 0.03  # [m]
 
 
 def _looked_at(arrays: CellArrays, q: Array, p: int, smooth: bool = True) -> tuple[float, Array]:
-    """Return the distance of pair ``p`` and its row."""
+    """Return the distance of pair ``p`` [m], and the row (nv,) that is its gradient."""
     data, row = placed(arrays, q), np.zeros(len(q))
     distance = measure_smooth(arrays.collision, data, p, SMOOTHING) if smooth else measure(arrays.collision, data, p)
     distance_row(arrays.collision, data, p, row)
@@ -73,7 +74,7 @@ def _radii(arrays: CellArrays, p: int) -> float:
 
 @pytest.fixture(scope="module")
 def seen() -> list[tuple[Array, int]]:
-    """Return postures and pairs, some with a box, whose cores are apart."""
+    """Return postures and pairs whose cores are apart there. Some of the pairs contain a box."""
     arrays, random = cell("dual_iiwa7"), np.random.default_rng(21)
     found = []
     for _ in range(300):
@@ -84,14 +85,16 @@ def seen() -> list[tuple[Array, int]]:
     return found
 
 
-def test_the_smooth_distance_exceeds_the_distance_by_no_more_than_stated(seen: list[tuple[Array, int]]) -> None:
+def test_the_smooth_distance_exceeds_the_exact_distance_by_at_most_the_stated_bound(
+    seen: list[tuple[Array, int]],
+) -> None:
     arrays = cell("dual_iiwa7")
     for q, p in seen:
         exact, smooth = _looked_at(arrays, q, p, smooth=False)[0], _looked_at(arrays, q, p)[0]
         assert exact - 1e-12 <= smooth <= exact + SMOOTHING / (4 * (exact + _radii(arrays, p))) + 1e-12
 
 
-def test_its_row_is_its_gradient_for_every_pair(seen: list[tuple[Array, int]]) -> None:
+def test_the_row_of_a_smooth_distance_is_its_gradient_for_every_pair(seen: list[tuple[Array, int]]) -> None:
     arrays = cell("dual_iiwa7")
     for q, p in seen:
         row = _looked_at(arrays, q, p)[1]
@@ -117,7 +120,7 @@ FIXED = {
 
 
 @pytest.mark.parametrize("kind", FIXED)
-def test_a_bar_that_tilts_over_another_body_turns_the_row_gradually_where_the_exact_row_jumps(kind: str) -> None:
+def test_while_a_bar_tilts_over_a_body_the_smooth_row_turns_gradually_and_the_exact_row_jumps(kind: str) -> None:
     quarter, fixed, height = FIXED[kind]
     urdf = LYING.format(quarter=quarter, fixed=fixed, height=height)
     arrays = arrays_of(Robot.from_urdf(urdf, {"left": "bar"}, unchecked_links=["beam"]))

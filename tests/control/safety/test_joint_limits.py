@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from q2r2_control.control.safety.joint_limits import JointLimits, VelocityBox, fastest_towards, next_velocity_box
 from q2r2_control.types import Array
 
-JOINTS = 60  # Joints that are stepped side by side.
+JOINTS = 60  # Number of joints that are tested at the same time.
 STEPS = 800
 RETURN_SPEED = 0.2
 # Tolerance for the accumulated rounding of positions.
@@ -42,7 +42,7 @@ def _keeps_p(q: Array, v: Array, bounds: JointLimits) -> bool:
 
 
 def _fastest_in_p(room: Array, bounds: JointLimits) -> Array:
-    """Return the largest speed for which property P holds with this much room."""
+    """Return the largest speed for which property P holds at the distance ``room`` from the limit."""
     a, H = bounds.acceleration, bounds.longest_step
     return np.minimum(bounds.velocity, -a * H + np.sqrt((a * H) ** 2 + 2 * a * np.maximum(room, 0.0)))
 
@@ -103,7 +103,7 @@ def _turning_point(v: Array, chosen: Array) -> Array:
     part=st.floats(1e-3, 1.0),
 )
 @settings(derandomize=True, max_examples=500, deadline=None)
-def test_the_bound_is_the_largest_velocity_that_can_still_stop(
+def test_the_bound_is_the_largest_velocity_from_which_a_joint_can_still_stop(
     room: float, share: float, a: float, longest: float, part: float
 ) -> None:
     h = part * longest
@@ -133,7 +133,7 @@ def _recover(q: Array, v: Array, bounds: JointLimits, choose: Choice, seconds: f
 
 @pytest.mark.parametrize("side", [1.0, -1.0], ids=["above", "below"])
 @pytest.mark.parametrize("choose", CHOICES.values(), ids=CHOICES.keys())
-def test_a_joint_outside_returns_without_a_jump_at_bounded_speed(choose: Choice, side: float) -> None:
+def test_a_joint_outside_its_limits_returns_without_a_jump_at_bounded_speed(choose: Choice, side: float) -> None:
     ones = np.ones(JOINTS)
     bounds = JointLimits(-2.0 * ones, 2.0 * ones, 1.5 * ones, 10.0 * ones, 0.002, RETURN_SPEED)
     outside = np.linspace(1e-6, 0.3, JOINTS)

@@ -17,7 +17,7 @@ H = 0.002
 
 
 def started() -> SafetyData:
-    """Return a filter at home with slow motion, a certified stop, and the box of the next step."""
+    """Return the data of a filter at home, with slow motion, a certified stop, and the box of the next step."""
     data = kernel_data("dual_iiwa7", HOME, V).safety
     data.distance[:] = distances(cell("dual_iiwa7"), HOME[None])[0]
     assert certify_start(MODEL, data)
@@ -26,12 +26,12 @@ def started() -> SafetyData:
 
 
 def moved(data: SafetyData, wish: Array, usable: bool = True) -> int:
-    """Return the filter's answer to a wish."""
+    """Do one step of the filter with the solver's velocities ``wish`` (nv,) [rad/s], and return its outcome."""
     outcome, _ = apply_safety_filter(MODEL, data, wish, usable, H, 1.0)
     return int(outcome)
 
 
-def test_a_wish_within_the_box_and_far_from_everything_is_followed_unchanged() -> None:
+def test_a_solution_within_the_box_and_far_from_collisions_is_executed_unchanged() -> None:
     data, wish = started(), V + np.linspace(0.008, -0.008, 14)
     assert moved(data, wish) == FOLLOWED
     np.testing.assert_array_equal(data.state.v, wish)
@@ -40,7 +40,7 @@ def test_a_wish_within_the_box_and_far_from_everything_is_followed_unchanged() -
     assert data.active.used[0] == 0
 
 
-def test_a_wish_beyond_the_box_is_cut_to_it_joint_by_joint_and_the_joint_is_named() -> None:
+def test_a_solution_beyond_the_box_is_clamped_joint_by_joint_and_the_joint_is_named() -> None:
     data, wish = started(), V.copy()
     wish[3] = 1e12
     assert moved(data, wish) == FOLLOWED
@@ -52,7 +52,7 @@ def test_a_wish_beyond_the_box_is_cut_to_it_joint_by_joint_and_the_joint_is_name
 
 @pytest.mark.parametrize("number", [np.nan, np.inf])
 @pytest.mark.parametrize("joint", [0, 13])
-def test_a_single_number_that_is_not_finite_continues_the_certified_stop(number: float, joint: int) -> None:
+def test_a_solution_with_one_number_that_is_not_finite_leads_to_the_certified_stop(number: float, joint: int) -> None:
     data, wish = started(), V.copy()
     wish[joint] = number
     assert moved(data, wish) == STOPPED
@@ -62,7 +62,7 @@ def test_a_single_number_that_is_not_finite_continues_the_certified_stop(number:
     np.testing.assert_array_equal(data.state.v, v)
 
 
-def test_an_unusable_wish_is_not_evaluated() -> None:
+def test_an_unusable_solution_is_not_executed() -> None:
     data = started()
     assert moved(data, V, usable=False) == STOPPED
     assert (np.abs(data.state.v) <= np.abs(V)).all()

@@ -38,7 +38,7 @@ def _stays_beyond(model: CollisionModel, data: CollisionData, step: QuadraticPie
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_proven_separation_is_true_during_the_whole_step_and_needs_little_room(name: str) -> None:
+def test_a_proven_distance_holds_during_the_whole_step_and_is_often_close_to_the_least_one(name: str) -> None:
     random, robot = np.random.default_rng(21), cell(name).robot
     proven = 0
     for _ in range(40):
@@ -55,15 +55,15 @@ def test_a_proven_separation_is_true_during_the_whole_step_and_needs_little_room
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_pair_without_any_room_is_proven_to_part(name: str) -> None:
-    """The distance alone would prove nothing, because half of the joints' way would have to be free."""
+def test_a_pair_exactly_at_its_distance_is_proven_to_move_apart(name: str) -> None:
+    """A bound from the distance alone would fail, because it needs a free distance of half of the joints' travel."""
     random, robot = np.random.default_rng(22), cell(name).robot
     parted = 0
     for _ in range(40):
         q, step = random_posture(robot, random), 1e-6
         here = distances(cell(name), q[None])[0]
         gradient = (distances(cell(name), q + step * np.eye(len(q))) - here) / step
-        # No joint changes some distances, such as the height of a first link above the table.
+        # Some distances depend on no joint, such as the distance of an arm's first link from the table.
         movable = np.abs(gradient).max(axis=0) > 0.01
         for p in np.flatnonzero((here > 1e-3) & (here < 0.3) & movable)[:4].tolist():
             away = gradient[:, p] / np.abs(gradient[:, p]).max()

@@ -18,7 +18,7 @@ H = 0.001
 
 
 class Seen:
-    """The measured distances and the written rows in one state, whose joints can stop together."""
+    """The measured distances and the written rows in one state. The known stop is that of all joints together."""
 
     def __init__(self, name: str, q: Array, v: Array) -> None:
         model, data = kernel_model(name).safety, kernel_data(name, q, v).safety
@@ -43,14 +43,16 @@ SEEDS = st.integers(0, 2**32 - 1)
 
 @given(seed=SEEDS, name=st.sampled_from(NAMES), speed=st.floats(0.0, 1.0))
 @settings(derandomize=True, max_examples=80, deadline=None)
-def test_distances_are_exact_where_they_matter_and_never_too_large(seed: int, name: str, speed: float) -> None:
+def test_distances_of_near_pairs_are_exact_and_other_distances_are_never_too_large(
+    seed: int, name: str, speed: float
+) -> None:
     q, v = _state(name, seed, speed)
     seen, exact = Seen(name, q, v), distances(cell(name), q[None])[0]
     assert (seen.distance <= exact + 1e-12).all()
     matters = exact <= STOP_DISTANCE
     np.testing.assert_allclose(seen.distance[matters], exact[matters], rtol=0, atol=1e-12)
     assert seen.distance[seen.closest] == pytest.approx(exact.min(), abs=1e-12)
-    # For a pair that is too close, the stop certificate uses a bound below the least distance.
+    # With a lower bound below its required distance, a pair would count as too close in the stop certificate.
     assert (seen.distance[~matters] > STOP_DISTANCE).all()
 
 
@@ -72,7 +74,7 @@ def _gradient(name: str, q: Array, p: int) -> Array:
 
 @given(seed=SEEDS, name=st.sampled_from(NAMES))
 @settings(derandomize=True, max_examples=80, deadline=None)
-def test_every_pair_that_is_too_close_gets_a_row_that_parts_it_at_bounded_speed(seed: int, name: str) -> None:
+def test_every_pair_that_is_too_close_gets_a_row_that_opens_it_at_bounded_speed(seed: int, name: str) -> None:
     q, v = _state(name, seed, 0.0)
     seen, exact = Seen(name, q, v), distances(cell(name), q[None])[0]
     for p in np.flatnonzero(exact < STOP_DISTANCE - 1e-3).tolist():
@@ -84,14 +86,14 @@ def test_every_pair_that_is_too_close_gets_a_row_that_parts_it_at_bounded_speed(
 
 
 def _least_free(name: str, q: Array, v: Array, duration: float, p: int) -> float:
-    """Return B, the least free distance of a pair on a straight stop in joint space from (q, v)."""
+    """Return B, the least free distance of a pair during a stop from (q, v) that is straight in joint space [m]."""
     way = np.linspace(0.0, 0.5 * duration, 33)[:, None] * v
     return float(distances(cell(name), q + way)[:, p].min()) - STOP_DISTANCE
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_velocities_that_keep_the_rows_use_up_what_the_stop_leaves_free_no_faster_than_the_gain(name: str) -> None:
-    """Velocities that break the rows use it up faster, so that the rows are neither too lax nor too strict."""
+def test_velocities_that_keep_the_rows_use_up_free_distance_no_faster_than_the_gain_allows(name: str) -> None:
+    """Velocities that break the rows use up free distance faster: the rows are neither too lax nor too strict."""
     random, kept, broken = np.random.default_rng(5), 0, 0
     for seed in range(150):
         q, v = _state(name, seed, 0.4)

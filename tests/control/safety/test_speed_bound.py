@@ -16,7 +16,7 @@ from tests.control.safety.motions import ACCELERATION, H, Motion, motion_of
 
 
 def prepared(name: str, motion: Motion) -> tuple[SafetyData, float]:
-    """Return the data of the certificate before it examines pairs, and the time of the bound [s]."""
+    """Return the data of the certificate before it examines pairs, and h + T / 2 [s], which the bound needs."""
     model, data = kernel_model(name).safety, kernel_data(name, motion.q, motion.v).safety
     data.distance[:] = distances(cell(name), motion.q[None])[0]
     data.candidate.q[:] = motion.q_next
@@ -28,7 +28,7 @@ def prepared(name: str, motion: Motion) -> tuple[SafetyData, float]:
 
 
 def bounds_of(name: str, motion: Motion) -> Array:
-    """Return the least distance of each pair (p,) by its speed [m]."""
+    """Return a lower bound on the distance of each pair (p,) in the motion, from the speeds of its bodies [m]."""
     data, time = prepared(name, motion)
     bounds = np.zeros_like(data.distance)
     _least_distances(kernel_model(name).safety, data, time, bounds)
@@ -37,7 +37,7 @@ def bounds_of(name: str, motion: Motion) -> Array:
 
 @kernel
 def _least_distances(model: SafetyModel, data: SafetyData, time: float, out: Array) -> None:
-    """All pairs are computed in one call, because each call from Python passes all arrays of the model again."""
+    """Compute all pairs in one call, because each call from Python passes all arrays of the model again."""
     for p in range(out.shape[0]):
         out[p] = least_distance(model, data, p, time)
 
@@ -50,7 +50,7 @@ def share_no_joint(name: str) -> Array:
     return cell(name).pairs.carried == 0
 
 
-def test_the_speed_of_bodies_is_that_of_their_places() -> None:
+def test_velocities_of_bodies_are_the_rates_of_change_of_their_positions() -> None:
     random, robot = np.random.default_rng(60), cell("dual_panda").robot
     q, v = random_posture(robot, random), random.uniform(-1.0, 1.0, robot.model.nv)
     later, earlier = (placed(cell("dual_panda"), q + share * v).posed for share in (1e-6, -1e-6))
@@ -71,7 +71,7 @@ def test_no_pair_comes_closer_in_a_step_and_any_stop_than_its_speed_bound_says(n
 
 
 def still_hand(q: Array, random: np.random.Generator) -> Array:
-    """Return velocities (14,) that turn the left elbow about a hand at rest. The right arm rests."""
+    """Return velocities (14,) [rad/s] that turn the left elbow while the left hand is at rest. The right arm rests."""
     robot = cell("dual_iiwa7").robot
     data = robot.model.createData()
     pin.computeJointJacobians(robot.model, data, q)
@@ -96,7 +96,7 @@ def test_a_hand_at_rest_on_a_moving_arm_may_come_closer_while_the_arm_stops(shap
 
 
 @pytest.mark.parametrize("speed", [0.01, 0.1], ids=["a stop as short as the step", "a long stop"])
-def test_the_bound_holds_and_is_tight_where_joints_stop_together(speed: float) -> None:
+def test_the_bound_holds_and_is_tight_if_joints_stop_together(speed: float) -> None:
     random, robot = np.random.default_rng(64), cell("dual_iiwa7").robot
     apart, used = share_no_joint("dual_iiwa7"), []
     for _ in range(40):
@@ -106,11 +106,11 @@ def test_the_bound_holds_and_is_tight_where_joints_stop_together(speed: float) -
         closer, bound = now - least_along("dual_iiwa7", motion), now - bounds_of("dual_iiwa7", motion)
         assert (closer <= bound + 1e-12)[apart].all()
         used.append((closer / bound)[apart].max())
-    assert np.median(used) > 0.6  # A smaller value would show that the bound is useless.
+    assert np.median(used) > 0.6  # A smaller value would show that the bound is too weak to be useful.
 
 
 @pytest.mark.parametrize("shape", [TOGETHER, OWN])
-def test_the_deviation_of_a_joint_includes_the_joints_before_it_that_carry_it(shape: int) -> None:
+def test_the_deviation_of_a_joint_includes_the_motion_of_the_joints_that_carry_it(shape: int) -> None:
     random, robot = np.random.default_rng(65), cell("dual_iiwa7").robot
     v, dv = random.uniform(-1, 1, 14), random.uniform(-1, 1, 14) * ACCELERATION * H
     motion = motion_of("dual_iiwa7", random_posture(robot, random), v, v + dv, shape)
@@ -128,7 +128,7 @@ def test_the_deviation_of_a_joint_includes_the_joints_before_it_that_carry_it(sh
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_pairs_that_one_joint_carries_together_are_distinguished_from_pairs_without_a_common_joint(name: str) -> None:
+def test_carried_marks_exactly_the_pairs_whose_bodies_share_a_moving_joint(name: str) -> None:
     model, pairs, bodies = cell(name).robot.model, cell(name).pairs, cell(name).bodies
     movers = [set(model.supports[int(joint)]) - {0} for joint in bodies.joint]
     together = [bool(movers[first] & movers[second]) for first, second in zip(pairs.first, pairs.second, strict=True)]
@@ -141,7 +141,7 @@ STEP = 1e-6  # Step of finite differences [s].
 
 
 def bounds_at(name: str, q: Array, v: Array) -> Array:
-    """Return the fastest approach (p,) of every pair [m/s]."""
+    """Return the bound on the approach speed of every pair (p,) [m/s]."""
     model, data = kernel_model(name).safety.collision, kernel_data(name, q, v).safety
     bounds = np.zeros(len(model.pairs.first))
     _fastest_approaches(data.velocities, model.pairs.first, model.pairs.second, bounds)

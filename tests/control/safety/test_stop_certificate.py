@@ -22,7 +22,7 @@ MIN_DISTANCE = 0.02
 
 @given(v=st.floats(-3, 3), v_next=st.floats(-3, 3), h=st.floats(1e-5, 0.02))
 @settings(derandomize=True, max_examples=200, deadline=None)
-def test_the_way_of_a_step_includes_motion_there_and_back(v: float, v_next: float, h: float) -> None:
+def test_the_travel_of_a_step_adds_motion_there_and_back(v: float, v_next: float, h: float) -> None:
     t = np.linspace(0.0, h, 2001)
     q = v * t + 0.5 * (v_next - v) / h * t**2
     way = float(np.abs(np.diff(q)).sum())
@@ -30,7 +30,7 @@ def test_the_way_of_a_step_includes_motion_there_and_back(v: float, v_next: floa
 
 
 def _least(name: str, motion: Motion) -> Array:
-    """Return the least distance (p,) of each pair along the whole motion; for a far pair, only a bound."""
+    """Return the least distance (p,) of each pair along the whole motion [m]; only a lower bound for a far pair."""
     samples = np.concatenate([motion.step(), motion.stop()])
     return np.asarray(distances(cell(name), samples, exact_below=0.05).min(axis=0))
 
@@ -60,7 +60,7 @@ def _motions_from(
 
 
 def _starts_apart(name: str, random: np.random.Generator, near: bool, count: int) -> Iterator[Array]:
-    """Yield postures in which every pair is apart. With ``near``, they are just before a collision on a way into it."""
+    """Yield postures in which every pair is apart. With ``near``, each is just before a collision on a random path."""
     arrays, found = cell(name), 0
     while found < count:
         q, other = random_posture(arrays.robot, random), random_posture(arrays.robot, random)
@@ -98,7 +98,10 @@ def test_nothing_comes_too_close_in_a_certified_motion_and_clearly_safe_motions_
 
 
 def _aimed_at_the_threshold(name: str, random: np.random.Generator, count: int, shape: int) -> Iterator[Motion]:
-    """Yield motions whose speed is scaled so that their stop ends very near the least distance."""
+    """Yield motions in turn: one that comes slightly closer than the required distance, and a slower one that does not.
+
+    Both have the same start and direction. ``count`` is the number of starts.
+    """
     found = 0
     for motion in _motions_from(name, _starts_apart(name, random, True, 10 * count), random):
         low, high = 0.0, 2.0
@@ -119,7 +122,7 @@ def _aimed_at_the_threshold(name: str, random: np.random.Generator, count: int, 
 
 @pytest.mark.parametrize("shape", range(SHAPES), ids=["together", "arm by arm", "own"])
 @pytest.mark.parametrize("name", ["dual_iiwa7", "dual_panda"])
-def test_the_certificate_distinguishes_motions_that_end_just_inside_and_well_outside(name: str, shape: int) -> None:
+def test_motions_just_too_fast_are_refused_and_clearly_slower_ones_are_mostly_certified(name: str, shape: int) -> None:
     accepted = total = 0
     for number, motion in enumerate(_aimed_at_the_threshold(name, np.random.default_rng(16), 6, shape)):
         if number % 2 == 0:
@@ -131,7 +134,10 @@ def test_the_certificate_distinguishes_motions_that_end_just_inside_and_well_out
 
 
 def _swings(random: np.random.Generator, count: int, dip: float) -> Iterator[Motion]:
-    """Yield steps that bring the nearest pair closer by ``dip`` [m] and away again, with stops without near pairs."""
+    """Yield steps that bring the nearest pair closer by ``dip`` [m] and away again.
+
+    In the stop after the step, no pair is too close.
+    """
     name, found = "dual_iiwa7", 0
     for q in _starts_apart(name, random, True, 20 * count):
         apart = distances(cell(name), q[None])[0]
@@ -158,7 +164,7 @@ def test_a_pair_that_comes_too_close_within_a_step_is_refused_even_if_it_is_apar
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_lower_bounds_in_place_of_distances_prove_nothing_false(name: str) -> None:
+def test_with_lower_bounds_instead_of_distances_no_unsafe_motion_is_certified(name: str) -> None:
     arrays, random = cell(name), np.random.default_rng(17)
     for motion in _motions_from(name, _starts_apart(name, random, True, 20), random):
         exact = distances(arrays, motion.q[None])[0]
@@ -193,7 +199,7 @@ def test_a_pair_that_starts_too_close_comes_no_closer_in_a_certified_motion(name
     assert certified > 3
 
 
-def test_a_step_that_brings_a_too_close_pair_closer_is_refused_even_if_the_pair_parts_at_its_end() -> None:
+def test_a_step_that_brings_a_too_close_pair_closer_is_refused_even_if_the_pair_opens_at_its_end() -> None:
     name, found = "dual_iiwa7", 0
     for q in _too_close(cell(name), np.random.default_rng(22), 200):
         apart = distances(cell(name), q[None])[0]
@@ -210,7 +216,7 @@ def test_a_step_that_brings_a_too_close_pair_closer_is_refused_even_if_the_pair_
 def test_rounding_errors_do_not_add_up_over_many_ticks() -> None:
     name, random = "dual_iiwa7", np.random.default_rng(23)
     for q in _starts_apart(name, random, True, 3):
-        for _ in range(2):  # The iteration finds a start at the pair's distance.
+        for _ in range(2):  # The iteration finds a start at which the pair is exactly at its required distance.
             apart = distances(cell(name), q[None])[0]
             pair = apart.argmin()
             gradient = (distances(cell(name), q + 1e-6 * np.eye(len(q)))[:, pair] - apart.min()) / 1e-6
@@ -226,7 +232,7 @@ def test_rounding_errors_do_not_add_up_over_many_ticks() -> None:
 def _turning_at_its_end(name: str, random: np.random.Generator, count: int) -> Iterator[Motion]:
     """Yield the fastest certified stops of all joints together from postures that are too close.
 
-    A faster one brings a pair closer again, at its end.
+    A faster stop would bring a pair closer again at its end.
     """
     found = 0
     for motion in _motions_from(name, _too_close(cell(name), random, 2000), random):
@@ -249,7 +255,7 @@ def test_a_pair_that_starts_too_close_comes_no_closer_between_the_samples_of_its
         found += 1
         close = np.flatnonzero(distances(arrays, motion.q[None])[0] < MIN_DISTANCE)
         way = distances(arrays, motion.stop(20 * DENSE), exact_below=MIN_DISTANCE, pairs=close)
-        # A pair that has come free may come closer again, up to its distance.
+        # A pair that has reached its required distance may come closer again, down to this distance.
         fall = np.where(way[1:] < MIN_DISTANCE, way[:-1] - way[1:], 0.0)
         assert fall.max() < 1e-9
     assert found == 10
@@ -320,7 +326,7 @@ def test_joints_that_stop_together_move_on_a_straight_line_in_joint_space(seed: 
 
 @given(seed=SEEDS)
 @settings(derandomize=True, max_examples=50, deadline=None)
-def test_arm_by_arm_each_arm_stops_in_the_time_of_its_slowest_joint(seed: int) -> None:
+def test_in_a_stop_arm_by_arm_each_arm_takes_the_time_of_its_slowest_joint(seed: int) -> None:
     v = _random_velocities(seed)
     v[7:] *= 0.1
     times = np.abs(v) / _decelerations(HOME, v, ARM_BY_ARM)
@@ -332,10 +338,10 @@ def test_arm_by_arm_each_arm_stops_in_the_time_of_its_slowest_joint(seed: int) -
 @pytest.mark.parametrize("shape", range(SHAPES), ids=["together", "arm by arm", "own"])
 @given(seed=SEEDS)
 @settings(derandomize=True, max_examples=200, deadline=None)
-def test_every_shape_keeps_position_limits_at_every_moment_of_the_stop(shape: int, seed: int) -> None:
-    """Every joint, near a limit or not, starts as fast as property P allows.
+def test_every_shape_of_stop_keeps_position_limits_at_every_moment(shape: int, seed: int) -> None:
+    """Each joint starts at, or below, the speed that property P allows at its distance from the limit.
 
-    Slow joints would drift for a long time.
+    A slow joint that stops together with a fast joint moves for a long time, and must not drift beyond its limit.
     """
     random, limits, h = np.random.default_rng(seed), MODEL.limits, 0.001
     room = 10.0 ** random.uniform(-6, 0, 14)

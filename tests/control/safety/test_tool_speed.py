@@ -1,4 +1,4 @@
-"""No tool is faster than its limit: the bound along motions, and a controller whose solver works against it."""
+"""No tool is faster than its limit: the bound B along motions, and a controller whose solver drives joints fully."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LIMIT, DT = 0.25, 0.002
 
 
 def speeds_along(name: str, motion: Motion) -> tuple[float, float]:
-    """Return the speed of the fastest tool at the motion's begin, and in the whole step and stop [m/s]."""
+    """Return the speed of the fastest tool at the start of the motion, and in the whole step and stop [m/s]."""
     robot = cell(name).robot
     tools, t = MeasuredToolSpeeds(robot), np.linspace(0.0, 1.0, 30)[:, None]
     in_step = motion.v + t * (motion.v_next - motion.v)
@@ -72,7 +72,7 @@ def limited(robot: Robot, solver: Solver | None = None) -> CartesianController:
     return CartesianController(robot, settings.model_copy(update={"tool_speed_limit": LIMIT}), solver=solver)
 
 
-def test_a_solver_that_pushes_makes_no_tool_too_fast_at_between_or_after_ticks(robot: Robot) -> None:
+def test_with_a_solver_that_drives_joints_at_full_speed_no_tool_is_too_fast_at_or_between_ticks(robot: Robot) -> None:
     controller = limited(robot, solver=Pushing())
     contract, fastest = Contract(controller, sample_all=True), 0.0
     for _ in range(450):
@@ -83,7 +83,7 @@ def test_a_solver_that_pushes_makes_no_tool_too_fast_at_between_or_after_ticks(r
     assert contract.margins["tool_speed"].checked > 400
 
 
-def test_a_tool_moves_near_its_limit_to_a_far_target_and_its_report_at_rest_names_no_limit(robot: Robot) -> None:
+def test_a_tool_moves_to_a_far_target_at_nearly_its_limit_and_the_limit_holds_no_step_back(robot: Robot) -> None:
     controller = limited(robot)
     contract, goal = Contract(controller), controller.tool_pose("left")
     goal.translation += [0.1, 0.2, 0.1]

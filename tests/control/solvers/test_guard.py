@@ -77,7 +77,7 @@ def test_an_answer_that_is_not_a_solution_is_a_failed_solve_and_the_arms_stop(an
 
 
 class Writer:
-    """A solver that opens every limit that it gets, and answers with what those would allow."""
+    """A solver that overwrites every limit that it gets with a huge value, and answers with huge velocities."""
 
     def solve(self, problem: QpProblem) -> QpSolution:
         problem.lower[:], problem.upper[:] = -1e6, 1e6
@@ -100,7 +100,7 @@ def test_a_solver_that_writes_into_the_limits_changes_none_of_them() -> None:
     assert np.abs(v).max() > 0.0, "it moves the arms"
 
 
-def test_an_answer_that_a_solver_changes_later_is_not_changed() -> None:
+def test_a_solver_that_changes_its_answer_later_does_not_change_the_solution() -> None:
     kept = np.full(NV, 0.001)
 
     class Late:

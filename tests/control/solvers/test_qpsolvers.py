@@ -1,4 +1,4 @@
-"""Every installed solver leads the arms as DAQP does, prints nothing, and raises nothing that a step shows."""
+"""With every installed solver, the arms move as with DAQP. No solver prints anything or lets a step raise."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ DT = 0.002
 ROBOT = cell("dual_iiwa7").robot
 NV = ROBOT.model.nv
 INSTALLED = [name for name in SOLVERS if name in (*OURS, *qpsolvers.available_solvers)]
-FAR_M = 2e-3  # Largest distance of a tool from where DAQP leads it. It allows for first-order solvers.
+FAR_M = 2e-3  # Largest distance of a tool from its position with DAQP. It allows for the errors of first-order solvers.
 
 
 @contextmanager
@@ -40,7 +40,7 @@ def silence(capfd: pytest.CaptureFixture[str]) -> Iterator[None]:
 
 
 def _driven(controller: CartesianController, ticks: int) -> tuple[Array, int]:
-    """Send the tools to each other, and return the postures of the run and the number of unsolved ticks."""
+    """Send the tools towards each other, and return the postures of the run and the number of unsolved ticks."""
     home = {arm: controller.tool_pose(arm) for arm in ROBOT.arms}
     contract, q, unsolved = Contract(controller), [], 0
     for tick in range(ticks):
@@ -60,7 +60,7 @@ def _problem(random: np.random.Generator, rows: int, hard: int = 0) -> QpProblem
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in INSTALLED if name != "daqp"])
-def test_arms_go_with_each_solver_where_they_go_with_daqp(name: str, capfd: pytest.CaptureFixture[str]) -> None:
+def test_arms_move_with_each_solver_as_they_move_with_daqp(name: str, capfd: pytest.CaptureFixture[str]) -> None:
     chosen = CartesianController(ROBOT, ControllerSettings(), solver=name)
     with silence(capfd):
         q, unsolved = _driven(chosen, 250)
@@ -72,7 +72,7 @@ def test_arms_go_with_each_solver_where_they_go_with_daqp(name: str, capfd: pyte
 
 
 @pytest.mark.parametrize("name", INSTALLED)
-def test_a_problem_without_a_solution_is_a_failed_solve_and_the_next_one_is_solved(
+def test_a_problem_without_a_solution_is_a_failed_solve_and_the_next_problem_is_solved(
     name: str, capfd: pytest.CaptureFixture[str]
 ) -> None:
     solver, random = make_solver(name, NV), np.random.default_rng(2)

@@ -14,7 +14,7 @@ from tests.control.cells import cell
 ROBOT = cell("dual_iiwa7").robot
 
 
-def test_an_unknown_solver_gives_one_line_with_the_installed_ones_and_the_way_to_others() -> None:
+def test_an_unknown_solver_gives_one_line_with_the_installed_solvers_and_how_to_install_others() -> None:
     with pytest.raises(ConfigError) as caught:
         CartesianController(ROBOT, ControllerSettings(solver="osqb"))
     line = str(caught.value)
@@ -36,7 +36,7 @@ def test_an_option_that_a_solver_does_not_have_is_refused_at_the_start(name: str
         CartesianController(ROBOT, ControllerSettings(solver=name, solver_options={"colour": 1}))
 
 
-def test_a_name_in_python_replaces_that_of_the_settings() -> None:
+def test_a_solver_name_in_python_replaces_the_name_in_the_settings() -> None:
     assert CartesianController(ROBOT, ControllerSettings(), solver="osqp").settings.solver == "osqp"
 
 

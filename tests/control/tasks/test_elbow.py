@@ -32,7 +32,7 @@ def test_the_swivel_is_the_angle_between_the_vertical_plane_and_the_plane_of_the
         assert task.angle("left", q) == pytest.approx(np.arctan2(sine, up @ out), abs=1e-9)
 
 
-def test_the_cost_pulls_along_the_gradient_of_the_angle_and_does_not_move_the_tool() -> None:
+def test_the_cost_turns_the_elbow_towards_its_angle_and_does_not_move_the_tool() -> None:
     robot, random = cell("dual_iiwa7").robot, np.random.default_rng(32)
     for _ in range(20):
         q = random_posture(robot, random)
@@ -48,9 +48,9 @@ def test_the_cost_pulls_along_the_gradient_of_the_angle_and_does_not_move_the_to
 
 
 def run(angles: dict[str, float | None], start: Array) -> tuple[ElbowSwivel, Array, float]:
-    """Return the final posture and the motion of the tools [m], which keep their pose.
+    """Drive for 4 s with the start poses of the tools as targets, and check the contract at every tick.
 
-    The contract holds at every tick.
+    Return the task, the final posture (nv,) [rad], and how far a tool has moved at most [m].
     """
     robot = cell("dual_iiwa7").robot
     run = Driven(CartesianController(robot, ControllerSettings(tasks={"swivel": {"angles": angles}})), start)
@@ -68,7 +68,7 @@ def test_elbows_turn_to_their_angles_and_the_tools_stay() -> None:
     assert way < 2e-4
 
 
-def test_a_stretched_arm_has_no_elbow_to_turn_and_rests() -> None:
+def test_a_stretched_arm_with_an_elbow_angle_keeps_the_contract_and_comes_to_rest() -> None:
     robot = cell("dual_iiwa7").robot
     _, q, _ = run({"left": 1.0}, np.where(np.isin(np.arange(14), robot.arms["left"].joints), 0.0, robot.home))
     assert np.isfinite(q).all()
@@ -108,13 +108,16 @@ ENTRIES = "[q2r2_control.tasks]\nelbow = elbow_package:KeepElbowsOut\nbroken = e
 
 @pytest.fixture(autouse=True)
 def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Return an installed package with two tasks, one of which is that of docs/extending.md."""
+    """Install a package with two tasks: the example of docs/extending.md, and a task whose cost is not finite."""
     install(tmp_path, "elbow_package", "\n".join([*blocks_of("docs/extending.md", "python"), BROKEN]), ENTRIES)
     monkeypatch.syspath_prepend(tmp_path)
 
 
 def moved_by(settings: ControllerSettings) -> float:
-    """Return the final angle of the left arm's third joint, with fixed tools and the contract at every tick."""
+    """Return how far the left arm's third joint has turned from home [rad].
+
+    The targets are the start poses of the tools. The contract is checked at every tick.
+    """
     robot = cell("dual_iiwa7").robot
     controller = CartesianController(robot, settings)
     reference = Driven(controller).drive(2.0, lambda _, start: start)
@@ -122,7 +125,7 @@ def moved_by(settings: ControllerSettings) -> float:
     return float(reference.q[2] - robot.home[2])
 
 
-def test_a_task_of_another_package_moves_the_arm_and_every_promise_holds() -> None:
+def test_a_task_of_another_package_moves_the_arm_and_the_contract_holds() -> None:
     settings = {"angle": float(cell("dual_iiwa7").robot.home[2]) + 0.3, "weight": 0.1}
     assert moved_by(ControllerSettings(tasks={"elbow": settings})) > 0.1
 

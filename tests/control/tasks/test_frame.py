@@ -111,7 +111,7 @@ def test_the_wanted_twist_never_exceeds_the_speed_limits() -> None:
         assert np.linalg.norm(twist[3:]) <= MOTION.full_speed[1] + 1e-12
 
 
-def test_a_tool_task_is_the_weighted_square_of_its_twist_error() -> None:
+def test_the_cost_of_a_tool_is_the_weighted_square_of_its_twist_error() -> None:
     random = np.random.default_rng(26)
     J, twist, weight = random.normal(size=(6, 14)), random.normal(size=6), random.uniform(size=6)
     J[:, 7:] = 0.0
@@ -122,7 +122,7 @@ def test_a_tool_task_is_the_weighted_square_of_its_twist_error() -> None:
     np.testing.assert_allclose(g, -0.1 * J.T @ W @ twist, atol=1e-12)
 
 
-# The keys are position and rotation weights. The values are the reached parts: x, y, z, then the tool's own z axis.
+# Position weights, rotation weights, whether x, y and z of a target are reached, and whether the tool's own z axis is.
 PARTS = {
     "position only": ((1, 1, 1), (0, 0, 0), (True, True, True), False),
     "rotation only": ((0, 0, 0), (1, 1, 1), (False, False, False), True),

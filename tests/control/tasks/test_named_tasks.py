@@ -20,7 +20,7 @@ DOWN = (0.0, 0.0, -1.0)  # The z axis of a tool at home points down, so that its
 
 
 def driven(tasks: dict[str, Any], moved: dict[str, pin.SE3] | None = None, **settings: Any) -> Driven:
-    """Drive for 5 s towards the tools at the start, or to ``moved`` ones, with the contract at every tick."""
+    """Drive for 5 s towards the start poses of the tools, displaced by ``moved``. Check the contract at every tick."""
     robot = cell("dual_iiwa7").robot
     run = Driven(CartesianController(robot, ControllerSettings(tasks=tasks, **settings)))
     goals = {
@@ -50,7 +50,7 @@ def test_a_tool_looks_at_a_point_and_stays_where_it_is() -> None:
     np.testing.assert_allclose(tool.translation, run.start["left"].translation, atol=1e-3)
 
 
-def test_a_tool_tilts_no_farther_than_its_cone_for_any_target() -> None:
+def test_a_tool_stays_near_its_cone_although_its_target_is_tilted_farther() -> None:
     tilted = pin.SE3(pin.exp3(np.array([0.6, 0.0, 0.0])), np.zeros(3))
     run = driven({"upright": {"angle": 0.2, "axis": DOWN, "arms": ["left"]}}, {"left": tilted, "right": tilted})
     lean = {arm: math.acos(run.controller.tool_pose(arm).rotation[:, 2] @ DOWN) for arm in run.start}
@@ -65,7 +65,7 @@ def test_a_tool_within_its_cone_has_no_cost() -> None:
     assert not g.any()
 
 
-def test_two_tools_keep_their_relative_pose_if_only_one_has_a_target() -> None:
+def test_two_tools_keep_their_relative_pose_although_only_one_target_moves() -> None:
     led = pin.SE3(pin.exp3(np.array([0.0, 0.0, 0.1])), np.array([0.0, 0.0, 0.08]))
     run = driven({"relative": {"weight": 1000.0}}, {"left": led})
     start = run.start["left"].actInv(run.start["right"])
@@ -75,7 +75,7 @@ def test_two_tools_keep_their_relative_pose_if_only_one_has_a_target() -> None:
     assert np.linalg.norm(pin.log3(start.rotation.T @ now.rotation)) < 5e-3
 
 
-def test_a_tool_that_looks_at_a_point_reduces_its_error_also_while_it_passes_by() -> None:
+def test_look_at_reduces_its_error_at_the_gain_also_while_the_tool_moves() -> None:
     robot, random = cell("dual_iiwa7").robot, np.random.default_rng(5)
     point = np.array([0.5, 0.1, 0.4])
 

@@ -1,4 +1,4 @@
-"""The nullspace alone, then a posture that is given at every tick: elbows reach it, and all promises hold."""
+"""The nullspace projection, and a posture that is given at every tick: the elbow reaches it, and the contract holds."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def controller(robot: Robot) -> CartesianController:
 
 
 def swung(robot: Robot, arm: str, way: float) -> Array:
-    """Return home with one elbow swung by ``way`` [rad] to first order, which leaves the tool where it is."""
+    """Return the home posture with one elbow swung by ``way`` [rad]. To first order, the tool keeps its pose."""
     q, joints = robot.home.copy(), robot.arms[arm].joints
     frame = robot.arms[arm].frame_id
     J = pin.computeFrameJacobian(robot.model, robot.model.createData(), q, frame, pin.LOCAL_WORLD_ALIGNED)
@@ -52,7 +52,7 @@ def test_the_elbow_moves_to_the_given_posture_or_home_while_the_tool_stays(
 
 
 @pytest.mark.parametrize("bad", [np.full(14, np.nan), np.full(14, np.inf), np.zeros(3)], ids=["nan", "inf", "short"])
-def test_an_impossible_posture_is_not_used(controller: CartesianController, robot: Robot, bad: Array) -> None:
+def test_an_unusable_posture_is_not_used(controller: CartesianController, robot: Robot, bad: Array) -> None:
     controller.reset(robot.home)
     goal = {"left": controller.tool_pose("left")}
     posture = swung(robot, "left", 0.2)
@@ -80,7 +80,7 @@ def test_motion_in_the_nullspace_moves_no_tool() -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_nullspace_stays_finite_in_a_stretched_posture(name: str) -> None:
+def test_the_projected_motion_stays_finite_in_a_stretched_posture(name: str) -> None:
     arrays = cell(name)
     tools, placements = tools_of(arrays.robot), placed(arrays, np.zeros(14)).placements
     J, rotation, translation = np.zeros((12, 14)), np.zeros((3, 3)), np.zeros(3)

@@ -1,4 +1,4 @@
-"""Two arms in each other's way: which one gives way, and that both stay safe, come to rest and get free again."""
+"""Two arms that block each other: which arm gives way, and that both stay safe, come to rest and get free again."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_two_arms_with_a_priority_come_to_rest(name: str, duration: float) -> No
 
 
 @pytest.mark.parametrize("priority", ["left", "right"])
-def test_the_arm_with_priority_reaches_a_place_that_both_want_as_fast_as_alone(priority: str) -> None:
+def test_the_arm_with_priority_reaches_a_target_of_both_arms_nearly_as_fast_as_alone(priority: str) -> None:
     times = {}
     for case in ("alone", "against the other"):
         run = Driven(controller_of(priority), dt=0.005)
@@ -63,7 +63,7 @@ def test_the_arm_with_priority_reaches_a_place_that_both_want_as_fast_as_alone(p
         pytest.param("crossing", ("left", "right"), "equal", id="both of two that are equal leave"),
     ],
 )
-def test_arms_that_blocked_each_other_reach_their_targets_when_the_way_is_free(
+def test_arms_that_blocked_each_other_reach_their_targets_when_the_path_is_free(
     blocked: str, arms: tuple[str, ...], priority: str
 ) -> None:
     run = Driven(controller_of(priority), dt=0.005)
