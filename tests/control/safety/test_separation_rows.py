@@ -67,6 +67,18 @@ def test_a_pair_that_approaches_fast_is_examined_early_enough(seed: int, name: s
     assert seen.near[exact < in_time - 1e-4].all()
 
 
+@given(seed=SEEDS, name=st.sampled_from(NAMES))
+@settings(derandomize=True, max_examples=40, deadline=None)
+def test_arms_at_rest_get_rows_for_the_pairs_that_one_step_can_make_matter(seed: int, name: str) -> None:
+    q, v = _state(name, seed, 0.0)
+    seen, exact, model = Seen(name, q, v), distances(cell(name), q[None])[0], kernel_model(name).safety
+    approach, surge = model.approach, float(np.max(model.limits.acceleration)) * model.limits.longest_step
+    reach = (2.0 / approach.gain[0]) * model.collision.pairs.leverage * surge
+    needed = approach.stop_distance + approach.contact_zone + reach
+    assert seen.near[exact < needed - 1e-6].all()
+    assert not seen.near[exact > needed + 1e-6].any()
+
+
 def _gradient(name: str, q: Array, p: int) -> Array:
     step = 1e-6 * np.eye(len(q))
     return np.asarray((distances(cell(name), q + step) - distances(cell(name), q - step))[:, p] / 2e-6)
