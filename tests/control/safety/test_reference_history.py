@@ -1,0 +1,41 @@
+"""The bounds on the past motion of the reference hold at the kept postures and between them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from q2r2_control.control.safety.reference_history import look_back, remember, rest_always
+from tests.control.cells import NAMES, cell, kernel_data, kernel_model
+
+H = 0.02  # Duration of a step, so long that joints move far between two kept postures [s].
+WINDOW = 0.08  # [s]
+DENSE = np.linspace(0.0, H, 21)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_no_joint_was_farther_away_in_the_window_than_the_bounds_say(name: str) -> None:
+    random, robot = np.random.default_rng(3), cell(name).robot
+    model, limit = kernel_model(name).safety, robot.velocity_limit
+    data = kernel_data(name, robot.home).safety
+    history = data.history
+    for _ in range(20):
+        q, v, times, positions = robot.home.copy(), np.zeros(robot.model.nv), [], []
+        history.window[1] = WINDOW
+        rest_always(history, q)
+        v_next = 0.05 * random.uniform(-limit, limit)
+        for step in range(8):
+            remember(history, q, v, v_next, H)
+            times.append(step * H + DENSE)
+            positions.append(q + np.outer(DENSE, v) + np.outer(0.5 * DENSE**2, (v_next - v) / H))
+            q, v = positions[-1][-1], v_next
+            # Joints that swing to and fro are at the same position at each tick, and elsewhere between the ticks.
+            v_next = -v if random.uniform() < 0.5 else 0.05 * random.uniform(-limit, limit)
+        look_back(model.collision, history, q, v)
+        age = times[-1][-1] - np.concatenate(times)
+        inside = age <= WINDOW
+        away = np.concatenate(positions)[inside] - q
+        travel, off = np.abs(away).max(axis=0), np.abs(away + np.outer(age[inside], v)).max(axis=0)
+        assert (history.travel >= travel - 1e-12).all()
+        assert (history.off >= off - 1e-12).all()
+        assert (history.travel <= 3.0 * travel + 1e-6).all(), "the bound is not far too large"
