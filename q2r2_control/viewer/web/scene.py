@@ -24,7 +24,7 @@ _SHORT = 0.01  # Lines up to this length are not drawn [m].
 _PER_NEWTON = 0.005  # Drawn length per force [m/N].
 _SINGULAR = 0.05  # Least ratio of a singular value to the largest one. Directions below it do not count.
 _NEAR = 0.1  # A pair with this margin or more is green [m].
-_CAMERA = np.array([2.0, 1.0, 1.1])  # Position of the camera from the middle of the arms [m].
+_CAMERA = np.array([-1.8, 0.35, 1.5])  # Position of the camera from the middle of the arms [m].
 FIELD_OF_VIEW = math.radians(40.0)  # Vertical angle of the camera's view [rad].
 _BACKGROUND: Colour = (238, 241, 244)
 
@@ -32,7 +32,7 @@ _BACKGROUND: Colour = (238, 241, 244)
 def first_view(model: pin.Model, home: Array) -> tuple[Array, Array]:
     """Return the first position (3,) of the camera, from which it sees both arms, and the point (3,) in its centre [m].
 
-    The position is in front of the arms and above them.
+    The position is behind the arms and above them, where an operator stands: the left arm is on the left.
     """
     data = model.createData()
     pin.forwardKinematics(model, data, home)
