@@ -247,7 +247,7 @@ def test_check_says_how_to_remove_a_floor_that_is_in_the_way(tmp_path: Path) -> 
 
 
 def test_a_stop_that_needs_too_much_torque_is_a_note_and_no_fault(tmp_path: Path) -> None:
-    fast = changed_cell(tmp_path, "acceleration_limit: {} ", "acceleration_limit: {A1: 10.0, A2: 10.0, A3: 10.0} ")
+    fast = changed_cell(tmp_path, "acceleration_limit: {}", "acceleration_limit: {A1: 10.0, A2: 10.0, A3: 10.0}")
     result = q2r2("check", fast)
     (note,) = (line for line in result.stdout.splitlines() if line.startswith("NOTE "))
     assert re.search(
