@@ -24,7 +24,7 @@ _LIMIT_TOLERANCE = 1e-3
 
 @dataclass(frozen=True)
 class Ask:
-    """Poses in the world and closed grippers, which the hands ask for until the tools have arrived."""
+    """Target poses of the tools (world frame) and gripper states. Scripted hands keep them until the tools arrive."""
 
     tools: Mapping[str, pin.SE3]  # Poses by arm. An arm that is left out keeps its last target.
     closed: tuple[str, ...] = ()  # Arms whose grippers are closed.

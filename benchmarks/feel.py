@@ -64,7 +64,7 @@ STOP_SPEED, STOP_TIME = 0.3, 0.1  # Speed of a hand that stops [m/s], and time f
 REACHES, REACH_REST_S = ((0.1, 0.6), (0.1, 1.2), (0.2, 0.8), (0.3, 1.0), (0.4, 1.2)), 0.3
 TREMOR_BAND, TREMOR_BAND_RMS = (8.0, 12.0), 1e-3  # Frequencies [Hz] and RMS [m] of a tremor within a band.
 _BAND_PERIOD, _BAND_SEED = 4.0, 0  # Time after which the tremor within a band repeats [s], and seed of its phases.
-# Begin and end of the press that engages, and begin of the hand's motion [s].
+# Start and end of the press that engages, and start of the hand's motion [s].
 _PRESS_INTERVAL, _MOTION_BEGINS_S = (0.2, 0.35), 0.8
 _MEASURED_S = 2.0  # Measured duration of every tone [s].
 # Duration of the run at rest, and time when the hand that stops begins to slow down [s].
@@ -104,8 +104,12 @@ class FeelFigures:
     tremors_db: tuple[float, ...]
     # Gain for the middle frequency of :data:`TREMOR_FREQUENCIES` of a hand that otherwise rests.
     tremor_at_rest_db: float
-    reach_delay_ms: float  # Delay over all of :data:`REACHES`, NaN if the tool does not follow.
-    worst_reach_delay_ms: float  # Largest delay of one of :data:`REACHES`, NaN if the tool does not follow.
+    # Delay of the tool behind the hand over all reaching motions :data:`REACHES` together [ms]. It is NaN if the tool
+    # does not follow.
+    reach_delay_ms: float
+    # Largest delay of the tool behind the hand among the reaching motions :data:`REACHES` [ms]. It is NaN if the tool
+    # does not follow.
+    worst_reach_delay_ms: float
     band_db: float  # Gain for a tremor in :data:`TREMOR_BAND` of a hand that moves at :data:`SLOW_SPEED`.
     band_at_rest_db: float  # Gain for a tremor in :data:`TREMOR_BAND` of a hand that otherwise rests.
     noise_um: float  # RMS of the tool's motion along the worst axis, for a hand at rest.

@@ -51,7 +51,7 @@ def watch_until(end: Any) -> None:
 
 
 def stand_stills(processor: int) -> list[tuple[float, float]]:
-    """Return begin and end of each standstill of a processor until the watch ends [s].
+    """Return start and end of each standstill of a processor until the watch ends [s].
 
     A standstill delays even the thread with the highest priority, which only sleeps.
     """
@@ -68,7 +68,7 @@ def stand_stills(processor: int) -> list[tuple[float, float]]:
 def held_up(late: list[tuple[float, float]], stills: list[tuple[float, float]]) -> int:
     """Return the number of late answers that waited for a standstill, or for an earlier answer that did.
 
-    Both lists have begin and end [s].
+    Both lists have start and end [s].
     """
     count, until = 0, -math.inf
     for begin, end in sorted(late):
@@ -80,7 +80,7 @@ def held_up(late: list[tuple[float, float]], stills: list[tuple[float, float]]) 
 def undisturbed(answers: list[tuple[float, float]], stills: list[tuple[float, float]]) -> list[float]:
     """Return the durations [s] of the answers during which no processor stood still.
 
-    Both lists have begin and end [s].
+    Both lists have start and end [s].
     """
     return [end - begin for begin, end in answers if not any(start < end and stop > begin for start, stop in stills)]
 

@@ -42,7 +42,7 @@ _APPROACH_SPEED = 0.5  # Speed of the target, far above the speed that contact a
 # Times when the tool goes down, slides and is lifted, and when the run ends [s].
 _DOWN_BEGINS_S, _SLIDE_BEGINS_S, _LIFT_BEGINS_S, _RUN_ENDS_S = 2.5, 6.0, 8.5, 10.5
 _APPROACH_S, _SLIDE_S = 2.0, 1.5  # Durations of the approach and of the slide [s].
-_SETTLING_S = 1.0  # Time after the begin of a part until its force is steady [s].
+_SETTLING_S = 1.0  # Time after the start of a part until its force is steady [s].
 NOTES = (
     "impact: Speed of the tool at the first touch [m/s], and largest force within the next 0.25 s [N].",
     "steady: Mean force while the tool stays [N].",
@@ -81,8 +81,8 @@ class PressFigures:
     slide_error_mm: float  # Distance of the tool behind its target along the table at the end of the slide [mm].
     friction_lag_mm: float  # Slide error that friction causes: friction times mean force divided by stiffness [mm].
     slide_force: float  # Mean force while the tool slides [N].
-    slide_least: float  # Least force from the begin of the slide to the lift [N].
-    slide_largest: float  # Largest force from the begin of the slide to the lift [N].
+    slide_least: float  # Least force from the start of the slide to the lift [N].
+    slide_largest: float  # Largest force from the start of the slide to the lift [N].
     violations: int  # Number of broken promises of the controller, over all ticks.
 
 

@@ -92,7 +92,7 @@ class CommandTimes:
         self.commands.append(tick.command.q[self._joints])
 
     def delays(self, moved: list[float]) -> Array:
-        """Return the time from each motion to the first command that differs from the command at its begin [s].
+        """Return the time from each motion to the first command that differs from the command at its start [s].
 
         ``moved`` are the times of the motions by the wall clock [s]. Motions without such a command are left out.
         """

@@ -329,7 +329,7 @@ def program(robot: Robot, controller: CartesianController) -> Program:
 
 
 @pytest.mark.parametrize("name", CALLS)
-def test_an_argument_of_a_wrong_kind_gives_one_line_of_our_errors(program: Program, name: str) -> None:
+def test_an_argument_of_a_wrong_kind_raises_an_error_of_this_package_with_one_line(program: Program, name: str) -> None:
     refused = []
     for value in KINDS:
         try:

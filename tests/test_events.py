@@ -47,7 +47,7 @@ def test_no_two_subpackages_have_kinds_of_reasons_with_the_same_value() -> None:
     assert not [kind for kind, count in Counter(str(kind) for room in ROOMS for kind in room).items() if count > 1]
 
 
-def test_the_kind_in_docs_extending_is_read_from_a_recording_and_has_its_sentence(tmp_path: Path) -> None:
+def test_the_example_reason_of_extending_md_is_restored_from_json_and_gives_its_sentence(tmp_path: Path) -> None:
     (source,) = [block for block in blocks_of("docs/extending.md", "python") if "DriveReason" in block]
     install(tmp_path, "my_drives", source, "[q2r2_control.reasons]\ndrives = my_drives:DriveReason\n")
     recorded = {"kind": "drive_too_hot", "detail": {"joint": "A4", "celsius": 81.2}}

@@ -1,4 +1,4 @@
-"""Rotations of four floats equal those of Pinocchio."""
+"""The functions for quaternions (tuples of four floats) give the same rotations as Pinocchio."""
 
 from __future__ import annotations
 

@@ -41,7 +41,7 @@ class WorkMotion:
     about: str
     duration: float  # Time between approach and rest [s].
     path: Path
-    approach: tuple[Array, ...] = ()  # Positions (2, 3) on the way from home to the begin of the motion [m].
+    approach: tuple[Array, ...] = ()  # Positions (2, 3) on the way from home to the start of the motion [m].
     tilt: tuple[float, float] = (0.0, 0.0)  # Turn of each tool about the world's x, kept after the approach [rad].
     has_goal: bool = False  # Whether the purpose is to arrive at the last targets.
     reachable: bool = True  # Whether both arms can reach all targets with every distance kept.

@@ -109,7 +109,7 @@ class RunOptions:
     real_time: bool  # Whether to request locked memory and SCHED_FIFO from the system.
     force: bool = False  # Whether to run although q2r2 check finds faults.
     tasks: tuple[AssemblyTask, ...] = ()  # Tasks to be judged.
-    steps: tuple[tuple[float, str], ...] = ()  # Steps of scripted work, each with its begin [s] and its name.
+    steps: tuple[tuple[float, str], ...] = ()  # Steps of scripted work, each with its start [s] and its name.
     record: Path | None = None  # Folder of recordings; None for no recording.
     notes: Mapping[str, str] = field(default_factory=dict)  # Notes for the recording, by name.
     anonymous: bool = False  # Whether the recording leaves out the operator and the computer's name.

@@ -332,7 +332,8 @@ class CartesianController(WatchedPairs):
         for array, kept in zip(self._restored, self._before, strict=True):
             array[:] = kept
         reference.q[:], reference.v[:] = self._state.q, self._state.v
-        # A later substep may have certified greater distances than the arms keep at their present posture.
+        # The withdrawn step may have increased the kept distances beyond those at the restored posture. They are
+        # therefore reduced to their values before the step.
         pairs_kept, objects_kept = self._kept_before
         self._live.keep_no_more_than(pairs_kept)
         self._objects.keep_no_more_than(objects_kept)

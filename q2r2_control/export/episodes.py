@@ -49,7 +49,7 @@ class FrameSampling:
     trim: bool = False  # Only the time in which arms are engaged or moving is exported.
     pictures: bool = False
     anonymous: bool = False  # Notes that identify a person or a computer are left out.
-    ahead: int = 0  # The number of frames by which actions that are positions come earlier.
+    ahead: int = 0  # Number of frames by which position actions are shifted to earlier rows.
 
     def __post_init__(self) -> None:
         if not 1 <= self.fps <= FASTEST:
@@ -70,7 +70,8 @@ class EpisodeVectors:
     notes: dict[str, str]  # The recorded notes, such as program, machine and operator.
     vectors: Vectors
     success: bool | None = None  # None if it is not known.
-    ahead: int = 0  # Actions that are positions come earlier: row k has those of frame k + ahead.
+    # Number of frames by which position actions are shifted. Row k contains the position action of frame k + ahead.
+    ahead: int = 0
     part: int = 0  # The number of the episode in the file, from 1 on; 0 for the whole file.
     cameras: Mapping[str, CameraFrames] = field(default_factory=dict)  # By camera, one picture for each frame.
     depths: Mapping[str, CameraFrames] = field(default_factory=dict)  # The same for each camera with recorded depth.

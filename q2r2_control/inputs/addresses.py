@@ -29,9 +29,9 @@ def reachable_addresses(host: str) -> tuple[str, ...]:
 
 
 def _way_out(family: socket.AddressFamily, elsewhere: str) -> str | None:
-    """Return this computer's address on the route to ``elsewhere``; None without such a route.
+    """Return this computer's address on the route to ``elsewhere``, or None if there is no route.
 
-    ``elsewhere`` is an address that is reserved for documentation.
+    The callers use addresses reserved for documentation (RFC 5737, RFC 3849), which belong to no computer.
     """
     # To connect a UDP socket sends nothing. It only selects the route.
     with suppress(OSError), socket.socket(family, socket.SOCK_DGRAM) as probe:

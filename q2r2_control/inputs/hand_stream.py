@@ -34,7 +34,10 @@ class HandStream:
 
     @property
     def connected(self) -> bool:
-        """Whether a headset drives, and no earlier lost connection is still to be noticed by a :meth:`take`."""
+        """Whether a headset is connected and sends hand data.
+
+        After a lost connection it stays False until :meth:`take` has noticed the loss.
+        """
         return self.peer is not None and not self._samples.is_cut
 
     def admit(self, peer: str) -> None:

@@ -107,7 +107,10 @@ class HeadsetServer:
 
     @property
     def connected(self) -> bool:
-        """Whether a headset is connected, and no earlier lost connection is still to be noticed by a :meth:`poll`."""
+        """Whether a headset is connected and sends hand data.
+
+        After a lost connection it stays False until :meth:`poll` has noticed the loss.
+        """
         return self._stream.connected
 
     @property

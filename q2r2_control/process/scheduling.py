@@ -128,7 +128,7 @@ def new_folder(parent: Path, name: str, what: str) -> Path:
     """Make a folder that did not exist before. Its ``name`` gets a number if several runs begin within one second.
 
     Raises:
-        ConfigError: With a text that begins with ``what``.
+        ConfigError: If the folder cannot be made. The message begins with ``what``.
     """
     for suffix in ("", *(f"-{number}" for number in range(2, 100))):
         folder = parent / (name + suffix)
@@ -145,7 +145,7 @@ def check_folder(folder: Path, what: str) -> None:
     """Make ``folder`` if it does not exist.
 
     Raises:
-        ConfigError: With a text that begins with ``what``, if nothing can be written in the folder.
+        ConfigError: If the folder cannot be made, or if nothing can be written in it. The message begins with ``what``.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -51,7 +51,7 @@ class Description:
     urdf: ET.Element
     srdf: ET.Element | None
     file: Path
-    notes: tuple[str, ...] = ()  # Notes on the text, which the user should read.
+    notes: tuple[str, ...] = ()  # Notes for the user on the model's URDF and SRDF.
 
     @property
     def name(self) -> str:

@@ -59,7 +59,8 @@ SENT_COMMAND_QOS = QoSProfile(depth=1, lifespan=Duration(seconds=0.1))
 STREAM_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 # The profile of messages that are only recorded. All of them count, and nobody waits for them.
 RECORDED_QOS = QoSProfile(depth=200)
-# The profile of messages that later subscribers need as well, such as robot_description.
+# The profile of latched messages (transient local), such as robot_description. A node that subscribes later still gets
+# the last message.
 LATCHED_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 _DIAGNOSTICS_PERIOD = 0.5  # Time between two diagnostics [s].
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)  # The clock of timers that go on while /clock stands still.

@@ -85,7 +85,8 @@ class TorqueSummary:
     def add(self, dt: float, impedance: ImpedanceReport, wall: WallReport) -> None:
         """Count one tick of ``dt`` [s]."""
         least = math.inf if self.min_measured_distance_mm is None else self.min_measured_distance_mm
-        # The distance is NaN if nothing was measured. The comparison is then False, and the tick counts as held.
+        # The distance is NaN if nothing was measured. The comparison is then False, so the smallest distance stays.
+        # ``held_ticks`` counts such ticks.
         if 1e3 * wall.closest_distance < least:
             self.min_measured_distance_mm = 1e3 * wall.closest_distance
             self.measured_closest_pair = wall.closest_pair

@@ -1,9 +1,10 @@
 """Limit how far grippers open and close, and find out which of them hold an object.
 
 The certificate treats the fingers of an arm as the volume that they sweep between two openings. This interval of
-openings must contain the gripper's present opening and its commanded opening. Therefore it covers all openings that
-were measured or commanded recently, with a tolerance. A gripper is sent only to openings in the interval that the
-controller has accepted. This holds for closing as well, because fingers that turn reach farther forward as they close.
+openings must contain the commanded opening and the present opening. The present opening lies between recently measured
+and recently commanded openings. The interval therefore covers all of these, plus a tolerance. A gripper is sent only to
+openings in the interval that the controller has accepted. This holds for closing as well, because fingers that turn
+reach farther forward as they close.
 
 If the wanted opening lies outside the interval, the gripper goes there in steps. A step is halved if the certificate
 fails, and doubled if it holds. A smaller interval counts as soon as it is certified. Until then the wider one counts.

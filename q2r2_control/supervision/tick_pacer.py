@@ -190,8 +190,8 @@ class _Limited:
         """Return the step towards a moving target, and whether a limit has reduced it.
 
         Args:
-            lag: Vector from the pose to the target (3,).
-            way: Motion of the target in this step (3,).
+            lag: Vector from the pose to the target (3,) [m or rad].
+            way: Displacement of the target in this step (3,) [m or rad].
             dt: Duration of the step [s].
         """
         own, (fastest, a) = way / dt, self.limits

@@ -147,9 +147,9 @@ class Leash:
         return _put(target, tool, way, turn)
 
     def _ends(self, tool: Pose, target: Pose) -> bool:
-        """Return whether the target is as far away as a leash reaches.
+        """Return whether the target has reached the maximum distance or angle from the tool.
 
-        It is not in most ticks, so this check is made cheap.
+        This is rare, so the check is kept cheap.
         """
         (start, (a, b, c, d)), (end, (x, y, z, w)) = tool, target
         # The scalar product of two unit quaternions is the cosine of half the angle between them, up to its sign.

@@ -58,7 +58,13 @@ class ArmWords:
     def __init__(
         self, joints: Mapping[str, Collection[str]], bindings: BindingSettings, device: DeviceWords = NO_WORDS
     ) -> None:
-        """Prepare sentences for arms with these ``joints``, by arm; ``bindings`` are the actions of the controls."""
+        """Prepare the sentences.
+
+        Args:
+            joints: The joint names of each arm.
+            bindings: The action of each control of the headset.
+            device: The words of the device that drives.
+        """
         self._joints, self._bindings, self._device = joints, bindings, device
         self.told: Mapping[str, Told] = {}  # By arm.
 

@@ -42,7 +42,7 @@ class LiveTable:
     ) -> None:
         """Prepare the table; ``words`` makes the sentences about the run's arms.
 
-        ``steps`` are the steps of the work, each with its begin [s] and its name, for a run with a known ``duration``
+        ``steps`` are the steps of the work, each with its start [s] and its name, for a run with a known ``duration``
         [s]. If ``simulated_time`` is True, the table compares the speed of the run with real time. ``episodes`` makes
         the words about episodes of a recorded run.
         """

@@ -158,7 +158,7 @@ def test_a_run_says_that_it_waits_for_a_cabinet_and_ctrl_c_ends_the_wait(fri_cel
     assert plant.is_released(), "nothing keeps the ports"
 
 
-def test_a_cabinets_port_that_another_program_uses_gives_one_line(fri_cell: str) -> None:
+def test_for_a_cabinets_port_that_another_program_uses_fri_cabinet_prints_one_line(fri_cell: str) -> None:
     port = load_config(fri_cell).fri["right"].port
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("127.0.0.3", port))
@@ -176,7 +176,7 @@ def test_a_cabinets_port_that_another_program_uses_gives_one_line(fri_cell: str)
         ((CELL, "--mode", "torque"), "answered every 10 ms: allowed with torques: 5 ms or less"),
     ],
 )
-def test_a_wrong_option_gives_one_line(arguments: tuple[str, ...], told: str) -> None:
+def test_for_a_wrong_option_fri_cabinet_prints_one_line(arguments: tuple[str, ...], told: str) -> None:
     done = q2r2("fri-cabinet", *arguments)
     assert (done.exit_code, done.stderr.count("\n")) == (2, 1)
     assert told in done.stderr

@@ -61,13 +61,13 @@ def test_a_line_says_whether_each_modbus_gripper_answers_and_none_is_moved(fri_c
     assert simulated.written == []
 
 
-def test_a_silent_cabinet_gives_one_line(fri_cell: str) -> None:
+def test_for_a_silent_cabinet_fri_check_prints_one_line(fri_cell: str) -> None:
     done = q2r2("fri-check", fri_cell, "--wait", "0.1")
     assert done.exit_code == 2
     assert "left: no FRI message from cabinet 127.0.0.2 on port" in done.stderr.splitlines()[-1]
 
 
-def test_a_cell_without_cabinets_gives_one_line() -> None:
+def test_for_a_cell_without_cabinets_fri_check_prints_one_line() -> None:
     done = q2r2("fri-check", "config/dual_iiwa7.yaml")
     assert done.exit_code == 2
     assert "fri.left: missing; allowed: the cabinet of each arm" in done.stderr.splitlines()[-1]

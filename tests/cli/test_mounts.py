@@ -79,7 +79,7 @@ def test_postures_that_determine_no_mount_are_refused(tmp_path: Path, text: str,
     assert done.stderr.count("\n") == 1
 
 
-def test_a_missing_file_of_postures_gives_one_line_without_the_number_of_the_error() -> None:
+def test_for_a_missing_file_of_postures_mounts_prints_one_line_without_the_number_of_the_error() -> None:
     done = q2r2("mounts", "config/dual_ur5.yaml", "--postures", "nope.txt")
     assert done.stderr.startswith("q2r2: --postures nope.txt: No such file or directory; allowed: a file with lines of")
 

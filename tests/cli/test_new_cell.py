@@ -44,7 +44,9 @@ def _in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
         pytest.param("", "--left example-robot-data:go2", "branches at base", id="a robot of legs"),
     ],
 )
-def test_a_model_that_makes_no_cell_gets_one_line_and_no_file(text: str, arguments: str, says: str) -> None:
+def test_for_a_model_that_makes_no_cell_new_cell_prints_one_line_and_writes_no_file(
+    text: str, arguments: str, says: str
+) -> None:
     Path("arm.urdf").write_text(text)
     Path("arm.xml").write_text(text)
     result = q2r2("new-cell", "cell", *arguments.split(), "--yes")

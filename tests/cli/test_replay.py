@@ -66,7 +66,7 @@ def test_on_another_plant_replay_prints_the_distances_of_the_tools(recorded: Pat
     ],
     ids=lambda value: " ".join(value) if isinstance(value, tuple) else "",
 )
-def test_options_that_exclude_each_other_give_one_line_and_exit_code_2(
+def test_for_options_that_exclude_each_other_replay_prints_one_line_and_exits_with_code_2(
     recorded: Path, options: tuple[str, ...], said: str
 ) -> None:
     result = q2r2("replay", str(recorded), *options)

@@ -62,7 +62,7 @@ def test_without_the_parts_of_a_task_a_note_says_that_the_hands_move_without_the
     assert "mujoco.objects" not in q2r2("run", CELL, *OPTIONS, "--trajectory", "handover").stderr
 
 
-def test_with_force_the_faults_are_printed_and_the_cell_runs(tmp_path: Path) -> None:
+def test_with_the_option_force_a_faulty_cell_runs_and_its_faults_are_printed(tmp_path: Path) -> None:
     file = changed_cell(tmp_path, "0.0204, 0.348,", "0.0204, 2.09,")
     result = q2r2("run", file, *OPTIONS, "--force")
     assert result.exit_code == 1, "no stop can be proven where links are in the floor"

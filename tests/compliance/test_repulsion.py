@@ -175,7 +175,7 @@ def test_the_torque_of_the_wall_rises_gradually_while_a_pair_closes_in() -> None
     assert crossed >= 3
 
 
-def test_the_stiffness_of_many_pairs_is_scaled_down_for_a_hard_wall_but_never_for_the_default() -> None:
+def test_the_repulsion_of_many_pairs_is_scaled_down_at_high_stiffness_but_not_at_the_default_stiffness() -> None:
     firm = {"maximum_force": 2000.0}
     stiffest = max(_postures(), key=lambda posture: len(posture[1].pressing))[0]
     for q, _ in _postures():

@@ -168,7 +168,7 @@ def test_a_bad_value_is_named_with_what_is_allowed(tmp_path: Path, path: str, va
     ],
     ids=lambda value: repr(value)[:40],
 )
-def test_a_file_that_is_not_a_cell_gives_one_line(tmp_path: Path, text: str | bytes, says: str) -> None:
+def test_a_file_that_is_not_a_cell_raises_an_error_of_one_line(tmp_path: Path, text: str | bytes, says: str) -> None:
     assert re.search(says, fault(tmp_path, text))
 
 

@@ -68,7 +68,7 @@ class TestRelativePathsAreLookedUp:
         assert config.packages == {"mine": str(cell / "robots")}
 
     @pytest.mark.parametrize("path", ["x" * 5000 + ".urdf", "a\x00.urdf", ""])
-    def test_a_name_that_no_file_can_have_gives_one_line(self, tmp_path: Path, path: str) -> None:
+    def test_a_name_that_no_file_can_have_raises_an_error_of_one_line(self, tmp_path: Path, path: str) -> None:
         config = loaded(tmp_path, changed("arms.left.model", path))
         with pytest.raises(Q2R2Error) as caught:
             Robot.from_config(config)

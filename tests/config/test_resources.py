@@ -36,7 +36,7 @@ def test_a_file_in_the_working_folder_comes_first(tmp_path: Path, monkeypatch: p
     ["config", "", "config/triple.yaml", "x\0y", "~nobody_of_this_name/x.yaml"],
     ids=["a folder", "nothing", "a misspelling", "a zero byte", "unknown home"],
 )
-def test_a_name_that_is_not_a_file_gives_one_line(path: str) -> None:
+def test_a_name_that_is_not_a_file_raises_an_error_of_one_line(path: str) -> None:
     with pytest.raises(ConfigError) as caught:
         load_config(path)
     assert len(str(caught.value).splitlines()) == 1

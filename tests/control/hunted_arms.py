@@ -90,17 +90,17 @@ class Coal:
 
 
 class Hunt:
-    """A hand that chases the nearest body at full speed for a while, and then moves at random for a while.
+    """A moving obstacle (sphere or box) that chases the nearest body at full speed, and moves at random in between.
 
-    At the end and in the middle of every tick, each body that moves is checked: it keeps its distance from the hand, or
-    comes no closer to the reported position of the hand. A solver works against the arms. All other pairs keep their
-    distances too.
+    Each body that moves is checked in the middle and at the end of every tick. It must keep its distance from the
+    obstacle, or must not approach the reported position of the obstacle. All other pairs must keep their distances too.
+    The solver returns deliberately bad solutions.
     """
 
     def __init__(
         self, controller: CartesianController, solver: FaultySolver, seed: int, lie: float = 1.0, box: bool = False
     ) -> None:
-        """Take a hand, or a ``box``, whose true speed is ``lie`` times the reported speed."""
+        """Make a sphere, or a ``box``, whose true speed is ``lie`` times the reported speed."""
         shape = coal.Box(*BOX) if box else coal.Sphere(RADIUS)
         self.controller, self.solver, self.coal, self.box = controller, solver, Coal(controller, shape), box
         self.random, self.lie = np.random.default_rng(seed), lie

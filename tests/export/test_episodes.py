@@ -128,7 +128,7 @@ def write_at_open_gate(episode: EpisodeVectors, path: Path) -> None:
     write_vectors(episode, path)
 
 
-def test_a_killed_worker_gives_one_line_and_the_next_export_goes_on(run: Run, tmp_path: Path) -> None:
+def test_a_killed_worker_raises_an_error_of_one_line_and_the_next_export_goes_on(run: Run, tmp_path: Path) -> None:
     files = [run.file, *(Path(shutil.copy(run.file, tmp_path / f"copy-{number}.mcap")) for number in range(2))]
     kept = tmp_path / "kept"
     kept.mkdir()

@@ -97,7 +97,7 @@ def with_one(value: float) -> Array:
         (np.zeros((2, 16)), [0.0, 0.1], (*JOINTS, "right_gripper", "left_gripper"), "names end with"),
     ],
 )
-def test_unusable_actions_give_one_line_that_names_the_fault(
+def test_the_fault_of_unusable_actions_is_named_in_one_line(
     actions: Any, times: Any, names: tuple[str, ...], told: str
 ) -> None:
     chunk = sent(opened(), actions, times, names)

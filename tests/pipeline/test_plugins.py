@@ -115,7 +115,7 @@ def test_the_input_in_docs_extending_engages_in_a_real_time_run_too(file: Path) 
     ],
     ids=["input", "cannot be imported", "plant", "binding", "binding by name"],
 )
-def test_a_part_that_is_not_installed_or_not_on_the_device_gives_one_line_in_check_and_run(
+def test_for_a_part_that_is_not_installed_or_not_on_the_device_check_prints_one_line_and_the_pipeline_raises_it(
     file: Path, change: dict[str, Any], told: str
 ) -> None:
     checked = q2r2("check", str(changed(file, change)))

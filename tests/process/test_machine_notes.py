@@ -57,7 +57,7 @@ def test_addresses_of_this_computer_need_no_card() -> None:
     ("release", "shares", "is_noted"),
     [
         ("6.12.0-rt5", "50000000", True),
-        ("6.12.0", None, True),  # The file may not be read.
+        ("6.12.0", None, True),  # This user has no permission to read the file.
         ("6.18.44", "0", False),
         ("6.8.0-48-generic", None, False),
     ],

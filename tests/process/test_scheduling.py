@@ -62,7 +62,7 @@ def test_if_everything_is_permitted_no_line_is_printed_and_everything_is_undone(
     assert system.calls[-1] == ("sched", 0, os.SCHED_OTHER, 0)
 
 
-def test_a_refusal_gives_one_line_with_the_cure(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_refusal_of_the_system_is_described_in_one_line_with_the_cure(monkeypatch: pytest.MonkeyPatch) -> None:
     FakeSystem(monkeypatch, grants_memory=False, grants_scheduler=False)
     with real_time() as refused:
         assert refused is not None

@@ -122,7 +122,7 @@ def test_the_folder_is_a_bag_of_version_nine_that_says_what_was_run(recorded: tu
     assert {"version", "machine", "libraries", "plant"} <= about.notes.keys() & bag["custom_data"].keys()
 
 
-def test_a_folder_that_cannot_be_written_gives_one_line_and_the_run_goes_on(
+def test_for_a_folder_that_cannot_be_written_one_line_is_logged_and_the_run_goes_on(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     file = tmp_path / "file"

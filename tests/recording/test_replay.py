@@ -239,7 +239,9 @@ def test_the_replay_of_a_cut_recording_summarises_the_ticks_that_are_left(circle
         replay(_cut(circle, tmp_path / "no_tick.mcap", 0))
 
 
-def test_a_file_that_is_not_a_recording_or_belongs_to_another_cell_gives_one_line(tmp_path: Path, circle: Path) -> None:
+def test_a_file_that_is_not_a_recording_or_belongs_to_another_cell_raises_an_error_of_one_line(
+    tmp_path: Path, circle: Path
+) -> None:
     data = circle.read_bytes()
     damaged = bytearray(data)
     # The byte is in the content of a chunk, not in an index.

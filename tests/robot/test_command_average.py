@@ -60,7 +60,7 @@ def test_no_pair_comes_closer_by_more_than_the_allowance_when_every_joint_is_off
     assert float((largest / np.maximum(allowance, 1e-12)).max()) > 0.2, "the allowance is far too large"
 
 
-def test_every_pair_keeps_more_distance_by_its_allowance(robot: Robot) -> None:
+def test_with_a_jerk_limit_the_kept_distance_of_every_pair_grows_by_its_allowance(robot: Robot) -> None:
     plain, limited = ControllerSettings(), ControllerSettings(jerk_limit=5000.0)
     more = kept_distances(robot, limited).values - kept_distances(robot, plain).values
     assert more == pytest.approx(average_allowance(robot, limited, robot.collision_model), abs=1e-12)

@@ -167,7 +167,9 @@ def test_names_that_the_urdf_adds_differ_from_all_names_of_the_file(arm: Path) -
         ('<body name="base".*?</worldbody>.*</actuator>', "</worldbody>", "arm.xml: no joint that turns or slides"),
     ],
 )
-def test_a_file_that_makes_no_urdf_gives_one_line(arm: Path, change: str, to: str, says: str) -> None:
+def test_an_mjcf_that_cannot_be_converted_to_urdf_raises_an_error_of_one_line(
+    arm: Path, change: str, to: str, says: str
+) -> None:
     text = re.sub(change, to, ARM, count=1, flags=re.DOTALL)
     assert text != ARM
     arm.write_text(text)

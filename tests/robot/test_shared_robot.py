@@ -220,7 +220,7 @@ def _changed(path: str, value: object) -> Config:
         ("obstacles", {"torso": {"shape": "sphere", "size": [0.1]}}, "obstacles.torso: the cell has a link of this"),
     ],
 )
-def test_a_bad_part_gives_one_line_that_says_what_is_allowed(path: str, value: object, says: str) -> None:
+def test_a_bad_part_raises_an_error_of_one_line_that_says_what_is_allowed(path: str, value: object, says: str) -> None:
     with pytest.raises(ConfigError) as error:
         Robot.from_config(_changed(path, value))
     assert says in str(error.value)

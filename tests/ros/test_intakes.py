@@ -300,7 +300,8 @@ def controller_state(arm: str, fault: Reason | None, outcome: Reason | None = No
 @pytest.mark.parametrize(
     ("arm", "fault", "unready"),
     [
-        ("following", Reason(RosReason.STOP_SERVICE), None),  # The arm's state decides.
+        # A following arm counts as ready, even if its controller reports a fault.
+        ("following", Reason(RosReason.STOP_SERVICE), None),
         ("paused", None, "controller_on_pause"),
         ("inactive", None, "controller_phase"),
         ("inactive", Reason(TeleopReason.CLOCK_NOT_FINITE), "controller_fault"),
@@ -317,7 +318,8 @@ def test_the_reason_why_a_controller_does_not_follow_is_read_from_its_state(
     Arrivals(node, "/c/state").arrive(String(data=controller_state(arm, fault)))
     assert (watch.unready and str(watch.unready.kind)) == unready
     assert watch.unready is None or watch.unready.root == (fault or watch.unready)
-    assert watch.unready is None or sentence(watch.unready)  # The sentence has all of its fields.
+    # `sentence` must not raise: the reason has a value for each placeholder.
+    assert watch.unready is None or sentence(watch.unready)
     node.destroy_node()
 
 

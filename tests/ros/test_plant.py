@@ -150,7 +150,7 @@ def test_arms_that_another_node_commands_are_released_and_the_node_is_named(
         wait_until(lambda: "/test commands the arms on /joint_trajectory" in caplog.text, "the other is named")
 
 
-def test_arms_that_others_command_and_missing_arms_give_one_line(
+def test_arms_that_others_command_and_missing_arms_raise_an_error_of_one_line(
     node: Any, robot: Robot, config: Config, processes: Processes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(plant_module, "_WAIT", 0.5)

@@ -288,7 +288,7 @@ def test_targets_that_begin_elsewhere_are_followed_after_they_jump_to_the_tool_o
     assert silent.offer(TOOL, [TOOL], 0.2) is None
 
 
-def test_a_stream_that_was_dropped_is_refused_even_at_the_tool() -> None:
+def test_after_drop_a_target_stream_is_refused_until_reset_even_if_its_target_equals_the_tool_pose() -> None:
     stream = TargetStream(StreamSettings())
     assert stream.offer(TOOL, [TOOL], 0.0) is None
     stream.drop()

@@ -103,7 +103,7 @@ class TestADeadMan:
         assert {event.kind for event in driver.events} == {"dead_man_held", "dead_man_released"}
         assert not any(map(is_fault, driver.events))
 
-    def test_a_dead_man_that_stays_held_during_a_fault_engages_only_after_its_release(self) -> None:
+    def test_after_a_fault_a_held_dead_man_switch_engages_only_after_release_and_a_new_press(self) -> None:
         driver = self.driver()
         driver.held = {"grip": 1.0}
         driver.run(0.05)

@@ -120,7 +120,7 @@ def test_motions_continue_from_the_target_and_a_single_late_motion_is_made_in_fu
         assert turned[2] == pytest.approx(0.2 * (index + 1), rel=0.05)
 
 
-def test_a_policy_that_stalls_stops_its_arms_and_a_chunk_that_begins_at_the_tools_moves_them_again() -> None:
+def test_arms_stop_if_their_policy_is_silent_and_move_again_with_a_chunk_from_the_tool_poses() -> None:
     run = Run()
     run.ways(0.1, chunk(np.array([run.now]), np.array([0.01])))
     run.ways(SILENT - 0.11)

@@ -70,7 +70,8 @@ def test_keys_and_a_gamepad_engage_an_arm_move_it_and_pause_it_when_the_page_is_
     assert run.end()["at_rest"]
 
 
-# The page's own flying hand, in simulated time of 20 ms per reading.
+# JavaScript that runs the page's class `Flying`, which moves a virtual hand by keyboard. Simulated time advances by
+# 20 ms before each call of `read`.
 LOOKS = """async ([events, looks, unsent = 0]) => {
     const { Flying } = await import("/fly.js");
     let now = performance.now();

@@ -100,7 +100,9 @@ class Rollout(NamedTuple):
     step: QuadraticPiece  # The step from the reference to the candidate.
     stop: QuadraticPiece  # The motion of the joints from the candidate to rest.
     piece: QuadraticPiece  # A part of the stop.
-    deviation: Array  # (nv,) rho + kappa of each joint, see speed_bound.py [rad or m].
+    # (nv,) Bound on the deviation of each joint from motion along its present velocity: rho + kappa in speed_bound.py
+    # [rad or m].
+    deviation: Array
 
     @classmethod
     def empty(cls, model: CollisionModel) -> Rollout:

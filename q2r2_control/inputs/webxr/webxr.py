@@ -179,7 +179,10 @@ class WebXrInput:
 
     @property
     def connected(self) -> bool:
-        """Whether a page drives, and no earlier lost connection is still to be noticed by a :meth:`poll`."""
+        """Whether a page is connected and sends hand data.
+
+        After a lost connection it stays False until :meth:`poll` has noticed the loss.
+        """
         return self._stream.connected and self._process is not None and self._process.alive
 
     @property

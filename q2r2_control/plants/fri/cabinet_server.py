@@ -209,7 +209,7 @@ class CabinetServer:
         self._sent_at: dict[str, float] = {}  # Time of the newest message of each arm [s].
 
     def run(self, until: Callable[[float], bool], tick: Callable[[float], None] = lambda t: None) -> None:
-        """Run until ``until``, called with the time since the begin [s], returns True.
+        """Run until ``until``, called with the time since the start [s], returns True.
 
         ``tick`` is called for each message.
         """

@@ -109,8 +109,8 @@ class ArmCommand:
     now: float  # Time of the tick [s].
     start: float  # Time at which the reference leaves the earlier stop [s].
     end: float  # Time of the reference's end [s].
-    q: Joints  # Posture at the end [rad].
-    v: Joints  # Velocity at the end [rad/s].
+    q: Joints  # Posture of the reference at the end of the tick [rad].
+    v: Joints  # Velocity of the reference at the end of the tick [rad/s].
     deceleration: Joints  # Deceleration of the stop [rad/s^2].
     outputs: dict[str, IoValue] = field(default_factory=dict)  # Outputs of the cabinet that are set, by name.
     tau: Joints | None = None  # Torque overlay [Nm]; None with positions, or if the damping brakes.

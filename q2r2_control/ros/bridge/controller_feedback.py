@@ -171,7 +171,7 @@ class GripperLimits:
         }
 
     def awaits(self, now: float) -> bool:
-        """Return whether a measured gripper may have a commanded opening that is not known here yet.
+        """Return whether the last commanded opening of a measured gripper may still arrive over ROS.
 
         Without this opening, the fingers count as anywhere between closed and open. Arms that rest near an object would
         then move away from it.

@@ -237,7 +237,8 @@ class JointOutput:
 
         The reference must not move on during this time, because the arms would jump afterwards.
         """
-        # All publishers are asked, because each has its own gap.
+        # ``waits`` is called for every publisher, even after one has returned True, because each publisher times its
+        # own pause in sending.
         return True in [channel.publisher.waits() for channel in self._channels]
 
     def listener_fault(self, off_reference: bool) -> Reason | None:

@@ -52,7 +52,8 @@ def test_distances_of_near_pairs_are_exact_and_other_distances_are_never_too_lar
     matters = exact <= STOP_DISTANCE
     np.testing.assert_allclose(seen.distance[matters], exact[matters], rtol=0, atol=1e-12)
     assert seen.distance[seen.closest] == pytest.approx(exact.min(), abs=1e-12)
-    # With a lower bound below its required distance, a pair would count as too close in the stop certificate.
+    # For far pairs only a lower bound of the distance is computed. If this bound were below the stop distance, the stop
+    # certificate would count the pair as too close.
     assert (seen.distance[~matters] > STOP_DISTANCE).all()
 
 

@@ -41,7 +41,7 @@ def bound_of(name: str, motion: Motion) -> float:
 
 @pytest.mark.parametrize("shape", range(SHAPES), ids=["together", "arm by arm", "own"])
 @pytest.mark.parametrize("name", NAMES)
-def test_no_tool_is_faster_than_the_bound_in_a_step_and_a_stop_of_any_shape(name: str, shape: int) -> None:
+def test_no_tool_is_faster_than_the_bound_in_a_step_and_in_any_kind_of_stop(name: str, shape: int) -> None:
     random, robot, shares = np.random.default_rng(71), cell(name).robot, []
     for _ in range(40):
         v = random.choice([0.02, 0.3, 1.0]) * random.uniform(-robot.velocity_limit, robot.velocity_limit)

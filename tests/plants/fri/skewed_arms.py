@@ -56,7 +56,7 @@ def side_by_side(config: Config, robot: Robot, apart: float) -> Array:
 
 
 class Case:
-    """A run in which both hands swing sideways. At their fastest, one arm has an incident."""
+    """A run in which both hands swing sideways. One arm is delayed, cut off or stopped when its speed is greatest."""
 
     def __init__(
         self,
