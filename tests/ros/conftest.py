@@ -53,14 +53,16 @@ def precedence() -> Iterator[None]:
     with suppress(OSError):
         os.setpriority(os.PRIO_PROCESS, 0, _NICE)
     # On Linux, nice levels count only within a session, and the session of a terminal goes on after the tests.
-    of_session, before = Path("/proc/self/autogroup"), ""
+    # The file is empty where control groups share the processor: then there is nothing to change and to restore.
+    of_session, words = Path("/proc/self/autogroup"), list[str]()
     with suppress(OSError):
-        before = of_session.read_text().split()[-1]
-        of_session.write_text(str(_NICE))
+        words = of_session.read_text().split()
+        if words:
+            of_session.write_text(str(_NICE))
     yield
-    if before:
+    if words:
         with suppress(OSError):
-            of_session.write_text(before)
+            of_session.write_text(words[-1])
 
 
 @pytest.fixture(scope="session", autouse=True)
