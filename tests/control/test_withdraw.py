@@ -38,6 +38,17 @@ def test_an_undone_step_leaves_state_and_stop_unchanged(robot: Robot) -> None:
     np.testing.assert_allclose(controller.tool_pose("left"), robot.tool_pose(before.q, "left"), atol=1e-9)
 
 
+def test_after_an_undone_step_no_pair_keeps_more_than_before_it(robot: Robot) -> None:
+    controller = CartesianController(robot)
+    controller.step({}, DT)
+    assert controller.change({"min_distance": controller.settings.min_distance + 0.01}) is None
+    before, late = controller.kept_distances, controller.step({}, DT)
+    while not (controller.kept_distances > before).any():  # Distances do not grow at every step.
+        before, late = controller.kept_distances, controller.step({}, DT)
+    controller.withdraw(late)
+    np.testing.assert_array_equal(controller.kept_distances, before)
+
+
 @pytest.mark.slow
 def test_arms_that_move_towards_each_other_keep_limits_and_distances_with_late_steps(robot: Robot) -> None:
     controller, random = CartesianController(robot), np.random.default_rng(0)
