@@ -62,7 +62,7 @@ from q2r2_control.plants.mujoco_cameras import window_fault
 from q2r2_control.plugins import PLANTS, load_class
 from q2r2_control.process.places import JobPlace, Processes, chosen_place
 from q2r2_control.process.scheduling import StopRequest, stop_on_signals
-from q2r2_control.robot.commissioned import has_real_cabinets, not_commissioned, slowed
+from q2r2_control.robot.commissioned import drives_real_arms, not_commissioned, slowed
 from q2r2_control.teleop.crossed_hands import CrossedHands
 from q2r2_control.types import CommandMode
 from q2r2_control.viewer.headset_table import headset_display, headset_table
@@ -121,7 +121,7 @@ def run(
     force: Annotated[bool, Option("--force", help="Run even if q2r2 check finds a fault.")] = False,
     i_know: Annotated[bool, Option("--i-know", help="Run real cabinets that are not commissioned.")] = False,
     full_speed: Annotated[
-        bool, Option("--full-speed", help="Run real cabinets at full speed, not a tenth of it.")
+        bool, Option("--full-speed", help="Move real arms at full speed, not a tenth of it.")
     ] = False,
     wait: Wait = None,
     verbose: Verbose = False,
@@ -131,7 +131,7 @@ def run(
 
     A cell in which q2r2 check finds a fault is refused with the same lines and exit code 2, unless --force is given. A
     cell with real cabinets that is not commissioned is refused too, unless --i-know is given. The joints of real
-    cabinets move at a tenth of their speed, unless --full-speed is given.
+    arms move at a tenth of their speed, unless --full-speed is given.
     Exit code 1 if a tool is more than 100 mm from its reference at the end, if an arm refused every press that engages
     it, if measured links met in torque mode, if a tick had no certificate, if a policy raised an error or gave actions
     that cannot be used, or if an arm still moves at the end. Exit code 3 if there is no such fault, but the recording
@@ -141,9 +141,9 @@ def run(
     cell = with_solver(load_config(config), solver)
     if (plant or cell.plant) == "fri" and not i_know and (why := not_commissioned(cell, find_resource(config))):
         raise ConfigError(f"{config}: {why}; q2r2 commission {config} commissions it; --i-know runs it all the same")
-    if (plant or cell.plant) == "fri" and not full_speed and has_real_cabinets(cell):
+    if not full_speed and drives_real_arms(cell, plant or cell.plant):
         cell = slowed(cell)
-        say("real cabinets: joints at a tenth of their speed; --full-speed ends that", style="yellow")
+        say("real arms: joints at a tenth of their speed; --full-speed ends that", style="yellow")
     source = input or cell.input
     for name in filter(None, (source, takeover)):
         cell = adapted(name, cell)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from q2r2_control._lazy import lazy_exports
 
 if TYPE_CHECKING:
+    from q2r2_control.plants.base import RealPlant as RealPlant
     from q2r2_control.plants.base import SessionPlant as SessionPlant
     from q2r2_control.plants.base import WaitingPlant as WaitingPlant
     from q2r2_control.plants.base import WindowedPlant as WindowedPlant
@@ -27,6 +28,7 @@ _MODULES = {
     "FriReason": "fri.reasons",
     "MujocoPlant": "mujoco",
     "ReferencePath": "fri.answers",
+    "RealPlant": "base",
     "SessionPlant": "base",
     "WaitingPlant": "base",
     "WindowedPlant": "base",

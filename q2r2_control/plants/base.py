@@ -128,6 +128,15 @@ class SessionPlant(Protocol):
 
 
 @runtime_checkable
+class RealPlant(Protocol):
+    """The additional method of a plant that can drive real arms. Its joints move slowly until the user allows more."""
+
+    @classmethod
+    def drives_real_arms(cls, config: Config) -> bool:
+        """Return whether at least one arm of the cell ``config`` is real, and not simulated on this computer."""
+
+
+@runtime_checkable
 class WaitingPlant(Protocol):
     """The additional attributes of a plant whose reset waits for a person, for ``--wait``."""
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+from collections.abc import Callable
 from ipaddress import ip_address
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from q2r2_control.config.cell_file import load_config
 from q2r2_control.config.control import LIVE
 from q2r2_control.config.resources import find_resource
 from q2r2_control.errors import ConfigError
+from q2r2_control.plugins import PLANTS, load_class
 from q2r2_control.robot.compose import compose
 
 FIRST_SPEED = 0.1  # Share of the cell's speed that is allowed at first.
@@ -35,6 +37,16 @@ def fingerprint(config: Config) -> str:
 def has_real_cabinets(config: Config) -> bool:
     """Return whether at least one cabinet is not on this computer. Simulated cabinets run on this computer."""
     return not all(ip_address(cabinet.address).is_loopback for cabinet in config.fri.values())
+
+
+def drives_real_arms(config: Config, plant: str) -> bool:
+    """Return whether the plant with the name ``plant`` moves real arms in this cell.
+
+    Raises:
+        ConfigError: If no installed plant has this name, or if the plant cannot be imported.
+    """
+    its_answer: Callable[[Config], bool] | None = getattr(load_class(PLANTS, plant), "drives_real_arms", None)
+    return its_answer is not None and its_answer(config)
 
 
 def slowed(config: Config) -> Config:
@@ -61,7 +73,7 @@ def not_commissioned(config: Config, cell: Path) -> str | None:
 def load_commissioned(path: str | os.PathLike[str], plant: str | None = None, *, full_speed: bool = False) -> Config:
     """Read a cell whose real arms may be driven, by the rules of ``q2r2 run``.
 
-    A cell that drives no real cabinets is returned as :func:`load_config` returns it.
+    A cell that drives no real arms is returned as :func:`load_config` returns it.
 
     Args:
         path: The cell's YAML, in a form that :func:`load_config` takes.
@@ -72,8 +84,7 @@ def load_commissioned(path: str | os.PathLike[str], plant: str | None = None, *,
         ConfigError: If the file cannot be used, or if its real cabinets were not commissioned in their present state.
     """
     config = load_config(path)
-    if (plant or config.plant) != "fri":
-        return config
-    if why := not_commissioned(config, find_resource(path)):
+    plant = plant or config.plant
+    if plant == "fri" and (why := not_commissioned(config, find_resource(path))):
         raise ConfigError(f"{path}: {why}; q2r2 commission {path} commissions it")
-    return slowed(config) if has_real_cabinets(config) and not full_speed else config
+    return slowed(config) if drives_real_arms(config, plant) and not full_speed else config

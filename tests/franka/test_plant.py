@@ -17,3 +17,15 @@ def test_a_jerk_limit_that_the_mean_of_five_positions_cannot_keep_is_refused() -
     stricter = config.model_copy(update={"control": config.control.model_copy(update={"jerk_limit": 1900.0})})
     with pytest.raises(ConfigError, match=r"control.jerk_limit = 1900.0: allowed with robots: 1920 rad/s\^3 or more"):
         FrankaPlant(robot, stricter)
+
+
+def test_arms_move_at_a_tenth_of_their_speed_unless_all_robots_are_simulated_on_this_computer() -> None:
+    pytest.importorskip("pylibfranka", reason="pip install -e plugins/q2r2_franka")
+    from q2r2_franka.plant import FrankaPlant
+
+    config = load_config("plugins/q2r2_franka/dual_fr3.yaml")
+    assert FrankaPlant.drives_real_arms(config)
+    for right, is_real in (("127.0.0.3", False), ("localhost", False), ("robot.lab", True), ("172.16.1.2", True)):
+        robots = {"left": {"address": "127.0.0.2"}, "right": {"address": right}}
+        cell = config.model_copy(update={"plant_settings": {"franka": robots}})
+        assert FrankaPlant.drives_real_arms(cell) is is_real, right

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import sys
 from pathlib import Path
 
 import pytest
@@ -12,9 +13,18 @@ from q2r2_control.config.cell import Config
 from q2r2_control.config.cell_file import load_config, parse_config
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.commissioned import fingerprint, load_commissioned, not_commissioned, sign_off_file, slowed
+from tests.support.modules import install
 
 TEXT = Path("config/dual_iiwa7_fri.yaml").read_text(encoding="utf-8")
 REAL = TEXT.replace("127.0.0.2", "192.170.10.2")
+OTHER_PLANT = """
+from q2r2_control.plants.kinematic import KinematicPlant
+
+class Other(KinematicPlant):
+    @classmethod
+    def drives_real_arms(cls, config):
+        return {real}
+"""
 
 
 def cell(old: str = "", new: str = "", text: str = REAL) -> Config:
@@ -100,3 +110,15 @@ def test_a_commissioned_cell_goes_at_a_tenth_of_its_speed_unless_full_speed_is_a
 
 def test_a_cell_of_simulated_cabinets_is_loaded_as_it_is() -> None:
     assert load_commissioned("config/dual_iiwa7_fri.yaml") == load_config("config/dual_iiwa7_fri.yaml")
+
+
+@pytest.mark.parametrize("real", [True, False])
+def test_a_plant_of_another_package_moves_at_a_tenth_of_the_speed_only_if_its_arms_are_real(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, real: bool
+) -> None:
+    install(tmp_path, "other_arms", OTHER_PLANT.format(real=real), "[q2r2_control.plants]\nother = other_arms:Other\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "other_arms", raising=False)
+    as_given = load_config("config/dual_iiwa7.yaml")
+    assert load_commissioned("config/dual_iiwa7.yaml", "other") == (slowed(as_given) if real else as_given)
+    assert load_commissioned("config/dual_iiwa7.yaml", "other", full_speed=True) == as_given

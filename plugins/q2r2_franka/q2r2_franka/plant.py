@@ -13,7 +13,7 @@ from q2r2_franka.answering import RobotAnswers
 from q2r2_franka.cell import FrankaCell
 from q2r2_franka.hand import Hand
 from q2r2_franka.limits import JOINTS, PERIOD
-from q2r2_franka.settings import franka_settings
+from q2r2_franka.settings import franka_settings, is_loopback
 from q2r2_franka.state import SessionState
 from q2r2_franka.stream import MEANS
 
@@ -66,6 +66,11 @@ class FrankaPlant:
     @classmethod
     def from_config(cls, robot: Robot, config: Config) -> FrankaPlant:
         return cls(robot, config)
+
+    @classmethod
+    def drives_real_arms(cls, config: Config) -> bool:
+        """See :class:`q2r2_control.plants.RealPlant`. A robot at a loopback address is simulated."""
+        return not all(is_loopback(its.address) for its in franka_settings(config).arms.values())
 
     def begin(self, mode: CommandMode, stopped: Callable[[], bool] = lambda: False) -> None:
         """See :meth:`SessionPlant.begin`."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from ipaddress import ip_address
 from typing import Annotated, Literal
 
 from pydantic import Field
@@ -71,6 +72,14 @@ class FrankaSettings(StrictModel):
     def arms(self) -> dict[str, FrankaArmSettings]:
         both = {"left": self.left, "right": self.right}
         return {arm: its for arm, its in both.items() if its is not None}
+
+
+def is_loopback(address: str) -> bool:
+    """Return whether ``address``, an address or a host name, certainly means this computer."""
+    try:
+        return ip_address(address).is_loopback
+    except ValueError:  # It is a host name.
+        return address == "localhost"
 
 
 def franka_settings(config: Config) -> FrankaSettings:

@@ -19,6 +19,7 @@ from q2r2_control.plants.fri.session_state import SessionState
 from q2r2_control.plants.fri.waiting import CabinetWait
 from q2r2_control.plants.fri.wire import JOINTS, CommandKind
 from q2r2_control.plants.modbus_gripper import ModbusGripper
+from q2r2_control.robot.commissioned import has_real_cabinets
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import ArmTiming, Array, Command, CommandMode, RobotState
 from q2r2_control.wording import sentence
@@ -65,6 +66,11 @@ class FriPlant:
     @classmethod
     def from_config(cls, robot: Robot, config: Config) -> FriPlant:
         return cls(robot, config)
+
+    @classmethod
+    def drives_real_arms(cls, config: Config) -> bool:
+        """See :class:`RealPlant`."""
+        return has_real_cabinets(config)
 
     @property
     def addresses(self) -> list[str]:
