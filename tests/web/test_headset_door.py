@@ -17,7 +17,7 @@ from cryptography.x509 import SubjectAlternativeName, load_pem_x509_certificate
 
 from q2r2_control.errors import ConfigError, InputError
 from q2r2_control.extras import install_line
-from q2r2_control.inputs.webxr.certificate import own_certificate
+from q2r2_control.inputs.webxr.certificate import installation_token, own_certificate
 from q2r2_control.inputs.webxr.webxr import _PACKAGES, WebXrInput
 from tests.support.processes import cell
 from tests.web.headset_page import Listen, refused
@@ -48,6 +48,17 @@ def test_only_the_servers_own_page_connects_and_from_other_machines_only_with_th
     assert again.url is not None
     assert urlsplit(again.url).query == token
     assert not any("certificate" in line for line in lines)
+
+
+def test_a_token_stays_but_an_empty_or_cut_one_is_replaced(tmp_path: Path) -> None:
+    token = installation_token(tmp_path)
+    assert installation_token(tmp_path) == token
+    file = tmp_path / "token"
+    for text in ("", "\n", token[:-1]):
+        file.write_text(text)
+        assert len(installation_token(tmp_path)) == len(token)
+        assert installation_token(tmp_path) == file.read_text()
+    assert file.stat().st_mode & 0o077 == 0, "the token is this user's only"
 
 
 def test_a_certificate_is_renewed_before_it_expires_or_if_it_does_not_name_an_address(tmp_path: Path) -> None:

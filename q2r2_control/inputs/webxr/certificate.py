@@ -15,6 +15,7 @@ from q2r2_control.extras import install_line
 from q2r2_control.inputs.addresses import NO_NETWORK
 
 _VALID = timedelta(days=365)  # Time from now to the expiry of a new certificate.
+_TOKEN_BYTES, _TOKEN_LENGTH = 16, 22  # Number of random bytes in a token, and length of its text.
 _RENEWED = timedelta(days=7)  # A certificate that expires within this time is replaced by a new one.
 
 
@@ -24,12 +25,20 @@ def installation_folder() -> Path:
 
 
 def installation_token(folder: Path) -> str:
-    """Return the token. It is the same in each run, so that a headset does not need a new URL each time."""
+    """Return the token. It is the same in each run, so that a headset does not need a new URL each time.
+
+    A file whose text is shorter than a token is replaced. It may be empty after a full disk, and opens no page.
+
+    Raises:
+        InputError: If the file cannot be read or written.
+    """
     file = folder / "token"
     try:
-        if not file.exists():
-            _write(file, secrets.token_urlsafe(16).encode())
-        return file.read_text(encoding="ascii").strip()
+        known = file.read_text(encoding="ascii").strip() if file.exists() else ""
+        if len(known) < _TOKEN_LENGTH:
+            known = secrets.token_urlsafe(_TOKEN_BYTES)
+            _write(file, known.encode())
+        return known
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"https: {file} cannot be used: {error}; allowed: a file of this user's") from error
 
