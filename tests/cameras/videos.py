@@ -17,10 +17,10 @@ _BITS = 8  # The number of bits of a picture's number. Each bit is a bright or d
 _MIDDLE = 128
 
 
-def write_video(path: Path, numbers: Iterable[int], size: tuple[int, int] = (WIDTH, HEIGHT)) -> Path:
+def write_video(path: Path, numbers: Iterable[int], size: tuple[int, int] = (WIDTH, HEIGHT), fps: float = FPS) -> Path:
     """Write a video whose pictures show these numbers."""
     cv2 = pytest.importorskip("cv2")
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), FPS, size)
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), fps, size)
     for number in numbers:
         writer.write(numbered(number, size))
     writer.release()

@@ -16,6 +16,10 @@ from tests.cli.command import one_object, q2r2
 CELL = Path("config/dual_iiwa7.yaml")
 
 
+# On a busy machine, a picture may come late. One that is late by two periods can be neither judged well nor exported.
+SLOW_FPS = 5.0
+
+
 def cell_with(folder: Path, cameras: dict[str, object], cell: Path = CELL) -> Path:
     data = yaml.safe_load(cell.read_text(encoding="utf-8"))
     file = folder / "with_cameras.yaml"
@@ -51,17 +55,17 @@ def test_a_picture_of_each_camera_is_taken_and_each_fault_is_named(tmp_path: Pat
 @pytest.mark.slow
 def test_a_run_with_a_real_camera_is_judged_and_exported_without_a_simulator(tmp_path: Path) -> None:
     pytest.importorskip("cv2")
-    write_video(tmp_path / "front.avi", range(250))
-    size = {"width": WIDTH, "height": HEIGHT, "rate": FPS}
+    write_video(tmp_path / "front.avi", range(250), fps=SLOW_FPS)
+    size = {"width": WIDTH, "height": HEIGHT, "rate": SLOW_FPS}
     cell = str(cell_with(tmp_path, {"front": {"device": "front.avi", **size}}))
     options = ("--input", "scripted", "--plant", "kinematic", "--headless", "--duration", "1", "--json")
     done = q2r2("run", cell, *options, "--record", str(tmp_path / "recordings"))
     recording = one_object(done.stdout)["recording"]
-    assert (recording["fault"], recording["lost_pictures"], recording["pictures"] >= 25) == (None, 0, True)
+    assert (recording["fault"], recording["lost_pictures"], recording["pictures"] >= SLOW_FPS) == (None, 0, True)
     fast = q2r2("run", cell, *options, "--fast", "--record", str(tmp_path / "fast"))
     assert "no pictures of front: real cameras keep real time; allowed: without --fast\n" in fast.stderr
     pytest.importorskip("h5py")
-    export = ("hdf5", str(tmp_path / "recordings"), "--output", str(tmp_path / "dataset"), "--fps", "10")
+    export = ("hdf5", str(tmp_path / "recordings"), "--output", str(tmp_path / "dataset"), "--fps", "5")
     assert q2r2("export", *export, "--keep-discarded").exit_code == 0
     import h5py
 
@@ -76,8 +80,8 @@ def test_a_run_of_arms_behind_cabinets_is_recorded_judged_and_exported_with_a_ca
 ) -> None:
     pytest.importorskip("cv2")
     h5py = pytest.importorskip("h5py")
-    write_video(tmp_path / "front.avi", range(250))
-    size = {"width": WIDTH, "height": HEIGHT, "rate": FPS}
+    write_video(tmp_path / "front.avi", range(250), fps=SLOW_FPS)
+    size = {"width": WIDTH, "height": HEIGHT, "rate": SLOW_FPS}
     cell = str(cell_with(tmp_path, {"front": {"device": "front.avi", **size}}, Path(fri_cell)))
     options = ("--input", "scripted", "--plant", "fri", "--i-know", "--full-speed", "--headless", "--duration", "2")
     done = q2r2("run", cell, *options, "--json", "--record", str(tmp_path / "recordings"))
@@ -85,11 +89,11 @@ def test_a_run_of_arms_behind_cabinets_is_recorded_judged_and_exported_with_a_ca
     assert (result["recording"]["fault"], result["recording"]["lost_pictures"]) == (None, 0)
     (judged,) = result["judge"]
     assert judged["figures"]["cameras"]["front"]["bad_pictures"] == 0
-    export = ("hdf5", str(tmp_path / "recordings"), "--output", str(tmp_path / "dataset"), "--fps", "25")
+    export = ("hdf5", str(tmp_path / "recordings"), "--output", str(tmp_path / "dataset"), "--fps", "5")
     assert q2r2("export", *export, "--keep-discarded").exit_code == 0
     with h5py.File(tmp_path / "dataset/episode_0.hdf5") as episode:
         numbers = [number_in(pixels) for pixels in episode["observations/images/front"]]
-    assert len(numbers) > FPS
+    assert len(numbers) > SLOW_FPS
     assert np.diff(numbers).min() >= 0, "the pictures are in the order of their capture"
     assert set(np.diff(numbers)) <= {0, 1, 2}
 
@@ -118,7 +122,7 @@ def test_without_a_cell_the_devices_of_this_computer_are_listed() -> None:
 
 def test_opencv_is_not_imported_before_a_camera_is_used() -> None:
     code = (
-        "import sys, q2r2_control.cli.cell_run, q2r2_control.cli.cameras, q2r2_control.recording.writer;"
+        "import sys, q2r2_control.cli.run_recording, q2r2_control.cli.cameras, q2r2_control.recording.writer;"
         "sys.exit('cv2' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
