@@ -99,11 +99,17 @@ def test_a_policy_sees_the_picture_whose_number_belongs_to_its_time(tmp_path: Pa
 def test_in_simulated_time_a_picture_has_a_time_of_the_loops_clock(tmp_path: Path) -> None:
     policy = Seeing()
     camera = front(write_video(tmp_path / "front.avi", range(COUNT)))
-    run = Run(camera, policy, lambda _: len(policy.seen) >= ENOUGH, realtime=False)
+
+    def saw_enough(tick: Tick) -> bool:
+        return (len(policy.seen) >= ENOUGH and policy.seen[-1][0] > 0.0) or tick.t > LONGEST
+
+    run = Run(camera, policy, saw_enough, realtime=False)
     begin, end = run.ticks[0].now, run.ticks[-1].now
     times = [time for time, _ in policy.seen]
     assert times == sorted(times)
-    assert all(begin <= time <= end for time in times[1:])
+    # On a busy machine, several pictures that were captured before the run arrive during it. Their times are negative.
+    assert begin - LONGEST < times[0] <= times[-1] <= end, (begin, end, times)
+    assert times[-1] > 0.0, (begin, end, times)
     assert run.ticks[0].now < 1.0, "the clock of the loop is another one than that of the computer"
 
 
@@ -170,7 +176,7 @@ def test_a_policy_that_does_not_read_a_camera_goes_on_when_it_stops(tmp_path: Pa
 )
 def test_a_camera_without_pictures_says_why_there_are_none(name: str, camera: dict[str, Any], says: str) -> None:
     loop = pipeline(cameras={"front": CameraConfig.model_validate(camera)})
-    pictures = NewestPictures(loop.config, loop.plant, {}, realtime=True).at(1.0)
+    pictures = NewestPictures(loop.config, loop.plant, None).at(1.0)
     assert pictures.get(name) is None
     with pytest.raises(CameraError, match=says):
         pictures[name]
