@@ -1,8 +1,8 @@
 """Optional subpackages can be removed: arms still move with everything that is left.
 
 An optional subpackage, here called a door, is a folder for one kind of devices, formats or programs: ROS, cabinets,
-pages, exports, tests for others. An import finder that raises for all modules of a folder acts as if the files were not
-there.
+cameras, pages, recordings, exports, tests for others. An import finder that raises for all modules of a folder acts as
+if the files were not there.
 """
 
 from __future__ import annotations
@@ -14,11 +14,14 @@ import pytest
 
 DOORS = (
     "benchmark",
+    "cameras",
     "export",
     "gym",
     "inputs.webxr",
+    "judging",
     "plants.fri",
     "process.cluster",
+    "recording",
     "ros",
     "verification",
     "viewer.web",
@@ -73,6 +76,7 @@ def test_the_demo_succeeds_without_an_optional_subpackage(door: str) -> None:
         (("ros", "up", "config/dual_iiwa7.yaml"), "q2r2_control.ros"),
         (("fri-check", "config/dual_iiwa7_fri.yaml"), "q2r2_control.plants.fri"),
         (("export", "csv", "run.mcap"), "q2r2_control.export"),
+        (("run", "config/dual_iiwa7.yaml", "--record", "build"), "q2r2_control.judging"),
     ],
 )
 def test_a_command_that_needs_a_missing_subpackage_names_it_in_one_line(

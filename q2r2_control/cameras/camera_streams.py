@@ -10,6 +10,7 @@ from typing import TypeVar
 
 from q2r2_control.cameras.camera_process import Answer, CameraLost, CameraShot, DepthShot
 from q2r2_control.cameras.device import check_installed
+from q2r2_control.cameras.newest_shots import NewestShots
 from q2r2_control.config.recording import CameraConfig
 from q2r2_control.errors import CameraError
 from q2r2_control.process.helper_process import HelperProcess, reason_of
@@ -113,6 +114,10 @@ class CameraStreams(AbstractContextManager["CameraStreams"]):
         """Wait until each camera has given a picture. Raises :class:`CameraError` if a camera gives none."""
         for stream in self.streams.values():
             stream.first_picture()
+
+    def newest_shots(self, realtime: bool) -> NewestShots:
+        """Return the newest pictures at each tick of a run. ``realtime``: whether the loop keeps real time."""
+        return NewestShots(self.streams, realtime)
 
     def close(self) -> None:
         for stream in self.streams.values():

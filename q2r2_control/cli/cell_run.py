@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -11,39 +11,29 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
-from q2r2_control.cameras.camera_streams import CameraStreams
 from q2r2_control.cli.output import (
     SCRIPTS_WAIT_S,
     as_json_text,
     late_line,
     notice_of_compiling,
-    recording_line,
+    print_lines,
     say,
     task_line,
-    verdict_markup,
 )
 from q2r2_control.cli.summary_figures import summary_table, verdict_line
 from q2r2_control.config.cell import Config
 from q2r2_control.config.external import ControllerKind
-from q2r2_control.config.recording import CameraConfig
 from q2r2_control.demo.assembly_tasks import AssemblyTask, TaskResult, TaskWatch, held_to_promises, note_on_parts
-from q2r2_control.errors import ConfigError, PlantError, RecordingError
+from q2r2_control.errors import ConfigError, PlantError
 from q2r2_control.inputs.base import PolicySource, is_simulated, make_input
-from q2r2_control.judging.episode_judge import EpisodeJudge
-from q2r2_control.judging.judge import Judged, judge, keep_verdicts
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.base import Plant, WaitingPlant, WindowedPlant, make_plant
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.plugins import INPUTS, PLANTS, load_class
-from q2r2_control.process.scheduling import check_folder, real_time
-from q2r2_control.recording.about import About, anonymous
-from q2r2_control.recording.device_pictures import DevicePictures
-from q2r2_control.recording.reader import Recording
-from q2r2_control.recording.recorder import ROOM, ROOM_WITH_PICTURES, Recorder, RecordingSummary
+from q2r2_control.process.scheduling import real_time
 from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.run_summary import RunSummary
 from q2r2_control.summary.tick import Tick
-from q2r2_control.teleop.both_arms import EpisodeMarks
 from q2r2_control.viewer.episode_words import EpisodeWords
 from q2r2_control.viewer.live import LiveTable
 from q2r2_control.viewer.live_pictures import LivePictures, ShownPictures
@@ -52,6 +42,9 @@ from q2r2_control.viewer.state_colours import obstacle_colour
 from q2r2_control.viewer.tables import print_table
 
 if TYPE_CHECKING:
+    from q2r2_control.cameras.camera_streams import CameraStreams
+    from q2r2_control.cli.run_recording import RunRecording
+    from q2r2_control.recording.recorder import RecordingSummary
     from q2r2_control.viewer.web.view import PageView
 
 _SHOWS_PICTURES = "show_picture"  # An input has this method if its device can show the run, as a headset can.
@@ -152,7 +145,7 @@ def run_cell(config: Config, options: RunOptions) -> CellRun:
     if options.window:
         check_window(options.plant)
     # The processes start before the pipeline is built, because building it takes longer than their start.
-    with CameraStreams(_watched_devices(config, options)) as streams:
+    with _opened_devices(config, options) as streams:
         if options.page is None:
             return _run_recorded(config, options, None, streams)
         from q2r2_control.viewer.web.view import PageView  # A run without a page needs no files of pages.
@@ -161,33 +154,35 @@ def run_cell(config: Config, options: RunOptions) -> CellRun:
             return _run_recorded(config, options, page, streams)
 
 
-def _watched_devices(config: Config, options: RunOptions) -> dict[str, CameraConfig]:
-    """Return the real cameras whose pictures are recorded, shown or observed. Other cameras stay closed."""
+def _opened_devices(config: Config, options: RunOptions) -> AbstractContextManager[CameraStreams | None]:
+    """Open the real cameras whose pictures are recorded, shown or observed; None if there are none."""
     source = load_class(INPUTS, options.input)
     sees = any(hasattr(source, method) for method in (_SHOWS_PICTURES, PolicySource.observe.__name__))
-    if options.fast or (options.record is None and options.page is None and not sees):
-        return {}
-    return config.device_cameras
+    used = not options.fast and (options.record is not None or options.page is not None or sees)
+    if not (used and config.device_cameras):
+        return nullcontext()
+    from q2r2_control.cameras.camera_streams import CameraStreams  # Other runs need no files of cameras.
+
+    return CameraStreams(config.device_cameras)
 
 
-def _run_recorded(config: Config, options: RunOptions, page: PageView | None, streams: CameraStreams) -> CellRun:
+def _run_recorded(config: Config, options: RunOptions, page: PageView | None, streams: CameraStreams | None) -> CellRun:
     if options.record is None:
         return _run_cell(config, options, None, page, streams)
-    check_folder(options.record, "--record")
-    pictures = bool(config.simulated_cameras) and issubclass(load_class(PLANTS, options.plant), MujocoPlant)
-    room = ROOM_WITH_PICTURES if streams.streams else ROOM
-    recorder = Recorder(options.record, options.name, waits=options.simulated_time, room=room, pictures=pictures)
-    try:
-        with recorder:
-            run = _run_cell(config, options, recorder, page, streams)
-    except PlantError:
-        _print_lines(Console(stderr=True), _recording_lines(recorder.summary))
-        raise
-    return replace(run, recording=recorder.summary)
+    from q2r2_control.cli.run_recording import RunRecording  # A run without --record needs no files of recordings.
+
+    devices = () if streams is None else tuple(streams.streams)
+    with RunRecording(options.record, options, config, devices) as recording:
+        run = _run_cell(config, options, recording, page, streams)
+    return replace(run, recording=recording.recorder.summary)
 
 
 def _run_cell(
-    config: Config, options: RunOptions, recorder: Recorder | None, page: PageView | None, streams: CameraStreams
+    config: Config,
+    options: RunOptions,
+    recording: RunRecording | None,
+    page: PageView | None,
+    streams: CameraStreams | None,
 ) -> CellRun:
     console = Console(stderr=True)
     source = make_input(options.input, config, say=partial(say, console=console), **options.input_options)
@@ -206,7 +201,7 @@ def _run_cell(
         with notice_of_compiling():
             pipeline = Pipeline(config, robot, source, plant, options.mode)
             faults = pipeline.preflight_faults()
-        return _run_pipeline(pipeline, faults, options, recorder, page, streams, console)
+        return _run_pipeline(pipeline, faults, options, recording, page, streams, console)
     finally:
         plant.close()  # This is necessary even if no run began: an open window would crash the process at its end.
 
@@ -223,9 +218,9 @@ def _run_pipeline(
     pipeline: Pipeline,
     faults: tuple[str, ...],
     options: RunOptions,
-    recorder: Recorder | None,
+    recording: RunRecording | None,
     page: PageView | None,
-    streams: CameraStreams,
+    streams: CameraStreams | None,
     console: Console,
 ) -> CellRun:
     config, source = pipeline.config, pipeline.input
@@ -247,17 +242,17 @@ def _run_pipeline(
     if hasattr(display, _SHOWS_PICTURES):
         from q2r2_control.viewer.headset_view import HeadsetView
 
-        HeadsetView(display, pipeline, recorder is not None)
+        HeadsetView(display, pipeline, recording is not None)
     if page is not None:
-        page.begin(pipeline, options.name, recorder is not None)
+        page.begin(pipeline, options.name, recording is not None)
         for line in page.lines:
             say(line, console)
-    summary = _run(pipeline, options, recorder, page, streams, console)
+    summary = _run(pipeline, options, recording, page, streams, console)
     results = () if watch is None else held_to_promises(watch.results(), summary)
     run = CellRun(summary, results, planned=options.duration)
     succeeded = all(task.succeeded for task in results)
-    if recorder is not None and results and (succeeded or not run.cut_short):
-        recorder.success = succeeded
+    if recording is not None and results and (succeeded or not run.cut_short):
+        recording.recorder.success = succeeded
     return run
 
 
@@ -268,9 +263,11 @@ def print_summary(run: CellRun, json: bool, verbose: bool = False) -> None:
         if run.tasks:
             data["tasks"] = run.tasks
         if run.recording is not None:
+            from q2r2_control.cli.run_recording import judge_recording
+
             data["recording"] = run.recording
-        if judged := _judge_recording(run.recording):
-            data["judge"] = [one.as_json() for one in judged]
+            if judged := judge_recording(run.recording):
+                data["judge"] = [one.as_json() for one in judged]
         print(as_json_text(data))
         return
     console = Console()
@@ -281,46 +278,22 @@ def print_summary(run: CellRun, json: bool, verbose: bool = False) -> None:
     if open_tasks := [task.name for task in run.tasks if task not in tasks]:
         after = f"stopped after {run.summary.duration_s:.1f} of {run.planned:.1f} s"
         stopped = f"[yellow]{after}[/]: not judged: {', '.join(open_tasks)}"
-    _print_lines(console, [verdict_line(run.summary, failed, stopped), *map(task_line, tasks)])
+    print_lines(console, [verdict_line(run.summary, failed, stopped), *map(task_line, tasks)])
     if (late := late_line(run.summary, run.tasks)) is not None:
-        _print_lines(console, [late])
+        print_lines(console, [late])
     if run.recording is not None:
-        _print_lines(console, _recording_lines(run.recording))
+        from q2r2_control.cli.run_recording import recording_lines
+
+        print_lines(console, recording_lines(run.recording))
     print_table(summary_table(run.summary, verbose), console)
-
-
-def _print_lines(console: Console, lines: Iterable[str]) -> None:
-    for line in lines:
-        console.print(line, soft_wrap=True, highlight=False)
-
-
-def _recording_lines(recording: RecordingSummary) -> Iterator[str]:
-    """Yield lines of markup with the file of the recording and the verdicts on its episodes."""
-    yield recording_line(recording)
-    for one in _judge_recording(recording):
-        which = "" if one.figures.part is None else f" on episode {one.figures.part}"
-        yield f"verdict{which}: {verdict_markup(one.verdict)}"
-
-
-def _judge_recording(recording: RecordingSummary | None) -> list[Judged]:
-    """Judge the written file, and keep the verdicts beside it. A failure is one line on stderr."""
-    if recording is None or recording.file is None or not Path(recording.file).exists():
-        return []
-    try:
-        judged = judge(Recording(Path(recording.file)))
-        keep_verdicts(judged)
-    except RecordingError as error:
-        say(f"not judged: {error}")
-        return []
-    return judged
 
 
 def _run(
     pipeline: Pipeline,
     options: RunOptions,
-    recorder: Recorder | None,
+    recording: RunRecording | None,
     page: PageView | None,
-    streams: CameraStreams,
+    streams: CameraStreams | None,
     console: Console,
 ) -> RunSummary:
     """Run the pipeline with its table, window, pictures and recording."""
@@ -331,7 +304,7 @@ def _run(
             title = f"{options.name}: Ctrl-C brings the arms to rest and ends"
             shown, simulated = ShownRobot.of(pipeline.robot, pipeline.config), options.simulated_time
             words = shown.words(pipeline.input.controls.words)
-            episodes = EpisodeWords(pipeline.config.recording.subtasks) if recorder is not None else None
+            episodes = EpisodeWords(pipeline.config.recording.subtasks) if recording is not None else None
             table = LiveTable(
                 title, words, options.steps, options.duration, simulated_time=simulated, episodes=episodes
             )
@@ -344,46 +317,28 @@ def _run(
             is_shown = options.window or page is not None or options.input == "webxr"
             unseen = "" if is_shown else "; --web shows the arms in a browser"
             say(f"{options.name}: begins, {lasts}, in {kind}{unseen}", console)
-        streams.wait_until_ready()
+        if streams is not None:
+            streams.wait_until_ready()
         pipeline.cameras = streams
+        devices = {} if streams is None else streams.streams
         drawn = pipeline.config.simulated_cameras if isinstance(pipeline.plant, MujocoPlant) else {}
-        for name, most, show, watched in _lookers(pipeline, page, [*drawn, *streams.streams]):
-            if name in streams.streams:
-                streams.streams[name].hear(ShownPictures(most, show, watched))
+        for name, most, show, watched in _lookers(pipeline, page, [*drawn, *devices]):
+            if name in devices:
+                devices[name].hear(ShownPictures(most, show, watched))
             elif isinstance(pipeline.plant, MujocoPlant):
                 pictures = LivePictures(pipeline.plant, name, drawn[name], most, show, watched)
                 pipeline.listeners.append(stack.enter_context(pictures))
         if options.real_time and (refused := stack.enter_context(real_time())):
             say(refused, console, "yellow")
-        recording, sees = None, isinstance(pipeline.input, PolicySource)
-        if options.fast and (recorder is not None or sees) and (real := ", ".join(pipeline.config.device_cameras)):
+        observes = recording is not None or isinstance(pipeline.input, PolicySource)
+        if options.fast and observes and (real := ", ".join(pipeline.config.device_cameras)):
             say(f"no pictures of {real}: real cameras keep real time; allowed: without --fast", console, "yellow")
-        if recorder is not None:
-            cameras = tuple(pipeline.config.simulated_cameras)
-            if cameras and isinstance(pipeline.plant, MujocoPlant):
-                recorder.prepare(pipeline.plant, pipeline.robot, pipeline.config.simulated_cameras)
-            elif cameras:
-                none = f"no pictures are recorded: the {options.plant} plant has none; allowed: --plant mujoco"
-                say(none, console, "yellow")
-                cameras = ()
-            cameras += tuple(streams.streams)
-            recorder.record_outcome = pipeline.record_outcome
-            notes = {"cell": pipeline.config.name, "input": options.input, **options.notes}
-            given = options.input_options.items()
-            # The option fast is left out, because it does not change the motion.
-            notes |= {name: str(value) for name, value in given if name != "fast"}
-            about = About.of(pipeline, not options.simulated_time, notes, cameras)
-            if options.anonymous:
-                about = replace(about, notes=anonymous(about.notes))
-            recorder.begin(about, pipeline.robot, pipeline.config.recording.topic_rate)
-            pipeline.listeners.append(recorder)
-            recording = recorder, about
-            if any(map(pipeline.config.teleop.bindings.words_of, EpisodeMarks.actions)):
-                judge_now = EpisodeJudge(lambda: recorder.file, pipeline.record_outcome)
-                pipeline.listeners.append(stack.enter_context(judge_now))
-        if streams.streams:
-            devices = DevicePictures(streams, not options.simulated_time, pipeline.record_outcome, recording)
-            pipeline.listeners.append(stack.enter_context(devices))
+        recorded = None if recording is None else recording.begin(pipeline, stack, console)
+        if streams is not None:
+            from q2r2_control.recording.device_pictures import DevicePictures
+
+            seen = DevicePictures(streams, not options.simulated_time, pipeline.record_outcome, recorded)
+            pipeline.listeners.append(stack.enter_context(seen))
         return pipeline.run(options.duration, realtime=not options.simulated_time, paced=not options.fast)
 
 

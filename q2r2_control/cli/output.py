@@ -7,7 +7,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic_core import to_json
 from rich.console import Console
@@ -21,10 +21,12 @@ from q2r2_control.control.jit import compiling
 from q2r2_control.control.solvers.registry import check_installed
 from q2r2_control.demo.assembly_tasks import TaskResult
 from q2r2_control.errors import ConfigError
-from q2r2_control.judging.judge import Verdict
-from q2r2_control.recording.recorder import RecordingSummary
 from q2r2_control.summary.run_summary import RunSummary
 from q2r2_control.viewer.tables import print_table
+
+if TYPE_CHECKING:
+    from q2r2_control.judging.judge import Verdict
+    from q2r2_control.recording.recorder import RecordingSummary
 
 # A task may fail because the loop was late: once by _LATE [us], or by more than a period in a share _OFTEN of ticks.
 _LATE, _OFTEN = 2e4, 0.2
@@ -197,6 +199,12 @@ def late_line(summary: RunSummary, tasks: Iterable[TaskResult]) -> str | None:
         return None
     line = f"the loop was late by up to {1e-3 * late:.0f} ms, in {summary.overruns} ticks by more than a period"
     return f"[yellow]{line}[/]: close other programs, or give it priority with --rt"
+
+
+def print_lines(console: Console, lines: Iterable[str]) -> None:
+    """Print lines of markup, each without a break at the width of the terminal."""
+    for line in lines:
+        console.print(line, soft_wrap=True, highlight=False)
 
 
 def recording_line(recording: RecordingSummary) -> str:

@@ -6,38 +6,25 @@ bodies. When a policy reads the pixels, they are decoded or rendered in the poli
 
 from __future__ import annotations
 
-import io
 import math
-import time
 from collections.abc import Callable, Mapping
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
-from PIL import Image
 
-from q2r2_control.cameras.camera_streams import CameraStream
-from q2r2_control.cameras.camera_watch import longest_silence
-from q2r2_control.cameras.loop_times import LoopTimes, TickTime
 from q2r2_control.config.cell import Config
 from q2r2_control.config.recording import CameraConfig
 from q2r2_control.errors import CameraError, shown
 from q2r2_control.plants.base import PicturedPlant, Plant
 from q2r2_control.types import ObservedPicture
 
+if TYPE_CHECKING:
+    from q2r2_control.cameras.newest_shots import NewestShots
+
 Pixels = npt.NDArray[np.uint8]  # (height, width, 3) r g b.
 _ROUNDING = 1e-6  # A picture counts as due this share of a period early, because times are rounded.
-
-
-class ReadPicture:
-    """A picture of a real camera. Implements :class:`ObservedPicture`."""
-
-    def __init__(self, time: float, jpeg: bytes) -> None:
-        self.time, self.jpeg = time, jpeg
-
-    @cached_property
-    def pixels(self) -> Pixels:
-        return np.array(Image.open(io.BytesIO(self.jpeg)).convert("RGB"))
 
 
 class DrawnPicture:
@@ -67,11 +54,9 @@ class PicturesByCamera(dict[str, ObservedPicture]):
 class NewestPictures:
     """The newest pictures at each tick of one run."""
 
-    def __init__(self, config: Config, plant: Plant, streams: Mapping[str, CameraStream], realtime: bool) -> None:
-        """``streams`` are the open cameras. The loop's clock is that of the computer if ``realtime`` is True."""
-        self._streams = {name: streams[name] for name in config.device_cameras if name in streams}
-        self._realtime, self._times = realtime, LoopTimes()
-        self._devices: dict[str, ReadPicture] = {}  # The newest picture of each open camera.
+    def __init__(self, config: Config, plant: Plant, shots: NewestShots | None) -> None:
+        """``shots`` are the pictures of the open real cameras, or None if none is open."""
+        self._shots = shots
         self._drawn: dict[str, _DrawnCamera] = {}
         if isinstance(plant, PicturedPlant):
             drawn = config.simulated_cameras.items()
@@ -79,36 +64,16 @@ class NewestPictures:
         self._reasons = {
             name: _why_without(camera)
             for name, camera in config.cameras.items()
-            if name not in {*self._streams, *self._drawn}
+            if name not in {*(() if shots is None else shots.names), *self._drawn}
         }
 
     def at(self, now: float) -> PicturesByCamera:
         """Return the newest picture of each camera at a tick that is at ``now`` [s]. It never waits."""
         found: dict[str, ObservedPicture] = {name: camera.at(now) for name, camera in self._drawn.items()}
-        if not self._streams:
+        if self._shots is None:
             return PicturesByCamera(found, self._reasons)
-        computer, reasons = now if self._realtime else time.monotonic(), dict(self._reasons)
-        self._times.add(TickTime(computer, now, 0))
-        for name, stream in self._streams.items():
-            if (why := self._why_lost(stream, computer)) is not None:
-                reasons[name] = why
-            else:
-                found[name] = self._devices[name]
-        return PicturesByCamera(found, reasons)
-
-    def _why_lost(self, stream: CameraStream, computer: float) -> str | None:
-        """Keep the newest picture. Return why it is missing or too old for a policy, or None if it may be used."""
-        if (shot := stream.newest) is None:
-            return f"no picture yet{_because(stream)}"
-        known = self._devices.get(stream.name)
-        if known is None or known.jpeg is not shot.jpeg:
-            self._devices[stream.name] = ReadPicture(self._times.at(shot.time).loop, shot.jpeg)
-        age = computer - shot.time - stream.camera.delay
-        return f"no picture for {age:.1f} s{_because(stream)}" if age >= longest_silence(stream.camera) else None
-
-
-def _because(stream: CameraStream) -> str:
-    return "" if stream.why_lost is None else f": {stream.why_lost}"
+        of_devices, reasons = self._shots.at(now)
+        return PicturesByCamera(found | of_devices, self._reasons | reasons)
 
 
 def _why_without(camera: CameraConfig) -> str:

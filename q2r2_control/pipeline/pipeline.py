@@ -8,12 +8,11 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pinocchio as pin
 
-from q2r2_control.cameras.camera_streams import CameraStreams
 from q2r2_control.config.cell import AUTO, Config
 from q2r2_control.control.constraints import Constraint
 from q2r2_control.control.controller import CartesianController
@@ -47,6 +46,9 @@ from q2r2_control.teleop.arm import OPEN
 from q2r2_control.teleop.teleop import Teleop
 from q2r2_control.types import LONGEST_DT, ArmTarget, Array, CommandMode, RobotState, is_number
 from q2r2_control.wording import sentence
+
+if TYPE_CHECKING:
+    from q2r2_control.cameras.camera_streams import CameraStreams
 
 STOPPING = "stopping"  # The state of every arm while the run ends.
 _STOP_ALLOWANCE_S = 1.0  # Time after full braking for an arm that still recovers into its limits.
@@ -341,8 +343,8 @@ class Pipeline(RequestedRun):
         is_torque = self.drive.mode is CommandMode.TORQUE
         self._longest_advance = max(_MAX_TORQUE_HOLD_S, self._clock.period) if is_torque else LONGEST_DT
         self._recorder = RunRecorder(self.robot, self.config.control, self.listeners, self.stop, counts)
-        streams = {} if self.cameras is None else self.cameras.streams
-        pictures = NewestPictures(self.config, self.plant, streams, realtime)
+        shots = None if self.cameras is None else self.cameras.newest_shots(realtime)
+        pictures = NewestPictures(self.config, self.plant, shots)
         self._operator = OperatorSide(
             self.teleop,
             self.input,

@@ -7,7 +7,6 @@ from collections import deque
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from q2r2_control.cameras.reasons import CameraReason
 from q2r2_control.compliance.impedance import ImpedanceController, check_springs
 from q2r2_control.config.bindings import Action
 from q2r2_control.config.cell import Config
@@ -122,25 +121,6 @@ class RequestedRun:
         """Report the outcome of the recording, or of an episode in it, to the operator; from any thread."""
         check_kind("reason", reason, Reason, "a Reason")
         self.requests.append(reason)
-
-
-# Kinds of requests that a replay repeats. The end of a recording is not repeated.
-REPEATED = {
-    *(
-        TeleopReason.HOME_REQUESTED,
-        TeleopReason.PAUSE_REQUESTED,
-        TeleopReason.POLICY_REQUESTED,
-        TeleopReason.ENGAGE_REQUESTED,
-    ),
-    TeleopReason.OBSTACLE_REPORTED,
-    *(
-        TeleopReason.RECORDING_REQUESTED,
-        TeleopReason.SETTINGS_REQUESTED,
-        TeleopReason.CONTROL_REQUESTED,
-        TeleopReason.VERDICT,
-    ),
-    *(CameraReason.CAMERA_STOPPED, CameraReason.CAMERA_SLOW, CameraReason.CAMERA_OTHER_SIZE, CameraReason.CAMERA_BACK),
-}
 
 
 def change_of(old: TeleopSettings, new: TeleopSettings) -> Reason:

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
+from q2r2_control.cameras.reasons import CameraReason
 from q2r2_control.config.cell import Config
 from q2r2_control.control.controller import CartesianController
 from q2r2_control.control.qp import QpProblem, QpSolution, Solver
@@ -20,7 +21,6 @@ from q2r2_control.drives.base import permitted
 from q2r2_control.errors import ConfigError, PlantError, RecordingError
 from q2r2_control.pipeline.loop_clock import LoopClock, WallPace
 from q2r2_control.pipeline.pipeline import Pipeline
-from q2r2_control.pipeline.requests import REPEATED
 from q2r2_control.plants.base import make_plant
 from q2r2_control.plugins import PLANTS, load_class
 from q2r2_control.recording.about import ROS, About, changes
@@ -30,6 +30,7 @@ from q2r2_control.recording.tick_rows import NOT_REPLAYED, TickPacker, tick_labe
 from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.run_summary import RunSummary
 from q2r2_control.summary.tick import Tick
+from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.types import (
     QUEST_CONTROLS,
     ActionChunk,
@@ -53,6 +54,23 @@ class ArmDifference:
 
 
 _REPEATABLE = ("mujoco", "kinematic")  # Plants that can move in a replay.
+# Kinds of requests that a replay repeats. The end of a recording is not repeated.
+_REPEATED = {
+    *(
+        TeleopReason.HOME_REQUESTED,
+        TeleopReason.PAUSE_REQUESTED,
+        TeleopReason.POLICY_REQUESTED,
+        TeleopReason.ENGAGE_REQUESTED,
+    ),
+    TeleopReason.OBSTACLE_REPORTED,
+    *(
+        TeleopReason.RECORDING_REQUESTED,
+        TeleopReason.SETTINGS_REQUESTED,
+        TeleopReason.CONTROL_REQUESTED,
+        TeleopReason.VERDICT,
+    ),
+    *(CameraReason.CAMERA_STOPPED, CameraReason.CAMERA_SLOW, CameraReason.CAMERA_OTHER_SIZE, CameraReason.CAMERA_BACK),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,7 +173,7 @@ class ReplayPipeline(Pipeline):
         """
         first = next(iter(self.robot.arms))
         asked = (event for event in tick.events if event.arm == first and event.source == event.destination)
-        self.requests.extend(event.reason for event in asked if event.kind in REPEATED)
+        self.requests.extend(event.reason for event in asked if event.kind in _REPEATED)
 
     def _prepare(self, realtime: bool) -> None:
         settings = permitted(self.config.control.timed(realtime=False), self.drive)
