@@ -1,8 +1,8 @@
 """Prove with a plane between two bodies that they stay apart, if a bound from their distance is too weak (compiled).
 
 The bound S with the reach of joints (stop_certificate.py) treats every joint as if it moved one body straight towards
-the other body. A pair that rests at its min_distance could then never be proven to move apart again. Here the direction
-of motion counts.
+the other body. With that bound alone, a pair that rests at its min_distance could never be proven to move apart again.
+The bound of this module therefore takes the direction of motion into account.
 
 **Claim.** Let n be the unit normal of two convex cores that do not meet, and e_1 and e_2 their corners (the ends of a
 segment, the corners of a box). Let J_e be the Jacobian of a corner at the start, and r the joints' reach. If the joints

@@ -29,18 +29,20 @@ from q2r2_control.control.safety.separating_plane import stays_beyond
 from q2r2_control.control.safety.speed_bound import least_distance, way, write_deviations
 from q2r2_control.control.safety.stop_rollout import begin_rollout, sample_of, write_piece
 
-# Tolerances for a pair that is too close. The first is for its distance [m], and a relative one for times.
+# If a pair is too close, its distance may fall by this from one sample to the next [m]. The same number is a relative
+# tolerance for times.
 _CLOSER = 1e-12
-_STILL = 1e-9  # Tolerance for its approach speed [m/s].
+_STILL = 1e-9  # If a pair is too close, it may approach at this speed [m/s].
 _NOISE = 1e-15  # By rounding, two measurements of the same distance may differ by this [m].
-# Accuracy of the closest points of a box and a segment. The gap along the plane between both may be smaller than their
-# distance by this. Without the tolerance, a pair exactly at its distance could never be proven to move apart again.
+# Accuracy of the closest points of a box and a segment. The gap along the normal of the plane between the box and the
+# segment may be smaller than their distance by this. Without the tolerance, a pair that is exactly at its required
+# distance could never be proven to move apart again.
 _LAST_DIGITS = 1e-11  # [m]
 
 
 @kernel
 def step_travel(v: float, v_next: float, h: float) -> float:
-    """Return the distance that a joint travels in a step with constant acceleration; there and back both count."""
+    """Return how far a joint travels in a step with constant acceleration [rad or m]. Both directions add up."""
     if v * v_next >= 0.0:
         return 0.5 * abs(v + v_next) * h
     return 0.5 * (v * v + v_next * v_next) / (abs(v) + abs(v_next)) * h
@@ -52,7 +54,7 @@ def certify(model: SafetyModel, data: SafetyData, h: float) -> bool:
 
     ``data.distance`` has the distances at the reference or lower bounds of them. A bound that does not suffice is
     replaced by the distance. ``data.velocities`` has the velocities at the reference. A pair that is too close must not
-    come closer, at the end of the step and during the stop. ``data.unproven`` names the pair that failed.
+    come closer, at the end of the step and during the stop. ``data.unproven`` gets the index of the pair that failed.
     """
     duration = begin_rollout(data)
     write_step(data, h)
@@ -81,13 +83,16 @@ def certify(model: SafetyModel, data: SafetyData, h: float) -> bool:
 
 @inlined_kernel
 def is_too_close(model: SafetyModel, data: SafetyData, p: int) -> bool:
-    """Return whether pair ``p`` is closer at the reference than its required distance. Near distances are exact."""
+    """Return whether pair ``p`` is closer at the reference than its required distance.
+
+    ``data.distance`` is exact for near pairs, so a mere lower bound is never below the required distance.
+    """
     return data.distance[p] < model.min_distance[p] - ROUNDING
 
 
 @kernel
 def _keeps_apart(model: SafetyModel, data: SafetyData, p: int, h: float, duration: float, alone: bool) -> bool:
-    """Return whether pair ``p`` is proven apart in the step and in the stop, with one plane or else part by part.
+    """Return whether pair ``p`` is proven to keep its distance in the step and the stop: with one plane, or in parts.
 
     With ``alone`` the proof also holds for arms that move and stop at different times.
     """

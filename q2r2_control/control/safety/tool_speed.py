@@ -57,7 +57,7 @@ class ToolLimits(NamedTuple):
 
 
 def tool_limits_of(robot: Robot, chain: Chain, speed: float | None) -> ToolLimits:
-    """Return the tools of a robot's arms with the speed limit ``speed`` [m/s]; None if there is no limit."""
+    """Return the tools of a robot's arms with their limit ``speed`` [m/s], which is None if there is no limit."""
     n, nv = len(robot.arms), robot.model.nv
     speed = np.inf if speed is None else speed
     limits = ToolLimits(np.zeros(n, dtype=np.int64), np.zeros((n, 3)), np.zeros((n, nv)), float(speed))
