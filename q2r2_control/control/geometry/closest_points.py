@@ -126,7 +126,7 @@ def segment_box(a0: Array, a1: Array, half: Array, on_a: Array, on_box: Array, n
 
 @kernel
 def _slope_along(a0: Array, a1: Array, half: Array, s: float) -> float:
-    """Return half the derivative of the squared distance at the parameter s."""
+    """Return half the derivative of the squared distance with respect to the parameter, at the parameter ``s``."""
     slope = 0.0
     for k in range(3):
         direction = a1[k] - a0[k]
@@ -139,9 +139,9 @@ def _slope_along(a0: Array, a1: Array, half: Array, s: float) -> float:
 def _minimum_along(a0: Array, a1: Array, half: Array) -> float:
     """Return the parameter s at which the distance is least; the middle if it is least on an interval.
 
-    It is least on an interval if the segment runs along a face. A break is a parameter at which the segment crosses the
-    plane of a face. The slope never falls with s. The largest break with a negative slope and the smallest break with a
-    positive slope therefore enclose all minima. Between them, the slope is zero at every break.
+    It is least on an interval if the segment runs along a face. A crossing is a parameter at which the segment crosses
+    the plane of a face. The slope never falls with s. The largest crossing with a negative slope and the smallest
+    crossing with a positive slope therefore enclose all minima. At every crossing between these two, the slope is zero.
     """
     low, low_slope = 0.0, _slope_along(a0, a1, half, 0.0)
     high, high_slope = 1.0, _slope_along(a0, a1, half, 1.0)

@@ -29,7 +29,7 @@ _REMEMBERED = 16
 
 
 class FingerOpenings:
-    """The interval of openings of each arm's gripper. At first, it is the whole interval."""
+    """The interval of openings of each arm's gripper. At first, it is the whole interval from closed to open."""
 
     def __init__(self, robot: Robot, bodies: CollisionBodies) -> None:
         """Begin with the ``bodies`` of ``robot``, in which fingers sweep their whole path."""
