@@ -42,11 +42,11 @@ class _PartLibrary(JITCodeLibrary):
 
     @property
     def codegen(self) -> Any:
-        """This library itself, so that Numba passes the kernel's Python objects to :meth:`set_env`. It has none."""
+        """This library itself. Numba passes a kernel's Python objects to the ``set_env`` of ``codegen``."""
         return self
 
     def set_env(self, name: str, environment: Any) -> None:
-        """Keep no Python objects, which no kernel reads."""
+        """Do not store the Python objects, because no kernel reads them."""
 
 
 class _WholeLibrary(JITCodeLibrary):
@@ -120,7 +120,10 @@ class Kernel(CPUDispatcher):
             return super().get_overload(sig) if part is None else part.entry_point
 
     def compile(self, sig: Any) -> Any:
-        """Compile for one signature, as a whole unless the compilation of another kernel needs a part."""
+        """Compile the kernel for one signature.
+
+        It is compiled as a part if the compilation of another kernel needs this kernel, and otherwise as a whole.
+        """
         with global_compiler_lock:
             as_part, self._wanted_as_part = self._wanted_as_part, False
             arguments, result = normalize_signature(sig)

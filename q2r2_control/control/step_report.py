@@ -1,4 +1,4 @@
-"""Report the outcome of a step, and the names of the limits that held it back."""
+"""Report the outcome of a step, and the names of the limits that were active in it."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class StepSummary:
     slack: float = 0.0
     solve_time: float = 0.0
     faults: tuple[str, ...] = ()  # As in StepReport.
-    constraints: tuple[ActiveLimit, ...] = ()  # The user's own constraints that are active in the last substep.
+    constraints: tuple[ActiveLimit, ...] = ()  # The user's own constraints that were active in the last substep.
 
     def status(self, apart: bool, dt_usable: bool, rejected: tuple[str, ...]) -> StepStatus:
         """Return the most important event of the step as its status."""
