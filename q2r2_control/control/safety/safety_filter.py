@@ -106,8 +106,7 @@ def certify_bodies(model: SafetyModel, data: SafetyData, grown: IntArray) -> int
     for p in range(pairs.first.shape[0]):
         if grown[pairs.first[p]] == 1 or grown[pairs.second[p]] == 1:
             any_grown = True
-            # No tolerance for rounding is allowed here, because a body's growth may always be refused.
-            if data.distance[p] < model.min_distance[p]:
+            if data.distance[p] < model.min_distance[p]:  # No rounding is tolerated: a body's growth can be refused.
                 return p
     stay_with_stop(data)
     if not any_grown or certify(model, data, 0.0):
