@@ -137,7 +137,7 @@ class ImpedanceController:
             self._wanted_borne[arm] = float(holding.get(arm, False))
 
     def _bear(self, change: float) -> None:
-        """Move the share of each payload's mass that is borne towards the wanted share, by at most ``change``."""
+        """Change the share of each payload's mass that is borne towards the wanted share, by at most ``change``."""
         inertias = {held.joint: self.robot.model.inertias[held.joint] for held in self._payloads.values()}
         for arm, held in self._payloads.items():
             way = self._wanted_borne[arm] - self._borne[arm]
