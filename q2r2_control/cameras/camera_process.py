@@ -39,7 +39,7 @@ class DepthShot(NamedTuple):
 
     time: float  # Time of its capture, by the monotonic clock [s].
     png: bytes  # A 16-bit number for each pixel: the depth in multiples of ``unit``; 0 where it is not known.
-    unit: float  # [m]
+    unit: float  # The depth for which the number 1 stands [m].
 
 
 class CameraLost(NamedTuple):
@@ -68,7 +68,7 @@ Answer = CameraShot | DepthShot | CameraLost
 
 
 def main(requests: Iterator[Any], answer: Callable[[Answer], None]) -> None:
-    """Answer with each picture of a camera until the requests end. The first request is the camera.
+    """Answer with each picture of a camera until the requests end. The first request is the camera's configuration.
 
     If the camera is lost later, this process tries again and again to open it.
 
