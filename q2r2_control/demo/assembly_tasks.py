@@ -121,7 +121,7 @@ def note_on_parts(motion: str, config: Config) -> str | None:
 
 
 def with_controls(config: Config) -> Config:
-    """Return the cell with controls for ``carry`` and ``precision``, which tasks need. Bindings of the cell stay."""
+    """Return the cell with controls for ``carry`` and ``precision``, which tasks need, unless it has such controls."""
     bindings = config.teleop.bindings
     given = {control: action for control, action in _TASK_CONTROLS.items() if bindings.words_of(action) is None}
     teleop = config.teleop.model_copy(update={"bindings": bindings.model_copy(update=given)})
@@ -188,7 +188,7 @@ class TaskWatch:
                 judge.see(dt, parts)
 
     def results(self) -> tuple[TaskResult, ...]:
-        """Return the results of all tasks. All fail if an arm touched anything, except a part with its fingers."""
+        """Return the results of all tasks. All tasks fail if an arm touched anything but a part with its fingers."""
         touches = [f"{one} touched {other} at {t:.1f} s" for (one, other), t in self._touches.forbidden.items()]
         results = []
         for name, judges in self._judges.items():
