@@ -21,14 +21,14 @@ LONGEST_HOLD = 0.11  # If a target was held for longer than this, it belonged to
 # may be late by a quarter of this time.
 _SPARE = 1.25
 _FARTHEST = 1e3  # Largest coordinate of a target that is interpolated. No arm could reach farther [m].
-# Largest error of R R' for the rotation R of a target that is interpolated. The controller itself refuses targets whose
-# error is more than twice as large.
+# Largest difference of R R' from the identity, for the rotation R of a target that is interpolated. The controller
+# itself refuses targets for which it is more than twice as large.
 _ORTHONORMAL = 5e-4
 _STEPS = 1.5  # If a target changes after fewer steps than this, targets are new at (nearly) every step.
 
 
 @dataclass(slots=True)
-class _Way:
+class _TargetPath:
     """The path of one arm's target from an earlier pose to the newest target."""
 
     start: pin.SE3
@@ -56,14 +56,14 @@ class _Way:
 
 
 class HeldTargets:
-    """The targets of all arms. While a newest target is held, it is approached from the pose before."""
+    """The targets of all arms. While a caller holds an arm's target, poses from the earlier one to it are returned."""
 
     def __init__(self) -> None:
-        self._ways: dict[str, _Way] = {}
+        self._paths: dict[str, _TargetPath] = {}
 
     def clear(self) -> None:
         """Forget all targets."""
-        self._ways.clear()
+        self._paths.clear()
 
     def between(self, targets: Mapping[str, pin.SE3 | None], dt: float) -> dict[str, pin.SE3 | None]:
         """Return the targets to follow in a step of ``dt`` [s].
@@ -73,29 +73,29 @@ class HeldTargets:
         """
         found: dict[str, pin.SE3 | None] = {}
         for arm, pose in targets.items():
-            way = self._ways.get(arm)
+            path = self._paths.get(arm)
             if not isinstance(pose, pin.SE3):
-                self._ways.pop(arm, None)
+                self._paths.pop(arm, None)
                 found[arm] = pose
                 continue
-            if way is None:
-                way = self._ways[arm] = _Way(pose, pose.copy())
-            elif pose != way.goal:
-                way.begin(pose.copy(), dt)
-            way.held += dt
-            found[arm] = pose if way.held >= way.duration else way.now()
-        if len(found) < len(self._ways):
-            self._ways = {arm: way for arm, way in self._ways.items() if arm in found}
+            if path is None:
+                path = self._paths[arm] = _TargetPath(pose, pose.copy())
+            elif pose != path.goal:
+                path.begin(pose.copy(), dt)
+            path.held += dt
+            found[arm] = pose if path.held >= path.duration else path.now()
+        if len(found) < len(self._paths):
+            self._paths = {arm: path for arm, path in self._paths.items() if arm in found}
         return found
 
     def peek(self, targets: Mapping[str, pin.SE3 | None], dt: float) -> dict[str, pin.SE3 | None]:
         """Return what :meth:`between` would return, and leave this instance as it is."""
-        kept = self._ways
+        kept = self._paths
         try:
-            self._ways = {arm: copy.copy(way) for arm, way in kept.items()}
+            self._paths = {arm: copy.copy(path) for arm, path in kept.items()}
             return self.between(targets, dt)
         finally:
-            self._ways = kept
+            self._paths = kept
 
 
 def _is_ordinary(pose: pin.SE3) -> bool:
