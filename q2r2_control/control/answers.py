@@ -13,7 +13,7 @@ from q2r2_control.errors import raised
 from q2r2_control.types import Array
 
 Answer = tuple[Array, Array]
-_MAX_LENGTH = 120  # Greatest length of a user's exception in such a line [characters].
+_MAX_LENGTH = 120  # If a user's function raises an exception, the line has at most this much of its text [characters].
 
 
 def answer_of(ask: Callable[[Array, Array], object], q: Array, v: Array, shapes: str = "") -> Answer | str:

@@ -20,7 +20,7 @@ from q2r2_control.types import ActiveLimit, Array, LimitKind
 
 HARD_TOLERANCE = 1e-4  # Permitted violation of a hard row of unit norm, because solvers have a tolerance [rad/s].
 _ACTIVE = 1e-7  # A row of unit norm that is this near to its bound is active [rad/s].
-_TINY = 1e-9  # A row with a smaller norm depends on no joint.
+_TINY = 1e-9  # If the norm of a row is smaller than this, the row counts as depending on no joint.
 
 
 class Constraint(Protocol):
@@ -88,7 +88,7 @@ class OwnConstraints:
         return bool(self._soft or self._hard)
 
     def write(self, q: Array, v: Array) -> tuple[str, ...]:
-        """Ask every constraint for its rows at ``q`` and ``v``; return a reason for each answer that is not used."""
+        """Compute the rows of every constraint at ``q`` and ``v``; return a line for each answer that is not used."""
         faults: list[str] = []
         found = [self._rows_of(kind, q, v, faults) for kind in (self._soft, self._hard)]
         rows = [answer for kind in found for _, answer in kind]

@@ -168,8 +168,8 @@ class CartesianController(WatchedPairs):
                 target is not a finite pose, the arm keeps its last target, and the report names the arm. If the last
                 target was held for several steps, up to 110 ms, the motion to the next target is interpolated. It takes
                 1.25 times as long as the last target was held.
-            dt: Duration of the step [s]. Above 0.1 s the reference moves by 0.1 s. If it is not above 0, the reference
-                does not move.
+            dt: Duration of the step [s]. If it is above 0.1 s, the reference moves as in a step of 0.1 s. If it is not
+                above 0, the reference does not move.
             posture: The posture to which the joints move as far as the tools leave them free (nv,) [rad]; None for
                 home. A posture that is not finite is not used.
 

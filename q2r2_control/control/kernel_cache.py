@@ -122,5 +122,5 @@ class KernelCache(FunctionCache):
     _impl_class = _KernelCacheImpl
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        with suppress(OSError):  # Without this, the kernel still works, and the next start compiles it again.
+        with suppress(OSError):  # If the code cannot be saved, the kernel still works, and the next start compiles it.
             super().save_overload(sig, data)

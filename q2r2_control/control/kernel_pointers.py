@@ -32,7 +32,7 @@ class _Address(types.Type):
 
     @property
     def key(self) -> Any:
-        """The type of the value, because two named tuples with different fields may have the same name."""
+        """The type of the value. A name is no key, because two named tuples with different fields may have the same."""
         return self.pointee
 
 
@@ -191,7 +191,7 @@ _kinds: dict[Any, _Pointer] = {}
 
 
 def _kind_of_pointer_to(value: Any, size: int) -> _Pointer:
-    """Return the type in kernels of a pointer to ``value``, which has ``size`` bytes."""
+    """Return the type that a pointer to ``value`` has in kernels. ``size`` is the size of the value [bytes]."""
     form = _form(value)
     if form not in _kinds:
         kind, context = _Pointer(numba.typeof(value)), cpu_target.target_context

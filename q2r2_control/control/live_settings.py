@@ -118,11 +118,11 @@ class ObjectPairs:
         self._write(np.minimum(self.kept, self._goal))
 
     def keep_no_more_than(self, kept: Array) -> None:
-        """Let pairs keep no more than the earlier distances ``kept`` [m], because the step since was undone."""
+        """Let pairs keep no more than the earlier distances ``kept`` [m], because a later step was undone."""
         self._write(np.where(np.isfinite(kept), np.minimum(self.kept, kept), self.kept))
 
     def _within_reach(self) -> Array:
-        """Return d - S - buffer of the objects' pairs [m]."""
+        """Return d - S - buffer of the objects' pairs [m]; see the module's docstring."""
         return np.asarray(provable_distances(self._safety, self._data)[self._range] - self._buffer)
 
     def _write(self, kept: Array) -> None:
@@ -144,7 +144,7 @@ class LiveSettings:
         # The final values of the gains, and the time until the gains have these values [s].
         self._gains, self._ramp = self._gains_of(settings), 0.0
         self._changing: list[tuple[Array, Array]] = []  # Arrays that kernels read, and their new values.
-        # Distances that pairs have to keep by the requested settings, and by the first settings (p,) [m].
+        # Distances that pairs have to keep according to the requested settings and to the first settings (p,) [m].
         self._goal = self._least = kept_distances(robot, settings).values
         self._stops = model.safety.approach.stop_distance[: len(self._goal)]  # Distances at which the QP stops pairs.
         # Growing: some kept distance is below the requested one. Crowded: some pair is within its buffer. Due: the time
@@ -190,7 +190,7 @@ class LiveSettings:
         self._approach_gains(self._ramp)
 
     def begin(self) -> None:
-        """After the reset, let pairs keep as much as the posture allows, and reduce the buffer of pairs within it."""
+        """After the reset, let pairs keep as much as the posture allows. Reduce the buffers of pairs within them."""
         self._grow(np.inf)
         distance = self._data.distance[: len(self.kept)]
         is_within = (distance >= self.kept - ROUNDING) & (distance < self._stops)
@@ -213,7 +213,7 @@ class LiveSettings:
                 self._stop_from(self._stops)
 
     def keep_no_more_than(self, kept: Array) -> None:
-        """Let pairs keep no more than the earlier distances ``kept`` (p,) [m], because the step since was undone."""
+        """Let pairs keep no more than the earlier distances ``kept`` (p,) [m], because a later step was undone."""
         self._write(np.minimum(self.kept, kept))
 
     def _grow(self, most: float) -> None:
@@ -240,7 +240,7 @@ class LiveSettings:
         self._crowded = bool((self._stops < wanted).any())
 
     def _lasting(self) -> Array:
-        """Return d - S of every monitored pair (p,) [m]."""
+        """Return d - S of every monitored pair (p,) [m]; see the module's docstring."""
         return provable_distances(self._safety, self._data)[: len(self._goal)]
 
     def _gains_of(self, settings: ControllerSettings) -> tuple[Array, ...]:

@@ -30,7 +30,7 @@ class StepProblem:
         self.constraints = OwnConstraints(robot, constraints)
 
     def connect(self, model: KernelPointer, targets: KernelPointer, data: KernelPointer) -> None:
-        """Compile the kernels for these pointers. A reset has to write the values at the pointers before."""
+        """Compile the kernels for these pointers. Before that, a reset has to write the values behind the pointers."""
         self._pointers = model, targets, data
         arrays: KernelData = data.value
         self._rows, self._tasks, self._state = arrays.safety.rows, arrays.tasks, arrays.safety.state

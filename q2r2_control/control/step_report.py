@@ -29,7 +29,7 @@ class LimitNames:
         self.pairs = [
             (names[first], names[second]) for first, second in both
         ]  # The pairs are those of the cell, then of objects, then of obstacles.
-        # In most ticks the same limits are active as in the last one.
+        # Key and result of the last call of :meth:`of`, because in most ticks the same limits are active as before.
         self._last: tuple[bytes, tuple[ActiveLimit, ...]] = b"", ()
         self._by_kind: dict[int, list[ActiveLimit]] = {
             kind: [ActiveLimit(limit, (joint,)) for joint in robot.joint_names] for kind, limit in _KINDS.items()

@@ -21,10 +21,10 @@ from q2r2_control.types import Array
 
 # Greatest coordinate of a target. It is larger than any cell, and squares of such numbers stay finite.
 _FARTHEST = 100.0  # [m]
-_ORTHONORMAL = 1e-3  # Largest error of R R' of a target's rotation R.
+_ORTHONORMAL = 1e-3  # Largest permitted difference of R R' from the identity, for the rotation R of a target.
 _AT_REST = 1e-2  # An arm whose joints are all slower than this counts as resting [rad/s].
 _NONE, _POSE, _NO_POSE = 0, 1, 2  # What is offered to an arm as its target: nothing, a pose, or something else.
-# A target faster than this multiple of the tool's own limit has jumped.
+# If a target is faster than this multiple of the tool's speed limit, it has jumped.
 _TELEPORT = 3.0
 
 

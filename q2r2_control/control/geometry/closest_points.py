@@ -216,8 +216,8 @@ def _push_out(a0: Array, a1: Array, half: Array, on_a: Array, on_box: Array, nor
 def _depth_across(a0: Array, a1: Array, half: Array, k: int, least: float, normal: Array) -> float:
     """Return how far the segment has to move to leave the box across an edge that is parallel to the axis ``k`` [m].
 
-    Infinite if the segment itself is parallel to this axis. ``normal`` is written. It points from the segment into the
-    box.
+    The result is infinite if the segment itself is parallel to this axis. ``normal`` is written. It points from the
+    segment into the box.
     """
     i, j = (k + 1) % 3, (k + 2) % 3
     # The translation is along the cross product e_k x (a1 - a0).
@@ -234,9 +234,9 @@ def _depth_across(a0: Array, a1: Array, half: Array, k: int, least: float, norma
 
 @kernel
 def _across_edge(a0: Array, a1: Array, half: Array, k: int, on_a: Array, on_box: Array, normal: Array) -> None:
-    """Write the closest points of the segment and the edge across which it leaves the box, against ``normal``.
+    """Write the closest points of the segment and of the edge across which the segment leaves the box.
 
-    The edge is parallel to the axis ``k``.
+    The segment moves against ``normal``. The edge is parallel to the axis ``k``.
     """
     i, j = (k + 1) % 3, (k + 2) % 3
     for axis in (i, j):

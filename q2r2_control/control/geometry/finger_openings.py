@@ -96,7 +96,7 @@ class _Turning:
         self._capsules = lru_cache(maxsize=_REMEMBERED)(TurningSweeps([body for _, body in found]).capsules)
 
     def set(self, interval: Interval, grown: IntArray) -> None:
-        """Set the capsules for ``interval``, and mark in ``grown`` (g,) the bodies that exceed their last volume."""
+        """Set the capsules for ``interval``. In ``grown`` (g,), mark bodies that are not within their last volume."""
         bodies, at = self._bodies, self._indices
         capsules = self._all if interval == ALL_OF_THE_WAY else self._capsules(interval)
         changed = sticks_out(capsules, self._now())

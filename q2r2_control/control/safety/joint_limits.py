@@ -57,7 +57,7 @@ class VelocityBox(NamedTuple):
     lower: Array  # (nv,) [rad/s]
     upper: Array  # (nv,) [rad/s]
     lower_limit: IntArray  # (nv,) POSITION, VELOCITY or ACCELERATION.
-    upper_limit: IntArray  # (nv,)
+    upper_limit: IntArray  # (nv,) POSITION, VELOCITY or ACCELERATION.
 
     @classmethod
     def empty(cls, nv: int) -> VelocityBox:

@@ -13,7 +13,7 @@ from q2r2_control.control.kernel_pointers import KernelPointers, pointers_to
 from q2r2_control.types import Array
 
 LONGEST_WINDOW = 0.1  # The longest time for which past postures are kept [s].
-_POSTURES = 21
+_POSTURES = 21  # Number of past postures that are kept.
 _SPACING = LONGEST_WINDOW / (_POSTURES - 1)  # Time between two postures, if steps are not longer [s].
 _LONG_AGO = 1e3  # The age of the postures of arms that have always rested [s].
 

@@ -100,7 +100,7 @@ def _keeps_apart(model: SafetyModel, data: SafetyData, p: int, h: float, duratio
     if data.distance[p] < model.min_distance[p] - 0.5 * ROUNDING and not _comes_no_closer(
         model, data, p, duration, _NOISE
     ):
-        return False  # Otherwise the tolerance below would add up from tick to tick to more than rounding.
+        return False  # Otherwise the tolerance in ``threshold`` would add up from tick to tick to more than rounding.
     threshold = min(model.min_distance[p], data.distance[p] - _LAST_DIGITS)
     if alone:  # This proof includes the case in which both arms move at the same time.
         return keeps_apart_at_any_time(model, data, p, duration, threshold)
@@ -137,7 +137,7 @@ def _has_room(model: SafetyModel, data: SafetyData, p: int, time: float) -> bool
 def _step_keeps_apart(
     model: SafetyModel, data: SafetyData, p: int, h: float, duration: float, threshold: float
 ) -> bool:
-    """Return whether pair ``p`` is proven apart in the step.
+    """Return whether pair ``p`` is proven to keep its distance in the step.
 
     The proof uses the distances at both ends and the travel of the joints, or else a plane at the start.
     """
@@ -153,7 +153,7 @@ def _step_keeps_apart(
 
 @kernel
 def _stop_keeps_apart(model: SafetyModel, data: SafetyData, p: int, duration: float, threshold: float) -> bool:
-    """Return whether pair ``p`` is proven apart along the whole stop, part by part."""
+    """Return whether pair ``p`` is proven to keep its distance during the whole stop, part by part."""
     rollout = data.rollout
     i, last = 0, rollout.q.shape[0] - 1
     stride = last

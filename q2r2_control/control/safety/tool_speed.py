@@ -44,7 +44,7 @@ from q2r2_control.types import Array
 if TYPE_CHECKING:
     from q2r2_control.control.safety.safety_data import SafetyData, SafetyModel
 
-_SAME_TIME = 1e-9  # Relative tolerance: two joints whose stops differ by less rest together.
+_SAME_TIME = 1e-9  # If the times until two joints rest differ by less than this share, both count as the same time.
 
 
 class ToolLimits(NamedTuple):

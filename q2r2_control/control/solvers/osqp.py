@@ -100,7 +100,7 @@ class _SizedOsqp:
         return QpSolution(v, time)
 
     def _write(self, problem: QpProblem, inverse: Array) -> None:
-        """Write the problem into OSQP, with unit rows; ``inverse`` is L^-1."""
+        """Write the problem into OSQP, with rows of unit norm; ``inverse`` is L^-1."""
         nv, m = self._nv, len(problem.rows_lower)
         rows = np.concatenate([inverse.T, problem.rows @ inverse.T])
         norms = np.sqrt(np.einsum("ij,ij->i", rows, rows))
