@@ -31,7 +31,7 @@ _WORK = np.array([0.62, 0.0, 0.05])  # Wanted position of the tool relative to t
 _AHEAD = np.array([0.8, 0.0, -0.6])  # Wanted direction in which the tool points.
 # Least wanted singular value of the tool's Jacobian, whose lengths are divided by the reach of the arm.
 _LEAST_GAIN = 0.15
-_BORNE = 0.7  # Share of the torque limits that gravity may need.
+_BORNE = 0.7  # Share of the torque limits that gravity may require.
 _ROOM = 0.04  # Wanted distance of a pair in addition to the distance that it keeps [m].
 _BELOW = 0.16  # Wanted additional distance between the tool and the floor [m]. Scripted hands move down by less.
 _NEEDED = 0.005  # Required additional distance [m].

@@ -31,8 +31,8 @@ Pair = tuple[str, str]  # The names of two bodies or of two links.
 def spreads_of(robot: Robot, pairs: Sequence[Pair]) -> dict[Pair, Interval]:
     """Return the least and the greatest distance of pairs of links [m], at home and in random postures.
 
-    The postures are always the same. ``pairs`` are the names of bodies, watched or not. Bodies of the same two links
-    count together, and so the keys are pairs of links.
+    The postures are always the same. ``pairs`` are the names of bodies, whose pairs need not be monitored. Bodies of
+    the same two links count together, and so the keys are pairs of links.
     """
     geometry = robot.collision_model.copy()
     geometry.removeAllCollisionPairs()
@@ -163,7 +163,7 @@ def warning_at_home(
     more = f"; and {len(lines) - _NAMED} more" if len(lines) > _NAMED else ""
     text = f"{robot.name}: at home, with min_distance {1e3 * kept:g} mm: {'; '.join([*lines.values()][:_NAMED])}{more}"
     if elsewhere := len(never) < len(lines):
-        # Pairs that overlap at this home are watched with a home at which they do not overlap.
+        # Pairs that overlap at this home are not watched. With a home at which they do not overlap, they are watched.
         hardly = [links for links, (least, greatest) in spreads.items() if least < 0.0 <= greatest < kept]
         never += [links for links in hardly if links not in never]
     # With an SRDF, links that overlap at home are no longer left out automatically.

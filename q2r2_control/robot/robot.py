@@ -319,7 +319,7 @@ class Robot:
             remove_disabled_pairs(self.collision_model, exclusions)
         postures = [self.home]
         if exclusions is not None:
-            # The SRDF is trusted. Only pairs that overlap everywhere are dropped, because nothing can part them.
+            # The SRDF is trusted. Only pairs that overlap in all postures are dropped: no motion separates them.
             random = np.random.default_rng(0)
             postures += [random.uniform(self.position_lower, self.position_upper) for _ in range(50)]
         return remove_overlapping_own_pairs(self.model, self.collision_model, own_links, postures)

@@ -45,7 +45,10 @@ class TurnCounter:
         return q
 
     def of_state(self, state: RobotState) -> RobotState:
-        """Return the state with the positions of :meth:`counted`, and the held posture within half a turn of them."""
+        """Return the state with positions as :meth:`counted` returns them.
+
+        The held posture gets as many turns as bring it within half a turn of these positions.
+        """
         q, held = self.counted(state.q, state.stamp), state.held
         if held is not None and len(joints := self._joints):
             held = held.copy()
