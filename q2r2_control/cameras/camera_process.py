@@ -53,7 +53,7 @@ class Thinning:
 
     def __init__(self, rate: float) -> None:
         self._period = 1.0 / rate
-        self._due: float | None = None  # Time of the next picture [s].
+        self._due: float | None = None  # Time at which the next picture is due [s].
 
     def keeps(self, time: float) -> bool:
         """Return whether the picture that was captured at ``time`` [s] is kept."""

@@ -72,7 +72,7 @@ def open_realsense(camera: CameraConfig) -> RealSense:
             allowed = ", ".join(f"{REALSENSE}{one}" for one in known) or "none is connected"
             raise CameraError(f"{shown_device(camera)}: no such camera; allowed: {allowed}")
         return RealSense(camera, known[serial])
-    except RuntimeError as error:  # The library has no other errors.
+    except RuntimeError as error:  # The library raises no other exceptions.
         raise CameraError(f"{shown_device(camera)}: it cannot be opened: {reason_of(error)}") from error
 
 

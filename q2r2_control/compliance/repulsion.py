@@ -91,7 +91,7 @@ class RepulsionModel(NamedTuple):
     """Data that do not change between ticks."""
 
     collision: CollisionModel
-    smoothing: Array  # (p,) [m^2]
+    smoothing: Array  # (p,) The number e of pair_distance.py [m^2].
     deep: Array  # (p,) Smaller distances than this are measured exactly [m].
     shell: Array  # (p,) Distance that the pair keeps [m].
     stiffness: float  # [N/m]
@@ -106,10 +106,10 @@ class RepulsionData(NamedTuple):
     M: Array  # (nv, nv) Mass matrix, of which the upper triangle is read. It is overwritten with its Cholesky factor.
     collision: CollisionData  # Collision data at q.
     near: IntArray  # (p,) Indices of the near pairs, which are inside the shell or just outside.
-    depth: Array  # (p,) Their depths [m].
-    rows: Array  # (p, nv) Gradients of their distances.
-    mobility: Array  # (p,) 1 / m [1/kg]
-    force: Array  # (p,) [N]
+    depth: Array  # (p,) Depths of the near pairs [m].
+    rows: Array  # (p, nv) Gradients of the distances of the near pairs.
+    mobility: Array  # (p,) 1 / m of the near pairs [1/kg].
+    force: Array  # (p,) Forces of the wall on the near pairs [N].
     row: Array  # (nv,) Buffer for L^-1 g of one pair.
     tau: Array  # (nv,) Torque of the wall [Nm].
 
@@ -252,7 +252,7 @@ class MeasuredSeparation:
         model = RepulsionModel(collision, *by_pair, law.stiffness, law.damping_ratio, law.maximum_force)
         self._fingers = FingerOpenings(robot, collision.bodies)
         self._kernel_data = RepulsionData.empty(model)
-        self._measured = self._kernel_data.measured.reshape(-1)  # A view, which shares its memory.
+        self._measured = self._kernel_data.measured.reshape(-1)  # A view of ``measured``, which has the same memory.
         self._model_pointer, self._data_pointer = pointer_to(model), pointer_to(self._kernel_data)
         self._pair_names = [(names[one], names[other]) for one, other in zip(pairs.first, pairs.second, strict=True)]
         # Every kernel runs once here, so that none is compiled during a motion.

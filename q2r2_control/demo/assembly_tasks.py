@@ -112,7 +112,7 @@ def tasks_named(names: Iterable[str]) -> tuple[AssemblyTask, ...]:
 
 
 def note_on_parts(motion: str, config: Config) -> str | None:
-    """Return one line about parts that the tasks of a scripted motion need and the cell lacks; None without any."""
+    """Return one line about parts that the tasks of a scripted motion need and the cell lacks; None if it has all."""
     parts = [part for name in motion.split("+") if name in TASKS for part in TASKS[name].parts]
     if not (missing := [part for part in parts if part not in config.mujoco.objects]):
         return None

@@ -27,7 +27,7 @@ from q2r2_control.process.scheduling import how_it_ended
 
 _LOOKS = 0.1  # While a process is ending, time between two checks of its progress [s].
 _AFTER_KILL = 1.0  # Time for the code that handles the last answer [s].
-_NO_ROOM = 1e-3  # Time between two attempts to send [s].
+_NO_ROOM = 1e-3  # While there is no room for a request, time between two attempts to queue it [s].
 
 
 class HelperProcess:

@@ -71,7 +71,8 @@ def reserve(runtime: float, period: float) -> bool:
 def schedule_thread_first(priority: int) -> str | None:
     """Let the calling thread run under SCHED_FIFO at ``priority``, from 1 to 99.
 
-    Other threads of the process do not change, and threads and processes that are started later do not inherit it.
+    Other threads of the process keep their scheduler. Threads and processes that are started later do not inherit the
+    scheduler of this thread.
 
     Returns:
         None, or one line that says why it is not permitted and how to permit it.
