@@ -41,7 +41,7 @@ class CameraStream:
 
     @property
     def why_lost(self) -> str | None:
-        """The reported reason why the camera gives no pictures; None while it gives pictures or if none was reported."""
+        """The reported reason why the camera gives no pictures; None while it gives pictures, or without a report."""
         return self.process.fault if self._lost is None or self.process.fault else self._lost.why
 
     def hear(self, hearer: Callable[[CameraShot], None]) -> None:
