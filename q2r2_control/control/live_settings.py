@@ -190,7 +190,10 @@ class LiveSettings:
         self._approach_gains(self._ramp)
 
     def begin(self) -> None:
-        """After the reset, let pairs keep as much as the posture allows. Reduce the buffers of pairs within them."""
+        """After the reset, let pairs keep as much as the posture allows.
+
+        Pairs that are within their buffer get a smaller buffer.
+        """
         self._grow(np.inf)
         distance = self._data.distance[: len(self.kept)]
         is_within = (distance >= self.kept - ROUNDING) & (distance < self._stops)

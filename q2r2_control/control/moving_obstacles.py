@@ -22,7 +22,7 @@ from q2r2_control.types import Array
 
 
 class MovingObstacles:
-    """The obstacles that are present, by name. Pairs with absent obstacles keep a distance of minus infinity."""
+    """The obstacles that are present, by name. For pairs with absent obstacles, the kept distance is minus infinity."""
 
     def __init__(
         self,

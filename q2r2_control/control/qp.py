@@ -4,10 +4,10 @@
     subject to  lower <= v <= upper,    rows v + s >= rows_lower,    s >= 0
 
 The box is never empty (joint_limits.py) and the rows are soft. A solution therefore always exists. Rows have unit norm,
-so that a slack is a joint speed. a_i' H^-1 a_i is the compliance of the cost along row i. Let the minimum of the cost
-violate row i only. With the compliance as a factor in rho_i, the share SOFTNESS of this violation remains in the
-solution as slack, however large the weights of the cost are. If the minimum of the cost alone keeps the box and the
-rows, it is the solution, and no solver is called.
+so that a slack is a joint speed. If the minimum of the cost violates only row i, the share SOFTNESS of this violation
+remains in the solution as slack. The factor a_i' H^-1 a_i in rho_i, which is the compliance of the cost along row i,
+makes this true however large the weights of the cost are. If the minimum of the cost alone keeps the box and the rows,
+it is the solution, and no solver is called.
 """
 
 from __future__ import annotations

@@ -186,7 +186,7 @@ class WatchedPairs:
         self._data_pointer.value.safety.history.window[1] = time
 
     def pairs_ahead(self, stop: float) -> PairsAhead:
-        """Return the functions and distances with which a path is checked before the arms follow it.
+        """Return the function and the distances with which a path is checked before the arms follow it.
 
         See :data:`PairsAhead`. Held objects count, and moving obstacles count where they were reported last.
 

@@ -69,7 +69,7 @@ def write_way(model: SafetyModel, data: SafetyData, h: float, duration: float) -
 
 @inlined_kernel
 def _stride(data: SafetyData, duration: float, finely: bool) -> int:
-    """Return the step from the index of one examined sample to the index of the next examined sample.
+    """Return the difference between the indices of two neighbouring samples of the stop that are both examined.
 
     The stop takes ``duration`` [s]. With ``finely``, four times as many samples are examined.
     """

@@ -39,7 +39,7 @@ from q2r2_control.types import Array
 
 # R [s]. A newer report counts as this old, so that the kept distance does not jump if reports come more often.
 REPORT_AGE = 0.1
-# T_0 if all reports are new and arms are as close to an obstacle as permitted. It falls no lower for new reports [s].
+# Least value of T_0 while all reports are new [s]. T_0 has this value if arms are close to an obstacle.
 _LEAST_STOP = 0.05
 _LOST = 0.5  # If a report is older than this, it does not tell which motion leads away from the obstacle [s].
 _SHARE = 0.5  # Share of the free distance to an obstacle that the obstacle's reach may take.

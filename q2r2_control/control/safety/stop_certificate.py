@@ -29,10 +29,10 @@ from q2r2_control.control.safety.separating_plane import stays_beyond
 from q2r2_control.control.safety.speed_bound import least_distance, way, write_deviations
 from q2r2_control.control.safety.stop_rollout import begin_rollout, sample_of, write_piece
 
-# If a pair is too close, its distance may fall by this from one sample to the next [m]. The same number is a relative
-# tolerance for times.
+# If the distance of a pair that is too close falls by less than this between two samples, the fall counts as rounding
+# [m]. The same number is a relative tolerance for times.
 _CLOSER = 1e-12
-_STILL = 1e-9  # If a pair is too close, it may approach at this speed [m/s].
+_STILL = 1e-9  # If a pair that is too close approaches more slowly than this, it counts as standing still [m/s].
 _NOISE = 1e-15  # By rounding, two measurements of the same distance may differ by this [m].
 # Accuracy of the closest points of a box and a segment. The gap along the normal of the plane between the box and the
 # segment may be smaller than their distance by this. Without the tolerance, a pair that is exactly at its required
