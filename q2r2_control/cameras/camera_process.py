@@ -39,7 +39,7 @@ class DepthShot(NamedTuple):
 
     time: float  # Time of its capture, by the monotonic clock [s].
     png: bytes  # A 16-bit number for each pixel: the depth in multiples of ``unit``; 0 where it is not known.
-    unit: float  # [m]
+    unit: float  # The depth for which the number 1 stands [m].
 
 
 class CameraLost(NamedTuple):
@@ -53,7 +53,7 @@ class Thinning:
 
     def __init__(self, rate: float) -> None:
         self._period = 1.0 / rate
-        self._due: float | None = None  # Time of the next picture [s].
+        self._due: float | None = None  # Time at which the next picture is due [s].
 
     def keeps(self, time: float) -> bool:
         """Return whether the picture that was captured at ``time`` [s] is kept."""
@@ -68,7 +68,7 @@ Answer = CameraShot | DepthShot | CameraLost
 
 
 def main(requests: Iterator[Any], answer: Callable[[Answer], None]) -> None:
-    """Answer with each picture of a camera until the requests end. The first request is the camera.
+    """Answer with each picture of a camera until the requests end. The first request is the camera's configuration.
 
     If the camera is lost later, this process tries again and again to open it.
 

@@ -42,7 +42,7 @@ class CameraStream:
 
     @property
     def why_lost(self) -> str | None:
-        """The reason why the camera gives no pictures, if it has told one; None while it gives pictures."""
+        """The reported reason why the camera gives no pictures; None while it gives pictures, or without a report."""
         return self.process.fault if self._lost is None or self.process.fault else self._lost.why
 
     def hear(self, hearer: Callable[[CameraShot], None]) -> None:
@@ -50,11 +50,11 @@ class CameraStream:
         self._hearers.append(hearer)
 
     def take(self) -> list[tuple[float, CameraShot]]:
-        """Return the pictures since the last call, each with the time of its receipt [s]. It never waits."""
+        """Return the pictures since the last call, each with the time of its receipt [s]. This method never waits."""
         return _taken(self._waiting)
 
     def take_depths(self) -> list[DepthShot]:
-        """Return the depth pictures since the last call. It never waits."""
+        """Return the depth pictures since the last call. This method never waits."""
         return _taken(self._depths)
 
     def first_picture(self) -> CameraShot:

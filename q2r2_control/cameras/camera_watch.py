@@ -15,9 +15,9 @@ from q2r2_control.events import Reason, ReasonKind
 # A camera has stopped if no picture came for the longer of these two times: a number of its periods, and a time [s].
 _STOPPED_PERIODS, _STOPPED_AFTER = 5.0, 1.0
 _WINDOW = 2.0  # Time over which the rate of a camera is measured [s].
-# A picture is missing if the sum of delays is at least a period less the first share of a period. The second number is
-# the share of this sum that still counts at the next picture.
-_NEARLY, _FORGETS = 0.3, 0.9
+# A picture counts as missing if the sum of delays is at least 1 - _NEARLY periods. The second number is the share of
+# this sum that still counts at the next picture.
+_NEARLY, _REMEMBERS = 0.3, 0.9
 # Shares of the rate. A camera becomes slow below the first share, and is no longer slow from the second share on.
 _SLOW, _FAST_ENOUGH = 0.8, 0.9
 
@@ -28,7 +28,7 @@ def longest_silence(camera: CameraConfig) -> float:
 
 
 class MissingPictures:
-    """Counts the pictures of a camera that are missing, by the times of those that came.
+    """Counts the pictures of a camera that are missing, from the times of the pictures that came.
 
     Pictures of a real camera come unevenly, and not at exactly its rate. Therefore the delays of successive pictures
     are added up, and small delays are forgotten within some ten pictures. A picture counts as missing if the sum is
@@ -45,7 +45,7 @@ class MissingPictures:
         """Take the time of the next picture [s]. Return how many pictures are missing just before it."""
         periods, self._newest = (time - self._newest) * self._rate, time
         # The first picture may come at any time within a period.
-        late = periods if self._late is None else max(_FORGETS * self._late, -1.0) + periods - 1.0
+        late = periods if self._late is None else max(_REMEMBERS * self._late, -1.0) + periods - 1.0
         missing = max(int(late + (0.0 if self._late is None else _NEARLY)), 0)
         self._late = 0.0 if self._late is None else late - missing
         self.count += missing

@@ -29,7 +29,7 @@ class Capture(NamedTuple):
 class DepthCapture(NamedTuple):
     time: float  # Time of the capture, by the monotonic clock of this computer [s].
     pixels: npt.NDArray[np.uint16]  # (height, width) Depth in multiples of ``unit``; 0 where it is not known.
-    unit: float  # [m]
+    unit: float  # The depth for which the number 1 stands [m].
 
 
 class CameraDevice(Protocol):
@@ -60,7 +60,7 @@ def shown_device(camera: CameraConfig) -> str:
 
 
 def address_of(camera: CameraConfig) -> str:
-    """Return the path or address to open. ``$NAME`` in it is that variable of the environment, such as a password."""
+    """Return the path or address to open. ``$NAME`` is replaced by the environment variable NAME, say a password."""
     return os.path.expandvars(str(camera.device))
 
 
@@ -84,7 +84,7 @@ def capture_time(received: float, stamp_ms: float, delay: float) -> float:
 
 
 def turned(pixels: npt.NDArray[_Number], camera: CameraConfig) -> npt.NDArray[_Number]:
-    """Return a picture of the device turned clockwise by ``camera.rotation``."""
+    """Return a picture of the device, turned clockwise by ``camera.rotation`` [deg]."""
     return np.ascontiguousarray(np.rot90(pixels, -camera.rotation // _RIGHT_ANGLE))
 
 

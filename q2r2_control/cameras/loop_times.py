@@ -11,7 +11,7 @@ _KEPT = 8192  # Number of ticks whose times are known: 8 s of a loop at 1 kHz.
 class TickTime(NamedTuple):
     computer: float  # By the monotonic clock [s].
     loop: float  # By the loop's clock [s].
-    number: int
+    number: int  # Number of the last tick up to this time.
 
 
 class LoopTimes:

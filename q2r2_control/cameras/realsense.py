@@ -24,7 +24,7 @@ from q2r2_control.errors import CameraError
 from q2r2_control.process.helper_process import reason_of
 
 _PATIENCE_MS = 2000  # Longest wait for a frame of each stream [ms].
-_WAITING = 4  # Number of frames that wait to be read.
+_WAITING = 4  # Largest number of frames that may wait to be read.
 _ENOUGH = 0.9  # A stream with less than this share of the wanted rate is too slow.
 
 
@@ -41,7 +41,7 @@ def is_installed() -> bool:
 
 
 def found_cameras() -> Iterator[tuple[FoundRealSense, Any]]:
-    """Yield the connected cameras, with their ``pyrealsense2.device``; none without the library."""
+    """Yield the connected cameras, each with its ``pyrealsense2.device``; nothing if the library is not installed."""
     if not is_installed():
         return
     import pyrealsense2 as rs
@@ -72,7 +72,7 @@ def open_realsense(camera: CameraConfig) -> RealSense:
             allowed = ", ".join(f"{REALSENSE}{one}" for one in known) or "none is connected"
             raise CameraError(f"{shown_device(camera)}: no such camera; allowed: {allowed}")
         return RealSense(camera, known[serial])
-    except RuntimeError as error:  # The library has no other errors.
+    except RuntimeError as error:  # The library raises no other exceptions.
         raise CameraError(f"{shown_device(camera)}: it cannot be opened: {reason_of(error)}") from error
 
 

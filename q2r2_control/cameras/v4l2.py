@@ -1,4 +1,4 @@
-"""V4L2 devices of this computer by Linux's own interface: which there are, and why one cannot be opened."""
+"""List the V4L2 devices of this computer, and find out why a device cannot be opened, with Linux's own interface."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def capture_devices() -> dict[str, str]:
         path = f"/dev/{folder.name}"
         with suppress(OSError):
             name = (folder / "name").read_text(encoding="utf-8", errors="replace").strip()
-            # A camera has other devices beside, such as one for metadata.
+            # A camera may have further devices that give no pictures, such as a device for metadata.
             if fault_of(path) != _NO_PICTURES:
                 found[path] = name
     return found
@@ -84,7 +84,7 @@ def fault_of(path: str) -> str | None:
 
 
 def formats_of(path: str) -> list[FrameFormat]:
-    """Return the formats of a device with sizes that the driver lists. Raises :class:`OSError`."""
+    """Return a device's formats for those sizes that the driver lists one by one. Raises :class:`OSError`."""
     file = os.open(path, os.O_RDWR | os.O_NONBLOCK)
     try:
         return [

@@ -1,4 +1,6 @@
-"""Let arms yield to a push: in torque mode by terms after the QP, in position mode by targets before the QP.
+"""Let arms yield to a push.
+
+In torque mode, torques for this are computed after the QP. In position mode, targets are displaced before the QP.
 
 ``impedance`` turns the QP's reference into torques with which each tool acts as a damped spring; ``impedance_law`` has
 the equations. ``repulsion`` adds a repulsive force between measured links. For arms that take positions, ``admittance``

@@ -6,8 +6,8 @@ target.
 
 At the tool, the admittance acts in series with the servos of the joints. In contact with a stiff body, the feedback
 loop contains the QP and the servos with their delay. With the default settings, a simulated arm rests quietly against a
-body of 10 kN/m. Against 30 kN/m it does so with twice the damping ratio or four times the mass. A load that the model
-does not know counts as a push downwards.
+body with a stiffness of 10 kN/m. With twice the damping ratio or four times the mass, it also rests quietly against a
+body of 30 kN/m. A load that the model does not know counts as a push downwards.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _NOTHING = 1e-9  # Smaller displacements [m], [rad] and velocities [m/s], [rad/s
 
 
 def estimate_wrench(J: Array, tau: Array) -> Array:
-    """Return the least-squares wrench (6,) for the torques ``tau`` (n,) [Nm] of an arm with the Jacobian J (6, n).
+    """Return the least-squares wrench (6,) [N, Nm] for the torques ``tau`` (n,) [Nm] of an arm with Jacobian J (6, n).
 
     With J J' = V s^2 V', the wrench is F = V f(s) V' J tau, where f(s) is 1 / s^2, and smaller for singular directions.
     """
@@ -46,7 +46,10 @@ def estimate_wrench(J: Array, tau: Array) -> Array:
 
 
 def rest_displacement(force: Array, dead_band: float, stiffness: float, limit: float) -> Array:
-    """Return the displacement (3,) at which the spring balances a force or torque (3,) beyond the dead band."""
+    """Return the displacement (3,) [m or rad] at which the spring balances the ``force`` (3,) [N or Nm].
+
+    The result is zero within the dead band, and at most ``limit`` long.
+    """
     size = math.hypot(*force)
     if size <= dead_band:
         return np.zeros(3)

@@ -94,7 +94,7 @@ class ImpedanceController:
         values = [float(getattr(settings, name)) for name in LIVE_IMPEDANCE]
         self._springs = np.tile(values, (len(self._arms), 1))  # The present values.
         self._kernel_data = ImpedanceData.empty(model, self._springs)
-        self._inputs = self._kernel_data.inputs.reshape(-1)  # A view, which shares its memory.
+        self._inputs = self._kernel_data.inputs.reshape(-1)  # A view of ``inputs``, which has the same memory.
         self._pointers = pointer_to(model), pointer_to(self._kernel_data)
         self._impedance_torque = bound(impedance_torque, *self._pointers, 0.0)
         self._model = robot.model.copy()  # Payloads are added to this copy.
@@ -137,7 +137,7 @@ class ImpedanceController:
             self._wanted_borne[arm] = float(holding.get(arm, False))
 
     def _bear(self, change: float) -> None:
-        """Move the share of each payload's mass that is borne towards the wanted share, by at most ``change``."""
+        """Change the share of each payload's mass that is borne towards the wanted share, by at most ``change``."""
         inertias = {held.joint: self.robot.model.inertias[held.joint] for held in self._payloads.values()}
         for arm, held in self._payloads.items():
             way = self._wanted_borne[arm] - self._borne[arm]

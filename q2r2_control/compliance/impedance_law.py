@@ -31,7 +31,7 @@ class PositionLimits(NamedTuple):
     """Position limits, and the spring that begins before each limit."""
 
     lower: Array  # (nv,) [rad]
-    upper: Array  # (nv,)
+    upper: Array  # (nv,) [rad]
     stiffness: float  # [Nm/rad]
     damping: float  # [Nms/rad]
     distance: float  # Distance from the limit at which the spring begins [rad].
@@ -39,7 +39,7 @@ class PositionLimits(NamedTuple):
 
 @numpy_kernel
 def plausible(numbers: Array) -> bool:
-    """Return whether all numbers are finite and below ``ABSURD``."""
+    """Return whether all numbers are finite and their absolute values are below ``ABSURD``."""
     return bool((np.abs(numbers) < ABSURD).all())
 
 

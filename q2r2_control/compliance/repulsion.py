@@ -83,6 +83,7 @@ _SMOOTHING = 0.07
 _DEEP = 0.25
 # The wall pushes bodies that may touch only at a greater depth than this, relative to the sum of the radii.
 _SOFT = 0.5
+# Stands for a moving obstacle that has no effect. It lies far below the cell.
 _OUT_OF_REACH = MovingObstacle(shape="sphere", size=(0.1,), position=(0.0, 0.0, -20.0), speed=0.0)
 
 
@@ -90,7 +91,7 @@ class RepulsionModel(NamedTuple):
     """Data that do not change between ticks."""
 
     collision: CollisionModel
-    smoothing: Array  # (p,) [m^2]
+    smoothing: Array  # (p,) The number e of pair_distance.py [m^2].
     deep: Array  # (p,) Smaller distances than this are measured exactly [m].
     shell: Array  # (p,) Distance that the pair keeps [m].
     stiffness: float  # [N/m]
@@ -105,12 +106,12 @@ class RepulsionData(NamedTuple):
     M: Array  # (nv, nv) Mass matrix, of which the upper triangle is read. It is overwritten with its Cholesky factor.
     collision: CollisionData  # Collision data at q.
     near: IntArray  # (p,) Indices of the near pairs, which are inside the shell or just outside.
-    depth: Array  # (p,) Their depths [m].
-    rows: Array  # (p, nv) Gradients of their distances.
-    mobility: Array  # (p,) 1 / m [1/kg]
-    force: Array  # (p,) [N]
-    row: Array  # (nv,)
-    tau: Array  # (nv,)
+    depth: Array  # (p,) Depths of the near pairs [m].
+    rows: Array  # (p, nv) Gradients of the distances of the near pairs.
+    mobility: Array  # (p,) 1 / m of the near pairs [1/kg].
+    force: Array  # (p,) Forces of the wall on the near pairs [N].
+    row: Array  # (nv,) Buffer for L^-1 g of one pair.
+    tau: Array  # (nv,) Torque of the wall [Nm].
 
     @classmethod
     def empty(cls, model: RepulsionModel) -> RepulsionData:
@@ -133,8 +134,8 @@ class RepulsionData(NamedTuple):
 def find_near(model_pointer: KernelPointer, data_pointer: KernelPointer) -> tuple[int, int, float]:
     """Write depths and gradients of the near pairs, which are inside the shell or just outside.
 
-    Returns the number of near pairs, the closest of all pairs and its distance [m]. If q or v is not finite, the number
-    is -1.
+    Returns the number of near pairs, the index of the closest of all pairs, and the distance of this pair [m]. If q or
+    v is not finite, the number is -1.
     """
     model, data = pointee(model_pointer), pointee(data_pointer)
     if not np.isfinite(data.measured.sum()):
@@ -230,8 +231,8 @@ class MeasuredSeparation:
     def __init__(self, robot: Robot, settings: ControllerSettings, wall_settings: WallSettings | None = None) -> None:
         """Make a wall that begins at the distances that pairs keep according to ``settings``.
 
-        Raises :class:`RobotError` if no kernel measures a shape, and :class:`ConfigError` if the settings do not fit
-        the robot.
+        Raises :class:`RobotError` if the kernels cannot measure a body's shape, and :class:`ConfigError` if the
+        settings do not fit the robot.
         """
         law, self._model, self._data = wall_settings or WallSettings(), robot.model, robot.model.createData()
         geometry = with_obstacle_bodies(robot, settings.moving_obstacles, held=False)
@@ -251,7 +252,7 @@ class MeasuredSeparation:
         model = RepulsionModel(collision, *by_pair, law.stiffness, law.damping_ratio, law.maximum_force)
         self._fingers = FingerOpenings(robot, collision.bodies)
         self._kernel_data = RepulsionData.empty(model)
-        self._measured = self._kernel_data.measured.reshape(-1)  # This is a view.
+        self._measured = self._kernel_data.measured.reshape(-1)  # A view of ``measured``, which has the same memory.
         self._model_pointer, self._data_pointer = pointer_to(model), pointer_to(self._kernel_data)
         self._pair_names = [(names[one], names[other]) for one, other in zip(pairs.first, pairs.second, strict=True)]
         # Every kernel runs once here, so that none is compiled during a motion.

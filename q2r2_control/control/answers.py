@@ -1,6 +1,6 @@
 """Ask a user's own tasks and constraints for their matrices and vectors, and check the answers.
 
-A step never raises. An answer that cannot be used therefore becomes a line that says what is wrong with it.
+A step never raises an exception. If an answer cannot be used, a line of text therefore says what is wrong with it.
 """
 
 from __future__ import annotations
@@ -13,17 +13,17 @@ from q2r2_control.errors import raised
 from q2r2_control.types import Array
 
 Answer = tuple[Array, Array]
-_MAX_LENGTH = 120  # Greatest length of the line [characters].
+_MAX_LENGTH = 120  # If a user's function raises an exception, the line has at most this much of its text [characters].
 
 
 def answer_of(ask: Callable[[Array, Array], object], q: Array, v: Array, shapes: str = "") -> Answer | str:
-    """Ask for a matrix and a vector at a state.
+    """Call a user's function for a joint state, and check the matrix and the vector that it returns.
 
     Args:
-        ask: The user's function. It gets copies of ``q`` and ``v``, and may raise or return anything.
+        ask: The user's function. It gets copies of ``q`` and ``v``. It may raise any exception or return any object.
         q: Joint positions (nv,) [rad].
         v: Joint velocities (nv,) [rad/s].
-        shapes: Text for the message that names the allowed shapes; "" if they are (k, nv) and (k,).
+        shapes: Text that names the allowed shapes in the line; "" if these shapes are (k, nv) and (k,).
 
     Returns:
         A finite matrix (k, nv) and vector (k,), or one line that says why the answer cannot be used.

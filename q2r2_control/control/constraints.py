@@ -1,9 +1,9 @@
-"""A user's own linear constraints on the next joint velocities: rows of the QP in addition to those of separation.
+"""A user's own linear constraints on the next joint velocities: rows of the QP in addition to the separation rows.
 
-A soft constraint has a slack, as the rows of separation have. A hard constraint has no slack, and is checked again
+A soft constraint has a slack, as the separation rows have. A hard constraint has no slack, and is checked again
 before a step is taken: if the velocities break it, the certified stop is executed instead. The certificate does not
-read these rows. For that reason, no constraint can make the arms break a limit or a distance. For the same reason, it
-is not proven that the stop keeps a constraint.
+read the users' rows. For that reason, no constraint can make the arms break a limit or a distance. For the same reason,
+it is not proven that the certified stop satisfies a constraint.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from q2r2_control.errors import ConfigError, shown
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import ActiveLimit, Array, LimitKind
 
-HARD_TOLERANCE = 1e-4  # Permitted violation of a hard row of unit norm, for the tolerance of the solver [rad/s].
+HARD_TOLERANCE = 1e-4  # Permitted violation of a hard row of unit norm, because solvers have a tolerance [rad/s].
 _ACTIVE = 1e-7  # A row of unit norm that is this near to its bound is active [rad/s].
-_TINY = 1e-9  # A row with a smaller norm depends on no joint.
+_TINY = 1e-9  # If the norm of a row is smaller than this, the row counts as depending on no joint.
 
 
 class Constraint(Protocol):
@@ -29,11 +29,12 @@ class Constraint(Protocol):
     ``CartesianController(robot, settings, constraints=[MyConstraint()])`` adds it. It is soft, unless the object has an
     attribute ``hard`` that is True.
 
-    **A hard constraint** is satisfied by every step but the certified stop: A v+ >= lower to 1e-4 rad/s for rows of
-    unit norm, with A and lower at the start of the step. If the solver finds no such velocities, or if they cannot be
-    certified, or if ``rows`` has no usable answer, the certified stop is executed instead. The stop was chosen earlier
-    and does not know the constraint, so that the arms may break it until they rest. This takes 0.3 s from full speed in
-    the shipped cells. At rest the constraint holds if no ``lower`` is above 0.
+    **A hard constraint** is satisfied by every step except the certified stop. For rows of unit norm, A v+ is at least
+    lower - 1e-4 rad/s, with the A and lower that ``rows`` returns at the start of the step. If the solver finds no such
+    velocities, or if they cannot be certified, or if ``rows`` has no usable answer, the certified stop is executed
+    instead. The stop was chosen earlier, without regard to the constraint, so the arms may break the constraint until
+    they rest. A stop from full speed takes 0.3 s in the shipped cells. At rest the constraint holds if no ``lower`` is
+    above 0.
 
     The constraint is about velocities and not about positions. How well the arms stay on one side of a plane depends on
     how well ``rows`` turns distances into velocities, and the stop may lead beyond the plane. Arms that can never
@@ -59,7 +60,7 @@ class Constraint(Protocol):
 
 
 class OwnConstraints:
-    """The constraints of one controller, and their rows at the present step."""
+    """The user's own constraints in one controller, and their rows at the present step."""
 
     def __init__(self, robot: Robot, own: Sequence[Constraint]) -> None:
         """Raise :class:`ConfigError` if an object is not a constraint, or has no usable rows at home."""
@@ -77,16 +78,17 @@ class OwnConstraints:
                 raise ConfigError(f"{key}: {name}.rows {rows}")
             (self._hard if hard else self._soft).append((f"{key} {name}", one))
         nv = robot.model.nv
-        self.matrix, self.lower = np.zeros((0, nv)), np.zeros(0)  # Rows of unit norm (k, nv), and (k,) [rad/s].
+        # Left-hand sides of the rows (k, nv), of unit norm, and their lower bounds (k,) [rad/s].
+        self.matrix, self.lower = np.zeros((0, nv)), np.zeros(0)
         self.hard = 0  # Number of hard rows, which are the last ones.
-        self._names: list[str] = []  # The name of each row's constraint.
+        self._names: list[str] = []  # For each row, the key and the class name of its constraint.
         self._unknown = False  # Whether a hard constraint has no usable answer.
 
     def __bool__(self) -> bool:
         return bool(self._soft or self._hard)
 
     def write(self, q: Array, v: Array) -> tuple[str, ...]:
-        """Ask every constraint for its rows at ``q`` and ``v``; return a reason for each answer that is not used."""
+        """Compute the rows of every constraint at ``q`` and ``v``; return a line for each answer that is not used."""
         faults: list[str] = []
         found = [self._rows_of(kind, q, v, faults) for kind in (self._soft, self._hard)]
         rows = [answer for kind in found for _, answer in kind]
@@ -118,7 +120,7 @@ class OwnConstraints:
         return not self._unknown and bool((self.matrix[first:] @ v >= self.lower[first:] - HARD_TOLERANCE).all())
 
     def active(self, v: Array) -> tuple[tuple[ActiveLimit, ...], float]:
-        """Return the constraints that are active at ``v`` (nv,) or broken by it, and the largest violation [rad/s]."""
+        """Return the constraints that are active at ``v`` (nv,) or broken there, and the largest violation [rad/s]."""
         slack = self.lower - self.matrix @ v
         names = dict.fromkeys(name for name, lacks in zip(self._names, slack, strict=True) if lacks >= -_ACTIVE)
         limits = tuple(ActiveLimit(LimitKind.CONSTRAINT, (name.partition(" ")[2],)) for name in names)
@@ -126,7 +128,10 @@ class OwnConstraints:
 
 
 def _unit_rows(constraint: Constraint, q: Array, v: Array) -> Answer | str:
-    """Return rows of unit norm, or the reason why there are none. Rows that hold for every velocity are left out."""
+    """Return a constraint's rows, scaled to unit norm, or a line that says why its answer cannot be used.
+
+    Rows that every velocity satisfies are left out.
+    """
     answer = answer_of(constraint.rows, q, v)
     if isinstance(answer, str):
         return answer

@@ -44,26 +44,27 @@ class CartesianController(WatchedPairs):
     The contract holds for every sequence of targets and every dt in (0, 0.1] s. All numbers are finite, and no
     exception is raised. Joints keep their limits of position, velocity and acceleration. Every monitored pair keeps its
     distance, also between ticks and during a stop. Its distance is ``min_distance``, or the one in ``distances`` or
-    ``pairs``. A constant target ends in rest. The reference is the controller's own state. It follows the targets and
-    not the measured joints, so that noise never enters it.
+    ``pairs``. If the targets stay constant, the arms come to rest. The reference is the controller's own state. It
+    follows the targets and not the measured joints, so that noise never enters it.
 
     One tick is three calls. :func:`assemble` takes the targets, writes the QP and finds the minimum of its cost. If
     this minimum breaks a constraint, a solver solves the QP. :func:`move_reference` moves the reference by the part of
-    the solution that can be certified. With :meth:`problem` and :meth:`advance` a program of yours solves the QP.
+    the solution that can be certified. With :meth:`problem` and :meth:`advance`, your own program can solve the QP.
 
     Args:
         robot: The robot.
         settings: The settings; None for the defaults.
-        solver: A name that replaces ``control.solver``, or an object that is asked at every tick. It gets copies
-            (guard.py), so that nothing that it answers, raises or writes can break the contract.
+        solver: A solver's name, which replaces ``control.solver``, or an object that solves the QP of each step. This
+            object gets copies of the QP's arrays (guard.py). Nothing that it returns, raises or writes can therefore
+            break the contract.
         tasks: Your own costs, in addition to those of ``settings.tasks``.
-        constraints: Your own rows, soft or hard.
+        constraints: Your own constraints of the QP, soft or hard.
         bridge_held: Whether targets that come less often than steps are interpolated, see
-            :mod:`q2r2_control.control.held_targets`. False for a loop whose targets are new at every step anyway.
+            :mod:`q2r2_control.control.held_targets`. False is for a loop that has new targets at every step.
 
     Raises:
-        ConfigError: If an argument is of another kind, if a task or a constraint has no usable answer at home, or if
-            the settings do not fit the robot.
+        ConfigError: If an argument has another type, if a task or a constraint has no usable answer at home, or if the
+            settings do not fit the robot.
     """
 
     def __init__(
@@ -92,7 +93,8 @@ class CartesianController(WatchedPairs):
         self._qp = StepProblem(robot, settings, tasks, constraints)
         self._tools: TaskData = self._data_pointer.value.tasks
         history = self._data_pointer.value.safety.history
-        self._restored = self._state.q, self._state.v, self._stop, *history.kept  # :meth:`withdraw` restores these.
+        # The arrays that :meth:`withdraw` restores.
+        self._restored = self._state.q, self._state.v, self._stop, *history.kept
         self._before = tuple(array.copy() for array in self._restored)  # Their values before the last step.
         self._kept_before = self._live.kept, self._objects.kept
         self._solution = np.zeros(self._nv)  # The solution of the QP, copied from the solver's array.
@@ -111,7 +113,7 @@ class CartesianController(WatchedPairs):
 
         Returns None, or the reason why the change is not possible. Gains change within half a second. A smaller
         ``min_distance`` counts at once. A greater ``min_distance`` counts for each pair as soon as it is certified
-        (:attr:`kept_distances`). It is refused if the home posture does not keep it.
+        (:attr:`kept_distances`). It is refused if some pair is too close for it in the home posture.
         """
         try:
             refused = self._live.change(self.settings.changed(values))
@@ -129,14 +131,14 @@ class CartesianController(WatchedPairs):
         self._move = bound(move_reference, model, data, self._solution, False, self.settings.max_substep, 1.0)
         self.step({arm: self.tool_pose(arm) for arm in self._arms}, self.settings.max_substep)
         problem = self._qp.problem
-        problem.minimum = None  # At home the minimum may be the solution, and the solver would not be set up.
+        problem.minimum = None  # At home the minimum may be the solution. The solver would then not be set up.
         self._solver.solve(problem)
 
     def reset(self, q: Array, v: Array | None = None) -> None:
         """Start again at joint positions ``q`` (nv,) [rad] and velocities ``v`` (nv,) [rad/s].
 
-        Targets, openings and held objects are forgotten. Moving obstacles stay where they are. A start outside the
-        limits or in penetration is allowed: the controller recovers from it.
+        Targets, openings and held objects are forgotten. Moving obstacles stay where they are. Joints may start outside
+        their limits, and bodies may penetrate each other at the start: the controller recovers from both.
 
         Raises:
             RobotError: If an array has another shape, or a number that is not finite.
@@ -164,10 +166,10 @@ class CartesianController(WatchedPairs):
         Args:
             targets: Poses of the tools by arm, in the world frame. An arm without a target, or with None, holds. If a
                 target is not a finite pose, the arm keeps its last target, and the report names the arm. If the last
-                target was held for several steps, up to 110 ms, the next target is interpolated over 1.25 times that
-                time.
-            dt: Duration of the step [s]. Above 0.1 s the reference moves by 0.1 s. If it is not above 0, the reference
-                does not move.
+                target was held for several steps, up to 110 ms, the motion to the next target is interpolated. It takes
+                1.25 times as long as the last target was held.
+            dt: Duration of the step [s]. If it is above 0.1 s, the reference moves as in a step of 0.1 s. If it is not
+                above 0, the reference does not move.
             posture: The posture to which the joints move as far as the tools leave them free (nv,) [rad]; None for
                 home. A posture that is not finite is not used.
 
@@ -364,7 +366,10 @@ class CartesianController(WatchedPairs):
 
     @property
     def solver_failure(self) -> str | None:
-        """The reason why the solver's last answer was no solution; None if it was a solution. DAQP gives no reasons."""
+        """The reason why the solver's last answer was no solution; None if it was a solution.
+
+        With our own DAQP it is always None.
+        """
         return getattr(self._solver, "failure", None)
 
     @property
@@ -383,7 +388,7 @@ class CartesianController(WatchedPairs):
     ) -> bool:
         """Build and solve the QP of one substep, certify the solution and move; return whether the QP was solved.
 
-        ``h`` is the duration of the substep [s], and ``share`` is this duration divided by that of the tick.
+        ``h`` is the duration of the substep [s], and ``share`` is ``h`` divided by the duration of the tick.
         """
         self._write_problem(h, tick, summary)
         solution = solve(self._qp.problem)
@@ -401,17 +406,17 @@ class CartesianController(WatchedPairs):
         summary.slack = max(summary.slack, slack)
         summary.solve_time += solution.solve_time
         was_apart, self._apart = self._apart, self._observed[-1] >= -ROUNDING
-        # What remains of a certified stop is certified. Any other step was certified just now. This proof is complete
-        # if all pairs kept their distance before the step.
+        # The remaining part of a certified stop stays certified. Any other step was certified in this call. Its proof
+        # is complete only if all pairs kept their distance before the step.
         self._certified = self._apart and (self._certified if outcome == STOPPED else was_apart)
         return solved
 
     def _move_as_permitted(self, solved: bool, h: float, share: float, summary: StepSummary) -> tuple[int, float]:
         """Move by the solution if the hard constraints permit it, or otherwise along the certified stop.
 
-        The safety filter may mix the solution with the stop. The mixture is checked against the constraints again. If
-        it breaks a constraint, the move is undone: posture, velocity and the known stop get their values from before
-        the step. The stop depends on nothing else, so it is the same stop that was certified before.
+        The safety filter may mix the solution with the stop. The mixture is then checked against the constraints. If it
+        breaks a constraint, the move is undone: posture, velocity and the known stop (safety_filter.py) get their
+        values from before the step. A stop depends on nothing else, so the stop that was certified before is executed.
         """
         own, problem, state = self._qp.constraints, self._qp.problem, self._state
         usable = solved and own.permit(np.clip(self._solution, problem.lower, problem.upper))
@@ -432,8 +437,8 @@ def check_settings(robot: Robot, settings: ControllerSettings) -> None:
     """Check ``settings`` for ``robot`` without compiling a kernel.
 
     Raises:
-        ConfigError: If the robot lacks a name, or a task cannot be made.
-        RobotError: If no kernel handles a joint or a shape.
+        ConfigError: If the settings name something that the robot does not have, or a task cannot be made.
+        RobotError: If the kernels cannot handle a joint or the shape of a body.
     """
     kernel_model_of(robot, settings)
     load_tasks(robot, settings.tasks)

@@ -1,4 +1,4 @@
-"""The cubic polynomial through two references, which gives positions and velocities between ticks."""
+"""Interpolate positions and velocities between two ticks with the cubic polynomial through both references."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from q2r2_control.types import Array
 def cubic(x: float, h: float, q: tuple[Array, Array], v: tuple[Array, Array]) -> tuple[Array, Array]:
     """Return position [rad] and velocity [rad/s] on the cubic when the share ``x`` of a time ``h`` [s] has passed.
 
-    If the acceleration between both ends is constant, the cubic is the parabola on which the reference moves.
+    The cubic has the given positions and velocities at both ends. If the reference had a constant acceleration between
+    both ends, the cubic is the parabola on which it moved.
 
     Args:
         x: Share of the time that has passed, from 0 to 1.

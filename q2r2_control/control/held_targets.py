@@ -1,10 +1,10 @@
 """Interpolate targets that come less often than the controller's steps, such as the targets of a tracker.
 
 If a target is held until the next target comes, it stands still in most steps, and jumps in one of them. At each jump,
-the controller would move some joint at its acceleration limit. Here, the poses between both targets are interpolated:
-on a straight line, with a constant angular velocity. This takes 1.25 times as long as the earlier target was held. The
-newest target is reached later by this time. A target that changes at every step, or after more than
-:data:`LONGEST_HOLD`, is passed on at once.
+the controller would move some joint at its acceleration limit. Here, poses between the earlier and the newest target
+are interpolated: on a straight line, with a constant angular velocity. The interpolation takes 1.25 times as long as
+the earlier target was held, so the newest target is reached later by that time. A target that changes at every step, or
+after more than :data:`LONGEST_HOLD`, is passed on at once.
 """
 
 from __future__ import annotations
@@ -16,23 +16,25 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-LONGEST_HOLD = 0.11  # A target that was held for longer did not belong to a stream [s].
+LONGEST_HOLD = 0.11  # If a target was held for longer than this, it belonged to no stream of targets [s].
 # Duration of an interpolation, divided by the time for which the earlier target was held. With 1.25, the next target
 # may be late by a quarter of this time.
 _SPARE = 1.25
 _FARTHEST = 1e3  # Largest coordinate of a target that is interpolated. No arm could reach farther [m].
-_ORTHONORMAL = 5e-4  # Largest error of R R' of a target's rotation R. The controller refuses a target at twice this.
-_STEPS = 1.5  # A target that changes after fewer steps than this is new at every step, or nearly so.
+# Largest difference of R R' from the identity, for the rotation R of a target that is interpolated. The controller
+# itself refuses targets for which it is more than twice as large.
+_ORTHONORMAL = 5e-4
+_STEPS = 1.5  # If a target changes after fewer steps than this, targets are new at (nearly) every step.
 
 
 @dataclass(slots=True)
-class _Way:
+class _TargetPath:
     """The path of one arm's target from an earlier pose to the newest target."""
 
     start: pin.SE3
     goal: pin.SE3
     duration: float = 0.0  # [s]
-    held: float = 0.0  # Time for which the goal has been given [s].
+    held: float = 0.0  # Time for which the caller has given the same goal [s].
 
     def begin(self, goal: pin.SE3, dt: float) -> None:
         """Begin a path to a new ``goal``, with steps of ``dt`` [s].
@@ -54,45 +56,46 @@ class _Way:
 
 
 class HeldTargets:
-    """The targets of all arms. While the newest target is held, poses between it and an earlier pose are returned."""
+    """The targets of all arms. While a caller holds an arm's target, poses from the earlier one to it are returned."""
 
     def __init__(self) -> None:
-        self._ways: dict[str, _Way] = {}
+        self._paths: dict[str, _TargetPath] = {}
 
     def clear(self) -> None:
         """Forget all targets."""
-        self._ways.clear()
+        self._paths.clear()
 
     def between(self, targets: Mapping[str, pin.SE3 | None], dt: float) -> dict[str, pin.SE3 | None]:
         """Return the targets to follow in a step of ``dt`` [s].
 
-        While the caller holds a pose of ``targets``, they are interpolated from the pose before to this pose.
+        While the caller gives the same pose for an arm, the arm's targets are interpolated from the pose before to this
+        pose.
         """
         found: dict[str, pin.SE3 | None] = {}
         for arm, pose in targets.items():
-            way = self._ways.get(arm)
+            path = self._paths.get(arm)
             if not isinstance(pose, pin.SE3):
-                self._ways.pop(arm, None)
+                self._paths.pop(arm, None)
                 found[arm] = pose
                 continue
-            if way is None:
-                way = self._ways[arm] = _Way(pose, pose.copy())
-            elif pose != way.goal:
-                way.begin(pose.copy(), dt)
-            way.held += dt
-            found[arm] = pose if way.held >= way.duration else way.now()
-        if len(found) < len(self._ways):
-            self._ways = {arm: way for arm, way in self._ways.items() if arm in found}
+            if path is None:
+                path = self._paths[arm] = _TargetPath(pose, pose.copy())
+            elif pose != path.goal:
+                path.begin(pose.copy(), dt)
+            path.held += dt
+            found[arm] = pose if path.held >= path.duration else path.now()
+        if len(found) < len(self._paths):
+            self._paths = {arm: path for arm, path in self._paths.items() if arm in found}
         return found
 
     def peek(self, targets: Mapping[str, pin.SE3 | None], dt: float) -> dict[str, pin.SE3 | None]:
         """Return what :meth:`between` would return, and leave this instance as it is."""
-        kept = self._ways
+        kept = self._paths
         try:
-            self._ways = {arm: copy.copy(way) for arm, way in kept.items()}
+            self._paths = {arm: copy.copy(path) for arm, path in kept.items()}
             return self.between(targets, dt)
         finally:
-            self._ways = kept
+            self._paths = kept
 
 
 def _is_ordinary(pose: pin.SE3) -> bool:

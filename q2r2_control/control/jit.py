@@ -16,7 +16,7 @@ from q2r2_control.control.kernel_compiler import Kernel
 def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile ``function`` at its first call: strict IEEE arithmetic, no Python objects, a division by 0 gives inf.
 
-    The function must not allocate memory. It therefore need not count references to the arrays of its arguments.
+    The function must not allocate memory. The compiled code therefore does not count references to arrays.
     """
     return _compiled(function, _nrt=False)
 
@@ -89,6 +89,6 @@ def bound(function: Callable[..., Any], *arguments: Any) -> Callable[..., Any]:
     and layouts.
     """
     function(*arguments)
-    dispatcher: Any = function  # At run time, Numba sets get_overload too.
+    dispatcher: Any = function  # Type checkers do not see that a kernel has the method get_overload.
     code: Callable[..., Any] = dispatcher.get_overload(tuple(numba.typeof(argument) for argument in arguments))
     return code

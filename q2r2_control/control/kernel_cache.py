@@ -37,7 +37,9 @@ def compiled_sources() -> list[Path]:
 
 
 def _cache_folder() -> Path:
-    """Return the folder of this version's machine code. It becomes the newest, and all but the two newest are deleted.
+    """Return the folder for the machine code of this version.
+
+    Its time of modification becomes the newest, and all folders except the two newest are deleted.
 
     The folder of another running process may be deleted too. That process has its machine code in memory, and the code
     that it still compiles is written to a new folder. If the cache cannot be written, its content is still used.
@@ -112,10 +114,13 @@ class _KernelCacheImpl(CompileResultCacheImpl):
 
 
 class KernelCache(FunctionCache):
-    """Numba's cache with our rule for finding a file. If the folder cannot be written, the cache is only read."""
+    """Numba's cache, in which :class:`_ContentLocator` finds the files.
+
+    If the cache folder cannot be written, the cache is only read.
+    """
 
     _impl_class = _KernelCacheImpl
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        with suppress(OSError):  # Without this, the kernel still works, and the next start compiles it again.
+        with suppress(OSError):  # If the code cannot be saved, the kernel still works, and the next start compiles it.
             super().save_overload(sig, data)

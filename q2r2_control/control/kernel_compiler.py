@@ -42,11 +42,11 @@ class _PartLibrary(JITCodeLibrary):
 
     @property
     def codegen(self) -> Any:
-        """This library itself, so that Numba passes the kernel's Python objects to :meth:`set_env`. It has none."""
+        """This library itself. Numba passes a kernel's Python objects to the ``set_env`` of ``codegen``."""
         return self
 
     def set_env(self, name: str, environment: Any) -> None:
-        """Keep no Python objects, which no kernel reads."""
+        """Do not store the Python objects, because no kernel reads them."""
 
 
 class _WholeLibrary(JITCodeLibrary):
@@ -92,7 +92,7 @@ class _PartCompiler(_WholeCompiler):
 class Kernel(CPUDispatcher):
     """A function that is compiled for each combination of argument types with which it is called."""
 
-    _being_compiled = 0  # Number of kernels in compilation. Each of them is a part of the kernel before it.
+    _being_compiled = 0  # Number of whole kernels that are being compiled. Meanwhile, other kernels become parts.
 
     def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
         super().__init__(function, targetoptions=options, pipeline_class=_WholeCompiler)
@@ -103,7 +103,7 @@ class Kernel(CPUDispatcher):
         self._part_compiler = numba_compiler(function, self.targetdescr, part_options, {}, _PartCompiler)
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
-        """Return the template with which Numba types a call of this kernel. A calling kernel needs only the part."""
+        """Return the template with which Numba types a call of this kernel. If a kernel calls it, a part suffices."""
         with global_compiler_lock:
             self._wanted_as_part = Kernel._being_compiled > 0
             return super().get_call_template(args, kws)
@@ -120,7 +120,10 @@ class Kernel(CPUDispatcher):
             return super().get_overload(sig) if part is None else part.entry_point
 
     def compile(self, sig: Any) -> Any:
-        """Compile for one signature, as a whole unless the compilation of another kernel needs a part."""
+        """Compile the kernel for one signature.
+
+        It is compiled as a part if the compilation of another kernel needs this kernel, and otherwise as a whole.
+        """
         with global_compiler_lock:
             as_part, self._wanted_as_part = self._wanted_as_part, False
             arguments, result = normalize_signature(sig)
@@ -135,7 +138,7 @@ class Kernel(CPUDispatcher):
     def _part(self, arguments: Any, result: Any) -> Any:
         """Return the kernel's code as a part. It is compiled separately even if Python calls the kernel too.
 
-        The optimised code of a whole kernel cannot serve as a part, because some of its functions may be gone.
+        The optimised code of a whole kernel cannot serve as a part, because optimisation may have removed functions.
         """
         known = self.parts.get(tuple(arguments))
         if known is None:

@@ -21,12 +21,12 @@ from q2r2_control.robot.pairs import pair_names
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
-# Least buffer of a pair [m]. Without a buffer, rows would lead a pair exactly to its distance, which the certificate
-# could then not prove.
+# Least buffer of a pair [m]. Without a buffer, the separation rows would let a pair come exactly to its kept distance.
+# The certificate could then not prove that the pair keeps this distance.
 LEAST_BUFFER = 0.00025
-# Pairs that may touch are slowed down below this distance [m], because bodies are larger than the parts in them.
+# Pairs that may touch are slowed down below this distance [m], because bodies are larger than the real parts in them.
 _CONTACT_ZONE = 0.002
-# Largest permitted depth, as a share of the depth at which the cores of two bodies meet.
+# Largest depth by which two bodies may penetrate, as a share of the depth at which their cores meet.
 _DEEPEST = 0.8
 
 
@@ -41,8 +41,8 @@ def kernel_model_of(robot: Robot, settings: ControllerSettings) -> KernelModel:
     """Return the arrays of a robot's joints, tools, pairs and limits.
 
     Raises:
-        RobotError: If no kernel handles a joint or a shape.
-        ConfigError: If the priority is not the name of an arm, or if no pair has a name in ``settings.pairs``.
+        RobotError: If the kernels cannot handle a joint or the shape of a body.
+        ConfigError: If the priority is not the name of an arm, or if a name in ``settings.pairs`` belongs to no pair.
     """
     check_priority(settings.priority, tuple(robot.arms))
     kept, geometry = kept_distances(robot, settings), with_obstacle_bodies(robot, settings.moving_obstacles)
@@ -81,7 +81,7 @@ def kernel_model_of(robot: Robot, settings: ControllerSettings) -> KernelModel:
 
 
 def _of_two_arms(pairs: Pairs) -> IntArray:
-    """Return 1 for each pair whose two bodies both move, and are moved by different joints, else 0 (p,)."""
+    """Return an array (p,): 1 if both bodies of a pair move and no joint moves both, otherwise 0."""
     own = (pairs.carried == 0) & (pairs.sign > 0).any(axis=1) & (pairs.sign < 0).any(axis=1)
     return own.astype(np.int64)
 

@@ -32,7 +32,7 @@ class _Address(types.Type):
 
     @property
     def key(self) -> Any:
-        """The type of the value, because two named tuples with different fields may have the same name."""
+        """The type of the value. A name is no key, because two named tuples with different fields may have the same."""
         return self.pointee
 
 
@@ -54,7 +54,7 @@ class KernelPointer:
     __slots__ = ("address", "memory", "numba_type", "value")
 
     def __init__(self, value: Any, memory: npt.NDArray[np.int64], numba_type: _Pointer) -> None:
-        self.value = value  # The arrays of the value have to stay in memory.
+        self.value = value  # This reference keeps the arrays of the value in memory.
         self.memory = memory
         self.address = memory.ctypes.data
         self.numba_type = numba_type
@@ -115,7 +115,7 @@ def pointee(typing_context: Any, pointer: Any) -> Any:
 
 @extending.intrinsic
 def pointee_at(typing_context: Any, pointers: Any, index: Any) -> Any:
-    """Return, in a kernel, the named tuple of number ``index`` in :class:`KernelPointers`, as :func:`pointee` does."""
+    """Return, in a kernel, the named tuple with the ``index`` in :class:`KernelPointers`, as :func:`pointee` does."""
 
     def read(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         addresses = builder.bitcast(arguments[0], cgutils.voidptr_t.as_pointer())
@@ -177,7 +177,7 @@ def _words(value: Any) -> list[int]:
 
 
 def _form(value: Any) -> Any:
-    """Return a key with everything on which Numba's type of ``value`` depends. It takes less time than the type."""
+    """Return a key with everything on which Numba's type of ``value`` depends. It is computed faster than the type."""
     if isinstance(value, tuple):
         return type(value), *[_form(part) for part in value]
     if isinstance(value, np.ndarray):
@@ -185,12 +185,13 @@ def _form(value: Any) -> Any:
     return value.numba_type if isinstance(value, KernelPointer | KernelPointers) else type(value)
 
 
-# Pointer types by the form of the value, because a controller has hundreds of pointers.
+# The pointer types, by the result of :func:`_form` for the value. Each type is computed once, because a controller has
+# hundreds of pointers.
 _kinds: dict[Any, _Pointer] = {}
 
 
 def _kind_of_pointer_to(value: Any, size: int) -> _Pointer:
-    """Return the type in kernels of a pointer to ``value``, which has ``size`` bytes."""
+    """Return the type that a pointer to ``value`` has in kernels. ``size`` is the size of the value [bytes]."""
     form = _form(value)
     if form not in _kinds:
         kind, context = _Pointer(numba.typeof(value)), cpu_target.target_context

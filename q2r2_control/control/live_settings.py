@@ -1,28 +1,29 @@
 """Change distances, held objects and gains while a controller runs.
 
-**Distances.** If the required distance of a pair became greater at once, the known stop could lose its certificate. The
-distance that a pair keeps therefore grows only as far as the known stop is certified with it. This bound is
-d - S - buffer,  where d is the distance of the pair at the reference, and S bounds by how much the stop brings the pair
-closer (stop_certificate.py). The kept distance of a pair
+**Distances.** The known stop is the stop that was certified last (safety_filter.py). If the required distance of a pair
+became greater at once, the known stop could lose its certificate. The distance that a pair keeps therefore grows only
+as far as the known stop is certified with it. This bound is d - S - buffer,  where d is the distance of the pair at the
+reference, and S bounds by how much the stop brings the pair closer (stop_certificate.py). The kept distance of a pair
 
 - falls at once if the requested distance is smaller, since the known stop stays certified;
 - grows at ``GROWTH`` towards the requested distance, up to the bound, before a step is decided on. The step is then
   certified with the greater distance, and the invariant of safety/README.md holds at every tick;
-- never falls while it grows. A pair that is nearer than the requested distance is not pushed apart.
+- does not fall if the bound falls below it. A pair that is nearer than the requested distance is not pushed apart.
 
-After a reset every pair keeps the distances of the controller's first settings, and at once as much of the present
-settings as the posture allows. If a pair starts closer than its kept distance, the controller recovers until the pair
-has its whole buffer. If a pair starts within the buffer, the QP stops it where it is, with ``LEAST_BUFFER`` at least.
-The buffer of this pair then grows with d - S as above. Arms that rest within the buffer are not pushed apart.
+After a reset, each pair keeps the distance of the controller's first settings, or the requested distance if that is
+smaller. If the requested distance is greater, the pair keeps at once as much of it as the posture allows. If a pair
+starts closer than its kept distance, the controller recovers until the pair has its whole buffer. If a pair starts
+within the buffer, the QP stops it where it is, with ``LEAST_BUFFER`` at least. The buffer of this pair then grows with
+d - S as above. Arms that rest within the buffer are not pushed apart.
 
-**Held objects.** The kept distance is minus infinity for pairs that do not count. When an object is gripped, each of
-its pairs keeps d - S - buffer, or the distance of its class if that is less. The known stop is then certified with the
-object too, so that the object never has to be refused. The kept distance grows with later values of d and S, and never
-falls. If two objects overlap when the second object is gripped, it is assumed that both hands hold one and the same
-object. Its two bodies are not kept apart until one hand lets go.
+**Held objects.** A pair of an object counts only while the object is held; otherwise its kept distance is minus
+infinity. When an object is gripped, each of its pairs keeps d - S - buffer, or the distance of its class if that is
+less. The known stop is then certified with the object too, so that the object never has to be refused. The kept
+distance grows with later values of d and S, and never falls. If two objects overlap when the second object is gripped,
+it is assumed that both hands hold one and the same object. Its two bodies are not kept apart until one hand lets go.
 
-**Gains** and weights change linearly to their new values. They are all arrays of the tasks that differ between the two
-settings. The certificate reads none of them.
+**Gains** and weights change linearly to their new values: all arrays of the tasks that differ between the old and the
+new settings, and the gain of the separation rows. The certificate reads none of them.
 """
 
 from __future__ import annotations
@@ -66,7 +67,7 @@ class ObjectPairs:
         self._buffer = stop_buffer(self._goal, settings)
 
     def clear(self) -> None:
-        """Let no object be held."""
+        """Forget all held objects."""
         self.holding: frozenset[str] = frozenset()
         self._due = 0.0
         self._new: npt.NDArray[np.bool_] = np.zeros(len(self._holders), dtype=np.bool_)
@@ -75,8 +76,8 @@ class ObjectPairs:
     def set_holding(self, arm: str, holds: bool) -> bool:
         """Note whether an arm's gripper holds its object; return whether this is a change.
 
-        Pairs that begin to count keep the distance of their class until they are measured. The caller then calls
-        :meth:`begin`.
+        Pairs that begin to count keep the distance of their class at first. The caller then measures these pairs and
+        calls :meth:`begin`.
 
         Raises:
             RobotError: If the arm has no object.
@@ -95,7 +96,7 @@ class ObjectPairs:
         return True
 
     def begin(self) -> None:
-        """Let the pairs that have begun to count keep as much as is certified. They have to be measured before."""
+        """Let the pairs that have begun to count keep as much distance as is certified. Measure these pairs before."""
         kept = np.where(self._new, np.minimum(self._goal, self._within_reach()), self.kept)
         overlap = self._data.distance[self._range] < np.minimum(self._goal, 0.0)
         if (overlap & self._shared & self._new).any():  # Both hands hold one object.
@@ -117,11 +118,11 @@ class ObjectPairs:
         self._write(np.minimum(self.kept, self._goal))
 
     def keep_no_more_than(self, kept: Array) -> None:
-        """Let pairs keep no more than the earlier distances ``kept`` [m], because the step since was undone."""
+        """Let pairs keep no more than the earlier distances ``kept`` [m], because a later step was undone."""
         self._write(np.where(np.isfinite(kept), np.minimum(self.kept, kept), self.kept))
 
     def _within_reach(self) -> Array:
-        """Return d - S - buffer of the objects' pairs [m]."""
+        """Return d - S - buffer of the objects' pairs [m]; see the module's docstring."""
         return np.asarray(provable_distances(self._safety, self._data)[self._range] - self._buffer)
 
     def _write(self, kept: Array) -> None:
@@ -140,12 +141,14 @@ class LiveSettings:
     ) -> None:
         self._robot, self._objects = robot, objects
         self._model, self._safety, self._data = model, model.safety, data.safety
-        self._gains, self._ramp = self._gains_of(settings), 0.0  # The gains to reach, and the time until then [s].
+        # The final values of the gains, and the time until the gains have these values [s].
+        self._gains, self._ramp = self._gains_of(settings), 0.0
         self._changing: list[tuple[Array, Array]] = []  # Arrays that kernels read, and their new values.
-        # Distances that pairs have to keep by the requested settings, and by the first settings (p,) [m].
+        # Distances that pairs have to keep according to the requested settings and to the first settings (p,) [m].
         self._goal = self._least = kept_distances(robot, settings).values
         self._stops = model.safety.approach.stop_distance[: len(self._goal)]  # Distances at which the QP stops pairs.
-        # Crowded means that some pair is within its buffer. The last number is the time until distances grow again [s].
+        # Growing: some kept distance is below the requested one. Crowded: some pair is within its buffer. Due: the time
+        # until distances and buffers grow again [s].
         self._growing, self._crowded, self._due = False, False, 0.0
         self.settings = settings
         self.kept = self._goal  # Distance that every monitored pair keeps (p,) [m]. Each change makes a new array.
@@ -156,7 +159,7 @@ class LiveSettings:
         return int(np.argmax(self._goal - self.kept)) if self._growing else -1
 
     def change(self, settings: ControllerSettings) -> str | None:
-        """Change to ``settings``, which may differ in ``LIVE`` only; return None, or why nothing was changed."""
+        """Change to ``settings``, which may differ only in what ``LIVE`` names; return None, or why it was refused."""
         before, goal = self.settings.min_distance, kept_distances(self._robot, settings)
         if settings.min_distance > before:
             if settings.min_distance > CLEARANCE:
@@ -164,7 +167,7 @@ class LiveSettings:
                     f"min_distance = {settings.min_distance:g} m: allowed while a controller runs: up to "
                     f"{CLEARANCE:g}, since pairs that always stay farther apart are not watched"
                 )
-            # If home has this much distance, arms that rest there keep the whole distance with its buffer.
+            # If the pairs have this much distance at home, arms that rest at home keep the new distance and its buffer.
             room = replace(goal, values=goal.values + stop_buffer(goal.values, settings))
             if faults := too_close_at_home(self._robot, room):
                 return f"min_distance = {settings.min_distance:g} m: {faults[0]} with distance_buffer"
@@ -180,21 +183,27 @@ class LiveSettings:
         return None
 
     def restart(self) -> None:
-        """Before a reset, return to the distances that do not depend on the posture, and finish the change of gains."""
+        """Before a reset, set kept distances that do not depend on the posture, and finish the change of gains."""
         self._due = 0.0
         self._write(np.minimum(self._goal, self._least))
         self._stops[:] = self.kept + stop_buffer(self.kept, self.settings)
         self._approach_gains(self._ramp)
 
     def begin(self) -> None:
-        """After the reset, let pairs keep as much as the posture allows, and reduce the buffer of pairs within it."""
+        """After the reset, let pairs keep as much as the posture allows.
+
+        Pairs that are within their buffer get a smaller buffer.
+        """
         self._grow(np.inf)
         distance = self._data.distance[: len(self.kept)]
         is_within = (distance >= self.kept - ROUNDING) & (distance < self._stops)
         self._stop_from(np.where(is_within, self.kept, self._stops))
 
     def step(self, h: float) -> None:
-        """Change kept distances and gains before a step of ``h`` [s]. The reference has to be observed before."""
+        """Change kept distances and gains before a step of ``h`` [s].
+
+        The distances at the reference have to be computed before.
+        """
         if self._objects.growing:
             self._objects.step(h)
         if self._ramp:
@@ -207,7 +216,7 @@ class LiveSettings:
                 self._stop_from(self._stops)
 
     def keep_no_more_than(self, kept: Array) -> None:
-        """Let pairs keep no more than the earlier distances ``kept`` (p,) [m], because the step since was undone."""
+        """Let pairs keep no more than the earlier distances ``kept`` (p,) [m], because a later step was undone."""
         self._write(np.minimum(self.kept, kept))
 
     def _grow(self, most: float) -> None:
@@ -234,7 +243,7 @@ class LiveSettings:
         self._crowded = bool((self._stops < wanted).any())
 
     def _lasting(self) -> Array:
-        """Return d - S of every monitored pair (p,) [m]."""
+        """Return d - S of every monitored pair (p,) [m]; see the module's docstring."""
         return provable_distances(self._safety, self._data)[: len(self._goal)]
 
     def _gains_of(self, settings: ControllerSettings) -> tuple[Array, ...]:

@@ -22,7 +22,7 @@ from q2r2_control.types import Array
 
 
 class MovingObstacles:
-    """The obstacles that are present, by name. The kept distance is minus infinity for pairs with other obstacles."""
+    """The obstacles that are present, by name. For pairs with absent obstacles, the kept distance is minus infinity."""
 
     def __init__(
         self,
@@ -39,7 +39,7 @@ class MovingObstacles:
         count, goal = len(self._number), kept_by_obstacles(robot, settings).values
         hulls = {f"{held.link}{HULL}": arm for arm, held in robot.objects.by_arm.items()}
         pairs = list(geometry.collisionPairs)[last - len(goal) :]
-        # For each pair with a held object, the arm that has to hold it for the pair to count.
+        # For each pair, the arm that has to hold the pair's object so that the pair counts; None for other pairs.
         self._holders = [hulls.get(names[pair.first]) for pair in pairs]
         self._limits = limits
         self.data = ObstacleData(
@@ -69,7 +69,7 @@ class MovingObstacles:
         return {name: ObstacleReport(self.there[name], age) for name, age in ages if name in self.there}
 
     def put(self, name: str, obstacle: MovingObstacle | None) -> IntArray:
-        """Take a report of an obstacle; None if it has gone. Returns an array (g,) with a 1 for the body that changed.
+        """Take a report of an obstacle; None if it has gone. Returns an array (g,): 1 for the body that has changed.
 
         Until :meth:`keep_clear` is called, all pairs with obstacles keep the distances that they need while the arms
         stop. Raises the same exceptions as :func:`check_obstacle`.
@@ -120,7 +120,7 @@ class MovingObstacles:
         self.data.age[:] += time
 
     def _count(self) -> None:
-        """Let those pairs count whose obstacle is present and whose object, if any, is held."""
+        """Let a pair count if its obstacle is present, and if its object, should it have one, is held."""
         if not self._number:
             return
         there = np.repeat([name in self.there for name in self._number], len(self._goal) // len(self._number))

@@ -4,9 +4,10 @@
     subject to  lower <= v <= upper,    rows v + s >= rows_lower,    s >= 0
 
 The box is never empty (joint_limits.py) and the rows are soft. A solution therefore always exists. Rows have unit norm,
-so that a slack is a joint speed. a_i' H^-1 a_i is the compliance of the cost along row i. With this factor in rho_i, a
-row that is violated alone gives way by the share SOFTNESS of its correction, however large the weights of the cost are.
-If the minimum of the cost alone keeps the box and the rows, it is the solution, and no solver is called.
+so that a slack is a joint speed. If the minimum of the cost violates only row i, the share SOFTNESS of this violation
+remains in the solution as slack. The factor a_i' H^-1 a_i in rho_i, which is the compliance of the cost along row i,
+makes this true however large the weights of the cost are. If the minimum of the cost alone keeps the box and the rows,
+it is the solution, and no solver is called.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from q2r2_control.control.targets import update_targets
 from q2r2_control.control.tasks.built_in import write_task_cost
 from q2r2_control.types import Array
 
-SOFTNESS = 1e-5  # Share of its correction by which a row gives way.
+SOFTNESS = 1e-5  # If the minimum of the cost violates one row, this share of the violation remains in the solution.
 
 
 @dataclass(slots=True)  # A frozen class would cost a microsecond a tick.
@@ -43,7 +44,7 @@ class QpProblem:
     Attributes:
         H: Matrix of the cost (nv, nv), symmetric and positive definite.
         g: Vector of the cost (nv,).
-        lower: Least next velocities (nv,) [rad/s]. They keep position, velocity and acceleration limits.
+        lower: Least next velocities (nv,) [rad/s], from the limits of position, velocity and acceleration.
         upper: Greatest next velocities (nv,) [rad/s].
         rows: Left-hand sides (m, nv), of unit norm: separation first, then soft constraints, then hard ones.
         rows_lower: Right-hand sides (m,) [rad/s].
@@ -136,7 +137,7 @@ def _find_minimum(data: KernelData) -> bool:
 def assemble(
     model_pointer: KernelPointer, targets_pointer: KernelPointer, data_pointer: KernelPointer, h: float, tick: float
 ) -> tuple[bool, bool, bool]:
-    """Write cost, rows and box of a step of ``h`` [s]. The reference has to be observed before.
+    """Write cost, rows and box of a step of ``h`` [s]. The distances at the reference have to be computed before.
 
     In the first step of a tick, ``tick`` is the duration of the tick [s], and the offered poses become the targets. In
     later steps of the tick, ``tick`` is below 0. Returns whether all targets were usable, whether all joints are within

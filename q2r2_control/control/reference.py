@@ -1,4 +1,7 @@
-"""Compute poses and distances at the reference, and move it as far as the safety filter allows (compiled)."""
+"""Observe the reference, and move it as far as the safety filter allows (compiled).
+
+To observe the reference means to compute the tool poses, the bodies' poses and the pairs' distances there.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +26,7 @@ Observed = tuple[int, float, int, float]
 
 @kernel
 def start_reference(model_pointer: KernelPointer, data_pointer: KernelPointer) -> bool:
-    """Observe the reference after a reset. Return whether some stop is proven to keep all pairs apart."""
+    """Observe the reference after a reset. Return whether a stop from there is proven to keep all pairs apart."""
     model, data = pointee(model_pointer), pointee(data_pointer)
     rest_always(data.safety.history, data.safety.state.q)
     _observe(model, data)
@@ -34,7 +37,8 @@ def start_reference(model_pointer: KernelPointer, data_pointer: KernelPointer) -
 def observe_bodies(model_pointer: KernelPointer, data_pointer: KernelPointer, grown: IntArray) -> tuple[Observed, int]:
     """Observe the reference after bodies or kept distances have changed. ``grown`` (g,) marks bodies that have grown.
 
-    Also returns the first pair that does not allow the bodies (:func:`certify_bodies`); -1 if they are allowed.
+    Returns what was observed, and the first pair that does not allow the grown bodies (:func:`certify_bodies`); -1 if
+    all pairs allow them.
     """
     model, data = pointee(model_pointer), pointee(data_pointer)
     return _observe(model, data), certify_bodies(model.safety, data.safety, grown)
@@ -44,9 +48,9 @@ def observe_bodies(model_pointer: KernelPointer, data_pointer: KernelPointer, gr
 def move_reference(
     model_pointer: KernelPointer, data_pointer: KernelPointer, solution: Array, usable: bool, h: float, share: float
 ) -> tuple[Observed, int, float]:
-    """Do one step of ``h`` [s] with the solver's next velocities (nv,), observe the reference, and return the results.
+    """Do one step of ``h`` [s] with the solver's next velocities (nv,) [rad/s], and observe the reference.
 
-    The last two results are those of the safety filter.
+    Returns what was observed, and the two results of :func:`apply_safety_filter`, which has the same last arguments.
     """
     model, data = pointee(model_pointer), pointee(data_pointer)
     outcome, slack = apply_safety_filter(model.safety, data.safety, solution, usable, h, share)
@@ -55,7 +59,10 @@ def move_reference(
 
 @kernel
 def spare_distance(model_pointer: KernelPointer, data_pointer: KernelPointer, pairs: IntArray) -> float:
-    """Return the least margin of some ``pairs`` (p,) at the reference [m]: its distance minus its kept distance."""
+    """Return the least margin among the ``pairs`` with these indices [m]; infinite if there are none.
+
+    The margin of a pair is its distance at the reference minus its kept distance.
+    """
     model, data = pointee(model_pointer).safety, pointee(data_pointer).safety
     least = np.inf
     for p in pairs:
@@ -66,7 +73,7 @@ def spare_distance(model_pointer: KernelPointer, data_pointer: KernelPointer, pa
 
 @kernel
 def _observe(model: KernelModel, data: KernelData) -> Observed:
-    """Compute tool poses and distances at the reference."""
+    """Observe the reference, as the module's docstring says."""
     collision, safety = model.safety.collision, data.safety
     update_placements(collision, safety.collision, safety.state.q)
     update_body_velocities(collision, safety.collision, safety.state.v, safety.velocities)

@@ -11,7 +11,7 @@ from q2r2_control.control.live_settings import arrays_in
 
 @contextmanager
 def put_back(values: tuple[Any, ...], objects: Iterable[object]) -> Iterator[None]:
-    """Restore all arrays in ``values`` and the attributes of ``objects`` to the bit when the block ends.
+    """When the block ends, restore all arrays in ``values`` and the attributes of ``objects`` exactly.
 
     Args:
         values: Tuples of arrays, which may be nested, as kernels read them.

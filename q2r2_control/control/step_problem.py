@@ -19,7 +19,7 @@ from q2r2_control.types import Array
 
 
 class StepProblem:
-    """Writes the ``problem`` of a step from the kernels' model, targets and data."""
+    """Writes the QP of a step, its ``problem``, from the kernels' model, targets and data."""
 
     def __init__(
         self, robot: Robot, settings: ControllerSettings, tasks: Sequence[Task], constraints: Sequence[Constraint]
@@ -30,7 +30,7 @@ class StepProblem:
         self.constraints = OwnConstraints(robot, constraints)
 
     def connect(self, model: KernelPointer, targets: KernelPointer, data: KernelPointer) -> None:
-        """Compile the kernels for these pointers. A reset has to write the values at the pointers before."""
+        """Compile the kernels for these pointers. Before that, a reset has to write the values behind the pointers."""
         self._pointers = model, targets, data
         arrays: KernelData = data.value
         self._rows, self._tasks, self._state = arrays.safety.rows, arrays.tasks, arrays.safety.state
@@ -72,15 +72,15 @@ class StepProblem:
 
 
 class GivenSolution:
-    """A solver that always gives the same answer, which a program has found elsewhere."""
+    """A solver that always gives the same answer, which the user's program has found."""
 
     def __init__(self, x: object, nv: int) -> None:
-        """Take the answer ``x``. Its first nv numbers are the velocities [rad/s]; anything else is no solution."""
+        """Take the answer ``x``. Its first nv numbers are the velocities [rad/s]. Any other ``x`` is no solution."""
         self._v: Array | None = None
         try:
             given = np.asarray(x)
             numbers = np.array(given, dtype=np.float64) if given.dtype.kind != "c" else np.zeros(0)
-        except Exception:  # An object of the caller's may raise anything.
+        except Exception:  # An object of the caller may raise any exception.
             return
         if numbers.ndim == 1 and len(numbers) >= nv and np.isfinite(numbers[:nv]).all():
             self._v = numbers[:nv]

@@ -1,4 +1,4 @@
-"""Report the outcome of a step, and the names of the limits that held it back."""
+"""Report the outcome of a step, and the names of the limits that were active in it."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class LimitNames:
         self.pairs = [
             (names[first], names[second]) for first, second in both
         ]  # The pairs are those of the cell, then of objects, then of obstacles.
-        # In most ticks the same limits are active as in the last one.
+        # Key and result of the last call of :meth:`of`, because in most ticks the same limits are active as before.
         self._last: tuple[bytes, tuple[ActiveLimit, ...]] = b"", ()
         self._by_kind: dict[int, list[ActiveLimit]] = {
             kind: [ActiveLimit(limit, (joint,)) for joint in robot.joint_names] for kind, limit in _KINDS.items()
@@ -65,7 +65,7 @@ class StepSummary:
     slack: float = 0.0
     solve_time: float = 0.0
     faults: tuple[str, ...] = ()  # As in StepReport.
-    constraints: tuple[ActiveLimit, ...] = ()  # The user's own constraints that are active in the last substep.
+    constraints: tuple[ActiveLimit, ...] = ()  # The user's own constraints that were active in the last substep.
 
     def status(self, apart: bool, dt_usable: bool, rejected: tuple[str, ...]) -> StepStatus:
         """Return the most important event of the step as its status."""

@@ -1,4 +1,4 @@
-"""The task of each arm: a checked target with its velocity, or the pose of a held arm."""
+"""What each arm has to do: its tool follows a checked target with a velocity, or its joints hold their positions."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from q2r2_control.types import Array
 
 # Greatest coordinate of a target. It is larger than any cell, and squares of such numbers stay finite.
 _FARTHEST = 100.0  # [m]
-_ORTHONORMAL = 1e-3  # Largest error of R R' of a target's rotation R.
+_ORTHONORMAL = 1e-3  # Largest permitted difference of R R' from the identity, for the rotation R of a target.
 _AT_REST = 1e-2  # An arm whose joints are all slower than this counts as resting [rad/s].
 _NONE, _POSE, _NO_POSE = 0, 1, 2  # What is offered to an arm as its target: nothing, a pose, or something else.
-# A target faster than this multiple of the tool's own limit has jumped.
+# If a target is faster than this multiple of the tool's speed limit, it has jumped.
 _TELEPORT = 3.0
 
 
@@ -111,13 +111,13 @@ class TargetTracker:
             return
         try:
             posture = np.asarray(posture)
-        except Exception:  # Rows may have different lengths, and an object of the caller may raise anything.
+        except Exception:  # Rows may have different lengths, and an object of the caller may raise any exception.
             return
         if posture.shape == self._home.shape and posture.dtype.kind in "fiu" and np.isfinite(posture).all():
             self._targets.posture[:] = posture
 
     def offer(self, targets: Mapping[str, pin.SE3 | None]) -> bool:
-        """Write the targets of one tick for :func:`update_targets`. Return whether every name is the name of an arm."""
+        """Write the targets of one tick for :func:`update_targets`. Return whether every key is the name of an arm."""
         known = 0
         for i, arm in enumerate(self._arms):
             target = targets.get(arm)
@@ -130,7 +130,7 @@ class TargetTracker:
         return known == len(targets)
 
     def rejected(self, targets: Mapping[str, pin.SE3 | None]) -> tuple[str, ...]:
-        """Return the names whose offered target is not usable, including unknown names."""
+        """Return the names of arms whose offered target is not usable, and the keys of ``targets`` that name no arm."""
         rejected = [arm for arm, offered in zip(self._arms, self._offered, strict=True) if offered == _NO_POSE]
         return (*rejected, *(str(name) for name in targets if name not in self._arms))
 
@@ -220,7 +220,10 @@ def _update_pose(targets: TaskTargets, i: int, dt: float) -> bool:
 
 @kernel
 def _checked_pose(pose: Array, scratch: PoseScratch) -> bool:
-    """Split a pose (4, 4) into ``scratch`` with an orthonormal rotation. Return False if it is not a finite pose."""
+    """Write translation and rotation of a ``pose`` (4, 4) into ``scratch``. Return False if it is not a finite pose.
+
+    A Newton step makes the written rotation orthonormal.
+    """
     rotation, translation, gram = scratch.rotation, scratch.translation, scratch.gram
     largest, total, error = 0.0, 0.0, 0.0
     for i in range(3):

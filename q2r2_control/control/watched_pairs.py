@@ -26,7 +26,8 @@ from q2r2_control.robot.pairs import pairs_with_others
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Interval
 
-# A function that measures the pairs' distances (p,) [m] at a posture (nv,), and the distances (p,) [m] that they keep.
+# Two things: a function that returns the distances of pairs (p,) [m] at a posture (nv,) [rad], and an array of the
+# distances (p,) [m] that these pairs have to keep.
 PairsAhead = tuple[Callable[[Array], Array], Array]
 
 
@@ -66,10 +67,10 @@ class WatchedPairs:
     def set_opening(self, arm: str, least: float, greatest: float) -> tuple[str, str] | None:
         """Declare that the gripper of an arm is, and stays, between two openings.
 
-        From the next step on, the bodies of its fingers are the volume that the fingers sweep between the openings. At
-        first, and after :meth:`reset`, this volume belongs to all openings. A part of the present volume is always
-        accepted. Another volume is accepted if every pair keeps its distance with it, at the reference and during the
-        certified stop from there. The caller may send the gripper only to openings that were accepted.
+        From the next step on, the bodies of its fingers are the volume that the fingers sweep between the two openings.
+        At first, and after :meth:`reset`, it is the volume between fully closed and fully open. A part of the present
+        volume is always accepted. Another volume is accepted if every pair keeps its distance with it, at the reference
+        and during the certified stop from there. The caller may send the gripper only to openings that were accepted.
 
         Args:
             arm: The arm.
@@ -118,7 +119,7 @@ class WatchedPairs:
 
     @property
     def holding(self) -> dict[str, bool]:
-        """For each arm that has an object, whether its gripper holds it by the last :meth:`set_holding`."""
+        """For each arm that has an object, whether its gripper holds the object, by the last :meth:`set_holding`."""
         return {arm: arm in self._objects.holding for arm in self.robot.objects.by_arm}
 
     @property
@@ -169,9 +170,10 @@ class WatchedPairs:
     def allow_skew(self, time: float) -> None:
         """Let the delays of the arms behind the reference differ by up to ``time`` [s], and each arm stop on its own.
 
-        From the next step on, bodies of two arms keep their distance wherever on its own path each arm is. The path
-        begins where the reference was ``time`` [s] ago, and ends where the certified stop ends. A greater time takes
-        effect as time passes, and a smaller time at once. After :meth:`reset` the whole time counts at once.
+        From the next step on, the bodies of two arms keep their distance at any point of the one arm's path and at any
+        point of the other arm's path. A path begins where the reference was ``time`` [s] ago, and ends where the
+        certified stop ends. A greater time takes effect gradually as time passes, and a smaller time at once. After
+        :meth:`reset` the whole time counts at once.
 
         Args:
             time: The difference, from 0 to 0.1 [s].
@@ -184,9 +186,9 @@ class WatchedPairs:
         self._data_pointer.value.safety.history.window[1] = time
 
     def pairs_ahead(self, stop: float) -> PairsAhead:
-        """Return what is needed to check a path before the arms follow it, see :data:`PairsAhead`.
+        """Return the function and the distances with which a path is checked before the arms follow it.
 
-        Held objects count, and moving obstacles count where they were reported last.
+        See :data:`PairsAhead`. Held objects count, and moving obstacles count where they were reported last.
 
         Args:
             stop: Time in which the arms stop on that path [s].
@@ -205,7 +207,7 @@ class WatchedPairs:
         return self._obstacles.reports
 
     def spare_distance(self, arm: str) -> float:
-        """Return by how much an arm may still approach other bodies at the reference [m]; infinite without a pair.
+        """Return the least margin of an arm's pairs with other bodies at the reference [m]; infinite without a pair.
 
         Raises:
             RobotError: If there is no such arm.

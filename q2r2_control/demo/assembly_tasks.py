@@ -112,7 +112,7 @@ def tasks_named(names: Iterable[str]) -> tuple[AssemblyTask, ...]:
 
 
 def note_on_parts(motion: str, config: Config) -> str | None:
-    """Return one line about parts that the tasks of a scripted motion need and the cell lacks; None without any."""
+    """Return one line about parts that the tasks of a scripted motion need and the cell lacks; None if it has all."""
     parts = [part for name in motion.split("+") if name in TASKS for part in TASKS[name].parts]
     if not (missing := [part for part in parts if part not in config.mujoco.objects]):
         return None
@@ -121,7 +121,7 @@ def note_on_parts(motion: str, config: Config) -> str | None:
 
 
 def with_controls(config: Config) -> Config:
-    """Return the cell with controls for ``carry`` and ``precision``, which tasks need. Bindings of the cell stay."""
+    """Return the cell with controls for ``carry`` and ``precision``, which tasks need, unless it has such controls."""
     bindings = config.teleop.bindings
     given = {control: action for control, action in _TASK_CONTROLS.items() if bindings.words_of(action) is None}
     teleop = config.teleop.model_copy(update={"bindings": bindings.model_copy(update=given)})
@@ -188,7 +188,7 @@ class TaskWatch:
                 judge.see(dt, parts)
 
     def results(self) -> tuple[TaskResult, ...]:
-        """Return the results of all tasks. All fail if an arm touched anything, except a part with its fingers."""
+        """Return the results of all tasks. All tasks fail if an arm touched anything but a part with its fingers."""
         touches = [f"{one} touched {other} at {t:.1f} s" for (one, other), t in self._touches.forbidden.items()]
         results = []
         for name, judges in self._judges.items():

@@ -112,11 +112,11 @@ class TouchWatch:
 HELD_TIME = 1.0  # The time for which a part has to be held, or to rest [s].
 _LIFT = 0.095  # The least height to which a part is lifted [m].
 _CARRY = 0.1  # The least distance over which a part is carried [m].
-_FALL = 0.005  # A part without a finger on it falls if it sinks more than this [m]. Putting it down needs less.
-_PUT_BACK = (0.01, 0.001)  # The largest distance from the place at the start, sideways and in height [m].
-_STACKED = (0.01, 0.001)  # The largest distance from the place on the part below, sideways and in height [m].
-_UPRIGHT = math.radians(2.0)
-_LEVEL = math.radians(5.0)  # The limit of the tilt of a part that both hands carry.
+_FALL = 0.005  # A part that no finger touches has fallen if it sinks by more than this [m]. A part put down sinks less.
+_PUT_BACK = (0.01, 0.001)  # The largest distance from the position at the start, sideways and in height [m].
+_STACKED = (0.01, 0.001)  # The largest distance from the position on the part below, sideways and in height [m].
+_UPRIGHT = math.radians(2.0)  # The largest tilt of a stacked part [rad].
+_LEVEL = math.radians(5.0)  # The limit of the tilt of a part that both hands carry [rad].
 
 
 class Judge:
@@ -154,7 +154,9 @@ class LiftJudge(Judge):
 
     def __init__(self, part: str) -> None:
         super().__init__(part)
-        self._start: tuple[float, float, float] | None = None
+        self._start: tuple[float, float, float] | None = None  # The position at the start [m].
+        # How long the part has been held up now, and at most [s]; its greatest height above the start [m]; the time for
+        # which it has lain at the start again [s].
         self._held = self._longest = self._height = self._lain = 0.0
         self._away = (0.0, 0.0)  # The distance from the start, sideways and in height [m].
 
@@ -254,6 +256,8 @@ class HandoverJudge(Judge):
     def __init__(self, part: str, giver: int, taker: int) -> None:
         super().__init__(part)
         self._giver, self._taker = giver, taker
+        # The times for which the giver held the part, and both hands held it [s]; for which the taker has held it far
+        # enough away now, and at most [s]; the greatest distance from where the giver let go [m].
         self._by_giver = self._by_both = self._alone = self._longest = self._farthest = 0.0
         self._given: tuple[float, float, float] | None = None  # The position at which the giver let go [m].
 

@@ -1,4 +1,4 @@
-"""Repeats tasks many times in simulated time, with scripted hands that tremble differently, or with a policy."""
+"""Repeats tasks many times in simulated time, with a policy, or with scripted hands whose tremor differs each time."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def try_tasks(
 
 
 def try_task(config: Config, mode: CommandMode, shaky: bool, job: tuple[str, int]) -> str:
-    """Let scripted hands try the task and the seed of ``job``; returns why it failed, or "" after success."""
+    """Let scripted hands try the task of ``job`` with its seed; returns why it failed, or "" after success."""
     name, seed = job
     work = trajectory_named(name)
     work = hurried(work, seed) if shaky else work
@@ -82,7 +82,7 @@ def try_task(config: Config, mode: CommandMode, shaky: bool, job: tuple[str, int
 
 
 def try_policy(config: Config, mode: CommandMode, policy: str, spread: float, job: tuple[str, int]) -> str:
-    """Let the ``policy`` MODULE:NAME try the task and the seed of ``job``, in the time that scripted hands take.
+    """Let the ``policy`` MODULE:NAME try the task of ``job`` with its seed, in the time that scripted hands take.
 
     The seed displaces the parts along x and along y by up to ``spread`` [m]. Returns why the task failed, or "".
     """

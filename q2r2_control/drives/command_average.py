@@ -11,7 +11,7 @@ from q2r2_control.control.cubic import cubic
 from q2r2_control.types import Array
 
 _ROUNDING = 1e-9  # Differences of times below this are rounding [s].
-_LATE = 1.5  # A tick that lasts longer, in periods, is not averaged.
+_LATE = 1.5  # If a tick lasts more periods than this, the reference itself is commanded at its end.
 
 
 class CommandAverage:
@@ -27,8 +27,8 @@ class CommandAverage:
         """Make the average over a ``window`` [s] (see ``average_window``), for ticks of a ``period`` [s]."""
         count = max(math.ceil((window - _ROUNDING) / period), 1)
         self._ages, self._longest = period * np.arange(count), _LATE * period
-        self._times: list[float] = []  # Times of the last ticks [s], with the reference of each.
-        self._path: list[tuple[Array, Array]] = []
+        self._times: list[float] = []  # Times of the last ticks [s].
+        self._path: list[tuple[Array, Array]] = []  # q and v of the reference at each of these times, (nv,) each.
         self.settled = True  # Whether the last command was exactly the newest reference.
 
     @property

@@ -44,7 +44,7 @@ class AnsweringProcess:
             PlantError: If the process cannot begin.
         """
         self._robots, self._longest_word = robots, longest_word
-        # States that nobody reads may fill their connection. Commands and replies therefore have another one.
+        # States that nobody reads may fill their socket. Commands and replies therefore have another socket.
         self._commands, commands = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._states, states = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._states.setblocking(False)
@@ -52,7 +52,7 @@ class AnsweringProcess:
         with commands, states:
             self._process = start_python(f"from {module} import main; main{links}", {}, files=[*links, *files])
         self.pid = self._process.pid
-        # If the loop has a real-time priority, the process has a higher one. Otherwise, the number is 0.
+        # If the loop has a real-time priority, the process gets a higher one. Otherwise, the number that it gets is 0.
         priority = thread_priority()
         self._commands.send(pickle.dumps((priority and priority + 1, *given)))
         word = b""
@@ -63,7 +63,7 @@ class AnsweringProcess:
         self._commands.settimeout(longest_word)
 
     def send(self, commands: Mapping[str, Any]) -> bool:
-        """Send a command for each arm; returns whether all of them came in time. If not, none of them is followed.
+        """Send a command for each arm; returns whether all commands came in time. If not, no command is followed.
 
         Raises:
             PlantError: If the process has ended, or does not reply.

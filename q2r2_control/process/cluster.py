@@ -170,7 +170,7 @@ def _tell(finished: SimpleQueue[int], number: int, future: Future[Any]) -> None:
 
 
 def _other_version(here: Any, there: Any) -> str | None:
-    """Return the first version of a worker that differs from ours, or None if all are equal.
+    """Return a text about the first version of a worker that differs from ours, or None if all versions are equal.
 
     ``here`` and ``there`` are dask's descriptions of this process and of the worker.
     """

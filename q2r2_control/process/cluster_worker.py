@@ -19,7 +19,7 @@ _SHARED = "allowed: a folder that all machines share, under the same path"
 
 @dataclass(frozen=True)
 class Needs:
-    """What a worker must have exactly as the computer that sends the jobs. All paths are absolute."""
+    """What must be the same for a worker as for the computer that sends the jobs. All paths are absolute."""
 
     sources: str  # The result of :func:`hash_of_sources`.
     folder: str | None = None  # The working directory, from which relative paths begin; None if no files are read.
@@ -47,7 +47,7 @@ class Call:
 
 @cache
 def hash_of_sources() -> str:
-    """Return a hash of this package's modules, as they were when this process first called it."""
+    """Return a hash of this package's modules, as they were when this process first called this function."""
     package = Path(__file__).parents[1]
     digest = hashlib.sha256()
     for file in sorted(package.rglob("*.py")):

@@ -27,7 +27,7 @@ from q2r2_control.process.scheduling import how_it_ended
 
 _LOOKS = 0.1  # While a process is ending, time between two checks of its progress [s].
 _AFTER_KILL = 1.0  # Time for the code that handles the last answer [s].
-_NO_ROOM = 1e-3  # Time between two attempts to send [s].
+_NO_ROOM = 1e-3  # While there is no room for a request, time between two attempts to queue it [s].
 
 
 class HelperProcess:
@@ -66,7 +66,7 @@ class HelperProcess:
         self._ending = self._killed = False
         self._queue: SimpleQueue[tuple[Any, int] | None] = SimpleQueue()
         self._lock = Lock()
-        self._put = self._sent = 0  # Bytes of all requests so far.
+        self._put = self._sent = 0  # Bytes of all requests that were queued, and of all that were sent, so far.
         self._moved = time.monotonic()  # Time at which the process last took or answered something.
         self._listener = Thread(target=self._listen, daemon=True)
         Thread(target=self._feed, daemon=True).start()
@@ -116,8 +116,8 @@ class HelperProcess:
     def kill(self) -> None:
         """End the process and all processes that it has started, at once. This is not a fault.
 
-        Otherwise, a process that it has started would keep files and ports open. It would also keep the pipe open whose
-        end shows that the process has ended.
+        If only the process itself were ended, the processes that it has started would keep files and ports open. They
+        would also keep its output pipe open. The end of this pipe shows that the process has ended.
         """
         self._killed = True
         if self._process.returncode is None:  # Otherwise, another process may have its number by now.
@@ -127,7 +127,7 @@ class HelperProcess:
         self._listener.join(_AFTER_KILL)
 
     def _is_ready_to_run(self) -> bool:
-        """Return whether one of its threads runs or could run. Only Linux tells this."""
+        """Return whether at least one thread of the process runs or is ready to run. Only Linux tells this."""
         with suppress(OSError):  # The thread has ended.
             states = [file.read_text() for file in Path(f"/proc/{self.pid}/task").glob("*/stat")]
             return any(state.rpartition(")")[2].split()[0] == "R" for state in states)

@@ -30,7 +30,7 @@ class JobPlace(Protocol):
         reads: Callable[[Job], Path] | None = None,
         writes: Path | None = None,
     ) -> Generator[Result]:
-        """Yield the results of ``work`` for all ``jobs``, in the order of the jobs. They are the same at every place.
+        """Yield the results of ``work`` for all ``jobs``, in the order of the jobs. Every place gives the same results.
 
         Args:
             work: A function at the top level of a module, or a ``functools.partial`` of one. Other processes import it.
@@ -98,7 +98,7 @@ class Processes:
 
 
 def chosen_place(workers: int, cluster: str | None) -> JobPlace:
-    """Return the place that a user chose by ``--workers`` or ``--cluster``; raises :class:`ConfigError` for both."""
+    """Return the place that ``--workers`` or ``--cluster`` chooses; raises :class:`ConfigError` if both are given."""
     if cluster is not None:
         if workers != 1:
             raise ConfigError("--workers cannot be used with --cluster, whose scheduler has the workers")

@@ -1,4 +1,4 @@
-"""Share work among processes, which end with the process that gave it to them."""
+"""Make pools of worker processes, which end when the process that made the pool ends."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from threading import Thread
 def pool_of(workers: int) -> ProcessPoolExecutor:
     """Return a pool of ``workers`` processes. They are spawned, not forked, because this process may have threads.
 
-    Ctrl-C reaches all processes, and this process ends the workers.
+    Workers ignore Ctrl-C, which reaches all processes, because this process ends its workers.
     """
     return ProcessPoolExecutor(workers, get_context("spawn"), initializer=_begin)
 

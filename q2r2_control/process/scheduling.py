@@ -20,7 +20,7 @@ from tempfile import TemporaryFile
 
 from q2r2_control.errors import ConfigError
 
-# Under Linux with PREEMPT_RT, interrupts have the priority 50. The loop waits for some of them, so it must be below.
+# Under Linux with PREEMPT_RT, interrupts have the priority 50. The loop waits for some of them and needs a lower one.
 _PRIORITY = 40
 LONGEST_END = 5  # Time that a process may take to end after it has closed everything. SIGALRM ends it then [s].
 _LEAST_ROOM = 1 << 16  # Free space that a folder for recordings must have [bytes].
@@ -55,7 +55,7 @@ def reserve(runtime: float, period: float) -> bool:
     """Reserve ``runtime`` [s] of a processor in every ``period`` [s] for the calling thread, before all others.
 
     If threads under SCHED_FIFO leave no time for other programs, Linux halts them for up to 50 ms. A reservation
-    (SCHED_DEADLINE) also goes before this halt. A thread that needs more time waits for its next period.
+    (SCHED_DEADLINE) has precedence over this halt. A thread that needs more time waits for its next period.
 
     Returns:
         False if the system has no such reservations, or does not permit one. Nothing has changed then.
@@ -71,7 +71,8 @@ def reserve(runtime: float, period: float) -> bool:
 def schedule_thread_first(priority: int) -> str | None:
     """Let the calling thread run under SCHED_FIFO at ``priority``, from 1 to 99.
 
-    Other threads of the process do not change, and threads and processes that are started later do not inherit it.
+    Other threads of the process keep their scheduler. Threads and processes that are started later do not inherit the
+    scheduler of this thread.
 
     Returns:
         None, or one line that says why it is not permitted and how to permit it.
@@ -96,7 +97,8 @@ def _lock_memory() -> str | None:
         return "memory is not locked: only done on Linux"
     import resource  # Not every system has this module.
 
-    # Under a limit, memory that is asked for later would be refused in mid-run instead of being left unlocked.
+    # If the size of locked memory is limited, the flag _FUTURE would let later requests for memory fail during the run.
+    # Without this flag, such memory is merely not locked.
     unlimited = os.geteuid() == 0 or resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] == resource.RLIM_INFINITY
     if ctypes.CDLL(None, use_errno=True).mlockall(_CURRENT | _FUTURE if unlimited else _CURRENT) == 0:
         return None
@@ -193,7 +195,7 @@ def how_it_ended(what: str, code: int) -> str:
 
 @contextmanager
 def few_garbage_collections() -> Iterator[None]:
-    """Exclude all existing objects from garbage collection, which would take several ticks each time.
+    """Exclude all existing objects from garbage collection. A collection of all objects would take several ticks.
 
     If the program has already frozen objects itself, they stay frozen, and this function does nothing.
     """

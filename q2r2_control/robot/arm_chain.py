@@ -20,7 +20,7 @@ from q2r2_control.robot.pinocchio_models import joint_origin
 _GRIPPER_JOINT = re.compile(r"gripper|finger|jaw|thumb|knuckle", re.IGNORECASE)
 # A wrist joint that turns the gripper, such as gripper_roll_joint, belongs to the arm.
 _WRIST_JOINT = re.compile(r"gripper_?(roll|rotat|twist|yaw|pitch|swivel)", re.IGNORECASE)
-# Names of links that are not the tool. A sensor may carry the tool.
+# Names of links that are not the tool. Links beyond a side branch are not the tool either. A sensor may carry the tool.
 _SIDE_BRANCH = re.compile(r"finger|jaw|thumb|knuckle|camera|antenna|imu", re.IGNORECASE)
 _SENSOR = re.compile(r"sensor|accelerometer|_range", re.IGNORECASE)
 # Names of tool frames. The first one that exists is taken.
@@ -28,7 +28,7 @@ _TOOL_FRAMES = [
     re.compile(pattern, re.IGNORECASE)
     for pattern in (r"tcp", r"tool", r"(^|_)eef?(_|$)|end_?effector|endpoint", r"grasp|gripper_?frame", r"flange")
 ]
-_SAME_PLACE = 1e-3  # Largest distance between links that count as being at the same place [m].
+_SAME_PLACE = 1e-3  # Largest distance between the origins of links that count as being at the same position [m].
 _LEAST_JOINTS = 4  # Least number of joints of an arm. Chains of wheels and heads have fewer.
 
 

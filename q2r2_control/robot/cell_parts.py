@@ -58,7 +58,7 @@ class Model:
         return f"robot_{name}" if not self.prefix and name == WORLD else self.prefix + name
 
     def urdf(self, mount: PoseConfig) -> list[ET.Element]:
-        """Return the links and joints of the model for the cell."""
+        """Return the links and joints with their names in the cell, and the joint that fixes the model at ``mount``."""
         joint = fixed_joint(f"{self.prefix or 'robot_'}mount", WORLD, self.name_in_cell(self.tree.root), mount)
         return [joint, *(renamed(part, self.name_in_cell) for part in self.parts)]
 
@@ -67,8 +67,8 @@ class Mounted(NamedTuple):
     """A flange or a tool on an arm."""
 
     model: Model
-    joint: ET.Element  # The joint to the part that carries it.
-    is_flat: bool  # True if it sits flat on the end of that part. An SRDF may then exclude pairs between both.
+    joint: ET.Element  # The joint between this flange or tool and the part that carries it.
+    is_flat: bool  # True if it sits flat on the end of that part. An SRDF may then exclude pairs between both parts.
 
 
 class ArmAssembly:
@@ -149,7 +149,7 @@ class ArmAssembly:
                 raise ConfigError(f"{self.key}: {shared}; name another tip")
 
     def mounted_urdf(self) -> list[ET.Element]:
-        """Return the links and joints of flange and tool for the cell."""
+        """Return the links and joints of flange and tool with their names in the cell."""
         return [renamed(part, self.name_in_cell) for item in self.mounted for part in [item.joint, *item.model.parts]]
 
     def mounted_exclusions(self) -> list[ET.Element]:
@@ -165,7 +165,7 @@ class ArmAssembly:
         return renamed_exclusions(parts, self.name_in_cell)
 
     def acceleration_limits(self) -> dict[str, float]:
-        """Return the acceleration limits in the model's files by the joints' names in the cell [rad/s^2]."""
+        """Return the acceleration limits that the configuration gives [rad/s^2], by the joints' names in the cell."""
         limits, names = self.config.acceleration_limit, [joint.get("name", "") for joint in self.joints]
         for name in limits:
             if name not in names:
@@ -174,7 +174,10 @@ class ArmAssembly:
         return {self.name_in_cell(name): value for name, value in limits.items()}
 
     def posture(self) -> dict[str, float]:
-        """Return the position of each joint, with the arm at home and the gripper open."""
+        """Return the position of each joint of arm and gripper, with the arm at home and the gripper open [rad or m].
+
+        The joints have the names of their models.
+        """
         config, names = self.config, [joint.get("name", "") for joint in self.joints]
         if len(config.home) != len(names):
             others = [name for name in self._beyond() if name not in names]
@@ -232,7 +235,10 @@ def load_model(
 
 
 def load_flange(config: FlangeConfig, packages: Mapping[str, str], key: str) -> Description | None:
-    """Return the flange of the block ``key``, if any; raises :class:`ConfigError` that begins with ``key``."""
+    """Return the flange of the block ``key``; None if the block has none.
+
+    Raises :class:`ConfigError`, with a text that begins with ``key``, if the model cannot be used.
+    """
     if config.thickness is not None and config.radius is not None:
         return cylinder_flange(config.thickness, config.radius, config.mass)
     return None if config.model is None else load_model(config, packages, key)

@@ -1,4 +1,4 @@
-"""The moving average that keeps commands within a limit of jerk: how long it is, and what distance it needs.
+"""The moving average that keeps commands within a limit of jerk: its window, and the distance that it needs.
 
 A robot may refuse positions whose acceleration changes too quickly, even if the acceleration itself is allowed. The
 reference of the controller bounds accelerations by A and lets them change at once. Commands are therefore the mean of
@@ -9,14 +9,15 @@ accelerations of the reference, divided by n. So its jerk is at most 2 A / (n h)
 j.
 
 **Other limits.** Positions, velocities and accelerations of the mean are means of those of the reference. If the
-reference keeps an interval of a joint, so does the mean.
+reference stays within an interval of a joint, so does the mean.
 
 **Distances.** A mean of postures is not a posture of the path, but it is near one. Let the reference be at ``q(c + s)``
 at the times of the window around its centre ``c``. The mean of ``q(c + s) - q(c) - s v(c)`` is at most A mean(s^2) / 2,
 and the mean of ``s v(c)`` is 0. With n >= 2 references the period is below W, and this bound is at most A W^2 / 8.
 Twice as much is allowed for, so that ticks may be irregular (``drives/command_average.py``). The reference keeps its
 distances at ``c``, also between two ticks. A pair's distance changes by no more than the sum, over the joints, of the
-joint's displacement times the distance of the pair's bodies from its axis. The reference keeps this much more distance.
+joint's displacement times the distance of the pair's bodies from the joint's axis. The reference therefore keeps the
+required distance plus this sum.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.robot.turning_fingers import TurningBody
 from q2r2_control.types import Array
 
-# Longest window [s]. Commands are behind the reference by half a window, and a person feels a longer delay.
+# Longest window [s]. Commands are behind the reference by half a window, and a person would feel a longer delay.
 LONGEST_WINDOW = 0.05
 
 

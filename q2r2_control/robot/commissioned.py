@@ -1,4 +1,4 @@
-"""The sign-off of a cell's commissioning: a file beside the cell, which counts as long as the cell is the same."""
+"""The sign-off of a cell's commissioning: a file beside the cell's file. It is valid while the cell does not change."""
 
 from __future__ import annotations
 

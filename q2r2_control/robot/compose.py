@@ -46,7 +46,7 @@ class ComposedCell:
     srdf: str
     tool_frames: dict[str, str]  # By arm, the link that the operator moves.
     home: dict[str, float]  # Position of every movable joint, with arms at home and grippers open.
-    obstacles: tuple[str, ...]  # Names of links.
+    obstacles: tuple[str, ...]  # Names of the fixed obstacles, which are also the names of their links.
     parts: KnownParts  # The roles of links.
 
     def arm_lengths(self) -> dict[str, float]:
@@ -80,7 +80,7 @@ def compose(config: Config) -> ComposedCell:
             srdf.extend(renamed_exclusions(arm.model.exclusions, arm.model.name_in_cell))
         urdf.extend(arm.mounted_urdf())
         srdf.extend(arm.mounted_exclusions())
-    _check_apart(urdf)
+    _check_unique_names(urdf)
     home = _home(urdf, arms)
     of_arms = [arm.name_in_cell(joint.get("name", "")) for arm in arms.values() for joint in arm.joints]
     following = links_that_follow(LinkTree(urdf, config.name), of_arms)
@@ -140,7 +140,10 @@ def _arms(config: Config) -> dict[str, ArmAssembly]:
 
 
 def _home(urdf: ET.Element, arms: Mapping[str, ArmAssembly]) -> dict[str, float]:
-    """Return the position of every joint that an arm or a gripper moves, with joints that mimic a finger."""
+    """Return the home position of every joint that an arm or a gripper moves [rad or m], by the name in the cell.
+
+    Joints that mimic a finger's joint are included.
+    """
     home: dict[str, float] = {}
     owner: dict[str, str] = {}
     fingers: set[str] = set()
@@ -170,15 +173,21 @@ def _check_resting(urdf: ET.Element, resting: Mapping[str, float], home: Mapping
 
 
 def _locked_at(urdf: ET.Element, given: Mapping[str, float]) -> dict[str, float]:
-    """Return the position of every joint: as ``given``, by its ``<mimic>``, or as near to 0 as its limits allow."""
+    """Return the position of every joint [rad or m].
+
+    It is the ``given`` one, or that of the joint's ``<mimic>``, or else the one nearest to 0 within the limits.
+    """
     joints = urdf.findall("joint")
     followers = followers_of(joints, driven=given)
     resting = {name: resting_position(joint) for joint in joints if (name := joint.get("name", "")) not in followers}
     return with_followers(resting | dict(given), followers)
 
 
-def _check_apart(urdf: ET.Element) -> None:
-    """Check that no name occurs twice: a robot's name without a prefix may equal a tool's name with its prefix."""
+def _check_unique_names(urdf: ET.Element) -> None:
+    """Check that no link or joint name occurs twice.
+
+    A name in ``robot``, which gets no prefix, may be the same as a tool's name with its prefix.
+    """
     for tag in ("link", "joint"):
         names = [element.get("name", "") for element in urdf.findall(tag)]
         if twice := sorted(name for name in set(names) if names.count(name) > 1):

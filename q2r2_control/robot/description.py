@@ -100,7 +100,10 @@ def load_description(
 
 
 def _shipped_model(model: str) -> Path:
-    """Return the file of a model's name; raises :class:`ConfigError` if there is none, or it is of another kind."""
+    """Return the URDF in robots/ that is called ``model``; raises :class:`ConfigError` if there is none.
+
+    If ``model`` is no name but the path of a file of another kind, the error says which kinds are allowed.
+    """
     try:
         return find_resource(f"robots/{model}.urdf")
     except ConfigError:
@@ -125,8 +128,8 @@ def parse_urdf(
     Args:
         text: The URDF.
         where: Names the text in errors.
-        folder: Relative paths of meshes start here.
-        packages: Folders of ``package://`` by name.
+        folder: The folder from which relative paths of meshes start.
+        packages: Folders of the packages that ``package://`` names, by name.
 
     Raises:
         RobotError: If the text cannot be used.
@@ -224,7 +227,7 @@ def joint_end(joint: ET.Element, end: str) -> str:
 
 
 def joint_limits(joint: ET.Element) -> tuple[float, float]:
-    """Return the position limits of a joint, as the URDF has them."""
+    """Return a joint's lower and upper position limit in the URDF [rad or m]; 0 for a limit that is not written."""
     limit = joint.find("limit")
     return (0.0, 0.0) if limit is None else (float(limit.get("lower", "0")), float(limit.get("upper", "0")))
 

@@ -1,7 +1,7 @@
 """Enclose collision shapes by the shapes that the distance kernels can measure.
 
-Capsules, spheres and boxes that are fixed in the world stay. Every other shape is enclosed. A moving box becomes a
-capsule as well, because the distance of two boxes has no short closed form.
+Capsules and spheres stay as they are, and so do boxes that are fixed in the world. Every other shape is enclosed. A
+moving box becomes a capsule as well, because the distance of two boxes has no short closed form.
 
 A mesh becomes a capsule around its vertices. The capsule is convex, and so it also encloses the triangles. For safety
 it must enclose every vertex, which the construction guarantees for any axis and any centre.
@@ -100,16 +100,19 @@ def capsules_around(shape: coal.CollisionGeometry, name: str, count: int) -> lis
 def enclosing_capsule(points: Array) -> Capsule:
     """Return a small capsule around ``points`` (n, 3): the radius and both ends of the segment (3,).
 
-    It starts from the principal axes, and minimises the volume over the direction of the axis (two angles), its
-    position (two offsets), and the radius. Let a point have the height t and the distance rho from the axis. It is
-    inside a capsule of radius r if the segment has a height within sqrt(r^2 - rho^2) of t.
+    The search starts from the principal axes. It minimises the volume over the direction of the axis (two angles), the
+    position of the axis (two offsets), and the radius. Let a point have the height t along the axis, and the distance
+    rho from it. The point is inside a capsule of radius r if the segment has a height within sqrt(r^2 - rho^2) of t.
     """
     return _cached_capsule(np.array(points, dtype=float, order="C").tobytes())
 
 
 @lru_cache(maxsize=256)
 def _cached_capsule(found: bytes) -> Capsule:
-    """Compute a capsule once for all equal meshes, which both arms usually share."""
+    """Compute a capsule once for all equal meshes, because both arms usually have the same meshes.
+
+    ``found`` are the bytes of the points (n, 3).
+    """
     points = _corners(np.frombuffer(found).reshape(-1, 3))
     centre = points.mean(axis=0)
     scale = max(float(np.abs(points - centre).max()), 1e-9)
@@ -173,7 +176,10 @@ def _corners(points: Array) -> Array:
 
 
 def _best_view(points: Array, axes: Array, scale: float = 1.0) -> tuple[Array, Array]:
-    """Return the order of ``axes`` (3, 3) whose last axis gives the smallest first capsule, and the points in it."""
+    """Return the best order of ``axes`` (3, 3), and the ``points`` (n, 3) along these axes, divided by ``scale``.
+
+    The capsule at which the search begins lies along the last axis. In the best order, this capsule is the smallest.
+    """
     frames = [axes[[index - 2, index - 1, index]] for index in range(3)]
     views = [points @ frame.T / scale for frame in frames]
     best = int(np.argmin([_volume(*_fit(view, _start(view))) for view in views]))
@@ -209,7 +215,11 @@ def _start(local: Array) -> Array:
 
 
 def _fit(local: Array, x: Array) -> tuple[float, Array]:
-    """Return radius and segment ends (2, 3) of the capsule around ``local`` whose axis is z, moved by ``x``."""
+    """Return the radius of a capsule around the points ``local`` (n, 3), and the ends of its segment (2, 3).
+
+    The axis has the direction (x0, x1, 1), and goes through the point (x2, x3, 0). The radius is the greatest distance
+    of a point from the axis, times 1 + abs(x4).
+    """
     direction = np.array([x[0], x[1], 1.0])
     direction /= np.linalg.norm(direction)
     place = np.array([x[2], x[3], 0.0])

@@ -27,7 +27,7 @@ from q2r2_control.types import ALL_OF_THE_WAY, Array, Interval
 
 @dataclass(frozen=True, slots=True)
 class FingerBody:
-    """A body that covers all positions of one arm's fingers that slide along one line."""
+    """A body that covers all positions of some fingers of one arm, which slide along one line."""
 
     arm: str
     name: str  # Name of the geometry object.
@@ -37,7 +37,10 @@ class FingerBody:
     ends: tuple[tuple[float, tuple[tuple[float, FingerJoint], ...]], ...]
 
     def part(self, interval: Interval) -> tuple[float, float]:
-        """Return the part of the segment in which fingers are at openings in ``interval``, as shares of its length."""
+        """Return the part of the segment in which the fingers are while the gripper's opening is in ``interval``.
+
+        Both ends of the part are given as shares of the segment's length, from 0 to 1.
+        """
         if interval == ALL_OF_THE_WAY:
             return 0.0, 1.0
         lowest, highest = [], []
@@ -95,7 +98,9 @@ _Finger = tuple[Array, tuple[FingerJoint, ...]]
 def sweep_fingers(
     model: pin.Model, geometry: pin.GeometryModel, tree: LinkTree, parts: KnownParts, home: Mapping[str, float]
 ) -> tuple[FingerBody | TurningBody, ...]:
-    """Replace in place the capsules and spheres of fingers, locked at ``home``, by what they sweep.
+    """Replace the capsules and spheres of fingers in place by capsules around the volumes that they sweep.
+
+    In ``model`` the fingers are locked at ``home``.
 
     If two fingers of one gripper slide on one line and are equally thick, their capsules become one. It keeps the name
     of the first capsule, and includes the space between the fingers. If a finger slides across the line of its body,
@@ -184,7 +189,10 @@ def _ends(item: pin.GeometryObject) -> Array:
 
 
 def _sweep(item: pin.GeometryObject, joints: tuple[FingerJoint, ...]) -> bool:
-    """Replace a shape by the volume that it sweeps, and return whether its whole segment moves along one line."""
+    """Replace a shape by a capsule around the volume that it sweeps.
+
+    Returns True if the whole segment of the shape moves along one line.
+    """
     ways = [[(end - joint.home) * joint.axis for end in (joint.before, joint.beyond)] for joint in joints]
     points = np.array([end + np.sum(move, axis=0) for move in product(*ways) for end in _ends(item)])
     radius, line = float(item.geometry.radius), _line_of(points)

@@ -71,8 +71,8 @@ def remove_unreachable_floor_pairs(model: pin.Model, geometry: pin.GeometryModel
     """Remove each pair of the floor and a body that provably cannot come near to it.
 
     There are two kinds of such bodies. Some turn about vertical axes only, as the first link of an arm does, and keep
-    their height. Others are carried by a joint that can tip them, but do not reach from it to within :data:`CLEARANCE`
-    of the floor.
+    their height. Others are carried by a joint that can tip them, but stay more than :data:`CLEARANCE` above the floor
+    even if they point straight down from this joint.
     """
     data = model.createData()
     pin.computeJointJacobians(model, data, pin.neutral(model))

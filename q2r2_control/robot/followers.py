@@ -12,7 +12,7 @@ from q2r2_control.robot.urdf_parts import CONTINUOUS_RANGE, mimic_of
 
 @dataclass(frozen=True, slots=True)
 class Follower:
-    """A joint that is at ``multiplier * q + offset`` where its driver is at ``q`` [rad or m]."""
+    """A joint that is at ``multiplier * q + offset`` when its driver is at ``q`` [rad or m]."""
 
     driver: str  # A joint without a <mimic>.
     multiplier: float
@@ -31,7 +31,7 @@ def followers_of(joints: Iterable[ET.Element], driven: Collection[str] = (), whe
     Args:
         joints: All joints of the model.
         driven: Joints with a motor. They follow no joint, even with a <mimic>. The same holds for fixed joints.
-        where: Begins the text of an error.
+        where: The text with which an error begins.
 
     Raises:
         RobotError: If a joint follows a joint that is not in ``joints``, or itself through other joints.
@@ -71,8 +71,8 @@ def narrow_limits(joints: Collection[ET.Element], where: str = "") -> None:
     limits have the wrong sign, as in models of mirrored fingers, gets the range in which it follows.
 
     Raises:
-        RobotError: With a text that begins with ``where``, as :func:`followers_of`, or if a follower leaves its driver
-            no range.
+        RobotError: In the cases in which :func:`followers_of` raises it, or if a follower leaves its driver no range.
+            The text begins with ``where``.
     """
     limits = {joint.get("name", ""): joint.find("limit") for joint in joints}
     for name, follower in followers_of(joints, where=where).items():

@@ -6,9 +6,9 @@ with the fingers of other hands, because these must be able to take the object o
 
 **The distance of two boxes** has no short closed form. One of the two closest points of two convex polyhedra can be
 taken on an edge. If both points lie inside of faces, these faces are parallel. Both points can then be moved along
-them until one of them meets an edge. Two polyhedra also begin to overlap only by an edge of one in the other. The
-distance of two boxes is therefore the least distance of the twelve edges of each box from the other box. Each edge is
-a capsule without a radius.
+them until one of them meets an edge. When two polyhedra begin to overlap, an edge of one of them enters the other one.
+The distance of two boxes is therefore the least distance of the twelve edges of each box from the other box. Each edge
+is a capsule without a radius.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ class HeldObject:
 
     arm: str
     link: str  # The link after which its bodies are named.
-    joint: int  # The joint in ``Robot.model`` that carries it.
-    placement: pin.SE3  # Placement of its centre in the frame of that joint.
+    joint: int  # Index of the joint in ``Robot.model`` that carries the object.
+    placement: pin.SE3  # Pose of the object's centre in the frame of that joint.
     config: HeldObjectConfig
 
     def inertia(self, share: float = 1.0) -> pin.Inertia:
@@ -130,7 +130,7 @@ class _Pairs:
 
 
 def _watched(geometry: pin.GeometryModel, roles: Mapping[str, Role], held: HeldObject) -> list[str]:
-    """Return the bodies with which the object has pairs: no hand that holds it, and no fingers that may take it."""
+    """Return the bodies with which the object has pairs. The hand that holds it and all fingers are left out."""
     items = geometry.geometryObjects
     # All obstacles count, also those that the hand itself cannot reach, because an object reaches farther.
     found = dict.fromkeys(item.name for item in items if roles[link_of(item.name)].part is LinkClass.OBSTACLE)

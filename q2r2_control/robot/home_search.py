@@ -1,9 +1,10 @@
-"""Find a home posture for a cell that names none, by sampling and a local search.
+"""Find a home posture for a cell whose YAML names no home, by sampling and a local search.
 
 A good home has joints near the middle of their ranges. The tool is before and below the shoulder, points forwards and
-down, and can move in all directions. Gravity needs clearly less than the torque limits. The bodies are clearly farther
-apart than the distances that they keep, most of all below the tool, because work goes down from home. A small part of
-these two reserves is required: without it, the cost of a posture jumps.
+down, and can move in all directions. Gravity requires clearly less torque than the joints' limits. The bodies are
+clearly farther apart than the distances that they keep, most of all below the tool, because the tool works below its
+home position. Two conditions are required, and the cost of a posture jumps without them: gravity is within the torque
+limits, and every pair is slightly farther apart than its kept distance.
 """
 
 from __future__ import annotations
@@ -26,11 +27,11 @@ if TYPE_CHECKING:
 _SAMPLES, _BEST, _STEPS = 2000, 24, 150
 _INSIDE = 0.85  # Share of its half range that each joint may use on both sides of the middle.
 _HALF = np.pi / 2  # Greatest half range that is assumed for a joint [rad].
-_WORK = np.array([0.62, 0.0, 0.05])  # Wanted position of the tool relative to the shoulder, in reaches of the arm.
+_WORK = np.array([0.62, 0.0, 0.05])  # Wanted position of the tool relative to the shoulder, in shares of the reach.
 _AHEAD = np.array([0.8, 0.0, -0.6])  # Wanted direction in which the tool points.
 # Least wanted singular value of the tool's Jacobian, whose lengths are divided by the reach of the arm.
 _LEAST_GAIN = 0.15
-_BORNE = 0.7  # Share of the torque limits that gravity may need.
+_BORNE = 0.7  # Share of the torque limits that gravity may require.
 _ROOM = 0.04  # Wanted distance of a pair in addition to the distance that it keeps [m].
 _BELOW = 0.16  # Wanted additional distance between the tool and the floor [m]. Scripted hands move down by less.
 _NEEDED = 0.005  # Required additional distance [m].

@@ -21,7 +21,7 @@ _OUTERMOST_FIRST = list(LinkClass)
 
 @dataclass(frozen=True, slots=True)
 class KeptDistances:
-    """The distances of all pairs, in the order of ``Robot.distances``."""
+    """The distances that pairs have to keep. The monitored pairs of a robot are in the order of ``Robot.distances``."""
 
     values: Array  # Kept distances (p,) [m]. For a pair that may touch: minus the depth to which the reference may go.
     keys: tuple[str, ...]  # Keys in the block ``control``, such as min_distance, distances.arm_arm or pairs[0].
@@ -36,7 +36,7 @@ def kept_distances(robot: Robot, settings: ControllerSettings) -> KeptDistances:
     on the reference's path.
 
     Raises:
-        ConfigError: If no monitored pair has a name in ``settings.pairs`` or ``settings.contact_allowed``, or if
+        ConfigError: If an entry of ``settings.pairs`` or ``settings.contact_allowed`` matches no monitored pair, or if
             ``settings.jerk_limit`` does not fit the robot.
     """
     return _of_all_pairs(robot, settings)[0]
@@ -73,7 +73,7 @@ def too_close_at_home(robot: Robot, kept: KeptDistances, *, remedies: bool = Fal
 
 
 def _of_all_pairs(robot: Robot, settings: ControllerSettings) -> tuple[KeptDistances, KeptDistances, KeptDistances]:
-    """Return the distances of the monitored pairs, of the pairs of objects, and of those of moving obstacles."""
+    """Return the distances of three groups of pairs: of the robot, of held objects, and of moving obstacles."""
     geometry = with_obstacle_bodies(robot, settings.moving_obstacles)
     names = pair_names(geometry)
     roles = roles_with_obstacles(robot, settings.moving_obstacles)
@@ -90,7 +90,8 @@ def _of_all_pairs(robot: Robot, settings: ControllerSettings) -> tuple[KeptDista
     speed = np.full(len(names), np.inf)
     count = len(robot.collision_model.collisionPairs)
     last = count + len(robot.objects.holders)
-    for i, contact in enumerate(settings.contact_allowed):  # Distances of held objects may be negative anyway.
+    # Pairs of held objects need no contact_allowed, because the distances that they keep may be negative anyway.
+    for i, contact in enumerate(settings.contact_allowed):
         for p in _found(f"contact_allowed[{i}]", contact.pair, names[:count]):
             values[p], keys[p], speed[p] = -contact.depth, f"contact_allowed[{i}]", contact.speed
     values += average_allowance(robot, settings, geometry)
@@ -109,7 +110,7 @@ def pair_class(first: Role, second: Role) -> str:
 
 
 def _found(key: str, patterns: tuple[str, str], names: tuple[tuple[str, str], ...]) -> list[int]:
-    """Return the numbers of the pairs that match ``patterns``."""
+    """Return the indices of the pairs that match ``patterns``."""
     one, two = patterns
     found = [p for p, (a, b) in enumerate(names) if (_is(one, a) and _is(two, b)) or (_is(one, b) and _is(two, a))]
     if not found:

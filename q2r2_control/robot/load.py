@@ -40,7 +40,7 @@ class LoadReport:
 
     @property
     def is_judged(self) -> bool:
-        """Whether a load explains the torques."""
+        """Whether :meth:`check` judges the load. With MODEL it does so only if some load explains the torques."""
         return self.against == PENDANT or self.residual_nm <= _EXPLAINED
 
     def check(self) -> None:

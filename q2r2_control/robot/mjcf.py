@@ -1,7 +1,7 @@
-"""Write the robot of an MJCF file as a URDF. It describes the model that MuJoCo compiles from the file.
+"""Write the robot of an MJCF file as a URDF. The URDF describes the model that MuJoCo compiles from the file.
 
-MJCF has no limits of speed, and so the caller gives them. The scene around the robot and everything that moves freely
-in it are left out. Kinematic loops that constraints close stay open.
+MJCF has no speed limits, and so the caller gives them. The scene around the robot is left out, and so is everything
+that moves freely in the scene. Kinematic loops that constraints close stay open.
 """
 
 from __future__ import annotations
@@ -197,7 +197,7 @@ class _Writer:
         touching = [g for g in geoms if model.geom_contype[g] or model.geom_conaffinity[g] or g in paired]
         for g in geoms:
             at = within.inverse() * _pose(model.geom_pos[g], model.geom_quat[g])
-            # A body without a shape that may touch something would not be watched. All its drawn shapes then count.
+            # A body without a shape that may touch something would not be watched. All its shapes then count.
             if g in touching or not touching:
                 self._add_shape(link, "collision", g, at)
             if g not in touching:

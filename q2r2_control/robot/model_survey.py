@@ -101,7 +101,7 @@ def gripper_of(description: Description, tree: LinkTree, tip: str) -> dict[str, 
     driven = [name for name, joint in beyond.items() if mimic_of(joint) is None and joint.get("type") != "floating"]
     if not driven:
         return {}
-    # A cell drives all finger joints alike, and so only joints with the same travel are taken: the most frequent one.
+    # A cell drives all finger joints alike. Therefore only the joints with the most frequent travel are taken.
     travels = [joint_limits(beyond[name]) for name in driven]
     ends = max(travels, key=travels.count)
     driven = [name for name, travel in zip(driven, travels, strict=True) if travel == ends]

@@ -31,8 +31,8 @@ Pair = tuple[str, str]  # The names of two bodies or of two links.
 def spreads_of(robot: Robot, pairs: Sequence[Pair]) -> dict[Pair, Interval]:
     """Return the least and the greatest distance of pairs of links [m], at home and in random postures.
 
-    The postures are always the same. ``pairs`` are the names of bodies, watched or not. Bodies of the same two links
-    count together, and so the keys are pairs of links.
+    The postures are always the same. ``pairs`` are the names of bodies, whose pairs need not be monitored. Bodies of
+    the same two links count together, and so the keys are pairs of links.
     """
     geometry = robot.collision_model.copy()
     geometry.removeAllCollisionPairs()
@@ -61,15 +61,15 @@ class NearPair(NamedTuple):
     key: str  # The key in the block ``control`` that names this distance.
 
 
-class _Ways(NamedTuple):
+class _Remedies(NamedTuple):
     """Possible remedies for a pair that belongs to one robot."""
 
     links: Pair
-    can_be_apart: bool  # True if the pair has its required distance in at least one posture.
+    can_be_apart: bool  # True if the pair has its required distance in at least one of the examined postures.
     nearer: float | None  # A smaller distance that control.pairs could name instead [m]; None if there is none.
 
 
-def _ways_out(robot: Robot, pair: NearPair) -> _Ways | None:
+def _remedies_of(robot: Robot, pair: NearPair) -> _Remedies | None:
     """Return the remedies for a pair.
 
     Returns None for bodies of two arms, for obstacles and for the floor, because these have to keep their distance.
@@ -79,20 +79,20 @@ def _ways_out(robot: Robot, pair: NearPair) -> _Ways | None:
         return None
     least, greatest = spreads_of(robot, [pair.names])[links]
     nearer = _whole_millimetres(pair.distance if greatest >= pair.kept else least)
-    return _Ways(links, greatest >= pair.kept, nearer if nearer >= 0.0 else None)
+    return _Remedies(links, greatest >= pair.kept, nearer if nearer >= 0.0 else None)
 
 
 def remedy(robot: Robot, pair: NearPair) -> str:
     """Return a text with the changes that make a near ``pair`` allowed, such as another home."""
     if FLOOR in map(link_of, pair.names):
         return "the key floor takes another height, or null for no floor"
-    ways = _ways_out(robot, pair)
-    if ways is None:
+    remedies = _remedies_of(robot, pair)
+    if remedies is None:
         return "to change: another home"
-    by_name = "" if ways.nearer is None else f"control: {{pairs: [{_pair_entry(ways.links, ways.nearer)}]}}"
-    if ways.can_be_apart:
+    by_name = "" if remedies.nearer is None else f"control: {{pairs: [{_pair_entry(remedies.links, remedies.nearer)}]}}"
+    if remedies.can_be_apart:
         return f"to change: {', or '.join(filter(None, ('another home', by_name)))}"
-    in_file = f"a file for srdf, such as q2r2 check --pairs writes, with the line {_srdf_line(ways.links)}"
+    in_file = f"a file for srdf, such as q2r2 check --pairs writes, with the line {_srdf_line(remedies.links)}"
     return f"they hardly part anywhere; to change: {', or '.join(filter(None, (by_name, in_file)))}"
 
 
@@ -103,11 +103,11 @@ def lines_to_paste(robot: Robot, config: Config, near: Iterable[NearPair]) -> li
     """
     nearer: dict[Pair, float] = {}
     disabled: dict[Pair, str] = {}
-    for ways in (_ways_out(robot, pair) for pair in near):
-        if ways is not None and ways.nearer is not None:
-            nearer[ways.links] = min(ways.nearer, nearer.get(ways.links, math.inf))
-        elif ways is not None and not ways.can_be_apart:
-            disabled[ways.links] = f"  {_srdf_line(ways.links)}"
+    for remedies in (_remedies_of(robot, pair) for pair in near):
+        if remedies is not None and remedies.nearer is not None:
+            nearer[remedies.links] = min(remedies.nearer, nearer.get(remedies.links, math.inf))
+        elif remedies is not None and not remedies.can_be_apart:
+            disabled[remedies.links] = f"  {_srdf_line(remedies.links)}"
     entries = [f"    - {_pair_entry(links, least)}" for links, least in nearer.items() if links not in disabled]
     lines = []
     if entries:
@@ -163,7 +163,7 @@ def warning_at_home(
     more = f"; and {len(lines) - _NAMED} more" if len(lines) > _NAMED else ""
     text = f"{robot.name}: at home, with min_distance {1e3 * kept:g} mm: {'; '.join([*lines.values()][:_NAMED])}{more}"
     if elsewhere := len(never) < len(lines):
-        # Pairs that overlap at this home are watched with a home at which they do not overlap.
+        # Pairs that overlap at this home are not watched. With a home at which they do not overlap, they are watched.
         hardly = [links for links, (least, greatest) in spreads.items() if least < 0.0 <= greatest < kept]
         never += [links for links in hardly if links not in never]
     # With an SRDF, links that overlap at home are no longer left out automatically.

@@ -35,12 +35,12 @@ class KnownParts:
 
     finger_joints: Mapping[str, tuple[str, ...]] = field(default_factory=dict)  # Joints of the fingers, by arm.
     tool_links: Mapping[str, tuple[str, ...]] = field(default_factory=dict)  # Links of the tool, by arm.
-    obstacles: tuple[str, ...] = ()  # Names of links.
+    obstacles: tuple[str, ...] = ()  # Links that are obstacles.
     # Positions of the finger joints with the gripper closed and open [m or rad], by arm.
     strokes: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     # Greatest number of capsules for each mesh, by link. The default is one.
     capsules: Mapping[str, int] = field(default_factory=dict)
-    # For each link beside an arm that follows the arm, such as a bar of a parallelogram: the joint that it follows.
+    # Links beside an arm that follow the arm, such as a bar of a parallelogram. The value is the joint that it follows.
     following: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
@@ -114,11 +114,11 @@ def hand_links(tree: LinkTree, finger_joints: Iterable[str]) -> set[str]:
     return {link for link in tree.joint_to if palms & set(tree.path(link))}
 
 
-# Links that always stay farther apart than this distance need no watching. It is more than twice the distance that is
-# usually kept [m].
+# Links that always stay farther apart than this distance [m] need no watching. The distance is more than twice as large
+# as the distance that pairs usually keep.
 CLEARANCE = 0.05
-# Links and shapes whose names end in this way stand for a whole tool at every opening. Their distances are watched, but
-# they have no contacts in the simulation.
+# Links and shapes whose names end with this text stand for a whole tool at every opening. Their distances are watched,
+# but they have no contacts in the simulation.
 ENVELOPE = "_envelope"
 
 
@@ -138,7 +138,7 @@ def add_movable_pairs(model: pin.Model, geometry: pin.GeometryModel, tree: LinkT
 
     Neighbours are bodies with one joint between them. Fixed parts such as a tool belong to the body that carries them.
     For Pinocchio everything that is fixed in the world is one body, although a table is no neighbour of an arm's first
-    link. In the world, only the link that carries the joint is a neighbour.
+    link. Of the links that are fixed in the world, only the link that carries the joint counts as a neighbour.
     """
     carrier = {joint.get("name", ""): joint_end(joint, "parent") for joint in tree.joint_to.values()}
     geometry.removeAllCollisionPairs()

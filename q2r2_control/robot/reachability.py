@@ -1,8 +1,8 @@
 """Find by sampling which monitored pairs can meet inside the joint limits, and write the SRDF that excludes the others.
 
-A sample can show that two bodies can come near, but never that they cannot. If no sample shows it, the search follows
-the nearest postures downhill. A pair is out of reach only if it stays farther apart than a clearance, which is much
-greater than the distance that pairs keep.
+A sample can show that two bodies can come near, but never that they cannot. If no sample shows it, the search descends
+along the gradient of the distance from the nearest samples. Two bodies count as unable to meet only if they stay
+farther apart than a clearance, which is much greater than the distance that pairs keep.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ from q2r2_control.robot.pairs import distance_gradient, link_of, pair_names
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
-# A function that is called with the progress of a search: what it does, how much of it is done, and how much there is.
+# A function that is called with the progress of a search. Its arguments are: the name of the present stage; the number
+# of its postures or pairs that are done; the number of all its postures or pairs.
 Progress = Callable[[str, int, int], None]
 
 _STARTS = 8  # Number of nearest samples of each pair that are followed downhill.

@@ -76,13 +76,13 @@ class Robot:
     Make it by :meth:`from_config` or :meth:`from_urdf`. All arrays are (nv,) in the order of ``model``'s velocity,
     which is the order of ``joint_names``. Positions are in [rad], velocities in [rad/s] and torques in [Nm]; for
     prismatic joints they are in [m], [m/s] and [N]. ``acceleration_limit`` is infinite for joints without such a limit
-    in the model. :meth:`capped_acceleration` returns the limits that hold.
+    in the model. :meth:`capped_acceleration` returns the limits that a controller uses.
 
     ``collision_model`` holds exactly the monitored pairs. Each arm has pairs with the other arm and its base, with its
     own links that it can meet, and with obstacles. Every monitored shape is a capsule, a sphere, or a box fixed in the
-    world. The body of a finger is the volume that it sweeps. ``finger_bodies`` tells its part at a known opening.
-    ``objects`` are the objects that grippers hold, in addition to the collision model. ``ignored_pairs`` are pairs of
-    one arm's shapes that overlap by construction.
+    world. The body of a finger is the volume that it sweeps. ``finger_bodies`` compute the smaller bodies that replace
+    such bodies while a gripper's opening is known. ``objects`` are the objects that grippers hold, in addition to the
+    collision model. ``ignored_pairs`` are pairs of one arm's shapes that overlap by construction.
 
     Attributes:
         name: Name of the URDF.
@@ -106,7 +106,7 @@ class Robot:
     def __new__(cls, urdf: ET.Element | None = None, *_: object, **__: object) -> Self:
         """Refuse a first argument that is no parsed URDF, before Python counts the arguments.
 
-        The error then names the right constructors. Python makes a copy of a robot without any argument.
+        The error then names the right constructors. When Python copies a robot, it calls this method without arguments.
         """
         if not isinstance(urdf, ET.Element | None):
             raise RobotError(
@@ -319,7 +319,7 @@ class Robot:
             remove_disabled_pairs(self.collision_model, exclusions)
         postures = [self.home]
         if exclusions is not None:
-            # The SRDF is trusted. Only pairs that overlap everywhere are dropped, because nothing can part them.
+            # The SRDF is trusted. Only pairs that overlap in all postures are dropped: no motion separates them.
             random = np.random.default_rng(0)
             postures += [random.uniform(self.position_lower, self.position_upper) for _ in range(50)]
         return remove_overlapping_own_pairs(self.model, self.collision_model, own_links, postures)
@@ -383,7 +383,7 @@ def _home_of(urdf: ET.Element, given: Mapping[str, float], where: str) -> dict[s
 
 
 def _text_of(path_or_text: str | os.PathLike[str], name_of_text: str) -> tuple[str, str, Path | None]:
-    """Return the text, its name in errors, and the folder of its file; None if it came from no file."""
+    """Return the text, its name in errors, and the folder of its file. The folder is None if there is no file."""
     if not isinstance(path_or_text, str | os.PathLike):
         raise RobotError(f"{shown(path_or_text)}: neither {name_of_text} nor the path of a file")
     if isinstance(path_or_text, str) and path_or_text.lstrip().startswith("<"):

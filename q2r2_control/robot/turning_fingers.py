@@ -40,7 +40,8 @@ import numpy as np
 from q2r2_control.types import ALL_OF_THE_WAY, Array, Interval
 
 _REMAINDER = 5e-5  # The wanted error of the interpolation. The steps are made short enough for it [m].
-# Greatest number of samples of all driven joints of a chain together. If more were needed, the error is greater.
+# Greatest number of samples of all driven joints of a chain together. If more samples were needed for the wanted error,
+# the error is greater.
 _MOST_SAMPLES = 512
 _ROUNDING = 1e-9  # Addition to radii for the rounding of numbers [m].
 # Both ends of a segment are pulled in by these multiples of the radius that its capsule needs without the shape's own

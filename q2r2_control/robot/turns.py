@@ -1,8 +1,8 @@
 """Count the turns of continuous joints, whose angle may be reported within one turn, as in (-pi, pi].
 
-If the angle jumps by a whole turn between two reports, the joint has not jumped. This is certain while it cannot have
-turned by half a turn between them. Reports that count turns themselves do not change. The same holds for the first
-report, and for a report after a longer gap.
+If the angle jumps by a whole turn between two reports, the joint has not jumped. This is certain if the joint cannot
+have turned by half a turn between the two reports. Reports that count turns themselves are not changed. The first
+report is not changed either, nor is a report after a longer time.
 """
 
 from __future__ import annotations
@@ -45,7 +45,10 @@ class TurnCounter:
         return q
 
     def of_state(self, state: RobotState) -> RobotState:
-        """Return the state with the positions of :meth:`counted`, and the held posture within half a turn of them."""
+        """Return the state with positions as :meth:`counted` returns them.
+
+        The held posture gets as many turns as bring it within half a turn of these positions.
+        """
         q, held = self.counted(state.q, state.stamp), state.held
         if held is not None and len(joints := self._joints):
             held = held.copy()

@@ -1,4 +1,4 @@
-"""Make the elements of URDF and SRDF of which a cell consists, by renaming others or from a configuration."""
+"""Make the URDF and SRDF elements of a cell: rename elements of models, or build them from the configuration."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ ATTRIBUTES = (ACCELERATION, "deceleration", "{http://drake.mit.edu}acceleration"
 
 
 def mimic_of(joint: ET.Element) -> tuple[str, float, float] | None:
-    """Return the joint that this one follows, the multiplier and the offset; None if it follows no joint."""
+    """Return the name of the joint that ``joint`` mimics, the multiplier and the offset; None if it mimics no joint."""
     if (mimic := joint.find("mimic")) is None:
         return None
     return mimic.get("joint", ""), float(mimic.get("multiplier", "1")), float(mimic.get("offset", "0"))

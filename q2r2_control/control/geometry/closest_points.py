@@ -126,7 +126,7 @@ def segment_box(a0: Array, a1: Array, half: Array, on_a: Array, on_box: Array, n
 
 @kernel
 def _slope_along(a0: Array, a1: Array, half: Array, s: float) -> float:
-    """Return half the derivative of the squared distance at the parameter s."""
+    """Return half the derivative of the squared distance with respect to the parameter, at the parameter ``s``."""
     slope = 0.0
     for k in range(3):
         direction = a1[k] - a0[k]
@@ -139,9 +139,9 @@ def _slope_along(a0: Array, a1: Array, half: Array, s: float) -> float:
 def _minimum_along(a0: Array, a1: Array, half: Array) -> float:
     """Return the parameter s at which the distance is least; the middle if it is least on an interval.
 
-    It is least on an interval if the segment runs along a face. A break is a parameter at which the segment crosses the
-    plane of a face. The slope never falls with s. The largest break with a negative slope and the smallest break with a
-    positive slope therefore enclose all minima. Between them, the slope is zero at every break.
+    It is least on an interval if the segment runs along a face. A crossing is a parameter at which the segment crosses
+    the plane of a face. The slope never falls with s. The largest crossing with a negative slope and the smallest
+    crossing with a positive slope therefore enclose all minima. At every crossing between these two, the slope is zero.
     """
     low, low_slope = 0.0, _slope_along(a0, a1, half, 0.0)
     high, high_slope = 1.0, _slope_along(a0, a1, half, 1.0)
@@ -216,8 +216,8 @@ def _push_out(a0: Array, a1: Array, half: Array, on_a: Array, on_box: Array, nor
 def _depth_across(a0: Array, a1: Array, half: Array, k: int, least: float, normal: Array) -> float:
     """Return how far the segment has to move to leave the box across an edge that is parallel to the axis ``k`` [m].
 
-    Infinite if the segment itself is parallel to this axis. ``normal`` is written. It points from the segment into the
-    box.
+    The result is infinite if the segment itself is parallel to this axis. ``normal`` is written. It points from the
+    segment into the box.
     """
     i, j = (k + 1) % 3, (k + 2) % 3
     # The translation is along the cross product e_k x (a1 - a0).
@@ -234,9 +234,9 @@ def _depth_across(a0: Array, a1: Array, half: Array, k: int, least: float, norma
 
 @kernel
 def _across_edge(a0: Array, a1: Array, half: Array, k: int, on_a: Array, on_box: Array, normal: Array) -> None:
-    """Write the closest points of the segment and the edge across which it leaves the box, against ``normal``.
+    """Write the closest points of the segment and of the edge across which the segment leaves the box.
 
-    The edge is parallel to the axis ``k``.
+    The segment moves against ``normal``. The edge is parallel to the axis ``k``.
     """
     i, j = (k + 1) % 3, (k + 2) % 3
     for axis in (i, j):

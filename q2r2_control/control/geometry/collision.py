@@ -95,10 +95,12 @@ class CollisionData(NamedTuple):
 
 
 def collision_model_of(robot: Robot, geometry: pin.GeometryModel | None = None) -> CollisionModel:
-    """Return the joints, bodies and pairs of a robot, or of a ``geometry`` that begins with the robot's.
+    """Return the joints, bodies and pairs of a robot.
+
+    If ``geometry`` is given, its bodies and pairs are used. It begins with the robot's own bodies and pairs.
 
     Raises:
-        RobotError: If no kernel handles a joint, a shape or a pair.
+        RobotError: If the kernels cannot handle a joint, the shape of a body, or a pair.
     """
     geometry = robot.collision_model if geometry is None else geometry
     chain, bodies = chain_of(robot.model), bodies_of(geometry)

@@ -29,7 +29,7 @@ _REMEMBERED = 16
 
 
 class FingerOpenings:
-    """The interval of openings of each arm's gripper. At first, it is the whole interval."""
+    """The interval of openings of each arm's gripper. At first, it is the whole interval from closed to open."""
 
     def __init__(self, robot: Robot, bodies: CollisionBodies) -> None:
         """Begin with the ``bodies`` of ``robot``, in which fingers sweep their whole path."""
@@ -96,7 +96,7 @@ class _Turning:
         self._capsules = lru_cache(maxsize=_REMEMBERED)(TurningSweeps([body for _, body in found]).capsules)
 
     def set(self, interval: Interval, grown: IntArray) -> None:
-        """Set the capsules for ``interval``, and mark in ``grown`` (g,) the bodies that exceed their last volume."""
+        """Set the capsules for ``interval``. In ``grown`` (g,), mark bodies that are not within their last volume."""
         bodies, at = self._bodies, self._indices
         capsules = self._all if interval == ALL_OF_THE_WAY else self._capsules(interval)
         changed = sticks_out(capsules, self._now())

@@ -1,7 +1,8 @@
-"""Forward kinematics of a tree of one-axis joints (compiled). It equals Pinocchio's, without the overhead of calls.
+"""Forward kinematics of a tree of one-axis joints (compiled). The results equal those of Pinocchio.
 
-The roll-out of a stop needs the placements of the links at many configurations in each tick. For that reason this part
-of Pinocchio is written again here. A test compares it with Pinocchio for every robot.
+The roll-out of a stop needs the placements of the links at many configurations in each tick. Calls of Pinocchio would
+take too long. For that reason this part of Pinocchio is written again here. A test compares it with Pinocchio for every
+robot.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ class Placements(NamedTuple):
 
     rotation: Array  # (n, 3, 3)
     translation: Array  # (n, 3) [m]
-    axis: Array  # (n, 3)
+    axis: Array  # (n, 3) Unit axis of each joint in the world frame.
 
     @classmethod
     def empty(cls, chain: Chain) -> Placements:

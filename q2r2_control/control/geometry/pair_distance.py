@@ -142,7 +142,10 @@ def _any_normal(a0: Array, a1: Array, b0: Array, b1: Array, normal: Array) -> No
 
 @kernel
 def distance_row(model: CollisionModel, data: CollisionData, p: int, row: Array) -> None:
-    """Write the gradient of pair ``p``'s last distance with respect to q into ``row`` (nv,) [m/rad]."""
+    """Write the gradient of pair ``p``'s distance with respect to q into ``row`` (nv,) [m/rad].
+
+    The pair has to be the one that was measured last in ``data``.
+    """
     chain, pairs, placements, contact = model.chain, model.pairs, data.placements, data.contact
     row[:] = 0.0
     nx, ny, nz = contact.normal[0], contact.normal[1], contact.normal[2]

@@ -26,7 +26,8 @@ before, so a growing window needs no proof.
 
 Most pairs need no plane. Compare each joint with a motion v t at its present velocity. In the window it deviates from
 this motion by at most e_j, which is known; in the step and the stop it deviates by at most rho_j (speed_bound.py). A
-body therefore comes closer by at most its own speed times the longer of both times, plus the effect of the deviations.
+body therefore comes closer by at most its own speed times a time, plus the effect of the deviations. This time is the
+window or, if that is longer, h + T / 2 for a step of h and a stop of T.
 """
 
 from __future__ import annotations
@@ -48,8 +49,8 @@ _STOP_SPACING = 0.015  # Longest time between two examined instants of a stop [s
 def write_way(model: SafetyModel, data: SafetyData, h: float, duration: float) -> None:
     """Write bounds on the motion of all joints along the whole path: window, step and stop.
 
-    Call :func:`look_back` before, and the functions of the other proofs that write the data of the step and the stop.
-    The step takes ``h`` [s], and the stop takes ``duration`` [s].
+    The step takes ``h`` [s], and the stop takes ``duration`` [s]. Before this function, call :func:`look_back`,
+    :func:`write_step` and :func:`write_deviations`.
     """
     history, v, v_next, candidate = data.history, data.state.v, data.candidate.v, data.candidate
     last = data.rollout.q.shape[0] - 1
@@ -68,9 +69,9 @@ def write_way(model: SafetyModel, data: SafetyData, h: float, duration: float) -
 
 @inlined_kernel
 def _stride(data: SafetyData, duration: float, finely: bool) -> int:
-    """Return how many samples a stop that takes ``duration`` [s] has from one examined instant to the next.
+    """Return the difference between the indices of two neighbouring samples of the stop that are both examined.
 
-    With ``finely``, four times as many instants are examined.
+    The stop takes ``duration`` [s]. With ``finely``, four times as many samples are examined.
     """
     stride = data.rollout.q.shape[0] - 1
     while stride > 1 and duration * stride / (data.rollout.q.shape[0] - 1) > _STOP_SPACING:
@@ -80,7 +81,7 @@ def _stride(data: SafetyData, duration: float, finely: bool) -> int:
 
 @inlined_kernel
 def is_far(model: SafetyModel, data: SafetyData, p: int, time: float) -> bool:
-    """Return whether pair ``p`` is so far apart that it keeps its distance wherever on its path each arm is.
+    """Return whether pair ``p`` is so far apart that it keeps its distance at all points of both arms' paths.
 
     The last paragraph of this module's docstring has the proof. ``time`` is h + T / 2 [s], the time that counts for the
     step and the stop. Call :func:`write_way` before.
@@ -116,7 +117,10 @@ def keeps_apart_at_any_time(model: SafetyModel, data: SafetyData, p: int, durati
 def _lowest_on_way(
     model: SafetyModel, data: SafetyData, body: int, side: float, duration: float, finely: bool
 ) -> float:
-    """Return the least coordinate of a ``body``'s core along ``side`` times the normal, over all instants [m]."""
+    """Return the least coordinate of a ``body``'s core along ``side`` times the normal on the arm's whole path [m].
+
+    ``side`` is 1 or -1. The path is examined at single instants, more closely with ``finely``.
+    """
     collision, bodies, history = model.collision, model.collision.bodies, data.history
     normal = data.collision.contact.normal
     lowest = _lowest(bodies, data.collision.posed, body, side, normal)
@@ -136,7 +140,7 @@ def _lowest_on_way(
 
 @inlined_kernel
 def _lowest(bodies: CollisionBodies, posed: BodyPlacements, body: int, side: float, normal: Array) -> float:
-    """Return the least coordinate of a body's core along ``side`` times ``normal`` (3,) [m]."""
+    """Return the least coordinate of a body's core along ``side`` times ``normal`` (3,), for a given posture [m]."""
     start, end, beside = 0.0, 0.0, 0.0
     for k in range(3):
         start += side * normal[k] * posed.start[body, k]

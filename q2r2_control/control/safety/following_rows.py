@@ -1,13 +1,13 @@
-"""Write the rows of the QP for an arm that follows another arm. The arm in front may stop alone (arm_skew.py).
+"""Write the rows of the QP for an arm that moves behind another arm, in the same direction.
 
-The arm in front may still be at the posture that the reference had a window D [s] ago. Let n be the normal of a pair.
-Along n, the arm behind has the free distance
+The arm in front may stop alone (arm_skew.py). It may also still be at the posture that the reference had a window D [s]
+ago. Let n be the normal of a pair. Along n, the arm behind has the free distance
 
     B = d - min_distance - buffer - n'(motion of the front arm in the window) - n'(motion of the arm behind in a stop).
 
-As in separation_rows.py, a step may use up only a share of B: B+ >= (1 - gain h) B. The present motion of the arm in
-front counts only after D. In a step, B therefore changes by the motion that the arm in front had D ago, and by the
-present motion of the arm behind.
+As in separation_rows.py, a step may use up only a share of B. After the step, B has to be at least (1 - gain h) times
+its value before. The present motion of the arm in front counts only after D. In a step, B therefore changes by the
+motion that the arm in front had D ago, and by the present motion of the arm behind.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from q2r2_control.control.safety.safety_data import SafetyData, SafetyModel
 def append_following_row(
     model: SafetyModel, data: SafetyData, p: int, h: float, duration: float, gain: float, count: int
 ) -> int:
-    """Add the row of pair ``p`` of two arms if one arm follows the other arm and the row may bind.
+    """Add the row of pair ``p`` of two arms if one arm moves behind the other arm and the row may bind.
 
     Args:
         model: The model.

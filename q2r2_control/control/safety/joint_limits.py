@@ -34,7 +34,8 @@ from q2r2_control.control.jit import kernel
 from q2r2_control.types import Array
 
 _RETURN_GAIN = 4.0  # Inward speed per radian outside of the limit [1/s].
-_RETURN_DEPTH = 1e-3  # The return aims this far inside, so that it ends after a finite time [rad].
+# A joint beyond its limit is moved to this far inside of the limit, so that it crosses the limit in finite time [rad].
+_RETURN_DEPTH = 1e-3
 
 NO_LIMIT, POSITION, VELOCITY, ACCELERATION = 0, 1, 2, 3  # The kinds of limits that hold a joint back.
 
@@ -56,7 +57,7 @@ class VelocityBox(NamedTuple):
     lower: Array  # (nv,) [rad/s]
     upper: Array  # (nv,) [rad/s]
     lower_limit: IntArray  # (nv,) POSITION, VELOCITY or ACCELERATION.
-    upper_limit: IntArray  # (nv,)
+    upper_limit: IntArray  # (nv,) POSITION, VELOCITY or ACCELERATION.
 
     @classmethod
     def empty(cls, nv: int) -> VelocityBox:

@@ -39,11 +39,12 @@ from q2r2_control.types import Array
 
 # R [s]. A newer report counts as this old, so that the kept distance does not jump if reports come more often.
 REPORT_AGE = 0.1
-# Least value of T_0 if all reports are new, which it has if arms are close to an obstacle [s].
+# Least value of T_0 while all reports are new [s]. T_0 has this value if arms are close to an obstacle.
 _LEAST_STOP = 0.05
 _LOST = 0.5  # If a report is older than this, it does not tell which motion leads away from the obstacle [s].
 _SHARE = 0.5  # Share of the free distance to an obstacle that the obstacle's reach may take.
-# A row asks a pair that is too close to open by at most this [m]. The arms are then not pushed, and can still leave.
+# If a pair with an obstacle is too close, its row asks for an increase of the distance by at most this [m]. The row
+# does not push the arms, but they can still move away.
 _OPENING = 1e-4
 
 
@@ -89,7 +90,7 @@ def keep_clear(
                 _measure(model, data, obstacles, p)  # A lower bound of the distance does not suffice here.
                 stop_time = _stop_time(data, obstacles, o, p)
                 wanted = min(wanted, stop_time)
-                if age > _LOST:  # The time until the obstacle may have used up the whole room.
+                if age > _LOST:  # The time until the obstacle may have used up the whole free distance.
                     least_stop = min(least_stop, max((stop_time + age) / _SHARE - age, 0.0))
     known = obstacles.stop_time[0]
     time = min(max(wanted, least_stop, known - h), known + h, longest)
@@ -140,8 +141,8 @@ def _measure(model: SafetyModel, data: SafetyData, obstacles: ObstacleData, p: i
 def _stop_time(data: SafetyData, obstacles: ObstacleData, o: int, p: int) -> float:
     """Return the largest T_0 with which the reach of obstacle ``o`` takes only its share of the free distance [s].
 
-    The free distance is that of the obstacles' pair ``p``. Infinite if this pair does not count now, or if the obstacle
-    does not move.
+    The free distance is that of the obstacles' pair ``p``. T_0 is infinite if this pair does not count now, or if the
+    obstacle does not move.
     """
     if obstacles.kept[p] == -np.inf or obstacles.speed[o] == 0.0:
         return np.inf

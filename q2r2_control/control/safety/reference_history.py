@@ -13,7 +13,7 @@ from q2r2_control.control.kernel_pointers import KernelPointers, pointers_to
 from q2r2_control.types import Array
 
 LONGEST_WINDOW = 0.1  # The longest time for which past postures are kept [s].
-_POSTURES = 21
+_POSTURES = 21  # Number of past postures that are kept.
 _SPACING = LONGEST_WINDOW / (_POSTURES - 1)  # Time between two postures, if steps are not longer [s].
 _LONG_AGO = 1e3  # The age of the postures of arms that have always rested [s].
 
@@ -26,18 +26,20 @@ class ReferenceHistory(NamedTuple):
     v: Array  # (m, nv) [rad/s]
     a: Array  # (m, nv) Greatest acceleration from each posture to the next newer one [rad/s^2].
     age: Array  # (m,) Age of each posture [s].
-    known: Array  # (m,) 1 if the bodies of a posture are placed.
+    known: Array  # (m,) 1 if ``samples`` contains the poses of the bodies at a posture, 0 if they are not computed yet.
     samples: KernelPointers  # (m,) CollisionData at each posture.
     counted: IntArray  # (1,) Number of postures in the window.
     time: Array  # (1,) Age of the oldest posture in the window [s].
     travel: Array  # (nv,) Greatest distance of a joint in the window from its present position [rad or m].
-    off: Array  # (nv,) Greatest deviation of a joint from v t in the window, plus the effect of turning [rad or m].
+    # (nv,) Greatest deviation of a joint in the window from motion at its present velocity, plus the effect of turning
+    # [rad or m].
+    off: Array
     speed: Array  # (nv,) Greatest speed of a joint in the window [rad/s].
     # (3, nv) How much each joint makes a body's corner leave a straight line between two instants [rad or m]. The first
     # row is for the window. The second row is for the whole path with instants that are far apart, and the third row is
     # for the whole path with instants that are close together.
     bend: Array
-    deviation: Array  # (nv,) Greatest deviation from v t on the whole path, plus the effect of turning [rad or m].
+    deviation: Array  # (nv,) As ``off``, but on the whole path: window, step and stop [rad or m].
 
     @classmethod
     def empty(cls, model: CollisionModel, shared: CollisionData) -> ReferenceHistory:
@@ -123,7 +125,7 @@ def look_back(model: CollisionModel, history: ReferenceHistory, q: Array, v: Arr
         for j in range(q.shape[0]):
             later = v[j] if i == 0 else history.v[i - 1, j]
             moved |= history.v[i, j] != 0.0 or history.a[i, j] != 0.0 or later != 0.0
-        # Arms at rest have rested for the whole window.
+        # If the arms have not moved since a posture, its age counts only up to the window.
         age = history.age[i] if moved else min(history.age[i], max(newer, window))
         if moved:
             longest = max(longest, age - newer)
@@ -152,7 +154,7 @@ def look_back(model: CollisionModel, history: ReferenceHistory, q: Array, v: Arr
 def turning(model: CollisionModel, way: Array, j: int) -> float:
     """Return w_j (w_j + 2 sum_(i before j) w_i) for the motions w = ``way`` (nv,) of all joints.
 
-    Times reach_j, it bounds how much joint ``j`` bends the path of a corner, see separating_plane.py.
+    This number times reach_j bounds how much joint ``j`` bends the path of a corner, see separating_plane.py.
     """
     before = 0.0
     joint = model.chain.parent[j + 1]

@@ -45,9 +45,10 @@ class SafetyModel(NamedTuple):
 
 
 _SAMPLES = 65  # Number of samples of a stop, with both ends.
-# The samples of a stop for which the QP has rows: its start, about the middle of its path, and its end.
+# Indices of the samples of a stop for which the QP has rows: its start, about the middle of its path, and its end.
 INSTANTS = (0, 20, 64)
-# At each instant, a row for the closest points and four for segment ends. One more if an arm follows another arm.
+# A pair has at most one row for the closest points and four rows for ends of segments at each instant. It may have one
+# more row if one arm moves behind the other arm (following_rows.py).
 _ROWS_PER_PAIR = 5 * len(INSTANTS) + 1
 
 
@@ -96,10 +97,10 @@ class Rollout(NamedTuple):
     q: Array  # (s, nv)
     v: Array  # (s, nv)
     samples: KernelPointers  # (s,) CollisionData at each sample. They share the arrays of frame rotations and contact.
-    known: Array  # (s,) 1 if the bodies of the sample are placed.
+    known: Array  # (s,) 1 if the sample contains the poses of the bodies, 0 if they are not computed yet.
     step: QuadraticPiece  # The step from the reference to the candidate.
     stop: QuadraticPiece  # The motion of the joints from the candidate to rest.
-    piece: QuadraticPiece  # A part of the stop.
+    piece: QuadraticPiece  # The motion of the joints in a part of the stop.
     # (nv,) Bound on the deviation of each joint from motion along its present velocity: rho + kappa in speed_bound.py
     # [rad or m].
     deviation: Array

@@ -106,7 +106,7 @@ def certify_bodies(model: SafetyModel, data: SafetyData, grown: IntArray) -> int
     for p in range(pairs.first.shape[0]):
         if grown[pairs.first[p]] == 1 or grown[pairs.second[p]] == 1:
             any_grown = True
-            if data.distance[p] < model.min_distance[p]:  # No rounding is allowed, because the body need not grow.
+            if data.distance[p] < model.min_distance[p]:  # No rounding is tolerated: a body's growth can be refused.
                 return p
     stay_with_stop(data)
     if not any_grown or certify(model, data, 0.0):
@@ -137,7 +137,7 @@ def _largest_certified(model: SafetyModel, data: SafetyData, h: float) -> int:
         return FOLLOWED
     unproven = data.unproven[0]
     if unproven >= 0 and is_too_close(model, data, unproven) and not data.state.v.any():
-        return STOPPED  # From rest, a smaller motion would bring the pair closer too. Attempts take long.
+        return STOPPED  # From rest, a smaller motion would bring the pair closer too. To try it would take long.
     low, high = 0.0, 1.0
     for _ in range(_BISECTIONS):
         share = 0.5 * (low + high)
@@ -233,7 +233,7 @@ def _note_too_close(model: SafetyModel, data: SafetyData) -> None:
 
 @kernel
 def measure_pairs(model: SafetyModel, data: SafetyData) -> int:
-    """Measure the pairs at the reference; return the closest pair.
+    """Measure the pairs at the reference; return the index of the closest pair.
 
     ``data`` has to contain the placements and velocities of the bodies at the reference. ``data.distance`` gets the
     exact distance of the closest pair and of pairs whose rows may bind, and a lower bound for other pairs.
@@ -249,13 +249,13 @@ def measure_pairs(model: SafetyModel, data: SafetyData) -> int:
     fastest = 2.0 * fastest_body(data.velocities)
     for p in range(pairs.first.shape[0]):
         data.near[p] = 0
-        if model.min_distance[p] == -np.inf:  # Its object is not held, or its obstacle is not present.
+        if model.min_distance[p] == -np.inf:  # The pair's object is not held, or the pair's obstacle is not present.
             distance[p] = np.inf
             continue
         distance[p] = at_least(collision, data.collision, p)
-        # Let s be the greatest speed at which the pair can close in after this step. A stop of T uses up s T / 2 of the
-        # free distance. At the speed s a row binds below s / gain. A pair with more than s T / 2 + 2 s / gain gets no
-        # row. Rows are not needed for safety.
+        # Let s be the greatest speed at which the pair can close in after this step. A stop that takes T uses up
+        # s T / 2 of the free distance. At the speed s a row binds if the free distance is below s / gain. A pair whose
+        # free distance is more than s T / 2 + 2 s / gain gets no row. Rows are not needed for safety.
         always = approach.stop_distance[p] + approach.contact_zone[p] + horizon * pairs.leverage[p] * surge
         far = distance[p] >= least
         if far and distance[p] > always + horizon * fastest:

@@ -1,8 +1,8 @@
 """Prove with a plane between two bodies that they stay apart, if a bound from their distance is too weak (compiled).
 
 The bound S with the reach of joints (stop_certificate.py) treats every joint as if it moved one body straight towards
-the other body. A pair that rests at its min_distance could then never be proven to move apart again. Here the direction
-of motion counts.
+the other body. With that bound alone, a pair that rests at its min_distance could never be proven to move apart again.
+The bound of this module therefore takes the direction of motion into account.
 
 **Claim.** Let n be the unit normal of two convex cores that do not meet, and e_1 and e_2 their corners (the ends of a
 segment, the corners of a box). Let J_e be the Jacobian of a corner at the start, and r the joints' reach. If the joints
@@ -41,12 +41,13 @@ from q2r2_control.types import Array
 
 
 class Gap(NamedTuple):
-    """The share of a corner in the gap along the normal between the bodies, in a piece of motion and in the next piece.
+    """What a corner contributes to the gap between the bodies along the normal, in a piece of motion and the next one.
 
-    From its start, a piece changes the share by rate t + change t^2 / 2, and by ``loose`` or more.
+    From its start, a piece changes this share by rate t + change t^2 / 2, and by ``loose`` or more. Fields that begin
+    with ``then_`` belong to the next piece.
     """
 
-    now: float  # Share at the start of the piece [m].
+    now: float  # Share of the corner in the gap at the start of the piece [m].
     rate: float  # [m/s]
     change: float  # [m/s^2]
     loose: float  # Least change by joints that come to rest in the piece; 0 or negative [m].
@@ -131,7 +132,7 @@ def _gap(
     piece: QuadraticPiece,
     then: QuadraticPiece,
 ) -> Gap:
-    """Return the share of a ``corner`` (3,) in the gap. ``side`` is -1 if it is the first body's, 1 if the second's."""
+    """Return the share of a ``corner`` (3,) in the gap. ``side`` is -1 for a corner of the first body, else 1."""
     chain, pairs, placements, normal = model.chain, model.pairs, data.placements, data.contact.normal
     nx, ny, nz = side * normal[0], side * normal[1], side * normal[2]
     x, y, z = corner[0], corner[1], corner[2]

@@ -5,10 +5,10 @@ The rows tell the QP what the certified stop can do. Let B be the least free dis
     B = min over the stop of  d - min_distance - buffer.
 
 A step may use up only a share of B: B(q+, v+) >= (1 - gain h) B(q, v). This is a control barrier function that is built
-from a backup manoeuvre (Gurriet, Mote, Ames, Feron, CDC 2018). Motion that keeps its distance uses up nothing and is
-not slowed. Motion that closes in is slowed in time for the stop. The rows are linearised at those instants of the stop
-at which the free distance is least, or may soon be least, so that rows do not come and go from tick to tick. An instant
-with more free distance than B may use up the difference at 50 /s.
+from a backup manoeuvre (Gurriet, Mote, Ames, Feron, CDC 2018). A motion during which the pair's distance stays the same
+uses up nothing and is not slowed. A motion that brings the pair closer is slowed in time for the stop. The rows are
+linearised at those instants of the stop at which the free distance is least, or may soon be least, so that rows do not
+come and go from tick to tick. An instant with more free distance than B may use up the difference at 50 /s.
 
 A stop takes the time T. At its time t, joints that stop together have travelled v s, with s = t - t^2 / 2T. If the stop
 after the step takes T too, the step changes the posture at the time t by D q, and the row is
@@ -87,7 +87,7 @@ def write_separation_rows(model: SafetyModel, data: SafetyData, h: float) -> Non
         for i in range(len(INSTANTS)):
             t = duration * INSTANTS[i] / INSTANTS[-1]
             s = t - 0.5 * t * t / duration if duration > 0.0 else 0.0
-            # From rest, a step to v+ moves a joint by h v+ / 2, and the stop after it by as much again at most.
+            # From rest, a step to v+ moves a joint by h v+ / 2. The stop after this step moves it by at most h v+ / 2.
             lever = max(s, 0.5 * h) + 0.5 * h
             if data.rows.ahead[i] > least + _SAME_DISTANCE or (i > 0 and lever <= h):
                 continue

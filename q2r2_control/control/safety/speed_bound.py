@@ -1,4 +1,4 @@
-"""Bound from their present speeds how much closer two bodies come in a step and the stop after it (compiled).
+"""From the present speeds of two bodies, bound how much closer they come in a step and the stop after it (compiled).
 
 The bound S with the reach of joints (stop_certificate.py) treats every joint as if it moved one body straight towards
 the other body. For most pairs of two moving arms, a bound from the speeds of the bodies suffices. Joints that stop
@@ -151,9 +151,9 @@ def least_distance(model: SafetyModel, data: SafetyData, p: int, time: float) ->
 
 @inlined_kernel
 def way(model: SafetyModel, p: int, travel: Array) -> float:
-    """Return how far the bodies of pair ``p`` can move relative to each other [m].
+    """Return how far the bodies of pair ``p`` can move relative to each other if each joint moves [m].
 
-    Each joint travels ``travel`` (nv,) [rad or m].
+    ``travel`` (nv,) is how far each joint travels [rad or m].
     """
     pairs = model.collision.pairs
     total = 0.0

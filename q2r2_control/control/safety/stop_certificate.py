@@ -29,18 +29,20 @@ from q2r2_control.control.safety.separating_plane import stays_beyond
 from q2r2_control.control.safety.speed_bound import least_distance, way, write_deviations
 from q2r2_control.control.safety.stop_rollout import begin_rollout, sample_of, write_piece
 
-# Tolerances for a pair that is too close. The first is for its distance [m], and a relative one for times.
+# If the distance of a pair that is too close falls by less than this between two samples, the fall counts as rounding
+# [m]. The same number is a relative tolerance for times.
 _CLOSER = 1e-12
-_STILL = 1e-9  # Tolerance for its approach speed [m/s].
+_STILL = 1e-9  # If a pair that is too close approaches more slowly than this, it counts as standing still [m/s].
 _NOISE = 1e-15  # By rounding, two measurements of the same distance may differ by this [m].
-# Accuracy of the closest points of a box and a segment. The gap along the plane between both may be smaller than their
-# distance by this. Without the tolerance, a pair exactly at its distance could never be proven to move apart again.
+# Accuracy of the closest points of a box and a segment. The gap along the normal of the plane between the box and the
+# segment may be smaller than their distance by this. Without the tolerance, a pair that is exactly at its required
+# distance could never be proven to move apart again.
 _LAST_DIGITS = 1e-11  # [m]
 
 
 @kernel
 def step_travel(v: float, v_next: float, h: float) -> float:
-    """Return the distance that a joint travels in a step with constant acceleration; there and back both count."""
+    """Return how far a joint travels in a step with constant acceleration [rad or m]. Both directions add up."""
     if v * v_next >= 0.0:
         return 0.5 * abs(v + v_next) * h
     return 0.5 * (v * v + v_next * v_next) / (abs(v) + abs(v_next)) * h
@@ -52,7 +54,7 @@ def certify(model: SafetyModel, data: SafetyData, h: float) -> bool:
 
     ``data.distance`` has the distances at the reference or lower bounds of them. A bound that does not suffice is
     replaced by the distance. ``data.velocities`` has the velocities at the reference. A pair that is too close must not
-    come closer, at the end of the step and during the stop. ``data.unproven`` names the pair that failed.
+    come closer, at the end of the step and during the stop. ``data.unproven`` gets the index of the pair that failed.
     """
     duration = begin_rollout(data)
     write_step(data, h)
@@ -81,13 +83,16 @@ def certify(model: SafetyModel, data: SafetyData, h: float) -> bool:
 
 @inlined_kernel
 def is_too_close(model: SafetyModel, data: SafetyData, p: int) -> bool:
-    """Return whether pair ``p`` is closer at the reference than its required distance. Near distances are exact."""
+    """Return whether pair ``p`` is closer at the reference than its required distance.
+
+    ``data.distance`` is exact for near pairs, so a mere lower bound is never below the required distance.
+    """
     return data.distance[p] < model.min_distance[p] - ROUNDING
 
 
 @kernel
 def _keeps_apart(model: SafetyModel, data: SafetyData, p: int, h: float, duration: float, alone: bool) -> bool:
-    """Return whether pair ``p`` is proven apart in the step and in the stop, with one plane or else part by part.
+    """Return whether pair ``p`` is proven to keep its distance in the step and the stop: with one plane, or in parts.
 
     With ``alone`` the proof also holds for arms that move and stop at different times.
     """
@@ -95,7 +100,7 @@ def _keeps_apart(model: SafetyModel, data: SafetyData, p: int, h: float, duratio
     if data.distance[p] < model.min_distance[p] - 0.5 * ROUNDING and not _comes_no_closer(
         model, data, p, duration, _NOISE
     ):
-        return False  # Otherwise the tolerance below would add up from tick to tick to more than rounding.
+        return False  # Otherwise the tolerance in ``threshold`` would add up from tick to tick to more than rounding.
     threshold = min(model.min_distance[p], data.distance[p] - _LAST_DIGITS)
     if alone:  # This proof includes the case in which both arms move at the same time.
         return keeps_apart_at_any_time(model, data, p, duration, threshold)
@@ -132,7 +137,7 @@ def _has_room(model: SafetyModel, data: SafetyData, p: int, time: float) -> bool
 def _step_keeps_apart(
     model: SafetyModel, data: SafetyData, p: int, h: float, duration: float, threshold: float
 ) -> bool:
-    """Return whether pair ``p`` is proven apart in the step.
+    """Return whether pair ``p`` is proven to keep its distance in the step.
 
     The proof uses the distances at both ends and the travel of the joints, or else a plane at the start.
     """
@@ -148,7 +153,7 @@ def _step_keeps_apart(
 
 @kernel
 def _stop_keeps_apart(model: SafetyModel, data: SafetyData, p: int, duration: float, threshold: float) -> bool:
-    """Return whether pair ``p`` is proven apart along the whole stop, part by part."""
+    """Return whether pair ``p`` is proven to keep its distance during the whole stop, part by part."""
     rollout = data.rollout
     i, last = 0, rollout.q.shape[0] - 1
     stride = last

@@ -23,7 +23,8 @@ from q2r2_control.control.safety.joint_limits import JointLimits
 from q2r2_control.control.safety.safety_data import QuadraticPiece, SafetyData, SafetyModel
 from q2r2_control.types import Array
 
-# The shapes of a stop: all joints rest at the same time, the joints of each arm do, or each joint brakes fully.
+# The shapes of a stop. TOGETHER: all joints come to rest at the same time. ARM_BY_ARM: the joints of each arm come to
+# rest at the same time. OWN: each joint brakes fully.
 TOGETHER, ARM_BY_ARM, OWN = 0, 1, 2
 SHAPES = 3
 
@@ -63,7 +64,7 @@ def _least_deceleration(limits: JointLimits, j: int, q: float, v: float) -> floa
 
 @kernel
 def brake(q: Array, v: Array, deceleration: Array, t: float, q_out: Array, v_out: Array) -> None:
-    """Write the state of a stop after ``t`` [s], from (q, v) with decelerations above 0 (nv,)."""
+    """Write the state at ``t`` [s] after the start of a stop from (q, v), with decelerations above 0 (nv,)."""
     for j in range(q.shape[0]):
         speed = abs(v[j])
         sign = 1.0 if v[j] >= 0.0 else -1.0

@@ -44,7 +44,7 @@ from q2r2_control.types import Array
 if TYPE_CHECKING:
     from q2r2_control.control.safety.safety_data import SafetyData, SafetyModel
 
-_SAME_TIME = 1e-9  # Relative tolerance: two joints whose stops differ by less rest together.
+_SAME_TIME = 1e-9  # If the times until two joints rest differ by less than this share, both count as the same time.
 
 
 class ToolLimits(NamedTuple):
@@ -57,7 +57,7 @@ class ToolLimits(NamedTuple):
 
 
 def tool_limits_of(robot: Robot, chain: Chain, speed: float | None) -> ToolLimits:
-    """Return the tools of a robot's arms with the speed limit ``speed`` [m/s]; None if there is no limit."""
+    """Return the tools of a robot's arms with their limit ``speed`` [m/s], which is None if there is no limit."""
     n, nv = len(robot.arms), robot.model.nv
     speed = np.inf if speed is None else speed
     limits = ToolLimits(np.zeros(n, dtype=np.int64), np.zeros((n, 3)), np.zeros((n, nv)), float(speed))

@@ -16,8 +16,8 @@ _HARD, _SOFT = 0, 8  # Flags of a hard and of a soft row in DAQP.
 class DaqpSolver:
     """DAQP (Arnstrom, Bemporad, Axehill, IEEE TAC 2022), a dual active-set method with soft rows.
 
-    It starts cold at each tick. With a warm start from the last multipliers, 16 of 17 iterations in contact would be
-    saved, but no time, because most of the time goes into the set-up of the problem. Moreover, the solution would then
+    DAQP starts cold at each tick. A warm start from the last multipliers would save 16 of 17 iterations in contact. It
+    would save no time, because the set-up of the problem takes most of the time. Moreover, the solution would then
     depend on the past.
 
     Args:
@@ -36,7 +36,7 @@ class DaqpSolver:
         self._sense = np.zeros(nv, dtype=np.int32)
 
     def solve(self, problem: QpProblem) -> QpSolution:
-        """See :class:`Solver`. DAQP is called only if a bound holds the minimum of the cost back."""
+        """See :class:`Solver`. DAQP is called only if the minimum of the cost breaks the box or a row."""
         if problem.minimum is not None:
             return QpSolution(problem.minimum, 0.0)
         nv = self._nv

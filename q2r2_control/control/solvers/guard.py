@@ -1,4 +1,4 @@
-"""Protect the controller's arrays from other solvers, and a step from their failures.
+"""Protect the controller's arrays from solvers other than DAQP, and a step from the failures of these solvers.
 
 The safety filter clamps the answer to the same box that a solver gets. If a solver wrote into this box, it would change
 the limits, and the certificate would use the changed limits. A solver therefore gets copies.
@@ -45,7 +45,7 @@ class Guard:
     def solve(self, problem: QpProblem) -> QpSolution:
         """See :class:`Solver`.
 
-        The answer must have a real array ``v`` of shape (nv,), all finite, and a finite ``solve_time`` of at least 0.
+        The answer must have an array ``v`` (nv,) of finite real numbers, and a finite ``solve_time`` of at least 0.
         An exception or any other answer counts as a failed solve. With ``v = None`` the solver itself reports a failed
         solve. The ``solve_time`` of the result is at least our measured time, so that no solver can hide a delay.
         """

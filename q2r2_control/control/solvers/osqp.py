@@ -1,15 +1,16 @@
 """Call OSQP (Stellato et al., Mathematical Programming Computation 2020) with a warm start from tick to tick.
 
-OSQP is a first-order method, which needs a problem of even scale. With H = L L' and w = L' v the quadratic part of the
-cost is w' w / 2. With rows a_i L^-T of unit norm, the slacks of all rows have the same softness:
+OSQP is a first-order method, which is fast only if all directions of a problem have similar scales. With H = L L' and
+w = L' v the quadratic part of the cost is w' w / 2. With rows a_i L^-T of unit norm, the slacks of all rows have the
+same softness:
 
     minimise    1/2 w' w + (L^-1 g)' w + 1/2 sum_i t_i^2
     subject to  D lower <= D L^-T w <= D upper,    a_i L^-T w / n_i + sqrt(SOFTNESS) t_i >= lower_i / n_i
 
 Here n_i = |L^-1 a_i|, and D scales the rows of the box to unit norm as well. A slack below 0 costs as much as a slack
-above 0, so the problem does not need t >= 0. There is a problem of a fixed, dense pattern for 16, 32, 48, ... rows. Its
-unused rows have infinite bounds. Each of these problems is set up at the first tick that needs it. Later ticks start it
-from its last solution.
+above 0, so the problem does not need t >= 0. OSQP needs a fixed sparsity pattern. One problem with a dense pattern is
+therefore set up for 16 rows, another problem for 32 rows, and so on. Unused rows have infinite bounds. Each problem is
+set up at the first tick that needs it. At later ticks, OSQP starts from the last solution of the same problem.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ class OsqpSolver:
         self._sized: dict[int, _SizedOsqp] = {}
 
     def solve(self, problem: QpProblem) -> QpSolution:
-        """See :class:`Solver`. OSQP is called only if a bound holds the minimum of the cost back.
+        """See :class:`Solver`. OSQP is called only if the minimum of the cost breaks the box or a row.
 
         Raises:
             numpy.linalg.LinAlgError: If H is not positive definite.
@@ -87,7 +88,7 @@ class _SizedOsqp:
         self._cold = np.zeros(nv + capacity)
 
     def solve(self, problem: QpProblem) -> QpSolution:
-        """Solve a problem in which a bound holds the cost's minimum back; see :meth:`OsqpSolver.solve`."""
+        """Solve a problem whose minimum of the cost breaks the box or a row; see :meth:`OsqpSolver.solve`."""
         inverse = _inverse_factor(problem.H)
         self._write(problem, inverse)
         answer = self._solver.solve(raise_error=False)
@@ -99,7 +100,7 @@ class _SizedOsqp:
         return QpSolution(v, time)
 
     def _write(self, problem: QpProblem, inverse: Array) -> None:
-        """Write the problem into OSQP, with unit rows; ``inverse`` is L^-1."""
+        """Write the problem into OSQP, with rows of unit norm; ``inverse`` is L^-1."""
         nv, m = self._nv, len(problem.rows_lower)
         rows = np.concatenate([inverse.T, problem.rows @ inverse.T])
         norms = np.sqrt(np.einsum("ij,ij->i", rows, rows))

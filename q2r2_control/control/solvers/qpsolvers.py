@@ -79,16 +79,16 @@ class QpSolversSolver:
         warnings.filterwarnings("ignore", module=r"qpsolvers\.solvers\.")
 
     def solve(self, problem: QpProblem) -> QpSolution:
-        """See :class:`Solver`. The solver is called only if a bound holds the minimum of the cost back.
+        """See :class:`Solver`. The solver is called only if the minimum of the cost breaks the box or a row.
 
-        All exceptions of qpsolvers and of its solver are passed on.
+        Exceptions that qpsolvers or its solver raises are passed on.
         """
         if problem.minimum is not None:
             return QpSolution(problem.minimum, 0.0)
         made = slack_problem(problem, self._sparse, scaled=self._name == "quadprog")
         if made.h is not None:
-            # Some solvers print a warning if a bound is so large that they take it as infinite. The box alone keeps a
-            # row with such a bound. The bound is therefore reduced to just beyond what the box allows.
+            # Some solvers print a warning if a bound is so large that they take it as infinite. Every velocity in the
+            # box satisfies a row with such a bound. The bound is therefore reduced to just beyond what the box allows.
             fastest = np.maximum(np.abs(problem.lower), np.abs(problem.upper))
             made.h = np.minimum(made.h, np.abs(problem.rows) @ fastest + 1.0)
         _state_equations(made, self._sparse)

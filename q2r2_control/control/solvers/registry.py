@@ -69,7 +69,7 @@ def _made(name: str, nv: int, time_limit: float | None, options: dict[str, Any])
 
 @contextmanager
 def printing_to_stderr() -> Iterator[None]:
-    """Send output to stderr, also the output of compiled libraries: on stdout, a command may print JSON."""
+    """Send output to stderr, also that of compiled libraries, because a command may print JSON on stdout."""
     try:
         sys.stdout.flush()
         stdout = os.dup(1)

@@ -35,7 +35,7 @@ _DAMPING = 1e-6  # Damping of the projection into the nullspace of the tool's mo
 
 
 class ElbowSwivel:
-    """Turns elbows to wanted swivel angles, in the nullspace of the tools. The motion of a tool does not suffer.
+    """Turns elbows to wanted swivel angles, in the nullspace of the tools. The tools' motion stays the same.
 
     The cost of each arm is  s w (n' v - k (psi* - psi))^2.  Here psi is the swivel angle, as in the module's docstring,
     and n is its gradient, projected into the nullspace of the tool's motion. The factor s falls from 1 to 0 near the
@@ -46,7 +46,7 @@ class ElbowSwivel:
         robot: The robot that has the arms.
         angles: Wanted angle psi* of each arm that has the task; 0 for elbow up, None for the angle at home [rad].
         joints: Names of the joints at shoulder, elbow and wrist, without the arm's prefix.
-        gain: The swivel speed per angle k [1/s].
+        gain: The gain k: swivel speed per angle [1/s].
         weight: The weight w, compared with 1 for a tool's error in metres.
 
     Raises:

@@ -71,7 +71,7 @@ def load_tasks(robot: Robot, wanted: Mapping[str, Mapping[str, Any]]) -> dict[st
 
 
 def _fault(made: Any, settings: Mapping[str, Any], error: Exception) -> str:
-    """Return the first unknown or missing setting, or else the task's own message."""
+    """Return a text about the first unknown or missing setting, or else about the ``error`` that the task raised."""
     parameters = list(inspect.signature(made).parameters.values())[1:]
     known = [one.name for one in parameters if one.kind not in (one.VAR_KEYWORD, one.VAR_POSITIONAL)]
     allowed = f"; its settings: {', '.join(known) or 'none'}"
@@ -85,7 +85,7 @@ def _fault(made: Any, settings: Mapping[str, Any], error: Exception) -> str:
 
 
 class ExternalTasks:
-    """The tasks of one controller that are called at every substep. The tasks of its settings come first."""
+    """The tasks of one controller whose costs are computed at every substep. The tasks of its settings come first."""
 
     def __init__(self, robot: Robot, settings: Mapping[str, Mapping[str, Any]], own: Sequence[Task]) -> None:
         """Raise :class:`ConfigError` if an object is not a task, or if its cost at home is not usable."""

@@ -61,7 +61,7 @@ _SHARE_OF_LIMIT = 0.9
 
 
 class Motion(NamedTuple):
-    """How a tool approaches its target: each array has a linear and an angular value. All may change between ticks."""
+    """How a tool approaches its target. Arrays (2,): a linear and an angular value. All may change between ticks."""
 
     gain: Array  # (2,) [1/s]
     deceleration: Array  # (2,) [m/s^2, rad/s^2]
@@ -86,7 +86,7 @@ class FrameData(NamedTuple):
     """Data that are written at each tick."""
 
     twist: Array  # (n, 6) Wanted twist [m/s, rad/s].
-    feedback: Array  # (n, 6) Part of the twist that comes from the error.
+    feedback: Array  # (n, 6) Part of the twist that comes from the tool's pose error [m/s, rad/s].
     turn: Array  # (3, 3) Buffer for the rotation from a tool to its target.
 
     @classmethod
@@ -200,8 +200,9 @@ def approach_speed(error: float, gain: float, deceleration: float) -> float:
     """Return the wanted speed towards a target at the distance ``error`` (e): proportional to e near the target.
 
     Up to e0 = deceleration / gain^2 the speed is v = gain e. Farther away it is the speed from which a tool stops with
-    constant deceleration, v = sqrt(2 deceleration e - (deceleration / gain)^2); both agree smoothly at e0. A purely
-    proportional law would need the deceleration gain v, which the joints cannot reach at high speed.
+    constant deceleration, v = sqrt(2 deceleration e - (deceleration / gain)^2). Both formulas have the same value and
+    slope at e0. A purely proportional law would need a deceleration of gain times v, which is too much for the joints
+    at high speed.
     """
     if error * gain * gain <= deceleration:
         return gain * error
@@ -232,7 +233,7 @@ def wanted_twist(motion: Motion, data: TaskData, targets: TaskTargets, i: int) -
 
 @kernel
 def accumulate_tool_cost(J: Array, twist: Array, weight: Array, priority: float, H: Array, g: Array) -> None:
-    """Add ``priority`` |J v - twist|^2_W of one arm to H (nv, nv) and g (nv,). ``weight`` (6,) has one for each row."""
+    """Add ``priority`` |J v - twist|^2_W of one arm to H (nv, nv) and g (nv,). ``weight`` (6,) is for the rows of J."""
     nv = g.shape[0]
     square = priority * ROTATION_LENGTH * ROTATION_LENGTH
     for i in range(nv):

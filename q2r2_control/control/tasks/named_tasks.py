@@ -205,7 +205,7 @@ class RelativePose:
     Args:
         robot: A robot with the arms ``left`` and ``right``.
         position: Position of the right tool in the left tool's frame (3,) [m]; None for the position at home.
-        rpy: Its roll, pitch and yaw there (3,) [rad]; None for the rotation at home.
+        rpy: Roll, pitch and yaw of the right tool in the left tool's frame (3,) [rad]; None for the rotation at home.
         gain: The gain k: speed per distance [1/s].
         weight: The weight w, compared with 1 for a tool's error in metres.
 
@@ -245,7 +245,7 @@ class RelativePose:
 def _turn(of: Array, to: Array) -> Array:
     """Return the shortest rotation vector (3,) [rad] that turns the unit vector ``of`` into the unit vector ``to``.
 
-    If they are opposite, one of the possible axes is taken.
+    If the two vectors are opposite, one of the possible axes is taken.
     """
     across = np.cross(of, to)
     sine = float(np.linalg.norm(across))

@@ -80,7 +80,7 @@ def project_to_nullspace(J: Array, factor: Array, moved: Array, v: Array) -> Non
             factor[i, j] = dot(J[i], J[j])
         factor[i, i] += _PROJECTION_DAMPING * _PROJECTION_DAMPING
         moved[i] = dot(J[i], v)
-    factorise(factor)  # The matrix is positive definite for any finite J. If J is not finite, nor is the result.
+    factorise(factor)  # The matrix is positive definite for any finite J. If J is not finite, v becomes not finite too.
     substitute(factor, moved)
     for j in range(J.shape[1]):
         for i in range(J.shape[0]):
