@@ -1,4 +1,4 @@
-"""Judge the measured joints: whether the states are plausible, and whether arms of another controller keep apart."""
+"""Judge the measured joints: are they plausible, and do arms of another controller keep their distances?"""
 
 from __future__ import annotations
 
@@ -178,15 +178,15 @@ class JointWatch:
     def _jump(self, q: list[float], last: list[float], time: float) -> Reason | None:
         """Return the fault of a joint that moved farther than it can in ``time`` [s], else None."""
         moved = np.abs(np.subtract(q, last))
-        reach = self._velocity_limit * (time + _JUMP_TIME) + _JUMP_ALLOWANCE
-        if not (moved > reach).any():
+        allowed = self._velocity_limit * (time + _JUMP_TIME) + _JUMP_ALLOWANCE
+        if not (moved > allowed).any():
             return None
-        worst = int((moved - reach).argmax())
+        worst = int((moved - allowed).argmax())
         return Reason.of(SupervisionReason.STATE_JUMPED, joint=self._names[worst], distance=float(moved[worst]))
 
     def _fail(self, fault: Reason) -> None:
         self._still_since, self._lost = math.inf, False
-        # The first fault tells most about the cause. Before the first good state, the newest fault does.
+        # The first fault says most about the cause. Before the first good state, the newest fault says most.
         if self.fault is None or self.state is None:
             self.fault = fault
 
@@ -265,9 +265,9 @@ class ExternalArms:
     def left_behind(self, state: RobotState, holding: Iterable[str], now: float) -> Reason | None:
         """Return a reason if an arm without a target has been too far from the reference for too long, else None.
 
-        The measured tool pose is compared with the reference's tool pose. Such an arm is not moved to the reference by
-        the other controller. The operator could not engage it either: an operator's targets begin at the measured tool,
-        and they would have to begin at the reference's tool.
+        The measured tool pose is compared with the tool pose in the reference. The other controller does not move such
+        an arm to the reference. The operator could not engage it either: an operator's targets begin at the measured
+        tool pose, but they would have to begin at the tool pose in the reference.
 
         Args:
             state: The measured state.
@@ -276,13 +276,13 @@ class ExternalArms:
         """
         holding = set(holding)
         for arm in self._robot.arms:
-            tool, led = self._robot.tool_pose(state.q, arm), self._controller.tool_pose(arm)
-            way, turn = apart(tool, led)
-            near = way <= self._streams.engage_distance and turn <= self._streams.engage_angle
+            measured, commanded = self._robot.tool_pose(state.q, arm), self._controller.tool_pose(arm)
+            distance, turn = apart(measured, commanded)
+            near = distance <= self._streams.engage_distance and turn <= self._streams.engage_angle
             if near or arm not in holding or arm not in self._near_at:
                 self._near_at[arm] = now
             elif now - self._near_at[arm] > self._watch.deviation_time:
-                return Reason.of(SupervisionReason.LEFT_BEHIND, arm=arm, distance=way, angle=turn)
+                return Reason.of(SupervisionReason.LEFT_BEHIND, arm=arm, distance=distance, angle=turn)
         return None
 
     def too_close(self, state: RobotState) -> Reason | None:

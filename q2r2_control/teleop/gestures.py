@@ -96,7 +96,7 @@ class GestureRecognizer:
         self.forget()
 
     def cancel(self) -> None:
-        """Drop all unfinished gestures except one that stops the arms. Held controls count again after their release."""
+        """Drop unfinished gestures, except a gesture that stops the arms. Held controls count after their release."""
         for control in self._controls.values():
             control.mute()
 
