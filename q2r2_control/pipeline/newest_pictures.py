@@ -26,7 +26,7 @@ from q2r2_control.plants.base import PicturedPlant, Plant
 from q2r2_control.types import ObservedPicture
 
 Pixels = npt.NDArray[np.uint8]  # (height, width, 3) r g b.
-_ROUNDING = 1e-6  # A picture counts as due this share of a period early, because times are rounded.
+_ROUNDING = 1e-6  # A picture counts as due by this share of a period too early, because times are rounded.
 
 
 class ReadPicture:
@@ -52,7 +52,7 @@ class DrawnPicture:
 
 
 class PicturesByCamera(dict[str, ObservedPicture]):
-    """Pictures by the name of their camera. A camera without a picture raises :class:`CameraError`, which says why."""
+    """Pictures by the name of their camera. Reading a missing picture raises :class:`CameraError`, which says why."""
 
     def __init__(self, pictures: Mapping[str, ObservedPicture], reasons: Mapping[str, str]) -> None:
         super().__init__(pictures)
@@ -68,7 +68,7 @@ class NewestPictures:
     """The newest pictures at each tick of one run."""
 
     def __init__(self, config: Config, plant: Plant, streams: Mapping[str, CameraStream], realtime: bool) -> None:
-        """``streams`` are the open cameras. The loop's clock is that of the computer if ``realtime`` is True."""
+        """``streams`` are the open cameras. If ``realtime`` is True, the loop's time is the computer's."""
         self._streams = {name: streams[name] for name in config.device_cameras if name in streams}
         self._realtime, self._times = realtime, LoopTimes()
         self._devices: dict[str, ReadPicture] = {}  # The newest picture of each open camera.
@@ -83,7 +83,7 @@ class NewestPictures:
         }
 
     def at(self, now: float) -> PicturesByCamera:
-        """Return the newest picture of each camera at a tick that is at ``now`` [s]. It never waits."""
+        """Return the newest picture of each camera at the tick whose time is ``now`` [s], without waiting."""
         found: dict[str, ObservedPicture] = {name: camera.at(now) for name, camera in self._drawn.items()}
         if not self._streams:
             return PicturesByCamera(found, self._reasons)
@@ -123,7 +123,7 @@ class _DrawnCamera:
     def __init__(self, name: str, rate: float, plant: PicturedPlant) -> None:
         self._name, self._rate, self._plant = name, rate, plant
         self._start: float | None = None  # Time of the first tick [s].
-        self._number = 0  # Number of the newest picture.
+        self._number = 0  # Number of the newest picture, counted in periods since the first tick.
         self._newest: DrawnPicture | None = None
 
     def at(self, now: float) -> DrawnPicture:
