@@ -1,7 +1,7 @@
 """Find other publishers of topics that may have one publisher only: hands, targets and commands.
 
-A publisher that appears is found in the graph, 0.04 s after the middleware has discovered it. A publisher that was
-there before and was silent is found by its first message.
+A publisher that appears is found in the graph within 0.04 s after the middleware has discovered it. A publisher that
+was there before and was silent is found by its first message.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def takers_of(node: BaseNode, topic: str) -> str:
 
 
 class OnePublisher:
-    """Checks whether topics, by their full names, have more than one publisher. It may be asked at every tick."""
+    """Checks whether topics, given by full name, have more than one publisher. Every tick may call :meth:`conflict`."""
 
     def __init__(self, node: BaseNode, topics: Iterable[str]) -> None:
         self._node, self._topics = node, tuple(topics)
@@ -73,11 +73,12 @@ class CommandWatch:
         self._subscriptions: list[Any] = []
         self._born = time.monotonic()
         self._asked_at = -math.inf  # Time of the last query of the graph [s].
-        self._known: int | None = None  # Number of other publishers at the last query; None while it does not command.
+        # Number of other publishers at the last query; None while this node does not command.
+        self._known: int | None = None
         self._found: Reason | None = None  # Another commander that was found since this node began to command.
 
     def begin(self) -> None:
-        """Begin to listen."""
+        """Begin to listen to commands."""
         if self._subscriptions:
             return
         for topic, publisher in self._publishers.items():
@@ -87,7 +88,7 @@ class CommandWatch:
             publisher.own_listeners = 1
 
     def end(self) -> None:
-        """Cease to listen."""
+        """Cease to listen to commands."""
         for subscription in self._subscriptions:
             self._node.destroy_subscription(subscription)
         for publisher in self._publishers.values():
@@ -127,7 +128,7 @@ class CommandWatch:
         return self._reason(reason.detail["topic"])
 
     def rest(self) -> None:
-        """Record that this node has ceased to command. Publishers that exist when it begins again are not new ones."""
+        """Record that this node has ceased to command. Publishers that exist when it begins again are not new."""
         self._known = None
 
     def _reason(self, topic: str) -> Reason:

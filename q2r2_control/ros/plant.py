@@ -61,7 +61,7 @@ class RosPlant:
         self._fingers, self._kind = Fingers(robot, config), TrajectoryOutput(self._period, robot)
         self._openings = dict.fromkeys(self._fingers.arms, 1.0)  # No opening is measured before a run.
         self._context: Context | None = None
-        self._stopped: Callable[[], bool] = lambda: False  # Whether the wait for the robot should end.
+        self._stopped: Callable[[], bool] = lambda: False  # Returns whether the wait for the robot should end.
 
     @classmethod
     def from_config(cls, robot: Robot, config: Config) -> RosPlant:
@@ -93,8 +93,8 @@ class RosPlant:
         }
         self._openings = {}
         self._joints = JointIntake(node, self._robot)
-        self._bad: Reason | None = None  # What is wrong with the newest joint states.
-        self._fault: Reason | None = None  # Why nothing is commanded.
+        self._bad: Reason | None = None  # Why the newest joint states are unusable; None if they are good.
+        self._fault: Reason | None = None  # Why nothing is commanded; None if commands are sent.
         self._joints.subscribe(self._take_state, self._take_fingers)
         # Times of the computer's clock: when the newest joint states came, and when a receiver appeared [s].
         self._seen = self._received_since = -math.inf

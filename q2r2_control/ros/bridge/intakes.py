@@ -82,7 +82,7 @@ class TargetIntake:
         self.publishers = Publishers(node, self.topics.values())
         self._delays = {arm: DelayWatch(STREAM_TIMEOUT) for arm in robot.arms}
         self._stamps = {arm: DelayWatch(_LATEST) for arm in robot.arms}  # The delays since targets were made.
-        self._newest = dict.fromkeys(robot.arms, (0, 0.0))  # Stamp of the last target [ns], and its age [s].
+        self._newest = dict.fromkeys(robot.arms, (0, 0.0))  # Stamp of the last target [ns], and its age at receipt [s].
         # By arm, why its last target was not used, and the time of that [s].
         self._refused: dict[str, tuple[Reason, float]] = {}
         self.rejected = dict.fromkeys(robot.arms, 0)
@@ -135,7 +135,7 @@ class TargetIntake:
         return stamp + stamps.usual if known else None
 
     def _stood_still(self, arm: str, made: int, received: float) -> float:
-        """Return for how long the sender was frozen between making and sending a target [s]; 0 if not for long.
+        """Return the time for which the sender was frozen between making and sending a target [s]; 0 if it was short.
 
         If the process froze just before its middleware recorded the time of sending, only the stamp of the target shows
         this.
@@ -167,7 +167,7 @@ def _frame_of(node: BaseNode, robot: Robot, arm: str) -> TargetFrame:
 
 
 class JointIntake:
-    """Merges joint states of one topic or several into one state of all arms, which is as old as its oldest part."""
+    """Merges joint states of one topic or several into one state of all arms. It is as old as its oldest part."""
 
     def __init__(
         self, node: BaseNode, robot: Robot, needs_external_torque: bool = False, told_by_drivers: bool = False
@@ -285,7 +285,7 @@ class JointIntake:
         return text if len(self._topics) == 1 else f"{topic}: {text}"
 
     def _part(self, topic: str, given: tuple[str, ...]) -> tuple[list[str], list[int]]:
-        """Return the joints of a topic that are in a message. Each arm may have its own publisher on the topic."""
+        """Return the names and indices of a topic's joints that a message has. Each arm may have its own publisher."""
         if (part := self._parts.get((topic, given))) is None:
             if len(self._parts) >= _PARTS:  # A publisher sends new names each time.
                 self._parts.clear()
@@ -344,6 +344,6 @@ class Fingers:
             return found
         for arm, (joints, closed, opened) in self._grippers.items():
             if not isinstance(order := order_of(tuple(message.name), joints), str):
-                position = sum(message.position[place] for place in order) / len(joints)
+                position = sum(message.position[index] for index in order) / len(joints)
                 found[arm] = (position - closed) / (opened - closed)
         return found

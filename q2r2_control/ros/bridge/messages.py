@@ -26,7 +26,7 @@ _OLDEST = 0.1  # A message waits only until the next tick. A greater age means t
 
 
 def ended_topic(target_topic: str) -> str:
-    """Return the topic on which the sender of targets ends a stream in order, because the operator paused."""
+    """Return the topic on which the sender of targets ends a stream, because the operator has paused the arm."""
     return f"{target_topic}/ended"
 
 

@@ -36,7 +36,7 @@ class SimulationInput(BaseNode):
     The script starts when every hand that it plays has a subscriber. The hands rest until the arms' nodes report that
     they can be engaged. Then the buttons are pressed. They are pressed again if an arm is not engaged when the hands
     would move, or if it stops in the first six seconds. After that time, and after an arm's ``~/pause``, ``~/reset`` or
-    way home, only a person can engage an arm. The script's own presses may still pause an arm.
+    motion home, only a person can engage an arm. The script's own presses may still pause an arm.
     """
 
     ticks = True
@@ -60,7 +60,7 @@ class SimulationInput(BaseNode):
         self._pressed = False  # Whether the buttons were pressed once to engage them.
         self._moves = False  # Whether the hands move.
         self._until = math.inf  # Time until which arms are engaged again [s].
-        self._not_to_press: set[str] | None = None  # Hands that do not press; None before that is decided.
+        self._not_to_press: set[str] | None = None  # Hands that do not press; None if that is not decided yet.
         self._rewind(self.now)
         self._timer = self.create_tick(_LONGEST, self._tick)
 

@@ -82,7 +82,7 @@ class WebPage(BaseNode):
             allowed = "allowed: controller: builtin, or mode: filtered"
             raise ConfigError(f"--web: {config.name} has no ticks to show; {allowed}")
         self._asked: SimpleQueue[Any] = SimpleQueue()
-        self._page = Page(host, port, self._asked.put)  # Its process starts during the work below.
+        self._page = Page(host, port, self._asked.put)  # The page's process starts during the work below.
         self._cell, self._robot = config.model_copy(update={"loop_rate_hz": rate}), Robot.from_config(config)
         self._begun = time.monotonic_ns()
         self._ticks = RosTicks(self._begun, self._robot)
@@ -154,7 +154,7 @@ class WebPage(BaseNode):
         match request:
             case PageRequest.ENGAGE:
                 return [f"{arm}/engage" for arm in arms]
-            case PageRequest.PAUSE:  # The pause also ends the way home.
+            case PageRequest.PAUSE:  # The pause also ends the motion home.
                 return [f"{self._controller}/hold", *(f"{arm}/pause" for arm in arms)]
             case PageRequest.RESET:
                 return [f"{self._controller}/reset", *(f"{arm}/reset" for arm in arms)]
