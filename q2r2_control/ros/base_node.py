@@ -41,7 +41,8 @@ from q2r2_control.ros.launch.middleware import set_up_middleware
 from q2r2_control.ros.reasons import RosReason
 from q2r2_control.wording import sentence
 
-# If a real-time process computes for this time without a sleep, Linux sends it a signal [s]. Others could not run.
+# If a real-time process computes for this time without a sleep, Linux sends it a signal [s]. Other processes could
+# not run meanwhile.
 _NEVER_IDLE = 0.5
 # After its nodes are closed, a process has at least this time to end [s]. To close a node takes up to 3 s, because its
 # arms brake.
@@ -262,11 +263,11 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):
         return TransitionCallbackReturn.SUCCESS
 
     def _tried(self, what: str, act: Callable[[], str | None], meanwhile: str, done: str) -> TransitionCallbackReturn:
-        """Call ``act`` to go to the state ``done``. If it returns a problem, the node keeps the state before."""
+        """Call ``act`` to go to the state ``done``. If it returns a problem, the node keeps its state."""
         before, self.lifecycle_state = self.lifecycle_state, meanwhile
         try:
             problem = act()
-        except Exception as error:  # rclpy would hide it.
+        except Exception as error:  # rclpy would hide the exception.
             problem = f"{type(error).__name__}: {error}"
         self.lifecycle_state = done if problem is None else before
         if problem is None:
@@ -341,7 +342,7 @@ def end_in_time() -> None:
 
 
 def _take_priority(nodes: Sequence[BaseNode]) -> None:
-    """Take a real-time priority before the nodes tick. Slow work, such as compiling, is done before, without it."""
+    """Take a real-time priority before the nodes tick. Slow work, such as compiling, is done earlier, without it."""
     priority = max(node.priority for node in nodes)
     if not priority:
         return

@@ -63,7 +63,7 @@ class Publishers:
         return self._names[topic]
 
     def source(self, topic: str) -> str:
-        """Return the same names for the middle of a sentence, such as " from /node"; "" if there were none."""
+        """Return the names of :meth:`of` as a part of a sentence, such as " from /node"; "" if there were none."""
         return f" from {names}" if (names := self.of(topic)) else ""
 
     def _ask(self, *topics: str) -> None:
@@ -175,7 +175,7 @@ class NodeStates:
     ) -> None:
         """Observe only the nodes in ``namespace``."""
         self._node, self._on_state, self._prefix = node, on_state, f"{namespace.rstrip('/')}/"
-        self._heard: set[str] = set()  # The topics that have a subscription.
+        self._heard: set[str] = set()  # The topics to which this object has subscribed.
         self.newest: dict[str, tuple[dict[str, Any], float]] = {}  # By node, the state and the time of receipt [s].
 
     def look(self) -> None:
@@ -190,7 +190,7 @@ class NodeStates:
         try:
             state = json.loads(message.data)
         except ValueError:
-            return  # The topic belongs to some other node.
+            return  # The topic belongs to a node of another kind.
         if isinstance(state, dict) and {"level", "message"} <= state.keys():
             self.newest[name] = state, time.monotonic()
             self._on_state(name, state)
@@ -230,7 +230,7 @@ class HandListeners:
         return any(state.get("last_event_kind") in HOLD_REQUESTS for _, state, _ in self._arms())
 
     def _arms(self) -> list[tuple[str, dict[str, Any], float]]:
-        """Return name, state and age of the state [s] of the arms' nodes that follow these hands."""
+        """Return the name, the state and the state's age [s] for each arm's node that follows one of the hands."""
         now = time.monotonic()
         said = ((name, state, now - at) for name, (state, at) in self._states.newest.items())
         return [one for one in said if one[2] <= _GONE and one[1].keys() >= _ARM and one[1]["hand"] in self._hands]

@@ -46,7 +46,7 @@ _AWAY = 0.02  # If a command is farther from the measured joints, a new receiver
 
 
 class _PlantNode(BaseNode):
-    ticks = True  # Its messages are taken when the loop ticks.
+    ticks = True  # The messages of this node are taken when the loop ticks.
 
 
 class RosPlant:
@@ -119,7 +119,7 @@ class RosPlant:
             return self._bad or Reason.of(SupervisionReason.NO_STATES_YET, source=_CURE)
         if not self._publisher.listeners:
             return Reason.of(RosReason.NO_SUBSCRIBER, topic=self._publisher.topic_name)
-        if self._seen <= self._received_since:  # The newest state is older than the robot that receives now.
+        if self._seen <= self._received_since:  # The newest state came before the present receiver.
             return Reason.of(SupervisionReason.NO_STATES_YET, source=_CURE)
         return self._bad
 

@@ -142,7 +142,7 @@ class ArmFeedback:
             self._shown = now
             if not self._markers.get_subscription_count():
                 return
-            asked = None if sent is None else with_offset(sent, target.offset)  # The goal of the tool.
+            asked = None if sent is None else with_offset(sent, target.offset)  # The target of the measured tool.
             for marker in self._drawn.at(asked, tool, engaged, now):
                 self._markers.publish(marker)
 

@@ -107,7 +107,7 @@ class ArmOutputs:
 
     @property
     def homing(self) -> tuple[bool, Reason | None]:
-        """True if the built-in controller reports that it goes home, and how the last motion home ended by itself."""
+        """Whether the built-in controller reports a motion home, and how the last motion home ended, or None."""
         return (False, None) if self._follows is None else (self._follows.homing, self._follows.homing_outcome)
 
     @property
@@ -206,13 +206,13 @@ class FollowWatch:
         self._since = math.inf  # Time since which targets have been sent and not followed [s].
         self._followed_since = math.inf  # Time since which targets have been sent and followed [s].
         self._node, self._state_topic = node, f"{controller}/state"
-        self._unready: Reason | None = None  # Why the controller is not ready, as its newest report says.
+        self._unready: Reason | None = None  # Why the controller is not ready, by its newest report, or None.
         # The number of the controller's starts, and the time of its newest report [s].
         self._starts, self._reported_at = 0, -math.inf
         # Whether a node publishes ``~/state``, and the time at which the graph was last asked for it [s].
         self._is_there, self._looked = False, -math.inf
         self.homing = False  # Whether the controller reports that it goes home.
-        self.homing_outcome: Reason | None = None  # How the last motion home ended; None if it was interrupted.
+        self.homing_outcome: Reason | None = None  # How the last motion home ended; None if nothing is reported.
         self.gripper_held = ""  # The pair of bodies that stops the gripper; empty if none does.
         node.create_subscription(Bool, self._topic, self._on_following, LATCHED_QOS)
         node.create_subscription(String, self._state_topic, self._on_state, STREAM_QOS)

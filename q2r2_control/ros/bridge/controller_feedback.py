@@ -46,7 +46,7 @@ GRIPPER_DELAY = 0.3
 _DISCOVERY = 1.0  # Time in which the latched messages of other nodes reach a new node, even on a busy machine [s].
 _UNMEASURED = "its fingers are not in the joint states, or nothing is proven while the arms are stopped"
 _MARKER_PERIOD = 0.1  # Time between two markers [s].
-_FAR, _NEAR = 0.10, 0.02  # The marker is green beyond the first distance, and red below the second [m].
+_FAR, _NEAR = 0.10, 0.02  # The marker of a distance is green above the first value, and red below the second value [m].
 
 
 class ControllerFeedback:

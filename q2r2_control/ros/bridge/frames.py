@@ -30,7 +30,7 @@ _TF, _TF_STATIC = "tf", "tf_static"
 _SAME = 0.05, 0.1
 _REMEMBERED = 2.0  # A difference between two publishers is remembered for this time [s].
 _PAUSE = 1.0  # After a silence of this time a publisher may have been restarted [s].
-_KEPT = 16  # Messages that are kept, because another node of the process may have to read them too.
+_KEPT = 16  # Number of messages that are kept, because another node of the process may have to read them too.
 
 
 class ReadTransform:
@@ -178,7 +178,7 @@ def _name(frame: str) -> str:
 
 
 class ToolFrame:
-    """The pose of a frame of /tf in the world."""
+    """The pose of one frame on /tf, in the world frame."""
 
     def __init__(self, node: BaseNode, frame: str, tree: FrameTree, world: str, timeout: float) -> None:
         self._tree, self._frame, self._world, self._timeout = tree, frame, world, timeout
@@ -207,7 +207,8 @@ class PoseTopic:
 
     def __init__(self, node: BaseNode, topic: str, tree: FrameTree, world: str, timeout: float) -> None:
         self._node, self._tree, self._world, self._timeout = node, tree, world, timeout
-        self._newest: tuple[str, int, float] | None = None  # Frame, stamp [ns] and receipt time [s].
+        # Frame, stamp [ns] and receipt time [s] of the newest message.
+        self._newest: tuple[str, int, float] | None = None
         self._pose: pin.SE3 | None = None  # The newest pose, in the message's frame.
         self.topic, self._publishers = topic, Publishers(node, [topic])
         self.problem: Reason | None = None

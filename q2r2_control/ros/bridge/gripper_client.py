@@ -145,7 +145,7 @@ class GripperClient:
             self._command(opening, now)
 
     def _go_on(self, now: float) -> None:
-        """Command the granted opening. If the controller has ended or does not answer, the gripper stays."""
+        """Command the granted opening. If the controller has ended or does not answer, end the motion."""
         assert self._grants is not None
         granted = self._grants.granted
         if not self._grants.answered:
@@ -217,7 +217,7 @@ class GripperClient:
 
     def _done(self, answer: Any, number: int) -> None:
         if number != self._goals or self._goal_closed is None:
-            return  # Another goal has replaced it.
+            return  # Another goal has replaced this goal.
         result = answer.result
         self._note(result)
         if self._waits:

@@ -179,7 +179,7 @@ class HandIntake:
 
     @property
     def stamps(self) -> tuple[float, float]:
-        """Return the receipt times of the newest pose and inputs [s]; -inf before the first."""
+        """Return the receipt times of the newest pose and of the newest inputs [s]; -inf if none has come yet."""
         return -math.inf if self._pose is None else self._pose[1], self._inputs[1]
 
     def silence(self, now: float) -> Reason | None:

@@ -40,12 +40,14 @@ from q2r2_control.supervision.targets import DelayWatch
 from q2r2_control.types import ArmTiming, Array, RobotState
 from q2r2_control.wording import sentence
 
-_SHARED = "joint_states"  # The default topic.
-_LATEST = 0.02  # If a target's delay exceeds the usual delay by more, its stamp does not tell when it is due [s].
+_SHARED = "joint_states"  # The default topic of joint states.
+# If a target's delay exceeds the usual delay by more than this, the stamp does not say when the target is due [s].
+_LATEST = 0.02
 # If a target is older at its receipt than the target before was, by more than this, its sender stood still after making
 # it [s].
 _OLD = 0.5
-# Longest period of joint states from which the lags of two arms can be compared [s], and the weight of a new period.
+# Longest period of joint states from which the lags of two arms can be compared [s], and the weight of a new period in
+# the mean period.
 _LONGEST_PERIOD, _PERIOD_SHARE = 0.02, 0.05
 COMMAND_TIME = 0.01  # Time from a command to the arm's motion, if drivers do not report this time [s].
 _PARTS = 64  # Largest number of sets of joint names whose joints are remembered.
@@ -145,7 +147,7 @@ class TargetIntake:
         return late if 0 < before < made and late > _OLD else 0.0
 
     def _refuse(self, arm: str, refusal: Reason) -> None:
-        """Log once for each kind of fault why targets are not used, until a target is used again or none comes."""
+        """Log why targets are not used, once for each kind of fault, until a target is used or no more targets come."""
         self.rejected[arm] += 1
         before = self._refused.get(arm)
         self._refused[arm] = (refusal, self._node.now)

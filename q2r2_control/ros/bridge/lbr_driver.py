@@ -45,7 +45,7 @@ class LbrDrivers:
         self._on_torques, self._torques = on_torques, np.zeros(robot.model.nv)
         # The posture at which the arms are held (nv,) [rad]; NaN without a session, or if it is not known.
         self._held = np.full(robot.model.nv, np.nan)
-        self._newest: dict[str, tuple[Any, float]] = {}  # By arm, the newest state and its time [s].
+        self._newest: dict[str, tuple[Any, float]] = {}  # By arm, the newest state and its receipt time [s].
         # Namespaces of drivers whose session has ended since commands began. They get no more commands, because the
         # first command of a new session has to equal the posture of the arm.
         self.withheld: set[str] = set()

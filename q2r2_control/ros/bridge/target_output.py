@@ -62,7 +62,7 @@ class TargetOutput:
         self._is_twist = preset.message == TWIST
         kind = TwistStamped if self._is_twist else PoseStamped
         self._publisher = WatchedPublisher(node, kind, topic, values.listener_timeout)
-        self.topic = self._publisher.topic_name  # The full name.
+        self.topic = self._publisher.topic_name  # The full name of the topic.
         self._one = OnePublisher(node, [self.topic])
         self._unknown_node = Reason.of(RosReason.SUBSCRIBER_UNKNOWN, topic=self.topic)
         self._wrench = None

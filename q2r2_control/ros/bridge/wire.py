@@ -91,7 +91,7 @@ class JointNumbers(NamedTuple):
 
 class _JointLayout(NamedTuple):
     names: tuple[str, ...]
-    same: tuple[tuple[int, bytes], ...]  # Offsets and bytes that all messages of this layout share.
+    same: tuple[tuple[int, bytes], ...]  # Offsets and bytes of the parts that are equal in all messages of this layout.
     arrays: tuple[tuple[int, int], ...]  # Offset and length of positions, velocities and efforts.
     end: int  # The end of the arrays. Bytes that the middleware appends to a message are ignored.
 
@@ -266,7 +266,7 @@ class TransformNumbers(NamedTuple):
 class _TransformLayout(NamedTuple):
     same: tuple[tuple[int, bytes], ...]  # See _JointLayout.
     frames: tuple[tuple[str, str], ...]  # Child and parent of each transform.
-    offsets: tuple[int, ...]  # Offsets of their numbers.
+    offsets: tuple[int, ...]  # Offset of the numbers of each transform.
 
 
 def transforms_reader() -> Callable[[bytes], list[TransformNumbers]]:

@@ -88,7 +88,7 @@ class BaseArmController(BaseNode):
             self.setup_state()
             self.setup_interfaces()
         except BaseException:
-            self.destroy_node()  # A node that is never returned could keep the process from ending.
+            self.destroy_node()  # A half-made node could keep the process from ending.
             raise
         # For its first log line rclpy takes some 60 ms, because it searches all modules for the line's origin. An
         # operator's press must not wait for that.

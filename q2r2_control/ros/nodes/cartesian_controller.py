@@ -50,11 +50,11 @@ from q2r2_control.wording import sentence
 _LONGEST_STOP = 3.0  # Longest time until the arms rest at the end [s].
 _QUIET = 0.3  # The node commands only after other commanders have been silent for this time [s].
 _LONGEST_ACTIVATION = 2.0  # Longest time of an activation in addition to the settle time [s].
-_SAFE_TARGET_PERIOD = 0.02  # Time between two safe targets if nodes only listen to them [s].
+_SAFE_TARGET_PERIOD = 0.02  # Time between two safe targets if no other controller follows them [s].
 
 
 class CartesianControllerNode(ManagedNode):
-    """Passes messages of its topics to a :class:`ControlLoop`, and publishes its commands."""
+    """Passes the messages of its topics to a :class:`ControlLoop`, and publishes the commands of this loop."""
 
     ticks = True
     priority = 40  # No other program may delay a joint command. ros2_control runs drivers at 50.
@@ -109,7 +109,7 @@ class CartesianControllerNode(ManagedNode):
             standstill=self._standstill(output),
         )
         self._supervisor = self._loop.supervisor
-        # If another controller moves the arms, their fingers count as anywhere between closed and open.
+        # If another controller moves the arms, the arms' fingers count as anywhere between closed and open.
         asking = {} if self._is_external else self._targets.topics
         self._grippers = GripperLimits(self, config, self._loop, asking)
         self._clock_of_ticks = TickClock(self._period)
@@ -201,7 +201,7 @@ class CartesianControllerNode(ManagedNode):
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         self._supervisor.pause(request.data)
-        self.report_health()  # Nodes that listen must not wait for the next report.
+        self.report_health()  # Nodes that listen to the reports need the new state at once.
         return _answer(response, None)
 
     def _serve(self, act: Callable[[], Reason | None], request: Any, response: Any) -> Any:
@@ -302,7 +302,7 @@ class CartesianControllerNode(ManagedNode):
         try:
             while self._supervisor.phase is Phase.BRAKING and (now := time.monotonic()) < deadline:
                 # ``go_on`` takes joint states and runs ticks. If simulated time has ended, ticks no longer brake the
-                # arms, and they are braked here.
+                # arms. The code below then brakes them.
                 go_on()
                 if self._advances != advances:
                     advances, last = self._advances, now

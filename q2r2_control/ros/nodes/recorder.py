@@ -227,7 +227,7 @@ class RecorderNode(BaseNode):
         return OK, f"records to {recorder.file}", values
 
     def close(self) -> None:
-        """Write all messages, and report the result of the recording. If it failed, the exit code shows it as well."""
+        """Write all messages, and report the result of the recording. If it is a failure, the exit code says so."""
         recorder = self._recorder
         self._judge.close()
         recorder.record([*self._waiting, *self._devices.take(time.monotonic())[0]])

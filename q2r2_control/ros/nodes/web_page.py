@@ -184,7 +184,7 @@ class WebPage(BaseNode):
         while not self._asked.empty():
             self._serve(self._asked.get())
         waiting, self._waiting = self._waiting, []
-        # A frame shows only the newest posture, flags and targets. All ticks, references and events count.
+        # A frame shows only the newest posture, flags and targets, but the data of all ticks and all events are used.
         try:
             chunk = self._ticks.add_messages(waiting)
         except _UNREADABLE as error:
@@ -203,7 +203,7 @@ class WebPage(BaseNode):
         self._row["q"], self._row["v"], self._row["tau"] = self._ticks.joints
         nodes = node_views(self._states)
         views = arm_views(nodes, self._cell)
-        # The nodes report this age twice a second, and at each event.
+        # The nodes report the age of the hands' poses twice a second, and at each event.
         told = {node.arm: node.values.get("hand_age") for node in nodes}
         ages = {arm: age for arm, age in told.items() if arm is not None and isinstance(age, int | float)}
         frame = Frame(

@@ -100,7 +100,7 @@ def _examine(view: DriverView, cell: Config, robot: Robot, with_session: bool) -
 
 
 def _compare_limits(view: DriverView, cell: Config, robot: Robot) -> Iterator[Finding]:
-    """Compare the limits of commanded positions and velocities with those of the driver."""
+    """Compare the limits of commanded positions and velocities with the limits of the driver."""
     where = f"{view.namespace}/robot_description"
     try:
         urdf = parse_urdf(view.description, where)
@@ -121,7 +121,7 @@ def _compare_limits(view: DriverView, cell: Config, robot: Robot) -> Iterator[Fi
     low, high, fastest = (
         np.array([float(limits[theirs[name]].get(key, "0")) for name in ours]) for key in ("lower", "upper", "velocity")
     )
-    if view.state is not None:  # The driver's safe_stop allows no position within one step of its limits.
+    if view.state is not None:  # The driver's safe_stop allows no position from which one step leads beyond a limit.
         low, high = low + fastest * view.state.sample_time, high - fastest * view.state.sample_time
     lower, upper = robot.position_lower[joints], robot.position_upper[joints]
     margin = np.maximum(low - lower, upper - high)

@@ -1,6 +1,6 @@
 """Listen only to the reports of a set's nodes on ``~/state``, so that the listener does not change what the set does.
 
-An arm's node would take a listener to its targets for a controller, and would let the arm be engaged. A controller
+An arm's node would mistake a listener to its targets for a controller, and would let the arm be engaged. A controller
 stops commanding arms whose commands get a new receiver. Therefore each sender counts its messages, and reports the
 number.
 """

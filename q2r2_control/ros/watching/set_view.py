@@ -89,7 +89,7 @@ class ArmView:
 
     name: str
     node: str  # Full name of the arm's node; "" if none runs.
-    state: str  # State of its teleoperation.
+    state: str  # State of the arm's teleoperation.
     controller: str  # State of the arm in the built-in controller; "" if not reported.
     why: str  # One line: why the arm moves or does not move.
 
@@ -100,7 +100,7 @@ class DriverView:
 
     arm: str
     command: str  # Topic of the arm's commands.
-    states: dict[str, set[str]] = field(default_factory=dict)  # Published types by topic of states.
+    states: dict[str, set[str]] = field(default_factory=dict)  # The types that are published on each topic of states.
     takers: set[str] = field(default_factory=set)  # Types that nodes receive on the topics of commands.
     state: Any = None  # The newest LBRState.
     description: str = ""  # The newest URDF.
