@@ -41,7 +41,7 @@ class GripperLimiter:
         self._controller = controller
         travels = {name: arm.finger_way for name, arm in controller.robot.arms.items()}
         self._grippers = {name: _Gripper(travel, remembered) for name, travel in travels.items() if travel > 0.0}
-        # For each gripper that may not move on, the names of the two bodies that would come too close.
+        # For each gripper that may not move farther, the names of the two bodies that would come too close.
         self.held: dict[str, tuple[str, str]] = {}
         self.changed = False  # Whether the controller's openings changed in the last tick.
 
@@ -229,7 +229,7 @@ class Grip:
     def __init__(self, stroke: float, stall: float = STALL) -> None:
         self._stroke, self._stall = stroke, stall
         self.holds = False
-        # The finger's opening when it last moved [m or rad], and that time [s].
+        # The opening of the finger when it last moved [m or rad], and the time of this motion [s].
         self._seen, self._since = math.nan, -math.inf
 
     def look(self, wanted: float, measured: float | None, now: float) -> bool:

@@ -80,7 +80,7 @@ class JointHoming:
         # The smallest value so far of the distance between the next waypoint and the farthest joint [rad].
         self._least_left = np.inf
         self._waited = 0.0  # Time without progress [s].
-        self.outcome: ReasonKind | None = None  # How the motion home ended.
+        self.outcome: ReasonKind | None = None  # How the motion home ended; None while it goes on.
 
     def step(self, q: Array, v: Array, dt: float) -> HomingStep:
         """See :class:`WayHome`."""
@@ -88,7 +88,7 @@ class JointHoming:
             if float(np.abs(v).max()) > _AT_REST:
                 return HomingStep(None, {})
             self._distances, kept = self._look()
-            # A pair that is closer than this at the start of the path may stay as close as it is there.
+            # A pair that is closer than this distance at the start of the path may stay as close as it is there.
             self._needed = np.minimum(kept + _EXTRA_DISTANCE, self._distances(q) - 1e-4)
             self._at = self._leg = q.copy()
             self._search = self._check_paths(self._at)
@@ -170,7 +170,7 @@ _PATIENCE = 5.0  # The tools may arrive by this time later than their targets [s
 
 
 class ToolHoming:
-    """Moves all tools home at the same time, on straight lines. If the QP holds a tool up, homing ends where it is."""
+    """Moves all tools home at the same time, on straight lines. If the QP holds a tool up, homing ends there."""
 
     def __init__(self, home: Mapping[str, pin.SE3], tool_pose: Callable[[str], pin.SE3]) -> None:
         """Prepare the motion to the poses ``home``. ``tool_pose`` returns the tool pose of an arm in the reference."""
@@ -205,14 +205,15 @@ class ToolHoming:
 class Homing:
     """Begins, continues and ends the motion home.
 
-    With ``tools_only`` it gives targets to the tools and moves no joints itself, because another controller does that.
+    With ``tools_only``, this class gives targets to the tools and moves no joints, because another controller moves
+    them.
     """
 
     def __init__(self, robot: Robot, controller: CartesianController, tools_only: bool) -> None:
         self._robot, self._controller, self._tools_only = robot, controller, tools_only
         self._home = {arm: robot.tool_pose(robot.home, arm) for arm in robot.arms}
         self._motion: WayHome | None = None
-        self.outcome: Reason | None = None  # How the last motion home ended, if nobody interrupted it.
+        self.outcome: Reason | None = None  # How the last motion home ended; None if :meth:`end` ended it.
 
     @property
     def active(self) -> bool:
@@ -244,7 +245,8 @@ class Homing:
         """End the motion home if the arms have arrived or cannot go on. Return the outcome; None if it goes on.
 
         Args:
-            reference: The newest reference. If the arms are held up, the outcome names its tightest pair.
+            reference: The newest reference. If the arms are held up, the outcome names the tightest pair of the
+                reference.
         """
         kind = None if self._motion is None else self._motion.outcome
         if kind is None:

@@ -71,7 +71,7 @@ class JointWatch:
     ) -> None:
         self._names, self._velocity_limit, self._settings = names, velocity_limit, settings
         self._source = source  # Text for messages that names the sender, such as " from /node", or "".
-        self.state: RobotState | None = None  # The newest state that was good.
+        self.state: RobotState | None = None  # The newest state that was good; None before the first one.
         self.fault: Reason | None = Reason.of(SupervisionReason.NO_STATES_YET, source="")
         self._lost = False  # True if the fault is a lost session, and all states since then were good.
         self._q: list[float] = []  # Joint positions of ``state`` [rad].
@@ -127,7 +127,8 @@ class JointWatch:
         """Return the present fault, or None. A state that is too old becomes a fault here."""
         if self.fault is not None:
             return self.fault
-        # After a clock was set back, the newest state seems to come from the future, and would look fresh for long.
+        # After a clock was set back, the newest state seems to come from the future, and would look fresh for a long
+        # time.
         timeout, age = self._settings.timeout, now - self._stamp
         if not -timeout <= age <= timeout:
             self._fail(Reason.of(SupervisionReason.STATES_SILENT, age=age, timeout=timeout, source=self._source()))

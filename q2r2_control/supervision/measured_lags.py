@@ -1,4 +1,4 @@
-"""Estimate from measured postures how far each arm lags behind the reference, for drivers that do not report it."""
+"""Estimate from measured postures how far each arm lags behind the reference, if its driver does not report this."""
 
 from __future__ import annotations
 

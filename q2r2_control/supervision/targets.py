@@ -160,7 +160,7 @@ class TargetStreams:
         return refusal
 
     def release(self, arm: str) -> None:
-        """Let the arm hold because its sender ended the stream. The next target begins a new one."""
+        """Let the arm hold because its sender ended the stream. The next target begins a new stream."""
         self._streams[arm].reset()
 
     def end(self, why: Reason) -> None:

@@ -141,7 +141,7 @@ class ArmTeleop:
         timeout = self._settings.gate.timeout
         if self._gate.stale(now):
             return Reason.of(TeleopReason.POSE_SILENT, timeout=timeout)
-        if now - self._inputs_stamp > timeout:  # The operator could not stop the arm by a button.
+        if now - self._inputs_stamp > timeout:  # Now the operator could not stop the arm by a button.
             return Reason.of(TeleopReason.INPUTS_SILENT, timeout=timeout)
         return None
 

@@ -17,7 +17,7 @@ from q2r2_control.config.teleop import FilterSettings
 from q2r2_control.quaternions import IDENTITY, Quaternion, Vector, normalized, turn_between, turned_by
 from q2r2_control.types import Pose
 
-# Samples that arrive closer together are merged, because the jitter of their receipt would look like speed [s].
+# Samples that arrive within this time are merged, because the jitter of their receipt would look like speed [s].
 _MIN_SPACING = 0.005
 _USUAL_PERIOD = 1.0 / 75.0  # Period of a headset's samples that is assumed until it is measured [s].
 # Gains of the delay-locked loop: the shares of a sample's jitter that correct the sample's time and the period.
@@ -212,12 +212,13 @@ class RestingPose:
         self._origin = IDENTITY  # The rotation from which rotation vectors are measured.
         self._newest: deque[_Sample] = deque(maxlen=_NEWEST)
         self._mean: _Sample = (0.0,) * 6
-        self._count = 0  # Number of samples of this rest.
+        self._count = 0  # Number of samples since the hand came to rest.
         self._held: Pose = (0.0, 0.0, 0.0), IDENTITY  # The mean towards which the filtered pose is moved.
         self._leaving = False  # Whether the hand has left ``_held`` and the weight of this mean is falling to 0.
         self._share, self._now = 0.0, 0.0
         self._last: deque[_Sample] = deque(maxlen=2)
-        self._noise, self._noise_count = [one**2 for one in _NOISE], _NOISE_SAMPLES[0]  # The variance of one axis.
+        # The variance of one axis [m^2], [rad^2], and its weight in samples.
+        self._noise, self._noise_count = [one**2 for one in _NOISE], _NOISE_SAMPLES[0]
 
     def add(self, pose: Pose) -> None:
         position, rotation = pose

@@ -177,7 +177,7 @@ class _Control:
 
     def cancel(self) -> None:
         self._muted = False
-        self.began: float | None = None  # Beginning of the press that is not decided yet [s].
+        self.began: float | None = None  # Time at which the undecided press began [s]; None without one.
 
     def begin(self, stamp: float) -> None:
         self.began, self._muted = stamp, False

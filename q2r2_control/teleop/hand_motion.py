@@ -74,7 +74,7 @@ class HandMotion:
             self._filter.add(hand, stamp, now)
 
     def anchor(self, hand: Pose, tool: Pose, shares: Shares, now: float) -> None:
-        """Let ``hand``, the hand's newest pose, correspond to ``tool`` (world frame) from now on."""
+        """Let ``hand``, the hand's newest pose (input's frame), correspond to ``tool`` (world frame) from now on."""
         if self._carried is not None:
             self._bound_one_tool()
         hand = self._rest.begin(hand, now)

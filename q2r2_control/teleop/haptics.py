@@ -17,8 +17,8 @@ class Pulse(NamedTuple):
 
     frequency: float  # Relative frequency of the vibration, from 0 to 1.
     amplitude: float  # Relative amplitude, from 0 to 1.
-    duration: float  # [s]
-    meaning: str
+    duration: float  # Duration of the vibration [s].
+    meaning: str  # The event that the vibration reports, in words.
     strongest: float | None = None  # Greatest amplitude, if the amplitude grows with a quantity; otherwise None.
 
     def grown(self, share: float) -> Pulse:

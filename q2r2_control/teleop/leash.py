@@ -52,15 +52,16 @@ class ComponentLeash:
         """Begin with a slack leash and no slip."""
         self.slip = 0.0  # The sum of all shifts of the target since the reset [m or rad].
         self.taut = False
-        self._back = 0.0  # Distance by which the hand has come back towards the tool [m or rad].
+        # Distance by which the hand has come back towards the tool since it was farthest away [m or rad].
+        self._back = 0.0
 
     def releases_slack(self, shift: Vector, by_hand: Vector, by_tool: Vector, dt: float) -> bool:
         """Return whether the target is to be put at the tool pose, because the hand comes back from a blocked tool.
 
         Args:
             shift: Displacement from the tool to the target [m or rad].
-            by_hand: Motion of the unslipped target since the last tick, which is the unfiltered hand's motion.
-            by_tool: Motion of the tool since the last tick.
+            by_hand: Motion of the unslipped target since the last tick, by the unfiltered hand [m or rad].
+            by_tool: Motion of the tool since the last tick [m or rad].
             dt: Duration of the tick [s].
         """
         distance = math.hypot(*shift)

@@ -199,7 +199,7 @@ class PolicyMotion:
         return target if tool is None else self._leash.hold(target, tool)
 
     def gripper(self, now: float) -> float | None:
-        """Return the opening of the newest action at or before ``now``; None if the policy does not command it."""
+        """Return the opening of the newest action up to ``now``; None if the policy does not command the gripper."""
         if self._plan is None or not self._plan.grippers:
             return None
         index = bisect_right(self._plan.times, now) - 1

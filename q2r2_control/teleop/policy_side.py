@@ -60,7 +60,7 @@ class PolicySide:
         faults: dict[str, Reason] = {}
         for name, motion in self._motions.items():
             if motion.following and self._arms[name].state is not ArmState.POLICY:
-                motion.forget()  # The arm was stopped, or a hand has taken it over. It may go on with the next chunk.
+                motion.forget()  # The arm was stopped or taken over by a hand. It may follow the next chunk.
         for chunk in chunks:
             self._asked = {*chunk.tools, *chunk.motions} or self._asked
             for name, motion in self._motions.items():

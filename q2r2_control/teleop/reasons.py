@@ -46,7 +46,7 @@ class TeleopReason(ReasonKind):
         "hands_crossed",
         "the left hand has been to the right of the right hand for {time:g} s: are the two controllers swapped?",
     )
-    # Refusals: nothing changed. Those of the first group have a cause.
+    # Refusals, after which nothing has changed. The first five have a cause.
     NOT_ENGAGED = "not_engaged", "not engaged: {cause}"
     NOT_HOMING = "not_homing", "not homing: {cause}"
     NOT_CARRIED = "not_carried", "not carried: {cause}"

@@ -115,11 +115,17 @@ class RelativeMotion:
         self.anchor_floats(hand, tool)
 
     def anchor_position(self, hand: Vector, tool: Vector) -> None:
-        """Let ``hand`` (input's frame) correspond to ``tool`` (world frame). The anchor of rotations stays."""
+        """Let the position ``hand`` (input's frame) correspond to the position ``tool`` (world frame) from now on.
+
+        The anchor of rotations stays.
+        """
         self._hand_position, self._tool_position = hand, tool
 
     def anchor_rotation(self, hand: Quaternion, tool: Quaternion) -> None:
-        """Let ``hand`` (input's frame) correspond to ``tool`` (world frame). The anchor of positions stays."""
+        """Let the rotation ``hand`` (input's frame) correspond to the rotation ``tool`` (world frame) from now on.
+
+        The anchor of positions stays.
+        """
         self._hand_rotation = normalized(hand)
         self._hand_back = inverse(self._hand_rotation)
         self._tool_rotation = tool = normalized(tool)
@@ -195,7 +201,7 @@ class RelativeMotion:
 
 
 def _checked_floats(name: str, pose: pin.SE3) -> Pose:
-    """Return a pose as floats. Raises :class:`Q2R2Error` if it is no pose, not finite, or its matrix no rotation."""
+    """Return a pose as floats. Raises :class:`Q2R2Error` if it is not a finite pose with a rotation matrix."""
     if not isinstance(pose, pin.SE3) or not np.allclose(pose.rotation @ pose.rotation.T, np.eye(3), atol=1e-3):
         raise Q2R2Error(f"RelativeMotion.{name} = {shown(pose)}: allowed: a pin.SE3 with a proper rotation")
     if not np.isfinite(pose.translation).all():

@@ -134,7 +134,7 @@ class Teleop:
             tools: The measured tool poses, in the world frame.
             now: The time, by the same clock as the samples' stamps [s].
             commanded: The tool poses at the controller's reference, in the world frame. The leash keeps each target
-                near this pose. Without it there is no leash.
+                near this pose. Without these poses there is no leash.
             obstacles: For each arm that may not be engaged now, the reason. The caller has to find these reasons.
             in_step: Whether all poses in ``commanded`` belong to one moment. Only then may they correct the relative
                 pose of two tools that carry one object.
