@@ -1,4 +1,4 @@
-"""Events of the arms as data: a kind and its details. Code decides by the kind, and :mod:`wording` makes sentences."""
+"""Events of the arms as data: a kind and its details. Code uses the kind, and :mod:`wording` makes sentences."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class CommonReason(ReasonKind):
     HOMING_INTERRUPTED = "homing_interrupted", "the way home was interrupted"
     HOMING_ENDED = "homing_ended", "the way home was ended"
     HOMING_FAULT = "homing_fault", "on the way home: {cause}"
-    # Others.
+    # Other kinds.
     POLICY_UNUSABLE = "policy_unusable", "actions of the policy that cannot be used: {text}"
     LOOP_STALLED = "loop_stalled", "the control loop stood still for {duration:.3f} s"
     OTHER = "other", "{text}"  # The sentence was made elsewhere. No code makes a decision from it.

@@ -115,8 +115,8 @@ class HandSample:
     """
 
     hand: str
-    position: Array  # (3,) In the input's own frame [m].
-    quaternion: Array  # (4,) x y z w of any length.
+    position: Array  # (3,) Position in the input's own frame [m].
+    quaternion: Array  # (4,) Rotation x y z w, of any length.
     pose_stamp: float  # Time of receipt of the pose [s].
     inputs: HandInputs = field(default_factory=HandInputs)
     inputs_stamp: float = float("-inf")  # Time of receipt of the controls [s]; -inf if none were received yet.
@@ -190,7 +190,7 @@ class Observation:
 
     time: float  # Time of the loop's clock [s].
     state: RobotState  # Measured before the command of the tick.
-    openings: Mapping[str, float]  # Measured openings by arm, from 0 for closed to 1; only arms that measure them.
+    openings: Mapping[str, float]  # Measured openings by arm, from 0 for closed to 1; only of arms that measure it.
     tools: Mapping[str, pin.SE3]  # Measured poses of the tools, in the world frame.
     # The newest picture of each camera of the cell. If a camera gives no picture, reading it raises CameraError.
     pictures: Mapping[str, ObservedPicture] = field(default_factory=dict)

@@ -105,7 +105,7 @@ class ControlLoop:
 
     @property
     def held_grippers(self) -> dict[str, tuple[str, str]]:
-        """For each gripper that is not commanded as wanted, the pair of bodies that prevents it."""
+        """For each gripper that is not commanded to its wanted opening, the pair of bodies that prevents this."""
         return {} if self._limiter is None else self._limiter.held
 
     def pace(self, gap: float) -> float:
@@ -325,7 +325,7 @@ class ArmConditions:
         return {arm: self.look_at(arm, state, now) for arm in self._joints}
 
     def look_at(self, arm: str, state: RobotState, now: float) -> ArmCondition:
-        """Return the conditions of one arm at ``now``. It is too slow for every tick, since distances are measured."""
+        """Return the conditions of one arm at ``now``. Distances are measured, which is too slow for every tick."""
         self._limited = {name: t for name, t in self._limited.items() if now - t <= _LIMIT_LASTS}
         limited = frozenset(self._joints[arm] & self._limited.keys())
         return ArmCondition(self._controller.spare_distance(arm), limited, self._contact_force(arm, state))

@@ -46,7 +46,8 @@ class LoopClock:
     def __init__(self, period: float, realtime: bool, pace: WallPace | None = None) -> None:
         self.period, self._realtime, self._pace = period, realtime, pace
         self._ticks = 0
-        self.start = self.now = self._due = time.monotonic() if realtime else 0.0  # [s]
+        # Times of the loop's clock: start of the run, newest tick, and when this tick was due [s].
+        self.start = self.now = self._due = time.monotonic() if realtime else 0.0
         self._wall_start = time.perf_counter()
         self.lateness = Histogram(1e-3)  # Delay of each tick after it was due.
         self.overruns = 0  # Number of ticks that began more than a period after they were due.
@@ -54,7 +55,7 @@ class LoopClock:
         self.woke = self._wall_start  # Beginning of the newest tick, by time.perf_counter() [s].
 
     def wait(self) -> float:
-        """Wait for the next tick; returns the time since the last one [s], even if it is long."""
+        """Wait for the next tick; returns the time since the last tick [s], even if this time is long."""
         self._ticks += 1
         if not self._realtime:
             self.now = self._ticks * self.period
@@ -109,7 +110,7 @@ class LoopClock:
 class PlantClock:
     """Stamps the states of a plant by the loop's clock.
 
-    A state that the plant repeats gets older by the time for which the plant was advanced since.
+    If the plant repeats a state, the state gets older by the time for which the plant was advanced meanwhile.
     """
 
     def __init__(self, state: RobotState) -> None:

@@ -26,7 +26,7 @@ from q2r2_control.plants.base import PicturedPlant, Plant
 from q2r2_control.types import ObservedPicture
 
 Pixels = npt.NDArray[np.uint8]  # (height, width, 3) r g b.
-_ROUNDING = 1e-6  # A picture counts as due by this share of a period too early, because times are rounded.
+_ROUNDING = 1e-6  # A picture counts as due if only this share of its period is missing, because times are rounded.
 
 
 class ReadPicture:

@@ -32,7 +32,8 @@ from q2r2_control.teleop.teleop import Teleop
 from q2r2_control.types import ActionChunk, ArmTarget, HandSample, Observation
 from q2r2_control.wording import event_line, sentence
 
-_PERIOD = 0.02  # Each arm's conditions, slip and gripper are examined once in this time, its events at each tick [s].
+# Each arm's conditions, slip and gripper are examined once in this time, and its events at each tick [s].
+_PERIOD = 0.02
 _logger = logging.getLogger(__name__)
 
 
@@ -116,7 +117,7 @@ class OperatorSide:
         for event in tick.events:
             self._pulses[event.arm].start_pulse(event)
         self._conditions.note(tick.reference.report, now)
-        self._due = max(self._due, now - _PERIOD + self._wait)  # Each arm is examined at most once.
+        self._due = max(self._due, now - _PERIOD + self._wait)  # Each arm is examined at most once per tick.
         while now >= self._due:
             self._due += self._wait
             self._inspect(next(self._turns), tick)

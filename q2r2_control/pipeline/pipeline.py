@@ -284,7 +284,7 @@ class Pipeline(RequestedRun):
         return fit
 
     def _resting_ticks(self) -> Iterator[float]:
-        """Take ticks in real time while the arms rest, and yield how long each took without its wait [s]."""
+        """Take ticks in real time while the arms rest, and yield the duration of each tick without its wait [s]."""
         self._pace = None
         self._prepare(realtime=True)
         self._begin(realtime=True)
@@ -310,7 +310,8 @@ class Pipeline(RequestedRun):
         period, delay = 1.0 / self.config.nominal_rate_hz, self.config.gripper_delay
         if not isinstance(self.plant, SessionPlant):
             self.drive.average(period)
-        standstill = getattr(self.plant, "standstill", None)  # A plant has it if another process moves its arms.
+        # A plant has this attribute if another process moves its arms.
+        standstill = getattr(self.plant, "standstill", None)
         self.loop = ControlLoop(
             self.controller, self.drive, period, streams, watch, gripper_delay=delay, standstill=standstill
         )
@@ -473,7 +474,10 @@ class Pipeline(RequestedRun):
         return {name: pin.updateFramePlacement(model, data, arm.frame_id).copy() for name, arm in arms.items()}
 
     def _posture(self) -> Array | None:
-        """Return the joint positions that a policy asks for (nv,) [rad], or None. All other arms get their home."""
+        """Return the joint positions that a policy asks for (nv,) [rad], or None.
+
+        Arms for which it asks for none get their home posture.
+        """
         asked = {arm: posture for arm, target in self._targets.items() if (posture := target.posture) is not None}
         if not asked:
             return None

@@ -100,7 +100,7 @@ class SlowRun:
         self._newest: Moment | None = None
         self._rest: Moment  # The first moment of the present rest.
         self._moments: list[Moment] | None = None  # The moments of the present motion; None between motions.
-        self._lost: Reason | None = None  # Why the arms were not commanded any more during the motion.
+        self._lost: Reason | None = None  # Why the arms were not commanded any more in this motion, or None.
 
     def __enter__(self) -> SlowRun:
         self._thread.start()

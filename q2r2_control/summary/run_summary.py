@@ -112,7 +112,7 @@ class ArmSummary:
     rotation_error_deg_rms: float | None = None
     gripper_changes: int = 0
     gripper_held_s: float = 0.0  # Time for which a body near the fingers prevented the wanted opening of the gripper.
-    gripper_held_by: tuple[str, str] | None = None  # The pair of geometries that prevented it last.
+    gripper_held_by: tuple[str, str] | None = None  # The pair of geometries that prevented the opening last.
     object_held_s: float | None = None  # Time for which the gripper held its object; None if the arm has no object.
     slip_mm_max: float = 0.0  # Largest slip of the target in one engagement.
     slip_deg_max: float = 0.0
@@ -132,21 +132,21 @@ class ArmSummary:
 
 @dataclass(frozen=True, slots=True)
 class RunSummary:
-    """Figures of a whole run. Ratios and margins are the worst of all ticks, and a ratio of 1 is the limit."""
+    """Figures of a whole run. Ratios and margins are the worst of all ticks. A ratio of 1 means the limit."""
 
     ticks: int
     duration_s: float
     loop_rate_hz: float
     real_time_factor: float | None  # Simulated seconds per second of the computer's clock; None in real time.
     tick_us: Percentiles  # Time from polling the input to the command, without the plant.
-    lateness_us: Percentiles  # Time by which ticks began after they were due; None in simulated time.
+    lateness_us: Percentiles  # Delay of ticks after the times at which they were due; None in simulated time.
     input_to_command_ms: Percentiles  # Time from the receipt of a sample to the command that follows from it.
     arms: dict[str, ArmSummary]
     min_distance_mm: float | None  # Least distance in the reference; None if there is no monitored pair.
     closest_pair: tuple[str, str] | None
     max_velocity_ratio: float
     max_acceleration_ratio: float
-    min_position_margin_rad: float  # Least distance from a position limit, minus the configured margin.
+    min_position_margin_rad: float  # Least distance of a joint from a position limit, minus the configured margin.
     fallback_ticks: int
     uncertified_ticks: int
     rejected_targets: int
