@@ -94,16 +94,16 @@ class StandstillWatch:
         if not self._seen or now - self._seen[0][0] < WINDOW:
             return None
         _, asked_then, path_then = self._seen[0]
-        commanded, moved = _largest_change(asked, asked_then), _largest_change(self._seen[-1][2], path_then)
-        if max(commanded, moved) < self._limits.least:
+        way, moved = _largest_change(asked, asked_then), _largest_change(self._seen[-1][2], path_then)
+        if max(way, moved) < self._limits.least:
             self._follows = False  # The arm is at rest.
-        elif moved > _FOLLOWS_ABOVE * commanded:
+        elif moved > _FOLLOWS_ABOVE * way:
             self._follows = True
         ahead = _largest_change(asked_then, measured)
-        stands = commanded >= self._limits.least and moved <= _STANDS_BELOW * commanded and ahead >= self._limits.ahead
+        stands = way >= self._limits.least and moved <= _STANDS_BELOW * way and ahead >= self._limits.ahead
         self._since = min(self._since, now) if stands else math.inf
         needed = self._limits.patience if self._follows else max(self._limits.begins, self._limits.patience)
-        return commanded if stands and now - self._since >= needed else None
+        return way if stands and now - self._since >= needed else None
 
 
 class StandingArms:
