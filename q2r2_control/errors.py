@@ -10,7 +10,7 @@ class Q2R2Error(Exception):
     """Base class of all errors that q2r2_control raises on purpose.
 
     Attributes:
-        faults: A line for each fault if they are known; otherwise the message alone.
+        faults: One line for each fault, if the faults are given; otherwise the message alone.
     """
 
     def __init__(self, message: str, faults: Sequence[str] = ()) -> None:
@@ -59,11 +59,11 @@ class RobotError(Q2R2Error):
 
 
 class ProtocolError(Q2R2Error):
-    """A peer sent bytes that its protocol does not allow. The message says which, and what is allowed."""
+    """A peer sent bytes that its protocol does not allow. The message says which bytes, and what is allowed."""
 
 
 class InputError(Q2R2Error):
-    """An input cannot be opened. The message says which and why."""
+    """An input cannot be opened. The message names the input and says why."""
 
 
 class PlantError(Q2R2Error):
@@ -71,7 +71,7 @@ class PlantError(Q2R2Error):
 
 
 class CameraError(Q2R2Error):
-    """A camera cannot be opened, or gives no more pictures. The message says which, why, and what is allowed."""
+    """A camera cannot be opened, or gives no more pictures. The message says which camera, why, and what is allowed."""
 
 
 class RecordingError(Q2R2Error):

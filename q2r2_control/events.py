@@ -1,4 +1,4 @@
-"""Events of the arms as data: a kind and its details. Code decides by the kind, and :mod:`wording` makes sentences."""
+"""Events of the arms as data: a kind and its details. Code uses the kind, and :mod:`wording` makes sentences."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class ReasonKind(StrEnum):
 
     Each subpackage that gives reasons has an enum of its own kinds, a subclass of this class, such as
     :class:`TeleopReason`. The enum is an entry point of the group ``q2r2_control.reasons``, so that recordings and
-    messages with its kinds can be read.
+    messages that contain its kinds can be read.
 
     The values never change, so that old recordings stay readable. Each kind has the ``template`` of its sentence. The
     fields of the template are the details of the reason, and ``cause`` is the sentence of its cause.
@@ -33,7 +33,7 @@ class ReasonKind(StrEnum):
 class CommonReason(ReasonKind):
     """Kinds of reasons that several subpackages give."""
 
-    # The way home.
+    # The motion home.
     HOMING = "homing", "way home"
     HOMING_ARRIVED = "homing_arrived", "at home"
     HOMING_HELD_UP = "homing_held_up", "held up by {by}"
@@ -41,16 +41,16 @@ class CommonReason(ReasonKind):
     HOMING_INTERRUPTED = "homing_interrupted", "the way home was interrupted"
     HOMING_ENDED = "homing_ended", "the way home was ended"
     HOMING_FAULT = "homing_fault", "on the way home: {cause}"
-    # Others.
+    # Other kinds.
     POLICY_UNUSABLE = "policy_unusable", "actions of the policy that cannot be used: {text}"
     LOOP_STALLED = "loop_stalled", "the control loop stood still for {duration:.3f} s"
-    OTHER = "other", "{text}"  # The sentence was made elsewhere, and no code decides by it.
+    OTHER = "other", "{text}"  # The sentence was made elsewhere. No code makes a decision from it.
 
 
 @cache
 def _kinds() -> dict[str, ReasonKind]:
-    rooms: list[type[ReasonKind]] = [CommonReason, *(load_class(REASONS, name) for name in names_of(REASONS))]
-    return {str(kind): kind for room in rooms for kind in room}
+    enums: list[type[ReasonKind]] = [CommonReason, *(load_class(REASONS, name) for name in names_of(REASONS))]
+    return {str(kind): kind for enum in enums for kind in enum}
 
 
 def kind_named(value: str) -> ReasonKind:
@@ -75,7 +75,7 @@ class Reason:
 
     @classmethod
     def in_words(cls, text: str) -> Reason:
-        """Make a reason from a sentence. No code decides by this reason."""
+        """Make a reason from a sentence. No code makes a decision from this reason."""
         return cls(CommonReason.OTHER, {"text": text})
 
     @property

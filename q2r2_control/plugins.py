@@ -25,10 +25,10 @@ REASONS = "q2r2_control.reasons"
 
 
 def points_of(group: str) -> Mapping[str, EntryPoint]:
-    """Return the entry points that installed packages declare, by name in alphabetical order.
+    """Return the entry points that installed packages declare in ``group``, by name in alphabetical order.
 
     The result is kept, because reading the files of some hundred packages takes longer than loading a cell. The files
-    are read again when a folder of the path has changed, as it does when a package is installed.
+    are read again when a folder of ``sys.path`` has changed, as it does when a package is installed.
     """
     folders = tuple((folder, _changed_at(folder)) for folder in sys.path)
     return _points(group, folders)
@@ -36,7 +36,7 @@ def points_of(group: str) -> Mapping[str, EntryPoint]:
 
 @lru_cache(maxsize=32)
 def _points(group: str, folders: tuple[tuple[str, int], ...]) -> Mapping[str, EntryPoint]:
-    """Return the entry points of a group. ``folders`` are those of the path, with the times of their changes [ns]."""
+    """Return the entry points of a group. ``folders`` are those of ``sys.path``, with their times of change [ns]."""
     return {point.name: point for point in sorted(entry_points(group=group), key=lambda point: point.name)}
 
 
@@ -48,7 +48,7 @@ def _changed_at(folder: str) -> int:
 
 
 def names_of(group: str) -> tuple[str, ...]:
-    """Return the names that installed packages declare, in alphabetical order."""
+    """Return the names that installed packages declare in ``group``, in alphabetical order."""
     return tuple(points_of(group))
 
 
@@ -56,7 +56,7 @@ def load_class(group: str, name: str) -> Any:
     """Return the class, the preset or the format called ``name``.
 
     Raises:
-        ConfigError: If there is no such name, or if it cannot be imported.
+        ConfigError: If the group has no such name, or if the object cannot be imported.
     """
     found = points_of(group)
     if name not in found:

@@ -65,7 +65,7 @@ class HandInputs:
 
     ``button_lower`` is A on the right and X on the left controller, ``button_upper`` is B and Y. Triggers go from 0 to
     1, and sticks from -1 to 1. ``more`` has further controls of other devices by name, from 0 at rest to 1 for pressed.
-    A name that is missing is at rest.
+    A missing control is at rest.
     """
 
     button_upper: bool = False
@@ -115,8 +115,8 @@ class HandSample:
     """
 
     hand: str
-    position: Array  # (3,) In the input's own frame [m].
-    quaternion: Array  # (4,) x y z w of any length.
+    position: Array  # (3,) Position in the input's own frame [m].
+    quaternion: Array  # (4,) Rotation x y z w, of any length.
     pose_stamp: float  # Time of receipt of the pose [s].
     inputs: HandInputs = field(default_factory=HandInputs)
     inputs_stamp: float = float("-inf")  # Time of receipt of the controls [s]; -inf if none were received yet.
@@ -136,12 +136,12 @@ class HapticFeedback:
 class RobotState:
     """The measured state of a plant, in the joint order of ``Robot.model``."""
 
-    q: Array  # (nv,) [rad]
-    v: Array  # (nv,) [rad/s]
-    tau: Array  # (nv,) Measured joint torque [Nm].
+    q: Array  # (nv,) Joint positions [rad].
+    v: Array  # (nv,) Joint velocities [rad/s].
+    tau: Array  # (nv,) Measured joint torques [Nm].
     tau_external: Array | None  # (nv,) Torque from contacts [Nm]; None if the plant does not measure it.
-    stamp: float  # [s]
-    held: Array | None = None  # (nv,) Where the plant's drives hold the arms [rad]; None if it does not report this.
+    stamp: float  # Time of the measurement or of its receipt [s].
+    held: Array | None = None  # (nv,) Posture at which the drives hold the arms [rad]; None if it is not reported.
 
 
 class CommandMode(StrEnum):
@@ -161,9 +161,9 @@ class Command:
     """A command for the plant, in the joint order of ``Robot.model``."""
 
     mode: CommandMode
-    q: Array  # (nv,) [rad]. In velocity and torque mode this is the reference, for plants that show it.
-    v: Array  # (nv,) [rad/s]
-    tau: Array  # (nv,) The commanded torque in torque mode [Nm].
+    q: Array  # (nv,) Joint positions [rad]. In velocity and torque mode, the reference, for plants that show it.
+    v: Array  # (nv,) Joint velocities [rad/s].
+    tau: Array  # (nv,) The commanded joint torques in torque mode [Nm].
     grippers: dict[str, float]  # Openings by arm, from 0 for closed to 1 for fully open.
     # (nv,) Deceleration of the certified stop from q and v [rad/s^2]; None if no stop is known.
     deceleration: Array | None = None
@@ -188,9 +188,9 @@ class ObservedPicture(Protocol):
 class Observation:
     """The data of one tick for a policy: the state before the command, with the time of the loop's clock."""
 
-    time: float  # [s]
-    state: RobotState
-    openings: Mapping[str, float]  # Measured openings by arm, from 0 for closed to 1; only arms that measure them.
+    time: float  # Time of the loop's clock [s].
+    state: RobotState  # Measured before the command of the tick.
+    openings: Mapping[str, float]  # Measured openings by arm, from 0 for closed to 1; only of arms that measure it.
     tools: Mapping[str, pin.SE3]  # Measured poses of the tools, in the world frame.
     # The newest picture of each camera of the cell. If a camera gives no picture, reading it raises CameraError.
     pictures: Mapping[str, ObservedPicture] = field(default_factory=dict)
@@ -203,15 +203,14 @@ class ActionChunk:
     times: Array  # (n,) Ascending times of the loop's clock [s].
     period: float  # Time from one action to the next [s]. It is also given for a single action.
     tools: Mapping[str, Array] = field(default_factory=dict)  # By arm (n, 7): x y z qx qy qz qw in the world frame.
-    motions: Mapping[str, Array] = field(
-        default_factory=dict
-    )  # By arm (n, 6): motions, in the frame of the target before.
-    grippers: Mapping[str, Array] = field(default_factory=dict)  # By arm (n,): openings.
+    # By arm (n, 6): translation [m] and rotation vector [rad], in the frame of the target before.
+    motions: Mapping[str, Array] = field(default_factory=dict)
+    grippers: Mapping[str, Array] = field(default_factory=dict)  # By arm (n,): openings, 0 closed .. 1 fully open.
     postures: Array | None = None  # (n, nv) Positions of all joints, used where the tool poses leave them free [rad].
-    fault: Reason | None = None
+    fault: Reason | None = None  # Why the actions are not usable; None if they are.
 
     def as_json(self) -> dict[str, Any]:
-        """Return data for ``json.dumps``, from which :meth:`from_json` makes the same chunk to the bit."""
+        """Return data for ``json.dumps``, from which :meth:`from_json` makes the same chunk, bit for bit."""
         named = {"tools": self.tools, "motions": self.motions, "grippers": self.grippers}
         data: dict[str, Any] = {
             name: {arm: _packed(values) for arm, values in arms.items()} for name, arms in named.items()
@@ -239,7 +238,7 @@ class ActionChunk:
 
 
 def _packed(values: Array) -> str:
-    """Return the float64 values of an array as base64. Decimal numbers of a long chunk would take a millisecond."""
+    """Return the float64 values of an array as base64. To write decimal numbers would take a millisecond."""
     return b64encode(values.tobytes()).decode("ascii")
 
 
@@ -253,7 +252,7 @@ class StepStatus(StrEnum):
     OK = "ok"
     TARGET_REJECTED = "target_rejected"  # A target was not usable, and its arm keeps the last target.
     DT_REJECTED = "dt_rejected"  # dt was not in (0, 0.1] s.
-    RECOVERING = "recovering"  # A joint is outside a limit, or a pair is too close, and the arms are on the way back.
+    RECOVERING = "recovering"  # A joint is outside a limit, or a pair is too close. The arms move back.
     FALLBACK = "fallback"  # The certified stop was executed instead of the solution of the QP, at least in part.
 
 
@@ -282,10 +281,10 @@ class StepReport:
     status: StepStatus
     rejected: tuple[str, ...]  # Arms whose target was not usable, and which keep the last target.
     binding: tuple[ActiveLimit, ...]  # The limits that were active in the solution.
-    closest_pair: tuple[str, str]  # Names of the geometries.
-    closest_distance: float  # [m]
+    closest_pair: tuple[str, str]  # Names of the two closest geometries.
+    closest_distance: float  # Distance of the closest pair [m].
     certified: bool  # Whether a stop is known that keeps all limits and distances.
-    fallback: bool
+    fallback: bool  # Whether the certified stop was executed, at least in part.
     slack: float  # Largest violation of a row of unit norm [rad/s].
     solve_time: float  # Time of the solver [s]; 0 if the solver was not needed.
     tightest_pair: tuple[str, str] = ("", "")  # Names of the geometries of the pair with the least margin.
@@ -298,13 +297,13 @@ class StepReport:
 class Reference:
     """The certified joint motion of one tick.
 
-    ``a`` is the mean acceleration from the last tick's velocity to ``v``. It does not lead exactly to ``q``, because
+    ``a`` is the mean acceleration from the last tick's velocity to ``v``. Its integral is not exactly ``q``, because
     the acceleration may change between substeps.
     """
 
-    q: Array  # (nv,) [rad]
-    v: Array  # (nv,) [rad/s]
-    a: Array  # (nv,) Mean since the last tick [rad/s^2].
+    q: Array  # (nv,) Joint positions [rad].
+    v: Array  # (nv,) Joint velocities [rad/s].
+    a: Array  # (nv,) Mean joint accelerations since the last tick [rad/s^2].
     report: StepReport
 
 
@@ -314,15 +313,15 @@ class ArmTarget:
 
     pose: pin.SE3 | None  # Target of the tool in the world frame; None lets the arm hold.
     gripper: float  # Opening, from 0 for closed to 1 for fully open.
-    slip: float = 0.0  # By how much the leash and the workspace have held the target back since engaging [m].
+    slip: float = 0.0  # Distance by which leash and workspace have held the target back since engaging [m].
     slip_angle: float = 0.0  # The same for the rotation [rad].
     offset: Array | None = None  # (3,) Measured minus commanded tool position when engaged [m]; None if not known.
     filtered_hand: Pose | None = None  # The filtered pose of the hand from which the target was computed.
-    posture: Array | None = None  # (nv,) Joint positions that a policy wants where the tool leaves them free [rad].
+    posture: Array | None = None  # (nv,) Posture that a policy wants, as far as the tool leaves it free [rad].
 
     @property
     def hand(self) -> pin.SE3 | None:
-        """Return ``filtered_hand`` as a pose."""
+        """Return ``filtered_hand`` as a pose, in the input's frame; None if there is none."""
         if self.filtered_hand is None:
             return None
         position, quaternion = self.filtered_hand
@@ -330,11 +329,11 @@ class ArmTarget:
 
     @property
     def command(self) -> pin.SE3 | None:
-        """Return the target for the controller that brings the measured tool to ``pose``."""
+        """Return the controller's target for which the measured tool reaches ``pose``; None if ``pose`` is None."""
         return None if self.pose is None else self.command_for(self.pose)
 
     def command_for(self, tool: pin.SE3) -> pin.SE3:
-        """Return the target for the controller that brings the measured tool to ``tool`` (world frame)."""
+        """Return the controller's target for which the measured tool reaches ``tool`` (both in the world frame)."""
         return tool if self.offset is None else moved_by(tool, -self.offset)
 
 
@@ -342,7 +341,7 @@ class ArmTarget:
 class ArmTiming:
     """The timing of one arm relative to the reference that it follows. All times are in seconds."""
 
-    behind: float | None  # Lag that the arm's newest message reports; None if it is not reported but measured.
+    behind: float | None  # Lag that the arm's newest message reports; None if the lag is measured instead.
     silent: float  # Time since that message.
     period: float  # Usual time between two messages.
     noise: float = 0.0  # Noise of ``behind``.

@@ -1,4 +1,4 @@
-"""Make sentences for people from events and reasons. No code decides by these sentences."""
+"""Make sentences for people from events and reasons. No code makes decisions from these sentences."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def sentence(reason: Reason, words: DeviceWords | None = None) -> str:
 
 
 def _text(value: Any) -> Any:
-    """Return a list as its names and a mapping as JSON. Numbers are formatted by their sentence."""
+    """Return a list as its names, and a mapping as JSON. Numbers stay, since the sentence's template formats them."""
     if isinstance(value, Mapping):
         return json.dumps(value)
     return " and ".join(map(str, value)) if isinstance(value, list | tuple) else value

@@ -36,7 +36,7 @@ class LoopStep:
     reference: Reference | None  # None if nothing is commanded.
     command: Command | None  # The command for the plant; None if nothing is commanded.
     grippers: dict[str, float]  # Commanded openings, from 0 for closed to 1 for fully open.
-    trusted: bool  # Whether the command may depend on the measured state.
+    trusted: bool  # True if the command may be computed from the measured state.
     report: DriveReport
     refusals: dict[str, Reason] = field(default_factory=dict)  # For each arm that refuses its target, the reason.
 
@@ -77,8 +77,8 @@ class ControlLoop:
             watch: The limits for measured states.
             origins: See :class:`Supervisor`.
             external: See :class:`Supervisor`.
-            owns_plant: Whether commands go on while the arms are stopped. If not, another controller holds the arms
-                then, and is left alone.
+            owns_plant: Whether this loop also commands the arms while they are stopped. If not, another controller then
+                holds the arms and gets no commands.
             gripper_delay: The longest time until a gripper gets its command [s].
             standstill: See :class:`Supervisor`.
         """
@@ -97,7 +97,7 @@ class ControlLoop:
         self.granted_openings: dict[str, tuple[float, float]] = {}  # By arm, the wanted and the granted opening.
         self._lags = MeasuredLags(robot)
         self._usual_lag = 0.0  # The longest recent lag [s].
-        # For each arm whose driver does not report its lag, the time at which it was measured [s].
+        # For each arm whose driver does not report its lag, the time at which the arm was measured [s].
         self._untold: dict[str, float] = {}
         self._velocity = np.zeros(robot.model.nv)  # Joint velocities of the last reference [rad/s].
         self._first: float | None = None  # Time of the first tick [s].
@@ -105,7 +105,7 @@ class ControlLoop:
 
     @property
     def held_grippers(self) -> dict[str, tuple[str, str]]:
-        """For each gripper that is not commanded as wanted, the pair of bodies that prevents it."""
+        """For each gripper that is not commanded to its wanted opening, the pair of bodies that prevents this."""
         return {} if self._limiter is None else self._limiter.held
 
     def pace(self, gap: float) -> float:
@@ -118,21 +118,21 @@ class ControlLoop:
     def observe(self, state: RobotState | Reason, now: float, passed: float = 0.0, lost: Reason | None = None) -> None:
         """Pass a measured state to supervision, or the reason why there is no state; see :meth:`JointWatch.observe`.
 
-        ``lost`` is the reason why the arms cannot be commanded although they are measured. If one of them can still be
-        commanded, it then brakes from this state until it rests.
+        ``lost`` is the reason why the arms cannot be commanded although they are measured. An arm that can still be
+        commanded then brakes from this state until it rests.
         """
         self.supervisor.update_state(state, now, passed, lost)
 
     def watch_skew(self, timings: Mapping[str, ArmTiming], lead: float, now: float) -> None:
         """Let supervision compare the lags of arms, each of which follows the reference with its own lag.
 
-        It is called before a step and before an activation. The controller keeps the arms apart for the greatest
-        difference between their lags.
+        The caller calls it before a step and before an activation. The controller then keeps the arms apart for every
+        difference of their lags that may occur.
 
         Args:
             timings: The timing of each arm's messages.
-            lead: Longest time along the reference from the posture to which an arm has been sent to the end of the
-                newest step [s].
+            lead: Longest time from the newest posture that was sent to an arm to the end of the newest step of the
+                reference [s]. See :meth:`SessionPlant.lead`.
             now: The time [s].
         """
         self._untold = untold = {arm: now - its.silent for arm, its in timings.items() if its.behind is None}
@@ -140,7 +140,8 @@ class ControlLoop:
             behind = self._lags.behind(state.q, untold)
             timings = {arm: replace(its, behind=behind.get(arm, its.behind)) for arm, its in timings.items()}
             self._usual_lag = max(_REMEMBERED_LAG * self._usual_lag, *behind.values())
-            lead += self._usual_lag  # An arm whose driver reports no lag may be this far behind what it was sent.
+            # An arm whose driver reports no lag may be this far behind the posture that it was sent.
+            lead += self._usual_lag
         self.controller.allow_skew(min(skew_window(timings, lead), LONGEST_WINDOW))
         self.supervisor.skew.observe(timings, now)
 
@@ -232,9 +233,10 @@ class ControlLoop:
     def age_obstacles(self, now: float) -> None:
         """Let reports of moving obstacles age by the clock, up to ``now`` [s].
 
-        They age from the first call on. A step ages them by the time by which it advances the reference. This is less
-        than the time of the clock while the loop stalls, and nothing while the arms are not commanded. The rest is
-        added here, by every step and by a caller who is about to pass on a report of a known age.
+        The reports age from the first call on. A step of the controller ages them only by the time by which it advances
+        the reference. This time is shorter than the clock's time if the loop stalls, and zero while the arms are not
+        commanded. This method adds the rest. Every :meth:`step` calls it. A caller calls it before it passes on a new
+        report whose age counts from ``now``.
         """
         if self._first is None:
             self._first = now
@@ -299,7 +301,7 @@ def without_proof(wanted: float, before: tuple[float, float] | None) -> float:
     return min(wanted, before[1]) if before[0] > before[1] else max(wanted, before[1])
 
 
-_LIMIT_LASTS = 0.5  # A limit may bind in some ticks only, and counts for this time after it last did [s].
+_LIMIT_LASTS = 0.5  # A limit that has held a step back counts as reached for this time [s].
 
 
 class ArmConditions:
@@ -323,7 +325,7 @@ class ArmConditions:
         return {arm: self.look_at(arm, state, now) for arm in self._joints}
 
     def look_at(self, arm: str, state: RobotState, now: float) -> ArmCondition:
-        """Return the conditions of one arm at ``now``. To measure its distances in every tick would take too long."""
+        """Return the conditions of one arm at ``now``. Distances are measured, which is too slow for every tick."""
         self._limited = {name: t for name, t in self._limited.items() if now - t <= _LIMIT_LASTS}
         limited = frozenset(self._joints[arm] & self._limited.keys())
         return ArmCondition(self._controller.spare_distance(arm), limited, self._contact_force(arm, state))

@@ -20,10 +20,10 @@ _SLOWEST, _FASTEST = 1.0, 500.0  # Lowest and highest rate of samples [Hz].
 class SampledTargets:
     """Tool targets at every step, on straight lines from each sample to the next.
 
-    The controller itself interpolates targets that its caller holds for some steps. It assumes that a target is held as
-    long as the target before. This class gets the rate of the samples instead. The motion is therefore smoother if
-    samples come unevenly, or less than nine times a second. A sample is reached :attr:`delay` after it was set. Steps
-    in between get poses on the line between two samples::
+    The controller itself interpolates targets that its caller holds for some steps. It assumes that each target is held
+    for the same time as the target before. This class gets the rate of the samples instead. The motion is therefore
+    smoother if samples come unevenly, or less than nine times a second. The targets reach each sample with a delay of
+    :attr:`delay` [s]. Steps in between get poses on the line between two samples::
 
         targets = SampledTargets(controller, rate_hz=90)
         while True:
@@ -54,7 +54,7 @@ class SampledTargets:
     def set(self, arm: str, pose: pin.SE3, now: float) -> bool:
         """Take a sample.
 
-        The first sample of an arm, and the first one after :meth:`release`, begins a line at the arm's tool pose.
+        The first sample of an arm, and the first sample after :meth:`release`, begin a line at the arm's tool pose.
 
         Args:
             arm: The arm that the sample is for.

@@ -1,1 +1,1 @@
-"""The loop in one process: input -> teleop -> control -> plant. Only this package imports all of them."""
+"""The loop in one process: input -> teleop -> control -> plant. Only this package imports all four."""

@@ -31,9 +31,9 @@ class JointMotion:
     """The motion of a joint that was commanded a degree away and back."""
 
     joint: str
-    commanded_deg: float
-    measured_deg: float
-    behind_deg: float  # Largest lag on the way.
+    commanded_deg: float  # Commanded motion away from the first posture.
+    measured_deg: float  # Measured motion away from the first posture.
+    behind_deg: float  # Largest lag of the joint behind its reference, during the motion.
     others_deg: float  # Largest motion of another joint.
 
     def check(self) -> JointMotion:
@@ -51,7 +51,8 @@ class JointMotion:
 def measure_joint(run: SlowRun, joint: int) -> JointMotion:
     """Move a joint by a degree towards the middle of its range and back, and check the motion.
 
-    ``joint`` is an index of ``Robot.joint_names``.
+    ``joint`` is an index of ``Robot.joint_names``. Raises :class:`PlantError` if the path is not free, or if the check
+    fails.
     """
     robot, start = run.robot, run.reference
     goal = start.copy()
@@ -85,8 +86,8 @@ class LoadSurvey:
     def measure(self) -> list[LoadReport] | None:
         """Return each arm's load, compared with the loads in the model and on the pendant.
 
-        Return None if the cabinets measure no torques. After a :class:`PlantError`, the next call goes on with the next
-        posture.
+        Return None if the cabinets measure no torques. After a :class:`PlantError`, another call continues with
+        the next posture.
         """
         while len(self._rests) < LEAST_POSTURES:
             if (goal := next(self._goals, None)) is None:
@@ -125,10 +126,10 @@ class StopReport:
 
     arm: str
     cause: str
-    tool_speed_mm_s: float
-    stopped_mm: float
-    allowed_mm: float  # Largest distance of the certified stop, after the latency.
-    stopped_s: float
+    tool_speed_mm_s: float  # Speed of the tool when the stop began.
+    stopped_mm: float  # Measured distance of the tool from the beginning of the stop to rest.
+    allowed_mm: float  # Distance of the certified stop, plus the motion during the latency.
+    stopped_s: float  # Measured duration of the stop.
     allowed_s: float
 
     def check(self) -> StopReport:
@@ -145,7 +146,7 @@ class StopReport:
 
 
 def measure_stop(run: SlowRun, arm: str) -> StopReport:
-    """Let a hand of the program move ``arm`` upwards and let go, like an operator's hand, and check the stop."""
+    """Let a simulated hand move ``arm`` upwards and let go, like an operator's hand, and check the stop."""
     return let_go_report(run.robot, arm, run.let_go([arm], LED)).check()
 
 
@@ -178,8 +179,8 @@ def stop_report(
     v = np.where(np.isin(np.arange(len(rest)), robot.arms[arm].joints), last.v, 0.0)
     deceleration = np.full_like(v, np.inf) if last.deceleration is None else np.maximum(last.deceleration, 1e-6)
     brakes = np.abs(v) / deceleration
-    way = v * (_LATENCY + 0.5 * brakes)
-    here, end, furthest = (robot.tool_pose(q, arm).translation for q in (released, rest, released + way))
+    travel = v * (_LATENCY + 0.5 * brakes)
+    here, end, furthest = (robot.tool_pose(q, arm).translation for q in (released, rest, released + travel))
     return StopReport(
         arm=arm,
         cause=cause,
@@ -192,6 +193,6 @@ def stop_report(
 
 
 def tool_speed(robot: Robot, arm: str, moment: Moment) -> float:
-    """Return the speed of the reference during the next 10 ms [m/s]."""
+    """Return the speed of the arm's tool in the reference during the next 10 ms [m/s]."""
     at, ahead = (robot.tool_pose(q, arm).translation for q in (moment.reference, moment.reference + 0.01 * moment.v))
     return float(100.0 * np.linalg.norm(ahead - at))

@@ -1,4 +1,4 @@
-"""A run that is killed while hands move its arms. A process that outlives the run has to stop the arms.
+"""A run that is killed while hands move its arms. Another process, which goes on, has to stop the arms.
 
 If a loop dies, the process that answers the cabinets brings the arms to rest on the certified stop, and then ends and
 releases its ports. A commissioning checks this with a loop that runs in a process of its own.
@@ -36,7 +36,7 @@ def main(requests: Iterator[Config], answer: Callable[[Any], None]) -> None:
 def measure_kill(config: Config, posture: Callable[[], Array], led: float = LED) -> list[StopReport]:
     """Kill a run after its tools have moved up for ``led`` [s], and return the unchecked report of each arm's stop.
 
-    ``posture`` is called when nothing commands the arms any more, and returns where they rest (nv,) [rad]. Raises
+    ``posture`` is called when nothing commands the arms any more, and returns their posture at rest (nv,) [rad]. Raises
     :class:`PlantError` if the arms do not go up.
     """
     robot = Robot.from_config(config)
@@ -58,7 +58,7 @@ def measure_kill(config: Config, posture: Callable[[], Array], led: float = LED)
             raise PlantError(f"a run that was killed still holds the cabinets' ports after {_PATIENCE:g} s")
         time.sleep(_LOOKS)
     took = time.monotonic() - killed
-    # Arms that wait for each other may have begun to brake just before the end.
+    # Arms that waited for each other may have begun to brake just before the process was killed.
     last, rest = next(moment for moment in reversed(moments) if _goes_up(robot, moment)), posture()
     reports = [stop_report(robot, arm, "program killed", last, last.q, rest, took) for arm in robot.arms]
     return [replace(report, allowed_s=report.allowed_s + _FREEING) for report in reports]
@@ -70,7 +70,7 @@ def _goes_up(robot: Robot, moment: Moment) -> bool:
 
 
 def _led(moments: list[Moment]) -> float:
-    """Return how long all arms have followed their hands by now [s]."""
+    """Return the time for which all arms have followed their hands [s]; 0 if an arm does not follow now."""
     if not moments or not all(moments[-1].engaged.values()):
         return 0.0
     begun = next((moment for moment in moments if all(moment.engaged.values())), moments[-1])

@@ -8,45 +8,46 @@ from dataclasses import replace
 from q2r2_control.summary.run_summary import Histogram
 from q2r2_control.types import RobotState
 
-_SHORTEST_DT = 1e-6  # Least duration of a tick that is returned [s].
-# A shorter sleep is left out. It would cost more than it is worth: a picture of the arms is shown eight times as long
-# [s].
+_SHORTEST_DT = 1e-6  # Least duration of a tick that :meth:`LoopClock.wait` returns [s].
+# Shorter sleeps are left out [s]. Nobody sees the difference, because a window shows each picture of the arms for eight
+# times as long.
 _SHORTEST_SLEEP = 0.004
 # If simulated time is farther behind than this, it does not catch up, and the motion goes on in slow motion [s].
 _LONGEST_LAG = 0.1
 _WINDOW = 1.0  # Time over which late ticks are counted [s].
-_MANY_LATE = 0.1  # Share of late ticks in a window from which the loop falls behind.
+_MANY_LATE = 0.1  # The loop falls behind if a larger share of the ticks in a window is late.
 
 
 class WallPace:
     """Lets simulated time pass no faster than the computer's clock, and more slowly if the computer is too slow."""
 
     def __init__(self) -> None:
-        self._ahead_since: float | None = None  # Time of the computer's clock at simulated time zero [s].
+        self._wall_at_zero: float | None = None  # Computer's time at simulated time zero [s].
 
     def wait_for(self, elapsed: float) -> None:
-        """Sleep until the computer's clock allows that ``elapsed`` [s] of simulated time are over."""
+        """Sleep until ``elapsed`` [s] of simulated time may be over by the computer's clock."""
         now = time.monotonic()
-        if self._ahead_since is None:
-            self._ahead_since = now - elapsed
-        ahead = self._ahead_since + elapsed - now
+        if self._wall_at_zero is None:
+            self._wall_at_zero = now - elapsed
+        ahead = self._wall_at_zero + elapsed - now
         if ahead >= _SHORTEST_SLEEP:
             time.sleep(ahead)
         elif ahead < -_LONGEST_LAG:
-            self._ahead_since -= ahead + _LONGEST_LAG
+            self._wall_at_zero -= ahead + _LONGEST_LAG
 
 
 class LoopClock:
     """Ticks on a grid of ``period`` [s], in real time or in simulated time. Simulated time is never late.
 
     Simulated time passes as fast as the ticks are computed, or no faster than ``pace`` allows. The ticks are the same
-    in both cases, so that their results are equal to the bit.
+    in both cases, so that their results are equal, bit for bit.
     """
 
     def __init__(self, period: float, realtime: bool, pace: WallPace | None = None) -> None:
         self.period, self._realtime, self._pace = period, realtime, pace
         self._ticks = 0
-        self.start = self.now = self._due = time.monotonic() if realtime else 0.0  # [s]
+        # Times of the loop's clock: start of the run, newest tick, and when this tick was due [s].
+        self.start = self.now = self._due = time.monotonic() if realtime else 0.0
         self._wall_start = time.perf_counter()
         self.lateness = Histogram(1e-3)  # Delay of each tick after it was due.
         self.overruns = 0  # Number of ticks that began more than a period after they were due.
@@ -54,7 +55,7 @@ class LoopClock:
         self.woke = self._wall_start  # Beginning of the newest tick, by time.perf_counter() [s].
 
     def wait(self) -> float:
-        """Wait for the next tick; returns the time since the last one [s], even if it is long."""
+        """Wait for the next tick; returns the time since the last tick [s], even if this time is long."""
         self._ticks += 1
         if not self._realtime:
             self.now = self._ticks * self.period
@@ -69,12 +70,12 @@ class LoopClock:
         self.lateness.add(late)
         self.overruns += late > self.period
         self._late_in_window += late > self.period
-        # Late ticks do not add up, because ticks are due on a grid. Missed ticks are not made up for.
+        # Delays do not add up, because ticks are due on a grid. Ticks that were missed are not repeated later.
         self._due = max(self._due, self.now - self.period)
         return max(self.now - before, _SHORTEST_DT)
 
     def keep_pace(self) -> None:
-        """Wait if simulated time is ahead of the computer's clock and must not be."""
+        """Wait if simulated time is ahead of the computer's clock and has to keep its pace."""
         if self._pace is not None:
             self._pace.wait_for(self.now - self.start)
 
@@ -86,7 +87,7 @@ class LoopClock:
         return late * self.period > _MANY_LATE * _WINDOW
 
     def after(self, duration: float) -> bool:
-        """Return whether ``duration`` [s] is over. The test is half a period early, so that rounding costs no tick."""
+        """Return whether ``duration`` [s] is over. Half a period may be missing, so that rounding adds no tick."""
         return self.now - self.start >= duration - 0.5 * self.period
 
     def read(self) -> float:
@@ -109,7 +110,7 @@ class LoopClock:
 class PlantClock:
     """Stamps the states of a plant by the loop's clock.
 
-    A state that the plant repeats gets older by the time for which the plant was advanced since.
+    If the plant repeats a state, the state gets older by the time for which the plant was advanced meanwhile.
     """
 
     def __init__(self, state: RobotState) -> None:

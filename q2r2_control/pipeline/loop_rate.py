@@ -10,10 +10,11 @@ import numpy as np
 
 from q2r2_control.config.cell import HIGHEST_FITTING_RATE_HZ
 
-# The highest rate that leaves enough time free is chosen. The torques of the impedance are stable at the lowest, too.
+# The highest rate that leaves enough time free is chosen. The torques of the impedance are stable even at the lowest
+# rate.
 FITTING_RATES_HZ = (HIGHEST_FITTING_RATE_HZ, 500.0, 250.0)
-_ROOM = 0.4  # Share of the period that 99 of 100 ticks must leave free for other programs.
-_WARM_UP, _LOOKED_AT = 50, 250  # Numbers of ticks that are ignored at first, and that are timed then.
+_FREE_SHARE = 0.4  # 99 of 100 ticks must leave this share of the period free for other programs.
+_WARM_UP, _TIMED = 50, 250  # Number of first ticks that are ignored, and number of timed ticks after them.
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,16 +27,16 @@ class RateFit:
     @property
     def leaves_room(self) -> bool:
         """Whether 99 of 100 ticks leave 40 % of the period free."""
-        return self.p99_s * self.rate_hz <= 1.0 - _ROOM
+        return self.p99_s * self.rate_hz <= 1.0 - _FREE_SHARE
 
     def __str__(self) -> str:
         used = f"99 of 100 ticks take at most {1e6 * self.p99_s:.0f} us, {100 * self.p99_s * self.rate_hz:.0f} %"
         if self.leaves_room:
             return f"loop rate {self.rate_hz:.0f} Hz: {used} of the period (loop_rate_hz: auto)"
-        most = f"more than {100 * (1.0 - _ROOM):.0f} %"
+        most = f"more than {100 * (1.0 - _FREE_SHARE):.0f} %"
         return f"loop rate {self.rate_hz:.0f} Hz, the lowest: {used} of the period, {most}; close other programs"
 
 
 def largest_usual_time(durations_s: Iterator[float]) -> float:
     """Return the duration that 99 of 100 ticks do not exceed [s], without the first ticks."""
-    return float(np.percentile(list(islice(durations_s, _WARM_UP, _WARM_UP + _LOOKED_AT)), 99))
+    return float(np.percentile(list(islice(durations_s, _WARM_UP, _WARM_UP + _TIMED)), 99))

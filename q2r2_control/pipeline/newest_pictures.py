@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from q2r2_control.cameras.newest_shots import NewestShots
 
 Pixels = npt.NDArray[np.uint8]  # (height, width, 3) r g b.
-_ROUNDING = 1e-6  # A picture counts as due this share of a period early, because times are rounded.
+_ROUNDING = 1e-6  # A picture counts as due if only this share of its period is missing, because times are rounded.
 
 
 class DrawnPicture:
@@ -39,7 +39,7 @@ class DrawnPicture:
 
 
 class PicturesByCamera(dict[str, ObservedPicture]):
-    """Pictures by the name of their camera. A camera without a picture raises :class:`CameraError`, which says why."""
+    """Pictures by the name of their camera. Reading a missing picture raises :class:`CameraError`, which says why."""
 
     def __init__(self, pictures: Mapping[str, ObservedPicture], reasons: Mapping[str, str]) -> None:
         super().__init__(pictures)
@@ -68,7 +68,7 @@ class NewestPictures:
         }
 
     def at(self, now: float) -> PicturesByCamera:
-        """Return the newest picture of each camera at a tick that is at ``now`` [s]. It never waits."""
+        """Return the newest picture of each camera at the tick whose time is ``now`` [s], without waiting."""
         found: dict[str, ObservedPicture] = {name: camera.at(now) for name, camera in self._drawn.items()}
         if self._shots is None:
             return PicturesByCamera(found, self._reasons)
@@ -88,7 +88,7 @@ class _DrawnCamera:
     def __init__(self, name: str, rate: float, plant: PicturedPlant) -> None:
         self._name, self._rate, self._plant = name, rate, plant
         self._start: float | None = None  # Time of the first tick [s].
-        self._number = 0  # Number of the newest picture.
+        self._number = 0  # Number of the newest picture, counted in periods since the first tick.
         self._newest: DrawnPicture | None = None
 
     def at(self, now: float) -> DrawnPicture:

@@ -1,4 +1,4 @@
-"""The operator's side of one run: input, teleop layer, way home, requests of a program, vibrations and log."""
+"""The operator's side of one run: input, teleop layer, motion home, requests of a program, vibrations and log."""
 
 from __future__ import annotations
 
@@ -32,7 +32,8 @@ from q2r2_control.teleop.teleop import Teleop
 from q2r2_control.types import ActionChunk, ArmTarget, HandSample, Observation
 from q2r2_control.wording import event_line, sentence
 
-_PERIOD = 0.02  # Each arm's conditions, slip and gripper are examined once in this time, its events at each tick [s].
+# Each arm's conditions, slip and gripper are examined once in this time, and its events at each tick [s].
+_PERIOD = 0.02
 _logger = logging.getLogger(__name__)
 
 
@@ -58,21 +59,21 @@ class OperatorSide:
         self._pictures, self._since = pictures, since
         self._teleop, self._input, self._supervisor = teleop, source, supervisor
         self._policy = source if isinstance(source, PolicySource) else None
-        self.chunks: list[ActionChunk] = []  # Chunks of a policy since the last poll.
+        self.chunks: list[ActionChunk] = []  # The chunks of a policy that the last poll has read.
         self._feels = getattr(source, "feels", True)  # False if no device can vibrate.
         self._controller, self._requests, self._impedance = controller, requests, impedance
-        self._homing = False  # True while supervision is on the way home.
-        self._in_the_way: frozenset[str] = frozenset()  # Moving obstacles that were in the way at their last report.
+        self._homing = False  # True while supervision moves the arms home.
+        self._in_the_way: frozenset[str] = frozenset()  # Moving obstacles too close to an arm in their last report.
         self.connected = False
         arms = controller.robot.arms
         self._conditions = ArmConditions(controller)
         self._pulses = {arm: HapticPulses(teleop.settings.haptics) for arm in arms}
         self._grips = {arm: Grip(arms[arm].stroke) for arm in arms}
-        # Only one arm is examined in a tick, because both would make that tick long.
+        # Only one arm is examined in a tick, because two arms would make the tick long.
         self._turns, self._wait, self._due = cycle(arms), _PERIOD / len(arms), -np.inf
 
     def poll(self, now: float) -> list[HandSample]:
-        """Take samples of the hands. A lost connection stops the arms that follow hands."""
+        """Return the new samples of the hands. A lost connection stops the arms that follow hands."""
         samples = check_samples(self._input.poll(now))
         self.chunks = [] if self._policy is None else self._policy.chunks()
         was_connected, self.connected = self.connected, self._input.connected
@@ -85,7 +86,7 @@ class OperatorSide:
         if self._requests:
             self._fulfil(now)
         commanded = {arm: self._controller.tool_pose(arm) for arm in tools}
-        # Arms whose plant ended its session wait for the next one. Meanwhile, a press is refused.
+        # If the plant has ended its session, the arms wait for the next session. Meanwhile, a press is refused.
         waits = self._supervisor.phase is not Phase.ACTIVE and self._supervisor.fault
         obstacles = dict.fromkeys(tools, waits) if waits else None
         targets = self._teleop.update(samples, tools, now, commanded, obstacles, chunks=self.chunks)
@@ -116,7 +117,7 @@ class OperatorSide:
         for event in tick.events:
             self._pulses[event.arm].start_pulse(event)
         self._conditions.note(tick.reference.report, now)
-        self._due = max(self._due, now - _PERIOD + self._wait)  # Each arm is examined at most once.
+        self._due = max(self._due, now - _PERIOD + self._wait)  # Each arm is examined at most once per tick.
         while now >= self._due:
             self._due += self._wait
             self._inspect(next(self._turns), tick)
@@ -143,7 +144,7 @@ class OperatorSide:
             self._do(request, now)
 
     def _do(self, request: Reason, now: float) -> None:
-        """Do what a program asks for. The outcome of a recording is only an event."""
+        """Do what a program asks for. A reported outcome needs no action, because it is already an event."""
         match request.kind:
             case TeleopReason.HOME_REQUESTED:
                 self._teleop.home(now)
@@ -183,7 +184,7 @@ class OperatorSide:
         self._teleop.record_event(now, outcome)
 
     def _go_home(self, now: float) -> None:
-        """Begin and end the way home as the operator asks, and report how it ended."""
+        """Begin and end the motion home as the operator asks, and report how it ended."""
         asked, homing = self._teleop.homing, self._supervisor.homing
         if asked and not self._homing:
             refusal = self._supervisor.go_home()

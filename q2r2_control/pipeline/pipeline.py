@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     from q2r2_control.cameras.camera_streams import CameraStreams
 
 STOPPING = "stopping"  # The state of every arm while the run ends.
-_STOP_ALLOWANCE_S = 1.0  # Time after full braking for an arm that still recovers into its limits.
+_STOP_ALLOWANCE_S = 1.0  # Time after full braking for an arm that still returns into its limits.
 _REST = 1e-6  # The reference is at rest if no joint is faster [rad/s].
 _ROUNDING_S = 1e-9
 _MAX_TORQUE_HOLD_S = 0.005  # A torque that a late tick held for 0.1 s would drive the arms into each other.
@@ -125,7 +125,7 @@ class Pipeline(RequestedRun):
         self._stopping = False
         self._ticked = time.monotonic()  # The end of the last tick, or the time before the first one [s].
         self._rate_was_fitted = False  # Whether :meth:`fit_rate` chose the rate of the loop.
-        self._pace: WallPace | None = None  # If given, simulated time must not be faster than the clock.
+        self._pace: WallPace | None = None  # Keeps simulated time from being faster than the clock; None if it may be.
         self._set_up()
 
     @classmethod
@@ -167,16 +167,17 @@ class Pipeline(RequestedRun):
         return self.loop.supervisor
 
     def preflight_faults(self) -> tuple[str, ...]:
-        """Return one line for each reason why a run should not start at home; empty if it may, as ``q2r2 run`` checks.
+        """Return one line for each reason why a run should not start at home; empty if it may.
 
-        The controller is reset to the home posture. See :func:`preflight_faults` of ``supervision``.
+        ``q2r2 run`` makes the same check. The controller is reset to the home posture. See :func:`preflight_faults` of
+        ``supervision``.
         """
         return preflight_faults(self.robot, self.config.control.without_contact(), self.controller)
 
     def stop(self) -> None:
         """Bring the arms to rest and end the run, or end the next run if none goes on.
 
-        Any thread and any signal handler may call it.
+        Any thread and any signal handler may call this method.
         """
         self._stopping = True
 
@@ -188,7 +189,7 @@ class Pipeline(RequestedRun):
             realtime: True if the loop follows the clock, and a late tick moves no joint farther than a period allows.
                 False if time is simulated, which makes the run repeatable.
             paced: True if simulated time must not pass faster than the clock. On a slow computer it passes more slowly.
-                The result is the same to the bit.
+                The result is the same, bit for bit.
 
         Raises:
             ConfigError: If the duration is not positive, or if the plant cannot keep the kind of time asked for.
@@ -214,7 +215,7 @@ class Pipeline(RequestedRun):
         """Begin a run in simulated time whose ticks the caller takes, by :meth:`tick`, :meth:`check` and :meth:`end`.
 
         Raises:
-            ConfigError: If the plant is real, because nothing brings these arms to rest.
+            ConfigError: If the plant is real, because nothing would bring its arms to rest.
         """
         if isinstance(self.plant, SessionPlant):
             raise ConfigError("ticks one by one: allowed with a plant that is simulated only")
@@ -259,7 +260,7 @@ class Pipeline(RequestedRun):
         self.input.start()
 
     def make_clock(self, realtime: bool) -> LoopClock:
-        """Make the clock of a run that begins now. A replay has a clock of its own."""
+        """Make the clock of a run that begins now. A replay overrides this method."""
         return LoopClock(1.0 / self.config.nominal_rate_hz, realtime, self._pace)
 
     def fit_rate(self) -> RateFit | None:
@@ -285,7 +286,7 @@ class Pipeline(RequestedRun):
         return fit
 
     def _resting_ticks(self) -> Iterator[float]:
-        """Take ticks in real time while the arms rest, and yield how long each took without its wait [s]."""
+        """Take ticks in real time while the arms rest, and yield the duration of each tick without its wait [s]."""
         self._pace = None
         self._prepare(realtime=True)
         self._begin(realtime=True)
@@ -311,7 +312,8 @@ class Pipeline(RequestedRun):
         period, delay = 1.0 / self.config.nominal_rate_hz, self.config.gripper_delay
         if not isinstance(self.plant, SessionPlant):
             self.drive.average(period)
-        standstill = getattr(self.plant, "standstill", None)  # A plant has it if another process moves its arms.
+        # A plant has this attribute if another process moves its arms.
+        standstill = getattr(self.plant, "standstill", None)
         self.loop = ControlLoop(
             self.controller, self.drive, period, streams, watch, gripper_delay=delay, standstill=standstill
         )
@@ -330,7 +332,8 @@ class Pipeline(RequestedRun):
         self._turns = TurnCounter(self.robot)
         self._turns.counted(self._state.q, self._clock.now)
         self.controller.pass_time(self._clock.since(self._ticked))
-        self.loop.age_obstacles(self._clock.now + self._clock.period)  # A first tick that is later makes them older.
+        # If the first tick is late, the reports age more.
+        self.loop.age_obstacles(self._clock.now + self._clock.period)
         self._start = RunStart(self._clock.now, self._state)
         self._plant_clock = PlantClock(self._state)
         self._lead = TargetLead()
@@ -365,8 +368,8 @@ class Pipeline(RequestedRun):
                 self.tick()
                 self.check()
         except BaseException:
-            # The arms come to rest first, whatever has failed. A part may fail again here, and its first error is the
-            # more helpful one.
+            # The arms come to rest first, whatever has failed. A part that fails again must not hide its first error,
+            # which is more helpful.
             with suppress(Exception):
                 self._bring_to_rest()
             raise
@@ -387,7 +390,7 @@ class Pipeline(RequestedRun):
             while (velocity.max() > _REST or not self.drive.at_rest(self._state)) and self._clock.now < deadline:
                 velocity = np.abs(self.tick().reference.v)
         finally:
-            # The last state that came is used, because a plant that has lost its sensors still takes commands.
+            # The last received state is used, because a plant that has lost its sensors still takes commands.
             if (command := self.drive.last_command(self._state, self._grippers)) is not None:
                 self.plant.apply(command)
 
@@ -411,7 +414,7 @@ class Pipeline(RequestedRun):
         self.loop.observe(seen, now, passed, lost)
         self._watch_skew(now)
         openings, tools = self.plant.gripper_openings(), self._measured_tools(state)
-        self.loop.age_obstacles(now)  # The age of a report that comes now is known.
+        self.loop.age_obstacles(now)  # Before new reports come, because their ages count from now.
         if self._following:
             self._targets = self._operator.targets(samples, tools, now)
         step = self._control(state, openings, now, gap, dt, braked)
@@ -423,7 +426,7 @@ class Pipeline(RequestedRun):
             self.controller.withdraw(step.reference)
         compute_time = time.perf_counter() - began
         self._recorder.add_latency(samples, self._clock.read())
-        # A simulated plant advances by no more than this at once, as if the computer had stood still meanwhile.
+        # A simulated plant advances by no more than this time at once. Its time stands still for the rest of the gap.
         advance = min(gap, self._longest_advance)
         self.plant.advance(advance)
         self._plant_clock.give(advance)
@@ -473,7 +476,10 @@ class Pipeline(RequestedRun):
         return {name: pin.updateFramePlacement(model, data, arm.frame_id).copy() for name, arm in arms.items()}
 
     def _posture(self) -> Array | None:
-        """Return the joint positions that a policy asks for (nv,) [rad], or None. Other arms get their home."""
+        """Return the joint positions that a policy asks for (nv,) [rad], or None.
+
+        Arms for which it asks for none get their home posture.
+        """
         asked = {arm: posture for arm, target in self._targets.items() if (posture := target.posture) is not None}
         if not asked:
             return None

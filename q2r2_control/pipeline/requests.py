@@ -1,4 +1,4 @@
-"""Requests of a program to a run, from any thread: each is done at the next tick, and recorded for a replay."""
+"""Requests of a program to a run, from any thread. The next tick carries them out, and records them for a replay."""
 
 from __future__ import annotations
 
@@ -57,26 +57,26 @@ class RequestedRun:
         return self.drive.impedance if isinstance(self.drive, TorqueDrive) else None
 
     def go_home(self) -> None:
-        """Bring both arms home, as an operator may; from any thread.
+        """Bring both arms home, as an operator may. Any thread may call it.
 
-        Any press ends the way home, and events report the result.
+        Any press ends the motion home. Events report the result.
         """
         self.requests.append(Reason(TeleopReason.HOME_REQUESTED))
 
     def pause(self) -> None:
-        """Let both arms hold until a new press; from any thread."""
+        """Let both arms hold until a new press. Any thread may call it."""
         self.requests.append(Reason(TeleopReason.PAUSE_REQUESTED))
 
     def engage(self) -> None:
-        """Engage both arms as presses of their hands would, under the same conditions; from any thread."""
+        """Engage both arms as presses of their hands would, under the same conditions. Any thread may call it."""
         self.requests.append(Reason(TeleopReason.ENGAGE_REQUESTED))
 
     def give_back(self) -> None:
-        """Give the arms back from the hands to the policy, which goes on where the arms are; from any thread."""
+        """Give the arms back from the hands to the policy, which goes on where the arms are. Any thread may call it."""
         self.requests.append(Reason(TeleopReason.POLICY_REQUESTED))
 
     def mark(self, action: Action) -> None:
-        """Begin, end or mark an episode of the recording, as an operator may; from any thread.
+        """Begin, end or mark an episode of the recording, as an operator may. Any thread may call it.
 
         Raises :class:`ConfigError` for an unknown action.
         """
@@ -85,7 +85,7 @@ class RequestedRun:
         self.requests.append(Reason.of(TeleopReason.RECORDING_REQUESTED, action=str(action)))
 
     def change_teleop(self, settings: TeleopSettings) -> None:
-        """Change settings of the teleoperation for the rest of this run, without a jump; from any thread.
+        """Change settings of the teleoperation for the rest of this run, without a jump. Any thread may call it.
 
         :meth:`Teleop.change` says when a change takes effect, and an event tells whether it did. Raises
         :class:`ConfigError` if a binding names a control that the input lacks.
@@ -95,7 +95,7 @@ class RequestedRun:
         self.requests.append(settings)
 
     def change_control(self, values: Mapping[str, float]) -> None:
-        """Change settings of the controller by name for the rest of this run, without a jump; from any thread.
+        """Change settings of the controller by name for the rest of this run, without a jump. Any thread may call it.
 
         In torque mode, settings in ``LIVE_IMPEDANCE`` may change too. :meth:`CartesianController.change` and
         :meth:`ImpedanceController.change` say how a change takes effect, and an event tells whether it did. Raises
@@ -108,7 +108,7 @@ class RequestedRun:
         self.requests.append(Reason.of(TeleopReason.CONTROL_REQUESTED, changes=dict(values)))
 
     def move_obstacle(self, name: str, obstacle: MovingObstacle | None) -> None:
-        """Report where a moving obstacle is now, or that it is gone; from any thread.
+        """Report where a moving obstacle is now, or that it is gone. Any thread may call it.
 
         :meth:`CartesianController.move_obstacle` says what follows, and an event names a pair that is in the way. In
         real time, the report ages from now on, also before the run begins. Raises :class:`ConfigError` if
@@ -118,7 +118,7 @@ class RequestedRun:
         self.requests.append(ObstacleRequest(name, obstacle, time.monotonic()))
 
     def record_outcome(self, reason: Reason) -> None:
-        """Report the outcome of the recording, or of an episode in it, to the operator; from any thread."""
+        """Report the outcome of the recording, or of an episode in it, to the operator. Any thread may call it."""
         check_kind("reason", reason, Reason, "a Reason")
         self.requests.append(reason)
 

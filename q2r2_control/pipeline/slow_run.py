@@ -1,4 +1,4 @@
-"""Move arms slowly, to given postures or with a hand of the program, while a person at a terminal watches.
+"""Move arms slowly, to given postures or with simulated hands, while a person at a terminal watches.
 
 The pipeline runs in a thread of its own, keeps every promise of an ordinary run, and holds the arms between the
 motions. The speed limits of its controller are 5 % of the joints' limits, so that nothing can move faster.
@@ -34,18 +34,18 @@ from q2r2_control.types import SIDES, Array, HandInputs
 from q2r2_control.wording import sentence
 
 SPEED = 0.05  # Share of the joints' speed limits.
-HAND_SPEED = 0.03  # Upward speed of the program's hands [m/s].
-_PATIENCE = 20.0  # Longest time until the cabinets command, and until arms come to rest [s].
+HAND_SPEED = 0.03  # Upward speed of the simulated hands [m/s].
+_PATIENCE = 20.0  # Longest duration of a motion, of the wait for sessions, and of the wait for rest [s].
 STILL, REST = 2e-3, 0.3  # Joints at rest move less than this [rad] in this time [s].
 _LOOKS = 0.05  # Time between two checks [s].
-_RATE = 75.0  # Rate of the hands [Hz].
+_RATE = 75.0  # Rate of the hands' samples [Hz].
 
 
 class _Hands(PlayedInput):
-    """Both hands. A hand rests until its button is held. Then its arm is engaged, and hand and arm move up."""
+    """Both simulated hands. A hand rests until its button is held. Then its arm is engaged, and both move up."""
 
     def __init__(self) -> None:
-        self.held: tuple[str, ...] = ()
+        self.held: tuple[str, ...] = ()  # The hands whose buttons are held.
         self._height = dict.fromkeys(SIDES, 1.0)  # Height of each hand [m].
         super().__init__(self._posed, self._pressed, {hand: EvenSampling(_RATE) for hand in SIDES})
 
@@ -64,17 +64,17 @@ class Moment(NamedTuple):
     q: Array  # Measured positions.
     tau: Array  # Measured torques [Nm].
     external: Array  # Torques that the cabinet's model does not explain [Nm]; NaN if the cabinet does not report them.
-    reference: Array
+    reference: Array  # Positions of the reference.
     v: Array  # Velocities of the reference [rad/s].
     deceleration: Array | None  # Deceleration of the certified stop from the reference [rad/s^2].
     engaged: dict[str, bool]  # By arm, whether it follows a hand.
 
 
 class SlowRun:
-    """A context manager that moves the arms of ``plant``. Leaving it brings them to rest, and closes the plant.
+    """A context manager that moves the arms of ``plant``. At its end, the arms come to rest, and the plant is closed.
 
     Every method raises :class:`PlantError` if the arms do not do what they are asked to do. The method may be called
-    again, unless the run :attr:`is_over`.
+    again as long as :attr:`is_over` is False.
     """
 
     def __init__(
@@ -96,11 +96,11 @@ class SlowRun:
         self._thread = Thread(target=self._run, args=(realtime,), name="slow run")
         self._listener = listener
         self._error: BaseException | None = None
-        self._goal: Array | None = None  # The next goal, which the loop takes.
+        self._goal: Array | None = None  # The next goal (nv,) [rad]; None after the loop has taken it.
         self._newest: Moment | None = None
         self._rest: Moment  # The first moment of the present rest.
-        self._moments: list[Moment] | None = None  # The moments of a motion that goes on.
-        self._lost: Reason | None = None  # Why the arms were not commanded any more during the motion.
+        self._moments: list[Moment] | None = None  # The moments of the present motion; None between motions.
+        self._lost: Reason | None = None  # Why the arms were not commanded any more in this motion, or None.
 
     def __enter__(self) -> SlowRun:
         self._thread.start()
@@ -123,7 +123,7 @@ class SlowRun:
 
     @property
     def reference(self) -> Array:
-        """The present target of the joints (nv,) [rad]."""
+        """Joint positions of the newest reference (nv,) [rad]."""
         assert self._newest is not None
         return self._newest.reference
 
@@ -135,7 +135,8 @@ class SlowRun:
     def lead_to(self, goal: Array) -> list[Moment] | None:
         """Move all joints straight to ``goal`` (nv,) [rad], and wait until they rest.
 
-        Return the moments of all ticks from rest to rest; None if the straight way is not free, and nothing has moved.
+        Return the moments of all ticks from rest to rest; None if the straight path is not free; then nothing has
+        moved.
         """
         homing = self._pipeline.supervisor.homing
         self._begin()
@@ -150,7 +151,7 @@ class SlowRun:
         return self._end()
 
     def let_go(self, arms: Sequence[str], duration: float) -> list[Moment]:
-        """Let hands move ``arms`` upwards for ``duration`` [s] and let go. Return the moments from rest to rest."""
+        """Let the hands of ``arms`` move up for ``duration`` [s], and let go. Return the moments from rest to rest."""
         self._begin()
         self._hands.held = tuple(self._pipeline.teleop.hand_of(arm) for arm in arms)
         try:
@@ -244,5 +245,5 @@ class SlowRun:
 
 
 def resting(moments: list[Moment]) -> list[Moment]:
-    """Return the last moments, in which the arms rested."""
+    """Return the last moments of a motion, in which the arms rested."""
     return [moment for moment in moments if moments[-1].now - moment.now <= REST]

@@ -18,25 +18,25 @@ _REST = 1e-6  # A target that moves more slowly stands still [m/s], [rad/s].
 class TargetLead:
     """Extrapolates each target with its own smoothed velocity.
 
-    A target at constant velocity is extrapolated by exactly the delay. If the target stops abruptly, the result is
-    beyond it by at most its velocity times the delay, for about ``_SMOOTHING``. A target at rest is not changed.
+    A target at constant velocity is extrapolated by exactly the delay. If the target stops abruptly, the result
+    overshoots it by at most its velocity times the delay, for about ``_SMOOTHING``. A target at rest is not changed.
     """
 
     def __init__(self) -> None:
         self._last: dict[str, pin.SE3] = {}
-        # Linear velocity, and angular velocity in the target's frame (6,) [m/s], [rad/s].
+        # By arm, linear velocity, and angular velocity in the target's frame (6,) [m/s], [rad/s].
         self._velocities: dict[str, Array] = {}
 
     def ahead(self, targets: Mapping[str, pin.SE3 | None], dt: float, delay: float) -> dict[str, pin.SE3 | None]:
         """Return where the targets will be after ``delay`` [s], in the world frame.
 
         Args:
-            targets: The present targets.
+            targets: The present targets by arm, in the world frame; None for an arm without a target.
             dt: Time since the targets of the last call [s].
             delay: Delay of the plant [s].
         """
         velocities, self._velocities = self._velocities, {}
-        led: dict[str, pin.SE3 | None] = dict(targets)
+        extrapolated: dict[str, pin.SE3 | None] = dict(targets)
         for arm, pose in targets.items():
             if pose is None or arm not in self._last or not dt > 0.0:
                 continue
@@ -44,9 +44,9 @@ class TargetLead:
             velocity += dt / (_SMOOTHING + dt) * (_velocity(self._last[arm], pose, dt) - velocity)
             if np.abs(velocity).max() > _REST:
                 turned = pose.rotation @ pin.exp3(delay * velocity[3:])
-                led[arm] = pin.SE3(turned, pose.translation + delay * velocity[:3])
+                extrapolated[arm] = pin.SE3(turned, pose.translation + delay * velocity[:3])
         self._last = {arm: pose for arm, pose in targets.items() if pose is not None}
-        return led
+        return extrapolated
 
 
 def _velocity(before: pin.SE3, pose: pin.SE3, dt: float) -> Array:

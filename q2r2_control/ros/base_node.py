@@ -41,10 +41,11 @@ from q2r2_control.ros.launch.middleware import set_up_middleware
 from q2r2_control.ros.reasons import RosReason
 from q2r2_control.wording import sentence
 
-# Linux signals a real-time process that has computed this long without a sleep [s]. Other processes could not run.
+# If a real-time process computes for this time without a sleep, Linux sends it a signal [s]. Other processes could
+# not run meanwhile.
 _NEVER_IDLE = 0.5
-# After its nodes are closed, a process may take at least this long to end [s]. To close a node takes up to 3 s, because
-# its arms brake.
+# After its nodes are closed, a process has at least this time to end [s]. To close a node takes up to 3 s, because its
+# arms brake.
 _LEAST_END = 2.0
 _deadline = math.inf  # Time of the steady clock at which this process must have ended [s].
 # All QoS profiles keep the last messages. They are reliable and volatile unless they say otherwise.
@@ -87,7 +88,7 @@ class BaseNode(Node):
         self._state = self.create_publisher(String, "~/state", 10)
         self._ros_time = 0.0, time.monotonic()  # The newest ROS time, and the steady time when it was first seen [s].
         self._dropped: set[str] = set()  # Topics with messages that could not be read.
-        # Number of ticks since the rate was last asked for, and the time of that [s].
+        # Number of ticks since the last call of :meth:`tick_rate`, and the time of this call [s].
         self.ticked, self._counted_at = 0, time.monotonic()
         self.create_timer(_DIAGNOSTICS_PERIOD, self.report_health, clock=STEADY)
 
@@ -172,13 +173,13 @@ class BaseNode(Node):
         return OK, "running", {}
 
     def drop(self, topic: str, text: str) -> None:
-        """Warn once for each topic that a message of another node cannot be read; ``text`` describes the message."""
+        """Warn, once for each topic, that a message of another node cannot be read. ``text`` describes the message."""
         if topic not in self._dropped:
             self._dropped.add(topic)
             self.get_logger().warning(sentence(Reason.of(RosReason.MESSAGE_UNREADABLE, topic=topic, text=text)))
 
     def report_health(self) -> None:
-        """Publish :meth:`health` now. A timer does so twice a second. Call it after an urgent change."""
+        """Publish :meth:`health` now. A timer calls this twice a second. Call it also after an urgent change."""
         level, line, values = self.health()
         if (problem := self.clock_problem()) is not None:
             level, line = max(level, WARN), f"{sentence(problem)}; {line}"
@@ -217,8 +218,8 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):
     """A node with a lifecycle, which starts active: ``ros2 lifecycle set /cartesian_controller deactivate``.
 
     Subclasses override :meth:`begin` and :meth:`end`, which make the node active or inactive, or return why this is not
-    possible. A transition is answered when it is complete. Parameters are read at the start only, so that ``cleanup``
-    fails.
+    possible. A transition is answered when it is complete. Parameters are read at the start only. For this reason
+    ``cleanup`` fails.
     """
 
     def __init__(self, name: str, **kwargs: Any) -> None:
@@ -262,11 +263,11 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):
         return TransitionCallbackReturn.SUCCESS
 
     def _tried(self, what: str, act: Callable[[], str | None], meanwhile: str, done: str) -> TransitionCallbackReturn:
-        """Call ``act`` to go to the state ``done``. If it returns a problem, the node keeps the state before."""
+        """Call ``act`` to go to the state ``done``. If it returns a problem, the node keeps its state."""
         before, self.lifecycle_state = self.lifecycle_state, meanwhile
         try:
             problem = act()
-        except Exception as error:  # rclpy would hide it.
+        except Exception as error:  # rclpy would hide the exception.
             problem = f"{type(error).__name__}: {error}"
         self.lifecycle_state = done if problem is None else before
         if problem is None:
@@ -320,7 +321,8 @@ def run_node(*makes: Callable[[], BaseNode]) -> int:
         asked = time.monotonic()
         for node in reversed(nodes):
             node.close()
-        # No arm waits for this process any more. The middleware may end slowly, without priority and within a limit.
+        # No arm waits for this process any more. The middleware may end slowly: without priority, but within a time
+        # limit.
         schedule_thread_as_others()
         global _deadline
         _deadline = max(asked + LONGEST_END, time.monotonic() + _LEAST_END)
@@ -340,7 +342,7 @@ def end_in_time() -> None:
 
 
 def _take_priority(nodes: Sequence[BaseNode]) -> None:
-    """Take a real-time priority before the nodes tick. Slow work, such as compiling, is done before, without it."""
+    """Take a real-time priority before the nodes tick. Slow work, such as compiling, is done earlier, without it."""
     priority = max(node.priority for node in nodes)
     if not priority:
         return

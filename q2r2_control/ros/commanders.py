@@ -1,7 +1,7 @@
 """Find other publishers of topics that may have one publisher only: hands, targets and commands.
 
-A publisher that appears is found in the graph, 0.04 s after the middleware has discovered it. A publisher that was
-there before and was silent is found by its first message.
+A publisher that appears is found in the graph within 0.04 s after the middleware has discovered it. A publisher that
+was there before and was silent is found by its first message.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from q2r2_control.ros.base_node import STREAM_QOS, BaseNode
 from q2r2_control.ros.monitoring import WatchedPublisher, node_of
 from q2r2_control.ros.reasons import RosReason
 
-_DISCOVERY = 1.0  # Publishers that are discovered within this time are taken to be older than the node [s].
+_DISCOVERY = 1.0  # Publishers that are discovered within this time count as older than the node [s].
 _GRAPH_PERIOD = 0.04  # Time between two queries of the graph [s].
 _UNKNOWN = "a node not known yet"  # The graph lists an endpoint before the name of the endpoint's node.
 HEARD = 0.3  # A node that sent a command within this time is a commander [s].
@@ -31,13 +31,13 @@ def publishers_of(node: BaseNode, topic: str, *, own: bool = True) -> str:
 
 
 def takers_of(node: BaseNode, topic: str) -> str:
-    """Return the names of the nodes that receive what this node sends on ``topic``, for a sentence."""
+    """Return the names of the other nodes that subscribe to ``topic``, for a sentence; "" if there are none."""
     found = {node_of(info) or _UNKNOWN for info in node.get_subscriptions_info_by_topic(topic)}
     return " and ".join(sorted(found - {node.get_fully_qualified_name()}))
 
 
 class OnePublisher:
-    """Checks whether topics, by their full names, have more than one publisher. It may be asked at every tick."""
+    """Checks whether topics, given by full name, have more than one publisher. Every tick may call :meth:`conflict`."""
 
     def __init__(self, node: BaseNode, topics: Iterable[str]) -> None:
         self._node, self._topics = node, tuple(topics)
@@ -73,11 +73,12 @@ class CommandWatch:
         self._subscriptions: list[Any] = []
         self._born = time.monotonic()
         self._asked_at = -math.inf  # Time of the last query of the graph [s].
-        self._known: int | None = None  # Number of other publishers at the last query; None while it does not command.
+        # Number of other publishers at the last query; None while this node does not command.
+        self._known: int | None = None
         self._found: Reason | None = None  # Another commander that was found since this node began to command.
 
     def begin(self) -> None:
-        """Begin to listen."""
+        """Begin to listen to commands."""
         if self._subscriptions:
             return
         for topic, publisher in self._publishers.items():
@@ -87,7 +88,7 @@ class CommandWatch:
             publisher.own_listeners = 1
 
     def end(self) -> None:
-        """Cease to listen."""
+        """Cease to listen to commands."""
         for subscription in self._subscriptions:
             self._node.destroy_subscription(subscription)
         for publisher in self._publishers.values():
@@ -127,7 +128,7 @@ class CommandWatch:
         return self._reason(reason.detail["topic"])
 
     def rest(self) -> None:
-        """Record that this node has ceased to command. Publishers that exist when it begins again are not new ones."""
+        """Record that this node has ceased to command. Publishers that exist when it begins again are not new."""
         self._known = None
 
     def _reason(self, topic: str) -> Reason:

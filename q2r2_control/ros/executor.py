@@ -24,15 +24,15 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor, T
 from rclpy.impl.implementation_singleton import rclpy_implementation
 
 _SERVED = 0.05  # Period for services, slow timers and silent topics, which are neither ticks nor streams [s].
-_MOST_CALLS = 20  # Greatest number of such callbacks in a row. A coroutine that waits is always ready to run.
+_MOST_CALLS = 20  # Greatest number of such callbacks in a row, because a coroutine that waits is always ready to run.
 _MOST_MESSAGES = 100  # Greatest number of messages of one subscription between two ticks.
 _SIMULATED = 0.001  # Period for looking at a simulated clock [s].
 
 
 class TickGroup(MutuallyExclusiveCallbackGroup):
-    """The ticks of a node and the messages that they use. Other executors run it as any callback group."""
+    """The ticks of a node and the messages that they use. Other executors run it like any callback group."""
 
-    is_taken = False  # Whether a TickExecutor runs it.
+    is_taken = False  # Whether a TickExecutor runs this group.
 
     def can_execute(self, entity: Any) -> bool:
         return not self.is_taken and bool(super().can_execute(entity))
@@ -43,9 +43,9 @@ class TickExecutor(SingleThreadedExecutor):
 
     def __init__(self, *, context: Context | None = None) -> None:
         super().__init__(context=context)
-        self._changed = True  # Whether entities were made or destroyed.
+        self._changed = True  # Whether timers, subscriptions or the like were made or destroyed.
         self._subscriptions: list[Any] = []  # Subscriptions, each with the number of arguments of its callback.
-        self._streams: list[Any] = []  # Subscriptions with a publisher. To look at others would be a waste of time.
+        self._streams: list[Any] = []  # The subscriptions that have a publisher. Others need not be looked at.
         self._ticks: list[Any] = []  # The timers of ticks.
         self._served_at = -math.inf  # Time of the last look at services, slow timers and silent topics [s].
         self._simulated = False  # See _is_simulated.
@@ -60,7 +60,7 @@ class TickExecutor(SingleThreadedExecutor):
         super().wake()
 
     def spin_once(self, timeout_sec: float | None = None) -> None:
-        """Sleep until a tick is due, for 50 ms or ``timeout_sec`` at most, and run what is due then."""
+        """Sleep until a tick is due, for 50 ms or ``timeout_sec`` [s] at most, and run the callbacks that are due."""
         if not self.context.ok():
             raise ExternalShutdownException
         if self._changed:
@@ -84,7 +84,7 @@ class TickExecutor(SingleThreadedExecutor):
                 self._serve()
 
     def take_messages(self) -> None:
-        """Run the callbacks of all messages that have arrived. A service that ticks by itself also calls it."""
+        """Run the callbacks of all messages that have arrived. A service that runs ticks itself also calls this."""
         if self._changed:
             self._collect()
         for one, arguments in self._streams:

@@ -21,7 +21,7 @@ from q2r2_control.ros.reasons import RosReason
 from q2r2_control.teleop.reasons import HOLD_REQUESTS
 
 _MAX_AGE = 0.1  # If the graph's last answer is older than this, the graph is asked again [s].
-_PERIOD = 2.0  # Time between two queries of the graph, if no other code asks [s].
+_PERIOD = 2.0  # Time between two queries of the graph, if no other code queries it [s].
 _NO_WAIT = Duration(nanoseconds=0)
 # A subscriber may take 5 ms to acknowledge, which is longer than the period of a fast stream. Every _CHECK seconds
 # messages are therefore left out until the last one has been acknowledged, for at most _GAP seconds.
@@ -31,7 +31,7 @@ _LIFESPAN = SENT_COMMAND_QOS.lifespan.nanoseconds * 1e-9  # A command that is ol
 _LATELY = 32  # Number of sent messages that are remembered. The queue of the node's own subscription is shorter.
 _STATE = "/state"
 _LOOK_PERIOD = 0.3  # Time between two queries of the graph for nodes that report [s].
-_DISCOVERY = 2.0  # Time within which every arm that is there has reported. Nodes report twice a second [s].
+_DISCOVERY = 2.0  # Time in which the node of every running arm has reported. Nodes report twice a second [s].
 _SILENT, _GONE = 2.0, 5.0  # Times without a report, after which a node is silent, and has gone [s].
 _ARM = {"engaged", "ready", "hand"}  # The keys by which the report of an arm's node is recognised.
 # Names of nodes by the unique number of an endpoint. The graph loses a node that was frozen or unreachable for longer
@@ -63,7 +63,7 @@ class Publishers:
         return self._names[topic]
 
     def source(self, topic: str) -> str:
-        """Return the same names for the middle of a sentence, such as " from /node"; "" if there were none."""
+        """Return the names of :meth:`of` as a part of a sentence, such as " from /node"; "" if there were none."""
         return f" from {names}" if (names := self.of(topic)) else ""
 
     def _ask(self, *topics: str) -> None:
@@ -84,7 +84,7 @@ def publish_in_time(publisher: Any, message: Any, decided: float) -> bool:
     Args:
         publisher: The publisher.
         message: The message.
-        decided: When the contents were decided on, by the steady clock [s].
+        decided: The time at which the contents were decided on, by the steady clock [s].
     """
     data = message if isinstance(message, bytes) else serialize_message(message)
     in_time = time.monotonic() - decided <= _LIFESPAN
@@ -165,7 +165,7 @@ class WatchedPublisher:
 
 
 class NodeStates:
-    """The newest state of every node that reports one, by its full name. The node has to be spun."""
+    """The newest state of every node that reports one, by full name. The node that listens has to be spun."""
 
     def __init__(
         self,
@@ -175,7 +175,7 @@ class NodeStates:
     ) -> None:
         """Observe only the nodes in ``namespace``."""
         self._node, self._on_state, self._prefix = node, on_state, f"{namespace.rstrip('/')}/"
-        self._heard: set[str] = set()  # The topics that have a subscription.
+        self._heard: set[str] = set()  # The topics to which this object has subscribed.
         self.newest: dict[str, tuple[dict[str, Any], float]] = {}  # By node, the state and the time of receipt [s].
 
     def look(self) -> None:
@@ -190,7 +190,7 @@ class NodeStates:
         try:
             state = json.loads(message.data)
         except ValueError:
-            return  # The topic belongs to some other node.
+            return  # The topic belongs to a node of another kind.
         if isinstance(state, dict) and {"level", "message"} <= state.keys():
             self.newest[name] = state, time.monotonic()
             self._on_state(name, state)
@@ -230,7 +230,7 @@ class HandListeners:
         return any(state.get("last_event_kind") in HOLD_REQUESTS for _, state, _ in self._arms())
 
     def _arms(self) -> list[tuple[str, dict[str, Any], float]]:
-        """Return name, state and age of the state [s] of the arms' nodes that follow these hands."""
+        """Return the name, the state and the state's age [s] for each arm's node that follows one of the hands."""
         now = time.monotonic()
         said = ((name, state, now - at) for name, (state, at) in self._states.newest.items())
         return [one for one in said if one[2] <= _GONE and one[1].keys() >= _ARM and one[1]["hand"] in self._hands]

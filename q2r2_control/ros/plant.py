@@ -46,7 +46,7 @@ _AWAY = 0.02  # If a command is farther from the measured joints, a new receiver
 
 
 class _PlantNode(BaseNode):
-    ticks = True  # Its messages are taken when the loop ticks.
+    ticks = True  # The messages of this node are taken when the loop ticks.
 
 
 class RosPlant:
@@ -61,7 +61,7 @@ class RosPlant:
         self._fingers, self._kind = Fingers(robot, config), TrajectoryOutput(self._period, robot)
         self._openings = dict.fromkeys(self._fingers.arms, 1.0)  # No opening is measured before a run.
         self._context: Context | None = None
-        self._stopped: Callable[[], bool] = lambda: False  # Whether the wait for the robot should end.
+        self._stopped: Callable[[], bool] = lambda: False  # Returns whether the wait for the robot should end.
 
     @classmethod
     def from_config(cls, robot: Robot, config: Config) -> RosPlant:
@@ -93,8 +93,8 @@ class RosPlant:
         }
         self._openings = {}
         self._joints = JointIntake(node, self._robot)
-        self._bad: Reason | None = None  # What is wrong with the newest joint states.
-        self._fault: Reason | None = None  # Why nothing is commanded.
+        self._bad: Reason | None = None  # Why the newest joint states are unusable; None if they are good.
+        self._fault: Reason | None = None  # Why nothing is commanded; None if commands are sent.
         self._joints.subscribe(self._take_state, self._take_fingers)
         # Times of the computer's clock: when the newest joint states came, and when a receiver appeared [s].
         self._seen = self._received_since = -math.inf
@@ -119,7 +119,7 @@ class RosPlant:
             return self._bad or Reason.of(SupervisionReason.NO_STATES_YET, source=_CURE)
         if not self._publisher.listeners:
             return Reason.of(RosReason.NO_SUBSCRIBER, topic=self._publisher.topic_name)
-        if self._seen <= self._received_since:  # The newest state is older than the robot that receives now.
+        if self._seen <= self._received_since:  # The newest state came before the present receiver.
             return Reason.of(SupervisionReason.NO_STATES_YET, source=_CURE)
         return self._bad
 

@@ -21,14 +21,17 @@ from q2r2_control.types import ArmTarget, HandSample
 from q2r2_control.wording import sentence
 
 _BINS = 100_000
-EVENTS_KEPT = 10_000  # Number of the newest events that are kept. A broken button can cause more.
+EVENTS_KEPT = 10_000  # Number of the newest events that are kept. A broken button can cause more events.
 _FOLLOWED = 100.0  # Distance up to which the impedance pushes back with a growing force [mm].
-_REST = 1e-3  # [rad/s]
+_REST = 1e-3  # The reference is at rest if no joint is faster [rad/s].
 
 
 @dataclass(frozen=True, slots=True)
 class Percentiles:
-    """Percentiles of a duration, to 1/1000 of the histogram's unit for p50 and p99; None if nothing was measured."""
+    """Percentiles of a duration, or None if nothing was measured.
+
+    p50 and p99 are exact to 1/1000 of the histogram's unit.
+    """
 
     p50: float | None
     p99: float | None
@@ -69,7 +72,7 @@ class TorqueSummary:
 
     # By arm, the time for which its distance from the reference was larger than the impedance's error clip.
     off_reference_s: dict[str, float]
-    min_measured_distance_mm: float | None = None  # None if there is no monitored pair.
+    min_measured_distance_mm: float | None = None  # By the measured joints; None if there is no monitored pair.
     measured_closest_pair: tuple[str, str] | None = None
     pressed_pairs: list[tuple[str, str]] = field(default_factory=list)  # Pairs that the wall has pushed apart.
     max_wall_force_n: float = 0.0  # The greatest force of the wall on one pair.
@@ -102,14 +105,14 @@ class TorqueSummary:
 
 @dataclass(slots=True)
 class ArmSummary:
-    """Figures of one arm while it was engaged. Errors are those of the measured tool from the operator's target."""
+    """Figures of one arm while it was engaged. Errors compare the measured tool with the operator's target."""
 
     engaged_s: float = 0.0
     position_error_mm_rms: float | None = None  # None if the arm was never engaged.
     rotation_error_deg_rms: float | None = None
     gripper_changes: int = 0
     gripper_held_s: float = 0.0  # Time for which a body near the fingers prevented the wanted opening of the gripper.
-    gripper_held_by: tuple[str, str] | None = None  # The pair of geometries that prevented it last.
+    gripper_held_by: tuple[str, str] | None = None  # The pair of geometries that prevented the opening last.
     object_held_s: float | None = None  # Time for which the gripper held its object; None if the arm has no object.
     slip_mm_max: float = 0.0  # Largest slip of the target in one engagement.
     slip_deg_max: float = 0.0
@@ -129,27 +132,27 @@ class ArmSummary:
 
 @dataclass(frozen=True, slots=True)
 class RunSummary:
-    """Figures of a whole run. Ratios and margins are the worst of all ticks, and a ratio of 1 is the limit."""
+    """Figures of a whole run. Ratios and margins are the worst of all ticks. A ratio of 1 means the limit."""
 
     ticks: int
     duration_s: float
     loop_rate_hz: float
     real_time_factor: float | None  # Simulated seconds per second of the computer's clock; None in real time.
     tick_us: Percentiles  # Time from polling the input to the command, without the plant.
-    lateness_us: Percentiles  # Time by which ticks began after they were due; None in simulated time.
+    lateness_us: Percentiles  # Delay of ticks after the times at which they were due; None in simulated time.
     input_to_command_ms: Percentiles  # Time from the receipt of a sample to the command that follows from it.
     arms: dict[str, ArmSummary]
-    min_distance_mm: float | None  # None if there is no monitored pair.
+    min_distance_mm: float | None  # Least distance in the reference; None if there is no monitored pair.
     closest_pair: tuple[str, str] | None
     max_velocity_ratio: float
     max_acceleration_ratio: float
-    min_position_margin_rad: float  # Least distance from a position limit, minus the configured margin.
+    min_position_margin_rad: float  # Least distance of a joint from a position limit, minus the configured margin.
     fallback_ticks: int
     uncertified_ticks: int
     rejected_targets: int
     overruns: int  # Ticks that began more than a period after they were due.
     missed_ticks: int  # Ticks that were due and did not come, because the loop was late.
-    stretched_s: float  # Time by which the motion became late because the loop was late.
+    stretched_s: float  # Time by which the motion is late because the loop was late.
     at_rest: bool  # Whether the reference was at rest when the run ended.
     torque: TorqueSummary | None  # None in position mode.
     events: list[Event]
@@ -169,7 +172,7 @@ class RunSummary:
             broken.append(f"measured {met} met: {self.torque.min_measured_distance_mm:.1f} mm")
         if self.uncertified_ticks:
             broken.append(f"{self.uncertified_ticks} ticks without a certificate")
-        # Both arms report the same error of a policy. It is named only once.
+        # Both arms report the same error of a policy. The error is named only once.
         roots = (event.reason.root for event in self.events)
         broken += dict.fromkeys(sentence(root) for root in roots if root.kind is CommonReason.POLICY_UNUSABLE)
         if not self.at_rest:
@@ -272,7 +275,7 @@ class RunStatistics:
             self._torque.add(tick.dt, tick.impedance, tick.wall)
 
     def add_latency(self, samples: list[HandSample], now: float) -> None:
-        """Count the time from the receipt of a tick's newest sample to its command, sent at ``now`` [s]."""
+        """Count the time from the receipt of a tick's newest sample to the tick's command, sent at ``now`` [s]."""
         if samples:
             self._latency.add(now - max(max(sample.pose_stamp, sample.inputs_stamp) for sample in samples))
 
@@ -290,7 +293,7 @@ class RunStatistics:
         """
         robot, control = self.robot, self._control
         acceleration_limit = robot.capped_acceleration(control.acceleration_limit)
-        room = np.minimum(self._lowest - robot.position_lower, robot.position_upper - self._highest).min()
+        to_limit = np.minimum(self._lowest - robot.position_lower, robot.position_upper - self._highest).min()
         moves = self._newest is not None and bool(np.abs(self._newest.reference.v).max() >= _REST)
         return RunSummary(
             ticks=self._ticks,
@@ -307,7 +310,7 @@ class RunStatistics:
             closest_pair=self._pair if self._distance < math.inf else None,
             max_velocity_ratio=float((self._speed / (control.velocity_scale * robot.velocity_limit)).max()),
             max_acceleration_ratio=float((self._acceleration / acceleration_limit).max()),
-            min_position_margin_rad=float(room - control.position_margin) if np.isfinite(room) else 0.0,
+            min_position_margin_rad=float(to_limit - control.position_margin) if np.isfinite(to_limit) else 0.0,
             fallback_ticks=self._fallback,
             uncertified_ticks=self._uncertified,
             rejected_targets=self._rejected,

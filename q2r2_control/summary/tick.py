@@ -18,9 +18,9 @@ from q2r2_control.types import ActionChunk, ArmTarget, Command, HandSample, Refe
 
 @dataclass(frozen=True, slots=True)
 class RunStart:
-    """The beginning of a run, by the clock of its loop and by its plant."""
+    """The time and the measured state at the beginning of a run."""
 
-    now: float  # [s]
+    now: float  # Time of the loop's clock [s].
     state: RobotState
 
 
@@ -33,12 +33,12 @@ class Tick:
     now: float  # Time of the loop's clock, which also stamps the samples [s].
     dt: float  # Time since the last tick [s].
     step: float  # Time by which the reference moved; less than dt if the motion is stretched after a late tick [s].
-    following: bool  # False while the run ends, when input and targets do not count any more.
+    following: bool  # False while the run ends. Input and targets then do not count any more.
     connected: bool  # Whether the input was connected.
-    samples: list[HandSample]
+    samples: list[HandSample]  # The new samples of the hands.
     targets: dict[str, ArmTarget]  # The operator's targets, without the displacement of an admittance.
-    engaged: dict[str, bool]
-    states: dict[str, str]  # States of the teleop layer, or STOPPING.
+    engaged: dict[str, bool]  # By arm, whether it follows a hand or a policy.
+    states: dict[str, str]  # By arm, the state of the teleop layer, or STOPPING while the run ends.
     reference: Reference
     state: RobotState  # Measured before the command of this tick.
     openings: dict[str, float]  # Openings of the grippers, measured before the command of this tick.
@@ -46,9 +46,9 @@ class Tick:
     command: Command  # The command that the plant got.
     events: list[Event]  # Events of teleoperation.
     grippers: dict[str, float]  # Openings measured after the plant has advanced.
-    compute_time: float  # [s]
-    impedance: ImpedanceReport | None = None  # Only in torque mode.
-    wall: WallReport | None = None  # Only in torque mode.
+    compute_time: float  # Time from polling the input to the command [s].
+    impedance: ImpedanceReport | None = None  # None unless in torque mode.
+    wall: WallReport | None = None  # None unless in torque mode.
     admittance: AdmittanceReport | None = None  # None unless in position mode with an admittance.
     held_grippers: dict[str, tuple[str, str]] = field(default_factory=dict)  # See :attr:`ControlLoop.held_grippers`.
     holding: dict[str, bool] = field(default_factory=dict)  # For each arm with an object, whether its gripper holds it.

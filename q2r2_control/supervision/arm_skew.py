@@ -35,8 +35,8 @@ def skew_window(timings: Mapping[str, ArmTiming], lead: float) -> float:
 
     Args:
         timings: The period and the noise of each arm's messages.
-        lead: Longest time along the reference from the posture to which an arm has been sent to the end of the newest
-            step [s].
+        lead: Longest time from the newest posture that was sent to an arm to the end of the newest step of the
+            reference [s].
     """
     if len(timings) < 2:
         return 0.0
@@ -53,8 +53,8 @@ class SkewWatch:
     def observe(self, timings: Mapping[str, ArmTiming], now: float) -> None:
         """Compare the ``timings`` of all arms that follow the reference at time ``now`` [s]."""
         self._allowed, lags = allowed_skew(timings), {arm: timing.lag for arm, timing in timings.items()}
-        self._last = max(lags, key=lambda arm: lags[arm], default="")
-        self._skew = lags[self._last] - min(lags.values()) if lags else 0.0
+        self._slowest = max(lags, key=lambda arm: lags[arm], default="")
+        self._skew = lags[self._slowest] - min(lags.values()) if lags else 0.0
         self.holds = self._skew > self._allowed or self._one_is_silent(timings)
         if not self.holds or self._last_together_s == math.inf:
             self._last_together_s = now
@@ -68,9 +68,9 @@ class SkewWatch:
         return any(timing.silent - min(silent) > 2.0 * timing.period + _TIMING_NOISE_S for timing in timings.values())
 
     def fault(self, now: float) -> Reason | None:
-        """Return a reason if the arms have waited for each other for too long at time ``now`` [s], else None."""
+        """Return a reason if, at ``now`` [s], the arms have waited for each other for too long; otherwise None."""
         if not self.holds or now - self._last_together_s <= _MAX_WAIT_S:
             return None
         return Reason.of(
-            SupervisionReason.ARMS_APART, arm=self._last, skew=1e3 * self._skew, allowed=1e3 * self._allowed
+            SupervisionReason.ARMS_APART, arm=self._slowest, skew=1e3 * self._skew, allowed=1e3 * self._allowed
         )

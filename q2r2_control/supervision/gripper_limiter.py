@@ -7,7 +7,8 @@ openings in the interval that the controller has accepted. This holds for closin
 reach farther forward as they close.
 
 If the wanted opening lies outside the interval, the gripper goes there in steps. A step is halved if the certificate
-fails, and doubled if it holds. A smaller interval counts as soon as it is certified. Until then the wider one counts.
+fails, and doubled if the certificate holds. A smaller interval counts as soon as it is certified. Until then the wider
+one counts.
 """
 
 from __future__ import annotations
@@ -38,9 +39,9 @@ class GripperLimiter:
     def __init__(self, controller: CartesianController, remembered: float = REMEMBERED) -> None:
         """``remembered`` is the longest delay of a gripper behind its command [s]."""
         self._controller = controller
-        ways = {name: arm.finger_way for name, arm in controller.robot.arms.items()}
-        self._grippers = {name: _Gripper(way, remembered) for name, way in ways.items() if way > 0.0}
-        # For each gripper that may not move on, the names of the two bodies that would come too close.
+        travels = {name: arm.finger_way for name, arm in controller.robot.arms.items()}
+        self._grippers = {name: _Gripper(travel, remembered) for name, travel in travels.items() if travel > 0.0}
+        # For each gripper that may not move farther, the names of the two bodies that would come too close.
         self.held: dict[str, tuple[str, str]] = {}
         self.changed = False  # Whether the controller's openings changed in the last tick.
 
@@ -98,11 +99,11 @@ class GripperLimiter:
 class _Gripper:
     """The recent openings of one gripper, and the next step that it may ask for."""
 
-    def __init__(self, way: float, remembered: float) -> None:
-        """``way``: distance of a finger from closed to open [m]. ``remembered``: see :class:`GripperLimiter`."""
+    def __init__(self, travel: float, remembered: float) -> None:
+        """``travel``: a finger's motion from closed to open [m]. ``remembered``: see :class:`GripperLimiter`."""
         self._remembered = remembered
-        self._tolerance, self._finest = TOLERANCE / way, min(_FINEST / way, 1.0)
-        self.granted: float | None = None  # The opening that is commanded.
+        self._tolerance, self._finest = TOLERANCE / travel, min(_FINEST / travel, 1.0)
+        self.granted: float | None = None  # The opening that is commanded; None before the first tick.
         self.asks_at = -math.inf
         self._wanted = math.nan
         # Largest difference between the next opening and the commanded one. It is 1 when a new opening is wanted.
@@ -135,7 +136,7 @@ class _Gripper:
         return rolled and len(self._seen) > 1
 
     def needed(self, share: float = 1.0) -> Interval:
-        """Return the interval of openings at which the gripper may be, widened by a share of the tolerance."""
+        """Return the interval of openings that the gripper may have now, widened by a share of the tolerance."""
         least, greatest = self._seen[0] if len(self._seen) == 1 else _hull(*self._seen)
         return _hull(self.around(least, share), self.around(greatest, share))
 
@@ -145,7 +146,7 @@ class _Gripper:
         return min(max(opening - tolerance, 0.0), 1.0), min(max(opening + tolerance, 0.0), 1.0)
 
     def goal(self) -> float:
-        """Return the next opening on the way to the wanted one."""
+        """Return the opening of the next step towards the wanted opening."""
         if self.granted is None or abs(self._wanted - self.granted) <= self._step:
             return self._wanted
         return self.granted + math.copysign(self._step, self._wanted - self.granted)
@@ -167,7 +168,7 @@ class _Gripper:
             self._step = max(0.5 * self._step, self._finest)
 
     def worth_asking(self, accepted: Interval, rolled: bool) -> bool:
-        """Return whether the interval has to grow, or can shrink by enough to be worth the computation."""
+        """Return whether the accepted interval has to grow, or can shrink by enough to be worth the computation."""
         needed = self.needed()
         if not _holds(accepted, self.needed(0.5)):
             return True
@@ -223,12 +224,12 @@ class GraspWatch:
 
 
 class Grip:
-    """Decides from openings whether one gripper holds something."""
+    """Decides from the commanded and the measured openings whether one gripper holds something."""
 
     def __init__(self, stroke: float, stall: float = STALL) -> None:
         self._stroke, self._stall = stroke, stall
         self.holds = False
-        # The finger's opening when it last moved [m or rad], and that time [s].
+        # The opening of the finger when it last moved [m or rad], and the time of this motion [s].
         self._seen, self._since = math.nan, -math.inf
 
     def look(self, wanted: float, measured: float | None, now: float) -> bool:

@@ -1,4 +1,4 @@
-"""Judge the measured joints: whether the states are plausible, and whether arms of another controller keep apart."""
+"""Judge the measured joints: are they plausible, and do arms of another controller keep their distances?"""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class JointWatch:
     ) -> None:
         self._names, self._velocity_limit, self._settings = names, velocity_limit, settings
         self._source = source  # Text for messages that names the sender, such as " from /node", or "".
-        self.state: RobotState | None = None  # The newest state that was good.
+        self.state: RobotState | None = None  # The newest state that was good; None before the first one.
         self.fault: Reason | None = Reason.of(SupervisionReason.NO_STATES_YET, source="")
         self._lost = False  # True if the fault is a lost session, and all states since then were good.
         self._q: list[float] = []  # Joint positions of ``state`` [rad].
@@ -127,7 +127,8 @@ class JointWatch:
         """Return the present fault, or None. A state that is too old becomes a fault here."""
         if self.fault is not None:
             return self.fault
-        # After a clock was set back, the newest state seems to come from the future, and would look fresh for long.
+        # After a clock was set back, the newest state seems to come from the future, and would look fresh for a long
+        # time.
         timeout, age = self._settings.timeout, now - self._stamp
         if not -timeout <= age <= timeout:
             self._fail(Reason.of(SupervisionReason.STATES_SILENT, age=age, timeout=timeout, source=self._source()))
@@ -178,15 +179,15 @@ class JointWatch:
     def _jump(self, q: list[float], last: list[float], time: float) -> Reason | None:
         """Return the fault of a joint that moved farther than it can in ``time`` [s], else None."""
         moved = np.abs(np.subtract(q, last))
-        reach = self._velocity_limit * (time + _JUMP_TIME) + _JUMP_ALLOWANCE
-        if not (moved > reach).any():
+        allowed = self._velocity_limit * (time + _JUMP_TIME) + _JUMP_ALLOWANCE
+        if not (moved > allowed).any():
             return None
-        worst = int((moved - reach).argmax())
+        worst = int((moved - allowed).argmax())
         return Reason.of(SupervisionReason.STATE_JUMPED, joint=self._names[worst], distance=float(moved[worst]))
 
     def _fail(self, fault: Reason) -> None:
         self._still_since, self._lost = math.inf, False
-        # The first fault tells most about the cause. Before the first good state, the newest fault does.
+        # The first fault says most about the cause. Before the first good state, the newest fault says most.
         if self.fault is None or self.state is None:
             self.fault = fault
 
@@ -265,9 +266,9 @@ class ExternalArms:
     def left_behind(self, state: RobotState, holding: Iterable[str], now: float) -> Reason | None:
         """Return a reason if an arm without a target has been too far from the reference for too long, else None.
 
-        The measured tool pose is compared with the reference's tool pose. Such an arm is not moved to the reference by
-        the other controller. The operator could not engage it either: an operator's targets begin at the measured tool,
-        and they would have to begin at the reference's tool.
+        The measured tool pose is compared with the tool pose in the reference. The other controller does not move such
+        an arm to the reference. The operator could not engage it either: an operator's targets begin at the measured
+        tool pose, but they would have to begin at the tool pose in the reference.
 
         Args:
             state: The measured state.
@@ -276,13 +277,13 @@ class ExternalArms:
         """
         holding = set(holding)
         for arm in self._robot.arms:
-            tool, led = self._robot.tool_pose(state.q, arm), self._controller.tool_pose(arm)
-            way, turn = apart(tool, led)
-            near = way <= self._streams.engage_distance and turn <= self._streams.engage_angle
+            measured, commanded = self._robot.tool_pose(state.q, arm), self._controller.tool_pose(arm)
+            distance, turn = apart(measured, commanded)
+            near = distance <= self._streams.engage_distance and turn <= self._streams.engage_angle
             if near or arm not in holding or arm not in self._near_at:
                 self._near_at[arm] = now
             elif now - self._near_at[arm] > self._watch.deviation_time:
-                return Reason.of(SupervisionReason.LEFT_BEHIND, arm=arm, distance=way, angle=turn)
+                return Reason.of(SupervisionReason.LEFT_BEHIND, arm=arm, distance=distance, angle=turn)
         return None
 
     def too_close(self, state: RobotState) -> Reason | None:

@@ -1,4 +1,4 @@
-"""Estimate from measured postures how far each arm lags behind the reference, for drivers that do not report it."""
+"""Estimate from measured postures how far each arm lags behind the reference, if its driver does not report this."""
 
 from __future__ import annotations
 
@@ -43,18 +43,18 @@ class MeasuredLags:
 
         Args:
             q: Measured posture (nv,) [rad].
-            measured: For each arm, the time at which its part of ``q`` was measured [s].
+            measured: For each arm, the time at which its joints in ``q`` were measured [s].
         """
         if not self._past:
             return dict.fromkeys(measured, 0.0)
-        times, places = np.array([t for t, _ in self._past]), np.array([place for _, place in self._past])
-        found = {arm: self._possible(arm, t, times, places, q) for arm, t in measured.items()}
-        # The least possible lag of the arm that is farthest behind.
+        times, postures = np.array([t for t, _ in self._past]), np.array([place for _, place in self._past])
+        found = {arm: self._possible(arm, t, times, postures, q) for arm, t in measured.items()}
+        # The largest of the arms' least possible lags.
         reached = max(float(lags.min()) for lags in found.values())
         return {arm: float(lags[np.abs(lags - reached).argmin()]) for arm, lags in found.items()}
 
-    def _possible(self, arm: str, measured: float, times: Array, places: Array, q: Array) -> Array:
-        """Return all lags [s] that explain the posture of an arm that was measured at the time ``measured`` [s]."""
+    def _possible(self, arm: str, measured: float, times: Array, postures: Array, q: Array) -> Array:
+        """Return all lags (k,) [s] that explain the posture of an arm that was measured at time ``measured`` [s]."""
         joints = self._joints[arm]
-        off = np.sqrt(np.square(places[:, joints] - q[joints]).sum(axis=1))
+        off = np.sqrt(np.square(postures[:, joints] - q[joints]).sum(axis=1))
         return np.maximum(measured - times[off <= off.min() + _SAME_FIT], 0.0)

@@ -12,7 +12,7 @@ from q2r2_control.robot.stop_torque import joints_that_cannot_hold
 from q2r2_control.robot.unchecked import unchecked_faults
 from q2r2_control.robot.urdf_forms import LARGEST_ANGLE, LARGEST_SPEED
 
-_NARROWEST = 1e-3  # The margins must leave a joint at least this range, so that a home position fits in [rad or m].
+_NARROWEST = 1e-3  # The margins must leave each joint at least this range, which contains its home [rad or m].
 
 
 def _in_degrees(robot: Robot) -> list[str]:

@@ -9,8 +9,8 @@ whose controller stands still does not move at all, which shows within a few sta
 
 Here r is the commanded and m the measured position: the joints of an arm, of which the greatest value counts, or its
 tool. W is the window. An arm that lags by L and reverses still moves by the share W / (4 L) of the commanded distance,
-which is more than 0.1 for a lag up to 0.12 s. Nothing is judged while the states have a gap, or just after this loop
-had a gap.
+which is more than 0.1 for a lag up to 0.12 s. Nothing is judged while no new states come, or just after this loop was
+late.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.supervision.reasons import SupervisionReason
 from q2r2_control.types import Array, RobotState
 
-WINDOW = 0.05  # W [s]
+WINDOW = 0.05  # Length W of the window [s].
 _STANDS_BELOW = 0.1  # An arm stands still if it moves by less than this share of the commanded distance.
 _FOLLOWS_ABOVE = 0.5  # An arm follows if it moves by more than this share of the commanded distance.
 _LOOK_PERIOD = 0.0075  # Least time between two checks; the loop may tick more often [s].
@@ -68,7 +68,9 @@ class StandstillWatch:
         self._since, self._follows = math.inf, False
 
     def look(self, asked: Array, measured: Array, stamp: float, now: float) -> float | None:
-        """Return how far the arm was asked to go while it stood still, or None if it does not stand still.
+        """Return how far the command moved while the arm stood still; None if the arm does not stand still.
+
+        The unit is that of the arrays, [rad] for joints and [m] for a tool.
 
         Args:
             asked: The newest command that was sent before this tick (n,).
@@ -92,12 +94,12 @@ class StandstillWatch:
         if not self._seen or now - self._seen[0][0] < WINDOW:
             return None
         _, asked_then, path_then = self._seen[0]
-        way, moved = _way(asked, asked_then), _way(self._seen[-1][2], path_then)
+        way, moved = _largest_change(asked, asked_then), _largest_change(self._seen[-1][2], path_then)
         if max(way, moved) < self._limits.least:
             self._follows = False  # The arm is at rest.
         elif moved > _FOLLOWS_ABOVE * way:
             self._follows = True
-        ahead = _way(asked_then, measured)
+        ahead = _largest_change(asked_then, measured)
         stands = way >= self._limits.least and moved <= _STANDS_BELOW * way and ahead >= self._limits.ahead
         self._since = min(self._since, now) if stands else math.inf
         needed = self._limits.patience if self._follows else max(self._limits.begins, self._limits.patience)
@@ -125,10 +127,10 @@ class StandingArms:
 
 
 def standing(arm: str, takers: str, way: float, unit: str) -> Reason:
-    """Return the reason for an arm that stood still while it was asked to move by ``way`` within the window."""
+    """Return the reason for an arm that stood still while its command moved by ``way`` (in ``unit``) in the window."""
     kind = SupervisionReason.CONTROLLER_STANDS
     return Reason.of(kind, None, arm=arm, takers=takers, way=way, unit=unit, time=WINDOW)
 
 
-def _way(end: Array, start: Array) -> float:
+def _largest_change(end: Array, start: Array) -> float:
     return float(np.abs(end - start).max())

@@ -68,10 +68,12 @@ class Supervisor:
             controller: Its controller.
             streams: The rules for streams of targets.
             watch: The limits for measured states.
-            origins: Who sends targets and states, for messages.
-            external: If given, another controller moves the arms along the reference.
-            displace: If given, the admittance that displaces the targets.
-            standstill: When a driver counts as standing still; None if the driver is part of this program.
+            origins: Names of the senders of targets and states, for messages.
+            external: The checks for another controller, which moves the arms along the reference; None if there is no
+                other controller.
+            displace: The function of an admittance that displaces the targets; None without an admittance.
+            standstill: The limits by which a driver counts as standing still; None if the driver is part of this
+                program.
         """
         self._robot, self._controller, self._external, self._displace = robot, controller, external, displace
         self._origins = origins or Origins()
@@ -80,7 +82,7 @@ class Supervisor:
         self.skew = SkewWatch()
         self.homing = Homing(robot, controller, tools_only=external is not None)
         self._standing = None if standstill is None else StandingArms(robot, standstill, self._origins.takers)
-        self._stopped: Reason | None = None  # Why the arms stopped until a reset.
+        self._stopped: Reason | None = None  # Why the arms stop until a reset; None if they do not.
         self._last: Reference | None = None
         self.phase = Phase.INACTIVE
         self.paused = False
@@ -88,7 +90,7 @@ class Supervisor:
 
     @property
     def fault(self) -> Reason | None:
-        """Why nothing is commanded, or why the arms brake."""
+        """Why nothing is commanded, or why the arms brake; None if there is no fault."""
         fault = self._stopped or self._watch.fault
         if fault is not None and fault.kind is SupervisionReason.NO_STATES_YET:
             return Reason.of(fault.kind, source=self._origins.joint_states())
@@ -101,12 +103,12 @@ class Supervisor:
 
     @property
     def state(self) -> RobotState | None:
-        """The newest measured state that was good."""
+        """The newest measured state that was good; None if none has come yet."""
         return self._watch.state
 
     @property
     def trusted(self) -> bool:
-        """Whether the arms move or hold, and their joint states are good."""
+        """Whether the phase is active or braking, and the joint states are good."""
         return self.phase in (Phase.ACTIVE, Phase.BRAKING) and self._watch.fault is None
 
     def arm_state(self, arm: str) -> str:
@@ -221,7 +223,7 @@ class Supervisor:
         return self._controller.step(self._external.targets(targets, self._last), dt, state.q)
 
     def _compare(self, reference: Reference, now: float) -> None:
-        """Stop the arms or start over if they are not where the reference is, or if their driver stands still."""
+        """Stop or start over if the arms are too far from the reference, or if their driver stands still."""
         away, state = self._watch.deviates(reference.q, now), self._watch.state
         standing = None if self._standing is None or state is None else self._standing.look(reference.q, state, now)
         if standing is not None:
@@ -247,7 +249,7 @@ class Supervisor:
         return Reason.of(SupervisionReason.TOO_HEAVY, **away.detail, needed=needed, limit=limit)
 
     def pause(self, paused: bool) -> None:
-        """Hold all arms where they come to rest, or allow new streams of targets."""
+        """If ``paused``, let all arms hold where they come to rest; otherwise allow new streams of targets."""
         self.paused = paused
         self._forget_targets()
 
@@ -267,7 +269,7 @@ class Supervisor:
 
     @property
     def off_reference(self) -> bool:
-        """Whether a joint stands still away from the reference. A joint that only lags moves."""
+        """Whether a joint stands still away from the reference. A joint that only lags still moves."""
         state = self._watch.state
         if self.phase is not Phase.ACTIVE or self._last is None or state is None:
             return False
@@ -307,7 +309,7 @@ class Supervisor:
         return None
 
     def go_home(self, goal: Array | None = None) -> Reason | None:
-        """Begin the way home, or the way to ``goal``. Returns the reason if that is not possible now, else None.
+        """Begin the motion home, or the motion to ``goal``. Returns the reason if that is not possible now, else None.
 
         Args:
             goal: See :meth:`Homing.begin`.

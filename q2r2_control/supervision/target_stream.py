@@ -2,7 +2,7 @@
 
 An arm follows a stream whose first target lies within ``engage_distance`` and ``engage_angle`` of the tool, as it does
 when an operator engages. A stream that begins elsewhere comes from a sender that does not know that the arm was stopped
-meanwhile. All of it is refused, even if it passes the tool later.
+meanwhile. Such a stream is refused as a whole, even if it passes the tool pose later.
 
 A new stream begins with the first target, after a silence of ``timeout``, and after a reset. It also begins when the
 targets of a refused stream jump to the tool: then the operator has engaged again.
@@ -96,12 +96,12 @@ class TargetStream:
         if self.following:
             self.pose = pose
             return None
-        way, turn = (math.inf, math.inf) if last is None else apart(pose, last)
-        begins = way >= _JUMP or turn >= _TURN
-        # The position may be near one of the poses and the rotation near another one: an operator's first target has
-        # the measured position and the commanded rotation.
-        ways, turns = zip(*(apart(pose, tool) for tool in tools), strict=True)
-        distance, angle = min(ways), min(turns)
+        moved, turn = (math.inf, math.inf) if last is None else apart(pose, last)
+        begins = moved >= _JUMP or turn >= _TURN
+        # The position may be near one pose of ``tools``, and the rotation near another one: an operator's first target
+        # has the measured position and the commanded rotation.
+        distances, turns = zip(*(apart(pose, tool) for tool in tools), strict=True)
+        distance, angle = min(distances), min(turns)
         if begins and distance <= self._settings.engage_distance and angle <= self._settings.engage_angle:
             self.pose = pose
             return None
@@ -117,13 +117,13 @@ class TargetStream:
 def apart(a: pin.SE3, b: pin.SE3) -> tuple[float, float]:
     """Return the distance [m] and the angle [rad] between two poses."""
     difference = a.translation - b.translation
-    way = float(math.sqrt(difference @ difference))
+    distance = float(math.sqrt(difference @ difference))
     cosine = 0.5 * (float((a.rotation * b.rotation).sum()) - 1.0)
-    return way, math.acos(min(max(cosine, -1.0), 1.0))
+    return distance, math.acos(min(max(cosine, -1.0), 1.0))
 
 
-# Times between two targets from which a velocity is computed [s]. A shorter time is too inexact, and after a longer one
-# the targets are taken as steps.
+# Times between two targets from which a velocity is computed [s]. A shorter time makes the velocity too inexact. After
+# a longer time the targets are not extrapolated.
 _SHORTEST, _LONGEST = 0.001, 0.025
 _LOOKAHEAD = 2.5  # Targets are extrapolated for this many periods: one target may be lost, and the next one late.
 # The target is extrapolated only if the last prediction was this exact [m], [rad].

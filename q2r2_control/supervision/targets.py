@@ -33,7 +33,7 @@ class DelayWatch:
         self._stamp, self._late_since = 0.0, math.inf
 
     def take(self, delay: float, now: float) -> float:
-        """Return by how much a message is too late [s]; 0 if it is in time or if its delay is not known.
+        """Return the time by which a message is too late [s]; 0 if it is in time or if its delay is not known.
 
         Args:
             delay: Time of receipt minus time of sending [s]; not finite if it is not known.
@@ -52,9 +52,9 @@ class DelayWatch:
 
 
 # No publisher sends more often than _MAX_RATE_HZ, and no message takes longer than _MAX_DELIVERY_S. If sequence numbers
-# grow faster than that, they come from another publisher.
+# grow faster, they come from another publisher.
 _MAX_RATE_HZ, _MAX_DELIVERY_S = 2000.0, 0.1
-_ALONE = 1.0  # A break in the sequence counts for this time. Without breaks, one publisher is assumed again [s].
+_ALONE = 1.0  # A break in the sequence counts for this time. After it, one publisher is assumed again [s].
 
 
 class SequenceWatch:
@@ -160,7 +160,7 @@ class TargetStreams:
         return refusal
 
     def release(self, arm: str) -> None:
-        """Let the arm hold because its sender ended the stream. The next target begins a new one."""
+        """Let the arm hold because its sender ended the stream. The next target begins a new stream."""
         self._streams[arm].reset()
 
     def end(self, why: Reason) -> None:

@@ -1,4 +1,4 @@
-"""Keep a late tick from causing a jump: bound the time by which a tick advances the reference, and so its distance.
+"""Keep a late tick from causing a jump: bound the time by which a tick advances the reference.
 
 A plant takes one command per period. From one command to the next a joint may move as far as its velocity limit allows
 in one period, even if the command comes late. A late tick therefore moves the reference by the time t that has passed
@@ -21,7 +21,7 @@ import pinocchio as pin
 from q2r2_control.config.teleop import GuardSettings
 from q2r2_control.types import LONGEST_DT, Array
 
-_ROUNDING = 1e-9  # The gap before a punctual tick may exceed the period by this share of it.
+_ROUNDING = 1e-9  # The time before a punctual tick may exceed the period by this share of the period.
 
 
 class TickPacer:
@@ -39,7 +39,7 @@ class TickPacer:
         self.period = period
         self.missed_ticks = 0  # Number of commands that were due and were not sent.
         self.stretched = 0.0  # Time by which the motion is late because of late ticks [s].
-        self._way = velocity_limit * period  # The farthest that a joint may move in one period [rad].
+        self._travel = velocity_limit * period  # The farthest that each joint may move in one period (n,) [rad].
         self._acceleration = acceleration_limit
         self._coasts = coasts
 
@@ -55,7 +55,7 @@ class TickPacer:
         # A tick that is less than half a period late is jitter. If it is later, commands count as missing.
         self.missed_ticks += max(round(gap / self.period) - 1, 0)
         # For each joint, the time in which it can move at most as far as one period permits.
-        longest = 2.0 * self._way / (np.abs(v) + np.sqrt(v * v + 2.0 * self._acceleration * self._way))
+        longest = 2.0 * self._travel / (np.abs(v) + np.sqrt(v * v + 2.0 * self._acceleration * self._travel))
         step = min(gap, LONGEST_DT if self._coasts else max(self.period, float(longest.min())))
         self.stretched += gap - step
         return step
@@ -98,8 +98,8 @@ class PoseRateLimiter:
 
         s(d) = min(d / dt, a (-dt/2 + sqrt(dt^2/4 + 2 d/a))).
 
-    If the target moves faster than the limit, it has jumped, and u is 0. Rotations are limited in the same way, by the
-    rotation vector from pose to target. All poses are in one frame. A late step moves the pose no farther than the
+    If the target moves faster than the limit, it has jumped, and u is 0. Rotations are limited in the same way, by
+    the rotation vector from pose to target. All poses are in one frame. A late step moves the pose no farther than the
     velocity limits allow in one period, see :class:`TickPacer`. After a gap of more than 0.1 s the motion begins from
     rest, because whatever follows the pose has come to rest at the last pose.
     """
@@ -163,12 +163,12 @@ class PoseRateLimiter:
             shift, turn = (motion.towards(np.zeros(3), dt)[0] for motion in (self._linear, self._angular))
         else:
             last, self._target = self._target or at, target
-            # In a late step only a share of the target's motion is followed now. The rest counts as lag.
+            # In a late step the pose follows only a share of the target's motion now. The rest counts as lag.
             share = dt / gap
-            lag, way = last.translation - at.translation, target.translation - last.translation
-            shift, slow = self._linear.follow(lag + (1.0 - share) * way, share * way, dt)
-            lag, way = pin.log3(last.rotation @ at.rotation.T), pin.log3(target.rotation @ last.rotation.T)
-            turn, slow_turn = self._angular.follow(lag + (1.0 - share) * way, share * way, dt)
+            lag, moved = last.translation - at.translation, target.translation - last.translation
+            shift, slow = self._linear.follow(lag + (1.0 - share) * moved, share * moved, dt)
+            lag, moved = pin.log3(last.rotation @ at.rotation.T), pin.log3(target.rotation @ last.rotation.T)
+            turn, slow_turn = self._angular.follow(lag + (1.0 - share) * moved, share * moved, dt)
             limited = slow or slow_turn
         self.clipped += limited
         rotation = pin.Quaternion(pin.exp3(turn) @ at.rotation).normalized()
@@ -179,24 +179,24 @@ class PoseRateLimiter:
 class _Limited:
     """The velocity of a position or a rotation, within limits of velocity and acceleration."""
 
-    limits: tuple[float, float]  # The limits of velocity and acceleration.
-    velocity: Array  # (3,) [m/s] or [rad/s].
+    limits: tuple[float, float]  # The limits of velocity [m/s or rad/s] and of acceleration [m/s^2 or rad/s^2].
+    velocity: Array  # The present velocity (3,) [m/s] or [rad/s].
 
     @property
     def speed(self) -> float:
         return math.hypot(*self.velocity)
 
-    def follow(self, lag: Array, way: Array, dt: float) -> tuple[Array, bool]:
-        """Return the step towards a moving target, and whether a limit has reduced it.
+    def follow(self, lag: Array, moved: Array, dt: float) -> tuple[Array, bool]:
+        """Return the step towards a moving target (3,) [m or rad], and whether a limit has reduced the step.
 
         Args:
             lag: Vector from the pose to the target (3,) [m or rad].
-            way: Displacement of the target in this step (3,) [m or rad].
+            moved: Displacement of the target in this step (3,) [m or rad].
             dt: Duration of the step [s].
         """
-        own, (fastest, a) = way / dt, self.limits
+        own, (fastest, a) = moved / dt, self.limits
         if math.hypot(*own) > fastest:
-            lag, own = lag + way, np.zeros(3)
+            lag, own = lag + moved, np.zeros(3)
         distance, wanted = math.hypot(*lag), own
         if distance > 0.0:
             speed = min(distance / dt, a * (-0.5 * dt + math.sqrt(0.25 * dt * dt + 2.0 * distance / a)))

@@ -60,7 +60,7 @@ class AnalogGripper:
             self._wanted = wanted
 
     def opening(self, opening: float, now: float) -> float:
-        """Return the opening to command at ``now`` [s]. ``opening`` is the one that was commanded at the last call."""
+        """Return the opening to command at ``now`` [s]. ``opening`` is the present command."""
         passed, self._at = now - self._at, now
         if self._wanted is None or not self._picked_up or not math.isfinite(passed):
             return opening
@@ -75,7 +75,8 @@ class ArmTeleop:
         self.arm = arm
         self.state = ArmState.IDLE
         self.gripper = OPEN
-        # Distance of the measured tool from its command when the arm was last engaged (3,) [m]; None if not known.
+        # Measured tool position minus commanded tool position, when the arm was last engaged (3,) [m]; None if not
+        # known.
         self.offset: Array | None = None
         self.events: list[Event] = []
         self.motion = HandMotion(arm, settings)
@@ -83,10 +84,12 @@ class ArmTeleop:
         self._gate = PoseGate(settings.gate)
         self._use_controls(settings)
         self._inputs_stamp = -math.inf  # Time of the newest reading of the controls [s].
-        # Whether a reading of the hand's controls has come, since the start or since a program gave the arms back.
+        # Whether a reading of the hand's controls has come since the start, or since a program gave the arms to a
+        # policy.
         self.heard_of = False
         self._presses: list[Press] = []
-        self.gripped: bool | None = None  # True if the dead man was just pressed, False if it was just let go.
+        # True if the dead man's switch was just pressed, False if it was just released, None otherwise.
+        self.gripped: bool | None = None
         self._aligned_at = 0.0
 
     def _use_controls(self, settings: TeleopSettings) -> None:
@@ -95,7 +98,7 @@ class ArmTeleop:
         self._gestures = GestureRecognizer(settings)
 
     def configure(self, settings: TeleopSettings, last: pin.SE3 | None, now: float) -> None:
-        """Use other settings from now on. Settings of the controls may change only while the arm holds.
+        """Use other settings from now on. Settings of the hand's controls may change only while the arm holds.
 
         Args:
             settings: The new settings.
@@ -118,7 +121,7 @@ class ArmTeleop:
     def receive(self, sample: HandSample, now: float) -> Reason | None:
         """Process one sample of this arm's hand; returns the fault for which the arm must stop, or None."""
         stamp = min(sample.inputs_stamp, now)
-        if -math.inf < stamp and self._inputs_stamp <= stamp:  # A newer message has overtaken an older reading.
+        if -math.inf < stamp and self._inputs_stamp <= stamp:  # An older reading, overtaken by a newer one, is ignored.
             self._inputs_stamp, self.heard_of = stamp, True
             self._presses += self._gestures.receive(sample.inputs, stamp)
             before = self._held.actions
@@ -138,7 +141,7 @@ class ArmTeleop:
         timeout = self._settings.gate.timeout
         if self._gate.stale(now):
             return Reason.of(TeleopReason.POSE_SILENT, timeout=timeout)
-        if now - self._inputs_stamp > timeout:  # The operator could not stop the arm by a button.
+        if now - self._inputs_stamp > timeout:  # Now the operator could not stop the arm by a button.
             return Reason.of(TeleopReason.INPUTS_SILENT, timeout=timeout)
         return None
 
@@ -191,7 +194,7 @@ class ArmTeleop:
             self.go(Cause.LET_GO, now, Reason(TeleopReason.DEAD_MAN_RELEASED))
         if chord:
             self._aligned_at = now
-            # While it is open which gesture this hand makes, only its own chord counts, not the other hand's chord.
+            # While the gesture of this hand is not decided yet, only its own chord counts, not the other hand's chord.
             if self.state is not ArmState.PAUSING or self.chord:
                 self.go(Cause.CHORD, now, Reason(TeleopReason.ALIGNMENT_CHORD))
         elif self.state is ArmState.ALIGNING and self._gate.pose is not None and self._gate.stamp >= self._aligned_at:
@@ -206,6 +209,8 @@ class ArmTeleop:
 
     def target(self, now: float, expected: Pose | None = None) -> Pose:
         """Return the target pose of an engaged arm's tool, or of the frame between two tools that carry one object.
+
+        The pose is in the world frame.
 
         Args:
             now: The time [s].
@@ -266,5 +271,5 @@ def pressed(control: str) -> Reason:
 
 
 def of_controls(settings: TeleopSettings) -> tuple[object, ...]:
-    """Return those of the settings that concern buttons, triggers and gestures, for comparison."""
+    """Return the settings of buttons, triggers and gestures, so that two of these tuples can be compared."""
     return settings.bindings, settings.chord_window, settings.hold_time, settings.gripper_speed

@@ -1,4 +1,4 @@
-"""The states of an arm, and the causes that lead from one state to another. The docs show the same table."""
+"""The states of an arm, and a table of the causes that lead from one state to another. The docs show this table."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class ArmState(StrEnum):
     ENGAGED = "engaged"
     PAUSING = "pausing"  # A button has stopped the arm, and may still become a chord or another gesture.
     PAUSED = "paused"
-    ALIGNING = "aligning"  # The alignment chord has stopped the arm. It is engaged when the buttons are released.
+    ALIGNING = "aligning"  # The alignment chord has stopped the arm. The arm is engaged when the buttons are released.
     CARRIED = "carried"  # The arm moves with the other arm, which is engaged: one hand moves both.
     POLICY = "policy"  # The arm follows the actions of a policy.
     HOMING = "homing"
@@ -55,7 +55,7 @@ class Who(StrEnum):
 
 
 class Transition(NamedTuple):
-    """One row of the table."""
+    """One row of the table: ``cause`` leads from each state of ``sources`` to ``destination``."""
 
     sources: frozenset[ArmState]
     cause: Cause

@@ -1,4 +1,4 @@
-"""Carry out the actions that concern both arms: stop, motion home, carrying, recording. Either hand may ask."""
+"""Carry out the actions that concern both arms: stop, motion home, carrying, recording. Any hand may ask for them."""
 
 from __future__ import annotations
 
@@ -106,7 +106,9 @@ _Poses = Mapping[str, pin.SE3]
 
 
 class CarryMode:
-    """One hand moves both tools, which hold one object. Both arms stop together, so that neither pulls at the object.
+    """The mode in which one hand moves both tools, which hold one object.
+
+    Both arms stop together, so that neither pulls at the object.
 
     ``leader`` is the arm whose hand moves both tools. The follower is the other arm.
     """
@@ -235,13 +237,13 @@ class BothArms:
             arm.record_event(now, Reason(TeleopReason.NOT_HOMING, cause=problem))
 
     def end_carry(self, now: float, reason: Reason) -> None:
-        """End carrying, if two arms carry. Both arms hold then."""
+        """End carrying, if two arms carry. Afterwards both arms hold."""
         if self.carry is not None:
             self.carry.end(now, reason)
         self.carry = None
 
     def _take_up(self, arm: ArmTeleop, around: ArmMeasurements) -> Anchor | Reason:
-        """Return the tool pose at which an arm begins to carry, or the reason why the arm may not begin."""
+        """Return the tool pose at which ``arm`` begins to carry, or the reason why it may not carry."""
         if arm.state is not ArmState.ENGAGED:
             if arm.state not in AT_REST:
                 return Reason.of(TeleopReason.OTHER_ARM_BUSY, state=str(arm.state))

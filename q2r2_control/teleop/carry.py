@@ -1,9 +1,10 @@
 """Let one hand move two tools as one rigid body, for two arms that carry one box.
 
-The hand is anchored to a frame in the middle between both tools. The axes of this frame are those of the world at the
-beginning, and both tools keep their poses in it. No target jumps at the beginning, and both targets move exactly as one
-rigid body, except for the small correction of :class:`RelationKeeper`. If an arm is held up, a leash keeps the frame
-near this arm. This leash is shorter than the leash of one arm, so that the load is neither torn nor crushed.
+The hand is anchored to a frame in the middle between both tools. At the beginning, the axes of this frame are parallel
+to those of the world. Both tools keep their poses in this frame. No target jumps at the beginning, and both targets
+move exactly as one rigid body, except for the small correction of :class:`RelationKeeper`. If an arm is held up, a
+leash keeps the frame near this arm. This leash is shorter than the leash of one arm, so that the load is neither torn
+nor crushed.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ class CarriedTools:
         self._in_frame = {arm: self.frame.actInv(tool) for arm, tool in tools.items()}
 
     def frames_of(self, tools: Mapping[str, pin.SE3]) -> dict[str, pin.SE3]:
-        """Return, for each tool pose, the pose that the frame has if the tool is there. All are in the world frame."""
+        """Return, for each tool pose, the pose of the frame that belongs to it. All poses are in the world frame."""
         return {arm: tools[arm] * placed.inverse() for arm, placed in self._in_frame.items() if arm in tools}
 
     def slowest(self, frames: Mapping[str, pin.SE3]) -> pin.SE3 | None:
@@ -41,22 +42,22 @@ class CarriedTools:
         return max(frames.values(), key=self._away, default=None)
 
     def tool_at(self, arm: str, frame: pin.SE3) -> pin.SE3:
-        """Return the pose of one tool if the frame is at ``frame``."""
+        """Return the pose of one tool if the frame has the pose ``frame`` (both in the world frame)."""
         return frame * self._in_frame[arm]
 
     def at(self, frame: pin.SE3) -> dict[str, pin.SE3]:
-        """Return the poses of both tools if the frame is at ``frame``."""
+        """Return the poses of both tools if the frame has the pose ``frame`` (all in the world frame)."""
         return {arm: self.tool_at(arm, frame) for arm in self._in_frame}
 
     def _away(self, frame: pin.SE3) -> float:
-        """Return a bound on the distance from a tool to its target if the frame is at ``frame`` [m]."""
+        """Return an upper bound on the distance from a tool to its target if the frame has the pose ``frame`` [m]."""
         lever = max(float(np.linalg.norm(tool.translation)) for tool in self._in_frame.values())
         turn = float(np.linalg.norm(pin.log3(frame.rotation @ self.frame.rotation.T)))
         return float(np.linalg.norm(frame.translation - self.frame.translation)) + lever * turn
 
 
 class RelationKeeper:
-    """Shifts the target of the carried tool so that not only the targets but the tools keep their relative pose.
+    """Shifts the target of the carried tool so that the tools, like their targets, keep their relative pose.
 
     Each arm lags behind its target by some millimetres, and the two arms by different distances. Each tool pose gives
     one pose of the frame between the tools. So that both poses agree, a first-order loop shifts the carried tool's
@@ -73,8 +74,8 @@ class RelationKeeper:
         """Update the shift.
 
         Args:
-            leading: Pose of the frame by the leading tool at the controller's reference (world frame).
-            carried: Pose of the frame by the carried tool at the controller's reference (world frame).
+            leading: Pose of the frame, computed from the leading tool's pose in the reference (world frame).
+            carried: Pose of the frame, computed from the carried tool's pose in the reference (world frame).
             now: The time [s].
         """
         dt = 0.0 if self._now is None else min(max(now - self._now, 0.0), LONGEST_DT)

@@ -17,13 +17,13 @@ from q2r2_control.wording import sentence
 
 CROSSED_FOR = 3.0  # The hands count as crossed if they were crossed at every moment of this time [s].
 CROSSED = Reason.of(TeleopReason.HANDS_CROSSED, time=CROSSED_FOR)
-_BY = 0.1  # Hands are crossed at a moment if they are at least this far on the wrong side of each other [m].
+_BY = 0.1  # Hands are crossed if each is on the wrong side of the other by at least this distance [m].
 _AGREES = 0.5  # Least cosine between each controller's pointing direction and the mean direction of both.
 _NEWEST = 0.2  # A pose that is older than this does not count [s].
 
 
 class CrossedHands:
-    """Watches whether the left hand is to the left of the right hand, seen by the operator.
+    """Watches whether the left hand is to the left of the right hand, as the operator sees them.
 
     The samples do not say where the operator faces, so the controllers have to show it. Both point forward along the
     x axis of their own frames. Their mean horizontal direction is taken as the operator's forward direction. The

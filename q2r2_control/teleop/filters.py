@@ -17,7 +17,7 @@ from q2r2_control.config.teleop import FilterSettings
 from q2r2_control.quaternions import IDENTITY, Quaternion, Vector, normalized, turn_between, turned_by
 from q2r2_control.types import Pose
 
-# Samples that arrive closer together are merged, because the jitter of their receipt would look like speed [s].
+# Samples that arrive within this time are merged, because the jitter of their receipt would look like speed [s].
 _MIN_SPACING = 0.005
 _USUAL_PERIOD = 1.0 / 75.0  # Period of a headset's samples that is assumed until it is measured [s].
 # Gains of the delay-locked loop: the shares of a sample's jitter that correct the sample's time and the period.
@@ -28,9 +28,9 @@ _CATCH_UP = 0.5  # After a gap in the stream, the output catches up with the han
 class Interpolator:
     """Plays samples back ``delay`` seconds after their receipt, on straight lines from sample to sample.
 
-    A headset measures at even times, but its samples arrive at uneven times. This jitter would look like speed. A
-    delay-locked loop (Adriaensen 2005) removes it. The loop starts again when a sample is half a period early or late.
-    If no sample comes for longer than ``delay``, the output rests at the newest sample, because nothing is
+    A headset measures at constant intervals, but its samples arrive at irregular ones. This jitter would look like
+    speed. A delay-locked loop (Adriaensen 2005) removes it. The loop starts again when a sample is half a period early
+    or late. If no sample comes for longer than ``delay``, the output rests at the newest sample, because nothing is
     extrapolated. When samples come again, the output does not jump: it catches up within ``_CATCH_UP`` of the gap.
     """
 
@@ -67,12 +67,15 @@ class Interpolator:
         self._even = stamp
         while len(knots) > 1 and stamp - knots[-1][0] < _MIN_SPACING:
             knots.pop()
-        # A late sample is also reached no earlier than half the delay from now, so that the output need not be faster.
+        # The output reaches a late sample no earlier than half the delay from now. Otherwise it would have to be
+        # faster.
         earliest = max(self._caught_up, knots[0][0] + max(self.delay / 2.0, _MIN_SPACING))
         knots.append((max(stamp, earliest), position, rotation))
 
     def at(self, now: float) -> tuple[Vector, Quaternion, Vector]:
-        """Return the position and the rotation at ``now`` [s], and the rotation vector from the last call to this one.
+        """Return the position [m] and the rotation at ``now`` [s].
+
+        The third value is the rotation vector from the last call's rotation to this one [rad].
 
         ``now`` must not go back.
         """
@@ -109,7 +112,7 @@ class OneEuro:
 
     def __init__(self, min_cutoff: float, beta: float, derivative_cutoff: float, delay: float) -> None:
         self.delay = delay
-        # The rate 1 / tau is the first number plus the second one times the speed.
+        # The rate 1 / tau is the first number plus the product of the second number and the speed.
         self._least_rate, self._rate_per_speed = 2.0 * math.pi * min_cutoff, 2.0 * math.pi * beta
         self._derivative_tau = 1.0 / (2.0 * math.pi * derivative_cutoff)
         self.reset()
@@ -140,7 +143,7 @@ class PoseFilter:
     """Interpolates and filters the pose of one hand.
 
     At constant velocity the output lags by :attr:`FilterSettings.delay`. After a change of velocity it takes about
-    1 / (2 pi derivative_cutoff) until the lag is this one again.
+    1 / (2 pi derivative_cutoff) until the lag has this value again.
     """
 
     def __init__(self, settings: FilterSettings) -> None:
@@ -161,7 +164,7 @@ class PoseFilter:
 
     def add(self, pose: Pose, stamp: float, now: float) -> None:
         """Add a sample received at ``stamp`` [s]."""
-        # Rounding errors of quaternion products add up. Normalising once a sample is enough.
+        # Rounding errors of quaternion products add up. It is enough to normalise once per sample.
         self._out = self._out[0], normalized(self._out[1])
         self._interpolator.add(*pose, stamp, now)
 
@@ -192,7 +195,7 @@ _NOISE_SAMPLES = 4, 50  # Weight of the assumed noise, and greatest weight of th
 _LONGEST = 150  # Greatest number of samples in the mean: two seconds of a headset at 75 Hz.
 _TRUSTED = 10, 50  # Number of samples at which the weight of the mean begins to grow from 0, and at which it is 1.
 _LEAVING = 0.05  # When the hand moves again, the weight of the mean falls to zero within this time [s].
-# A hand that has turned by more than this is at rest anew, since only short rotation vectors average well [rad].
+# If a hand at rest has turned by more than this, a new mean begins [rad]. Only short rotation vectors can be averaged.
 _TURNED = 0.3
 
 # Position [m], and rotation vector from the rotation ``_origin`` [rad]. Six floats are faster than a NumPy array.
@@ -209,12 +212,13 @@ class RestingPose:
         self._origin = IDENTITY  # The rotation from which rotation vectors are measured.
         self._newest: deque[_Sample] = deque(maxlen=_NEWEST)
         self._mean: _Sample = (0.0,) * 6
-        self._count = 0  # Number of samples of this rest.
+        self._count = 0  # Number of samples since the hand came to rest.
         self._held: Pose = (0.0, 0.0, 0.0), IDENTITY  # The mean towards which the filtered pose is moved.
         self._leaving = False  # Whether the hand has left ``_held`` and the weight of this mean is falling to 0.
         self._share, self._now = 0.0, 0.0
         self._last: deque[_Sample] = deque(maxlen=2)
-        self._noise, self._noise_count = [one**2 for one in _NOISE], _NOISE_SAMPLES[0]  # The variance of one axis.
+        # The variance of one axis [m^2], [rad^2], and its weight in samples.
+        self._noise, self._noise_count = [one**2 for one in _NOISE], _NOISE_SAMPLES[0]
 
     def add(self, pose: Pose) -> None:
         position, rotation = pose
@@ -246,7 +250,7 @@ class RestingPose:
         return self._held
 
     def draw(self, pose: Pose, now: float) -> Pose:
-        """Return the filtered ``pose`` at ``now`` [s], moved towards the mean as far as the weight of the mean says."""
+        """Return the filtered ``pose`` at ``now`` [s], moved towards the mean by the weight of the mean."""
         passed, self._now = max(now - self._now, 0.0) / _LEAVING, now
         if self._leaving:
             self._share = max(self._share - passed, 0.0)

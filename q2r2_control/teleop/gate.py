@@ -14,8 +14,8 @@ from q2r2_control.quaternions import Quaternion
 from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.types import HandSample, Pose
 
-_MAX_COORDINATE = 1e6  # No tracking system reaches as far [m].
-_QUATERNION_LENGTHS = (1e-6, 1e6)  # A shorter or longer quaternion is not taken for a rotation.
+_MAX_COORDINATE = 1e6  # No tracking system measures positions as far away [m].
+_QUATERNION_LENGTHS = (1e-6, 1e6)  # A quaternion with a length outside this range counts as no rotation.
 # Least time over which a speed is measured [s]. Messages that a network held up arrive less than 1 ms apart, so that
 # the speed between two of them would mean nothing.
 _SPEED_WINDOW = 0.05
@@ -37,7 +37,7 @@ class PoseGate:
         self.pose: Pose | None = None
         self.stamp = -math.inf  # Time of the newest pose, usable or not [s].
         self._problem: Reason | None = None
-        self._way: deque[tuple[float, Pose]] = deque()  # Recent poses. The first one is about _SPEED_WINDOW old.
+        self._recent: deque[tuple[float, Pose]] = deque()  # Times and poses. The first is about _SPEED_WINDOW old.
 
     @property
     def problem(self) -> Reason | None:
@@ -45,7 +45,7 @@ class PoseGate:
         return None if self.pose is not None else self._problem or Reason(TeleopReason.NO_POSE)
 
     def stale(self, now: float) -> bool:
-        """Return whether no pose was received for longer than ``timeout``."""
+        """Return whether no pose, usable or not, was received for longer than the timeout of the settings."""
         return now - self.stamp > self.settings.timeout
 
     def receive(self, sample: HandSample, now: float) -> tuple[bool, Reason | None]:
@@ -66,10 +66,10 @@ class PoseGate:
         previous, gap = self.pose, stamp - self.stamp
         self.pose, self.stamp = pose, stamp
         if pose is None:
-            self._way.clear()
+            self._recent.clear()
             return False, self._problem or Reason(TeleopReason.POSE_UNUSABLE)
         if jump := None if previous is None else self._jump(previous, pose, gap):
-            self._way.clear()  # No speed is measured across the jump.
+            self._recent.clear()  # No speed is measured across the jump.
         return True, jump or self._speed(pose, stamp)
 
     def _jump(self, previous: Pose, pose: Pose, gap: float) -> Reason | None:
@@ -86,11 +86,11 @@ class PoseGate:
 
     def _speed(self, pose: Pose, stamp: float) -> Reason | None:
         """Return a fault if the hand's mean speed over the last ``_SPEED_WINDOW`` is too high, else None."""
-        way = self._way
-        way.append((stamp, pose))
-        while len(way) > 1 and stamp - way[1][0] >= _SPEED_WINDOW:
-            way.popleft()
-        since, start = way[0]
+        recent = self._recent
+        recent.append((stamp, pose))
+        while len(recent) > 1 and stamp - recent[1][0] >= _SPEED_WINDOW:
+            recent.popleft()
+        since, start = recent[0]
         time = stamp - since
         if time < _SPEED_WINDOW:
             return None

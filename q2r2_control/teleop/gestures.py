@@ -1,4 +1,4 @@
-"""Recognise taps, holds and the alignment chord of a hand's controls, and the actions that last while one is held."""
+"""Recognise taps, holds and the alignment chord, and find the actions that last while a control is held."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from q2r2_control.types import HandInputs
 
 # If a control has been held since the first reading, the operator is told after this time [s].
 _STUCK_AFTER = 1.0
-# Travels above which a control becomes held, and below which it becomes let go. Noise in between changes nothing.
+# A control counts as held above the first travel, and as let go below the second one. In between nothing changes.
 _HELD, _LET_GO = 0.6, 0.4
 
 
@@ -28,8 +28,8 @@ def travel(control: str, inputs: HandInputs) -> float:
     """Return how far a control is pressed or pushed, from 0 at rest to 1 at its end."""
     if control not in DEVICE_NAMES:
         return float(inputs.more.get(control, 0.0))
-    name, way = DEVICE_NAMES[control]
-    return way * float(getattr(inputs, name))
+    name, sign = DEVICE_NAMES[control]
+    return sign * float(getattr(inputs, name))
 
 
 def _is_held(control: str, inputs: HandInputs, was_held: bool) -> bool:
@@ -96,7 +96,7 @@ class GestureRecognizer:
         self.forget()
 
     def cancel(self) -> None:
-        """Drop all unfinished gestures except one that stops the arms. A held control counts after its release."""
+        """Drop unfinished gestures, except a gesture that stops the arms. Held controls count after their release."""
         for control in self._controls.values():
             control.mute()
 
@@ -151,7 +151,7 @@ class GestureRecognizer:
 
 
 class _Control:
-    """One control: whether it is held, and its present press as long as the kind of gesture is not decided."""
+    """One control: whether it is held, and its present press while the kind of gesture is not decided yet."""
 
     def __init__(self, waits: float, hold: float, stops: Gesture | None) -> None:
         """Make a control that counts as held.
@@ -177,7 +177,7 @@ class _Control:
 
     def cancel(self) -> None:
         self._muted = False
-        self.began: float | None = None  # Beginning of the press that is not decided yet [s].
+        self.began: float | None = None  # Time at which the undecided press began [s]; None without one.
 
     def begin(self, stamp: float) -> None:
         self.began, self._muted = stamp, False

@@ -18,7 +18,7 @@ from q2r2_control.teleop.leash import Leash, Workspace
 from q2r2_control.teleop.relative import RelativeMotion
 from q2r2_control.types import Array, Pose, moved_by
 
-Shares = tuple[float, float]  # Factors of the scales of position and rotation: 1 normally, 0 for a lock.
+Shares = tuple[float, float]  # Factors of the scales of position and rotation: 1 normally, 0 if locked.
 
 
 class HandMotion:
@@ -74,7 +74,7 @@ class HandMotion:
             self._filter.add(hand, stamp, now)
 
     def anchor(self, hand: Pose, tool: Pose, shares: Shares, now: float) -> None:
-        """Let the newest pose of the ``hand`` correspond to ``tool`` (world frame) from now on."""
+        """Let ``hand``, the hand's newest pose (input's frame), correspond to ``tool`` (world frame) from now on."""
         if self._carried is not None:
             self._bound_one_tool()
         hand = self._rest.begin(hand, now)
@@ -103,7 +103,7 @@ class HandMotion:
         Args:
             newest: The newest pose of the hand, not filtered; None if there is none. There is then no leash.
             expected: The pose of the tool, or of the frame, at the controller's reference (world frame). The leash
-                keeps the target near this pose. None if it is not known. There is then no leash.
+                keeps the target near this pose. None if the pose is not known. There is then no leash.
             shares: The present factors of the scales.
             now: The time [s].
         """
@@ -132,7 +132,7 @@ class HandMotion:
         self._unslipped.rescale(*shares, hand, tool)
 
 
-MAX_OFFSET = 0.05, 0.1  # Greatest plausible distance of a measured tool from its command [m], [rad].
+MAX_OFFSET = 0.05, 0.1  # Greatest plausible difference of a measured and a commanded tool pose [m], [rad].
 
 
 class Anchor(NamedTuple):
@@ -184,7 +184,7 @@ class ArmMeasurements:
         return (x + by_x, y + by_y, z + by_z), rotation
 
     def lag(self, arm: str, offset: Array | None) -> float:
-        """Return the distance from the expected tool position to the last target [m]; 0 if one is not known.
+        """Return the distance from the expected tool position to the last target [m]; 0 if one of the two is not known.
 
         See :meth:`expected`.
         """

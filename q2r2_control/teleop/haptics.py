@@ -17,12 +17,12 @@ class Pulse(NamedTuple):
 
     frequency: float  # Relative frequency of the vibration, from 0 to 1.
     amplitude: float  # Relative amplitude, from 0 to 1.
-    duration: float  # [s]
-    meaning: str
+    duration: float  # Duration of the vibration [s].
+    meaning: str  # The event that the vibration reports, in words.
     strongest: float | None = None  # Greatest amplitude, if the amplitude grows with a quantity; otherwise None.
 
     def grown(self, share: float) -> Pulse:
-        """Return the vibration with a greater amplitude: at ``share`` 0 the least one, at 1 or more the strongest."""
+        """Return the vibration with the amplitude for ``share``: its own at 0, and :attr:`strongest` at 1 or more."""
         most = self.amplitude if self.strongest is None else self.strongest
         return self._replace(amplitude=self.amplitude + (most - self.amplitude) * min(share, 1.0))
 
@@ -66,10 +66,10 @@ _WHILE_STATE_STAYS: dict[ReasonKind, Pulse] = {
 }
 
 # Slip is the distance or the angle by which leash and workspace have held the target back.
-_SLIP_STEP = 0.02  # Slip of the target's position from pulse to pulse [m].
-_SLIP_ANGLE_STEP = 0.1  # Slip of the target's rotation from pulse to pulse [rad].
-_NEAR_STEP, _NEAR_FROM = 0.005, 0.05  # Approach from pulse to pulse, and the distance at which pulses begin [m].
-_FORCE_STEP, _FORCE_TO = 5.0, 50.0  # Force from pulse to pulse, and the force of the strongest pulse [N].
+_SLIP_STEP = 0.02  # Slip of the target's position from one pulse to the next [m].
+_SLIP_ANGLE_STEP = 0.1  # Slip of the target's rotation from one pulse to the next [rad].
+_NEAR_STEP, _NEAR_FROM = 0.005, 0.05  # Approach from one pulse to the next, and the distance at which they begin [m].
+_FORCE_STEP, _FORCE_TO = 5.0, 50.0  # Force from one pulse to the next, and the force of the strongest pulse [N].
 _PAUSE = 0.05  # Pause between two vibrations, so that they are felt as two [s].
 
 
@@ -77,7 +77,7 @@ class ArmCondition(NamedTuple):
     """What the hand feels of an arm: bodies near it, joints at their limits, and the contact force."""
 
     spare: float  # Distance by which the arm may still approach another body; infinite if no body is near [m].
-    limits: frozenset[str]  # Joints at a position limit.
+    limits: frozenset[str]  # Names of the joints that are at a position limit.
     force: float | None  # Contact force at the tool; None if it is not measured [N].
 
 
@@ -130,7 +130,7 @@ class HapticPulses:
             self._want(CONTACT.grown(condition.force / _FORCE_TO))
 
     def grasps(self, holds: bool) -> None:
-        """Take whether the gripper holds something."""
+        """Take whether the gripper holds something. If it has begun to hold, ask for a vibration."""
         if holds and not self._grasps:
             self._want(GRASP)
         self._grasps = holds
@@ -138,7 +138,7 @@ class HapticPulses:
     def at(self, now: float, hand: str) -> HapticFeedback | None:
         """Return the message that begins or ends a vibration at ``now`` [s], or None.
 
-        ``hand`` drives the arm now. A message that ends a vibration goes to the hand that the vibration began in.
+        ``hand`` drives the arm now. A message that ends a vibration goes to the hand in which the vibration began.
         """
         if self._ends is not None and now >= self._ends:
             self._ends, self._next = None, now + _PAUSE

@@ -29,62 +29,64 @@ from q2r2_control.types import Interval, Pose
 # If the hand comes back by more than this, the target is put at the tool pose [m], [rad]. It is more than tremor, which
 # is 0.2 mm and 0.2 degrees to either side, and more than the noise of a headset. This noise has a standard deviation of
 # 0.2 mm and 0.03 degrees, and two samples of a hand at rest are at most about seven standard deviations apart.
-_WAY_BACK = 1.5e-3, 12e-3
+_COMES_BACK = 1.5e-3, 12e-3
 # A tool that is slower counts as blocked [m/s], [rad/s]. A tool of this speed stops within a fraction of a millimetre.
 _HELD_UP = 0.05, 0.2
 # With any settings, a controller ignores the velocity of a target that steps faster than this [m/s], [rad/s].
 _NO_MOTION = 10.0, 35.0
-_ROUNDING = 1e-9  # Of a distance [m], and of a cosine.
+_ROUNDING = 1e-9  # Bound on the rounding error of a distance [m], and of a cosine.
 
-_Tick = tuple[Pose, Pose, float]  # Of one tick: tool pose, unslipped target (see ``Leash.target``), and time [s].
+# The data of one tick: the tool pose, the unslipped target (see ``Leash.target``), and the time [s].
+_Tick = tuple[Pose, Pose, float]
 
 
 class ComponentLeash:
     """The leash of a position or of a rotation. Displacements are vectors in the world frame [m or rad]."""
 
-    def __init__(self, length: float | None, way_back: float, held_up: float, no_motion: float) -> None:
+    def __init__(self, length: float | None, comes_back: float, held_up: float, no_motion: float) -> None:
         self._length = math.inf if length is None else length
-        self._way_back, self._held_up, self._no_motion = way_back, held_up, no_motion
+        self._comes_back, self._held_up, self._no_motion = comes_back, held_up, no_motion
         self.reset()
 
     def reset(self) -> None:
         """Begin with a slack leash and no slip."""
         self.slip = 0.0  # The sum of all shifts of the target since the reset [m or rad].
         self.taut = False
-        self._back = 0.0  # How far the hand has come back towards the tool since it was farthest [m or rad].
+        # Distance by which the hand has come back towards the tool since it was farthest away [m or rad].
+        self._back = 0.0
 
-    def releases_slack(self, way: Vector, by_hand: Vector, by_tool: Vector, dt: float) -> bool:
+    def releases_slack(self, shift: Vector, by_hand: Vector, by_tool: Vector, dt: float) -> bool:
         """Return whether the target is to be put at the tool pose, because the hand comes back from a blocked tool.
 
         Args:
-            way: Displacement from the tool to the target [m or rad].
-            by_hand: Motion of the unslipped target since the last tick, which is the unfiltered hand's motion.
-            by_tool: Motion of the tool since the last tick.
+            shift: Displacement from the tool to the target [m or rad].
+            by_hand: Motion of the unslipped target since the last tick, by the unfiltered hand [m or rad].
+            by_tool: Motion of the tool since the last tick [m or rad].
             dt: Duration of the tick [s].
         """
-        distance = math.hypot(*way)
+        distance = math.hypot(*shift)
         # A taut leash stays taut until the distance is below half of its length. The tool has then caught up.
         self.taut = distance >= self._length or (self.taut and distance >= 0.5 * self._length)
         if not self.taut:
             self._back = 0.0
             return False
-        self._back = max(0.0, self._back - _dot(way, by_hand) / distance)
-        held_up = abs(_dot(way, by_tool)) < self._held_up * distance * dt
-        return self._back > self._way_back and held_up and distance > self._no_motion * dt
+        self._back = max(0.0, self._back - _dot(shift, by_hand) / distance)
+        held_up = abs(_dot(shift, by_tool)) < self._held_up * distance * dt
+        return self._back > self._comes_back and held_up and distance > self._no_motion * dt
 
-    def drop(self, way: Vector) -> Vector:
-        """Put the target at the tool pose: return the displacement 0, and count ``way`` as slip."""
+    def drop(self, shift: Vector) -> Vector:
+        """Put the target at the tool pose: return the displacement 0, and count ``shift`` as slip."""
         self.taut, self._back = False, 0.0
-        self.slip += math.hypot(*way)
+        self.slip += math.hypot(*shift)
         return 0.0, 0.0, 0.0
 
-    def hold(self, way: Vector) -> Vector | None:
-        """Return ``way`` (tool to target) cut to the length of the leash; None if it is not longer than the leash."""
-        distance = math.hypot(*way)
+    def hold(self, shift: Vector) -> Vector | None:
+        """Return ``shift`` (from tool to target), cut to the leash's length; None if it is not longer."""
+        distance = math.hypot(*shift)
         if distance <= self._length:
             return None
         self.slip += distance - self._length
-        share, (x, y, z) = self._length / distance, way
+        share, (x, y, z) = self._length / distance, shift
         return share * x, share * y, share * z
 
 
@@ -92,11 +94,12 @@ class Leash:
     """Keeps the target of one arm near its tool. The module's docstring says how and why."""
 
     def __init__(self, settings: LeashSettings) -> None:
-        limits = list(zip(_WAY_BACK, _HELD_UP, _NO_MOTION, strict=True))
+        limits = list(zip(_COMES_BACK, _HELD_UP, _NO_MOTION, strict=True))
         self.position = ComponentLeash(settings.distance, *limits[0])
         self.rotation = ComponentLeash(settings.angle, *limits[1])
         self._components = self.position, self.rotation
-        # Distance, and cosine of half the angle, from which on the leashes are computed. They are just before its ends.
+        # The leashes are computed from this distance on, and from this cosine of half the angle on. Both values are
+        # slightly before the end of the leash.
         self._distance = math.inf if settings.distance is None else settings.distance - _ROUNDING
         self._cosine = -math.inf if settings.angle is None else math.cos(0.5 * settings.angle) + _ROUNDING
         self._last: _Tick | None = None
@@ -112,13 +115,13 @@ class Leash:
         self._last = None
 
     def target(self, motion: RelativeMotion, hand: Pose, newest: Pose, tool: Pose, now: float) -> Pose:
-        """Return the target pose (world frame) for ``hand``, no farther from the tool than the leashes reach.
+        """Return the target pose (world frame) for ``hand``, no farther from the tool than the leashes allow.
 
         Args:
             motion: Maps the hand to its target. If a leash moves the target, ``motion`` is anchored again, so that the
                 hand moves the target from there.
             hand: The filtered pose of the hand, in the input's frame.
-            newest: The unslipped target (world frame): the one that the unfiltered hand would have if no leash and no
+            newest: The unslipped target (world frame). The unfiltered hand would have this target if no leash and no
                 workspace had held a target back since the anchor.
             tool: The tool pose, in the world frame.
             now: The time [s].
@@ -128,23 +131,26 @@ class Leash:
         # The first target is the anchor. It must not move the arm, even if the tool is measured somewhere else.
         if last is None or not (self.position.taut or self.rotation.taut or self._ends(tool, target)):
             return target
-        way, turn = self._pull(target, last, this)
-        position, rotation = target = _put(target, tool, way, turn)
-        if way is not None:
+        shift, turn = self._pull(target, last, this)
+        position, rotation = target = _put(target, tool, shift, turn)
+        if shift is not None:
             motion.anchor_position(hand[0], position)
         if turn is not None:
             motion.anchor_rotation(hand[1], rotation)
         return target
 
     def hold(self, target: Pose, tool: Pose) -> Pose:
-        """Return ``target``, moved to be no farther from ``tool`` than the leashes reach. Both are in the world frame.
+        """Return ``target``, moved to be no farther from ``tool`` than the leashes allow. Both are in the world frame.
 
-        This is for targets that no hand moves.
+        The caller uses this for targets that no hand moves.
         """
         if not self._ends(tool, target):
             return target
-        way, turn = (component.hold(way) for component, way in zip(self._components, _ways(tool, target), strict=True))
-        return _put(target, tool, way, turn)
+        shift, turn = (
+            component.hold(shift)
+            for component, shift in zip(self._components, _displacements(tool, target), strict=True)
+        )
+        return _put(target, tool, shift, turn)
 
     def _ends(self, tool: Pose, target: Pose) -> bool:
         """Return whether the target has reached the maximum distance or angle from the tool.
@@ -156,32 +162,38 @@ class Leash:
         return math.dist(start, end) >= self._distance or abs(a * x + b * y + c * z + d * w) <= self._cosine
 
     def _pull(self, target: Pose, last: _Tick, this: _Tick) -> list[Vector | None]:
-        """Return the displacements from the tool to the new target, of position and rotation.
+        """Return the displacement and the rotation vector from the tool to the new target [m], [rad].
 
-        A displacement is None if its part of the target stays.
+        The first one is None if the target's position stays, and the second one if its rotation stays.
         """
         (last_tool, last_newest, before), (tool, newest, now) = last, this
-        ways = _ways(tool, target)
-        moves = zip(self._components, ways, _ways(last_newest, newest), _ways(last_tool, tool), strict=True)
-        # Both components are asked, since each of them has to see every tick.
+        displacements = _displacements(tool, target)
+        moves = zip(
+            self._components,
+            displacements,
+            _displacements(last_newest, newest),
+            _displacements(last_tool, tool),
+            strict=True,
+        )
+        # Both components are called, since each of them has to see every tick.
         dt = now - before
-        releases = [leash.releases_slack(way, by_hand, by_tool, dt) for leash, way, by_hand, by_tool in moves]
+        releases = [leash.releases_slack(shift, by_hand, by_tool, dt) for leash, shift, by_hand, by_tool in moves]
         if any(releases):
-            return [component.drop(way) for component, way in zip(self._components, ways, strict=True)]
-        return [component.hold(way) for component, way in zip(self._components, ways, strict=True)]
+            return [component.drop(shift) for component, shift in zip(self._components, displacements, strict=True)]
+        return [component.hold(shift) for component, shift in zip(self._components, displacements, strict=True)]
 
 
-def _ways(start: Pose, end: Pose) -> tuple[Vector, Vector]:
+def _displacements(start: Pose, end: Pose) -> tuple[Vector, Vector]:
     """Return the displacement [m] and the rotation vector [rad] from ``start`` to ``end``."""
     ((x, y, z), rotation), ((to_x, to_y, to_z), turned) = start, end
     return (to_x - x, to_y - y, to_z - z), turn_between(rotation, turned)
 
 
-def _put(target: Pose, tool: Pose, way: Vector | None, turn: Vector | None) -> Pose:
-    """Return the target at the displacements ``way`` and ``turn`` from the tool; None leaves position or rotation."""
+def _put(target: Pose, tool: Pose, shift: Vector | None, turn: Vector | None) -> Pose:
+    """Return the target at the displacements ``shift`` and ``turn`` from the tool. None keeps position or rotation."""
     (position, rotation), ((x, y, z), tool_rotation) = target, tool
-    if way is not None:
-        position = x + way[0], y + way[1], z + way[2]
+    if shift is not None:
+        position = x + shift[0], y + shift[1], z + shift[2]
     return position, rotation if turn is None else turned_by(tool_rotation, turn)
 
 
@@ -190,7 +202,10 @@ def _dot(one: Vector, other: Vector) -> float:
 
 
 class Workspace:
-    """Keeps the targets of one arm in a box. If the tool was outside at the anchor, they may stay that far outside."""
+    """Keeps the targets of one arm in a box.
+
+    If the tool was outside of the box at the anchor, the targets may be as far outside.
+    """
 
     def __init__(self, settings: WorkspaceSettings | None) -> None:
         self._sides: tuple[Interval, ...] = () if settings is None else (settings.x, settings.y, settings.z)

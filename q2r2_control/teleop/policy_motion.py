@@ -26,7 +26,7 @@ from q2r2_control.types import ActionChunk, Array, Pose
 
 SILENT = 0.5  # The last action of a plan counts for this time. After that the arm rests [s].
 _FADING = 0.5, 2.0  # Greatest speed at which the difference between two chunks fades [m/s], [rad/s].
-# If a time of a chunk is farther from now, before or after, another clock has stamped the chunk [s].
+# If a time of a chunk is farther in the past or in the future, another clock has stamped the chunk [s].
 _AHEAD = 10.0
 
 
@@ -36,7 +36,7 @@ class _Plan(NamedTuple):
     start: float  # Time from which the plan is followed [s].
     chunk: ActionChunk
     times: list[float]  # Times of the poses [s].
-    # In the world frame. For a chunk of motions, relative to the tool pose at which the first motion begins.
+    # Poses in the world frame. For a chunk of motions, relative to the tool pose at which the first motion begins.
     poses: list[Pose]
     grippers: list[float]  # Openings of the gripper; empty if the policy does not command it.
 
@@ -143,28 +143,28 @@ class PolicyMotion:
         due = [plan for plan in self._plans if plan.start <= now]
         self._plans = self._plans[len(due) :]
         if due:
-            plan, places = due[-1], [tool] if tool is not None else []
+            plan, starts = due[-1], [tool] if tool is not None else []
             if self._plan is not None:
-                places = [self.target(tool, now), self._at(now)]
-            if jump := self._change(plan, places, now):
+                starts = [self.target(tool, now), self._at(now)]
+            if jump := self._change(plan, starts, now):
                 return jump
         if self._plan is None or now >= self._plan.end:
             return Reason.of(TeleopReason.POLICY_SILENT, timeout=SILENT)
         return None
 
-    def _change(self, plan: _Plan, places: list[Pose], now: float) -> Reason | None:
+    def _change(self, plan: _Plan, starts: list[Pose], now: float) -> Reason | None:
         """Follow ``plan`` from now on. Return why this is not possible, or None.
 
-        The target begins at the one of the poses ``places`` (world frame) that is nearest to the plan. A plan of
-        motions begins at the first of them.
+        The target begins at one of the poses ``starts`` (world frame): at the pose that is nearest to the plan. A plan
+        of motions begins at the first pose of ``starts``.
         """
         if self._arm in plan.chunk.motions:
-            plan = plan._replace(poses=_moved_to(places[0], _interpolated(plan, now), plan.poses))
+            plan = plan._replace(poses=_moved_to(starts[0], _interpolated(plan, now), plan.poses))
         planned, turned = _interpolated(plan, now)
-        position, rotation = min(places, key=lambda place: math.dist(place[0], planned))
+        position, rotation = min(starts, key=lambda start: math.dist(start[0], planned))
         (x, y, z), (at_x, at_y, at_z) = planned, position
-        self._way, self._turn = (at_x - x, at_y - y, at_z - z), turn_between(turned, rotation)
-        distance, angle = math.hypot(*self._way), math.hypot(*self._turn)
+        self._shift, self._turn = (at_x - x, at_y - y, at_z - z), turn_between(turned, rotation)
+        distance, angle = math.hypot(*self._shift), math.hypot(*self._turn)
         leash, gate = self._settings.leash, self._settings.gate
         most, most_angle = leash.distance or gate.max_jump, leash.angle or gate.max_rotation_jump
         if distance > most or angle > most_angle:
@@ -175,14 +175,14 @@ class PolicyMotion:
         return None
 
     def _at(self, now: float) -> Pose:
-        """Return the plan's pose at ``now``, plus what has not yet faded of the difference from the plan before it."""
+        """Return the plan's pose at ``now``, plus the part of the jump from the plan before that has not faded yet."""
         assert self._plan is not None
         (x, y, z), rotation = _interpolated(self._plan, now)
         left = 1.0 - min((now - self._began) / self._fades, 1.0)
         if left == 0.0:
             return (x, y, z), rotation
-        (way_x, way_y, way_z), (a, b, c) = self._way, self._turn
-        return (x + left * way_x, y + left * way_y, z + left * way_z), turned_by(
+        (shift_x, shift_y, shift_z), (a, b, c) = self._shift, self._turn
+        return (x + left * shift_x, y + left * shift_y, z + left * shift_z), turned_by(
             rotation, (left * a, left * b, left * c)
         )
 
@@ -199,7 +199,7 @@ class PolicyMotion:
         return target if tool is None else self._leash.hold(target, tool)
 
     def gripper(self, now: float) -> float | None:
-        """Return the opening of the newest action at or before ``now``; None if the policy does not command it."""
+        """Return the opening of the newest action up to ``now``; None if the policy does not command the gripper."""
         if self._plan is None or not self._plan.grippers:
             return None
         index = bisect_right(self._plan.times, now) - 1
@@ -209,7 +209,7 @@ class PolicyMotion:
         """Return the joint positions that the actions ask for at ``now`` (nv,) [rad]; None if they ask for none."""
         if self._plan is None or self._plan.chunk.postures is None:
             return None
-        postures, (index, share) = self._plan.chunk.postures, _place(self._plan.times, now)
+        postures, (index, share) = self._plan.chunk.postures, _segment_at(self._plan.times, now)
         after = postures[min(index + 1, len(postures) - 1)]
         return np.asarray(postures[index] + share * (after - postures[index]))
 
@@ -235,14 +235,14 @@ def _added_up(motions: list[list[float]]) -> list[Pose]:
     return poses
 
 
-def _moved_to(place: Pose, origin: Pose, poses: list[Pose]) -> list[Pose]:
-    """Return ``poses`` after the one rigid motion that moves the pose ``origin`` to the pose ``place``."""
-    move = se3_of(place) * se3_of(origin).inverse()
+def _moved_to(goal: Pose, origin: Pose, poses: list[Pose]) -> list[Pose]:
+    """Return ``poses`` after the one rigid motion that moves the pose ``origin`` to the pose ``goal``."""
+    move = se3_of(goal) * se3_of(origin).inverse()
     return [floats_of(move * se3_of(pose)) for pose in poses]
 
 
-def _place(times: list[float], t: float) -> tuple[int, float]:
-    """Return the index of the last action up to ``t``, and the share of the time to the next action that has passed."""
+def _segment_at(times: list[float], t: float) -> tuple[int, float]:
+    """Return the index of the last action up to ``t``, and the share of the time to the next action that is over."""
     index = min(max(bisect_right(times, t) - 1, 0), max(len(times) - 2, 0))
     if len(times) == 1:
         return 0, 0.0
@@ -256,7 +256,7 @@ def _interpolated(plan: _Plan, t: float) -> Pose:
     Rotations turn at constant speed from action to action.
     """
     times, poses = plan.times, plan.poses
-    index, share = _place(times, t)
+    index, share = _segment_at(times, t)
     if len(times) == 1:
         return poses[0]
     (start, rotation), (end, turned) = poses[index], poses[index + 1]
@@ -273,7 +273,7 @@ def _interpolated(plan: _Plan, t: float) -> Pose:
 
 
 def _velocity(times: list[float], poses: list[Pose], index: int) -> Vector:
-    """Return the velocity at an action: the mean from the action before it to the action after it [m/s]."""
+    """Return the velocity at an action: the mean velocity from the action before to the action after [m/s]."""
     first, last = max(index - 1, 0), min(index + 1, len(times) - 1)
     h, start, end = times[last] - times[first], poses[first][0], poses[last][0]
     return (end[0] - start[0]) / h, (end[1] - start[1]) / h, (end[2] - start[2]) / h

@@ -1,4 +1,4 @@
-"""Decide which arms follow a policy: the arms that no operator drives, until the actions end or have a fault."""
+"""Decide which arms follow a policy. These are arms that no operator drives, until the actions end or have a fault."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class PolicySide:
 
     After a fault, an arm whose hand has sent readings waits for a press. An arm without an operator goes on with the
     next chunk that begins at its tool pose. Linked arms begin together or not at all, since they may hold one object.
-    These are all arms for which the newest chunk has actions, and all arms that a fault has stopped together.
+    The arms that have to begin together are those in the newest chunk, and those that a fault has stopped together.
     """
 
     def __init__(self, arms: Mapping[str, ArmTeleop], settings: TeleopSettings) -> None:
@@ -44,7 +44,8 @@ class PolicySide:
     ) -> None:
         """Take the chunks of one tick, and decide which arms follow the policy.
 
-        Arms whose actions have ended or have a fault stop. Without a fault, arms that may follow begin to.
+        An arm stops if its actions have ended or have a fault. If there is no fault, arms that may follow the policy
+        begin to follow it.
 
         Args:
             chunks: The new chunks.
@@ -59,7 +60,7 @@ class PolicySide:
         faults: dict[str, Reason] = {}
         for name, motion in self._motions.items():
             if motion.following and self._arms[name].state is not ArmState.POLICY:
-                motion.forget()  # The arm was stopped, or a hand has taken it over. It may go on with the next chunk.
+                motion.forget()  # The arm was stopped or taken over by a hand. It may follow the next chunk.
         for chunk in chunks:
             self._asked = {*chunk.tools, *chunk.motions} or self._asked
             for name, motion in self._motions.items():
@@ -78,7 +79,7 @@ class PolicySide:
         return [name for name, arm in self._arms.items() if arm.state in states]
 
     def _refuse(self, faults: Mapping[str, Reason], now: float) -> None:
-        """Stop the arms with faults. If such an arm does not follow the policy, record a kind of fault only once."""
+        """Stop the arms with faults. If an arm does not follow the policy, record a kind of fault only once."""
         following = self._in(ArmState.POLICY)
         for name, fault in faults.items():
             self._motions[name].forget()

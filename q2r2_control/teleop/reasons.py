@@ -46,7 +46,7 @@ class TeleopReason(ReasonKind):
         "hands_crossed",
         "the left hand has been to the right of the right hand for {time:g} s: are the two controllers swapped?",
     )
-    # Refusals: nothing changed. Those of the first group have a cause.
+    # Refusals, after which nothing has changed. The first five have a cause.
     NOT_ENGAGED = "not_engaged", "not engaged: {cause}"
     NOT_HOMING = "not_homing", "not homing: {cause}"
     NOT_CARRIED = "not_carried", "not carried: {cause}"
@@ -106,5 +106,5 @@ _C = CommonReason
 _WAY_HOME = {_C.HOMING, _C.HOMING_ARRIVED, _C.HOMING_HELD_UP, _C.HOMING_NO_WAY, _C.HOMING_INTERRUPTED, _C.HOMING_ENDED}
 # Reasons that say that a hand's data did not come in time.
 SILENCES: frozenset[ReasonKind] = frozenset({_K.POSE_SILENT, _K.POSE_GAP, _K.INPUTS_SILENT})
-# Requests that arms hold, and the beginning and the outcomes of a motion home.
+# Requests to let arms hold, the start of a motion home, and its outcomes.
 HOLD_REQUESTS: frozenset[ReasonKind] = frozenset({_K.PAUSE_SERVICE, _K.RESET_SERVICE, *_WAY_HOME})

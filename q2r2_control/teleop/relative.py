@@ -100,20 +100,32 @@ class RelativeMotion:
         self.anchor_rotation(hand[1], tool[1])
 
     def rescale(self, position: float, rotation: float, hand: Pose, tool: Pose) -> None:
-        """Multiply the scales of the settings by these factors from now on, and anchor ``hand`` and ``tool``.
+        """Multiply the scales of the settings by these factors from now on, and anchor the hand and the tool.
 
-        The new anchor keeps the target from jumping.
+        Because of the new anchor, the target does not jump.
+
+        Args:
+            position: Factor of the position scale.
+            rotation: Factor of the rotation scale.
+            hand: The present hand pose, in the input's frame.
+            tool: The present target, in the world frame.
         """
         self._scale, self._rotation_scale = position * self._full[0], rotation * self._full[1]
         self._axes = self._scaled_axes()
         self.anchor_floats(hand, tool)
 
     def anchor_position(self, hand: Vector, tool: Vector) -> None:
-        """Make ``tool`` the target's position for the hand's present position. The anchor of rotations stays."""
+        """Let the position ``hand`` (input's frame) correspond to the position ``tool`` (world frame) from now on.
+
+        The anchor of rotations stays.
+        """
         self._hand_position, self._tool_position = hand, tool
 
     def anchor_rotation(self, hand: Quaternion, tool: Quaternion) -> None:
-        """Make ``tool`` the target's rotation for the hand's present rotation. The anchor of positions stays."""
+        """Let the rotation ``hand`` (input's frame) correspond to the rotation ``tool`` (world frame) from now on.
+
+        The anchor of positions stays.
+        """
         self._hand_rotation = normalized(hand)
         self._hand_back = inverse(self._hand_rotation)
         self._tool_rotation = tool = normalized(tool)
@@ -163,8 +175,8 @@ class RelativeMotion:
     def hand(self, tool: pin.SE3) -> pin.SE3:
         """Return the hand pose in the input's frame whose :meth:`target` is ``tool``.
 
-        If the rotation is more than half a turn from the anchor, the hand turns the shorter way round. With a scale of
-        0 the returned pose has the position or the rotation of the anchored hand.
+        If the rotation is more than half a turn from the anchor, the returned hand is turned in the shorter direction.
+        With a scale of 0 the returned pose has the position or the rotation of the anchored hand.
 
         Raises:
             Q2R2Error: If nothing has been anchored.
@@ -174,7 +186,7 @@ class RelativeMotion:
         position, now = _checked_floats("hand: tool", tool)
         scales = self._scale * self._axis_scales
         moved = np.subtract(position, self._tool_position)
-        way = self._map.T @ np.divide(moved, scales, out=np.zeros(3), where=scales > 0.0)
+        displacement = self._map.T @ np.divide(moved, scales, out=np.zeros(3), where=scales > 0.0)
         rotation = self._hand_rotation
         if self._rotation_scale > 0.0:
             back = inverse(self._tool_rotation)
@@ -182,14 +194,14 @@ class RelativeMotion:
             x, y, z = (self._turn_map.T @ scaled / self._rotation_scale).tolist()
             turn = rotation_of((x, y, z))
             rotation = product(rotation, turn) if self._in_tool_frame else product(turn, rotation)
-        return pin.XYZQUATToSE3((*(self._hand_position + way), *rotation))
+        return pin.XYZQUATToSE3((*(self._hand_position + displacement), *rotation))
 
     def _scaled_axes(self) -> list[tuple[int, float]]:
         return _axes_of(self._scale * self._axis_scales[:, None] * self._map)
 
 
 def _checked_floats(name: str, pose: pin.SE3) -> Pose:
-    """Return a pose as floats; raises :class:`Q2R2Error` if it is not a pose, not finite, or not a rotation."""
+    """Return a pose as floats. Raises :class:`Q2R2Error` if it is not a finite pose with a rotation matrix."""
     if not isinstance(pose, pin.SE3) or not np.allclose(pose.rotation @ pose.rotation.T, np.eye(3), atol=1e-3):
         raise Q2R2Error(f"RelativeMotion.{name} = {shown(pose)}: allowed: a pin.SE3 with a proper rotation")
     if not np.isfinite(pose.translation).all():
@@ -204,7 +216,7 @@ def _axes_of(matrix: Array) -> list[tuple[int, float]]:
 
 
 def _continued(vector: Vector, previous: Vector) -> Vector:
-    """Return the rotation vector that continues ``previous``: ``vector``, or the longer one of the same rotation."""
+    """Return the vector that continues ``previous``: ``vector``, or the longer vector of the same rotation [rad]."""
     angle = math.hypot(*vector)
     if angle == 0.0:
         return vector

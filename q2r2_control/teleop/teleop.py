@@ -21,7 +21,8 @@ from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.types import ActionChunk, ArmTarget, HandSample
 
 _BY_HANDS = ArmState.ENGAGED, ArmState.CARRIED
-_LED = FOLLOWING - {ArmState.CARRIED, ArmState.POLICY}  # States in which an arm's own hand drives it.
+# States in which a fault of an arm's own hand stops the arm.
+_HAND_FAULT_STOPS = FOLLOWING - {ArmState.CARRIED, ArmState.POLICY}
 
 
 class Teleop:
@@ -87,12 +88,12 @@ class Teleop:
 
     @property
     def engaged(self) -> dict[str, bool]:
-        """For each arm, whether it follows a hand or a policy now."""
+        """For each arm, True if it follows a hand or a policy now."""
         return {name: arm.state in (*_BY_HANDS, ArmState.POLICY) for name, arm in self._arms.items()}
 
     @property
     def interventions(self) -> dict[str, bool]:
-        """For each arm, whether a hand moves it although a policy has sent actions in this run."""
+        """For each arm, True if a hand moves it and a policy has sent actions in this run."""
         return {name: self._policy.seen and arm.state in _BY_HANDS for name, arm in self._arms.items()}
 
     @property
@@ -133,8 +134,8 @@ class Teleop:
             tools: The measured tool poses, in the world frame.
             now: The time, by the same clock as the samples' stamps [s].
             commanded: The tool poses at the controller's reference, in the world frame. The leash keeps each target
-                near this pose. Without it there is no leash.
-            obstacles: For each arm that may not be engaged now, the reason. The caller knows it, and not this class.
+                near this pose. Without these poses there is no leash.
+            obstacles: For each arm that may not be engaged now, the reason. The caller has to find these reasons.
             in_step: Whether all poses in ``commanded`` belong to one moment. Only then may they correct the relative
                 pose of two tools that carry one object.
             chunks: The new action chunks of a policy.
@@ -206,7 +207,7 @@ class Teleop:
             arm.record_event(now, reason)
 
     def mark(self, now: float, action: Action) -> None:
-        """Mark the recording because a program asks for it, as a press of a hand does; see :class:`EpisodeMarks`."""
+        """Apply an action of :class:`EpisodeMarks` because a program asks for it. A press has the same effect."""
         next(iter(self._arms.values())).record_event(now, self.marks.apply(action))
 
     def reset(self, now: float, arm: str, reason: Reason) -> None:
@@ -216,7 +217,7 @@ class Teleop:
         self._pair.change(Cause.GO_ON, now, reason)
 
     def hold(self, now: float, reason: Reason, arm: str) -> None:
-        """Let an arm hold because a program asks for it. This is an event even if the arm holds already."""
+        """Let an arm hold because a program asks for it. An event is recorded even if the arm holds already."""
         if self._arms[arm].state in AT_REST:
             self._arms[arm].record_event(now, reason)
         self.pause(now, reason, arm)
@@ -224,7 +225,7 @@ class Teleop:
     def connection_lost(self, now: float) -> None:
         """Stop the arms, and forget all samples, because the input is lost.
 
-        Arms go on to move home if a program has asked for it.
+        If arms move home because a program has asked for it, they continue.
         """
         now, _ = self._clock(now)
         if not self.homing or self._pair.asks_home is not None:
@@ -254,7 +255,8 @@ class Teleop:
     def give_back(self, now: float) -> None:
         """Let a policy move the arms that hands have driven.
 
-        After a fault the arms then wait for no press, until a reading of a hand comes again.
+        An arm that a fault stops afterwards waits for no press before the policy may move it again. This ends when a
+        reading of its hand comes.
         """
         now, _ = self._clock(now)
         reason = Reason(TeleopReason.POLICY_REQUESTED)
@@ -289,7 +291,7 @@ class Teleop:
             if (fault := faults.get(self._pair.asks_home or "")) is not None:
                 self._pair.change(Cause.FAULT, now, Reason(CommonReason.HOMING_FAULT, cause=fault))
             return
-        if active := {name: fault for name, fault in faults.items() if self._arms[name].state in _LED}:
+        if active := {name: fault for name, fault in faults.items() if self._arms[name].state in _HAND_FAULT_STOPS}:
             self._stop(active, now)
 
     def _stop(self, faults: Mapping[str, Reason], now: float) -> None:

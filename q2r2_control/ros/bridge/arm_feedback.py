@@ -1,4 +1,4 @@
-"""Report on one arm's teleoperation: to its hand as vibrations, to the log, to RViz and to a recording."""
+"""Report on the teleoperation of one arm: as vibrations of its hand, in the log, in RViz and in a recording."""
 
 from __future__ import annotations
 
@@ -93,8 +93,9 @@ class ArmFeedback:
     def __init__(self, node: BaseNode, arm: str, values: ArmParameters, hand: HandIntake) -> None:
         self._node, self._hand = node, hand
         self.haptics = HapticPulses(values.teleop.haptics)
-        self.last_line, self.last_kind = "not engaged yet", ""  # The last event, and the kind of its first cause.
-        self.paused = "not engaged yet"  # The last event that let the arm hold.
+        # The last event in words, and the kind of the reason from which it follows.
+        self.last_line, self.last_kind = "not engaged yet", ""
+        self.paused = "not engaged yet"  # The last event after which the arm holds.
         self._drawn = TargetMarkers(arm, values.tool_frame, values.world_frame)
         self._markers = node.create_publisher(Marker, "visualization_marker", 10)
         self._shown = 0.0
@@ -141,7 +142,7 @@ class ArmFeedback:
             self._shown = now
             if not self._markers.get_subscription_count():
                 return
-            asked = None if sent is None else with_offset(sent, target.offset)  # The goal of the tool.
+            asked = None if sent is None else with_offset(sent, target.offset)  # The target of the measured tool.
             for marker in self._drawn.at(asked, tool, engaged, now):
                 self._markers.publish(marker)
 

@@ -48,7 +48,7 @@ class ArmOutputs:
     def __init__(self, node: BaseNode, arm: str, values: ArmParameters, safe_target: PoseTopic) -> None:
         preset, self._filtered = values.preset, values.mode is Mode.FILTERED
         self._safe_target, self._tool_frame = safe_target, values.tool_frame
-        self._last: TargetOutput | None = None
+        self._relay: TargetOutput | None = None  # The output that relays the safe target; None in mode raw.
         if self._filtered:
             topic = BUILTIN.topic.format(ctrl=values.builtin_prefix)
             self.first = TargetOutput(
@@ -58,12 +58,13 @@ class ArmOutputs:
             terms = values.controller, values.target_topic, values.base_frame, values.guard
             theirs = TargetOutput(node, values, preset, *terms)
             if self._filtered:
-                self._last = theirs
+                self._relay = theirs
             else:
                 self.first = theirs
-        self._all = [self.first] if self._last is None else [self.first, self._last]
+        self._all = [self.first] if self._relay is None else [self.first, self._relay]
         self._follows: FollowWatch | None = None
-        # The name of the built-in controller if it gets the hand's targets; and its name if it also moves the arm home.
+        # The name of the built-in controller, or None: in ``builtin`` if it gets the hand's targets, and in
+        # ``home_controller`` if it also moves the arm home.
         self.builtin = values.builtin_node if self.first.preset is BUILTIN else None
         self.home_controller = None if self._filtered else self.builtin
         if self.first.preset is BUILTIN:
@@ -73,7 +74,7 @@ class ArmOutputs:
         self._command_type = (
             None if service is None else CommandType(node, service.format(ctrl=values.prefix), preset.message)
         )
-        self._safe_problem: Reason | None = self._safe_target.problem  # Why the relay cannot begin now.
+        self._safe_problem: Reason | None = self._safe_target.problem  # Why the relay cannot begin now, or None.
         self._relaying = False
         raw = not self._filtered and preset is not BUILTIN
         # The built-in controller needs no such watch: its reference is known here, and may stand still for a reason.
@@ -82,7 +83,7 @@ class ArmOutputs:
 
     def limit(self, guard: GuardSettings) -> None:
         """Change the limits of the targets for the preset's controller, from the next target on."""
-        output = self._last if self._filtered else self.first
+        output = self._relay if self._filtered else self.first
         if output is not None:
             output.guard.change(guard)
 
@@ -96,7 +97,7 @@ class ArmOutputs:
         """The reason why the arm may not be engaged yet, or None."""
         if unready := next((unready for output in self._all if (unready := output.unready)), None):
             return unready
-        if self._last is not None and not self._relaying:
+        if self._relay is not None and not self._relaying:
             unready = self._safe_problem
         if unready is None and self._follows is not None:
             unready = self._follows.unready
@@ -106,7 +107,7 @@ class ArmOutputs:
 
     @property
     def homing(self) -> tuple[bool, Reason | None]:
-        """True if the built-in controller reports that it goes home, and how the last way home ended by itself."""
+        """Whether the built-in controller reports a motion home, and how the last motion home ended, or None."""
         return (False, None) if self._follows is None else (self._follows.homing, self._follows.homing_outcome)
 
     @property
@@ -125,7 +126,7 @@ class ArmOutputs:
     def take_fault(self, now: float) -> Reason | None:
         """Check the controllers. If a fault of a controller has to pause the arm, return the reason once."""
         faults = [output.take_fault(now) for output in reversed(self._all)]
-        if self._last is not None and faults[0] is not None:
+        if self._relay is not None and faults[0] is not None:
             self._relaying = False
         if self._command_type is not None:
             self._command_type.step(self._all[-1].starts, now)
@@ -142,11 +143,11 @@ class ArmOutputs:
         asked = self.first.last_sent
         if self._stands is None or tool is None or asked is None or not self.first.following:
             return None
-        if (way := self._stands.look(asked.translation, tool.translation, received, now)) is None:
+        if (distance := self._stands.look(asked.translation, tool.translation, received, now)) is None:
             return None
         self.forget(now)  # A repeated target could make the arm jump.
         takers = f" {name}" if (name := takers_of(self._node, self.first.topic)) else ""
-        return _refused(standing(self._arm, takers, way, "m"))
+        return _refused(standing(self._arm, takers, distance, "m"))
 
     def step(
         self,
@@ -163,7 +164,7 @@ class ArmOutputs:
         self, engaged: bool, tool: pin.SE3 | None, base: pin.SE3 | None, now: float, decided: float
     ) -> Reason | None:
         """Pass on the safe target of the built-in controller. Return why the arm has to pause, or None."""
-        if self._last is None:
+        if self._relay is None:
             return None
         safe, fault = self._safe_target.at(now), None
         self._safe_problem = self._safe_target.problem if safe is None else self.away(safe, tool)
@@ -171,7 +172,7 @@ class ArmOutputs:
             self._relaying, fault = self._safe_problem is None and tool is not None, self._safe_problem
         self._relaying = self._relaying and safe is not None
         # A stream starts at the measured tool, and the safe target may differ from it by the arm's steady-state offset.
-        self._last.step(safe if self._relaying else None, tool, base, now, decided, start=tool)
+        self._relay.step(safe if self._relaying else None, tool, base, now, decided, start=tool)
         return _refused(fault)
 
     def away(self, safe: pin.SE3 | None, tool: pin.SE3 | None) -> Reason | None:
@@ -205,14 +206,14 @@ class FollowWatch:
         self._since = math.inf  # Time since which targets have been sent and not followed [s].
         self._followed_since = math.inf  # Time since which targets have been sent and followed [s].
         self._node, self._state_topic = node, f"{controller}/state"
-        self._unready: Reason | None = None  # Why the controller is not ready, as its newest report says.
+        self._unready: Reason | None = None  # Why the controller is not ready, by its newest report, or None.
         # The number of the controller's starts, and the time of its newest report [s].
         self._starts, self._reported_at = 0, -math.inf
         # Whether a node publishes ``~/state``, and the time at which the graph was last asked for it [s].
         self._is_there, self._looked = False, -math.inf
         self.homing = False  # Whether the controller reports that it goes home.
-        self.homing_outcome: Reason | None = None  # How the last way home ended, if nobody interrupted it.
-        self.gripper_held = ""  # The pair of bodies that stops the gripper.
+        self.homing_outcome: Reason | None = None  # How the last motion home ended; None if nothing is reported.
+        self.gripper_held = ""  # The pair of bodies that stops the gripper; empty if none does.
         node.create_subscription(Bool, self._topic, self._on_following, LATCHED_QOS)
         node.create_subscription(String, self._state_topic, self._on_state, STREAM_QOS)
 

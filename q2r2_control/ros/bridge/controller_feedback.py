@@ -1,9 +1,11 @@
-"""Outputs of the built-in controller besides joint commands: safe targets, which arms follow, openings of grippers.
+"""Outputs of the built-in controller besides joint commands.
+
+These are the safe targets, whether each arm follows its targets, and the openings of grippers.
 
 Fingers and held objects are bodies that must not collide. Openings are numbers from 0, closed, to 1, fully open. The
 client of a gripper publishes the wanted opening and the last commanded opening. The name of its topic is the name of
 the arm's topic of targets with ``/wanted_opening`` at its end. On ``~/opening/<arm>`` the controller answers with the
-wanted opening and the opening that is proven to be safe. The client commands the second one. The fingers count as
+wanted opening and the opening that is proven to be safe. The client commands the second opening. The fingers count as
 anywhere between closed and open if there is no client, if they are not measured, or if another controller moves the
 arms.
 """
@@ -44,11 +46,11 @@ GRIPPER_DELAY = 0.3
 _DISCOVERY = 1.0  # Time in which the latched messages of other nodes reach a new node, even on a busy machine [s].
 _UNMEASURED = "its fingers are not in the joint states, or nothing is proven while the arms are stopped"
 _MARKER_PERIOD = 0.1  # Time between two markers [s].
-_FAR, _NEAR = 0.10, 0.02  # The marker is green beyond the first distance, and red below the second [m].
+_FAR, _NEAR = 0.10, 0.02  # The marker of a distance is green above the first value, and red below the second value [m].
 
 
 class ControllerFeedback:
-    """Publishes all outputs except openings, tick by tick, and most of them only while somebody listens."""
+    """Publishes all outputs except openings at every tick, and most of them only while somebody listens."""
 
     def __init__(self, node: BaseNode, controller: CartesianController, targets: TargetIntake, every: int) -> None:
         """Make the publishers; ``every`` is the number of ticks from one safe target to the next."""
@@ -87,7 +89,7 @@ class ControllerFeedback:
                 publish_in_time(publisher, fill_pose(self._templates[arm], tool, now), decided)
 
     def tell_followed(self, follows: Callable[[str], bool]) -> None:
-        """Publish for each arm whether its targets are followed, when that changes."""
+        """Publish for each arm whether its targets are followed, each time that this changes."""
         for arm, publisher in self._following.items():
             if (followed := follows(arm)) != self._follows[arm]:
                 self._follows[arm] = followed
@@ -132,7 +134,7 @@ def _distance_marker(points: Array, now: float) -> Marker:
 
 
 class GripperLimits:
-    """Requests openings of grippers from the control loop, and publishes the granted ones."""
+    """Requests openings of grippers from the control loop, and publishes the granted openings."""
 
     def __init__(self, node: BaseNode, config: Config, loop: ControlLoop, targets: Mapping[str, str]) -> None:
         """Listen to grippers; ``targets`` are the topics of targets, by arm."""

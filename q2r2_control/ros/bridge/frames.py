@@ -28,9 +28,9 @@ from q2r2_control.supervision.targets import SequenceWatch
 _TF, _TF_STATIC = "tf", "tf_static"
 # If two publishers send poses of a frame that differ by more than this, they are about different robots [m], [rad].
 _SAME = 0.05, 0.1
-_REMEMBERED = 2.0  # Time for which such a difference is remembered [s].
+_REMEMBERED = 2.0  # A difference between two publishers is remembered for this time [s].
 _PAUSE = 1.0  # After a silence of this time a publisher may have been restarted [s].
-_KEPT = 16  # Messages that are kept, because another node of the process may have to read them too.
+_KEPT = 16  # Number of messages that are kept, because another node of the process may have to read them too.
 
 
 class ReadTransform:
@@ -40,7 +40,7 @@ class ReadTransform:
 
     def __init__(self, read: TransformNumbers) -> None:
         self.child_frame_id, self.frame_id, self.numbers = _name(read.child), _name(read.parent), read.numbers
-        self.is_pose = is_pose(self.numbers)  # False for numbers that are not finite, or no unit quaternion.
+        self.is_pose = is_pose(self.numbers)  # False if a number is not finite, or the quaternion has no unit length.
         self._pose: pin.SE3 | None = None
 
     @property
@@ -110,7 +110,7 @@ class FrameTree:
         return any(np.greater(apart(before[0].pose, transform.pose), _SAME))
 
     def upwards(self, frame: str) -> Iterator[tuple[str, Placement]]:
-        """Yield the frame and all its ancestors, with the frame's pose in each, and each of them only once."""
+        """Yield the frame and all its ancestors, each only once, together with the frame's pose in the ancestor."""
         frame, pose, received = _name(frame), pin.SE3.Identity(), math.inf
         seen: set[str] = set()
         while frame not in seen:
@@ -178,7 +178,7 @@ def _name(frame: str) -> str:
 
 
 class ToolFrame:
-    """The pose of a frame of /tf in the world."""
+    """The pose of one frame on /tf, in the world frame."""
 
     def __init__(self, node: BaseNode, frame: str, tree: FrameTree, world: str, timeout: float) -> None:
         self._tree, self._frame, self._world, self._timeout = tree, frame, world, timeout
@@ -207,7 +207,8 @@ class PoseTopic:
 
     def __init__(self, node: BaseNode, topic: str, tree: FrameTree, world: str, timeout: float) -> None:
         self._node, self._tree, self._world, self._timeout = node, tree, world, timeout
-        self._newest: tuple[str, int, float] | None = None  # Frame, stamp [ns] and receipt time [s].
+        # Frame, stamp [ns] and receipt time [s] of the newest message.
+        self._newest: tuple[str, int, float] | None = None
         self._pose: pin.SE3 | None = None  # The newest pose, in the message's frame.
         self.topic, self._publishers = topic, Publishers(node, [topic])
         self.problem: Reason | None = None

@@ -27,14 +27,14 @@ def wanted_topic(target_topic: str) -> str:
 class OpeningGrants:
     """Requests openings of one arm's gripper from the built-in controller: 0 closed .. 1 fully open.
 
-    It publishes the wanted opening and the last commanded one. From these, a restarted controller knows where the
+    It publishes the wanted opening and the last commanded opening. From these, a restarted controller knows where the
     gripper may be, and does not take an old request for a new one.
     """
 
     def __init__(self, node: BaseNode, controller: str, arm: str, target_topic: str) -> None:
         """Prepare requests to the built-in ``controller``, on a topic beside the arm's ``target_topic``."""
         self._wanted, self._commanded = math.nan, math.nan
-        self._answer: tuple[float, float] | None = None  # The wanted opening, and the granted one.
+        self._answer: tuple[float, float] | None = None  # The wanted and the granted opening.
         self._publisher = node.create_publisher(Float64MultiArray, wanted_topic(target_topic), LATCHED_QOS)
         self._node, self._topic = node, f"{controller}/opening/{arm}"
         node.create_subscription(Float64MultiArray, self._topic, self._on_answer, LATCHED_QOS)
@@ -45,7 +45,7 @@ class OpeningGrants:
 
     @property
     def granted(self) -> float | None:
-        """The opening that may be commanded now, on the way to the requested opening; None before an answer."""
+        """The opening that may be commanded now, as a step towards the requested opening; None before an answer."""
         return None if self._answer is None or self._answer[0] != self._wanted else self._answer[1]
 
     def ask(self, opening: float) -> None:
@@ -78,7 +78,7 @@ class GripperClient:
 
     def __init__(self, node: Node, name: str, settings: GripperSettings, grants: OpeningGrants | None = None) -> None:
         self.closed = False
-        self.holds = False  # Whether it closed on an object, as the result of the last goal says.
+        self.holds = False  # Whether the gripper has closed on an object, by the result of the last goal.
         self.problem: str | None = None
         self._node, self._name, self._settings, self._grants = node, name, settings, grants
         self._goal_closed: bool | None = None  # Whether the current goal closes the gripper; None without a goal.
@@ -145,7 +145,7 @@ class GripperClient:
             self._command(opening, now)
 
     def _go_on(self, now: float) -> None:
-        """Command the granted opening. If the controller has ended or does not answer, the gripper stays."""
+        """Command the granted opening. If the controller has ended or does not answer, end the motion."""
         assert self._grants is not None
         granted = self._grants.granted
         if not self._grants.answered:
@@ -217,11 +217,11 @@ class GripperClient:
 
     def _done(self, answer: Any, number: int) -> None:
         if number != self._goals or self._goal_closed is None:
-            return  # Another goal has replaced it.
+            return  # Another goal has replaced this goal.
         result = answer.result
         self._note(result)
         if self._waits:
-            return  # The gripper is on the way to the requested opening.
+            return  # The gripper still moves to the requested opening.
         if answer.status == GoalStatus.STATUS_SUCCEEDED or result.stalled or result.reached_goal:
             self.closed, self.holds = self._goal_closed, bool(result.stalled) and self._closes
             self._end(None)

@@ -85,7 +85,7 @@ class HandPublishers:
                 self.publish(topic, message, frame, sample.pose_stamp)
 
     def subscribers(self, hand: str) -> int:
-        """Return the number of subscribers of the topics of ``hand``. The recorder does not count."""
+        """Return the number of subscribers of the topics of ``hand``. The recorder is not counted."""
         publishers = [publisher for topic, publisher in self._publishers.items() if HAND_TOPICS[topic].hand == hand]
         recorder = f"{self._node.get_namespace().rstrip('/')}{RECORDER}"
         matched = sum(publisher.get_subscription_count() for publisher in publishers)
@@ -114,7 +114,9 @@ def subscribe_to_haptics(node: Node, vibrate: Callable[[HapticFeedback], None]) 
 
 
 class HandIntake:
-    """Takes the messages of the hand that drives an arm. Subscribes to a hand's topics when it first drives the arm.
+    """Takes the messages of the hand that drives an arm.
+
+    It subscribes to the topics of a hand when this hand first drives the arm.
 
     Messages go to ``on_pose`` and ``on_inputs``, which pass them to :meth:`put_pose` and :meth:`put_inputs`. If
     ``on_pose`` is None, poses go to :meth:`put_pose` directly.
@@ -177,7 +179,7 @@ class HandIntake:
 
     @property
     def stamps(self) -> tuple[float, float]:
-        """Return the receipt times of the newest pose and inputs [s]; -inf before the first."""
+        """Return the receipt times of the newest pose and of the newest inputs [s]; -inf if none has come yet."""
         return -math.inf if self._pose is None else self._pose[1], self._inputs[1]
 
     def silence(self, now: float) -> Reason | None:
@@ -195,7 +197,7 @@ class HandIntake:
 
     @property
     def conflict(self) -> Reason | None:
-        """Return a reason if the hand has more than one publisher, because the arm would follow both in turns."""
+        """Return a reason if the hand has more than one publisher, because the arm would follow them in turns."""
         return self._one[self.hand].conflict()
 
     def feel(self, pulse: HapticFeedback) -> None:

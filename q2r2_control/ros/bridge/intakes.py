@@ -40,12 +40,14 @@ from q2r2_control.supervision.targets import DelayWatch
 from q2r2_control.types import ArmTiming, Array, RobotState
 from q2r2_control.wording import sentence
 
-_SHARED = "joint_states"  # The default topic.
-_LATEST = 0.02  # If a target's delay exceeds the usual delay by more, its stamp does not tell when it is due [s].
+_SHARED = "joint_states"  # The default topic of joint states.
+# If a target's delay exceeds the usual delay by more than this, the stamp does not say when the target is due [s].
+_LATEST = 0.02
 # If a target is older at its receipt than the target before was, by more than this, its sender stood still after making
 # it [s].
 _OLD = 0.5
-# Longest period of joint states from which the lags of two arms can be compared [s], and the weight of a new period.
+# Longest period of joint states from which the lags of two arms can be compared [s], and the weight of a new period in
+# the mean period.
 _LONGEST_PERIOD, _PERIOD_SHARE = 0.02, 0.05
 COMMAND_TIME = 0.01  # Time from a command to the arm's motion, if drivers do not report this time [s].
 _PARTS = 64  # Largest number of sets of joint names whose joints are remembered.
@@ -82,7 +84,7 @@ class TargetIntake:
         self.publishers = Publishers(node, self.topics.values())
         self._delays = {arm: DelayWatch(STREAM_TIMEOUT) for arm in robot.arms}
         self._stamps = {arm: DelayWatch(_LATEST) for arm in robot.arms}  # The delays since targets were made.
-        self._newest = dict.fromkeys(robot.arms, (0, 0.0))  # Stamp of the last target [ns], and its age [s].
+        self._newest = dict.fromkeys(robot.arms, (0, 0.0))  # Stamp of the last target [ns], and its age at receipt [s].
         # By arm, why its last target was not used, and the time of that [s].
         self._refused: dict[str, tuple[Reason, float]] = {}
         self.rejected = dict.fromkeys(robot.arms, 0)
@@ -135,7 +137,7 @@ class TargetIntake:
         return stamp + stamps.usual if known else None
 
     def _stood_still(self, arm: str, made: int, received: float) -> float:
-        """Return for how long the sender was frozen between making and sending a target [s]; 0 if not for long.
+        """Return the time for which the sender was frozen between making and sending a target [s]; 0 if it was short.
 
         If the process froze just before its middleware recorded the time of sending, only the stamp of the target shows
         this.
@@ -145,7 +147,7 @@ class TargetIntake:
         return late if 0 < before < made and late > _OLD else 0.0
 
     def _refuse(self, arm: str, refusal: Reason) -> None:
-        """Log once for each kind of fault why targets are not used, until a target is used again or none comes."""
+        """Log why targets are not used, once for each kind of fault, until a target is used or no more targets come."""
         self.rejected[arm] += 1
         before = self._refused.get(arm)
         self._refused[arm] = (refusal, self._node.now)
@@ -167,7 +169,7 @@ def _frame_of(node: BaseNode, robot: Robot, arm: str) -> TargetFrame:
 
 
 class JointIntake:
-    """Merges joint states of one topic or several into one state of all arms, which is as old as its oldest part."""
+    """Merges joint states of one topic or several into one state of all arms. It is as old as its oldest part."""
 
     def __init__(
         self, node: BaseNode, robot: Robot, needs_external_torque: bool = False, told_by_drivers: bool = False
@@ -285,7 +287,7 @@ class JointIntake:
         return text if len(self._topics) == 1 else f"{topic}: {text}"
 
     def _part(self, topic: str, given: tuple[str, ...]) -> tuple[list[str], list[int]]:
-        """Return the joints of a topic that are in a message. Each arm may have its own publisher on the topic."""
+        """Return the names and indices of a topic's joints that a message has. Each arm may have its own publisher."""
         if (part := self._parts.get((topic, given))) is None:
             if len(self._parts) >= _PARTS:  # A publisher sends new names each time.
                 self._parts.clear()
@@ -344,6 +346,6 @@ class Fingers:
             return found
         for arm, (joints, closed, opened) in self._grippers.items():
             if not isinstance(order := order_of(tuple(message.name), joints), str):
-                position = sum(message.position[place] for place in order) / len(joints)
+                position = sum(message.position[index] for index in order) / len(joints)
                 found[arm] = (position - closed) / (opened - closed)
         return found

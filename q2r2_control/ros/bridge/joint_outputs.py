@@ -171,7 +171,7 @@ class Channel(NamedTuple):
     names: list[str]
     joints: np.ndarray  # Velocity indices in the robot's order.
     publisher: WatchedPublisher
-    optional: bool = False  # Whether messages are sent only while somebody listens.
+    optional: bool = False  # True if messages are sent only while somebody listens.
 
     @property
     def namespace(self) -> str | None:
@@ -217,7 +217,7 @@ class JointOutput:
             self.send(command, state, t, time.monotonic())
 
     def driver_namespaces(self, robot: Robot) -> dict[str, str]:
-        """Return the namespace of each arm's driver for outputs ``lbr_*``, in which it reports its session.
+        """Return by arm, for outputs ``lbr_*``, the namespace in which its driver reports the session; otherwise {}.
 
         Raises :class:`ConfigError` if a command topic does not tell the namespace.
         """
@@ -235,7 +235,7 @@ class JointOutput:
     def waits(self) -> bool:
         """Return whether nothing should be sent in this tick, so that the last command can be acknowledged.
 
-        The reference must not move on during this time, because the arms would jump afterwards.
+        The reference must not move during this time, because the arms would jump afterwards.
         """
         # ``waits`` is called for every publisher, even after one has returned True, because each publisher times its
         # own pause in sending.
@@ -267,7 +267,7 @@ def joints_of(robot: Robot, arms: Iterable[str]) -> np.ndarray:
 def make_output(name: str, node: BaseNode, robot: Robot, config: Config, period: float) -> JointOutput:
     """Make the output ``name`` on the topics of its parameters; raises :class:`ConfigError`.
 
-    ``period`` is that of the loop [s].
+    ``period`` is the period of the loop [s].
     """
     what = "arms that do not follow and whose joint positions nobody acknowledges are given up after [s]"
     timeout = node.parameter("listener_timeout", STREAM_TIMEOUT, what, within=(0.1, 5.0))
@@ -286,9 +286,9 @@ def make_output(name: str, node: BaseNode, robot: Robot, config: Config, period:
                 "needs a topic of its own"
             )
         channels.append(Channel(names, joints, WatchedPublisher(node, kind.message, topic, timeout)))
-        place, _, last = topic.rpartition("/")
+        parent, _, last = topic.rpartition("/")
         if kind.older is not None and last == kind.topic.rpartition("/")[2]:
-            older = WatchedPublisher(node, kind.message, f"{place}/{kind.older}", timeout)
+            older = WatchedPublisher(node, kind.message, f"{parent}/{kind.older}", timeout)
             channels.append(Channel(names, joints, older, optional=True))
     return JointOutput(drive, kind, channels)
 

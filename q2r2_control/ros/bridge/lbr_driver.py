@@ -45,9 +45,9 @@ class LbrDrivers:
         self._on_torques, self._torques = on_torques, np.zeros(robot.model.nv)
         # The posture at which the arms are held (nv,) [rad]; NaN without a session, or if it is not known.
         self._held = np.full(robot.model.nv, np.nan)
-        self._newest: dict[str, tuple[Any, float]] = {}  # By arm, the newest state and its time [s].
-        # Namespaces of drivers whose session has ended since commands began. They get no more commands, because a new
-        # session needs another first command.
+        self._newest: dict[str, tuple[Any, float]] = {}  # By arm, the newest state and its receipt time [s].
+        # Namespaces of drivers whose session has ended since commands began. They get no more commands, because the
+        # first command of a new session has to equal the posture of the arm.
         self.withheld: set[str] = set()
         kind = import_module("lbr_fri_idl.msg").LBRState
         for arm, namespace in self._namespaces.items():
@@ -86,7 +86,7 @@ class LbrDrivers:
         return held
 
     def begin(self) -> None:
-        """Let the next command be the first one after the controller was activated."""
+        """Let the next command count as the first command after the controller was activated."""
         self.withheld.clear()
         for arm, (state, _) in self._newest.items():
             if state.session_state != Session.COMMANDING_ACTIVE:

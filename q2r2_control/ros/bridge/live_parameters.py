@@ -1,4 +1,4 @@
-"""Settings that change while a node runs. If several are set together, all of them change, or none with a reason."""
+"""Settings that change while a node runs. If one of several cannot change, none does, and the answer says why."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:  # The nodes of arms have no controller, and must not wait for
     from q2r2_control.supervision.joint_watch import ExternalSettings, WatchSettings
     from q2r2_control.supervision.target_stream import StreamSettings
 
-# Settings of the controller's checks: field, parameter, description, least and greatest value.
+# For each setting of the controller's checks: field, parameter, description, least and greatest value.
 _Table = tuple[tuple[str, str, str, float, float], ...]
 _STREAMS: _Table = (
     ("timeout", "target_timeout", "an arm without targets for this long holds [s]", 0.02, 2.0),
@@ -51,7 +51,7 @@ class LiveArmParameters:
         guard: GuardSettings,
         apply: Callable[[TeleopSettings, GuardSettings], str | None],
     ) -> None:
-        """Watch the parameters; ``apply`` takes changed settings, or returns why they cannot change now."""
+        """Watch the parameters; ``apply`` uses changed settings, or returns why they cannot change now."""
         self._node, self._teleop, self._guard, self._apply = node, teleop, guard, apply
         node.add_on_set_parameters_callback(self._on_set)
 
@@ -77,7 +77,7 @@ def make_control_live(node: BaseNode, controller: CartesianController) -> None:
         field = ControllerSettings.model_fields[name]
         value, within = getattr(controller.settings, name), range_of(field)
         if name == "min_distance":
-            within = 0.0, max(CLEARANCE, value)  # The bounds of its type are not in the field.
+            within = 0.0, max(CLEARANCE, value)  # The field does not contain the bounds of this type.
         node.parameter(f"control.{name}", value, field.description or name, read_only=False, within=within)
 
     def on_set(parameters: Sequence[Parameter]) -> SetParametersResult:
@@ -89,7 +89,7 @@ def make_control_live(node: BaseNode, controller: CartesianController) -> None:
 
 
 def make_impedance_live(node: BaseNode, impedance: ImpedanceController) -> None:
-    """Declare the parameters of the impedance in torque mode. It changes gradually to new values."""
+    """Declare the parameters of the impedance in torque mode. The impedance changes gradually to new values."""
     for name in LIVE_IMPEDANCE:
         field = ImpedanceSettings.model_fields[name]
         value, bounds = getattr(impedance.settings, name), range_of(field)

@@ -26,7 +26,7 @@ _OLDEST = 0.1  # A message waits only until the next tick. A greater age means t
 
 
 def ended_topic(target_topic: str) -> str:
-    """Return the topic on which the sender of targets ends a stream in order, because the operator paused."""
+    """Return the topic on which the sender of targets ends a stream, because the operator has paused the arm."""
     return f"{target_topic}/ended"
 
 
@@ -128,7 +128,7 @@ def fill_pose(template: Template, pose: pin.SE3, t: float) -> bytes:
 
 
 def joint_state_template(names: Sequence[str], q: bool = True, v: bool = True, tau: bool = True) -> Template:
-    """Return the template of a JointState with positions ``q``, velocities ``v`` and torques ``tau``, if wanted."""
+    """Return the template of a JointState. It has positions if ``q``, velocities if ``v``, and torques if ``tau``."""
 
     def make(numbers: Iterator[float], stamp: Any) -> JointState:
         fields = [list(islice(numbers, len(names))) if given else [] for given in (q, v, tau)]

@@ -43,12 +43,13 @@ class ArmParameters:
     """The checked parameters of an arm controller."""
 
     base_frame: str  # The frame of the controller's targets.
-    world_frame: str  # A motion of the hand along its axes moves the tool along the axes of this frame.
+    # A hand's motion along an axis of the input's frame moves the tool along the same axis of this frame.
+    world_frame: str
     tool_frame: str
     controller: str  # The name of the controller's node.
     prefix: str  # The text for {ctrl} in the preset.
     target_topic: str
-    current_pose_topic: str  # "" for the pose from /tf.
+    current_pose_topic: str  # The topic of the tool pose; "" if the pose comes from /tf.
     builtin_node: str  # The name of the built-in controller's node.
     builtin_prefix: str
     tool_timeout: float  # Greatest age of the tool pose and of the safe target [s].
@@ -65,7 +66,7 @@ class ArmParameters:
 def arm_parameters(node: BaseNode, given: ArmDefaults) -> ArmParameters:
     """Declare all parameters and check them together; raises :class:`ConfigError`.
 
-    The defaults are those of the cell if the parameter ``config`` names one, and else the ``given`` ones.
+    If the parameter ``config`` names a cell, the defaults are the cell's settings; otherwise they are ``given``.
     """
     arm, declare = given.arm_name, node.parameter
     config = declare("config", "", 'YAML of the cell, whose teleop and external are defaults of these; "": none')
@@ -113,7 +114,7 @@ def teleop_defaults(mirror: bool, filter_window_size: int | None) -> TeleopSetti
     teleop = TeleopSettings(stance=Stance.MIRROR if mirror else Stance.SIDE_BY_SIDE)
     if filter_window_size is None:
         return teleop
-    # A mean over n samples of a 75 Hz headset comes (n - 1) / 2 periods late.
+    # A mean over n samples of a 75 Hz headset is delayed by (n - 1) / 2 periods.
     delay = min(max((filter_window_size - 1) / 2 / 75.0, 0.0), 0.2)
     return teleop.model_copy(update={"filter": teleop.filter.model_copy(update={"smoothing_delay": delay})})
 

@@ -31,17 +31,17 @@ _GRAPH_PERIOD = 0.1  # Time between two queries of the graph for subscribers [s]
 _NAME_TIMEOUT = 3.0
 # Time from a stream's last target to the message that ends the stream [s]. That message is on another topic, and must
 # not arrive before the target.
-_LAST_ON_ITS_WAY = 0.03
-# A tool farther from a held target than this was moved by something else, and the target is not repeated.
-_HELD = 0.15, 0.6  # [m, rad]
+_END_DELAY = 0.03
+# If the tool is farther from a held target than this, something else moved it. The target is then not repeated.
+_HELD = 0.15, 0.6  # [m], [rad]
 
 
 class TargetOutput:
     """Publishes one arm's target, or its velocity, to one controller, through a :class:`PoseRateLimiter`.
 
     The limiter starts at the tool, so that engaging moves nothing. When the target ends, the limiter brakes, and the
-    preset says whether the last pose is repeated then. The pose is never repeated if the tool is far from it, nor to a
-    restarted controller, because the arm would jump.
+    preset says whether the last pose is repeated then. The pose is not repeated if the tool is far from it, or if the
+    controller was restarted, because the arm would jump.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class TargetOutput:
         self._is_twist = preset.message == TWIST
         kind = TwistStamped if self._is_twist else PoseStamped
         self._publisher = WatchedPublisher(node, kind, topic, values.listener_timeout)
-        self.topic = self._publisher.topic_name  # The full name.
+        self.topic = self._publisher.topic_name  # The full name of the topic.
         self._one = OnePublisher(node, [self.topic])
         self._unknown_node = Reason.of(RosReason.SUBSCRIBER_UNKNOWN, topic=self.topic)
         self._wrench = None
@@ -73,13 +73,13 @@ class TargetOutput:
         self.last_sent: pin.SE3 | None = None  # The last target sent, in the world frame; None if there is none.
         self._ends = node.create_publisher(Empty, ended_topic(topic), SENT_COMMAND_QOS) if preset is BUILTIN else None
         self._sent_at = -math.inf  # Time of the last target of a stream that has not ended yet [s].
-        self._fault: Reason | None = None  # Why the controller is not the same as before.
+        self._fault: Reason | None = None  # Why the controller is not the same as before; None if it is.
         self._endpoints: set[bytes] = set()  # Endpoints of the controller.
         self._listeners = 0
         self._unknown = False  # Whether a subscriber's node is not known yet.
         # Times at which the graph was last asked, and at which a subscriber last appeared [s].
         self._asked_at = self._appeared_at = -math.inf
-        self.starts = 0  # How often the controller has appeared.
+        self.starts = 0  # Number of times that the controller has appeared.
 
     @property
     def sent(self) -> int:
@@ -138,10 +138,11 @@ class TargetOutput:
             decided: See :func:`publish_in_time`.
             start: The pose at which a new stream begins, in the world frame; None for the first target itself.
             state: The state of the arm. In PAUSING the stream continues, because the press may become another gesture.
-                In PAUSED it ends in order. If it stops in another way, the built-in controller also holds linked arms.
+                In PAUSED a message ends the stream. Without this message, the built-in controller also holds linked
+                arms.
         """
         if self._unknown or self._present() > self._listeners or (self._is_twist and base is None):
-            if self._is_twist:  # The controller would go on at the last velocity, so it is told to stop.
+            if self._is_twist:  # The controller would continue at the last velocity, so it is told to stop.
                 self.forget(now)
             return None
         idle = not self.following and self.guard.at_rest
@@ -169,10 +170,10 @@ class TargetOutput:
         return twist_stamped(base.rotation.T @ linear, base.rotation.T @ angular, self._frame, now)
 
     def _end_stream(self, state: ArmState, now: float) -> None:
-        """Publish that the stream ends if the operator paused the arm. A stream that stops otherwise is not ended."""
+        """If the operator paused the arm, publish the end of the stream. If it stops otherwise, publish nothing."""
         if self._ends is None or state is not ArmState.PAUSED:
             self._sent_at = -math.inf
-        elif _LAST_ON_ITS_WAY < now - self._sent_at < math.inf:
+        elif _END_DELAY < now - self._sent_at < math.inf:
             self._sent_at = -math.inf
             self._ends.publish(Empty())
 

@@ -32,19 +32,21 @@ _PATIENCE = 2.0  # Time to wait for an answer, for a controller to go home, and 
 
 
 class HomeClient:
-    """Calls the controller's service ``~/home`` when the teleop layer goes home, and ``~/hold`` when it ends that.
+    """Calls the controller's service ``~/home`` when the teleop layer begins a motion home, and ``~/hold`` at its end.
 
-    It never waits for an answer.
+    No call waits for an answer.
     """
 
     def __init__(self, node: Node, controller: str | None) -> None:
-        """``controller`` is the name of the built-in controller; None if the arms' controller has no way home."""
+        """``controller`` is the name of the built-in controller; None if the arms' controller cannot move them home."""
         self._name = controller
         self._home: Any = None if controller is None else node.create_client(Trigger, f"{controller}/home")
         self._hold: Any = None if controller is None else node.create_client(Trigger, f"{controller}/hold")
         self._answer: Any = None  # The future of a call; None if no service was called.
-        self._since: float | None = None  # When a way home was asked for, or accepted [s]; None if there is none.
-        self._said = self._seen = False  # Whether the controller reports that it goes home: now, and on this way.
+        # Time at which a motion home was requested or accepted [s]; None if there is none.
+        self._since: float | None = None
+        # Whether the controller reports a motion home: now, and at any time since the request.
+        self._said = self._seen = False
 
     def update(self, teleop: Teleop, said: bool, outcome: Reason | None, now: float) -> None:
         """Advance by one tick.
@@ -52,7 +54,7 @@ class HomeClient:
         Args:
             teleop: The teleop layer.
             said: Whether the controller reports that it goes home.
-            outcome: How the last way home ended.
+            outcome: How the last motion home ended; None if that is not known.
             now: The time [s].
         """
         asked, begins, self._said = teleop.homing, said and not self._said, said
@@ -71,7 +73,7 @@ class HomeClient:
             self._watch(teleop, outcome, now)
 
     def _watch(self, teleop: Teleop, outcome: Reason | None, now: float) -> None:
-        """End the way home if it is over, or if the controller does not begin."""
+        """End the motion home if it is over, or if the controller does not begin it."""
         self._seen |= self._said
         accepted = self._answer is None or (self._answer.done() and self._answer.result().success)
         late = self._since is not None and now - self._since > _PATIENCE
@@ -109,19 +111,20 @@ class HomeClient:
 
 
 class RecorderLink:
-    """The report of the recorder's node: whether it records, and whether an episode is open."""
+    """Listens to the report of the recorder's node: whether it records, and whether an episode is open."""
 
     def __init__(self, node: BaseNode) -> None:
         self._node = node
         self._state: dict[str, Any] | None = None  # The newest report that has not been used.
         self._heard = 0.0  # Steady time of the newest report [s].
-        self._served: int | None = None  # Number of service calls that the node has answered.
+        # Number of service calls that the recorder has answered; None before its first report.
+        self._served: int | None = None
         self._reasons: list[Reason] = []
         self._topic = f"{node.name_in_set(RECORDER)}/state"
         node.create_subscription(String, self._topic, self._on_state, STREAM_QOS)
 
     def update(self, marks: EpisodeMarks) -> list[Reason]:
-        """Update the marks before the teleoperation of a tick. Return the reasons of new events at the recorder."""
+        """Update the marks before the teleoperation of a tick. Return the reasons of newly reported events."""
         if self._state is not None:
             marks.restore(self._state)
             self._state = None

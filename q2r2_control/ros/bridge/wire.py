@@ -33,9 +33,9 @@ class Template:
     """A serialized message in which only the time stamps and the floating-point numbers are replaced."""
 
     def __init__(self, make: Callable[[Iterator[float], Any], Any], stamp: Any) -> None:
-        """Serialize the message of ``make``, which gets unique numbers and a stamp, and puts them into the message.
+        """Serialize the message of ``make``, which gets unique numbers and a stamp, and writes them into the message.
 
-        Later numbers are written to the same places in the same order.
+        :meth:`fill` writes other numbers to the same offsets, in the same order.
         """
         marks: list[float] = []
 
@@ -48,14 +48,15 @@ class Template:
         self._data = bytearray(serialize_message(make(numbers(), stamp)))
         # The search is for little-endian bytes, because every platform of ROS 2 Jazzy is little endian.
         self._stamps = _found(self._data, _STAMP.pack(_SECOND, _NANOSECOND))
-        places = [_found(self._data, struct.pack("<d", mark)) for mark in marks]
-        if any(len(found) != 1 for found in places):
+        offsets = [_found(self._data, struct.pack("<d", mark)) for mark in marks]
+        if any(len(found) != 1 for found in offsets):
             raise ValueError("a number of this message is not found where it was written")
-        self._runs: list[tuple[int, int, struct.Struct]] = []  # Runs of adjacent numbers: first, end, format.
-        self._places: list[int] = [found[0] for found in places]
+        # Runs of adjacent numbers: index of the first number, index after the last one, and format.
+        self._runs: list[tuple[int, int, struct.Struct]] = []
+        self._offsets: list[int] = [found[0] for found in offsets]
         first = 0
-        for index in range(1, len(places) + 1):
-            if index == len(places) or self._places[index] != self._places[index - 1] + 8:
+        for index in range(1, len(offsets) + 1):
+            if index == len(offsets) or self._offsets[index] != self._offsets[index - 1] + 8:
                 self._runs.append((first, index, struct.Struct(f"<{index - first}d")))
                 first = index
 
@@ -64,19 +65,19 @@ class Template:
         data = self._data
         whole, part = divmod(max(t, 0.0), 1.0)
         stamp = int(whole), min(round(part * 1e9), 999_999_999)
-        for place in self._stamps:
-            _STAMP.pack_into(data, place, *stamp)
+        for offset in self._stamps:
+            _STAMP.pack_into(data, offset, *stamp)
         for first, end, form in self._runs:
-            form.pack_into(data, self._places[first], *numbers[first:end])
+            form.pack_into(data, self._offsets[first], *numbers[first:end])
         return bytes(data)
 
 
 def _found(data: bytes | bytearray, part: bytes) -> list[int]:
-    places, place = list[int](), data.find(part)
-    while place >= 0:
-        places.append(place)
-        place = data.find(part, place + 1)
-    return places
+    offsets, offset = list[int](), data.find(part)
+    while offset >= 0:
+        offsets.append(offset)
+        offset = data.find(part, offset + 1)
+    return offsets
 
 
 class JointNumbers(NamedTuple):
@@ -90,28 +91,28 @@ class JointNumbers(NamedTuple):
 
 class _JointLayout(NamedTuple):
     names: tuple[str, ...]
-    same: tuple[tuple[int, bytes], ...]  # Offsets and bytes that all messages of this layout share.
+    same: tuple[tuple[int, bytes], ...]  # Offsets and bytes of the parts that are equal in all messages of this layout.
     arrays: tuple[tuple[int, int], ...]  # Offset and length of positions, velocities and efforts.
     end: int  # The end of the arrays. Bytes that the middleware appends to a message are ignored.
 
 
 class _Walk:
-    """Goes through a serialized message; raises SerdeError if it ends too early or has an invalid text."""
+    """Reads a serialized message from its start. Raises SerdeError if it ends too early or has an invalid text."""
 
     def __init__(self, data: bytes) -> None:
-        self.data, self.place = data, 4  # Alignment counts from the end of the encapsulation.
+        self.data, self.offset = data, 4  # Alignment counts from the end of the encapsulation.
         # Offsets and bytes of texts and lengths. The gaps between aligned parts may have any bytes.
         self.same = [(1, _LITTLE_ENDIAN)]
         if data[1:2] != _LITTLE_ENDIAN:
             raise SerdeError("not little endian, as every platform of this ROS is")
 
     def align(self, size: int) -> None:
-        self.place = 4 + -(-(self.place - 4) // size) * size
+        self.offset = 4 + -(-(self.offset - 4) // size) * size
 
     def skip(self, length: int) -> int:
         """Skip ``length`` bytes, and return the offset of the first one."""
-        began, self.place = self.place, self.place + length
-        if self.place > len(self.data):
+        began, self.offset = self.offset, self.offset + length
+        if self.offset > len(self.data):
             raise SerdeError(f"{len(self.data)} bytes are no whole message")
         return began
 
@@ -119,14 +120,14 @@ class _Walk:
         """Read a length."""
         self.align(4)
         began = self.skip(4)
-        self.same.append((began, self.data[began : self.place]))
-        return int.from_bytes(self.data[began : self.place], "little")
+        self.same.append((began, self.data[began : self.offset]))
+        return int.from_bytes(self.data[began : self.offset], "little")
 
     def text(self) -> str:
         began = self.skip(self.count())
-        self.same[-1] = began - 4, self.data[began - 4 : self.place]
+        self.same[-1] = began - 4, self.data[began - 4 : self.offset]
         try:
-            return self.data[began : self.place - 1].decode()
+            return self.data[began : self.offset - 1].decode()
         except UnicodeDecodeError as error:
             raise SerdeError(str(error)) from error
 
@@ -146,11 +147,11 @@ def _joints(data: bytes, arrays: int, before: Callable[[_Walk], bool] = lambda w
     if not before(walk):
         return None
     found = tuple(walk.numbers() for _ in range(arrays))
-    return _JointLayout(names, tuple(walk.same), found, walk.place)
+    return _JointLayout(names, tuple(walk.same), found, walk.offset)
 
 
 def _remembered(make: Callable[[bytes], Any]) -> Callable[[bytes], Any]:
-    """Return a function that finds the layout of a message. Each layout is made once by ``make``."""
+    """Return a function that returns the layout of a message. ``make`` computes each layout once."""
     # By the length of a message, the function that takes its constant parts, these parts, and the layout.
     layouts: dict[int, tuple[Callable[[bytes], Any], Any, Any]] = {}
 
@@ -265,7 +266,7 @@ class TransformNumbers(NamedTuple):
 class _TransformLayout(NamedTuple):
     same: tuple[tuple[int, bytes], ...]  # See _JointLayout.
     frames: tuple[tuple[str, str], ...]  # Child and parent of each transform.
-    places: tuple[int, ...]  # Offsets of their numbers.
+    offsets: tuple[int, ...]  # Offset of the numbers of each transform.
 
 
 def transforms_reader() -> Callable[[bytes], list[TransformNumbers]]:
@@ -274,19 +275,19 @@ def transforms_reader() -> Callable[[bytes], list[TransformNumbers]]:
 
     def read(data: bytes) -> list[TransformNumbers]:
         layout = find(data)
-        found = zip(layout.frames, layout.places, strict=True)
-        return [TransformNumbers(child, parent, _POSE.unpack_from(data, place)) for (child, parent), place in found]
+        found = zip(layout.frames, layout.offsets, strict=True)
+        return [TransformNumbers(child, parent, _POSE.unpack_from(data, offset)) for (child, parent), offset in found]
 
     return read
 
 
 def _layout_of_transforms(data: bytes) -> _TransformLayout:
-    walk, frames, places = _Walk(data), list[tuple[str, str]](), list[int]()
+    walk, frames, offsets = _Walk(data), list[tuple[str, str]](), list[int]()
     for _ in range(walk.count()):
         walk.align(4)
         walk.skip(8)  # The stamp.
         parent, child = walk.text(), walk.text()
         walk.align(8)
         frames.append((child, parent))
-        places.append(walk.skip(_POSE.size))
-    return _TransformLayout(tuple(walk.same), tuple(frames), tuple(places))
+        offsets.append(walk.skip(_POSE.size))
+    return _TransformLayout(tuple(walk.same), tuple(frames), tuple(offsets))

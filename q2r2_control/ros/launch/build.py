@@ -45,7 +45,7 @@ class Interfaces:
 
     def found_in(self) -> Path | None:
         """Return the folder from which a new Python process imports all types, or None."""
-        # The path is the same as if this environment's setup file is sourced after that of a ROS.
+        # The path is the same as if this environment's setup file is sourced after a ROS's setup file.
         libraries = os.pathsep.join(filter(None, [str(Path(sys.prefix, "lib")), os.environ.get("LD_LIBRARY_PATH")]))
         command = [sys.executable, "-c", f"{self.proof}\nprint({self.name}.__path__[0])"]
         environment = os.environ | {"LD_LIBRARY_PATH": libraries}
@@ -60,7 +60,7 @@ def interface_packages() -> list[Interfaces]:
 def build_interfaces(report: Callable[[str], None], force: bool = False) -> None:
     """Build packages that cannot be imported, and ``report`` one line for each; raises :class:`BuildError`.
 
-    ``force`` builds the packages of this environment again. Those of another install, such as a sourced one, stay.
+    ``force`` builds the packages of this environment again. Packages of another install, such as a sourced ROS, stay.
     """
     prefix = Path(sys.prefix)
     held = []  # Packages of this environment.
@@ -82,14 +82,14 @@ def build_interfaces(report: Callable[[str], None], force: bool = False) -> None
             raise BuildError(f"{package.name} was built into {prefix} but cannot be imported, see {log}")
         report(f"{package.name}: built in {time.monotonic() - began:.0f} s (log: {log})")
     sourced = _sourced()
-    if held and sourced and prefix not in sourced:  # The sourced ROS does not find their libraries.
+    if held and sourced and prefix not in sourced:  # The sourced ROS does not find the packages' libraries.
         report(f"before use: source {prefix}/share/{held[0]}/local_setup.bash")
 
 
 def build_missing(report: Callable[[str], None]) -> None:
     """Build the message packages if this environment lacks some; raises :class:`BuildError`.
 
-    Only their names are looked up, because importing all of them would delay the start of nodes by seconds.
+    Only the packages' names are looked up. To import all packages would delay the start of nodes by seconds.
     """
     if any(importlib.util.find_spec(package.name) is None for package in interface_packages()):
         report("building message packages, once for this environment")
@@ -98,7 +98,7 @@ def build_missing(report: Callable[[str], None]) -> None:
 
 
 def missing_tools(prefix: Path) -> list[str]:
-    """Return the things that a build into ``prefix`` lacks, each with where to get it."""
+    """Return one text for each thing that a build into ``prefix`` lacks. The text says where to get it."""
     missing = []
     # Debian's own Python imports from another folder.
     packages = prefix / "lib" / f"python{sys.version_info.major}.{sys.version_info.minor}" / "site-packages"

@@ -40,16 +40,16 @@ _WITHOUT_HAND = ArmState.CARRIED, ArmState.HOMING  # States in which the arm doe
 
 
 class BaseArmController(BaseNode):
-    """A node by which one arm follows one hand.
+    """A node that lets one arm follow one hand.
 
-    It takes the topics of the hand, and publishes the target pose, gripper goals, markers and vibrations. Its name is
-    ``<arm_name>_<robot_name>_arm_controller``. The other arguments are defaults of the parameters with the same names.
-    ``preset`` names what the arm's controller requires: topic, rate, speeds, and what it needs in pauses.
+    It receives the topics of the hand, and publishes the target pose, gripper goals, markers and vibrations. Its name
+    is ``<arm_name>_<robot_name>_arm_controller``. The other arguments are defaults of the parameters with the same
+    names. ``preset`` names what the arm's controller requires: topic, rate, speeds, and what it needs in pauses.
     ``filter_window_size``, in samples of a 75 Hz headset, sets ``teleop.filter.smoothing_delay``. ``partner`` is the
     node of the other arm in this process, see ``run_arms`` of :mod:`arm_controllers`. Both arms then share one
     teleoperation, as in ``q2r2 run``. Without ``partner``, a fault pauses this node's own arm only.
 
-    Steps to override: :meth:`setup_parameters`, :meth:`setup_state`, :meth:`setup_interfaces`, :meth:`current_pose`,
+    Methods to override: :meth:`setup_parameters`, :meth:`setup_state`, :meth:`setup_interfaces`, :meth:`current_pose`,
     :meth:`pose_callback`, :meth:`inputs_callback`, :meth:`toggle_gripper`.
     """
 
@@ -88,7 +88,7 @@ class BaseArmController(BaseNode):
             self.setup_state()
             self.setup_interfaces()
         except BaseException:
-            self.destroy_node()  # A node that is never returned could keep the process from ending.
+            self.destroy_node()  # A half-made node could keep the process from ending.
             raise
         # For its first log line rclpy takes some 60 ms, because it searches all modules for the line's origin. An
         # operator's press must not wait for that.
@@ -154,7 +154,7 @@ class BaseArmController(BaseNode):
         self.gripper.toggle(self.now)
 
     def begin_tick(self, now: float) -> Reason | None:
-        """Update :attr:`inputs` at ``now`` [s]. Return why the arm has to hold whatever its hand asks for, or None."""
+        """Update :attr:`inputs` at ``now`` [s]. Return why the arm has to hold, whatever its hand does, or None."""
         tool, base, controlled = self.current_pose(), self._base(), self._safe_target.at(now)
         obstacle = self._obstacle(tool, base, controlled)
         silence = None if self.state in _WITHOUT_HAND else self.intake.silence(now)
@@ -259,7 +259,8 @@ class BaseArmController(BaseNode):
         if base is None:
             return WARN, Reason.of(RosReason.NO_TRANSFORM, frame=values.base_frame, world=values.world_frame)
         unready = self.outputs.unready
-        # An arm that follows may lag behind the safe target. An arm that holds would begin and fail at every press.
+        # An arm that follows may lag behind the safe target. An arm that holds would be engaged and stopped again at
+        # every press.
         if self.outputs.builtin and self.state in HOLDING and (away := self.outputs.away(controlled, tool)):
             unready = unready or Reason(RosReason.CONTROLLER_REFUSES, cause=away)
             if self.state is ArmState.IDLE:
@@ -273,7 +274,7 @@ class BaseArmController(BaseNode):
     def _commanded(self, tool: pin.SE3, reference: pin.SE3 | None) -> pin.SE3:
         """Return the commanded tool pose, for leash and anchors.
 
-        It is the tool pose of the controller's ``reference`` if that is known, and else the last target or ``tool``.
+        It is the tool pose of the controller's ``reference`` if this is known; otherwise the last target, or ``tool``.
         """
         if self.engaged:
             return self._target.command_for(tool) if reference is None else reference

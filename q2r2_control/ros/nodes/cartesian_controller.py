@@ -50,11 +50,11 @@ from q2r2_control.wording import sentence
 _LONGEST_STOP = 3.0  # Longest time until the arms rest at the end [s].
 _QUIET = 0.3  # The node commands only after other commanders have been silent for this time [s].
 _LONGEST_ACTIVATION = 2.0  # Longest time of an activation in addition to the settle time [s].
-_SAFE_TARGET_PERIOD = 0.02  # Time between two safe targets if nodes only listen to them [s].
+_SAFE_TARGET_PERIOD = 0.02  # Time between two safe targets if no other controller follows them [s].
 
 
 class CartesianControllerNode(ManagedNode):
-    """Passes messages of its topics to a :class:`ControlLoop`, and publishes its commands."""
+    """Passes the messages of its topics to a :class:`ControlLoop`, and publishes the commands of this loop."""
 
     ticks = True
     priority = 40  # No other program may delay a joint command. ros2_control runs drivers at 50.
@@ -64,8 +64,8 @@ class CartesianControllerNode(ManagedNode):
         config = load_config(self.parameter("config", "config/dual_iiwa7.yaml", "YAML of the cell"))
         rate = self.parameter("rate", 250.0, "of the control loop [Hz]", within=(20, 1000))
         output = self.parameter("output", "trajectory", "what the arms are commanded with", one_of=(*KINDS, NONE))
-        self._only_leads = output == NONE
-        if self._only_leads:
+        self._is_external = output == NONE  # Whether another controller moves the arms.
+        if self._is_external:
             config = settings_for_external_arms(config)
         robot = Robot.from_config(config)
         check_watched(robot, config.name)
@@ -103,25 +103,25 @@ class CartesianControllerNode(ManagedNode):
             streams,
             watch,
             origins=Origins(self._joints.source, self._targets.source, self._takers),
-            external=ExternalArms(robot, self._controller, external, streams, watch) if self._only_leads else None,
+            external=ExternalArms(robot, self._controller, external, streams, watch) if self._is_external else None,
             gripper_delay=GRIPPER_DELAY,
             owns_plant=False,
             standstill=self._standstill(output),
         )
         self._supervisor = self._loop.supervisor
-        # If another controller moves the arms, their fingers count as anywhere between closed and open.
-        asking = {} if self._only_leads else self._targets.topics
+        # If another controller moves the arms, the arms' fingers count as anywhere between closed and open.
+        asking = {} if self._is_external else self._targets.topics
         self._grippers = GripperLimits(self, config, self._loop, asking)
         self._clock_of_ticks = TickClock(self._period)
         self._reference: Reference | None = None
         self._commanding, self._advances = False, 0  # ``_advances`` counts the ticks in which time has passed.
         # Another controller follows every safe target. Nodes that only listen need the newest one.
-        every = 1 if self._only_leads else max(round(_SAFE_TARGET_PERIOD * rate), 1)
+        every = 1 if self._is_external else max(round(_SAFE_TARGET_PERIOD * rate), 1)
         self._feedback = ControllerFeedback(self, self._controller, self._targets, every)
         self._last_tick = self.now
         self._deactivated = Reason.of(RosReason.CONTROLLER_DEACTIVATED, controller=self.get_fully_qualified_name())
         self._others = self._output.watch(self)
-        self._other: Reason | None = None  # Another node that commands the arms.
+        self._other: Reason | None = None  # Names another node that commands the arms; None if there is none.
         self._connect()
         self.start_active()
         self.get_logger().info(f"{config.name}: {', '.join(robot.arms)}; waits for joint states")
@@ -152,7 +152,7 @@ class CartesianControllerNode(ManagedNode):
         # A late tick makes no jump, and a clock that was set back moves nothing.
         gap = now - self._last_tick
         dt = self._loop.pace(gap)
-        if gap > max(LONGEST_DT, self._watch.timeout):  # There was no tick for longer than states may be missing.
+        if gap > max(LONGEST_DT, self._watch.timeout):  # No tick came for longer than states may be missing.
             self._supervisor.stalled(gap, now)
         self._last_tick = now
         self.ticked += 1
@@ -162,7 +162,7 @@ class CartesianControllerNode(ManagedNode):
 
     def _advance(self, now: float, dt: float, decided: float) -> None:
         self._advances += 1
-        if not self._only_leads:  # Arms of another controller are judged by their measured posture.
+        if not self._is_external:  # Arms of another controller are judged by their measured posture.
             self._loop.watch_skew(self._joints.timings(now), self._period + COMMAND_TIME, now)
         inactive = self._supervisor.phase is Phase.INACTIVE
         self._other = self._others.intruder() if self._commanding else self._others.commander()
@@ -170,7 +170,7 @@ class CartesianControllerNode(ManagedNode):
             return
         if self._other is not None and self._supervisor.phase is Phase.ACTIVE:
             self._supervisor.stop(self._other)
-        # A receiver that has just come must not get commands that the arms do not follow.
+        # A new receiver must not get commands for a posture away from the arms, because the arms would jump.
         if fault := self._output.listener_fault(self._supervisor.off_reference):
             self._supervisor.let_go(fault, now)
         state, openings = self._joints.state, self._grippers.openings(now)
@@ -201,7 +201,7 @@ class CartesianControllerNode(ManagedNode):
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         self._supervisor.pause(request.data)
-        self.report_health()  # Nodes that listen must not wait for the next report.
+        self.report_health()  # Nodes that listen to the reports need the new state at once.
         return _answer(response, None)
 
     def _serve(self, act: Callable[[], Reason | None], request: Any, response: Any) -> Any:
@@ -302,7 +302,7 @@ class CartesianControllerNode(ManagedNode):
         try:
             while self._supervisor.phase is Phase.BRAKING and (now := time.monotonic()) < deadline:
                 # ``go_on`` takes joint states and runs ticks. If simulated time has ended, ticks no longer brake the
-                # arms, and they are braked here.
+                # arms. The code below then brakes them.
                 go_on()
                 if self._advances != advances:
                     advances, last = self._advances, now
@@ -315,7 +315,7 @@ class CartesianControllerNode(ManagedNode):
             self._others.rest()
 
     def _tick_on(self) -> None:
-        """Take one tick in the middle of a service, for which the executor waits."""
+        """Run one tick during a call of a service. The executor runs no ticks until the call ends."""
         time.sleep(self._period)
         if isinstance(self.executor, TickExecutor):
             self.executor.take_messages()

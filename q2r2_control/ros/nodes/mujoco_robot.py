@@ -44,7 +44,7 @@ _TRAJECTORY = "joint_trajectory"
 _REACHED = 0.02  # Distance from the goal that counts as reached, as a share of the stroke.
 _STALLED_AFTER = 0.3  # A gripper that does not move by _MOVES within this time has stalled [s].
 _MOVES = 0.004  # Least motion of a gripper that counts, as a share of the stroke.
-_OUTSIDE = 0.02  # A goal beyond the stroke by this share still counts as its end.
+_OUTSIDE = 0.02  # A goal that exceeds the stroke by this share of it still counts as the stroke's end.
 _CLOSED = 0.05  # Closed position in goals, as in Quest2ROS2; 0 is fully open [m].
 
 
@@ -211,7 +211,7 @@ class MujocoRobot(BaseNode):
         if late := delays.take(delay(info), time.monotonic()):
             self._note(topic, f"{late:.2f} s late; its sender or this node stood still")
             return
-        # A message that came while this process stood still counts as one that came since the last tick.
+        # A message that came while this process stood still counts as if it had come since the last tick.
         self._received = time.monotonic() - min(age(info), self._period)
         self._note(topic, command(message))
 
@@ -279,7 +279,7 @@ class MujocoRobot(BaseNode):
 
 
 def link_transforms(model: Any, without: Collection[str]) -> tuple[LinkTransforms, LinkTransforms]:
-    """Return the transforms of a model's links with a joint, and those of its other links.
+    """Return the transforms of the links that a joint moves, and the transforms of all other links.
 
     Bodies that are named in ``without`` are left out.
     """

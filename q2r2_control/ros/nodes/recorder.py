@@ -152,7 +152,7 @@ class RecorderNode(BaseNode):
             self.report_health()
 
     def _day(self) -> int:
-        """Return the time of day [ns]. It goes on evenly if the computer's clock is set."""
+        """Return the time of day [ns]. It does not jump if the computer's clock is set."""
         return self._epoch + time.monotonic_ns() - self._begun
 
     def _day_at(self, monotonic: float) -> int:
@@ -160,10 +160,10 @@ class RecorderNode(BaseNode):
         return self._epoch + round(monotonic * 1e9) - self._begun
 
     def _write(self) -> None:
-        """Pass on, in the order of receipt, the messages that were there at the last call.
+        """Pass on, in the order of receipt, the messages that had come before the last call.
 
-        Topics are read one after the other. An older message of another topic may therefore arrive after a newer one,
-        until the next call.
+        Topics are read one after the other. Until the next call, an older message of another topic may therefore
+        still be read after a newer message.
         """
         pictures, reasons = self._devices.take(time.monotonic())
         self._waiting += pictures
@@ -227,7 +227,7 @@ class RecorderNode(BaseNode):
         return OK, f"records to {recorder.file}", values
 
     def close(self) -> None:
-        """Write all messages, and report the result of the recording. If it failed, the exit code shows it as well."""
+        """Write all messages, and report the result of the recording. If it is a failure, the exit code says so."""
         recorder = self._recorder
         self._judge.close()
         recorder.record([*self._waiting, *self._devices.take(time.monotonic())[0]])

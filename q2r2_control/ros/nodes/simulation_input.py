@@ -36,7 +36,7 @@ class SimulationInput(BaseNode):
     The script starts when every hand that it plays has a subscriber. The hands rest until the arms' nodes report that
     they can be engaged. Then the buttons are pressed. They are pressed again if an arm is not engaged when the hands
     would move, or if it stops in the first six seconds. After that time, and after an arm's ``~/pause``, ``~/reset`` or
-    way home, only a person can engage an arm. The script's own presses may still pause an arm.
+    motion home, only a person can engage an arm. The script's own presses may still pause an arm.
     """
 
     ticks = True
@@ -57,10 +57,10 @@ class SimulationInput(BaseNode):
         self._make_script = partial(ScriptedInput, trajectory, self._hands, rate_hz=rate, jitter=jitter)
         self._listeners = HandListeners(self, self._hands if MessageType.INPUTS in _MODES[mode] else ())
         self._starts = True  # Whether presses may still engage the arms.
-        self._pressed = False  # Whether the buttons were pressed once to engage them.
+        self._pressed = False  # Whether the buttons were pressed once to engage the arms.
         self._moves = False  # Whether the hands move.
         self._until = math.inf  # Time until which arms are engaged again [s].
-        self._not_to_press: set[str] | None = None  # Hands that do not press; None before that is decided.
+        self._not_to_press: set[str] | None = None  # Hands that do not press; None if that is not decided yet.
         self._rewind(self.now)
         self._timer = self.create_tick(_LONGEST, self._tick)
 
@@ -83,7 +83,7 @@ class SimulationInput(BaseNode):
             if self._missing():
                 return
             self._waits_for_subscribers = False
-            self._rewind(self.now)  # From now on, the arms are watched.
+            self._rewind(self.now)  # The script begins now.
             self.get_logger().info(f"plays {self._title}")
         now = self.now
         if self._starts:
@@ -95,7 +95,10 @@ class SimulationInput(BaseNode):
         self._timer.reset()
 
     def _engage(self, now: float) -> None:
-        """Restart the script, in which the hands rest first, until the arms are ready, and then until they follow."""
+        """Restart the script until the arms are ready, and then until they follow.
+
+        At the beginning of the script, the hands rest.
+        """
         self._listeners.look()
         t = now - self._began
         # The last event of an arm may be a request before the first press. Such a request does not count.

@@ -82,7 +82,7 @@ class WebPage(BaseNode):
             allowed = "allowed: controller: builtin, or mode: filtered"
             raise ConfigError(f"--web: {config.name} has no ticks to show; {allowed}")
         self._asked: SimpleQueue[Any] = SimpleQueue()
-        self._page = Page(host, port, self._asked.put)  # Its process starts during the work below.
+        self._page = Page(host, port, self._asked.put)  # The page's process starts during the work below.
         self._cell, self._robot = config.model_copy(update={"loop_rate_hz": rate}), Robot.from_config(config)
         self._begun = time.monotonic_ns()
         self._ticks = RosTicks(self._begun, self._robot)
@@ -154,7 +154,7 @@ class WebPage(BaseNode):
         match request:
             case PageRequest.ENGAGE:
                 return [f"{arm}/engage" for arm in arms]
-            case PageRequest.PAUSE:  # The pause also ends the way home.
+            case PageRequest.PAUSE:  # The pause also ends the motion home.
                 return [f"{self._controller}/hold", *(f"{arm}/pause" for arm in arms)]
             case PageRequest.RESET:
                 return [f"{self._controller}/reset", *(f"{arm}/reset" for arm in arms)]
@@ -184,7 +184,7 @@ class WebPage(BaseNode):
         while not self._asked.empty():
             self._serve(self._asked.get())
         waiting, self._waiting = self._waiting, []
-        # A frame shows only the newest posture, flags and targets. All ticks, references and events count.
+        # A frame shows only the newest posture, flags and targets, but the data of all ticks and all events are used.
         try:
             chunk = self._ticks.add_messages(waiting)
         except _UNREADABLE as error:
@@ -203,7 +203,7 @@ class WebPage(BaseNode):
         self._row["q"], self._row["v"], self._row["tau"] = self._ticks.joints
         nodes = node_views(self._states)
         views = arm_views(nodes, self._cell)
-        # The nodes report this age twice a second, and at each event.
+        # The nodes report the age of the hands' poses twice a second, and at each event.
         told = {node.arm: node.values.get("hand_age") for node in nodes}
         ages = {arm: age for arm, age in told.items() if arm is not None and isinstance(age, int | float)}
         frame = Frame(

@@ -62,7 +62,7 @@ _SEE = "docs/ros.md, What moves an arm, and what stops it"
 class Finding:
     """A fault and its cure, in one line each."""
 
-    stops_arms: bool  # Whether it keeps arms from moving, or stops them.
+    stops_arms: bool  # Whether the fault keeps arms from moving, or stops them.
     what: str
     cure: str
 
@@ -146,7 +146,7 @@ def _arms(view: SetView) -> Iterator[Finding]:
 
 
 def _cure(node: NodeView, line: str) -> str:
-    """Return the cure for the fault that a node reports. The lines of a refusal and of a stop name it themselves."""
+    """Return the cure for the fault that a node reports. The lines of a refusal and of a stop contain the cure."""
     kind = node.values.get("kind")
     if kind in _CURE_IN_SENTENCE or node.values.get("state") == ArmState.STOPPED:
         return line

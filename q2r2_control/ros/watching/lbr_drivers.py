@@ -28,7 +28,7 @@ _SHUT = "its driver shuts the connection beyond"
 
 
 class DriverListener:
-    """Listens to the states and descriptions of drivers, but not to commands. The node has to be spun."""
+    """Listens to the states and descriptions of drivers, but not to commands. ``node`` has to be spun."""
 
     def __init__(self, node: Node, cell: Config) -> None:
         self._node, external = node, cell.external
@@ -48,8 +48,8 @@ class DriverListener:
             for name in STATE_TOPICS:
                 topic = f"{view.namespace}/{name}"
                 view.states[topic] = {one.topic_type for one in self._node.get_publishers_info_by_topic(topic)}
-            place, _, last = view.command.rpartition("/")
-            topics = [view.command, *(f"{place}/{kind.older}" for kind in KINDS.values() if last in kind.topic)]
+            parent, _, last = view.command.rpartition("/")
+            topics = [view.command, *(f"{parent}/{kind.older}" for kind in KINDS.values() if last in kind.topic)]
             view.takers = {
                 one.topic_type for topic in topics for one in self._node.get_subscriptions_info_by_topic(topic)
             }
@@ -67,7 +67,10 @@ def examine_drivers(view: SetView, cell: Config) -> list[Finding]:
 
 
 def _examine(view: DriverView, cell: Config, robot: Robot, with_session: bool) -> Iterator[Finding]:
-    """Yield the findings of one driver. Its session is judged only ``with_session``: a running controller judges it."""
+    """Yield the findings of one driver.
+
+    Its session is judged only if ``with_session`` is True. A controller that runs judges the session itself.
+    """
     assert cell.external is not None
     arm, message, topics = view.arm, cell.external.terms.message, " and ".join(view.states)
     controller = cell.external.arm(arm).ctrl_prefix.rpartition("/")[2]
@@ -97,7 +100,7 @@ def _examine(view: DriverView, cell: Config, robot: Robot, with_session: bool) -
 
 
 def _compare_limits(view: DriverView, cell: Config, robot: Robot) -> Iterator[Finding]:
-    """Compare the limits of commanded positions and velocities with those of the driver."""
+    """Compare the limits of commanded positions and velocities with the limits of the driver."""
     where = f"{view.namespace}/robot_description"
     try:
         urdf = parse_urdf(view.description, where)
@@ -118,7 +121,7 @@ def _compare_limits(view: DriverView, cell: Config, robot: Robot) -> Iterator[Fi
     low, high, fastest = (
         np.array([float(limits[theirs[name]].get(key, "0")) for name in ours]) for key in ("lower", "upper", "velocity")
     )
-    if view.state is not None:  # The driver's safe_stop allows no position within one step of its limits.
+    if view.state is not None:  # The driver's safe_stop allows no position from which one step leads beyond a limit.
         low, high = low + fastest * view.state.sample_time, high - fastest * view.state.sample_time
     lower, upper = robot.position_lower[joints], robot.position_upper[joints]
     margin = np.maximum(low - lower, upper - high)

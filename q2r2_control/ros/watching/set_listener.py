@@ -1,6 +1,6 @@
 """Listen only to the reports of a set's nodes on ``~/state``, so that the listener does not change what the set does.
 
-An arm's node would take a listener to its targets for a controller, and would let the arm be engaged. A controller
+An arm's node would mistake a listener to its targets for a controller, and would let the arm be engaged. A controller
 stops commanding arms whose commands get a new receiver. Therefore each sender counts its messages, and reports the
 number.
 """
@@ -35,7 +35,7 @@ class WatchError(Q2R2Error):
 
 
 class SetListener:
-    """Queries the graph of one domain, and listens to reports on ``~/state``. The node has to be spun."""
+    """Queries the graph of one domain, and listens to reports on ``~/state``. ``node`` has to be spun."""
 
     def __init__(self, node: Node, cell: Config, drivers: bool = False) -> None:
         self._node, self._cell = node, cell
@@ -87,7 +87,7 @@ class SetListener:
         return sum(rates) if rates else None
 
     def _is_shown(self, topic: str, members: set[str]) -> bool:
-        """Return whether a node of the set expects the topic, or sends it.
+        """Return whether a node of the set expects messages on the topic, or sends messages on it.
 
         A topic that is sent is shown only if its sender counts the messages, or if somebody receives them.
         """

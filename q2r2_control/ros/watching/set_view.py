@@ -80,7 +80,7 @@ class TopicView:
     types: tuple[str, ...]
     publishers: tuple[str, ...]  # Full names of nodes.
     subscribers: tuple[str, ...]  # Full names of nodes.
-    rate: float | None  # [Hz]; None if not known.
+    rate: float | None  # Messages per second [Hz]; None if not known.
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,10 +88,10 @@ class ArmView:
     """One arm, and why it moves or does not move."""
 
     name: str
-    node: str  # Full name of its node; "" if none runs.
-    state: str  # State of its teleoperation.
-    controller: str  # Its state in the built-in controller; "" if not reported.
-    why: str
+    node: str  # Full name of the arm's node; "" if none runs.
+    state: str  # State of the arm's teleoperation.
+    controller: str  # State of the arm in the built-in controller; "" if not reported.
+    why: str  # One line: why the arm moves or does not move.
 
 
 @dataclass(slots=True)
@@ -100,7 +100,7 @@ class DriverView:
 
     arm: str
     command: str  # Topic of the arm's commands.
-    states: dict[str, set[str]] = field(default_factory=dict)  # Published types by topic of states.
+    states: dict[str, set[str]] = field(default_factory=dict)  # The types that are published on each topic of states.
     takers: set[str] = field(default_factory=set)  # Types that nodes receive on the topics of commands.
     state: Any = None  # The newest LBRState.
     description: str = ""  # The newest URDF.
@@ -114,7 +114,7 @@ class DriverView:
 class SetView:
     nodes: tuple[NodeView, ...]
     topics: tuple[TopicView, ...]
-    names: tuple[str, ...]  # Names of all nodes in the domain. A node that runs twice is there twice.
+    names: tuple[str, ...]  # Names of all nodes in the domain. The name of a node that runs twice is listed twice.
     arms: tuple[ArmView, ...]
     drivers: tuple[DriverView, ...] = ()  # Empty if drivers were not listened to.
 
