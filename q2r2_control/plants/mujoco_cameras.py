@@ -96,7 +96,7 @@ class CellPictures:
         mujoco.mj_camlight(self._model, self._data)
 
     def take(self, camera: str) -> npt.NDArray[np.uint8]:
-        """Return the picture (height, width, 3), r g b, of the cell as it was placed last."""
+        """Return the picture (height, width, 3), r g b, of the cell at the positions of the last :meth:`place`."""
         renderer = self._renderers[camera]
         renderer.update_scene(self._data, camera)
         return np.asarray(renderer.render())
