@@ -1,4 +1,4 @@
-"""Gizmos at the tools. One page at a time moves the tools with them, in place of a hand."""
+"""Gizmos at the tools: arrows and rings. One page at a time moves the tools by dragging them, in place of a hand."""
 
 from __future__ import annotations
 
@@ -24,10 +24,11 @@ _Gizmos = dict[str, viser.TransformControlsHandle]  # By arm.
 
 
 class Driving:
-    """The page that drags first drives until it lets go. Until then the other pages only watch, and show no gizmos.
+    """Lets pages drag the tools. The page that drags first drives until it lets go.
 
-    A browser sends nothing while the mouse rests. Therefore the page that drives is asked again and again for an
-    answer, which its own script gives. Each answer is a sample of the hands. Without answers the gate stops the arms.
+    Until then the other pages only watch, and show no gizmos. A browser sends nothing while the mouse rests. Therefore
+    the page that drives is asked again and again for an answer, which its script gives. At each answer, a sample of
+    each dragged hand is sent. Without answers, the teleop layer's gate stops the arms.
     """
 
     def __init__(self, server: viser.ViserServer, setup: PageSetup, answer: Callable[[Any], None]) -> None:
@@ -45,12 +46,12 @@ class Driving:
 
     @property
     def words(self) -> str:
-        """The page that drives, in words."""
+        """The page that drives, in words; instructions if no page drives."""
         driver = self._driver
         return "drag a tool's arrows or rings to move it" if driver is None else f"page {driver + 1} drives"
 
     def next_step(self, arm: str, moves: bool) -> str:
-        """Return what to do next with an arm that does not move although it is dragged; empty otherwise."""
+        """Return what to do next with an arm that is dragged but does not move; empty for other arms."""
         return "let go, then drag again to engage" if not moves and arm in {*self._dragged, *self._spent} else ""
 
     def slowness(self, silent: bool) -> str:
@@ -69,7 +70,7 @@ class Driving:
                             self._send(arm, pressed)
 
     def follow(self, frame: Frame) -> None:
-        """End each drag whose arm has stopped or was not engaged, because only a new drag can engage it."""
+        """End each drag whose arm has stopped or was refused, because only a new drag can engage the arm."""
         with self._lock:
             for arm in {event.arm for event in frame.events if _ends_drag(event)} & self._dragged.keys():
                 self._send(arm, drag=False)
@@ -96,13 +97,13 @@ class Driving:
             self._gizmos[page] = client, gizmos
 
     def _add_gizmo(self, client: viser.ClientHandle, arm: str) -> viser.TransformControlsHandle:
-        # Each gizmo has a name of its own. Under a known name, a browser would go on with the drag of the last one.
+        # Each gizmo has a new name. If an earlier gizmo had the same name, a browser would go on with its drag.
         self._gizmo_count += 1
         name = f"/gizmos/{arm}_{self._gizmo_count}"
         gizmo = client.scene.add_transform_controls(name, scale=_SIZE, depth_test=False, visible=False)
 
         async def drag(event: viser.TransformControlsEvent) -> None:
-            # There is no await, so that the pose belongs to this event.
+            # The function contains no await. Otherwise, the pose could be that of a later event.
             self._drag(client.client_id, arm, event)
 
         gizmo.on_update(drag)
@@ -127,7 +128,7 @@ class Driving:
                 begins, self._driver = self._driver is None, page
                 self._dragged[arm] = _pose_of(event.target)
                 self._spent.discard(arm)
-                for held in (False, True):  # A control has to be released before a press counts.
+                for held in (False, True):  # A press counts only if the control was released before.
                     self._send(arm, drag=held)
                 if begins:
                     self._pace.begin()
@@ -183,11 +184,11 @@ class Driving:
 
 
 def _ends_drag(event: Event) -> bool:
-    """Return whether the drag of the event's arm cannot engage it any more."""
+    """Return whether the present drag of the event's arm cannot engage the arm any more."""
     if event.kind is TeleopReason.NOT_ENGAGED:
         return True
     stops = event.source != event.destination and event.destination in HOLDING | {ArmState.HOMING}
-    return stops and event.kind is not TeleopReason.DEAD_MAN_RELEASED  # That is the end of an earlier drag.
+    return stops and event.kind is not TeleopReason.DEAD_MAN_RELEASED  # A release is the end of an earlier drag.
 
 
 def _pose_of(gizmo: viser.TransformControlsHandle) -> tuple[tuple[float, ...], tuple[float, ...]]:
