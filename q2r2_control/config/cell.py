@@ -213,7 +213,7 @@ class Config(StrictModel):
 
     @property
     def simulated_cameras(self) -> dict[str, CameraConfig]:
-        """The cameras of the simulated cell, by name. The others are on ROS topics or devices."""
+        """The cameras of the simulated cell, by name. All other cameras are real: on ROS topics or devices."""
         return {name: camera for name, camera in self.cameras.items() if camera.is_simulated}
 
     @property
@@ -228,7 +228,7 @@ class Config(StrictModel):
 
     @property
     def gripper_delay(self) -> float:
-        """The longest time until a gripper has its command and its opening is measured, besides a few ticks [s]."""
+        """The longest time until a gripper has got its command and its opening is measured, plus a few ticks [s]."""
         by_modbus = any(isinstance(cabinet.gripper, ModbusGripperConfig) for cabinet in self.fri.values())
         return MODBUS_DELAY if by_modbus else 0.0
 
@@ -247,7 +247,7 @@ class Config(StrictModel):
         return part_of.model or ""
 
     def named_tool_frame(self, arm: str) -> str | None:
-        """Return the name in the cell of the link that the operator moves; None if the file does not name it."""
+        """Return the link that the operator moves, by its name in the whole cell; None if the YAML does not name it."""
         made = next(made for side, made in self.arms.items() if side == arm)
         if made.tool.model is not None:
             return None if made.tool.frame is None else f"{arm}_{made.tool.frame}"

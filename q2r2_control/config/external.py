@@ -163,7 +163,7 @@ class ExternalConfig(StrictModel):
 
     @property
     def filtered(self) -> bool:
-        """Whether the built-in controller runs between hands and arms."""
+        """Whether the built-in controller computes the external controller's targets from those of the hands."""
         return self.mode is Mode.FILTERED
 
     def topic(self, arm: str) -> str:
