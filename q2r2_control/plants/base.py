@@ -1,4 +1,4 @@
-"""The interface of every plant, and the checks that keep bad commands from it."""
+"""The interface of every plant, and the checks that keep unusable commands from a plant."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Plant(Protocol):
     def apply(self, command: Command) -> None:
         """Take a command. Posture and velocity are due at the end of the next ``advance``; a torque acts at once.
 
-        If no newer command comes, later calls of ``advance`` hold its posture at rest, or its torque.
+        If no newer command comes, later calls of ``advance`` hold this command's posture at rest, or its torque.
 
         Raises:
             PlantError: If the plant lacks the mode, or a number is not finite. The previous command then stays.
@@ -59,7 +59,7 @@ class Plant(Protocol):
         """Return the measured opening of each gripper, from 0 for closed to 1 for open, as a new mapping each time."""
 
     def close(self) -> None:
-        """Free every resource. It may be called twice."""
+        """Free every resource. The method may be called twice."""
 
 
 @runtime_checkable
@@ -112,7 +112,7 @@ class SessionPlant(Protocol):
         """Return the time from the moment when a command is due until the arms are measured at its posture [s]."""
 
     def timings(self) -> dict[str, ArmTiming]:
-        """Return the timing of each arm that follows the reference on its own; empty if all arms move as one."""
+        """Return how the motion of each arm is timed relative to the reference; empty if all arms have one timing."""
 
     def lead(self) -> float:
         """Return the longest time by which commands are ahead of the arms [s].
@@ -140,7 +140,7 @@ class RealPlant(Protocol):
 class WaitingPlant(Protocol):
     """The additional attributes of a plant whose reset waits for a person, for ``--wait``."""
 
-    # Longest time that a reset waits for the robot [s]. After this time it raises :class:`PlantError`.
+    # Longest time that a reset waits for the robot [s]. After this time, the reset raises :class:`PlantError`.
     longest_wait: float
     longest_session_wait: float  # Longest time that a reset waits for all sessions [s]. A run then begins without them.
 
@@ -194,7 +194,8 @@ def check_command(command: Command, robot: Robot, modes: tuple[CommandMode, ...]
 def check_joints(what: str, values: Array, robot: Robot) -> None:
     """Raise :class:`PlantError` if ``values`` does not have one finite number for each joint of the robot."""
     _check_shape(what, values, robot)
-    # A scalar product is a fast test. The squares of large finite numbers may overflow, and so they are checked again.
+    # A scalar product is a fast test. But the squares of large finite numbers may overflow. The numbers themselves are
+    # therefore checked if the product is not finite.
     if not math.isfinite(values.dot(values)) and not np.isfinite(values).all():
         joint = int(np.flatnonzero(~np.isfinite(values))[0])
         raise PlantError(f"{what}: {robot.joint_names[joint]} = {values[joint]}: allowed: finite numbers")

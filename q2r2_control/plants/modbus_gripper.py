@@ -80,7 +80,8 @@ class ModbusGripper:
         self._where = f"{config.modbus}, unit {config.unit}"
         self.status: GripperStatus | None = None  # None if the gripper does not answer.
         self._wanted: float | None = None
-        # The measured opening, and the time at which the command that was in force then was chosen [s].
+        # The measured opening, and the time at which the command in force at the measurement was chosen [s]; None if
+        # the opening is not known.
         self._measured: tuple[float, float] | None = None
         self._used = False  # Whether the gripper was ready in this run.
         self._sent, self._told = b"", ""
@@ -120,7 +121,7 @@ class ModbusGripper:
             try:
                 self._exchange(began)
                 pause = began + _PERIOD - time.monotonic()
-            except Exception as error:  # A serial device raises more than OSError.
+            except Exception as error:  # A serial device also raises exceptions that are no OSError.
                 self._client.close()
                 self.status = self._measured = None
                 self._sent, pause = b"", _AGAIN

@@ -25,8 +25,8 @@ from q2r2_control.types import Array, Command, CommandMode, RobotState
 _STEP_ROUNDING = 1e-6
 
 # In every posture the inertia of a joint is at least its armature: M >= diag(armature). If K dt^2 / armature <= 0.16
-# and D dt / armature <= 1, all eigenvalues of 2 D dt + K dt^2 over M stay below 4. At 4 semi-implicit Euler integration
-# becomes unstable.
+# and D dt / armature <= 1, all eigenvalues of M^-1 (2 D dt + K dt^2) stay below 4. At 4, the semi-implicit Euler
+# integration becomes unstable.
 _MAX_STIFFNESS_STEP, _MAX_DAMPING_STEP = 0.16, 1.0
 
 
@@ -139,7 +139,7 @@ class MujocoPlant:
         """See :meth:`Plant.advance`. All whole physics steps that are due are taken, and the rest is carried over.
 
         Raises:
-            PlantError: Also if the simulation has diverged. ``reset`` makes it usable again.
+            PlantError: If ``dt`` is not allowed, or if the simulation has diverged. After ``reset`` it is usable again.
         """
         check_duration(dt)
         if dt == 0:

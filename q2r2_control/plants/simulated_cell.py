@@ -1,4 +1,4 @@
-"""The simulated cell behind ``mujoco_robot``. Commands come at any time, and the plant runs in fixed steps."""
+"""The simulated cell of the ROS node ``mujoco_robot``. Commands come at any time, and the physics has fixed steps."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from q2r2_control.types import Array, Command, CommandMode, RobotState
 # A busy computer delivers commands unevenly. If the next command is late, a joint therefore goes on at its velocity for
 # this number of intervals between commands. The other two numbers are the bounds of this time [s].
 _COAST_INTERVALS, _SHORTEST_COAST, _LONGEST_COAST = 3.0, 0.01, 0.1
-# Share of the newest interval in its running mean.
+# Share of the newest interval between commands in the running mean of these intervals.
 _INTERVAL_SHARE = 0.1
 
 

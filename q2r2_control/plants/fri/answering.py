@@ -24,7 +24,8 @@ from q2r2_control.process.answering_process import AnsweringProcess
 from q2r2_control.process.helper_process import leave_signals_to_the_run, reason_of
 from q2r2_control.process.scheduling import few_garbage_collections, real_time, reserve
 
-# Processor time that is reserved for answers, and the interval in which it is reserved [s]. An answer takes 0.2 ms.
+# Processor time that is reserved for answers in each interval, and the length of an interval [s]. An answer takes
+# 0.2 ms.
 _RESERVED = 0.0015, 0.002
 _POLL = 0.05  # Time between two checks whether the arms stand still, after the loop has ended [s].
 _LONGEST_REPLY_WAIT = 1.0  # Longest time that the loop waits for the reply to its commands [s]. Arms brake meanwhile.

@@ -41,8 +41,8 @@ _REMEMBERED = 1024
 class _Move(NamedTuple):
     """The motion from the posture and velocity of one tick to those of the next tick."""
 
-    start: float  # [s]
-    end: float  # [s]
+    start: float  # Time of the start [s].
+    end: float  # Time of the end [s].
     q: tuple[Array, Array]  # Postures at the start and at the end [rad].
     v: tuple[Array, Array]  # Velocities at the start and at the end [rad/s].
     deceleration: Array  # Deceleration of the certified stop from the end [rad/s^2].
@@ -63,10 +63,10 @@ class _Move(NamedTuple):
 class _Stop(NamedTuple):
     """The certified stop from a posture and a velocity."""
 
-    start: float  # [s]
-    q: Array  # [rad]
-    v: Array  # [rad/s]
-    deceleration: Array  # [rad/s^2]
+    start: float  # Time at which the braking starts [s].
+    q: Array  # Posture at the start (n,) [rad].
+    v: Array  # Velocity at the start (n,) [rad/s].
+    deceleration: Array  # Deceleration of each joint until it rests (n,) [rad/s^2].
 
     def at(self, t: float) -> tuple[Array, Array]:
         ran = np.minimum(max(t - self.start, 0.0), np.abs(self.v) / self.deceleration)
@@ -105,7 +105,7 @@ class ReferencePath:
             q: Posture at its end (n,) [rad].
             v: Velocity at its end (n,) [rad/s].
             deceleration: Deceleration of the stop from its end (n,) [rad/s^2].
-            start: Time at which the motion leaves the earlier stop [s]; by default the beginning of that stop.
+            start: Time at which the motion leaves the earlier stop [s]; by default the start of that stop.
         """
         stop, start = self._stop, max(start, self._stop.start)
         there, speed = stop.at(start)
@@ -116,8 +116,8 @@ class ReferencePath:
     def brake(self, t: float) -> None:
         """Remove all motions after the piece that contains ``t`` [s], so that only the piece's certified stop follows.
 
-        The stop begins at the end of the piece. If it began at ``t``, a joint that nearly stands at the end would
-        hardly brake, because its deceleration is small.
+        The stop begins at the end of the piece. If it began at ``t``, a joint that is nearly at rest at the end of the
+        piece would hardly brake, because the joint's deceleration is small.
         """
         piece = self._piece(t)
         if piece is not self._stop:
@@ -153,7 +153,7 @@ class MessageClock:
     def update(self, arrival: float, passed: float) -> None:
         """Update the estimate with a newer message, which came at ``arrival`` [s].
 
-        ``passed`` is the time since the message before by the cabinet's clock [s].
+        ``passed`` is the time between the message before and this message, by the cabinet's clock [s].
         """
         self._taken += 1
         expected = self.expected + passed

@@ -244,7 +244,7 @@ class Cabinet:
 
     @property
     def _bears_the_load(self) -> bool:
-        """True if the load data fit and, before torques are overlaid, the external torques are small."""
+        """True if the client's command may begin: the load data fit and, for torques, external torques are small."""
         torques = self.settings.command is CommandKind.TORQUE
         return self.load_fits and not (torques and max(map(abs, self.arm.external_tau)) > _LARGEST_LOAD_ERROR)
 

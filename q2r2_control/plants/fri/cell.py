@@ -58,7 +58,7 @@ class FriCell:
             robot: The robot.
             states: The state of each arm's session.
             period: Period of the loop [s].
-            longest: The longest step of the reference with one acceleration [s].
+            longest: The longest step of the reference, whose acceleration is constant [s].
             grippers: The grippers of those arms that have one.
         """
         self.states = {state.arm: state for state in states}
@@ -178,10 +178,10 @@ class FriCell:
         return self._withdraws
 
     def delay(self) -> float:
-        """Return the time from the end of a command until a tick finds the arm there [s].
+        """Return the time from the end of a command until a tick measures the arm at the command's posture [s].
 
-        A cabinet begins to move the arm there with its next message, and takes one period for this motion. The newest
-        message is half a period old on average. Torques act at once.
+        A cabinet begins to move the arm to this posture with its next message, and takes one period for this motion.
+        The newest message is half a period old on average. With torques the result is 0, because they act at once.
         """
         states = self.states.values()
         is_torque = any(state.wanted is CommandKind.TORQUE for state in states)

@@ -24,7 +24,7 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import ArmTiming, Array, Command, CommandMode, RobotState
 from q2r2_control.wording import sentence
 
-# Number of answers whose times are kept. It is bounded, because the garbage collector visits all of them during a run.
+# Number of answers whose times are kept. It is bounded, because the garbage collector visits all these times in a run.
 _KEPT = 100_000
 _KINDS = {CommandMode.POSITION: CommandKind.POSITION, CommandMode.TORQUE: CommandKind.TORQUE}
 

@@ -232,7 +232,7 @@ class ArmSession:
             self._begin_anew()
             if message.session is Session.IDLE:
                 return None
-            mirrored = message.commanded_q or message.q  # FRI 1 expects this, and FRI 2 does not need it.
+            mirrored = message.commanded_q or message.q  # FRI 1 expects these positions; FRI 2 does not need them.
             return FriCommand(counter, reflected, mirrored if message.version == 1 else None, io=self._io(message))
         if self._times is None:
             self._times = AnswerTimes(message.period * message.multiplier, DELAY)

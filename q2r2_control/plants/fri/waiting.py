@@ -1,4 +1,4 @@
-"""Wait for cabinets that a person has to start, and log what this person has to do and how long it has taken."""
+"""Wait for cabinets that a person has to start, and log what this person has to do and how long the wait has lasted."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from q2r2_control.plants.fri.session_state import SessionState
 from q2r2_control.plants.fri.wire import Session
 
 _CHECK_PERIOD = 0.01  # Time between two checks of the cabinets [s].
-_FIRST_LINE, _BETWEEN_LINES = 3.0, 10.0  # Delay of the first line, and time between two lines [s].
+_FIRST_LINE, _BETWEEN_LINES = 3.0, 10.0  # Delay of the first line in the log, and time between two lines [s].
 _START = (
     "start its FRI application at the smartPAD: choose it, in T1 or T2 hold the enabling switch, press the play key"
 )

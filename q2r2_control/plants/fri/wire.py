@@ -128,7 +128,7 @@ class Monitoring:
     commanded_tau: Joints | None = None
 
     def output(self, name: str, value: IoValue) -> IoValue | None:
-        """Return ``value`` in the type of the cabinet's output ``name``; None if it has no such output of that kind.
+        """Return ``value`` in the type of the cabinet's output ``name``; None if there is no such output of this kind.
 
         KUKA's own clients raise an exception for an output that the cabinet does not list.
         """
@@ -280,7 +280,7 @@ def _set_joints(message: Any, name: str, values: Joints | None) -> None:
         getattr(message, name).value.extend(values)
 
 
-# A call of an enum takes ten times as long as a look-up in this dictionary, and each message needs six look-ups.
+# Calling an enum takes ten times as long as a look-up in this dictionary, and each message needs six look-ups.
 _ENUMS: tuple[type[IntEnum], ...] = (Session, Quality, CommandKind, Safety, Operation, Drives)
 _MEMBERS = {kind: {one.value: one for one in kind} for kind in _ENUMS}
 
