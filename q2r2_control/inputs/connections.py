@@ -84,7 +84,7 @@ class Connections:
     ) -> None:
         self._door, self._allow, self._clock, self._handlers, self._log = door, allow, clock, handlers, door.log
         self._driver: Client | None = None
-        self._waiting: list[Client] = []  # In the order of their arrival.
+        self._waiting: list[Client] = []  # Clients that wait for a decision, in the order of their arrival.
         self._unwelcome: set[str] = set()  # Hosts outside ``allow`` that the log has already named.
         self._last_fault = ""
         self._waker, self._waiter = socket.socketpair()

@@ -7,7 +7,7 @@ import math
 from q2r2_control.inputs.way_points import LEFT_HOME, RIGHT_HOME, HandWork, WayPoint
 
 _TURN = 0.5 * math.pi  # With this turn, the fingers close along x [rad].
-_X, _Y, _HELD = 0.64, 0.10, 0.235  # Position x, y and z of the left tool at the tray's handle [m]. The right is at -y.
+_X, _Y, _HELD = 0.64, 0.10, 0.235  # Left tool at the tray's handle: x, y, z [m]. The right tool is at -y.
 _CARRIED = (_X - 0.115, _HELD + 0.11)  # Positions x and z of both tools at the end of the carry [m].
 
 

@@ -19,7 +19,7 @@ from q2r2_control.types import SIDES, Array, HandSample
 
 SILENCE = 2.0  # Time without data before advice is given [s].
 _PERIOD = 0.05  # Time between two polls of the server [s].
-_WINDOW = 0.5  # The movement during this time before now is put in words [s].
+_WINDOW = 0.5  # The movement in the newest time span of this length is put in words [s].
 _STILL = 0.02  # A hand that has moved by less than this in the window counts as still [m].
 _DIRECTIONS = (("back -x", "forward +x"), ("right -y", "left +y"), ("down -z", "up +z"))
 
@@ -111,7 +111,10 @@ def watch_headset(
     stopping: Callable[[], bool],
     watch: HandWatch,
 ) -> HeadsetCheck:
-    """Watch a started server for ``duration`` [s] or until ``stopping``. Show each state, and return the last one."""
+    """Watch a started server for ``duration`` [s] or until ``stopping()`` is True; None for no bound on the time.
+
+    Each state of the check is passed to ``show``, and the last one is returned.
+    """
     hands = {hand: HandMovement(config.teleop.axes) for hand in SIDES}
     start, heard = time.monotonic(), False
     last_data = dict.fromkeys(needed_topics(config), start)

@@ -70,7 +70,7 @@ class HostLog:
         self._hosts: dict[str, _Host] = {}
 
     def write(self, host: str, level: int, text: str, now: float) -> None:
-        """Write a line about ``host``, or hold it back. The ``level`` is one of ``logging``."""
+        """Write a line about ``host``, or hold it back. ``level`` is a level of the package ``logging``."""
         self.flush(now)
         if host not in self._hosts and len(self._hosts) >= MAX_HOSTS_NAMED:
             host = _OTHERS
@@ -115,7 +115,7 @@ class TcpListener:
     def __init__(self, host: str, port: int, log: HostLog) -> None:
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         both = family == socket.AF_INET6 and socket.has_dualstack_ipv6()
-        self._socket = socket.create_server((host, port), family=family, dualstack_ipv6=both)  # Sets SO_REUSEADDR.
+        self._socket = socket.create_server((host, port), family=family, dualstack_ipv6=both)  # It sets SO_REUSEADDR.
         self._socket.setblocking(False)
         self.port = int(self._socket.getsockname()[1])  # The port that was bound.
         self.log = log
@@ -235,6 +235,8 @@ SomePeer = TypeVar("SomePeer", bound=Peer)
 
 
 class Admission(Enum):
+    """A decision about a client that does not drive."""
+
     ADMIT = "admit"  # The client drives from now on, instead of the driver if there is one.
     WAIT = "wait"  # The client may stay until more is known about it. None of its data is used.
     REFUSE = "refuse"

@@ -90,7 +90,7 @@ _STEP_GAP = 0.032
 # The next constants concern a frame that is carried along.
 _WINDOW = 1.5  # Duration of the recent motion that is judged [s].
 _CARRIED = 0.15  # Least distance that both hands have to move [m].
-_NEAR = 0.4 * _CARRIED  # A left hand that stays within this distance is not carried along [m].
+_NEAR = 0.4 * _CARRIED  # If the left hand stays this near to one position, it is not carried along [m].
 _CARRIED_TOLERANCE = Move(0.001, math.radians(0.5))
 _SAME_TIME = 0.01  # Messages of the two hands within this time belong together [s].
 _ALIVE = 0.05  # A pose does not wait for the other hand if that hand has had no pose for longer than this [s].

@@ -105,8 +105,10 @@ class HeadsetSampling(SampleTiming):
         return min(float(self._random.exponential(_RECEIPT_JITTER)), 0.01)
 
 
-HandPose = Callable[[str, float], pin.SE3]  # Hand, time since the first poll [s] -> pose in the input's frame.
-HandButtons = Callable[[str, float], HandInputs]  # Hand, time since the first poll [s] -> buttons.
+# Functions of a hand and of the time since the first poll [s]. They return the hand's pose in the input's frame, or its
+# buttons.
+HandPose = Callable[[str, float], pin.SE3]
+HandButtons = Callable[[str, float], HandInputs]
 
 # If the input is not polled for longer than this, the motion waits for the next poll [s].
 _LONGEST_BACKLOG = 1.0

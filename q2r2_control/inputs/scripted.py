@@ -199,7 +199,8 @@ def trajectory_named(name: str, place: tuple[float, float] | None = None) -> Han
 _PLACES = 7  # Second seed. It makes the shifts independent of other random numbers with the same first seed.
 _PACE = 1.25  # Speed of hasty hands, as a multiple of the speed in the trajectory.
 _HESITATIONS, _HESITATES = 3, 0.4  # Number of hesitations, and the duration of each [s].
-# Times after the headset has lost the hands, at which it sees them again, they engage, they carry, and they go on [s].
+# Times since the headset has lost the hands [s]: when it sees them again, when they engage the arms, when they begin to
+# carry again, and when they go on with the work.
 _LOST, _ENGAGES, _CARRIES, _GOES_ON = 1.0, 1.3, 1.6, 2.1
 # Range of the fraction of the work after which the headset loses the hands. No tool presses on a part so early.
 _EARLY = (0.1, 0.45)
@@ -346,7 +347,7 @@ class ScriptedInput(PlayedInput):
 
     def hand_twist(self, hand: str, t: float) -> pin.Motion:
         """Return the ideal velocity of ``hand`` at ``t`` [s], in the axes of its poses [m/s, rad/s]."""
-        t -= self._origin or 0.0  # Subtracted first, since the difference of times since 1970 would be inexact.
+        t -= self._origin or 0.0  # Otherwise, the differences below would be inexact if times count from 1970.
         before, after = (self._ideal(hand, t + step) for step in (-_DIFFERENCE, _DIFFERENCE))
         linear = (after.translation - before.translation) / (2.0 * _DIFFERENCE)
         return pin.Motion(linear, pin.log3(after.rotation @ before.rotation.T) / (2.0 * _DIFFERENCE))

@@ -40,7 +40,7 @@ class Listening(NamedTuple):
     """The first answer, which says that the process listens."""
 
     port: int
-    urls: tuple[str, ...]  # One URL for each of its addresses.
+    urls: tuple[str, ...]  # One URL for each address of the server.
 
 
 class Admitted(NamedTuple):
@@ -62,7 +62,7 @@ class Received(NamedTuple):
 
 
 class Requested(NamedTuple):
-    """What a button of a page requests."""
+    """The request of a button of a page."""
 
     request: HeadsetRequest
 

@@ -43,7 +43,7 @@ class PageClient(Peer):
         self.closing: asyncio.Future[None] | None = None
 
     def end(self, code: int, reason: str) -> None:
-        """Begin to close the socket. This takes until the page answers."""
+        """Begin to close the socket. It is closed when the page has answered."""
         self.reason = reason
         shown = reason.encode()[:_LONGEST_REASON].decode(errors="ignore")
         self.closing = asyncio.ensure_future(self.connection.close(code, shown))

@@ -284,7 +284,7 @@ def _logger_of(answer: Callable[[Any], None]) -> logging.Logger:
 
 
 def _peer_of(connection: ServerConnection) -> tuple[str, str]:
-    """Return the host, and host and port as one text for people.
+    """Return the host of a page; and its host and port as one text for people.
 
     The host of an IPv4 connection through an IPv6 socket is an IPv4 address.
     """

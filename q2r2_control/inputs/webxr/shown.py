@@ -67,7 +67,7 @@ class ShownPair(TypedDict):
 
 
 class ShownState(TypedDict):
-    """A moment of a run."""
+    """The state of a run at one time."""
 
     arms: dict[str, ShownArm]
     joints: list[Seven]  # The poses of the joints. ``ShownMesh.joint`` is an index into this list.
@@ -85,7 +85,7 @@ class ShownVibration(TypedDict):
 
 
 class FromRun(TypedDict):
-    """A message with any of these fields."""
+    """A message from the run to the page. It contains at least one of these fields."""
 
     scene: NotRequired[ShownScene]
     state: NotRequired[ShownState]

@@ -233,7 +233,7 @@ class WebXrInput:
         self._ready.clear()
 
     def _take(self, answer: Any) -> None:
-        """Handle data from the process. A thread of its own calls this."""
+        """Handle data from the process. A separate thread calls this method."""
         match answer:
             case Received(receptions):
                 now = self._clock()
