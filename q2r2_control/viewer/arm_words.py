@@ -70,7 +70,7 @@ class ArmWords:
             device: The words of the device that drives.
         """
         self._joints, self._bindings, self._device = joints, bindings, device
-        self.told: Mapping[str, Told] = {}  # By arm.
+        self.told: Mapping[str, Told] = {}  # By arm, the events that say why it is in its state.
 
     def follow(self, events: Iterable[Event]) -> None:
         """Keep those of the newest ``events`` that say why an arm is in its state."""

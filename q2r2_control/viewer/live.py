@@ -53,7 +53,8 @@ class LiveTable:
         self._binding: dict[ActiveLimit, None] = {}  # Limits that held a step back since the last drawing.
         self._repelled: dict[str, None] = {}  # Joints that were pushed off their limits since the last drawing.
         self._simulated_time, self._episodes = simulated_time, episodes
-        self._drawn = (time.monotonic(), 0, 0.0)  # The last drawing: time [s], count of ticks, and time of the run [s].
+        # The last drawing: its time [s], the number of ticks until then, and the time of the run [s].
+        self._drawn = (time.monotonic(), 0, 0.0)
 
     def __call__(self, tick: Tick) -> None:
         """Store one tick, to be shown later."""

@@ -18,7 +18,7 @@ from q2r2_control.viewer.web.figure import place
 from q2r2_control.viewer.web.pace import BrowserPace
 
 _SIZE = 0.22  # Size of a gizmo [m].
-_PERIOD = 0.02  # Time between samples [s].
+_PERIOD = 0.02  # Shortest time between two samples of a dragged hand [s].
 _ANSWER = 60.0  # A page without an answer for this time loses control. The gate stops the arms long before [s].
 _Gizmos = dict[str, viser.TransformControlsHandle]  # By arm.
 
@@ -35,12 +35,13 @@ class Driving:
         self._server, self._arms, self._answer = server, tuple(setup.joints), answer
         self._pace = BrowserPace(setup.config.teleop.gate.timeout)
         self._lock = RLock()
-        self._gizmos: dict[int, tuple[viser.ClientHandle, _Gizmos]] = {}  # By page.
-        self._driver: int | None = None
-        self._dragged: dict[str, tuple[tuple[float, ...], tuple[float, ...]]] = {}  # By arm: position, x y z w.
+        self._gizmos: dict[int, tuple[viser.ClientHandle, _Gizmos]] = {}  # By page: its connection and its gizmos.
+        self._driver: int | None = None  # The page that drives; None if no page drives.
+        # By dragged arm, the pose of the gizmo in the world frame: position [m] and quaternion x y z w.
+        self._dragged: dict[str, tuple[tuple[float, ...], tuple[float, ...]]] = {}
         self._spent: set[str] = set()  # Arms whose last drag cannot engage them any more.
         self._gizmo_count = 0
-        self._tools: dict[str, tuple[float, ...]] = {}  # By arm: x y z qx qy qz qw.
+        self._tools: dict[str, tuple[float, ...]] = {}  # By arm, the tool pose x y z [m] qx qy qz qw (world frame).
         server.on_client_connect(self._connect)
         server.on_client_disconnect(self._disconnect)
 
@@ -79,7 +80,7 @@ class Driving:
                 self._forget_drag(arm)
 
     def show(self, frame: Frame) -> None:
-        """Put the gizmos that nobody drags at the tools."""
+        """Move all gizmos that nobody drags to the poses of their tools."""
         with self._lock:
             self._tools = {arm: tuple(pin.SE3ToXYZQUATtuple(tool)) for arm, tool in frame.tick.tools.items()}
             for page, (_, gizmos) in self._gizmos.items():
@@ -110,7 +111,7 @@ class Driving:
         return gizmo
 
     def _replace_gizmo(self, arm: str) -> None:
-        """Take the gizmo of a dragged arm away from the mouse, which ends the drag in the browser."""
+        """Replace the gizmo of a dragged arm by a new gizmo, which ends the drag in the browser."""
         if self._driver is not None:
             client, gizmos = self._gizmos[self._driver]
             gizmos[arm].remove()
@@ -148,7 +149,7 @@ class Driving:
             self._pace.end()
 
     def _ask(self, page: int) -> None:
-        """Ask the page that drives for answers, each of which is a sample."""
+        """Ask the page that drives for answers, until it no longer drives. At each answer, samples are sent."""
         while True:
             with self._lock:
                 if self._driver != page:

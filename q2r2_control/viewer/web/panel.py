@@ -90,7 +90,8 @@ class Panel:
         self._binding: dict[ActiveLimit, None] = {}
         self._told: list[tuple[str, str]] = []  # Time and text of each line about episodes.
         self._ticks, self._slowest = 0, 0.0  # Since the last table: number of ticks, and longest computing time [s].
-        self._rates, self._times = deque[float](maxlen=HISTORY), deque[float](maxlen=HISTORY)  # [Hz], [us]
+        # Values of the plots: rates of the loop [Hz], and computing times of the slowest ticks [us].
+        self._rates, self._times = deque[float](maxlen=HISTORY), deque[float](maxlen=HISTORY)
         self._moved: dict[PageSetting, float] = {}  # New values of moved sliders, which are not sent yet.
         self._shown = time.monotonic()  # Time of the last table [s].
         self._newest: Frame | None = None
@@ -192,7 +193,7 @@ class Panel:
         self._words.follow(frame.events)
         for event in frame.events:
             line = f"{event.t:.1f} s", sentence(event.reason)
-            if event.kind in _OF_EPISODES and line not in self._told[-2:]:  # Both arms have the same event.
+            if event.kind in _OF_EPISODES and line not in self._told[-2:]:  # Each arm has an event.
                 self._told.append(line)
         self._binding |= dict.fromkeys(frame.binding)
         if frame.pictures:

@@ -18,7 +18,7 @@ from q2r2_control.viewer.web.exchange import Frame, PageLost, PageRequest, PageS
 from q2r2_control.viewer.web.panel import Panel
 from q2r2_control.viewer.web.scene import CellScene
 
-_NICENESS = 10  # The loop has priority.
+_NICENESS = 10  # The process gets a low priority, since the loop comes first.
 _LAST_WORDS = 0.5  # Time in which browsers are told that the run is over, before their connections are closed [s].
 # Number of answers that are allowed per second, and number that are allowed at once. A page that moves two hands sends
 # 220 per second.
