@@ -53,7 +53,7 @@ class Gesture(StrEnum):
     HOLD = "hold"
 
 
-# Texts of each action for the operator.
+# The meaning of each action, in words for the operator.
 MEANINGS: dict[str, str] = {
     Action.PAUSE_TOGGLE: "engages the arm where it is, or pauses it",
     Action.GRIPPER_TOGGLE: "closes the gripper, or opens it, where the arm has one",

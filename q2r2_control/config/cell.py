@@ -103,14 +103,14 @@ class HeadsetConfig(StrictModel):
 
 
 class BoxConfig(StrictModel):
-    """A further box of a loose object."""
+    """A box of a loose object, in addition to the object's first box."""
 
     size: tuple[Extent, Extent, Extent] = Field(description="x y z [m]")
     at: Metres3 = Field(description="centre, relative to that of the first box [m]")
 
 
 class ObjectConfig(StrictModel):
-    """A loose box in the simulated cell, to be grasped. The controller does not know it."""
+    """A loose box in the simulated cell, to be grasped. The controller does not know this box."""
 
     size: tuple[Extent, Extent, Extent] = Field(description="x y z [m]")
     position: Metres3 = Field(description="position of the centre at the start [m]")
@@ -135,7 +135,7 @@ class MujocoConfig(StrictModel):
     position_damping_ratio: float = Field(1.0, gt=0, le=5, description="damping ratio of the position servos")
     rotor_share: float = Field(
         1.0,
-        ge=0.01,  # Light wrist joints without any rotor inertia could not be integrated.
+        ge=0.01,  # The simulation of light wrist joints without any rotor inertia would be unstable.
         le=1,
         description="share of the rotors' inertia that the joints feel; a torque loop at the joint hides most of it",
     )

@@ -56,7 +56,7 @@ def parse_config(
         data = yaml.load(text, Loader=_Loader)
     # Values such as dates and huge integers, and too deep nesting, raise Python's own exceptions.
     except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
-        said = str(error).replace(' "<unicode string>",', "")  # PyYAML's name for the text
+        said = str(error).replace(' "<unicode string>",', "")  # This is PyYAML's name for the text.
         raise ConfigError(f"{path}: not YAML: {_line(said)}") from error
     if data is None:
         raise ConfigError(f"{path}: the file is empty; allowed: a cell's YAML; q2r2 new-cell makes one")

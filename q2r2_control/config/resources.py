@@ -15,7 +15,7 @@ _CHECKOUT = Path(__file__).resolve().parents[2]
 
 
 def resource_roots() -> Iterator[Path]:
-    """Yield the folders that can hold config/ and robots/, nearest first."""
+    """Yield the folders that can hold config/ and robots/, in the order in which they are searched."""
     yield _CHECKOUT
     installed = [Path(sysconfig.get_path("data", scheme)) for scheme in ("venv", "posix_user", "posix_prefix")]
     # With pip --target, share/ is beside the package. With colcon, the package is in lib/python3.x/site-packages, and

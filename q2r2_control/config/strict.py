@@ -1,4 +1,4 @@
-"""The base of all settings."""
+"""The base class of all settings, and the error messages about settings that are not allowed."""
 
 from __future__ import annotations
 

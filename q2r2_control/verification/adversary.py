@@ -32,7 +32,7 @@ _GAIN_SHARES = {
     **dict.fromkeys(("position_gain", "rotation_gain", "posture_gain", "max_linear_speed"), (0.1, 1.0, 2.0)),
     **{"separation_gain": (0.5, 1.0, 4.0), "stretch_gain": (0.1, 1.0, 10.0), "posture_weight": (0.1, 1.0, 100.0)},
 }
-_WORKSPACE = np.array([[-0.6, -1.1, -0.1], [1.1, 1.1, 1.4]])  # Lower and upper corner [m].
+_WORKSPACE = np.array([[-0.6, -1.1, -0.1], [1.1, 1.1, 1.4]])  # Lower and upper corner of a box for random poses [m].
 
 
 class Adversary:
@@ -76,7 +76,7 @@ class Adversary:
         return self._constant(dict(self._home))
 
     def _teleport(self) -> Stream:
-        """Return a stream with a new pose at regular intervals."""
+        """Return a stream in which each tool gets a new random pose at regular intervals."""
         return self._renewed(int(self._random.integers(5, 800)), self._poses)
 
     def _postures(self) -> Stream:

@@ -91,7 +91,8 @@ class Contract:
         # Whether every tick must have a certificate now. A start at rest with all pairs apart is certified by itself.
         self._certain = self._from_rest and bool(self._apart.all())
         self._least = float(margins.min(initial=np.inf)) if self._certain else -np.inf
-        self._newest: deque[tuple[float, float]] = deque(maxlen=_NEWEST)  # Duration [s], and duration times |a|^2.
+        # For each of the newest ticks: its duration [s], and its duration times |a|^2 [rad^2/s^3].
+        self._newest: deque[tuple[float, float]] = deque(maxlen=_NEWEST)
 
     def set_openings(self, openings: Mapping[str, Interval], *, before_step: bool = True) -> None:
         """Note that the controller has accepted ``openings``.
@@ -116,7 +117,7 @@ class Contract:
             self._ask(settings)
         if len(before):
             self._note("withdrawn", float((np.minimum(before, self._asked) - kept).max()))
-        self._measured.kept = kept  # This tick has to prove these distances.
+        self._measured.kept = kept  # At this tick, pairs have to keep these distances.
 
     def _note_objects(self) -> None:
         """Take the kept distances of held objects from the controller.

@@ -18,7 +18,7 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Interval, StepReport
 
 RELATIVE = 1e-9  # Relative tolerance of the limits in the contract.
-COAL = 2e-6  # Error of Coal's distance between a capsule and a box [m].
+COAL = 2e-6  # Largest error of Coal's distance between a capsule and a box [m].
 
 PROMISES = {  # By key: name, unit, comparison and bound of the value.
     "exceptions": ("exceptions raised by step", "", "<=", 0.0),
