@@ -32,7 +32,7 @@ def _beside_the_file(value: str, info: ValidationInfo) -> str:
     path = f"robots/{value}.urdf" if info.field_name == "model" and not Path(value).suffix else value
     try:
         return str(folder / path) if folder is not None and value and (folder / path).exists() else value
-    except (OSError, ValueError):  # No file can have this name. The code that reads the file says so.
+    except (OSError, ValueError):  # No file can have this name. The code that reads the file will report this.
         return value
 
 
@@ -49,7 +49,7 @@ XacroArgs = Annotated[dict[str, str | bool | int | float], Field(description="ar
 
 
 class PoseConfig(StrictModel):
-    """A fixed placement in the parent frame."""
+    """A fixed pose in the parent frame."""
 
     position: Metres3 = (0.0, 0.0, 0.0)
     rpy: Radians3 = (0.0, 0.0, 0.0)
@@ -81,7 +81,7 @@ class FlangeConfig(StrictModel):
 
     @property
     def is_none(self) -> bool:
-        """Whether the tool sits on the arm's last link itself."""
+        """Whether there is no flange, so that the tool is mounted on the arm's last link."""
         return self.model is None and self.thickness is None
 
 

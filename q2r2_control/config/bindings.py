@@ -17,7 +17,7 @@ class Action(StrEnum):
     """Actions of a hand's controls. Their meanings are in ``MEANINGS``."""
 
     NONE = "none"
-    # These actions happen once, when a control was tapped or held for a while.
+    # These actions are done once, when a control was tapped or held for a while.
     PAUSE_TOGGLE = "pause_toggle"
     GRIPPER_TOGGLE = "gripper_toggle"
     HOME = "home"
@@ -43,14 +43,17 @@ LASTING = frozenset(
 
 
 class Gesture(StrEnum):
-    """How a control is used. ``DOWN`` is the beginning of a press. It only stops an arm that this control pauses."""
+    """How a control is used.
+
+    ``DOWN`` is the start of a press, and has no action. But if the control pauses an arm, the arm stops already then.
+    """
 
     DOWN = "down"
     TAP = "tap"
     HOLD = "hold"
 
 
-# Texts of each action for the operator.
+# The meaning of each action, in words for the operator.
 MEANINGS: dict[str, str] = {
     Action.PAUSE_TOGGLE: "engages the arm where it is, or pauses it",
     Action.GRIPPER_TOGGLE: "closes the gripper, or opens it, where the arm has one",
@@ -97,7 +100,7 @@ class Binding(NamedTuple):
 
     @property
     def field(self) -> str:
-        """The name of the setting."""
+        """The name of the setting that contains this binding, within the block ``teleop.bindings``."""
         return ("" if self.control in CONTROLS else "device.") + self.control + _SUFFIXES[self.gesture]
 
     @property
@@ -107,7 +110,7 @@ class Binding(NamedTuple):
 
 
 class BindingSettings(StrictModel):
-    """The controls of each hand. An action is bound to one gesture at most, and something has to engage the arm."""
+    """The actions of each hand's controls. An action has at most one gesture, and one control has to engage the arm."""
 
     lower: Action = Field(
         Action.PAUSE_TOGGLE, description="A or X, tapped: an action that is done once, except stop; or none"

@@ -103,14 +103,14 @@ class HeadsetConfig(StrictModel):
 
 
 class BoxConfig(StrictModel):
-    """A further box of a loose object."""
+    """A box of a loose object, in addition to the object's first box."""
 
     size: tuple[Extent, Extent, Extent] = Field(description="x y z [m]")
     at: Metres3 = Field(description="centre, relative to that of the first box [m]")
 
 
 class ObjectConfig(StrictModel):
-    """A loose box in the simulated cell, to be grasped. The controller does not know it."""
+    """A loose box in the simulated cell, to be grasped. The controller does not know this box."""
 
     size: tuple[Extent, Extent, Extent] = Field(description="x y z [m]")
     position: Metres3 = Field(description="position of the centre at the start [m]")
@@ -135,7 +135,7 @@ class MujocoConfig(StrictModel):
     position_damping_ratio: float = Field(1.0, gt=0, le=5, description="damping ratio of the position servos")
     rotor_share: float = Field(
         1.0,
-        ge=0.01,  # Light wrist joints without any rotor inertia could not be integrated.
+        ge=0.01,  # The simulation of light wrist joints without any rotor inertia would be unstable.
         le=1,
         description="share of the rotors' inertia that the joints feel; a torque loop at the joint hides most of it",
     )
@@ -213,7 +213,7 @@ class Config(StrictModel):
 
     @property
     def simulated_cameras(self) -> dict[str, CameraConfig]:
-        """The cameras of the simulated cell, by name. The others are on ROS topics or devices."""
+        """The cameras of the simulated cell, by name. All other cameras are real: on ROS topics or devices."""
         return {name: camera for name, camera in self.cameras.items() if camera.is_simulated}
 
     @property
@@ -228,7 +228,7 @@ class Config(StrictModel):
 
     @property
     def gripper_delay(self) -> float:
-        """The longest time until a gripper has its command and its opening is measured, besides a few ticks [s]."""
+        """The longest time until a gripper has got its command and its opening is measured, plus a few ticks [s]."""
         by_modbus = any(isinstance(cabinet.gripper, ModbusGripperConfig) for cabinet in self.fri.values())
         return MODBUS_DELAY if by_modbus else 0.0
 
@@ -247,7 +247,7 @@ class Config(StrictModel):
         return part_of.model or ""
 
     def named_tool_frame(self, arm: str) -> str | None:
-        """Return the name in the cell of the link that the operator moves; None if the file does not name it."""
+        """Return the link that the operator moves, by its name in the whole cell; None if the YAML does not name it."""
         made = next(made for side, made in self.arms.items() if side == arm)
         if made.tool.model is not None:
             return None if made.tool.frame is None else f"{arm}_{made.tool.frame}"

@@ -1,4 +1,4 @@
-"""Read the YAML of a cell, and say for each fault in which line it is."""
+"""Read the YAML of a cell, and name the line of each fault."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def parse_config(
         data = yaml.load(text, Loader=_Loader)
     # Values such as dates and huge integers, and too deep nesting, raise Python's own exceptions.
     except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
-        said = str(error).replace(' "<unicode string>",', "")  # PyYAML's name for the text
+        said = str(error).replace(' "<unicode string>",', "")  # This is PyYAML's name for the text.
         raise ConfigError(f"{path}: not YAML: {_line(said)}") from error
     if data is None:
         raise ConfigError(f"{path}: the file is empty; allowed: a cell's YAML; q2r2 new-cell makes one")
@@ -83,18 +83,20 @@ def parse_config(
 
 # A KUKA driver's joint limits are one degree inside the model's, and its soft limits 5 degrees inside these [rad].
 # Beyond the limits, lbr_fri_ros2_stack closes the connection, and a cabinet ends its session. The driver's safe_stop
-# closes it already if one more step at a joint's greatest speed would leave the limits. This step is 1.8 degrees at
-# most if commands are due every 10 ms. The 5 degrees include it.
+# closes the connection already if one more step at a joint's greatest speed would leave the limits. This step is 1.8
+# degrees at most if commands are due every 10 ms, and is smaller than the 5 degrees.
 _DRIVER_MARGIN = 0.105
-# Commands come unevenly. If a period of the driver gets one command more than usual, its filter with the time constant
-# T becomes faster by the share h / T, where h is the time between commands. This is an eighth for 5 ms and 40 ms. A
-# command that was late by d adds (d / T)^2 / 2. A joint beyond its velocity limit closes the connection as well.
+# Commands come unevenly. If one command more than usual comes within a period of the driver, the output of the driver's
+# filter is faster by the share h / T. T is the filter's time constant, and h is the time between commands. For h = 5 ms
+# and T = 40 ms, the share is an eighth. A command that was late by d adds (d / T)^2 / 2. The driver also closes the
+# connection if a joint is beyond its velocity limit.
 _DRIVER_SPEED = 0.85
 # If answers catch up with a cabinet's clock, the cabinet sees 1.05 times the reference's speeds (plants.fri.answers).
 _CABINET_SPEED = 0.95
 
 
 def _within_driver_limits(config: Config) -> Config:
+    """Return the cell with limits of joints that keep drivers and cabinets from ending the connection."""
     by_ros = config.external is not None and config.external.preset.startswith("lbr_")
     control = config.control
     if control.limits == "model" or not (by_ros or config.fri):
@@ -108,7 +110,10 @@ def _within_driver_limits(config: Config) -> Config:
 
 
 def _line_number(text: str, location: Sequence[int | str]) -> int | None:
-    """Return the line of a key in a YAML, or of the deepest block around it that the YAML has; None if it has none."""
+    """Return the number of the line of a key in a YAML, from 1 on.
+
+    If the key is missing, it is the line of the deepest block around the key; None if that is missing too.
+    """
     node, line = yaml.compose(text, Loader=_Loader), None
     for part in location:
         if isinstance(node, yaml.MappingNode):

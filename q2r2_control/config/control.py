@@ -193,17 +193,17 @@ class ControllerSettings(StrictModel):
         return names
 
     def without_contact(self) -> ControllerSettings:
-        """Return the settings for modes in which the arms do not yield. ``contact_allowed`` is empty there."""
+        """Return the settings for modes in which the arms do not yield. Their ``contact_allowed`` is empty."""
         return self.model_copy(update={"contact_allowed": ()}) if self.contact_allowed else self
 
     def without_jerk_limit(self) -> ControllerSettings:
-        """Return the settings for modes whose commands are torques. ``jerk_limit`` is None there."""
+        """Return the settings for modes whose commands are torques. Their ``jerk_limit`` is None."""
         return self if self.jerk_limit is None else self.model_copy(update={"jerk_limit": None})
 
     def with_solver(self, name: str | None) -> ControllerSettings:
         """Return the settings with the solver called ``name``; None keeps the solver.
 
-        Another solver has its own default options.
+        If the solver changes, ``solver_options`` is empty, because the options were for the old solver.
         """
         if name is None or name == self.solver:
             return self
@@ -296,8 +296,8 @@ class AdmittanceSettings(StrictModel):
     )
     mass: float = Field(10.0, ge=0.5, le=200, description="virtual mass of the tool [kg]")
     inertia: float = Field(0.3, ge=0.01, le=20, description="virtual inertia of the tool [kg m^2]")
-    # The tool's model may be wrong by the weight of 0.2 kg. The torque is that of this weight, 0.15 m from the tool
-    # frame.
+    # The mass in the tool's model may be wrong by 0.2 kg. The default force is the weight of this mass. The default
+    # torque is that of this weight at a distance of 0.15 m from the tool frame.
     force_dead_band: float = Field(2.0, ge=0, le=50, description="a smaller force moves nothing [N]")
     torque_dead_band: float = Field(0.3, ge=0, le=10, description="a smaller torque moves nothing [Nm]")
     filter_time: float = Field(0.01, ge=0, le=0.5, description="time constant of the wrench's low-pass [s]")
@@ -310,7 +310,7 @@ def _live_fields(settings: type[StrictModel]) -> tuple[str, ...]:
 
 
 LIVE = _live_fields(ControllerSettings)  # Names of the settings that may change while a controller runs.
-LIVE_IMPEDANCE = _live_fields(ImpedanceSettings)  # Names of the settings of an impedance that may change.
+LIVE_IMPEDANCE = _live_fields(ImpedanceSettings)  # Names of impedance settings that may change at run time.
 
 
 class SupervisionSettings(StrictModel):

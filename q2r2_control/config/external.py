@@ -68,7 +68,7 @@ class GripperSettings(StrictModel):
 
 
 class ExternalGripper(GripperSettings):
-    """An arm's gripper."""
+    """The gripper of an arm that an external controller moves, and the gripper's action or topic."""
 
     topic: RosName | None = Field(
         None, description="action or topic of the gripper; null: /q2r2/left_gripper/gripper_cmd"
@@ -99,7 +99,7 @@ class GuardLimits(StrictModel):
 
 
 class ExternalArm(StrictModel):
-    """One arm's controller."""
+    """The external controller of one arm: its ROS names and frames."""
 
     ctrl_prefix: AbsoluteName = Field(description="name of the controller's node, with its namespace")
     base_frame: FrameName = Field(description="frame_id of its targets; a frame of /tf")
@@ -163,7 +163,7 @@ class ExternalConfig(StrictModel):
 
     @property
     def filtered(self) -> bool:
-        """Whether the built-in controller runs between hands and arms."""
+        """Whether the built-in controller computes the external controller's targets from those of the hands."""
         return self.mode is Mode.FILTERED
 
     def topic(self, arm: str) -> str:
@@ -172,7 +172,7 @@ class ExternalConfig(StrictModel):
         return made.target_topic or self.terms.topic_of(made.ctrl_prefix)
 
     def arm(self, name: str) -> ExternalArm:
-        """Return one arm's controller."""
+        """Return the settings of one arm's controller."""
         return next(arm for side, arm in self.arms.items() if side == name)
 
 

@@ -23,8 +23,8 @@ class GripperIoConfig(StrictModel):
     digital: bool = Field(False, description="true if the output is digital, which is on or off")
 
 
-# A gripper on Modbus gets its newest command and measures its opening within this time. Otherwise the opening counts as
-# not known [s].
+# Within this time, a gripper on Modbus has to get its newest command, and its opening has to be measured [s]. Otherwise
+# the opening counts as not known.
 MODBUS_DELAY = 0.15
 _ENDPOINT = re.compile(r"(\[[0-9a-fA-F:.]+\]|[^\s:/]+)(?::([0-9]{1,5}))?")
 _Count = Annotated[int, Field(ge=0, le=255)]
@@ -65,7 +65,7 @@ class ModbusGripperConfig(StrictModel):
 
 
 def _kind(gripper: Any) -> str:
-    """Return the tag of a gripper's model. Tags stand in brackets, so that they are left out of keys in messages."""
+    """Return the tag of a gripper's pydantic model. Tags are in brackets, so that error messages can leave them out."""
     by_modbus = "modbus" in gripper if isinstance(gripper, dict) else isinstance(gripper, ModbusGripperConfig)
     return "[modbus]" if by_modbus else "[io]"
 

@@ -13,7 +13,7 @@ def with_mount(text: str, side: str, position: Sequence[float], rpy: Sequence[fl
     """Return the YAML ``text`` of a cell with another ``arms.SIDE.mount`` [m, rad].
 
     Raises:
-        ConfigError: If the text does not have that mount as a block of its own.
+        ConfigError: If the text has no block for this mount, for example because the mount is an alias.
     """
     node: yaml.Node | None = yaml.compose(text, Loader=yaml.SafeLoader)
     for key in ("arms", side, "mount"):
@@ -36,7 +36,10 @@ def with_mount(text: str, side: str, position: Sequence[float], rpy: Sequence[fl
 
 
 def _child(node: yaml.Node | None, key: str) -> yaml.Node | None:
-    """Return the value of a mapping's ``key``; None if it stands elsewhere in the text, as that of an alias."""
+    """Return the value of a mapping's ``key``.
+
+    The result is None if there is no such key, or if its value is an alias, which stands elsewhere in the text.
+    """
     pairs = node.value if isinstance(node, yaml.MappingNode) else []
     return next(
         (value for name, value in pairs if name.value == key and value.start_mark.index >= name.end_mark.index), None

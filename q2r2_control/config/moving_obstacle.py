@@ -12,7 +12,7 @@ from q2r2_control.errors import ConfigError, check_kind, shown
 
 
 class MovingObstacle(ObstacleConfig):
-    """The shape and pose of an obstacle in the world, and the greatest speed of any of its points after this pose."""
+    """The shape and pose of an obstacle in the world, and how fast any of its points may move after this pose."""
 
     shape: Literal["box", "sphere", "capsule"]
     speed: float = Field(ge=0, le=10, description="largest speed of any of its points; 0: the obstacle stays [m/s]")
@@ -29,12 +29,15 @@ class MovingObstacle(ObstacleConfig):
 
     @property
     def slower(self) -> float:
-        """The difference between the greatest speed of its points and their speed now [m/s]."""
+        """The greatest speed of its points minus their present speed [m/s].
+
+        It is 0 if ``acceleration`` or ``speed_now`` is None.
+        """
         return 0.0 if self.acceleration is None or self.speed_now is None else self.speed - self.speed_now
 
     @property
     def rise(self) -> float:
-        """The least time in which its points can reach their greatest speed, more than 0 [s]."""
+        """The shortest time in which its points can reach their greatest speed [s]. It is always above 0."""
         return max(self.slower / (self.acceleration or 1.0), 1e-9)
 
     @model_validator(mode="after")
@@ -52,7 +55,7 @@ class ObstacleReport(NamedTuple):
 
 
 def check_obstacle(name: str, obstacle: MovingObstacle | None, names: Collection[str]) -> None:
-    """Raise :class:`ConfigError` for a name that is not in ``names``, or if ``obstacle`` has another type."""
+    """Raise :class:`ConfigError` if ``name`` is not in ``names``, or if ``obstacle`` is of a wrong type."""
     if not isinstance(name, str) or name not in names:
         allowed = ", ".join(names) or "none; control.moving_obstacles names them"
         raise ConfigError(f"moving obstacle {shown(name)}: allowed: {allowed}")

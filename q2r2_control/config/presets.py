@@ -25,7 +25,7 @@ class Hold(StrEnum):
     SILENCE = "silence"  # No messages. The controller then holds the arm by itself, and stops for an old target.
 
 
-# Limits of targets for controllers that have no limits.
+# Limits of targets for controllers that have no limits of their own.
 _CAREFUL = GuardSettings()
 # The built-in controller keeps its own limits, which are narrower. These limits only prevent jumps of a target.
 _WIDE = GuardSettings(
@@ -45,9 +45,11 @@ class Preset:
     lowest_rate: float = 50.0  # Below this rate, it stops or moves unevenly [Hz].
     hold: Hold = Hold.REPEAT
     guard: GuardSettings = _CAREFUL
-    output: str = "none"  # The kind of joint commands that cartesian_controller sends itself in mode filtered, if any.
-    zero_wrench: str | None = None  # Topic for a zero wrench. Without this message, the controller may push.
-    command_type: str | None = None  # Service that sets the type of targets. It is called at each start.
+    # The kind of joint commands that the node cartesian_controller sends in mode filtered; "none" if it sends none.
+    output: str = "none"
+    # Topic for a message with a zero wrench, without which the controller may push; None if it needs no such message.
+    zero_wrench: str | None = None
+    command_type: str | None = None  # Service that sets the type of targets, called at each start; None if none.
 
     @property
     def takes_targets(self) -> bool:
@@ -99,7 +101,7 @@ _ALL = (
     Preset(
         "lbr_position",
         "the first command equals the measured positions",
-        topic="{robot}/command/lbr_joint_position_command",  # Resolved in the node's namespace.
+        topic="{robot}/command/lbr_joint_position_command",  # The driver resolves its topic in its node's namespace.
         message="lbr_fri_idl/msg/LBRJointPositionCommand",
         rate=200.0,
         lowest_rate=100.0,
@@ -170,7 +172,7 @@ RAW_WARNING = "raw: no limits, no distances, no self-collision"
 
 
 def preset_of(name: str, mode: str) -> tuple[Preset, Mode]:
-    """Return preset and mode by their names; raises :class:`ConfigError` for names or pairs that are not allowed."""
+    """Return preset and mode by their names; raises :class:`ConfigError` if a name or their combination is refused."""
     preset = preset_called(name)
     if mode not in list(Mode):
         raise ConfigError(f"mode = {mode!r:.60}: allowed are {', '.join(Mode)}")

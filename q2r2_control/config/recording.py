@@ -111,7 +111,7 @@ class JudgeSettings(StrictModel):
     needs_end: bool = Field(True, description="files without an end, as after a killed process, are discarded")
 
 
-TOPIC_RATE = 100.0  # [Hz]
+TOPIC_RATE = 100.0  # Default rate of the standard topics in a recording [Hz].
 SubtaskName = Annotated[str, StringConstraints(pattern=r"^\S(.*\S)?$", max_length=200)]
 
 
@@ -136,7 +136,7 @@ def subtask_name(names: Sequence[str], number: int) -> str:
 
 
 def subtask_names(names: Sequence[str], presses: int) -> tuple[str, ...]:
-    """Return the names of the subtasks that an episode has begun, or nothing if the episode has no subtasks.
+    """Return the names of the subtasks that have begun in an episode; empty if the episode has no subtasks.
 
     ``names`` are those of ``recording.subtasks``, and ``presses`` is how often the operator began another subtask.
     """
@@ -147,9 +147,9 @@ def subtask_names(names: Sequence[str], presses: int) -> tuple[str, ...]:
 CameraName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z][A-Za-z0-9_]*$", max_length=40)]
 DeviceNumber = Annotated[int, Field(ge=0, le=255)]
 DeviceText = Annotated[LocalPath, Field(min_length=1, max_length=500)]
-_LEAST_DISTANCE = 1e-6  # [m]
-_PLACE = ("position", "look_at", "rpy")
-_OF_A_DEVICE = ("exposure", "rotation", "delay", "repeat", "depth")
+_LEAST_DISTANCE = 1e-6  # Least distance between a camera and the point that it looks at [m].
+_POSE_KEYS = ("position", "look_at", "rpy")  # Keys that only a simulated camera has.
+_DEVICE_KEYS = ("exposure", "rotation", "delay", "repeat", "depth")  # Keys that only a device has.
 REALSENSE = "realsense:"  # The beginning of the device of a RealSense camera, before its serial number.
 
 
@@ -208,17 +208,17 @@ class CameraConfig(StrictModel):
         if self.topic is not None and self.device is not None:
             raise ValueError("allowed: either topic or device")
         if self.device is None:
-            self._refuse(_OF_A_DEVICE, "with device, which is of a real camera")
+            self._refuse(_DEVICE_KEYS, "with device, which is of a real camera")
         if self.topic is not None:
-            self._refuse(("link", *_PLACE), "without topic, which is of a real camera")
+            self._refuse(("link", *_POSE_KEYS), "without topic, which is of a real camera")
         elif self.device is not None:
-            self._refuse(_PLACE, "without device, which is of a real camera")
+            self._refuse(_POSE_KEYS, "without device, which is of a real camera")
             if self.exposure is not None and self.device_kind != "v4l2":
                 raise ValueError("exposure: allowed: of a V4L2 device")
             if self.depth and self.device_kind != "realsense":
                 raise ValueError(f"depth: allowed: with device: {REALSENSE}SERIAL")
         else:
-            self._check_place()
+            self._check_pose()
         return self
 
     def _refuse(self, names: tuple[str, ...], allowed: str) -> None:
@@ -226,7 +226,7 @@ class CameraConfig(StrictModel):
         if given := [name for name in names if getattr(self, name) != default[name]]:
             raise ValueError(f"{', '.join(given)}: allowed: {allowed}")
 
-    def _check_place(self) -> None:
+    def _check_pose(self) -> None:
         if self.position is None:
             raise ValueError("allowed: position, or topic or device of a real camera")
         if (self.look_at is None) == (self.rpy is None):

@@ -15,10 +15,11 @@ _CHECKOUT = Path(__file__).resolve().parents[2]
 
 
 def resource_roots() -> Iterator[Path]:
-    """Yield the folders that can hold config/ and robots/, nearest first."""
+    """Yield the folders that can hold config/ and robots/, in the order in which they are searched."""
     yield _CHECKOUT
     installed = [Path(sysconfig.get_path("data", scheme)) for scheme in ("venv", "posix_user", "posix_prefix")]
-    # With pip --target, share/ is beside the package. With colcon, it is beside lib/ of lib/python3.x/site-packages.
+    # With pip --target, share/ is beside the package. With colcon, the package is in lib/python3.x/site-packages, and
+    # share/ is beside lib/.
     installed += [_CHECKOUT, *_CHECKOUT.parents[2:3]]
     yield from (root / "share" / "q2r2_control" for root in installed)
 
@@ -47,7 +48,7 @@ def find_resource(path: str | os.PathLike[str]) -> Path:
 
 
 def _shipped(wanted: Path) -> str:
-    """Return the shipped files of this kind, or the name that was probably meant."""
+    """Return the end of an error message: the name that was probably meant, or the shipped files of the same kind."""
     names = {
         f"{folder}/{file.name}"
         for root in resource_roots()

@@ -1,4 +1,4 @@
-"""The base of all settings."""
+"""The base class of all settings, and the error messages about settings that are not allowed."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from q2r2_control.errors import ConfigError, shown
 Model = TypeVar("Model", bound=BaseModel)
 
 
-# What is allowed instead of a value, by pydantic's type of the fault. Braces enclose values that pydantic adds to it.
+# What is allowed instead of a value, by pydantic's type of the fault. Braces enclose values that pydantic adds to the
+# fault.
 _ALLOWED = {
     "list_type": "a list such as [a, b]",
     "tuple_type": "a list such as [a, b]",
@@ -67,8 +68,8 @@ class StrictModel(BaseModel):
     def model_validate_json(cls, json_data: str | bytes | bytearray, **options: Any) -> Self:
         return validated(cls, f"{cls.__name__}: ", json_data, as_json=True, **options)
 
-    # By this attribute, pydantic recognises its own initialiser. It would call any other initialiser also for settings
-    # within settings, and an error from there could not name the full key.
+    # With this attribute, pydantic takes this initialiser for its own. Otherwise it would call the initialiser for
+    # settings within settings too, and an error that is raised there could not name the full key.
     __init__.__pydantic_base_init__ = True  # type: ignore[attr-defined]
 
     def __setattr__(self, name: str, value: object) -> None:
@@ -108,7 +109,7 @@ def config_error(
 
 
 def _key(fault: ErrorDetails) -> str:
-    # Parts in brackets are notes of pydantic: "[key]", and the tags of alternative models for a key's value.
+    # Parts in brackets are not keys: pydantic adds "[key]", and the tags of alternative models for a key's value.
     key = ".".join(str(part) for part in fault["loc"] if not str(part).startswith("["))
     return " ".join(key.split())[:300] or "(top level)"
 
@@ -124,14 +125,14 @@ def _line(fault: ErrorDetails, model: type[BaseModel]) -> str:
         keys = _keys_at(fault["loc"][:-1], model)
         meant = get_close_matches(str(fault["loc"][-1]), keys, n=1)
         allowed = f"unknown key; {f'did you mean {meant[0]}? ' if meant else ''}allowed here: {', '.join(keys)}"
-    # An unknown block is named by its key alone. For a known one, the text names the keys that do not fit together.
+    # If the value is a block, it is not shown. For a known block, the text names the keys that do not fit together.
     is_block = fault["type"] in ("value_error", "extra_forbidden") and isinstance(fault["input"], dict)
     value = "" if is_block else f" = {shown(fault['input'])}"
     return f"{key}{value}: {allowed}"
 
 
 def allowed_instead(fault: ErrorDetails) -> str:
-    """Return what is allowed instead of a value, in the words of this package if pydantic's kind of fault has some."""
+    """Return what is allowed instead of a value, in the words of ``_ALLOWED``, or otherwise in those of pydantic."""
     words = _ALLOWED.get(fault["type"])
     text = fault["msg"].removeprefix("Value error, ")
     return text if words is None else f"allowed: {words.format(**fault.get('ctx', {}))}"

@@ -15,7 +15,7 @@ from q2r2_control.config.strict import STREAM_TIMEOUT, StrictModel
 from q2r2_control.types import SIDES, Array, Interval
 
 _Scale = Annotated[float, Field(ge=0, le=10)]
-PRECISION_SCALE = 0.25
+PRECISION_SCALE = 0.25  # Default of the setting ``precision_scale``.
 _SIGNS = (("+", 1.0), ("-", -1.0))
 _ALLOWED = "three of +x -x +y -y +z -z that use x, y and z once each, e.g. [+z, -x, +y]"
 
@@ -37,11 +37,13 @@ def axes_matrix(axes: Sequence[str]) -> Array:
 
 
 class Stance(StrEnum):
-    """The operator's place, which decides which hand moves which arm."""
+    """Where the operator stands and looks. It decides which hand moves which arm."""
 
-    SIDE_BY_SIDE = "side_by_side"  # Beside the robot, facing the same way. The left hand moves the left arm.
-    MIRROR = "mirror"  # Facing the robot. The hands are swapped, and a motion keeps its direction in the world.
-    MIRROR_REFLECTED = "mirror_reflected"  # The hands are swapped, and the motion is reflected left to right.
+    # The operator looks in the same direction as the robot. The left hand moves the left arm.
+    SIDE_BY_SIDE = "side_by_side"
+    # The operator faces the robot. The left hand moves the right arm, and motions keep their direction in the world.
+    MIRROR = "mirror"
+    MIRROR_REFLECTED = "mirror_reflected"  # The hands are swapped too, but motions are reflected left to right.
 
     def hand_of(self, arm: str) -> str:
         """Return the hand that moves an arm."""
@@ -105,7 +107,7 @@ class LeashSettings(StrictModel):
     carried_angle: float = Field(0.1, ge=0.03, le=2, description="the same for the rotation of that frame [rad]")
 
     def carried(self) -> LeashSettings:
-        """Return the leash of the frame between two tools, which is not longer than that of a tool."""
+        """Return the leash of the frame between two tools that carry one object. It is at most as long as a tool's."""
         distance, angle = (math.inf if length is None else length for length in (self.distance, self.angle))
         shorter = {"distance": min(distance, self.carried_distance), "angle": min(angle, self.carried_angle)}
         return self.model_copy(update=shorter)

@@ -1,4 +1,4 @@
-"""YAML as text. With libyaml, it is read and written ten times as fast as by PyYAML alone."""
+"""Read and write YAML as text. With libyaml, this is ten times as fast as with PyYAML alone."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Collects the distances that the controller kept in one step of an environment, and why it did less than asked."""
+"""Collects the distances in one step of an environment, and why arms or grippers did less than was asked."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from q2r2_control.wording import sentence
 
 
 class StepPromises:
-    """A listener of a run. Call :meth:`begin` at the beginning of each step."""
+    """A listener of a run. Its caller calls :meth:`begin` at the start of each step of the environment."""
 
     def __init__(self) -> None:
         self._why: dict[str, str] = {}  # The reason of each arm's last event.

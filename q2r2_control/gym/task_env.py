@@ -32,7 +32,7 @@ from q2r2_control.types import Array, is_number
 
 CELL = "config/dual_iiwa7.yaml"
 _FRONT = CameraConfig(position=(1.9, 0.0, 1.0), look_at=(0.4, 0.0, 0.3), width=320, height=240)
-_REACH = 2.0  # The largest coordinate of a tool in the world [m].
+_LARGEST_COORDINATE = 2.0  # The largest absolute coordinate of a tool in the world, for the space of actions [m].
 
 _LOOP_RATES = 50.0, 1000.0  # The lowest and the highest rate of the control loop [Hz].
 
@@ -45,7 +45,7 @@ class TaskEnv(gymnasium.Env):
     Observations and actions have the numbers of the datasets' features, in their order. ``action_names`` has the names
     of the numbers of the ``space``, followed by the openings of grippers. An action is followed for 1 / ``rate`` [s],
     and the observation after n steps is frame n of a dataset at this rate. An untrained agent can move the arms in the
-    default space, ``action.tool_delta``. In the other spaces it would command jumps, which are refused.
+    default space, ``action.tool_delta``. In the other spaces, the agent would command jumps, which are refused.
 
     ``spread`` [m] is the largest random offset of the task's parts, along x and along y; the seed decides it. With
     ``pictures``, observations contain pictures of the cell's simulated cameras. If the cell has none, a camera in front
@@ -55,8 +55,8 @@ class TaskEnv(gymnasium.Env):
 
     No action breaks a limit or a distance. ``info["promises"]`` describes a step. ``nearest_distance`` [m] is the
     smallest distance of any pair, and ``nearest_pair`` is this pair. ``margin`` [m] is the smallest distance of a pair
-    minus its kept distance. ``certified`` is True if all ticks were. ``held_back`` says why arms or grippers did less
-    than was asked, and which limits were reached. ``info["measured"]`` has the figures of the judge, and
+    minus its kept distance. ``certified`` is True if all ticks had a certificate. ``held_back`` says why arms or
+    grippers did less than was asked, and which limits were reached. ``info["measured"]`` has the judge's figures, and
     ``info["reason"]`` says why the task is not done. A fault that stops the arms ends the episode, with its reason.
     """
 
@@ -76,8 +76,9 @@ class TaskEnv(gymnasium.Env):
     ) -> None:
         """Make the cell and its simulation.
 
-        Raises :class:`ConfigError` for an unknown task or space, a ``loop_rate`` that is not allowed, and a cell that
-        lacks a part of the task.
+        Raises:
+            ConfigError: For an unknown task or space, a ``loop_rate`` that is not allowed, and a cell that lacks a part
+                of the task.
         """
         config = cell if isinstance(cell, Config) else load_config(cell)
         if not config.simulated_cameras:
@@ -132,7 +133,7 @@ class TaskEnv(gymnasium.Env):
         return self._observed(), float(done), done or bool(fault), False, info
 
     def render(self) -> npt.NDArray[np.uint8] | None:
-        """Return the picture (height, width, 3) of the first camera; None without ``render_mode``."""
+        """Return the picture (height, width, 3), r g b, of the first camera; None if ``render_mode`` is None."""
         return None if self.render_mode is None else self._take([next(iter(self._config.simulated_cameras))])[0]
 
     def close(self) -> None:
@@ -182,7 +183,7 @@ class TaskEnv(gymnasium.Env):
         if self._policy.space is ActionSpace.JOINTS:
             low, high = robot.position_lower, robot.position_upper
         elif self._policy.space is ActionSpace.TOOL:
-            high = np.tile([_REACH] * 3 + [1.0] * 4, len(robot.arms))
+            high = np.tile([_LARGEST_COORDINATE] * 3 + [1.0] * 4, len(robot.arms))
             low = -high
         else:  # The largest allowed motion from one action to the next.
             most = min(gate.max_jump, gate.max_speed / self._rate) / math.sqrt(3.0)
@@ -205,7 +206,7 @@ class TaskEnv(gymnasium.Env):
 
 
 def _with_loop_rate(config: Config, rate: float) -> Config:
-    """Return the cell with another ``rate`` of its loop [Hz]. The controller does not cut longer ticks into steps."""
+    """Return the cell with another ``rate`` of its loop [Hz]. The controller does not split its ticks into substeps."""
     if not is_number(rate) or not _LOOP_RATES[0] <= rate <= _LOOP_RATES[1]:
         raise ConfigError(f"loop_rate = {shown(rate)}: allowed: {_LOOP_RATES[0]:g} to {_LOOP_RATES[1]:g} Hz, or None")
     control = config.control.model_copy(update={"max_substep": max(config.control.max_substep, 1.0 / rate)})

@@ -11,7 +11,7 @@ from pathlib import Path
 
 EVERY_NETWORK = ("", "0.0.0.0", "::")  # A server with one of these hosts listens on all networks.
 NO_NETWORK = "of this machine (it has no network now)"
-# Linux: requests about a network interface by its name, and flags of the interface's state.
+# Numbers of Linux: ioctl requests about the network interface with a given name, and flags of an interface's state.
 _GET_FLAGS, _GET_ADDRESS = 0x8913, 0x8915
 _UP, _LOOPBACK, _RUNNING = 0x1, 0x8, 0x40
 _IPV6_TABLE = Path("/proc/net/if_inet6")
@@ -33,7 +33,7 @@ def _way_out(family: socket.AddressFamily, elsewhere: str) -> str | None:
 
     The callers use addresses reserved for documentation (RFC 5737, RFC 3849), which belong to no computer.
     """
-    # To connect a UDP socket sends nothing. It only selects the route.
+    # Connecting a UDP socket sends no data. It only selects the route.
     with suppress(OSError), socket.socket(family, socket.SOCK_DGRAM) as probe:
         probe.connect((elsewhere, 9))
         return str(probe.getsockname()[0])
@@ -41,7 +41,7 @@ def _way_out(family: socket.AddressFamily, elsewhere: str) -> str | None:
 
 
 def _ipv4_addresses() -> Iterator[str]:
-    """Yield the address of each network interface that is connected."""
+    """Yield the IPv4 address of each network interface that is connected, except loopback."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asked:
         for _, name in socket.if_nameindex():
             request = struct.pack("16s24x", name.encode())
@@ -52,7 +52,10 @@ def _ipv4_addresses() -> Iterator[str]:
 
 
 def _ipv6_addresses() -> Iterator[str]:
-    """Yield the addresses with global scope. A link-local address needs the link's name, which a URL cannot have."""
+    """Yield the IPv6 addresses with global scope.
+
+    Link-local addresses are left out, because they need the link's name, which a URL cannot contain.
+    """
     with suppress(OSError):
         for line in _IPV6_TABLE.read_text().splitlines():
             digits, _, _, scope, flags, _ = line.split()

@@ -1,4 +1,4 @@
-"""Small assembly work of two hands, as way points. The hands pick up parts on the table of config/dual_iiwa7.yaml.
+"""Small assembly tasks for two hands, as way points. The parts lie on the table of config/dual_iiwa7.yaml.
 
 Nothing is corrected during the work. The positions of the parts are known, and each tool arrives as precisely as the
 robot follows the hand.
@@ -144,7 +144,13 @@ HANDOVER = HandWork(
         ),
         "right": (
             (3.4, *RIGHT_HOME),
-            (5.8, 0.46, -_OFF - _BACK_Y, 0.38 + _BACK_Z, *_RIGHT),  # At the place where the bar's right end will be.
+            (
+                5.8,
+                0.46,
+                -_OFF - _BACK_Y,
+                0.38 + _BACK_Z,
+                *_RIGHT,
+            ),  # Over the future position of the bar's right end.
             (6.8, 0.46, -_OFF - _BACK_Y, 0.38 + _BACK_Z, *_RIGHT),
             (8.0, 0.46, -_OFF, 0.38, *_RIGHT),
             (10.2, 0.46, -_OFF, 0.38, *_RIGHT),  # Grasp, and wait until the other hand has left.

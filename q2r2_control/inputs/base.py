@@ -128,7 +128,7 @@ def adapted(source: str, config: Config) -> Config:
 
 
 def make_input(source: Input | str, config: Config, **options: object) -> Input:
-    """Return the input of a name, or ``source`` itself if it is an input. Nothing is received before its ``start``.
+    """Return the input called ``source``, or ``source`` itself if it is an input. It receives nothing before ``start``.
 
     Args:
         source: The name of an installed input, such as ``headset``, or an object with all methods of :class:`Input`.

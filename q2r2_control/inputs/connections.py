@@ -31,7 +31,7 @@ KEEPALIVE_AFTER = 1.0  # The server sends a keepalive if it has sent nothing for
 # A driver that sends no whole frame for longer than this is dropped [s]. The app sends a keepalive after 1 s.
 SILENCE_ALLOWED = 2.0
 TURN = 0.05  # Longest wait for the network. Timeouts are checked this often [s].
-_RECEIVE_BYTES = 1 << 12  # Bytes to read at once: about 40 messages. Between two reads, the control loop can run.
+_RECEIVE_BYTES = 1 << 12  # Bytes to read at once, about 40 messages. The control loop can run between two reads.
 MAX_FRAMES_PER_SECOND = 2000  # The app sends about 450. More would take processor time from the control loop.
 
 _LOG = logging.getLogger("q2r2_control.inputs.headset")
@@ -52,7 +52,7 @@ class Client(Peer):
         self._frames = RateLimit(MAX_FRAMES_PER_SECOND)
 
     def receive(self, frame: WireFrame, now: float) -> Reception | None:
-        """Take one frame, and return the hand's message if the frame has one.
+        """Take one frame, and return the hand's message in it; None if the frame has no such message.
 
         Raises:
             ProtocolError: For bytes that the protocol does not allow, and for too many frames in a second.
@@ -73,7 +73,7 @@ class Handlers:
     admitted: Callable[[Client], None]  # Called when a client begins to drive.
     lost: Callable[[str], None]  # Called with the reason when the driver's connection has ended.
     receive: Callable[[Client, WireFrame, float], None]  # Takes a driver's frame and time [s]. May raise ProtocolError.
-    due: Callable[[], Iterable[HapticFeedback]]  # Returns the vibrations to send to the driver.
+    due: Callable[[], Iterable[HapticFeedback]]  # Returns the vibrations that have to be sent to the driver now.
 
 
 class Connections:
@@ -84,7 +84,7 @@ class Connections:
     ) -> None:
         self._door, self._allow, self._clock, self._handlers, self._log = door, allow, clock, handlers, door.log
         self._driver: Client | None = None
-        self._waiting: list[Client] = []  # In the order of their arrival.
+        self._waiting: list[Client] = []  # Clients that wait for a decision, in the order of their arrival.
         self._unwelcome: set[str] = set()  # Hosts outside ``allow`` that the log has already named.
         self._last_fault = ""
         self._waker, self._waiter = socket.socketpair()
@@ -102,11 +102,11 @@ class Connections:
 
     def serve(self) -> None:
         """Wait for the network once, for ``TURN`` at most, and handle all events."""
-        # All data that were sent before this time are read before the decisions about clients. Otherwise a client could
-        # count as silent after this thread, or the whole process, has stood still.
+        # All data that were sent before this time are read before the decisions about clients. Otherwise, after this
+        # thread or the whole process has stalled, a client could count as silent although it has sent data.
         asked = self._clock()
         self._watch_door(asked)
-        # A connection ends only in its own event or after this loop. No event can then belong to an ended connection.
+        # During this loop, only the event of a connection itself can end it. No event of an ended connection follows.
         for key, _ in self._selector.select(TURN):
             key.data()
         self._settle(asked)
@@ -133,9 +133,9 @@ class Connections:
             open_one.close()
 
     def _watch_door(self, now: float) -> None:
-        """Watch for new connections only while the rate allows some.
+        """Watch for new connections only while the limit of their rate allows one more.
 
-        Other connections wait in the kernel, which takes no time of this process.
+        Further connections wait in the kernel, which takes no time of this process.
         """
         watched = self._door.accepts.is_open(now)
         if watched and not self._door_watched:

@@ -7,8 +7,8 @@ import math
 from q2r2_control.inputs.way_points import LEFT_HOME, RIGHT_HOME, HandWork, WayPoint
 
 _TURN = 0.5 * math.pi  # With this turn, the fingers close along x [rad].
-_X, _Y, _HELD = 0.64, 0.10, 0.235  # Position x, y and z of the left tool at the tray's handle [m]. The right is at -y.
-_CARRIED = (_X - 0.115, _HELD + 0.11)  # x and z of both tools where the tray is carried to [m].
+_X, _Y, _HELD = 0.64, 0.10, 0.235  # Left tool at the tray's handle: x, y, z [m]. The right tool is at -y.
+_CARRIED = (_X - 0.115, _HELD + 0.11)  # Positions x and z of both tools at the end of the carry [m].
 
 
 def _at_handle(side: float) -> tuple[WayPoint, ...]:
@@ -57,8 +57,9 @@ CARRY = HandWork(
     engages=(14.4,),
 )
 
-_SPONGE_X, _SPONGE_Y, _SPONGE_HELD = 0.60, 0.42, 0.248
+_SPONGE_X, _SPONGE_Y, _SPONGE_HELD = 0.60, 0.42, 0.248  # Position x, y and z of the tool at the sponge [m].
 _WIPING = _SPONGE_HELD - 0.012  # Height of the tool while it wipes [m]. It is lower, so that the sponge is pressed.
+# Ends of the strokes: positions x and y of the tool [m].
 _STROKES = ((0.72, 0.42), (0.72, 0.39), (0.60, 0.39), (0.60, 0.36), (0.72, 0.36))
 WIPE = HandWork(
     duration=19.4,
@@ -86,7 +87,7 @@ WIPE = HandWork(
     presses={"left": (3.1, 16.7)},
 )
 
-_PEG, _HOLE = (0.60, -0.40), (0.66, -0.24)
+_PEG, _HOLE = (0.60, -0.40), (0.66, -0.24)  # Positions x and y of the peg and of the hole [m].
 _PEG_HELD = 0.265  # Height of the tool at the peg [m]. It is 30 mm above the middle of the peg, which is 70 mm long.
 _ON_TOP = _PEG_HELD + 0.04  # Height of the tool when the peg stands on the socket [m].
 # The search for the hole: turns of the spiral, its greatest radius [m], and depth of the target below ``_ON_TOP`` [m].
@@ -94,7 +95,10 @@ _TURNS, _WIDEST, _PRESSED = 4, 0.004, 0.005
 
 
 def _searching(begins: float, duration: float) -> tuple[WayPoint, ...]:
-    """Return way points on a spiral with light pressure, on which the peg finds the hole."""
+    """Return way points on a spiral, along which the peg is pressed lightly on the socket and finds the hole.
+
+    The spiral starts at the time ``begins`` [s], and takes ``duration`` [s].
+    """
     points, steps = [], 8 * _TURNS
     for i in range(steps + 1):
         angle, radius = 2.0 * math.pi * _TURNS * i / steps, _WIDEST * i / steps

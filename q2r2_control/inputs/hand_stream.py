@@ -22,7 +22,7 @@ class HandStream:
 
         Args:
             watch: Finds poses that must not be followed.
-            tell: Gets each message. Then no samples are queued for the loop.
+            tell: Gets each message. If it is given, no samples are queued for the loop.
         """
         self._watch, self._tell = watch, tell
         self._samples, self._tracker = SampleQueue(), HandTracker()
@@ -51,7 +51,7 @@ class HandStream:
 
     def lose(self, reason: str) -> None:
         """Note that the connection of the headset that drove is lost."""
-        # This comes before the peer changes. Otherwise `connected` could be True for the next headset too early.
+        # The cut comes before the peer changes. Otherwise `connected` could be True for the next headset too early.
         self._samples.cut()
         with self._lock:
             self.peer, self._last_disconnect = None, reason
@@ -72,7 +72,7 @@ class HandStream:
         return self._samples.take()
 
     def statistics(self, address: tuple[str, int], now: float) -> HeadsetStatistics:
-        """Return a snapshot for people, of a server at ``address``."""
+        """Return a snapshot for people at ``now`` [s]. ``address`` is the host and port of the server."""
         with self._lock:
             return HeadsetStatistics(
                 address=address,

@@ -25,7 +25,7 @@ _LOG = logging.getLogger(__name__)
 
 
 def watch_of(config: Config) -> HandsWatch:
-    """Return a watch for the faults of a headset's poses, with the settings of the cell."""
+    """Return an object that detects faults of a headset's poses, with the settings of the cell."""
     headset = config.headset
     return HandsWatch(headset.frozen_time, headset.watch_frame, config.teleop.gate.timeout)
 
@@ -39,8 +39,8 @@ class HeadsetServer:
     Args:
         host: The address to listen on.
         port: The port to listen on; 0 for any free port.
-        clock: Stamps the samples when their bytes are received [s].
-        listener: Gets each message at once, in the receiving thread. In this case, :meth:`poll` returns nothing.
+        clock: The clock of the samples' stamps, which are the times at which their bytes are received [s].
+        listener: Gets each message at once, in the receiving thread. If it is given, :meth:`poll` returns nothing.
         allow: The networks whose hosts may connect; None for all networks. If several clients connect,
             :func:`~q2r2_control.inputs.listener.decide` decides which one drives.
         watch: Finds poses that must not be followed.

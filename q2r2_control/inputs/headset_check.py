@@ -18,8 +18,8 @@ from q2r2_control.inputs.session import HAND_TOPICS, HeadsetStatistics
 from q2r2_control.types import SIDES, Array, HandSample
 
 SILENCE = 2.0  # Time without data before advice is given [s].
-_PERIOD = 0.05  # [s]
-_WINDOW = 0.5  # The movement during this time before now is put in words [s].
+_PERIOD = 0.05  # Time between two polls of the server [s].
+_WINDOW = 0.5  # The movement in the newest time span of this length is put in words [s].
 _STILL = 0.02  # A hand that has moved by less than this in the window counts as still [m].
 _DIRECTIONS = (("back -x", "forward +x"), ("right -y", "left +y"), ("down -z", "up +z"))
 
@@ -43,15 +43,15 @@ class HandMovement:
         if not self._positions:
             return "no data"
         with np.errstate(over="ignore"):
-            way = self._positions[-1][1] - self._positions[0][1]
-        axis = int(np.abs(way).argmax())
-        if not np.abs(way[axis]) >= _STILL:
+            displacement = self._positions[-1][1] - self._positions[0][1]
+        axis = int(np.abs(displacement).argmax())
+        if not np.abs(displacement[axis]) >= _STILL:
             return "still"
-        return _DIRECTIONS[axis][int(way[axis] > 0)]
+        return _DIRECTIONS[axis][int(displacement[axis] > 0)]
 
     @property
     def position(self) -> Array | None:
-        """The newest position of the window (3,) [m]; None without data."""
+        """The hand's newest position in the world's axes (3,) [m]; None if no sample came in the last half second."""
         return self._positions[-1][1] if self._positions else None
 
 
@@ -77,6 +77,8 @@ class HandWatch(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class HeadsetCheck:
+    """What is known about a headset's data at one time."""
+
     statistics: HeadsetStatistics
     directions: dict[str, str]  # Direction of movement by hand, in words.
     positions: dict[str, Array | None]  # Position in the world frame (3,) [m], by hand; None without data.
@@ -109,7 +111,10 @@ def watch_headset(
     stopping: Callable[[], bool],
     watch: HandWatch,
 ) -> HeadsetCheck:
-    """Watch a started server for ``duration`` [s] or until ``stopping``. Show each state, and return the last one."""
+    """Watch a started server for ``duration`` [s] or until ``stopping()`` is True; None for no bound on the time.
+
+    Each state of the check is passed to ``show``, and the last one is returned.
+    """
     hands = {hand: HandMovement(config.teleop.axes) for hand in SIDES}
     start, heard = time.monotonic(), False
     last_data = dict.fromkeys(needed_topics(config), start)

@@ -52,7 +52,7 @@ class RateLimit:
 
 @dataclass
 class _Host:
-    since: float  # Time of the last line about this host [s].
+    since: float  # Time at which the last line about this host was written [s].
     level: int = 0  # Highest level of the lines that are held back.
     text: str = ""  # The newest line of this level that is held back.
     held_back: int = 0  # Number of lines that are held back.
@@ -61,8 +61,8 @@ class _Host:
 class HostLog:
     """Writes at most one line a second about each host.
 
-    A line that comes too early is held back. When the second is over, the newest line of the highest level is written,
-    with the number of the lines that are left out.
+    A line that comes too early is held back. When the second is over, the newest of the held lines with the highest
+    level is written, with the number of the lines that are left out.
     """
 
     def __init__(self, logger: logging.Logger) -> None:
@@ -70,7 +70,7 @@ class HostLog:
         self._hosts: dict[str, _Host] = {}
 
     def write(self, host: str, level: int, text: str, now: float) -> None:
-        """Write a line about ``host``, or hold it back. The ``level`` is one of ``logging``."""
+        """Write a line about ``host``, or hold it back. ``level`` is a level of the package ``logging``."""
         self.flush(now)
         if host not in self._hosts and len(self._hosts) >= MAX_HOSTS_NAMED:
             host = _OTHERS
@@ -97,16 +97,16 @@ class HostLog:
         self._logger.log(level, "%s", text)  # The text is no format string, since it may contain words of a client.
 
 
-# To accept a connection occupies the interpreter for about 0.1 ms, and the control loop cannot run meanwhile. At the
-# following rate, a client in the kernel's queue of 128 waits 0.35 s at most. If the queue is full, the kernel drops new
-# clients, and a client tries again after 1 s.
+# Accepting a connection occupies the interpreter for about 0.1 ms, and the control loop cannot run meanwhile. At the
+# following rate, a client in the kernel's queue of 128 waits 0.35 s at most. If the queue is full, the kernel drops a
+# new client, which tries again after 1 s.
 ACCEPTS, ACCEPTS_PERIOD = 20, 0.05  # At most this many connections are accepted in this period [s].
 ANSWERS_PER_SECOND = 10  # Greatest number of answers to one host in a second. The app connects once a second.
 _RESET = struct.pack("ii", 1, 0)  # SO_LINGER: close with a reset, which leaves nothing behind in the kernel.
 
 
 class TcpListener:
-    """Listens on ``host`` and ``port``. Raises OSError, OverflowError or ValueError if that is not possible.
+    """Listens on ``host`` and ``port``; raises OSError, OverflowError or ValueError if they cannot be bound.
 
     If a host connects more than ``ANSWERS_PER_SECOND`` times in a second, its further connections are closed without an
     answer, because this takes the least time.
@@ -115,7 +115,7 @@ class TcpListener:
     def __init__(self, host: str, port: int, log: HostLog) -> None:
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         both = family == socket.AF_INET6 and socket.has_dualstack_ipv6()
-        self._socket = socket.create_server((host, port), family=family, dualstack_ipv6=both)  # Sets SO_REUSEADDR.
+        self._socket = socket.create_server((host, port), family=family, dualstack_ipv6=both)  # It sets SO_REUSEADDR.
         self._socket.setblocking(False)
         self.port = int(self._socket.getsockname()[1])  # The port that was bound.
         self.log = log
@@ -209,12 +209,12 @@ def is_loopback(host: str) -> bool:
         return host == "localhost"
 
 
-# Rules 1 to 4 are in docs/headset.md, "Who drives". A driver that sends no frames gives way only to its own host, after
-# 37 periods of the app's poses. That is more than three times the time after which the arms pause. Without this rule, a
-# headset whose link was lost without a message could not drive again for seconds.
-# A driver without a frame for longer than this gives way to a new connection of the same headset [s].
+# Rules 1 to 4 are in docs/headset.md, "Who drives". A driver that sends no frames is replaced after 37 periods of the
+# app's poses, but only by a client of its own host. That is more than three times the time after which the arms pause.
+# Without this rule, a headset whose connection was lost without a message could not drive again for seconds.
+# A driver without a frame for longer than this is replaced by a new connection of the same headset [s].
 QUIET_ALLOWED = 0.5
-# A driver without a hand pose for longer than this gives way to a client that sends poses [s].
+# A driver without a hand pose for longer than this is replaced by a client that sends poses [s].
 POSES_ALLOWED = 5.0
 WAIT_ALLOWED = 2.0  # A newcomer that may not drive after this time is refused [s].
 
@@ -235,6 +235,8 @@ SomePeer = TypeVar("SomePeer", bound=Peer)
 
 
 class Admission(Enum):
+    """A decision about a client that does not drive."""
+
     ADMIT = "admit"  # The client drives from now on, instead of the driver if there is one.
     WAIT = "wait"  # The client may stay until more is known about it. None of its data is used.
     REFUSE = "refuse"
@@ -244,7 +246,8 @@ def decide(driver: Peer | None, newcomer: Peer, now: float) -> tuple[Admission, 
     """Decide about ``newcomer`` at ``now`` [s] by rules 2 to 4.
 
     Returns:
-        The decision, and why the newcomer or, if it is admitted, the ``driver`` has to leave; empty if nobody has to.
+        The decision, and a reason. The reason says why a refused newcomer, or the ``driver`` that an admitted newcomer
+        replaces, has to leave. It is empty if no client has to leave.
     """
     if driver is None:
         return Admission.ADMIT, ""

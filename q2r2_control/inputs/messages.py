@@ -49,7 +49,10 @@ class MessageType(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class HandPose:
-    """A hand's pose as it was sent: nothing is normalised, restamped or renamed. An identity rotation has w = -1."""
+    """A hand's pose as it was sent: nothing is normalised, restamped or renamed.
+
+    For the identity rotation, the app sends w = -1.
+    """
 
     position: Array  # (3,) [m]
     quaternion: Array  # (4,) x y z w
@@ -59,6 +62,8 @@ class HandPose:
 
 @dataclass(frozen=True, slots=True)
 class HandTwist:
+    """A hand's velocity as it was sent."""
+
     linear: Array  # (3,) [m/s]
     angular: Array  # (3,) [rad/s]
 
@@ -91,7 +96,8 @@ def decode(kind: MessageType, payload: bytes, dialect: Dialect) -> HandMessage:
     """Read a message: a pose, a twist, or the inputs of a hand. Its numbers may have any value, also NaN.
 
     Raises:
-        ProtocolError: If a length, an encapsulation, a boolean or a string is not one of ``kind`` in ``dialect``.
+        ProtocolError: If a length, an encapsulation, a boolean or a string cannot be that of a message of ``kind`` in
+            ``dialect``.
     """
     _check_bytes(kind, payload, dialect)
     store = message_types(dialect)
@@ -173,12 +179,14 @@ def _vector(message: Any) -> Array:
     return np.array([message.x, message.y, message.z])
 
 
-# A hand message has under 200 bytes. If a frame seems longer than this, its start was read at a wrong place.
+# A hand message has under 200 bytes. If a frame seems longer than this, the stream was read from a wrong position.
 MAX_FRAME_BYTES = 1 << 20
 KEEPALIVE = bytes(8)  # A frame without destination and payload.
 
 
 class WireFrame(NamedTuple):
+    """One frame of the stream."""
+
     destination: str
     payload: bytes
     terminated: bool  # Whether the destination came with a trailing NUL.

@@ -1,4 +1,4 @@
-"""Detect that the frame in which the hands' poses are measured has moved, and not the hands.
+"""Detect that the coordinate frame of the measured hand poses has moved, and not the hands.
 
 A frame moves in one step if the headset is recentred. The motion lasts longer if something carries the frame along,
 such as the operator's head. In both cases the two hands seem to move as one rigid body, and no arm may follow this
@@ -18,7 +18,7 @@ import pinocchio as pin
 from q2r2_control.inputs.messages import HandPose
 from q2r2_control.types import SIDES, Array, HandInputs
 
-_FARTHEST = 1e3  # Greatest coordinate. No tracking system reaches as far [m].
+_FARTHEST = 1e3  # Greatest allowed coordinate of a hand. No tracking system measures so far [m].
 
 
 class Move(NamedTuple):
@@ -36,7 +36,7 @@ class Place(NamedTuple):
 
     @classmethod
     def of(cls, pose: HandPose) -> Place | None:
-        """Return the pose with a rotation matrix; None if the numbers of ``pose`` are not a pose."""
+        """Return the pose with a rotation matrix; None if the numbers in ``pose`` cannot be a pose."""
         length = math.sqrt(float(pose.quaternion @ pose.quaternion))
         if not 0.5 <= length <= 2.0 or not float(np.abs(pose.position).max()) <= _FARTHEST:
             return None
@@ -44,14 +44,14 @@ class Place(NamedTuple):
 
 
 class HandPair(NamedTuple):
-    """Both hands at one time, and the quantities that stay the same if both hands move as one rigid body."""
+    """The poses of both hands at one time, and the quantities that do not change if they move as one rigid body."""
 
     t: float  # [s]
     left: Place
     right: Place
-    seen: Array  # (3,) The right hand's position in the left hand's axes [m].
+    seen: Array  # (3,) Vector from the left to the right hand, in the left hand's axes [m].
     apart: float  # Distance between the hands [m].
-    turn: Array  # (3, 3) The right hand's rotation in the left hand's axes.
+    turn: Array  # (3, 3) Rotation of the right hand's axes in the left hand's axes.
 
     @classmethod
     def of(cls, t: float, left: Place, right: Place) -> HandPair:
@@ -60,13 +60,14 @@ class HandPair(NamedTuple):
 
 
 def moved_as_one(before: HandPair, after: HandPair, tolerance: Move) -> bool:
-    """Return whether the hands' distance, relative rotation and relative direction are the same in both pairs.
+    """Return whether the hands can have moved as one rigid body between two times.
 
-    They are the same after the two hands have moved as one rigid body.
+    If they have, their distance, their relative rotation and the vector between them are the same ``before`` and
+    ``after``, up to the ``tolerance``.
 
-    If one hand's measured rotation has an error of the tolerance's angle, the other hand seems to move in its axes, by
-    this angle times the distance between the hands. The bound on ``seen`` contains this motion. Without it, less noise
-    of the rotation would be allowed than the tolerance says.
+    If the left hand's measured rotation has an error of the tolerance's angle, the right hand seems to move in the left
+    hand's axes, by this angle times the distance between the hands. The bound on ``seen`` includes this motion.
+    Otherwise less noise of the rotation would be allowed than the tolerance says.
     """
     shift = math.dist(after.seen, before.seen)
     if (
@@ -81,27 +82,29 @@ def moved_as_one(before: HandPair, after: HandPair, tolerance: Move) -> bool:
 # _STANDS_OUT times each of the last _BEFORE motions. From rest, this is 0.7 m/s within one sample: over 30 m/s^2.
 _STEP = Move(0.010, math.radians(2.0))
 _STANDS_OUT, _BEFORE = 3.0, 4
-_PERIOD = 1.0 / 72.0  # Period of samples [s]. Samples come closer together if one was delayed on the way.
+_PERIOD = 1.0 / 72.0  # Period of samples [s]. The time between two samples is shorter if the first one was delayed.
 _STEP_TOLERANCE = Move(0.002, math.radians(0.75))
-# From rest, hands that accelerate at 20 m/s^2 and 70 rad/s^2 move by _STEP in this time [s]. In a longer gap between
-# two samples they may move farther, by the square of the ratio of both times.
+# From rest, hands that accelerate at 20 m/s^2 and 70 rad/s^2 move by _STEP in this time [s]. If the time between two
+# samples is longer, the allowed motion grows with the square of the ratio of both times.
 _STEP_GAP = 0.032
 # The next constants concern a frame that is carried along.
 _WINDOW = 1.5  # Duration of the recent motion that is judged [s].
-_CARRIED = 0.15  # Least distance that both hands move [m].
-_NEAR = 0.4 * _CARRIED  # A left hand that stays within this distance is not carried along [m].
+_CARRIED = 0.15  # Least distance that both hands have to move [m].
+_NEAR = 0.4 * _CARRIED  # If the left hand stays this near to one position, it is not carried along [m].
 _CARRIED_TOLERANCE = Move(0.001, math.radians(0.5))
 _SAME_TIME = 0.01  # Messages of the two hands within this time belong together [s].
 _ALIVE = 0.05  # A pose does not wait for the other hand if that hand has had no pose for longer than this [s].
-_LONGEST_GAP = 0.15  # Motion across a longer gap between two poses of a hand is not judged [s].
-# A moved frame counts as a fault only after this delay [s]. If the operator has aligned the frame, the message of the
-# buttons may come after the poses.
+_LONGEST_GAP = 0.15  # The motion between two poses of a hand is not judged if the time between them is longer [s].
+# A moved frame counts as a fault only after this delay [s]. If the operator has aligned the frame, the message with the
+# pressed buttons may come after the first poses in the new frame.
 _CHORD_TIME = 0.04
-# A pose within this time after the buttons of an alignment is dropped, so that the receiver gets the buttons first [s].
+# A pose within this time after the press of an alignment is dropped, so that the receiver gets the buttons first [s].
 _CHORD_SEEN = 0.01
 
 
 class PoseVerdict(Enum):
+    """What the receiver of a pose has to do with it."""
+
     FOLLOW = "as it is"
     WAIT = "not before the other hand's next pose has come"
     DROP = "nobody needs to see it: what it means is told soon"
@@ -114,16 +117,18 @@ class MovedFrame:
     def __init__(self, fault_time: float) -> None:
         """Make a detector. After the frame has moved, each pose has a fault for ``fault_time`` [s]."""
         self._fault_time = fault_time
-        self._chords: dict[str, float] = {}  # Since when a hand has held both buttons, to align the frame, by hand [s].
+        # For each hand that holds both buttons to align the frame, the time since which it holds them [s].
+        self._chords: dict[str, float] = {}
         self.reset()
 
     def reset(self) -> None:
         """Forget everything that was received, except which hand holds the buttons of an alignment."""
-        self._ways = {hand: _Way() for hand in SIDES}
+        self._motions = {hand: _HandMotion() for hand in SIDES}
         self._pairs: deque[HandPair] = deque()
-        # The left hand has stayed within _NEAR of its position in this pair ever since. Set if there are pairs.
+        # Since this pair, the left hand has stayed within _NEAR of its position in the pair. It is set if ``_pairs`` is
+        # not empty.
         self._near: HandPair
-        self._suspected: float | None = None  # When a step of the frame was detected that may be an alignment [s].
+        self._suspected: float | None = None  # When a step was detected that may be an alignment [s]; None if not so.
         self._bad_until = -math.inf  # Until this time, poses have a fault [s].
 
     def take_inputs(self, hand: str, inputs: HandInputs, now: float) -> None:
@@ -135,30 +140,31 @@ class MovedFrame:
             self._chords.pop(hand, None)
 
     def receive(self, hand: str, pose: HandPose, now: float) -> PoseVerdict:
+        """Take a pose of ``hand`` that was received at ``now`` [s], and return what to do with it."""
         place = Place.of(pose)
         if self._chords or place is None:
-            self._ways[hand] = _Way()
+            self._motions[hand] = _HandMotion()
             just_now = now - min(self._chords.values(), default=-math.inf) < _CHORD_SEEN
             return PoseVerdict.DROP if just_now else PoseVerdict.FOLLOW
-        way, other = self._ways[hand], self._ways["right" if hand == "left" else "left"]
-        if not way.add(place, now):
+        motion, other = self._motions[hand], self._motions["right" if hand == "left" else "left"]
+        if not motion.add(place, now):
             self._pairs.clear()
         other.is_new = other.is_new and now - other.stamp <= _SAME_TIME
-        if other.is_new:  # The other hand's pose belongs to this one.
-            way.is_new = other.is_new = False
-            self._judge(HandPair.of(now, *(self._ways[side].place for side in SIDES)), now)
+        if other.is_new:  # The other hand's pose was received at nearly the same time.
+            motion.is_new = other.is_new = False
+            self._judge(HandPair.of(now, *(self._motions[side].place for side in SIDES)), now)
         if self._suspected is not None:
             if now - self._suspected < _CHORD_TIME:
                 return PoseVerdict.DROP
             self._suspected, self._bad_until = None, now + self._fault_time
         if now < self._bad_until:
             return PoseVerdict.FAULT
-        waits = way.stands_out and way.is_new and now - other.stamp < _ALIVE
+        waits = motion.stands_out and motion.is_new and now - other.stamp < _ALIVE
         return PoseVerdict.WAIT if waits else PoseVerdict.FOLLOW
 
     def _judge(self, pair: HandPair, now: float) -> None:
         pairs = self._pairs
-        steps = pairs and all(way.stands_out for way in self._ways.values())
+        steps = pairs and all(motion.stands_out for motion in self._motions.values())
         if steps and moved_as_one(pairs[-1], pair, _STEP_TOLERANCE):
             self._suspected = now if self._suspected is None else self._suspected
             pairs.clear()
@@ -176,7 +182,7 @@ class MovedFrame:
             pairs.clear()
 
 
-class _Way:
+class _HandMotion:
     """The recent motion of one hand."""
 
     place: Place  # The newest pose. It is set when the first pose is added.
@@ -188,7 +194,7 @@ class _Way:
         self._moves: deque[Move] = deque(maxlen=_BEFORE)
 
     def add(self, place: Place, now: float) -> bool:
-        """Add the newest pose. Return whether it continues the motion, without a long gap."""
+        """Add a pose that came at ``now`` [s]. Return whether it follows the pose before without a long gap in time."""
         gap = now - self.stamp
         goes_on = gap <= _LONGEST_GAP
         if goes_on:
@@ -215,10 +221,10 @@ def _carried(pairs: deque[HandPair]) -> bool:
     for pair in list(pairs)[-2::-1]:
         if not moved_as_one(pair, newest, _CARRIED_TOLERANCE):
             return False
-        ways = (
+        distances = (
             math.dist(pair.left.position, newest.left.position),
             math.dist(pair.right.position, newest.right.position),
         )
-        if min(ways) > _CARRIED:
+        if min(distances) > _CARRIED:
             return True
     return False

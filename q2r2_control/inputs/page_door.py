@@ -23,7 +23,7 @@ _PORT = re.compile(r":\d{1,5}$")
 def text_response(status: http.HTTPStatus, text: str, kind: str = "text/plain") -> Response:
     body = text.encode()
     headers = Headers({"Content-Type": f"{kind}; charset=utf-8", "Content-Length": str(len(body))})
-    headers["X-Frame-Options"] = "DENY"  # A page around this one could steal a click.
+    headers["X-Frame-Options"] = "DENY"  # A foreign page that contains this page could steal a click.
     return Response(status.value, status.phrase, headers, body)
 
 

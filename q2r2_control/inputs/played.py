@@ -1,4 +1,4 @@
-"""Play hands whose poses and buttons are functions of time. They are the same in every run."""
+"""Play the motion of hands whose poses and buttons are functions of time. The samples are the same in every run."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ _ROTATION_NOISE = math.radians(0.03)  # Standard deviation of the noise about ea
 
 
 class SampleTiming(ABC):
-    """When the samples of one hand are measured, with what noise, and when they are received.
+    """The times at which the samples of one hand are measured, their noise, and the times at which they are received.
 
-    The caller takes the next of the ``times``, then calls ``measured`` once, and then ``lateness`` once.
+    For each sample, the caller takes the next of the ``times``, then calls ``measured`` once, and ``lateness`` once.
     """
 
     @abstractmethod
@@ -53,7 +53,7 @@ class EvenSampling(SampleTiming):
 
 
 class HeadsetSampling(SampleTiming):
-    """Samples as of a headset: at an uneven rate of 72-76 Hz, received late, and with sensor noise.
+    """Samples like those of a headset: at an uneven rate of 72-76 Hz, received late, and with sensor noise.
 
     Args:
         hand: The hand. Each hand has other random numbers.
@@ -79,7 +79,7 @@ class HeadsetSampling(SampleTiming):
         self._lost = lost
         self._random = np.random.default_rng([seed, SIDES.index(hand)])
         self._position_noise, self._dropout_probability = position_noise, dropout_probability
-        # The sum of two tones per degree of freedom rises and falls in amplitude, like a real tremor.
+        # In each degree of freedom, the amplitude of a sum of two sines rises and falls, like that of a real tremor.
         self._frequencies = self._random.uniform(*((5.5, 6.5) if shaky else (8.0, 12.0)), (6, 2))
         self._phases = self._random.uniform(0.0, 2.0 * math.pi, (6, 2))
         self._amplitudes = (1.0 if shaky else 0.5) * tremor * np.array([1e-3] * 3 + [math.radians(0.3)] * 3)
@@ -105,15 +105,17 @@ class HeadsetSampling(SampleTiming):
         return min(float(self._random.exponential(_RECEIPT_JITTER)), 0.01)
 
 
-HandPose = Callable[[str, float], pin.SE3]  # Hand, time since the first poll [s] -> pose in the input's frame.
-HandButtons = Callable[[str, float], HandInputs]  # Hand, time since the first poll [s] -> buttons.
+# Functions of a hand and of the time since the first poll [s]. They return the hand's pose in the input's frame, or its
+# buttons.
+HandPose = Callable[[str, float], pin.SE3]
+HandButtons = Callable[[str, float], HandInputs]
 
 # If the input is not polled for longer than this, the motion waits for the next poll [s].
 _LONGEST_BACKLOG = 1.0
 
 
 class PlayedInput:
-    """Gives samples of hands that move as given functions of time say. The time starts at the first poll.
+    """Gives samples of hands whose poses and buttons are given functions of time. The time starts at the first poll.
 
     Implements :class:`Input`.
     """
@@ -142,7 +144,7 @@ class PlayedInput:
         """Do nothing, since played hands have no vibration."""
 
     def hand_pose(self, hand: str, t: float) -> pin.SE3:
-        """Return the ideal pose of ``hand`` at ``t`` [s] on the clock of the stamps.
+        """Return the pose of ``hand``, without noise, at ``t`` [s] on the clock of the stamps.
 
         Before any poll, ``t`` is the time since the first poll.
         """
@@ -176,7 +178,7 @@ class PlayedInput:
         return min((sample.pose_stamp for sample in self._next), default=math.inf)
 
     def _samples(self, hand: str, sampling: SampleTiming) -> Iterator[HandSample]:
-        """Yield samples whose stamps are times of receipt since the first poll [s]."""
+        """Yield samples whose stamps are their times of receipt, counted from the first poll [s]."""
         for t in sampling.times():
             pose = sampling.measured(self._pose(hand, t), t)
             due, quaternion = t + sampling.lateness(), pin.Quaternion(pose.rotation).coeffs()

@@ -1,8 +1,8 @@
 """An input whose data are the actions of a policy. The actions have the same form as in a dataset.
 
-An action has the same numbers as a feature of datasets, in the same order; see :class:`ActionSpace`. The policy's own
-thread checks them, and converts joint positions to tool poses. The teleop layer follows these poses as it follows a
-hand.
+An action has the same numbers as a feature of datasets, in the same order; see :class:`ActionSpace`. The thread that
+sends actions also checks them, and converts joint positions to tool poses. The teleop layer follows these poses as it
+follows a hand.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ from q2r2_control.types import POSE_FIELDS, QUEST_CONTROLS, ActionChunk, Array, 
 
 MOTION_FIELDS = ("x", "y", "z", "rx", "ry", "rz")
 _GAPS = 0.002, 0.5  # Least and greatest time from one action to the next [s].
-_MOST = 1000  # Greatest number of actions in a chunk.
+_MOST = 1000  # Greatest number of actions that may be sent at once.
 _NO_OPERATOR = replace(QUEST_CONTROLS, words=replace(QUEST_CONTROLS.words, nobody="a policy moves the arms"))
 _KEPT = 20  # Number of chunks that are kept between two ticks. If more come, the newest ones are kept.
-_JOINED = 1.0  # When the run ends, a policy that still computes is waited for, for this time [s].
+_JOINED = 1.0  # Longest time that the end of a run waits for a policy that still computes [s].
 
 
 class ActionSpace(StrEnum):
@@ -74,19 +74,20 @@ class PolicyInput:
 
     Args:
         policy: A function of an :class:`Observation` that returns the next actions, (n, size) or (size,). The first
-            action is for the observation's time. The function runs on a thread of its own, and is called again when
-            half of its actions are over. In simulated time, the loop waits for it. Without a policy, a program calls
-            :meth:`send` itself, from any thread.
+            action is for the observation's time. The function runs in a thread of its own, and is called again when
+            half of its actions are over. In simulated time, the loop waits for its result. Without a policy, a program
+            calls :meth:`send` itself, from any thread.
         space: The space of the actions; None for the policy's attribute ``space``, or joints if it has none.
         rate: The rate of the actions [Hz]; None for the policy's attribute ``rate``, or 30 Hz if it has none.
-        operator: An input whose hands take over. A press engages an arm, and the next press gives it back.
+        operator: An input whose hands take over arms. A press takes over an arm, and the next press gives it back to
+            the policy.
 
     Raises:
         ConfigError: If the space, the rate, the policy or the operator is not allowed.
     """
 
     options = ("policy", "takeover", "fast", "say")
-    simulated = True  # With an operator, only if the operator's input is simulated too.
+    simulated = True  # With an operator, simulated time is possible only if the operator's input is simulated too.
 
     def __init__(
         self,
@@ -197,7 +198,7 @@ class PolicyInput:
     def send(self, actions: npt.ArrayLike, times: npt.ArrayLike | None = None, names: Sequence[str] = ()) -> None:
         """Send actions (n, size), or one action (size,). From the first action's time on, they replace earlier actions.
 
-        The method never raises. Actions that cannot be used stop the arms, with a line that says why.
+        The method never raises. Actions that cannot be used stop the arms, with a reason that the run shows.
 
         Args:
             actions: The numbers of the actions.
@@ -310,9 +311,12 @@ class PolicyInput:
 
 
 def _loaded(where: str, named: str) -> Policy:
-    """Return the policy at "module:name", from this folder or installed; raises :class:`ConfigError` without one.
+    """Return the policy "module:name" of a module that is installed or in the working directory.
 
-    Error messages begin with ``named``, which is what the command line calls the policy.
+    Error messages begin with ``named``, such as the option that names the policy.
+
+    Raises:
+        ConfigError: If there is no such policy.
     """
     check_kind(named, where, str, "MODULE:NAME")
     module, _, name = where.partition(":")

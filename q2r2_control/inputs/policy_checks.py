@@ -39,9 +39,9 @@ def check_finite(values: Array, names: Sequence[str]) -> None:
 
 
 def check_names(names: Sequence[str], expected: Sequence[str], grippers: Sequence[str]) -> None:
-    """Raise :class:`UnusableError` unless ``names`` are all ``expected`` names, and then none or some of ``grippers``.
+    """Raise :class:`UnusableError` if ``names`` have to be refused.
 
-    The order of both has to be kept.
+    All ``expected`` names have to come first, in their order. Any of ``grippers`` may follow, in their order.
     """
     for place, name in enumerate(expected):
         if place >= len(names) or names[place] != name:
@@ -60,7 +60,7 @@ class PolicyErrors:
 
     def show(self, error: BaseException) -> None:
         """Log ``error`` with its traceback, unless this type was logged from the same line before."""
-        own = error.__traceback__  # Its first stack frame is the caller of the policy, which is left out.
+        own = error.__traceback__  # The first stack frame is left out, because it is the caller of the policy.
         trace = None if own is None else own.tb_next
         frames = traceback.extract_tb(trace)
         place = f"{type(error).__name__} {[(frame.filename, frame.lineno) for frame in frames[-1:]]}"

@@ -27,7 +27,7 @@ class HandTracker:
     def update(self, hand: str, message: HandMessage, now: float, fault: HandFault | None = None) -> HandSample | None:
         """Return the sample after ``message`` was received at ``now`` [s]; None before the first pose and for a twist.
 
-        ``fault`` is the fault of the pose in ``message``.
+        ``fault`` is the fault of the pose in ``message``; None if it has none.
         """
         if isinstance(message, HandPose):
             self._poses[hand] = (message, now, fault)
@@ -78,22 +78,24 @@ class SampleQueue:
             self._takes_owed = 2
 
 
-# A pose that stays the same for this long is frozen [s]. A headset sends 37 samples meanwhile, and noise changes each.
+# A pose that stays the same for this long is frozen [s]. In this time, a headset sends 37 poses, all changed by noise.
 FROZEN_TIME = 0.5
 
 
 class Watched(NamedTuple):
+    """A message after the check of its pose."""
+
     reception: Reception
     stamp: float  # Time of receipt [s].
-    fault: HandFault | None = None  # The fault of a pose.
+    fault: HandFault | None = None  # The fault of the message's pose; None if there is none.
 
 
 class HandsWatch:
     """Finds poses of real hands that must not be followed: frozen poses, and poses after their frame has moved.
 
     Sensor noise changes each pose of a hand at rest, so a pose that stays the same is a copy of an old one. After the
-    frame has moved, poses are faulty for twice ``timeout``. A receiver that leaves faulty poses out then has no pose
-    for long enough to stop its arm. Only a pose after an unusually large step may be delayed, because it may wait for
+    frame has moved, poses are faulty for twice ``timeout``. For a receiver that leaves faulty poses out, this is long
+    enough to stop its arm. Poses are passed on without delay. Only a pose after an unusually large step may wait for
     the other hand's pose.
     """
 

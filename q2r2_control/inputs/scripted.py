@@ -1,7 +1,7 @@
 """Scripted hands: ideal or human-like motions with button presses, which are the same in every run.
 
-A motion is a displacement from the pose that the hand has at the start. Motions without assembly work are written for
-the left hand, and the right hand mirrors them left to right. The axes are x forwards, y to the left, and z up.
+A motion is a displacement from the pose that the hand has at the start. Motions that are no assembly work are written
+for the left hand, and the right hand moves as its mirror image. The axes are x forwards, y to the left, and z up.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from q2r2_control.inputs.way_points import HOME, HandWork, WayPoint, WayPoints, 
 from q2r2_control.robot.compose import compose
 from q2r2_control.types import SIDES, Array, HandInputs
 
-PRESS_DURATION = 0.15  # [s]
+PRESS_DURATION = 0.15  # Time for which a button is pressed [s].
 FIRST_PRESS = 0.6  # Time at which the lower buttons engage both arms [s].
 START = 1.2  # Time at which the motion starts [s].
 # Time from the end of the work to the press that pauses both arms, and from this press to the end of the run [s].
 _LAST_PRESS, _REST = 0.4, 0.6
-_RAMP = 1.0  # Periodic motions accelerate for this long [s].
+_RAMP = 1.0  # Time for which a periodic motion accelerates at its start [s].
 
 # (t [s], frequency [Hz]) -> displacement (3,) [m] and rotation vector (3,) [rad] of a hand.
 Path = Callable[[float, float], tuple[Array, Array]]
@@ -43,7 +43,7 @@ class HandTrajectory:
     """
 
     left: Path
-    right: Path | None = None  # None if the right hand mirrors the left one.
+    right: Path | None = None  # None if the right hand moves as the mirror image of the left hand.
     upper_presses: Mapping[str, tuple[float, ...]] = field(default_factory=dict)  # Times of presses, by hand [s].
     lower_presses: tuple[float, ...] = (FIRST_PRESS,)  # Times of presses by both hands [s].
     duration: float | None = None  # [s]; None if the motion has no end.
@@ -62,7 +62,7 @@ class HandTrajectory:
         return displacement * (1.0, -1.0, 1.0), turn * (-1.0, 1.0, -1.0)
 
     def inputs(self, hand: str, t: float) -> HandInputs:
-        """Return the buttons of ``hand`` at time ``t`` [s]. The index trigger is held while the gripper is closed."""
+        """Return the buttons of ``hand`` at ``t`` [s]. The index trigger is held while the gripper has to be closed."""
         upper = self.upper_presses.get(hand, ())
         grips = self.grips if hand == "left" else ()
         pressed = [
@@ -98,8 +98,8 @@ def _circle(t: float, frequency: float) -> tuple[Array, Array]:
 
 def _line(t: float, frequency: float) -> tuple[Array, Array]:
     """Return the hand's displacement at ``t`` on a line of 0.15 m, which leads forwards and up, and back."""
-    way = 0.15 * (1.0 - math.cos(_phase(t, frequency))) / 2.0
-    return way * np.array([0.6, 0.0, 0.8]), np.zeros(3)
+    distance = 0.15 * (1.0 - math.cos(_phase(t, frequency))) / 2.0
+    return distance * np.array([0.6, 0.0, 0.8]), np.zeros(3)
 
 
 def _rotate(t: float, frequency: float) -> tuple[Array, Array]:
@@ -124,8 +124,8 @@ def in_sequence(works: Sequence[tuple[str, HandWork]]) -> HandTrajectory:
     for name, work in works:
         steps += [(begins + t, f"{name}: {words}") for t, words in work.steps]
         for hand, home in homes.items():
-            way = [(begins + point[0], *point[1:]) for point in (home, *work.tools.get(hand, ()))]
-            points[hand] += [point for point in way if point[0] > points[hand][-1][0]]
+            added = [(begins + point[0], *point[1:]) for point in (home, *work.tools.get(hand, ()))]
+            points[hand] += [point for point in added if point[0] > points[hand][-1][0]]
             presses[hand] += [begins + t for t in work.presses.get(hand, ())]
         grips += [begins + t for t in work.grips]
         engages += [begins + t for t in work.engages]
@@ -144,13 +144,16 @@ def in_sequence(works: Sequence[tuple[str, HandWork]]) -> HandTrajectory:
 
 
 def _from_home(points: Sequence[WayPoint], hand: str, precise: Sequence[tuple[float, float]]) -> Path:
-    way, home = WayPoints(points), np.array(HOME[hand])
+    """Return the motion of ``hand`` that moves its tool through ``points``, with precision in the spans ``precise``."""
+    tool, home = WayPoints(points), np.array(HOME[hand])
 
     def displacement(t: float, frequency: float) -> tuple[Array, Array]:
-        place, turn = way.at(t)
+        place, turn = tool.at(t)
         # With precision, the tool moves only by a fraction of the hand's motion. The hand therefore moves farther than
         # the tool, and keeps this offset afterwards.
-        fine = sum((way.at(min(max(t, begins), ends))[0] - way.at(begins)[0] for begins, ends in precise), np.zeros(3))
+        fine = sum(
+            (tool.at(min(max(t, begins), ends))[0] - tool.at(begins)[0] for begins, ends in precise), np.zeros(3)
+        )
         return place - home + (1.0 / PRECISION_SCALE - 1.0) * fine, turn
 
     return displacement
@@ -165,7 +168,7 @@ TRAJECTORIES: Mapping[str, HandTrajectory] = {
 
 
 def place_of(seed: int, spread: float) -> tuple[float, float]:
-    """Return a random shift of the parts of all tasks along x and y [m], of up to ``spread`` [m] to either side."""
+    """Return a random shift of all tasks' parts along x and y [m]. Each is between -``spread`` and ``spread`` [m]."""
     x, y = np.random.default_rng([seed, _PLACES]).uniform(-spread, spread, 2).tolist()
     return x, y
 
@@ -196,9 +199,10 @@ def trajectory_named(name: str, place: tuple[float, float] | None = None) -> Han
 _PLACES = 7  # Second seed. It makes the shifts independent of other random numbers with the same first seed.
 _PACE = 1.25  # Speed of hasty hands, as a multiple of the speed in the trajectory.
 _HESITATIONS, _HESITATES = 3, 0.4  # Number of hesitations, and the duration of each [s].
-# Times after the headset has lost the hands, at which it sees them again, they engage, they carry, and they go on [s].
+# Times since the headset has lost the hands [s]: when it sees them again, when they engage the arms, when they begin to
+# carry again, and when they go on with the work.
 _LOST, _ENGAGES, _CARRIES, _GOES_ON = 1.0, 1.3, 1.6, 2.1
-# Range of the fraction of the work after which the headset loses the hands. No tool presses on anything so early.
+# Range of the fraction of the work after which the headset loses the hands. No tool presses on a part so early.
 _EARLY = (0.1, 0.45)
 _NO_PRESS = (0.3, 0.6)  # Hands do not stop within these times before and after a press [s].
 
@@ -249,7 +253,7 @@ def hurried(work: HandTrajectory, seed: int) -> HandTrajectory:
     )
 
 
-# Poses of an operator's hands at the start, in the input's frame. Arms follow only the motion from there.
+# Poses of an operator's hands at the start, in the input's frame. Arms follow only the motion from these poses.
 HANDS_AT_REST = {
     "left": pin.SE3(pin.rpy.rpyToMatrix(0.1, -0.2, 0.3), np.array([0.35, 0.25, 1.1])),
     "right": pin.SE3(pin.rpy.rpyToMatrix(-0.1, -0.2, -0.3), np.array([0.35, -0.25, 1.1])),
@@ -335,8 +339,7 @@ class ScriptedInput(PlayedInput):
     ) -> ScriptedInput:
         """Make an input whose motions are scaled to the shortest arm of the cell, if it is shorter than an iiwa 7.
 
-        ``fast`` changes nothing, because the samples depend only on the times of the polls. It makes no difference
-        whether these are simulated.
+        ``fast`` changes nothing: the samples depend only on the times of the polls, which may be simulated or real.
         """
         shortest = min(compose(config).arm_lengths().values())
         scale = min(shortest / _FULL_LENGTH, 1.0)
@@ -344,7 +347,7 @@ class ScriptedInput(PlayedInput):
 
     def hand_twist(self, hand: str, t: float) -> pin.Motion:
         """Return the ideal velocity of ``hand`` at ``t`` [s], in the axes of its poses [m/s, rad/s]."""
-        t -= self._origin or 0.0  # Subtracted first, since the difference of times since 1970 would be inexact.
+        t -= self._origin or 0.0  # Otherwise, the differences below would be inexact if times count from 1970.
         before, after = (self._ideal(hand, t + step) for step in (-_DIFFERENCE, _DIFFERENCE))
         linear = (after.translation - before.translation) / (2.0 * _DIFFERENCE)
         return pin.Motion(linear, pin.log3(after.rotation @ before.rotation.T) / (2.0 * _DIFFERENCE))

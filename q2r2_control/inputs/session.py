@@ -31,7 +31,7 @@ class HandTopic(NamedTuple):
     """A topic that the app publishes."""
 
     hand: str
-    kind: MessageType
+    kind: MessageType  # Type of the messages.
 
 
 HAND_TOPICS = {
@@ -63,8 +63,8 @@ def log_frame(level: str, text: str) -> bytes:
     return encode_frame(f"__{level}", json.dumps({"text": text}).encode())
 
 
-# The first frame that the server sends. The app takes any other first frame for that of another version of the server,
-# and ignores it.
+# The first frame that the server sends. If it were another frame, the app would ignore it, because it would assume that
+# the server has another version.
 HANDSHAKE = encode_frame(
     "__handshake",
     json.dumps({"version": "v0.7.0", "metadata": json.dumps({"protocol": Dialect.ROS2.value})}).encode(),
@@ -76,10 +76,10 @@ class _IncompleteRegistrationError(Exception):
 
 
 class HeadsetSession:
-    """The protocol state of one client. :meth:`receive` takes its frames; :attr:`outgoing` has the bytes to send to it.
+    """The protocol state of one client. :meth:`receive` takes the client's frames. :attr:`outgoing` has bytes for it.
 
-    The server sends first, in the dialect ROS2, before the client's dialect is known. An app that is set to ROS1 logs
-    an error and goes on. The client's first frame shows its dialect: only ROS2 clients put a NUL behind every
+    The server sends the first frame, in the dialect ROS2, before it knows the client's dialect. An app that is set to
+    ROS1 logs an error and goes on. The client's first frame shows its dialect: only ROS2 clients put a NUL behind every
     destination. Each payload then has to fit this dialect, so that no message is read by guessing.
 
     Data on topics outside ``HAND_TOPICS`` is counted and ignored. A registration whose topic or type the app's user
@@ -98,7 +98,7 @@ class HeadsetSession:
         self._incomplete = 0  # Number of registrations without topic or type so far.
 
     def receive(self, frame: WireFrame) -> Reception | None:
-        """Take one frame, and return the hand's message if the frame has one.
+        """Take one frame, and return the hand's message in it; None if the frame has no such message.
 
         Raises:
             ProtocolError: If the client has to be dropped.
@@ -127,7 +127,7 @@ class HeadsetSession:
         return self._data(frame, dialect)
 
     def queue_haptic(self, vibration: HapticFeedback) -> None:
-        """Add a vibration to the outgoing bytes, if the client listens to them; otherwise nothing happens."""
+        """Add a vibration to the outgoing bytes, if the client listens to vibrations; otherwise nothing happens."""
         destination = self.subscribed.get(HAPTIC_TOPICS[vibration.hand])
         if destination is not None and self.dialect is not None:
             self.outgoing += encode_frame(destination, encode(vibration, self.dialect))
@@ -188,7 +188,7 @@ class HeadsetSession:
 
 
 def _parameters(command: str, payload: bytes) -> dict[str, Any]:
-    """Return the JSON object of a system command. JSON with too deep nesting or too long a number is refused too."""
+    """Return the JSON object of a system command. Too deep nesting and too long numbers are refused too."""
     if len(payload) > MAX_COMMAND_BYTES:
         raise ProtocolError(f"{command!r:.60}: {len(payload)} bytes, at most {MAX_COMMAND_BYTES} are allowed")
     try:
@@ -210,14 +210,14 @@ def _text(command: str, parameters: dict[str, Any], key: str, whose: str = "") -
 
 
 def _topic_name(name: str) -> str:
-    """Return the name without its leading slash, which clients may write or not."""
+    """Return the name without its leading slash, which is optional."""
     bare = name.removeprefix("/")
     if not _TOPIC_NAME.fullmatch(bare):
         raise ProtocolError(f"{name!r:.60} is not a topic name")
     return bare
 
 
-_STAMPS_KEPT = 1000  # No headset sends as many messages in a second.
+_STAMPS_KEPT = 1000  # Number of times of receipt that are kept per topic. No headset sends so many messages a second.
 
 
 @dataclass(frozen=True, slots=True)
@@ -238,11 +238,11 @@ class HeadsetStatistics:
     peer: str | None  # Host and port of the connected headset, as host:port; None if there is none.
     dialect: Dialect | None
     topics: dict[str, TopicStatistics]
-    unknown_topics: dict[str, int]  # By topic that nothing here reads: the number of messages.
+    unknown_topics: dict[str, int]  # Number of messages on each topic that the server does not know, by topic.
     published: tuple[str, ...]  # Topics that the app announced.
     subscribed: tuple[str, ...]  # Topics that the app listens to.
     connections: int  # Number of connections since the server was started.
-    last_disconnect: str | None  # The reason of the last disconnection.
+    last_disconnect: str | None  # Why the last connection ended; None if no connection has ended.
 
 
 class TopicRecorder:
@@ -260,6 +260,6 @@ class TopicRecorder:
         self._last = message
 
     def snapshot(self, now: float) -> TopicStatistics:
-        """Return the figures at ``now`` [s]. A message has to be recorded first."""
+        """Return the statistics at ``now`` [s]. At least one message has to be recorded before."""
         rate = float(sum(stamp > now - 1.0 for stamp in self._stamps))
         return TopicStatistics(self._count, rate, now - self._stamps[-1], self._last)

@@ -1,6 +1,6 @@
-"""Work of two hands, as way points of their tools in the world frame.
+"""Tasks of two hands, as way points of their tools in the world frame.
 
-The hands repeat the motions of the tools, wherever the hands are at the start.
+The hands make the same motions as the tools are to make, wherever the hands are at the start.
 """
 
 from __future__ import annotations
@@ -20,20 +20,29 @@ _X, _Z = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
 
 
 def minimum_jerk(fraction: float) -> float:
-    """Return the fraction of the path at a ``fraction`` of the time, clipped to 0 .. 1 (Flash and Hogan, 1985)."""
+    """Return the fraction of the path that is done after a ``fraction`` of the time (Flash and Hogan, 1985).
+
+    A ``fraction`` outside of 0 .. 1 is clipped.
+    """
     s = min(max(fraction, 0.0), 1.0)
     return s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
 
 
 class WayPoints:
-    """A motion through ``points``, whose times have to rise. Before the first point and after the last, it rests."""
+    """A motion through ``points``, whose times have to rise. It rests before the first point and after the last one.
+
+    Each motion from point to point has minimum jerk, and rests at both ends.
+    """
 
     def __init__(self, points: Sequence[WayPoint]) -> None:
         table = np.array(points, dtype=np.float64)
         self._times, self._values = table[:, 0], table[:, 1:]
 
     def at(self, t: float) -> tuple[Array, Array]:
-        """Return the position (3,) [m] and the rotation vector (3,) [rad] at ``t`` [s]."""
+        """Return the tool's position (3,) [m] in the world frame at ``t`` [s], and its rotation vector (3,) [rad].
+
+        The rotation is relative to the tool's rotation at home.
+        """
         times, values = self._times, self._values
         index = int(np.clip(np.searchsorted(times, t, side="right") - 1, 0, len(times) - 2))
         share = minimum_jerk((t - times[index]) / (times[index + 1] - times[index]))
@@ -64,7 +73,7 @@ class HandWork:
     precise: tuple[tuple[float, float], ...] = ()
 
     def moved(self, x: float, y: float) -> HandWork:
-        """Return the same work on parts that are shifted by ``x`` and ``y`` [m] along the axes of the world."""
+        """Return the same work for parts that are shifted by ``x`` and ``y`` [m] along the axes of the world."""
         tools = {
             hand: tuple((p[0], p[1] + x, p[2] + y, *p[3:]) if p[1:4] != HOME[hand] else p for p in points)
             for hand, points in self.tools.items()

@@ -28,7 +28,7 @@ _MOTION = ("stance", "axes", "position_scale", "rotation_scale", "axis_scales", 
 
 
 def web_cell(config: Config) -> Config:
-    """Return the cell with the page's controls, and with scales of 1: a tool moves as far as it is dragged."""
+    """Return the cell with the page's controls, and with scales of 1, so that a tool moves as far as it is dragged."""
     usual = TeleopSettings()
     changes = {name: getattr(usual, name) for name in _MOTION} | {"bindings": _BINDINGS}
     return config.model_copy(update={"teleop": config.teleop.model_copy(update=changes)})
@@ -62,7 +62,7 @@ class WebInput:
     def receive(
         self, hand: str, position: Sequence[float], quaternion: Sequence[float], controls: Mapping[str, float]
     ) -> None:
-        """Take the pose of a hand, ``position`` [m] and ``quaternion`` x y z w, and its ``controls``.
+        """Take a hand's ``position`` [m], its ``quaternion`` x y z w, and the values of its ``controls`` by name.
 
         Any thread may call this.
         """

@@ -1,4 +1,4 @@
-"""The interface of every plant, and the checks that keep bad commands from it."""
+"""The interface of every plant, and the checks that keep unusable commands from a plant."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from q2r2_control.plugins import PLANTS, load_class
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import ArmTiming, Array, Command, CommandMode, RobotState, is_number
 
-# Longest time of one call of ``advance`` [s]. A loop that is farther behind must not catch up at once.
+# Longest time that one call of ``advance`` lets pass [s]. A loop that is farther behind must not catch up at once.
 MAX_ADVANCE = 1.0
 
 
@@ -40,7 +40,7 @@ class Plant(Protocol):
     def apply(self, command: Command) -> None:
         """Take a command. Posture and velocity are due at the end of the next ``advance``; a torque acts at once.
 
-        If no newer command comes, later calls of ``advance`` hold its posture at rest, or its torque.
+        If no newer command comes, later calls of ``advance`` hold this command's posture at rest, or its torque.
 
         Raises:
             PlantError: If the plant lacks the mode, or a number is not finite. The previous command then stays.
@@ -52,14 +52,14 @@ class Plant(Protocol):
     def state(self) -> RobotState:
         """Return the newest measurement, with a stamp of the plant's own clock, which starts at 0 on ``reset``.
 
-        The plant never changes its arrays afterwards, because the callers keep them for some ticks.
+        The plant never changes the arrays of a returned state, because the callers keep them for some ticks.
         """
 
     def gripper_openings(self) -> dict[str, float]:
         """Return the measured opening of each gripper, from 0 for closed to 1 for open, as a new mapping each time."""
 
     def close(self) -> None:
-        """Free every resource. It may be called twice."""
+        """Free every resource. The method may be called twice."""
 
 
 @runtime_checkable
@@ -70,7 +70,7 @@ class WindowedPlant(Protocol):
         """Open the window; raises :class:`PlantError` if there is no display."""
 
     def viewer_sync(self, obstacles: Iterable[tuple[MovingObstacle, tuple[int, int, int]]] = ()) -> bool:
-        """Show the plant and ``obstacles`` in colours r g b; returns False if the window was closed."""
+        """Show the plant and ``obstacles``, each with its colour r g b (0 to 255); returns False after it is closed."""
 
 
 @runtime_checkable
@@ -87,7 +87,7 @@ class PicturedPlant(Protocol):
 
 @runtime_checkable
 class SessionPlant(Protocol):
-    """The additional methods of a plant whose arms follow only during sessions, with a timing of their own.
+    """The additional methods of a plant whose arms follow only during sessions, each arm with its own timing.
 
     The arms start where they stand. If the session of one arm ends, the run goes on. All arms brake. They are activated
     again where they rest, as soon as all of them are in a session again.
@@ -101,23 +101,23 @@ class SessionPlant(Protocol):
     def due(self, now: float) -> tuple[float, float]:
         """Return two durations for the tick at ``now`` [s]: of the certified stop, and of the motion after it [s].
 
-        If a command was late, the plant follows the certified stop already, for the first duration. The next command is
-        for the end of both durations.
+        If a command was late, the plant already follows the certified stop, and the first duration says for how long;
+        otherwise it is 0. The tick's command is for the end of both durations.
         """
 
     def withdraws(self) -> bool:
         """Return whether the newest command came too late. The arms then follow the stop of the command before it."""
 
     def delay(self) -> float:
-        """Return the time from when a command is due until the arms are measured there [s]."""
+        """Return the time from the moment when a command is due until the arms are measured at its posture [s]."""
 
     def timings(self) -> dict[str, ArmTiming]:
-        """Return the timing of each arm that follows the reference on its own; empty if all arms move as one."""
+        """Return how the motion of each arm is timed relative to the reference; empty if all arms have one timing."""
 
     def lead(self) -> float:
         """Return the longest time by which commands are ahead of the arms [s].
 
-        It is the time of the end of a tick's command, minus the time of the posture that the arms are sent.
+        It is the end time of a tick's command, minus the time of the posture that is sent to the arms.
         """
 
     def fault(self) -> Reason | None:
@@ -140,7 +140,7 @@ class RealPlant(Protocol):
 class WaitingPlant(Protocol):
     """The additional attributes of a plant whose reset waits for a person, for ``--wait``."""
 
-    # Longest time that a reset waits for the robot [s]. After this time it raises :class:`PlantError`.
+    # Longest time that a reset waits for the robot [s]. After this time, the reset raises :class:`PlantError`.
     longest_wait: float
     longest_session_wait: float  # Longest time that a reset waits for all sessions [s]. A run then begins without them.
 
@@ -163,10 +163,11 @@ def check_mode(mode: CommandMode | str, plant: Plant) -> CommandMode:
 
 
 def keeps_jerk_limit(plant: Plant, mode: CommandMode) -> bool:
-    """Return whether commands of ``mode`` reach the arms within ``control.jerk_limit``, where the limit counts.
+    """Return whether commands reach the arms within ``control.jerk_limit``; True in torque mode, which has no limit.
 
-    Commands of most plants are averaged by their drive. A :class:`SessionPlant` executes the certified stop by itself,
-    and so it has to average what it sends, and says so by the attribute ``averages``.
+    For most plants, the loop's drive averages the commands, and the averages keep the limit. A :class:`SessionPlant`
+    executes the certified stop by itself. It therefore has to average what it sends to the arms, and then has the
+    attribute ``averages``, which is True.
     """
     return mode is CommandMode.TORQUE or not isinstance(plant, SessionPlant) or getattr(plant, "averages", False)
 
@@ -193,7 +194,8 @@ def check_command(command: Command, robot: Robot, modes: tuple[CommandMode, ...]
 def check_joints(what: str, values: Array, robot: Robot) -> None:
     """Raise :class:`PlantError` if ``values`` does not have one finite number for each joint of the robot."""
     _check_shape(what, values, robot)
-    # A scalar product is a fast test. The squares of large finite numbers may overflow, and so they are checked again.
+    # A scalar product is a fast test. But the squares of large finite numbers may overflow. The numbers themselves are
+    # therefore checked if the product is not finite.
     if not math.isfinite(values.dot(values)) and not np.isfinite(values).all():
         joint = int(np.flatnonzero(~np.isfinite(values))[0])
         raise PlantError(f"{what}: {robot.joint_names[joint]} = {values[joint]}: allowed: finite numbers")
@@ -250,5 +252,5 @@ class GripperMotion:
 
     def advance(self, dt: float) -> None:
         for arm, rate in self._rate.items():
-            gap, reach = self._wanted[arm] - self.openings[arm], rate * dt
-            self.openings[arm] += min(max(gap, -reach), reach)
+            change, largest = self._wanted[arm] - self.openings[arm], rate * dt
+            self.openings[arm] += min(max(change, -largest), largest)

@@ -1,11 +1,12 @@
-"""A Robotiq gripper on Modbus, for any plant. It has its own thread, so that the loop never waits for it.
+"""A Robotiq gripper that a plant commands by Modbus, in a thread of its own, so that the loop never waits for it.
 
 Hand-E, 2F-85 and 2F-140 have the same registers (chapter 4 of their instruction manuals).
 
-**Safety.** Until an opening is measured, the bodies of the fingers cover all their positions. After that, they cover
-the openings that were measured and commanded a moment ago. An activation opens and closes the fingers fully. It is
-therefore done only before the first opening of a run. If the measured opening, or the command at that time, is older
-than ``MODBUS_DELAY``, the opening is no longer known. Supervision then grants no other opening.
+**Safety.** Until an opening is measured, the bodies of the fingers cover all positions of the fingers. After that, they
+cover the openings that were measured and commanded a moment ago. An activation opens and closes the fingers fully. The
+gripper is therefore activated only before an opening is measured in a run. If the measured opening, or the command that
+was in force then, is older than ``MODBUS_DELAY``, the opening is no longer known. Supervision then grants no other
+opening.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ _TIMEOUT, _REPEATS = 0.3, 1  # Time to wait for an answer [s], and the number of
 _ACTIVATE, _GO = 0x01, 0x08  # The bits rACT and rGTO of the action request.
 _RESET, _ACTIVATION = bytes(6), bytes((_ACTIVATE, 0, 0, 0, 0, 0))
 _MAJOR = 0x0A  # Only a reset ends a fault with this number or a greater one.
-_FAULTS = {  # Faults with other numbers end by an activation, or by reading them.
+_FAULTS = {  # Faults with other numbers end with an activation, or when they are read.
     0x08: "too hot, it has to cool down",
     0x0A: "supply voltage too low",
     0x0B: "automatic release in progress",
@@ -55,7 +56,7 @@ class GripperStatus:
 
     @classmethod
     def of(cls, registers: Sequence[int]) -> GripperStatus:
-        """Decode three registers; raises struct.error for another number of them."""
+        """Decode the three input registers; raises struct.error for another number of registers."""
         status, _, fault, _, position, _ = struct.pack(">3H", *registers)
         return cls(bool(status & 0x01), status >> 4 & 0x03 == 3, status >> 6 in (1, 2), fault & 0x0F, position)
 
@@ -79,7 +80,8 @@ class ModbusGripper:
         self._where = f"{config.modbus}, unit {config.unit}"
         self.status: GripperStatus | None = None  # None if the gripper does not answer.
         self._wanted: float | None = None
-        # The measured opening, and the time at which the command that was in force then was chosen [s].
+        # The measured opening, and the time at which the command in force at the measurement was chosen [s]; None if
+        # the opening is not known.
         self._measured: tuple[float, float] | None = None
         self._used = False  # Whether the gripper was ready in this run.
         self._sent, self._told = b"", ""
@@ -87,11 +89,11 @@ class ModbusGripper:
         self._thread = Thread(target=self._serve, name=f"{arm} gripper", daemon=True)
 
     def start(self) -> None:
-        """Read the gripper from now on. It is not activated before the first :meth:`command`."""
+        """Start the thread, which reads the gripper regularly. The first :meth:`command` activates the gripper."""
         self._thread.start()
 
     def command(self, opening: float) -> None:
-        """Move to an opening from now on."""
+        """Let the gripper move to ``opening``, from 0 for closed to 1 for open, until the next call."""
         self._wanted = opening
 
     @property
@@ -119,7 +121,7 @@ class ModbusGripper:
             try:
                 self._exchange(began)
                 pause = began + _PERIOD - time.monotonic()
-            except Exception as error:  # A serial device raises more than OSError.
+            except Exception as error:  # A serial device also raises exceptions that are no OSError.
                 self._client.close()
                 self.status = self._measured = None
                 self._sent, pause = b"", _AGAIN
@@ -129,7 +131,7 @@ class ModbusGripper:
         self._client.close()
 
     def _exchange(self, now: float) -> None:
-        """Write the request if it has changed, and then read."""
+        """Write the request to the gripper if it has changed, and then read the gripper's status."""
         status, wanted, unit = self.status, self._wanted, self._config.unit
         if status is not None and wanted is not None and (request := self._request(status, wanted)) != self._sent:
             if request == _ACTIVATION:
@@ -156,7 +158,7 @@ class ModbusGripper:
         return _RESET if status.requested else _ACTIVATION
 
     def _position(self, opening: float) -> int:
-        """Return the position for an opening. At both ends the fingers are sent as far as they go."""
+        """Return the position to request for an opening. For 0 and 1, the fingers move as far as they can."""
         if opening in (0.0, 1.0):
             return 255 - round(255 * opening)
         opened, closed = self._config.counts

@@ -20,12 +20,13 @@ from q2r2_control.plants.mujoco_model import build_model, settle_mimics
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Command, CommandMode, RobotState
 
-# Largest rounding error of the sum of ticks, in physics steps. A step that is due within this error is taken.
+# Largest rounding error of the sum of all ticks' durations, in physics steps. A step that is due within this error is
+# taken.
 _STEP_ROUNDING = 1e-6
 
 # In every posture the inertia of a joint is at least its armature: M >= diag(armature). If K dt^2 / armature <= 0.16
-# and D dt / armature <= 1, all eigenvalues of 2 D dt + K dt^2 over M stay below 4. At 4 semi-implicit Euler integration
-# becomes unstable.
+# and D dt / armature <= 1, all eigenvalues of M^-1 (2 D dt + K dt^2) stay below 4. At 4, the semi-implicit Euler
+# integration becomes unstable.
 _MAX_STIFFNESS_STEP, _MAX_DAMPING_STEP = 0.16, 1.0
 
 
@@ -138,7 +139,7 @@ class MujocoPlant:
         """See :meth:`Plant.advance`. All whole physics steps that are due are taken, and the rest is carried over.
 
         Raises:
-            PlantError: Also if the simulation has diverged. ``reset`` makes it usable again.
+            PlantError: If ``dt`` is not allowed, or if the simulation has diverged. After ``reset`` it is usable again.
         """
         check_duration(dt)
         if dt == 0:
@@ -152,7 +153,7 @@ class MujocoPlant:
             self._start, self._end, self._next = self._end, self._next, None
         self._grippers.advance(dt)
         self._drive_fingers()
-        # A tick that is shorter than a step must not look like a jump of the velocity.
+        # A tick that is shorter than a step must not cause a very large acceleration.
         self._acceleration[self._v_index] = (self._end[1] - self._start[1]) / max(dt, self._timestep)
         due = math.floor(self._clock / self._timestep + _STEP_ROUNDING)
         while self._steps < due:
@@ -224,7 +225,7 @@ class MujocoPlant:
     def _tuned(self, config: Config) -> tuple[Array, Array]:
         """Return stiffness [Nm/rad] and damping [Nm s/rad] of the servos (nv,). The timestep bounds both.
 
-        The damping fits the effective inertia of each joint at home, 1 / (M^-1)_ii, while the other joints yield.
+        The damping fits the effective inertia of each joint at home, if all other joints can move: 1 / (M^-1)_ii.
         """
         inverse = np.empty((self.model.nv, self.model.nv))
         mujoco.mj_solveM(self.model, self.data, inverse, np.eye(self.model.nv))

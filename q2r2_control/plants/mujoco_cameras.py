@@ -18,13 +18,14 @@ from q2r2_control.errors import PlantError
 from q2r2_control.process.machine_notes import has_display
 from q2r2_control.types import Array
 
-# A camera of MuJoCo looks along -z, with y up in the picture. Ours looks along x, with z up.
+# Rotation from the axes of a MuJoCo camera, which looks along -z with y up in the picture, to those of our cameras,
+# which look along x with z up.
 _FROM_OURS = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 _STRAIGHT = 1e-9  # With a smaller sine of the angle to the vertical, the camera looks straight up or down.
 _LONGEST_CLOSE = 5.0  # Time to wait until a window is closed [s].
 _OPACITY = 0.6  # Opacity of moving obstacles.
-# Without a graphics card, MuJoCo's 8 samples per pixel and shadow map of 8192 take five times as long. Its round shapes
-# of 28 x 16 parts take twice as long.
+# Size of the shadow map, number of samples per pixel, and numbers of slices and stacks of round shapes. On a computer
+# without a graphics card, MuJoCo's defaults (8192 and 8) take five times as long, and (28, 16) twice as long.
 _SHADOW_MAP, _SAMPLES, _ROUND = 1024, 0, (16, 8)
 
 
@@ -96,7 +97,7 @@ class CellPictures:
         mujoco.mj_camlight(self._model, self._data)
 
     def take(self, camera: str) -> npt.NDArray[np.uint8]:
-        """Return the picture (height, width, 3), r g b, of the cell as it was placed last."""
+        """Return the picture (height, width, 3), r g b, of the cell at the positions of the last :meth:`place`."""
         renderer = self._renderers[camera]
         renderer.update_scene(self._data, camera)
         return np.asarray(renderer.render())

@@ -40,7 +40,7 @@ _MIN_DAMPING = 0.2
 # A negligible inertia. It is a thousandth of the inertia that a drive's rotor adds to its joint [kg m^2].
 _NEGLIGIBLE_INERTIA = 1e-6
 
-# Friction of rubber on a box.
+# Coefficients of friction of rubber pads on a box: sliding, torsional [m] and rolling [m].
 _PAD_FRICTION = (1.0, TORSION, ROLLING)
 
 # Time constant [s] and damping ratio of a finger's contacts. MuJoCo scales their stiffness with the inertia behind
@@ -88,7 +88,7 @@ def build_model(robot: Robot, config: Config) -> mujoco.MjModel:
 
 
 def _moving_without_mass(spec: mujoco.MjSpec) -> list[str]:
-    """Return all moving bodies to which neither they nor bodies fixed to them give a mass.
+    """Return the names of all moving bodies without a mass, if no body that is fixed to them has a mass either.
 
     MuJoCo's own error names one only.
     """
@@ -101,7 +101,7 @@ def _moving_without_mass(spec: mujoco.MjSpec) -> list[str]:
 
 
 def _readable_urdf(urdf: str) -> str:
-    """Return the URDF with settings that keep every link as a body, and with every drawing that MuJoCo can read.
+    """Return the URDF with settings that keep every link as a body, and without meshes that MuJoCo cannot draw.
 
     Each <mimic> is removed, because not every version of MuJoCo reads it. :func:`_set_grippers` couples the joints.
     """
@@ -120,7 +120,7 @@ def _readable_urdf(urdf: str) -> str:
 
 
 def _load_meshes(spec: mujoco.MjSpec) -> None:
-    """Read by Coal every mesh of ``spec`` that MuJoCo cannot read, such as DAE. The mesh keeps its scale."""
+    """Use Coal to read every mesh of ``spec`` that MuJoCo cannot read, such as DAE. The mesh keeps its scale."""
     for mesh in spec.meshes:
         if mesh.file.lower().endswith(_FORMATS):
             continue
@@ -147,10 +147,10 @@ def _set_solver(spec: mujoco.MjSpec, config: MujocoConfig) -> None:
 
 
 def _correct_inertias(spec: mujoco.MjSpec) -> None:
-    """Raise eigenvalues of inertias that no real body can have.
+    """Increase eigenvalues of inertias that are slightly too small for any real body.
 
     Some files have such inertias for antennas of a milligram, and MuJoCo refuses these files as a whole. The added
-    terms are too small for a joint to feel. MuJoCo still refuses inertias that are wrong by more.
+    terms do not change the motion noticeably. MuJoCo still refuses inertias with larger errors.
     """
     for body in spec.bodies:
         if not body.explicitinertial or np.isnan(body.fullinertia).any():

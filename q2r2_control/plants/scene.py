@@ -14,7 +14,7 @@ VISUAL_GROUP, COLLISION_GROUP, ENVELOPE_GROUP = 2, 3, 4
 def furnish(spec: mujoco.MjSpec, floor: bool) -> None:
     """Add sky and lights, make a plane of the cell's ``floor`` if it has one, and set the view of a window.
 
-    A cell without a floor gets a drawing of a floor at z = 0. Nothing touches it, since the arms may reach below.
+    A cell without a floor gets a drawing of a floor at z = 0. It causes no contacts, since the arms may move below it.
     """
     spec.add_texture(
         name="sky",
@@ -85,7 +85,8 @@ def _add_lights(spec: mujoco.MjSpec) -> None:
     )
 
 
-# Priorities of contacts. The shape with the larger priority decides: first gripper pads, then obstacles.
+# Priorities of shapes. In a contact, the settings of the shape with the larger priority apply: obstacles come before
+# gripper pads, and pads before all other shapes.
 PAD_PRIORITY, _OBSTACLE_PRIORITY = 1, 2
 
 # Torsional and rolling friction [m] of a contact of about one square centimetre.
@@ -103,7 +104,7 @@ FRICTION_IMPEDANCE = 100.0
 
 
 def set_obstacles(spec: mujoco.MjSpec, config: Config) -> None:
-    """Set the contacts of obstacles, which have priority over the contacts of the pads."""
+    """Set the contact settings of obstacles, which have priority over the settings of the pads."""
     for name in config.obstacles:
         for geom in spec.body(name).geoms:
             geom.condim, geom.friction = 4, (config.mujoco.obstacle_friction, TORSION, ROLLING)
@@ -111,7 +112,7 @@ def set_obstacles(spec: mujoco.MjSpec, config: Config) -> None:
 
 
 def let_fingers_slide(spec: mujoco.MjSpec, config: Config) -> None:
-    """Add a pair for each pad and obstacle that can touch, with a friction that does not change the normal force."""
+    """Add a contact pair for each pad and obstacle that can touch. Its friction does not change the normal force."""
     pads = [geom for body in spec.bodies for geom in body.geoms if geom.priority == PAD_PRIORITY and geom.contype]
     friction = config.mujoco.obstacle_friction
     for name in config.obstacles:
@@ -124,13 +125,13 @@ def let_fingers_slide(spec: mujoco.MjSpec, config: Config) -> None:
                 pair.solref, pair.solreffriction = _STIFFNESS, _SLIDING
 
 
-# Contacts of soft objects. The numbers are MuJoCo's impedance (``solimp``), the share of the force by which it would
-# stop a rigid body; the time in which foam takes its shape again [s]; and the number of points on which a box stands.
+# Contacts of soft objects: MuJoCo's impedance (``solimp``), which is a share of the force that would stop a rigid body;
+# the time in which foam returns to its first shape [s]; and the number of points on which a box stands.
 _SHARE, _RECOVERY, _CORNERS = 0.9, 0.02, 4
 
 
 def let_objects_yield(spec: mujoco.MjSpec, config: Config) -> None:
-    """Set the contacts of soft objects with obstacles. MuJoCo's ``solref`` takes a stiffness per mass and corner."""
+    """Set the contacts of soft objects with obstacles. MuJoCo's ``solref`` is a stiffness per mass and corner."""
     for name, thing in config.mujoco.objects.items():
         if thing.stiffness is None:
             continue
@@ -143,7 +144,7 @@ def let_objects_yield(spec: mujoco.MjSpec, config: Config) -> None:
 
 
 def _add_pair(spec: mujoco.MjSpec, one: mujoco.MjsGeom, other: mujoco.MjsGeom, friction: float) -> mujoco.MjsPair:
-    for shape in (one, other):  # A pair names its shapes.
+    for shape in (one, other):  # A pair refers to its shapes by their names.
         number = next(i for i, geom in enumerate(shape.parent.geoms) if geom == shape)
         shape.name = shape.name or f"{shape.parent.name}_shape_{number}"
     pair = spec.add_pair(geomname1=one.name, geomname2=other.name)

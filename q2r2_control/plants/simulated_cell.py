@@ -1,4 +1,4 @@
-"""The simulated cell behind ``mujoco_robot``. Commands come at any time, and the plant runs in fixed steps."""
+"""The simulated cell of the ROS node ``mujoco_robot``. Commands come at any time, and the physics has fixed steps."""
 
 from __future__ import annotations
 
@@ -13,19 +13,20 @@ from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Command, CommandMode, RobotState
 
-# If the next command is late, a joint goes on at its velocity for this number of intervals between commands, because a
-# busy machine delivers them unevenly; and the bounds of this time [s].
+# A busy computer delivers commands unevenly. If the next command is late, a joint therefore goes on at its velocity for
+# this number of intervals between commands. The other two numbers are the bounds of this time [s].
 _COAST_INTERVALS, _SHORTEST_COAST, _LONGEST_COAST = 3.0, 0.01, 0.1
-# Share of the newest interval in its running mean.
+# Share of the newest interval between commands in the running mean of these intervals.
 _INTERVAL_SHARE = 0.1
 
 
 class JointFollower:
     """Computes the wanted position of each joint at any time, from the newest command that names it.
 
-    A command has a posture and a velocity at a time. Until the next command, the joint moves on at that velocity. If no
-    command comes for too long, the joint brakes at its ``acceleration_limit`` (nv,) [rad/s^2], so that no velocity
-    outlives its sender. No joint moves faster than its ``velocity_limit`` (nv,) [rad/s]. Times are passed in [s].
+    A command has a posture and a velocity for one time. Until the next command, the joint moves on at that velocity. If
+    no command comes for too long, the joint brakes at its ``acceleration_limit`` (nv,) [rad/s^2]. It therefore does not
+    move for ever if the sender has ended. No joint moves faster than its ``velocity_limit`` (nv,) [rad/s]. The caller
+    passes the times in [s].
     """
 
     def __init__(self, q: Array, acceleration_limit: Array, velocity_limit: Array) -> None:
@@ -33,7 +34,7 @@ class JointFollower:
         self.stop(q, np.zeros_like(q))
 
     def stop(self, q: Array, v: Array) -> None:
-        """Forget all commands, and brake from posture ``q`` and velocity ``v`` (nv,)."""
+        """Forget all commands, and brake from posture ``q`` (nv,) [rad] and velocity ``v`` (nv,) [rad/s]."""
         self.q, self.v = q.copy(), np.minimum(np.maximum(v, -self._velocity_limit), self._velocity_limit)
         self._command_q, self._command_v = q.copy(), np.zeros_like(q)
         self._due = np.full(len(q), -np.inf)
@@ -63,28 +64,30 @@ class JointFollower:
         age = now - self._due
         coast = np.minimum(np.maximum(_COAST_INTERVALS * self._interval, _SHORTEST_COAST), _LONGEST_COAST)
         fresh = age <= coast
-        reach = self._velocity_limit * dt
+        largest = self._velocity_limit * dt
         slower = np.sign(self.v) * np.maximum(np.abs(self.v) - self._acceleration * dt, 0.0)
-        way = np.where(
+        change = np.where(
             fresh, self._command_q + self._command_v * np.where(fresh, age, 0.0) - self.q, 0.5 * (self.v + slower) * dt
         )
-        bounded = np.minimum(np.maximum(way, -reach), reach)
+        bounded = np.minimum(np.maximum(change, -largest), largest)
         self.q = self.q + bounded
         # A joint far from its wanted position catches up at its limit. Its velocity is then that of this motion.
-        on_time = np.abs(way) <= reach
+        on_time = np.abs(change) <= largest
         self.v = np.where(fresh, np.where(on_time, self._command_v, bounded / dt), slower)
 
 
 # Longest time that a late loop catches up [s]. The rest is dropped, because it would be a jump.
 _LONGEST_CATCH_UP = 0.05
-# Time for which one torque acts [s]. A robot stops if its sender misses a few periods. The simulation waits instead.
+# Time for which one torque acts [s]. A real robot stops if its sender misses a few periods. The simulation instead lets
+# no time pass until the next torque.
 _LONGEST_TORQUE = 0.012
 
 
 class SimulatedCell:
-    """A plant that follows commands. Without commands, position servos stop and hold it in any mode.
+    """The simulated arms and their commands. If commands cease, position servos stop and hold the arms.
 
-    A command that is refused changes nothing, and its method returns a line of text with the reason.
+    The method of a command returns None. If the command is refused, it changes nothing, and the method returns a line
+    of text with the reason.
     """
 
     def __init__(self, robot: Robot, config: Config, hold_after: float, max_jump: float) -> None:
@@ -117,7 +120,7 @@ class SimulatedCell:
         self._openings = dict.fromkeys(self.plant.gripper_openings(), 1.0)
 
     def mode(self, now: float) -> str:
-        """Return the kind of commands that drive the arms at ``now`` [s]: positions, torques or none."""
+        """Return what moves the arms at ``now`` [s]: "position" or "torque" commands, or "holding" without commands."""
         if now - self._last_command > self._hold_after:
             return "holding"
         return "position" if self._tau is None else "torque"
@@ -127,7 +130,8 @@ class SimulatedCell:
     ) -> str | None:
         """Follow the positions ``q`` [rad] and, if known, the velocities ``v`` [rad/s] of the joints ``names``.
 
-        Names of other joints are ignored. The command came at ``now`` [s], and is due ``delay`` [s] later.
+        Names of joints that the cell does not have are ignored. The command came at ``now`` [s], and is due ``delay``
+        [s] later.
         """
         if fault := self._unusable(names, q, v, delay):
             return fault
@@ -148,7 +152,7 @@ class SimulatedCell:
         return None
 
     def command_velocities(self, v: Array, now: float) -> str | None:
-        """Move all joints on from their wanted positions at ``v`` (nv,) [rad/s], which came at ``now`` [s]."""
+        """Move all joints from their wanted positions at velocities ``v`` (nv,) [rad/s], which came at ``now`` [s]."""
         if len(v) != len(self._columns):
             return f"{len(v)} velocities for {len(self._columns)} joints"
         q = self._follower.q if self._tau is None else self.plant.state().q
@@ -171,19 +175,19 @@ class SimulatedCell:
         self._openings[arm] = opening
 
     def gripper_force(self, arm: str) -> float:
-        """Return the force of an arm's gripper [N]."""
+        """Return the largest force of the arm's finger servos [N, or Nm if the fingers turn]; 0 without a gripper."""
         return float(np.abs(self.plant.data.actuator_force[self._finger_actuators[arm]]).max(initial=0.0))
 
     def finger_positions(self) -> Array:
-        """Return positions of ``fingers`` [m or rad]."""
+        """Return the positions of the joints ``fingers`` (n,) [m or rad]."""
         return np.array(self.plant.data.qpos[self._finger_q])
 
     def finger_velocities(self) -> Array:
-        """Return velocities of ``fingers`` [m/s or rad/s]."""
+        """Return the velocities of the joints ``fingers`` (n,) [m/s or rad/s]."""
         return np.array(self.plant.data.qvel[self._finger_v])
 
     def advance(self, now: float) -> RobotState:
-        """Do all physics steps that are due at ``now`` [s], and measure."""
+        """Take all physics steps that are due at ``now`` [s], and return the measured state."""
         before = now if self._time is None else self._time
         time = max(before, now - _LONGEST_CATCH_UP)
         # If the last torque is too old to act, but the arms are not held yet, the simulation waits for the sender.
@@ -227,7 +231,10 @@ class SimulatedCell:
         return None
 
     def _find(self, names: tuple[str, ...]) -> tuple[list[int], Array] | str:
-        """Return the indices of our joints in ``names``, and in our arrays; or the fault of these names."""
+        """Return, for the cell's joints in ``names``, their indices in ``names`` and in arrays (nv,).
+
+        If the names cannot be used, the result is a text that says why.
+        """
         if len(set(names)) != len(names):
             return "a joint is named twice"
         if not (ours := [place for place, name in enumerate(names) if name in self._columns]):

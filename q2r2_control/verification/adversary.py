@@ -25,14 +25,14 @@ class Request(NamedTuple):
 # A function of the tick within the segment and of the last reference's joint positions (nv,), which returns a request.
 Stream = Callable[[int, Array], Request]
 _TABLE = 0.2  # Height of the table's top, on which tools press, as in the shipped cells [m].
-_TICK = 0.001  # Tick at which work motions are played [s].
+_TICK = 0.001  # Time by which a work motion at its usual speed goes on in a tick [s].
 # A gain changes to its first value times one of these factors. A small separation gain slows the arms long before
 # contact, which tests little.
 _GAIN_SHARES = {
     **dict.fromkeys(("position_gain", "rotation_gain", "posture_gain", "max_linear_speed"), (0.1, 1.0, 2.0)),
     **{"separation_gain": (0.5, 1.0, 4.0), "stretch_gain": (0.1, 1.0, 10.0), "posture_weight": (0.1, 1.0, 100.0)},
 }
-_WORKSPACE = np.array([[-0.6, -1.1, -0.1], [1.1, 1.1, 1.4]])  # Lower and upper corner [m].
+_WORKSPACE = np.array([[-0.6, -1.1, -0.1], [1.1, 1.1, 1.4]])  # Lower and upper corner of a box for random poses [m].
 
 
 class Adversary:
@@ -56,7 +56,7 @@ class Adversary:
         return made
 
     def pose(self) -> pin.SE3:
-        """Return a random tool pose anywhere around the cell."""
+        """Return a random tool pose (world frame) anywhere around the cell."""
         return pin.SE3(pin.exp3(self._random.normal(size=3) * 1.5), self._random.uniform(*_WORKSPACE))
 
     def _constant(self, targets: dict[str, Any]) -> Stream:
@@ -76,7 +76,7 @@ class Adversary:
         return self._constant(dict(self._home))
 
     def _teleport(self) -> Stream:
-        """Return a stream with a new pose at regular intervals."""
+        """Return a stream in which each tool gets a new random pose at regular intervals."""
         return self._renewed(int(self._random.integers(5, 800)), self._poses)
 
     def _postures(self) -> Stream:
@@ -119,7 +119,7 @@ class Adversary:
         return self._constant(self._moved(lambda: np.array([*self._random.uniform(-0.3, 0.3, size=2), -depth])))
 
     def _random_walk(self) -> Stream:
-        """Return a random walk that is faster than an arm can move, and that tends back towards home."""
+        """Return a stream of random walks, which are faster than an arm can move, and which tend back towards home."""
         speed, turn = self._random.uniform(0.001, 0.05), self._random.uniform(0.0, 0.1)
         poses = {arm: pose.copy() for arm, pose in self._home.items()}
 
@@ -174,7 +174,7 @@ class Adversary:
         return stream
 
     def _elbow(self) -> Stream:
-        """Return a stream in which one tool reaches for the elbow or wrist of another arm, which moves elsewhere."""
+        """Return a stream in which one tool chases the elbow or wrist of another arm, which has a random target."""
         chaser = str(self._random.choice(self._arms))
         joint = int(self._robot.arms[self._others[chaser]].joints[3 if self._random.random() < 0.5 else 5]) + 1
         request = Request({})
@@ -191,12 +191,15 @@ class Adversary:
         return stream
 
     def _chatter(self) -> Stream:
-        """Return a stream of targets that jump to and fro at every tick."""
+        """Return a stream of targets that jump between two poses at every tick."""
         pair = [Request(self._poses()) for _ in range(2)]
         return lambda tick, q: pair[tick % 2]
 
     def _shaking(self) -> Stream:
-        """Return an oscillation that may be faster than the tool's limit, mainly towards the other arm."""
+        """Return a stream of oscillating targets, which may be faster than the tool's limit.
+
+        The targets move mainly along y, towards the other arm.
+        """
         size, rate = self._random.uniform(0.05, 0.6), self._random.uniform(0.005, 0.1)
         along = self._random.normal(size=3) * [0.3, 1.0, 0.3]
 
@@ -207,7 +210,10 @@ class Adversary:
         return stream
 
     def _work(self) -> Stream:
-        """Return a work motion of two arms, from a random time in it on, at up to three times its speed."""
+        """Return a stream that plays a work motion of two arms, from a random time on, at up to three times its speed.
+
+        Robots with other arms get the stream "shaking".
+        """
         if self._arms != ARMS:
             return self._shaking()
         motion = tuple(WORK_MOTIONS.values())[int(self._random.integers(len(WORK_MOTIONS)))]
@@ -215,7 +221,7 @@ class Adversary:
         return lambda tick, q: Request(dict(motion.targets(begins + speed * tick, self._home)))
 
     def _pressing(self) -> Stream:
-        """Return a stream that presses a tool onto the table, or both tools against each other, and slides about."""
+        """Return a stream that presses the tools onto the table, or against each other, and lets them slide."""
         down, rate = self._random.random() < 0.5, self._random.uniform(0.001, 0.02)
         place, depth = self._random.uniform([0.3, -0.2, 0.3], [0.7, 0.2, 0.6]), self._random.uniform(0.0, 0.1)
 

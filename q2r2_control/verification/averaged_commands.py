@@ -1,4 +1,7 @@
-"""Checks the promises about averaged commands. A cell with a jerk limit commands moving averages of its references."""
+"""Checks the promises about averaged commands. A cell with a jerk limit commands moving averages of its references.
+
+Each average is the mean of the references in a window of time; see ``robot/command_average.py``.
+"""
 
 from __future__ import annotations
 
@@ -14,11 +17,11 @@ from q2r2_control.types import Array
 from q2r2_control.verification.promises import MeasuredDistances
 
 _PERIOD = 0.001  # Only ticks of exactly this duration, which are called regular, are checked [s].
-_EXACT = 1e-12  # Differences of times below this are rounding [s].
+_EXACT = 1e-12  # A smaller difference between two durations is a rounding error [s].
 
 
 class AveragedCommands:
-    """Averages one reference after another, as a drive does, and measures the commands.
+    """Averages one reference after another, as a drive does, and measures the resulting commands.
 
     Jerk and acceleration are differences of commands in ticks of exactly one period. Distances are checked only if the
     bodies did not change in the command's whole window. After a change of fingers or objects, the new bodies are those
@@ -31,11 +34,12 @@ class AveragedCommands:
         self._acceleration = robot.capped_acceleration(settings.acceleration_limit)
         limit = settings.jerk_limit
         self._jerk = np.broadcast_to(np.inf if limit is None else np.asarray(limit, float), self._acceleration.shape)
+        # (p,) By this much, the distance of a pair at a command may be below its kept distance [m].
         self._allowance = average_allowance(robot, settings, robot.collision_model)
         self._window = 2 * round(self._average.delay / _PERIOD) + 1  # Number of references in a mean.
         self._commands: deque[Array] = deque(maxlen=4)
-        self._kept: deque[Array] = deque(maxlen=self._window)
-        self._regular = 0  # Number of regular ticks in succession.
+        self._kept: deque[Array] = deque(maxlen=self._window)  # Kept distances (p,) at the newest regular ticks [m].
+        self._regular = 0  # Number of regular ticks since the last irregular one.
 
     def start(self, q: Array) -> None:
         """Begin again at ``q`` (nv,) [rad], after a reset."""
@@ -49,7 +53,11 @@ class AveragedCommands:
         self._kept.clear()
 
     def update(self, q: Array, v: Array, h: float) -> dict[str, float]:
-        """Average a reference ``h`` [s] after the last one. Return the values to check, by the key of their promise."""
+        """Average a reference ``q`` (nv,) [rad], ``v`` (nv,) [rad/s] that is ``h`` [s] after the last one.
+
+        Returns:
+            The values to check, by the key of their promise; empty until enough ticks in succession were regular.
+        """
         if abs(h - _PERIOD) > _EXACT:
             self._regular = 0
             self._kept.clear()

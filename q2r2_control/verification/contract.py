@@ -39,10 +39,11 @@ def time_of(dt: Any) -> float:
 class Contract:
     """Checks one reference after another, from a start at ``q`` [rad], ``v`` [rad/s], (nv,) each; by default at home.
 
-    A start outside the limits, too fast or in penetration is allowed. For the limits that it breaks, the promise is to
-    recover, and separate margins check that. Coal measures distances between ticks and during full stops, in ticks that
-    ``random`` chooses, or in all ticks if ``sample_all`` is True. In a tick longer than one substep, the joints move
-    along several parabolas. The reference does not show them, so only its end is checked.
+    A start outside the limits, too fast or in penetration is allowed. For the limits that the start breaks, the promise
+    is to recover, and separate margins check that. Coal measures distances between ticks and during full stops, in
+    ticks that ``random`` chooses, or in all ticks if ``sample_all`` is True. In a tick longer than one substep, the
+    joints move along several parabolas. The reference does not contain these parabolas, so only the tick's end is
+    checked.
     """
 
     def __init__(
@@ -90,7 +91,8 @@ class Contract:
         # Whether every tick must have a certificate now. A start at rest with all pairs apart is certified by itself.
         self._certain = self._from_rest and bool(self._apart.all())
         self._least = float(margins.min(initial=np.inf)) if self._certain else -np.inf
-        self._newest: deque[tuple[float, float]] = deque(maxlen=_NEWEST)  # Duration [s], and duration times |a|^2.
+        # For each of the newest ticks: its duration [s], and its duration times |a|^2 [rad^2/s^3].
+        self._newest: deque[tuple[float, float]] = deque(maxlen=_NEWEST)
 
     def set_openings(self, openings: Mapping[str, Interval], *, before_step: bool = True) -> None:
         """Note that the controller has accepted ``openings``.
@@ -109,13 +111,13 @@ class Contract:
         self._asked_of_objects = kept_by_objects(self._robot, settings).values
 
     def _note_kept(self) -> None:
-        """Check that kept distances fall at most to those of the settings."""
+        """Check that no kept distance falls below the smaller of its last value and the distance in the settings."""
         before, kept, settings = self._measured.kept, self._controller.kept_distances, self._controller.settings
         if settings is not self._settings:
             self._ask(settings)
         if len(before):
             self._note("withdrawn", float((np.minimum(before, self._asked) - kept).max()))
-        self._measured.kept = kept  # This tick has to prove these distances.
+        self._measured.kept = kept  # At this tick, pairs have to keep these distances.
 
     def _note_objects(self) -> None:
         """Take the kept distances of held objects from the controller.
@@ -221,7 +223,10 @@ class Contract:
         return max(float(np.abs(stop_q - q).max()), float(np.abs(stop_v - v).max()))
 
     def _braked(self, q: Array, v: Array, deceleration: Array, t: float | Array) -> tuple[Array, Array]:
-        """Return position and velocity at ``t`` [s] in a stop with ``deceleration`` (nv,); ``t`` may be (s, 1)."""
+        """Return position and velocity (nv,) at ``t`` [s] in a stop from ``q`` and ``v`` with ``deceleration`` (nv,).
+
+        If ``t`` is (s, 1), both results are (s, nv).
+        """
         time = np.minimum(t, np.abs(v) / deceleration)
         brake = np.sign(v) * deceleration
         return q + v * time - 0.5 * brake * time * time, v - brake * time
@@ -275,7 +280,7 @@ class Contract:
             self._note("tool_speed", self._tools.fastest(q, v) / self._tool_limit)
 
     def _sample(self, q: Array, v: Array, stop: Array, h: float, report: StepReport) -> None:
-        """Measure distances that the controller did not measure itself."""
+        """In randomly chosen ticks, measure distances with Coal: at the tick, between ticks and during a full stop."""
         draw = 0.0 if self._sample_all else self._random.random()
         if report.margin < _NEAR:
             draw /= _NEAR_SHARE

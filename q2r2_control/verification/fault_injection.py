@@ -1,4 +1,4 @@
-"""Input of a soak: segments of hostile targets, uneven ticks, failing or hostile solvers, and bad starts."""
+"""Makes the input of a soak: segments of hostile targets, uneven ticks, failing or hostile solvers, and bad starts."""
 
 from __future__ import annotations
 
@@ -20,12 +20,13 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 from q2r2_control.verification.adversary import Adversary, Stream
 
-# "towards_nearest" is the vertex of the QP's box that brings the pair with the least margin together fastest.
-# "corner" is a random vertex for some ticks. "again" is the last answer, even if the box has changed since.
-# "no_rows" is the QP's solution without separation rows, which goes straight to the targets.
+# Answers of a solver that attacks. "towards_nearest" is the vertex of the QP's box at which the bodies of one of the
+# pairs with the least margins approach each other fastest. "corner" is a random vertex for some ticks. "again" is the
+# last answer, even if the box has changed since. "no_rows" is the QP's solution without separation rows, which leads
+# straight to the targets.
 ATTACKS = ("towards_nearest", "corner", "again", "no_rows")
 _PATIENCE = 200  # Largest number of ticks for which an attack goes on with the same pair or the same corner.
-_CANDIDATES = 4  # An attack chooses one of so many pairs with the least margins.
+_CANDIDATES = 4  # An attack chooses one of this number of pairs with the least margins.
 
 
 class WorstSolver:
@@ -70,10 +71,11 @@ class WorstSolver:
 # Solver failures that require the certified stop. A solution of absurd numbers is clipped to the limits instead.
 STOPPING_FAULTS = ("none", "nan", "one_nan", "infinite", "late")
 FAULTS = (*STOPPING_FAULTS, "absurd", "noise")
-_ATTACK_SHARES = (0.6, 0.15, 0.1, 0.15)
+_ATTACK_SHARES = (0.6, 0.15, 0.1, 0.15)  # Probabilities of ATTACKS in a segment whose solver attacks.
 _FAULTY, _ATTACKED = 0.2, 0.3  # Shares of the segments whose solver fails, or works against the arms.
+# Kinds of tick durations in a segment.
 _TIMINGS = ("1 ms", "1 ms, jittering", "a few ms", "any", "tiny", "long", "partly invalid")
-_TIMING_SHARES = (0.42, 0.20, 0.15, 0.08, 0.05, 0.04, 0.06)  # Shares of the segments.
+_TIMING_SHARES = (0.42, 0.20, 0.15, 0.08, 0.05, 0.04, 0.06)  # Shares of the segments with each kind.
 _INVALID_DT: tuple[Any, ...] = (0.0, -0.001, math.nan, math.inf, -math.inf, None, "soon", 0.2, 5.0)
 _STARTS = ("home", "apart", "anywhere", "outside", "at limits", "moving", "too fast", "in penetration")
 LATE = 1.0  # Solve time of a late solution [s].
@@ -81,15 +83,19 @@ _DEEPEST = -0.03  # Least distance of a pair at a start in penetration [m].
 
 
 def untimed(solver: Solver, nv: int) -> Guard:
-    """Return ``solver`` with a guard that uses only its reported time, so that nothing depends on the load."""
+    """Return ``solver`` with a guard that measures no time.
+
+    The guard uses only the solve time that the solver reports, so that no result depends on the computer's load.
+    """
     return Guard(solver, nv, clock=lambda: 0.0)
 
 
 class FaultySolver:
     """A real solver that fails as :attr:`fault` says: one of ``FAULTS`` or ``ATTACKS``, or None if it does not fail.
 
-    Its solve times are invented, so that no result depends on the load of the machine. ``worst`` answers while
-    :attr:`fault` is an attack that needs no solver, and uses ``q`` (nv,) [rad] and ``kept`` (p,) [m].
+    Its solve times are invented, so that no result depends on the load of the machine. If :attr:`fault` is an attack
+    other than "no_rows", ``worst`` answers instead. It uses the posture :attr:`q` (nv,) [rad] and the kept distances
+    :attr:`kept` (p,) [m], which the caller sets before each step.
     """
 
     def __init__(
@@ -135,17 +141,17 @@ class Start:
 class Segment:
     """A sequence of ticks of one kind."""
 
-    targets: str
-    timing: str
-    ticks: int
+    targets: str  # Name of the stream of targets.
+    timing: str  # Kind of the ticks' durations.
+    ticks: int  # Number of ticks.
     start: Start | None  # None if it continues from the end of the last segment.
-    fault: str | None
-    fault_period: int  # The solver fails in every second period of so many ticks. An attack lasts the whole segment.
+    fault: str | None  # The fault of the solver; None if the solver works.
+    fault_period: int  # The solver fails in every second period of this many ticks. An attack lasts the whole segment.
     stream: Stream
-    dt: Callable[[], Any]
+    dt: Callable[[], Any]  # Returns the duration of the next tick [s], which may be invalid.
 
     def fault_at(self, tick: int) -> str | None:
-        """Return the fault of the solver in a tick of this segment, or None."""
+        """Return the fault of the solver in a tick of this segment; None if the solver works in this tick."""
         lasts = self.fault in ATTACKS or (tick // self.fault_period) % 2 == 0
         return self.fault if lasts else None
 
@@ -234,7 +240,7 @@ class Starts:
         return self._robot.home.copy()
 
     def _in_penetration(self) -> Array:
-        """Return a posture in which a distance is just too small.
+        """Return a posture in which the distance of at least one pair is slightly too small.
 
         It lies on the straight line from home to a random posture in penetration.
         """
@@ -254,12 +260,13 @@ class Starts:
         return q
 
 
+# Pairs that may touch: with TABLE_ONLY, fingers and the table; with FINGERS, also fingers of both hands.
 TABLE_ONLY = (ContactPair(pair=("*_finger_*", "table")),)
 FINGERS = (*TABLE_ONLY, ContactPair(pair=("left_*_finger_*", "right_*_finger_*"), depth=0.005))
 
 
 def with_contact(config: Config, pairs: tuple[ContactPair, ...]) -> Config:
-    """Return the cell unchanged if it allows contact, else with ``pairs`` that may touch."""
+    """Return the cell with ``pairs`` that may touch. A cell that allows contact already is not changed."""
     if config.control.contact_allowed:
         return config
     return config.model_copy(update={"control": config.control.model_copy(update={"contact_allowed": pairs})})

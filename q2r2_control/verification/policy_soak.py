@@ -33,9 +33,9 @@ COUNTED = {
 }
 STREAMS = ("walk", "limits", "other_arm", "oscillate", "random", "broken", "late", "stall")
 _MOST, _LONGEST = 8, 0.4  # Largest number of actions in a chunk, and longest duration of a chunk [s].
-_STOPS = 1.0  # Time from the last action that counts until all arms are at rest [s].
+_STOPS = 1.0  # Time in which all arms have to come to rest after the last action that is followed [s].
 _PERIODS = (0.02, 0.1)  # Range of the time between two actions [s].
-_TOOLS = np.array([[-0.6, -1.1, -0.1], [1.1, 1.1, 1.4]])  # Coordinates of far targets for tools [m].
+_TOOLS = np.array([[-0.6, -1.1, -0.1], [1.1, 1.1, 1.4]])  # Coordinates of far targets for tools, in any order [m].
 
 
 class _Segment(NamedTuple):
@@ -44,7 +44,7 @@ class _Segment(NamedTuple):
     stream: str
     space: ActionSpace
     ticks: int
-    every: int  # Ticks from one chunk to the next.
+    every: int  # Number of ticks from one chunk to the next.
     step: float  # Largest step of an action [m or rad].
     goal: Array  # The action to which most streams lead.
 
@@ -52,7 +52,7 @@ class _Segment(NamedTuple):
 class HostilePolicy:
     """Makes random actions.
 
-    Most of them begin where the arms are, because other actions would be refused and move nothing.
+    Most actions begin at the arms' present poses, because other actions would be refused and would move nothing.
     """
 
     def __init__(self, robot: Robot, random: np.random.Generator) -> None:
@@ -75,7 +75,7 @@ class HostilePolicy:
         return found
 
     def draw(self, segment: _Segment, tick: Tick) -> tuple[Any, Any]:
-        """Return random actions and their times [s]. Streams of some kinds have invalid ones."""
+        """Return random actions (n, size) and their times (n,) [s]. In some kinds of streams, either may be invalid."""
         random, names = self._random, action_names(self._robot, segment.space)
         count = int(random.integers(1, _MOST + 1))
         period = random.uniform(*_PERIODS)
@@ -103,7 +103,10 @@ class HostilePolicy:
         return np.zeros(6 * len(self._robot.arms))
 
     def goal(self, stream: str, space: ActionSpace, step: float) -> Array:
-        """Return a random goal of a stream. In the space of tool motions, the goal is the motion of each action."""
+        """Return a random goal of a stream (size,).
+
+        It is an action to which most streams lead. In the space of tool motions, it is the motion in each action.
+        """
         random, robot = self._random, self._robot
         q = self._posture()
         if stream == "limits":

@@ -18,7 +18,7 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Interval, StepReport
 
 RELATIVE = 1e-9  # Relative tolerance of the limits in the contract.
-COAL = 2e-6  # Error of Coal's distance between a capsule and a box [m].
+COAL = 2e-6  # Largest error of Coal's distance between a capsule and a box [m].
 
 PROMISES = {  # By key: name, unit, comparison and bound of the value.
     "exceptions": ("exceptions raised by step", "", "<=", 0.0),
@@ -63,8 +63,8 @@ class Margin:
     allowed: float
     worst: float = field(init=False)
     tick: int | None = None  # Tick of the worst value.
-    checked: int = 0
-    violations: int = 0
+    checked: int = 0  # Number of values that were checked.
+    violations: int = 0  # Number of values that broke the promise.
 
     def __post_init__(self) -> None:
         self.worst = -math.inf if self.sense == "<=" else math.inf
@@ -79,7 +79,7 @@ class Margin:
         return kept
 
     def add(self, other: Margin) -> None:
-        """Add what another run has checked of the same promise. ``tick`` becomes the tick of the worst value."""
+        """Add the results of another run for the same promise. ``tick`` becomes the tick of the worst value of both."""
         self.checked += other.checked
         self.violations += other.violations
         self._keep_worst(other.worst, other.tick)
@@ -97,8 +97,8 @@ class Margin:
 class MeasuredDistances:
     """Margins of all monitored pairs and of the pairs of held objects: distances minus the kept distances.
 
-    ``kept`` (p,) and ``held`` (o,) are the kept distances of pairs and of pairs of objects [m]. A pair with minus
-    infinity does not count.
+    ``kept`` (p,) has the kept distances of monitored pairs, and ``held`` (o,) those of pairs of held objects [m]. A
+    pair whose kept distance is minus infinity does not count.
     """
 
     def __init__(self, robot: Robot, kept: Array) -> None:
@@ -136,7 +136,7 @@ class MeasuredDistances:
         return np.asarray(self._values(q) - self.kept + self._at_corners)
 
     def reported_margin(self, report: StepReport) -> float:
-        """Return the least margin in a report [m]. The report's nearest pair has to keep its distance in ``kept``."""
+        """Return the least margin of a report [m]: that of its tightest pair, or of its nearest pair by ``kept``."""
         closest = frozenset(report.closest_pair)
         if closest in self._objects:
             return report.margin

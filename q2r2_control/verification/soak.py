@@ -48,7 +48,7 @@ COUNTED = {
     "grasps": "grasps and releases",
     "changes": "changes of settings",
 }
-_LOOKS = (0.1, 0.4, 0.7, 1.0)  # Shares of the ticks after which the memory is measured.
+_MEASURED_AFTER = (0.1, 0.4, 0.7, 1.0)  # Shares of the ticks after which the memory is measured.
 MEMORY_ALLOWED = 5.0  # Allowed growth of the memory [MB].
 
 
@@ -60,12 +60,12 @@ class Violation:
     seed: int
     tick: int
     segment: str
-    since_segment: int  # Ticks since the segment began.
-    q: Array  # (nv,) before the tick [rad]
-    v: Array  # (nv,) before the tick [rad/s]
-    targets: dict[str, Any]  # By arm, a homogeneous matrix (4, 4).
-    dt: str
-    error: str  # Text of an exception.
+    since_segment: int  # Number of ticks since the segment began.
+    q: Array  # (nv,) Reference before the tick [rad].
+    v: Array  # (nv,) Velocity of the reference before the tick [rad/s].
+    targets: dict[str, Any]  # By arm, a homogeneous matrix (4, 4), or the text of a target that is no pose.
+    dt: str  # Duration of the tick, as text.
+    error: str  # Text of the exception; empty if there was none.
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +79,7 @@ class SoakReport:
     simulated_s: float
     counts: dict[str, int]  # See :data:`COUNTED`.
     margins: list[Margin]
-    memory_growth_mb: float | None  # See steady_growth; None if not measured.
+    memory_growth_mb: float | None  # See :func:`steady_growth`; None if it was not measured.
     broken: list[Violation]  # The first violation of each promise, in the order of their ticks.
     seeds: int = 1  # The number of soaks, with the seeds from ``seed`` on. Ticks, times and counts are sums over them.
 
@@ -102,7 +102,10 @@ def run_soak(
     progress: Callable[[str], None] = lambda what: None,
     solver: Solver | None = None,
 ) -> SoakReport:
-    """Soak the controller of a cell. At ticks without an injected fault, the cell's solver or ``solver`` is used."""
+    """Run a soak of the controller of a cell.
+
+    At ticks without an injected fault, ``solver`` is used; the cell's solver if it is None.
+    """
     robot = Robot.from_config(config)
     settings = config.control.timed(realtime=True)
     # The solver gets no time limit, because a soak that finds a fault has to find it again.
@@ -132,9 +135,9 @@ class Soak:
 
     def run(self, ticks: int, progress: Callable[[str], None] = lambda what: None) -> SoakReport:
         """Run ``ticks`` ticks."""
-        looks, memory = [round(share * ticks) for share in _LOOKS], list[float | None]()
+        measured, memory = [round(share * ticks) for share in _MEASURED_AFTER], list[float | None]()
         for tick, (segment, since) in enumerate(self._ticks(ticks)):
-            if tick in looks:
+            if tick in measured:
                 memory.append(_memory_mb())
             if tick % max(ticks // 20, 1) == 0:
                 progress(f"tick {tick} of {ticks}")
@@ -153,7 +156,10 @@ class Soak:
         )
 
     def _ticks(self, ticks: int) -> Iterator[tuple[Segment, int]]:
-        """Yield the segment of each tick and the tick within it. A segment with a start resets the controller."""
+        """Yield, for each tick, its segment and its number in the segment.
+
+        A segment with a start resets the controller.
+        """
         left = ticks
         robot, settings = self._controller.robot, self._controller.settings
         kept = kept_distances(robot, settings).values
@@ -180,7 +186,7 @@ class Soak:
         self._change_cell()
         try:
             reference = self._controller.step(request.targets, dt)
-        except Exception as error:  # The contract promises that there is none.
+        except Exception as error:  # The contract promises that ``step`` raises nothing.
             self._contract.raised()
             self._keep(tick, segment, since, request, dt, ["exceptions"], f"{type(error).__name__}: {error}")
             self._reset(self._controller.robot.home, np.zeros_like(self._q))

@@ -1,4 +1,4 @@
-"""Speeds of tools that Pinocchio computes, for a check that does not use our kernels."""
+"""Speeds of tools that Pinocchio computes, for checks that do not rely on this package's own kinematics."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Views of a run or a headset. Nothing waits for a view, and no view needs ROS."""
+"""Views of a run or of a headset's data. The control loop never waits for a view, and no view needs ROS."""
 
 from __future__ import annotations
 

@@ -16,9 +16,10 @@ from q2r2_control.teleop.reasons import SILENCES, TeleopReason
 from q2r2_control.types import ActiveLimit, LimitKind
 from q2r2_control.wording import sentence
 
-# A tool within this distance of its target follows [m], [rad]. Beyond it, the sentence names what holds the tool back.
+# A tool within this distance [m] and angle [rad] of its target counts as following. Otherwise the sentence names what
+# holds the tool back.
 _FOLLOWS, _TURNED = 0.005, 0.05
-_ANSWER_S = 4.0  # Time for which a pause is answered that changes nothing.
+_ANSWER_S = 4.0  # If a paused arm is asked to pause, the answer "already paused" is shown for this time.
 _PAUSES = (TeleopReason.PAUSE_REQUESTED, TeleopReason.PAUSE_SERVICE)
 _HELD_BY = {LimitKind.POSITION: "at its limit", LimitKind.VELOCITY: "as fast as it may turn"}
 _FOLLOWS_WHAT = {str(ArmState.CARRIED): "goes with the other arm", str(ArmState.POLICY): "follows the policy"}
@@ -28,11 +29,14 @@ class Told(NamedTuple):
     """The events of an arm that say why it is in its state."""
 
     change: Event | None = None  # The last change of state.
-    refusal: Event | None = None  # The newest refusal since then.
-    pause: Event | None = None  # The newest request since then to pause the arm, which holds already.
+    refusal: Event | None = None  # The newest refusal since this change.
+    pause: Event | None = None  # The newest request to pause the arm, which held already; None since the last change.
 
     def after(self, event: Event) -> Told:
-        """Return the events to tell after one more ``event``. Events without a change of state hide no reason."""
+        """Return the events that say why the arm is in its state after one more ``event``.
+
+        An event that changes the state replaces all earlier ones. Other events replace no change of state.
+        """
         if event.source != event.destination:
             return Told(event)
         if event.kind in _PAUSES and event.destination in HOLDING:
@@ -45,7 +49,7 @@ class Told(NamedTuple):
 
 
 def told_after(told: Mapping[str, Told], events: Iterable[Event]) -> dict[str, Told]:
-    """Return the events of each arm to tell after ``events``."""
+    """Return, by arm, the events that say why it is in its state after ``events``. ``told`` are the ones before."""
     newest = dict(told)
     for event in events:
         newest[event.arm] = newest.get(event.arm, Told()).after(event)
@@ -66,21 +70,21 @@ class ArmWords:
             device: The words of the device that drives.
         """
         self._joints, self._bindings, self._device = joints, bindings, device
-        self.told: Mapping[str, Told] = {}  # By arm.
+        self.told: Mapping[str, Told] = {}  # By arm, the events that say why it is in its state.
 
     def follow(self, events: Iterable[Event]) -> None:
-        """Keep the ``events`` that tell the state of an arm."""
+        """Keep those of the newest ``events`` that say why an arm is in its state."""
         self.told = told_after(self.told, events)
 
     def controls(self) -> dict[str, str]:
-        """Return the action of each bound control of a hand, in words."""
+        """Return the action of each control of a hand that is bound to an action. Both are in words."""
         bound = {self._device.noun(binding.words): MEANINGS[binding.action] for binding in self._bindings.bound()}
         both = [self._device.noun(control) for control in ("lower", "upper") if control in self._device.nouns]
         chord = {} if len(both) < 2 else {" and ".join(both): "the headset's alignment: stops both arms until let go"}
         return bound | chord
 
     def why(self, tick: Tick, arm: str, binding: Collection[ActiveLimit]) -> str:
-        """Return why ``arm`` is in its state. ``binding`` are limits that held the last steps back, as in a report."""
+        """Return why ``arm`` is in its state, in words. ``binding`` are the limits that held the last steps back."""
         if not tick.following:
             return "the run ends"
         if tick.states[arm] in (ArmState.ALIGNING, ArmState.HOMING):
@@ -107,7 +111,7 @@ class ArmWords:
         return sentence(reason, self._device)
 
     def next_press(self, tick: Tick, arm: str) -> str:
-        """Return instructions for the operator of an arm, with their effects."""
+        """Return what the operator of an arm can press next, and the effect of each press."""
         state, device, bindings = tick.states[arm], self._device, self._bindings
         if device.nobody:
             return f"nothing: {device.nobody}"
@@ -134,7 +138,10 @@ class ArmWords:
 
 
 def _held_by(tick: Tick, arm: str, joints: Collection[str], binding: Collection[ActiveLimit]) -> str | None:
-    """Return the pair or limit that holds an arm back, if any: a pair of bodies first, then tool speed, then joints."""
+    """Return in words what holds an arm back: a pair of bodies first, then the tool speed, then a joint.
+
+    ``joints`` are the names of the arm's joints. The result is None if nothing holds the arm back.
+    """
     report = tick.reference.report
     pairs = [limit.names for limit in binding if limit.kind is LimitKind.SEPARATION]
     pairs = [pair for pair in pairs if any(body.startswith(f"{arm}_") for body in pair)]

@@ -17,7 +17,7 @@ _EPISODE_OVER = (
 
 
 class EpisodeWords:
-    """Makes a line about the present episode from the events of a recorded run.
+    """Makes a line of text about the present episode from the events of a recorded run.
 
     If no episode begins in a run, the whole run is one episode.
     """

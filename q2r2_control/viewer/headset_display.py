@@ -17,7 +17,7 @@ from q2r2_control.viewer.shown_robot import ShownRobot
 from q2r2_control.viewer.state_colours import state_colour
 from q2r2_control.viewer.tightest_pair import TightestPair
 
-_DIGITS = 4  # Decimals of metres and quaternions.
+_DIGITS = 4  # Number of decimals to which metres and quaternions are rounded.
 
 
 class ShownTick(NamedTuple):
@@ -32,13 +32,13 @@ class ShownTick(NamedTuple):
 
 
 class RunDisplay:
-    """Makes the messages of the display. This is done in the process that sends them, which reads the robot's URDF."""
+    """Makes the messages of the display, in the process that sends them. This process reads the robot's URDF again."""
 
     def __init__(self, run: ShownRobot, model: pin.Model, pairs: pin.GeometryModel, parts: Mapping[str, int]) -> None:
         """Prepare the display.
 
-        ``pairs`` are the monitored pairs of bodies of the controller's ``model``; ``parts`` are from
-        :func:`places_of_parts`.
+        ``model`` is the controller's model, and ``pairs`` has its bodies and monitored pairs. ``parts`` is the result
+        of :func:`places_of_parts`.
         """
         self._run, self._model, self._pairs, self._parts = run, model, pairs, parts
         # The texts contain names of controls in braces. The page knows the operator's device, and replaces the names by
@@ -74,12 +74,12 @@ class RunDisplay:
         }
 
     def _joints_of_tool(self, joints: Array) -> list[int]:
-        """Return the index of an arm's last joint, and the indices of all joints that it carries, such as fingers."""
+        """Return the index of an arm's last joint, and the indices of all joints behind it, such as the fingers'."""
         model = self._tree.model
         return [int(joint) for joint in model.subtrees[model.getJointId(self._run.joint_names[joints[-1]])]]
 
     def message(self, shown: ShownTick) -> ShownState:
-        """Return the message about one moment of the run."""
+        """Return the message about one tick of the run."""
         tick, words = shown.tick, self._words
         words.told = shown.told
         pin.forwardKinematics(self._tree.model, self._data, self._tree.posture(tick.state.q, tick.grippers))
@@ -115,6 +115,9 @@ def _rounded(pose: pin.SE3) -> Seven:
 
 
 def _part(moved: Array, at: int) -> Seven:
-    """Return the pose of a part, with the quaternion in the order x y z w. In MuJoCo's ``moved`` it is w x y z."""
+    """Return the pose of a part, with the quaternion in the order x y z w.
+
+    The pose begins at the index ``at`` of MuJoCo's positions ``moved``, where the quaternion is in the order w x y z.
+    """
     x, y, z, qw, qx, qy, qz = moved[at : at + 7].round(_DIGITS).tolist()
     return x, y, z, qx, qy, qz, qw

@@ -18,7 +18,7 @@ from q2r2_control.inputs.messages import HandMessage, HandPose, HandTwist
 from q2r2_control.inputs.session import TopicStatistics
 from q2r2_control.viewer.tables import Cell, figure_table
 
-_REFRESH_RATE = 6.0  # [Hz]
+_REFRESH_RATE = 6.0  # Greatest rate at which the live table is drawn [Hz].
 _COLUMNS = ("topic", "messages", "rate [Hz]", "age [s]", "last value")
 
 
@@ -80,7 +80,10 @@ def headset_table(check: HeadsetCheck) -> Table:
 
 @contextmanager
 def headset_display(console: Console) -> Iterator[Callable[[HeadsetCheck], None]]:
-    """Show the state of a headset as a live table on a terminal. Elsewhere, print only advice when it changes."""
+    """Yield a function that shows the state of a headset, as a live table if the console is a terminal.
+
+    Otherwise the function prints only the advice, each time that it changes.
+    """
     drawn, advised = -math.inf, tuple[str, ...]()
 
     def advise(check: HeadsetCheck) -> None:

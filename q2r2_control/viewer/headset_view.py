@@ -44,7 +44,7 @@ class DisplayInput(Input, Protocol):
 
 
 class HeadsetView:
-    """A listener of one run. It stores what each tick brings, and sends it to the input's process 30 times a second."""
+    """A listener of one run. It collects the ticks' data, and sends them to the input's process 30 times a second."""
 
     def __init__(self, source: DisplayInput, pipeline: Pipeline, recorded: bool) -> None:
         self._source = source

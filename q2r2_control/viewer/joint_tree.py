@@ -26,7 +26,7 @@ class JointTree:
         self.model = pin.buildModelFromXML(shown.urdf)
         self._index = {name: self.model.joints[self.model.getJointId(name)].idx_q for name in self.model.names[1:]}
         self._arms = np.array([self._index[name] for name in shown.joint_names])
-        # Joints of each arm's gripper, and their closed and open position.
+        # Indices of the joints of each arm's gripper in the configuration (nq,), and their closed and open positions.
         self._strokes: dict[str, tuple[list[int], float, float]] = {}
         for arm, config in shown.config.arms.items():
             joints = [self._index[name] for name in shown.fingers[arm]]

@@ -20,8 +20,8 @@ from q2r2_control.viewer.episode_words import EpisodeWords
 from q2r2_control.viewer.tables import times_real_time
 from q2r2_control.wording import limit_name
 
-_REFRESH_RATE = 6.0  # [Hz]
-# The thread that draws computes for milliseconds at a time. The loop gets the interpreter back after this time [s].
+_REFRESH_RATE = 6.0  # Rate at which the table is drawn [Hz].
+# The thread that draws may compute for milliseconds. The loop gets the interpreter back from it after this time [s].
 _SWITCH_INTERVAL = 2e-5
 _LIMITS_SHOWN, _BAR = 4, 20  # Greatest number of limits that are named, and length of the progress bar [characters].
 _NEAR = 0.01  # A pair with a smaller margin is coloured [m].
@@ -50,10 +50,11 @@ class LiveTable:
         self._steps, self._duration = steps, duration
         self._newest: Tick | None = None
         self._count = 0  # Number of ticks so far.
-        self._binding: dict[ActiveLimit, None] = {}
-        self._repelled: dict[str, None] = {}
+        self._binding: dict[ActiveLimit, None] = {}  # Limits that held a step back since the last drawing.
+        self._repelled: dict[str, None] = {}  # Joints that were pushed off their limits since the last drawing.
         self._simulated_time, self._episodes = simulated_time, episodes
-        self._drawn = (time.monotonic(), 0, 0.0)  # The last drawing: time [s], count of ticks, and time of the run [s].
+        # The last drawing: its time [s], the number of ticks until then, and the time of the run [s].
+        self._drawn = (time.monotonic(), 0, 0.0)
 
     def __call__(self, tick: Tick) -> None:
         """Store one tick, to be shown later."""

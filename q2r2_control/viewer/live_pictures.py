@@ -25,7 +25,7 @@ from q2r2_control.summary.tick import Tick
 if TYPE_CHECKING:
     from q2r2_control.cameras.camera_process import CameraShot
 
-_NICENESS = 19  # Lowest priority of the process, since the loop and the hands come first.
+_NICENESS = 19  # The process gets the lowest priority, since the loop and the hands come first.
 _QUALITY = 70  # JPEG quality, from 0 to 100.
 _logger = logging.getLogger(__name__)
 
@@ -39,7 +39,7 @@ class PictureSetup(NamedTuple):
 
 
 def main(requests: Iterator[Any], answer: Callable[[bytes], None]) -> None:
-    """Run the process. The first request is the setup; each further one has MuJoCo's positions (qpos).
+    """Run the process. The first request is the setup; each further request is MuJoCo's positions (qpos) as bytes.
 
     The answer to each further request is a picture as JPEG.
     """
@@ -69,7 +69,7 @@ class LivePictures(AbstractContextManager["LivePictures"]):
         show: Callable[[bytes], object],
         watched: Callable[[], bool],
     ) -> None:
-        """Start the process; raises :class:`OSError`.
+        """Start the process; raises :class:`OSError` if it cannot be started.
 
         ``show`` gets up to ``most`` pictures a second in a thread of its own, as long as ``watched`` returns True.
         """

@@ -10,7 +10,10 @@ from q2r2_control.plants.mujoco import MujocoPlant
 
 
 def places_of_parts(plant: object, config: Config) -> dict[str, int]:
-    """Return the loose parts of a simulated cell by name, with the index in qpos at which the pose of each begins."""
+    """Return, for each loose part of a simulated cell by name, the index in MuJoCo's qpos at which its pose begins.
+
+    The result is empty for other plants.
+    """
     if not isinstance(plant, MujocoPlant):
         return {}
     return {name: int(plant.model.joint(f"{name}_free").qposadr[0]) for name in config.mujoco.objects}

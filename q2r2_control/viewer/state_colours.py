@@ -25,5 +25,5 @@ def state_colour(state: str) -> Colour:
 
 
 def obstacle_colour(report: ObstacleReport) -> Colour:
-    """Return RED if the obstacle moves and its report is so old that arms keep a larger distance; else AMBER."""
+    """Return RED if the obstacle may move and its report is so old that arms keep a larger distance; else AMBER."""
     return RED if report.obstacle.speed > 0.0 and report.age > REPORT_AGE else AMBER

@@ -24,9 +24,9 @@ def figure_table(
     """Return a table of figures and names under headings; ``notes`` are lines below it.
 
     In a column with a unit or with numbers, the last word of the heading is the unit, and is put into a second line.
-    Such a column is aligned to the right and is never cut. Text in other columns continues in the next line. A row of
-    one cell is the heading of the rows below. If the console is too narrow, the table is wider than the console.
-    Therefore print it by :func:`print_table`.
+    Such a column is aligned to the right and is never cut. In other columns, text that is too long continues in the
+    next line. A row of one cell is the heading of the rows below. If the console is too narrow, the table is wider than
+    the console. It therefore has to be printed by :func:`print_table`.
     """
     given = list(given)
     rows = [tuple(map(_shown, row)) for row in given]

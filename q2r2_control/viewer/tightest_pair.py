@@ -26,7 +26,7 @@ class TightestPair:
     def ends(self, report: StepReport) -> Array | None:
         """Return the nearest points (2, 3) of the pair in the world frame [m]; None if the pair is not known.
 
-        The bodies are where :meth:`place` has put them.
+        The bodies have the poses of the last call of :meth:`place`.
         """
         if report.tightest_pair not in self._names or not math.isfinite(report.margin):
             return None

@@ -25,12 +25,12 @@ def installation_folder() -> Path:
 
 
 def installation_token(folder: Path) -> str:
-    """Return the token. It is the same in each run, so that a headset does not need a new URL each time.
+    """Return the token of the page's URL. It is the same in each run, so that a headset does not need a new URL.
 
     A file whose text is shorter than a token is replaced. It may be empty after a full disk, and opens no page.
 
     Raises:
-        InputError: If the file cannot be read or written.
+        InputError: If the token's file cannot be read or written.
     """
     file = folder / "token"
     try:
@@ -99,7 +99,7 @@ def _made(names: list[str], now: datetime) -> bytes:
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, f"q2r2_control on {socket.gethostname()}"[:64])])
     made = (
         x509.CertificateBuilder(subject, subject, key.public_key(), x509.random_serial_number())
-        .not_valid_before(now - timedelta(days=1))  # A headset's clock may be slow.
+        .not_valid_before(now - timedelta(days=1))  # The clock of a headset may be behind.
         .not_valid_after(now + _VALID)
         .add_extension(x509.SubjectAlternativeName([_general_name(name) for name in names]), critical=False)
         .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)

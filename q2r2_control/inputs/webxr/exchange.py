@@ -13,13 +13,13 @@ from q2r2_control.inputs.webxr.shown import ShownScene, ShownState
 
 
 class Display(Protocol):
-    """Makes the data of a run that a headset shows. The run makes this instance, and the page's process uses it."""
+    """Makes the data of a run that a headset shows. The run creates the instance, and the page's process uses it."""
 
     def scene(self) -> ShownScene:
-        """Return the data that is sent once to each page, as JSON."""
+        """Return the data that is sent once to each page, in a form that JSON can represent."""
 
     def message(self, shown: Any) -> ShownState:
-        """Return the JSON data of the state that was given to :meth:`DisplayInput.show`."""
+        """Return the data of a state that was passed to :meth:`WebXrInput.show`, in a form that JSON can represent."""
 
 
 @dataclass(frozen=True)
@@ -40,29 +40,29 @@ class Listening(NamedTuple):
     """The first answer, which says that the process listens."""
 
     port: int
-    urls: tuple[str, ...]  # One URL for each of its addresses.
+    urls: tuple[str, ...]  # One URL for each address of the server.
 
 
 class Admitted(NamedTuple):
-    """A page drives from now on."""
+    """Says that the page with the address ``peer`` drives from now on."""
 
     peer: str
 
 
 class Lost(NamedTuple):
-    """The connection to the page that drove has ended."""
+    """Says that the connection to the page that drove has ended, and why."""
 
     reason: str
 
 
 class Received(NamedTuple):
-    """The newest hands of the page that drives."""
+    """The newest poses and controls of the hands, from the page that drives."""
 
     receptions: list[Reception]
 
 
 class Requested(NamedTuple):
-    """What a button of a page requests."""
+    """The request of a button of a page."""
 
     request: HeadsetRequest
 

@@ -25,30 +25,31 @@ class PageClient(Peer):
     """A page that is connected. It may drive, wait or only watch."""
 
     def __init__(self, connection: ServerConnection, host: str, peer: str, page: str, now: float) -> None:
-        # A page keeps its number when it is reloaded. Like the app's registrations, the number shows that a page is the
-        # same as before.
+        # A page keeps its number ``page`` when it is reloaded. Like the app's registrations, the number shows that a
+        # new connection is from the same page as before.
         super().__init__(peer, host, since=now, last_frame=now, registrations=({"page": page} if page else {}, {}))
         self.connection = connection
         self.newest: PageMessage | None = None  # The newest message; None if it has been passed on.
-        self.acknowledged = -1  # Number of the newest message.
+        self.acknowledged = -1  # Number of the newest message that was received; -1 before the first one.
         self.refused_hosts: set[str] = set()  # Hosts that the log has named as refused while this page drives.
         self.due = asyncio.Event()  # Set if something has to be sent.
         self.vibrations: dict[str, HapticFeedback] = {}  # The newest vibration of each hand that is not sent yet.
         self.shown: Any = None  # The newest state of the run; None if it has been sent.
         self.picture: bytes | None = None  # The newest picture of a camera; None if it has been sent.
-        self.driver: str | None = None  # The driver, which a page that watches has to be told; None if it knows.
+        # Address of the page that drives, which a page that watches has to be told; None if it has been told.
+        self.driver: str | None = None
         self.rate = RateLimit(MAX_MESSAGES_PER_SECOND)
-        self.reason = ""  # Why the server has closed the socket.
+        self.reason = ""  # Why the server has closed the socket; empty if it has not.
         self.closing: asyncio.Future[None] | None = None
 
     def end(self, code: int, reason: str) -> None:
-        """Begin to close the socket. This takes until the page answers."""
+        """Begin to close the socket. It is closed when the page has answered."""
         self.reason = reason
         shown = reason.encode()[:_LONGEST_REASON].decode(errors="ignore")
         self.closing = asyncio.ensure_future(self.connection.close(code, shown))
 
     async def send_newest(self, scene: str | None, display: Display | None) -> None:
-        """Send the ``scene`` first, and then the newest data each time they are due. Older data are left out."""
+        """Send the ``scene`` first, and then the newest data each time ``due`` is set. Older data are left out."""
         connection = self.connection
         with suppress(ConnectionClosed):
             if scene is not None:

@@ -1,4 +1,7 @@
-"""Read the messages of the page: the hands as JSON, once for each picture of the headset. No sockets are used."""
+"""Read the messages of the page. They are JSON, and have the hands' poses and controls for each picture of the headset.
+
+This module uses no sockets.
+"""
 
 from __future__ import annotations
 
@@ -53,11 +56,12 @@ class HeadsetHand(_PageModel):
     pose: Seven | None
     fault: Literal["hand_untracked", "hand_frame_moved"] | None = None
     buttons: tuple[bool, bool, bool] = (False, False, False)  # Upper, lower, pinch.
-    axes: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)  # Stick to the right and forward, index, middle.
+    # Stick to the right, stick forward (both -1 to 1); trigger of the index finger, grip of the middle finger (0 to 1).
+    axes: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
 
 
 class PageMessage(_PageModel):
-    """The message for one picture of the headset. Without hands it only says that the page is alive."""
+    """The message for one picture of the headset. A message without hands only says that the page still runs."""
 
     seq: int = Field(ge=0, le=1 << 53)
     hands: dict[_Hand, HeadsetHand] = Field(default_factory=dict)
@@ -66,7 +70,7 @@ class PageMessage(_PageModel):
 
     @property
     def controls(self) -> dict[str, tuple[bool, ...]]:
-        """The buttons of each hand."""
+        """The buttons of each hand: upper, lower, pinch."""
         return {name: hand.buttons for name, hand in self.hands.items()}
 
     def receptions(self) -> list[Reception]:
@@ -94,7 +98,7 @@ _MESSAGES = TypeAdapter(PageMessage)
 
 
 def read(message: str | bytes) -> PageMessage:
-    """Read a message of the page; raises :class:`ProtocolError` for anything else."""
+    """Read a message of the page; raises :class:`ProtocolError` if ``message`` is not such a message."""
     if isinstance(message, bytes):
         raise ProtocolError(f"{len(message)} bytes that are no text; allowed: JSON of the hands")
     try:

@@ -43,7 +43,9 @@ from q2r2_control.inputs.webxr.page_client import MAX_MESSAGES_PER_SECOND, PageC
 from q2r2_control.inputs.webxr.page_messages import LONGEST, HeadsetRequest, read
 from q2r2_control.types import HapticFeedback
 
-REFUSED, DROPPED, OVER, FREE = 4001, 4002, 4003, 4004  # Codes of a closed socket, which the page reads.
+# Codes with which a socket is closed, which the page reads. FREE says that no page drives, so that a page that watched
+# may drive.
+REFUSED, DROPPED, OVER, FREE = 4001, 4002, 4003, 4004
 _MOST_WATCHERS = 8  # Greatest number of pages that only watch.
 _WATCHED = 0.1  # Least time between two states that are sent to pages that watch [s].
 _MOST_SOCKETS = 16  # Greatest number of open pages.
@@ -68,7 +70,7 @@ class PageServer:
         self._scene = json.dumps({"scene": setup.display.scene()}) if setup.display is not None else None
 
     async def run(self, requests: Iterator[Any]) -> None:
-        """Serve until the run closes its end of the connection to this process."""
+        """Serve until ``requests`` ends, because the run has closed its end of the connection to this process."""
         loop, ended = asyncio.get_running_loop(), asyncio.Event()
 
         def pass_on() -> None:
@@ -106,7 +108,7 @@ class PageServer:
         return [*([] if self._driver is None else [self._driver]), *self._waiting, *self._watchers]
 
     def _answer_request(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Return a file of the page, a refusal, or None for the socket."""
+        """Return a file of the page or a refusal; None if a socket may be opened."""
         path = urlsplit(request.path).path
         name = path.removeprefix("/") or "index.html"
         is_socket = path == "/socket"
@@ -179,7 +181,7 @@ class PageServer:
         client.newest = message
 
     def _ask(self, client: PageClient, request: HeadsetRequest | None) -> None:
-        """Pass on what a button requests: a stop by every page, and everything by the page that drives."""
+        """Pass on the request of a button: a stop from any page, other requests only from the page that drives."""
         if request is HeadsetRequest.STOP or (request is not None and client is self._driver):
             self._answer(Requested(request))
 
@@ -200,7 +202,7 @@ class PageServer:
             client.due.set()
 
     def _take(self, request: Any) -> None:
-        """Take data of the run: a vibration, a state or a picture for the driver, and a state for pages that watch."""
+        """Take data from the run: vibrations, states and pictures for the driver, and states for pages that watch."""
         driver = self._driver
         if driver is None:
             return
@@ -254,7 +256,7 @@ class PageServer:
         self._forget(client, reason)
 
     def _forget(self, client: PageClient, reason: str) -> None:
-        """Remove a page whose connection has ended, or that may not drive any more. May be called twice."""
+        """Remove a page whose connection has ended, or that may not drive any more. Repeated calls do nothing."""
         for pages in (self._waiting, self._watchers):
             if client in pages:
                 pages.remove(client)
@@ -282,7 +284,7 @@ def _logger_of(answer: Callable[[Any], None]) -> logging.Logger:
 
 
 def _peer_of(connection: ServerConnection) -> tuple[str, str]:
-    """Return the host, and host and port as one text for people.
+    """Return the host of a page; and its host and port as one text for people.
 
     The host of an IPv4 connection through an IPv6 socket is an IPv4 address.
     """

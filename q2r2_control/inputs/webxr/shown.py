@@ -17,21 +17,21 @@ Point = tuple[float, float, float]
 class ShownMesh(TypedDict):
     """A mesh in the frame of a joint."""
 
-    joint: int
+    joint: int  # Index into ``ShownState.joints``.
     colour: Colour
-    vertices: list[float]
-    faces: list[int]
+    vertices: list[float]  # x y z of all vertices one after the other [m].
+    faces: list[int]  # The indices of three vertices for each triangle, one triangle after the other.
 
 
 class ShownPart(TypedDict):
     """A loose part, which is drawn as a box."""
 
-    size: Point
+    size: Point  # Lengths of the edges along x y z [m].
     colour: Colour
 
 
 class ShownScene(TypedDict):
-    """The part of a run that does not change."""
+    """The data of a run that do not change."""
 
     name: str
     meshes: list[ShownMesh]
@@ -62,16 +62,16 @@ class ShownArm(TypedDict):
 class ShownPair(TypedDict):
     """The pair of bodies with the least margin."""
 
-    ends: tuple[Point, Point]
+    ends: tuple[Point, Point]  # The nearest points of both bodies.
     margin: float  # [m]
 
 
 class ShownState(TypedDict):
-    """A moment of a run."""
+    """The state of a run at one time."""
 
     arms: dict[str, ShownArm]
     joints: list[Seven]  # The poses of the joints. ``ShownMesh.joint`` is an index into this list.
-    parts: dict[str, Seven]
+    parts: dict[str, Seven]  # Poses of the loose parts, by name.
     pair: ShownPair | None
     recording: str
 
@@ -85,7 +85,7 @@ class ShownVibration(TypedDict):
 
 
 class FromRun(TypedDict):
-    """A message with any of these fields."""
+    """A message from the run to the page. It contains at least one of these fields."""
 
     scene: NotRequired[ShownScene]
     state: NotRequired[ShownState]

@@ -46,7 +46,7 @@ from q2r2_control.types import SIDES, HandSample, HapticFeedback
 PORT = 8443
 _READY = 120.0  # Longest time until the process is ready, on a busy computer [s].
 _PATIENCE, _LONGEST = 2.0, 10.0  # Longest time until the process ends if it is idle, and if it is busy [s].
-_ROOM = 2  # Number of messages that may wait for the process. More would only delay the newest data.
+_QUEUED = 2  # Number of states and pictures that may wait for the process. More would only delay the newest data.
 _LOG = logging.getLogger(__name__)
 
 
@@ -62,9 +62,9 @@ def _check_packages() -> None:
 class WebXrInput:
     """Gives the hands of a headset's browser. Implements :class:`~q2r2_control.inputs.base.Input`.
 
-    A process of its own serves page and socket, so that neither HTTPS nor JSON delays the loop. The messages of that
-    process become samples as the messages of the Quest2ROS app do; see
-    :class:`~q2r2_control.inputs.hand_stream.HandStream`. ``clock`` gives the time at which they come from it [s].
+    A process of its own serves the page and its socket, so that neither HTTPS nor JSON delays the loop. The messages of
+    this process become samples in the same manner as the messages of the Quest2ROS app; see
+    :class:`~q2r2_control.inputs.hand_stream.HandStream`. ``clock`` gives the time at which such a message comes [s].
     """
 
     controls = CONTROLS
@@ -82,7 +82,10 @@ class WebXrInput:
         say: Callable[[str], None] = _LOG.info,
         silence: float = SILENCE_ALLOWED,
     ) -> None:
-        """A page that sends nothing for ``silence`` [s] is dropped. The teleop layer stops the arms long before."""
+        """Make an input, which listens on ``host`` and ``port`` after :meth:`start`.
+
+        A page that sends nothing for ``silence`` [s] is dropped. The teleop layer stops the arms long before.
+        """
         self.address = host, port  # After ``start``, the port is the one that was bound.
         self.urls: tuple[str, ...] = ()  # After ``start``, one URL for each address of this computer.
         self._clock, self._allow, self._usb, self._certificate, self._say = clock, allow, by_usb, certificate, say
@@ -158,7 +161,7 @@ class WebXrInput:
         pem = None if certificate is None else str(certificate)
         setup = HeadsetPageSetup(host, port, self._allow, addresses, pem, token, self._silence, self._display)
         try:
-            self._process = HelperProcess("serves the page", "q2r2_control.inputs.webxr.server", self._take, _ROOM)
+            self._process = HelperProcess("serves the page", "q2r2_control.inputs.webxr.server", self._take, _QUEUED)
         except OSError as error:
             raise InputError(f"webxr: {reason_of(error)}") from error
         self._process.send(setup)
@@ -192,7 +195,7 @@ class WebXrInput:
 
     @property
     def driver(self) -> str | None:
-        """The address of the headset that drives; None if none does."""
+        """The address of the page that drives, as host:port; None if no page drives."""
         return self._stream.peer
 
     def poll(self, now: float) -> list[HandSample]:
@@ -230,7 +233,7 @@ class WebXrInput:
         self._ready.clear()
 
     def _take(self, answer: Any) -> None:
-        """Handle data from the process. A thread of its own calls this."""
+        """Handle data from the process. A separate thread calls this method."""
         match answer:
             case Received(receptions):
                 now = self._clock()

@@ -1,8 +1,8 @@
 """Answer the cabinets in a process of its own, so that no tick of the loop makes a cabinet wait.
 
 The loop sends commands to this process, and gets back whether they came in time. After each message of a cabinet the
-loop gets the state of the session. If the loop ends in any way, the process goes on until the arms have come to rest
-on their certified stop.
+loop gets the state of the session. However the loop ends, the process goes on until the arms have come to rest at the
+end of their certified stop.
 """
 
 from __future__ import annotations
@@ -24,13 +24,14 @@ from q2r2_control.process.answering_process import AnsweringProcess
 from q2r2_control.process.helper_process import leave_signals_to_the_run, reason_of
 from q2r2_control.process.scheduling import few_garbage_collections, real_time, reserve
 
-# Processor time that is reserved for answers, and the interval in which it is reserved [s]. An answer takes 0.2 ms.
+# Processor time that is reserved for answers in each interval, and the length of an interval [s]. An answer takes
+# 0.2 ms.
 _RESERVED = 0.0015, 0.002
 _POLL = 0.05  # Time between two checks whether the arms stand still, after the loop has ended [s].
-_LONGEST_WORD = 1.0  # Longest time that the loop waits for the reply to its commands [s]. Arms brake meanwhile.
+_LONGEST_REPLY_WAIT = 1.0  # Longest time that the loop waits for the reply to its commands [s]. Arms brake meanwhile.
 # The socket option SO_TIMESTAMPNS, by which Linux stamps each arriving datagram with its real-time clock; the layout of
-# such a stamp; the size of the buffer for it [bytes]; and the longest time that a datagram can have waited [s]. If the
-# stamp tells a longer wait, that clock has jumped.
+# such a stamp; the size of the buffer for the stamp [bytes]; and the longest time that a datagram can have waited [s].
+# If the stamp shows a longer wait, the real-time clock has jumped.
 _TIMESTAMP, _TIMESPEC, _EXTRA, _LONGEST_WAIT = 35, struct.Struct("@qq"), 64, 0.1
 
 
@@ -48,20 +49,21 @@ class CabinetAnswers(AnsweringProcess):
     """The loop's end of the connection to the process that answers the cabinets."""
 
     def __init__(self, lines: Sequence[Line]) -> None:
-        """Start the process, with a line to each cabinet.
+        """Start the process, which takes over the connections ``lines`` to the cabinets.
 
-        The process gets a copy of each socket, so that the caller may then close its own.
+        The process gets a copy of each socket, so that the caller may then close its own sockets.
 
         Raises:
-            PlantError: If the process cannot begin.
+            PlantError: If the process cannot be started.
         """
         files = [line.file for line in lines]
-        super().__init__(__name__, "the cabinets", (list(lines),), _LONGEST_WORD, files)
+        super().__init__(__name__, "the cabinets", (list(lines),), _LONGEST_REPLY_WAIT, files)
 
     def receive(self) -> tuple[list[SessionState], list[tuple[float, float]]]:
-        """Return each arm's newest state since the last call, and two times for each message that was answered.
+        """Return the newest states of the sessions, and two times for each message that was answered.
 
-        These times are the arrival of the message, and the time from its arrival until its answer was sent [s].
+        Both contain only what has come since the last call. The two times are the message's arrival by the monotonic
+        clock, and the time from its arrival until its answer was sent [s].
 
         Raises:
             PlantError: If the process has ended.
@@ -76,7 +78,12 @@ class CabinetAnswers(AnsweringProcess):
 
 
 def main(commands: int, states: int) -> None:
-    """Run in the process: answer until the loop has ended and the arms stand still."""
+    """Run the process: answer the cabinets until the loop has ended and the arms stand still.
+
+    Args:
+        commands: File descriptor of the socket from which the loop's commands come.
+        states: File descriptor of the socket to which the states of the sessions are sent.
+    """
     leave_signals_to_the_run()
     with socket.socket(fileno=commands) as from_loop, socket.socket(fileno=states) as to_loop:
         try:
@@ -116,7 +123,7 @@ class _Answering:
                     self._answer(*self._lines[file])
 
     def _take_commands(self) -> bool:
-        """Take all commands that have come; returns True if the loop has not ended."""
+        """Take all commands that have come from the loop; returns False if the loop has ended."""
         try:
             while said := self._commands.recv(CabinetAnswers.LARGEST):
                 self._commands.send(
@@ -144,7 +151,7 @@ class _Answering:
                 state.took = time.monotonic() - came
         except OSError:  # The cabinet has gone. Its silence will be noticed.
             return
-        with suppress(OSError):  # If the loop stands still, there is no space for this state. It gets a later one.
+        with suppress(OSError):  # If the loop stalls, the socket has no space for this state. A later state follows.
             self._states.send(pickle.dumps((vars(state) | {"newest": None}, line.newest)))
 
 

@@ -1,16 +1,19 @@
 """Compute where an arm has to be when its cabinet asks: the reference between ticks, and the time of an answer.
 
-**Two clocks.** A cabinet asks by its own clock, which drifts against ours, through a network that delays and loses
-messages. For the cabinet, the difference of two answers divided by its period is a velocity. If an answer were for the
-time at which its question arrived, the jitter of the network would reach the arm. The times of answers are therefore
-evenly spaced: each one is one period after the time of the newest answer that the cabinet has heard.
+**Two clocks.** A cabinet sends its questions by its own clock, which drifts against ours, through a network that delays
+and loses messages. To the cabinet, the difference between the positions of two answers, divided by its period, is a
+velocity. If an answer were for the time at which its question arrived, the jitter of the network would reach the arm.
+The times of answers are therefore evenly spaced: each one is one period after the time of the newest answer that the
+cabinet has heard.
 
-**Catching up.** Lost messages and drift let this even time fall behind. It catches up at a rate of 1 + ``CATCH_UP`` at
-most, and the rate changes by ``CATCH_UP_RAMP`` per second. If the reference has the velocity v and the acceleration a,
-the cabinet sees at most the velocity (1 + CATCH_UP) v and the acceleration (1 + CATCH_UP)^2 a + CATCH_UP_RAMP v.
+**Catching up.** Lost messages and drift let the times of answers fall behind. They catch up at a rate of 1 +
+``CATCH_UP`` at most, and the rate changes by at most ``CATCH_UP_RAMP`` per second. If the reference has the velocity v
+and the acceleration a, the cabinet sees at most the velocity (1 + CATCH_UP) v and the acceleration
+(1 + CATCH_UP)^2 a + CATCH_UP_RAMP v.
 
 **Never beyond the certificate.** If the newest reference ends before the time of an answer, because our loop is late,
-its certified stop follows. The loop then lets its own reference follow the same stop for the same time.
+the answer lies on the reference's certified stop. The loop then lets its own reference follow the same stop for the
+same time.
 """
 
 from __future__ import annotations
@@ -25,21 +28,21 @@ import numpy as np
 from q2r2_control.control.cubic import cubic
 from q2r2_control.types import Array
 
-CATCH_UP = 0.05  # Greatest additional rate of the even time.
+CATCH_UP = 0.05  # The rate at which the times of answers pass differs from 1 by at most this number.
 CATCH_UP_RAMP = 0.4  # Greatest change of this rate per second [1/s].
 # Number of messages within which ``MessageClock`` follows a cabinet's clock that is slower than it was assumed.
 _SETTLED = 500
 _PIECES = 1024  # Number of pieces of the path that are kept. A piece is the motion of one tick, or a stop.
-# Number of answers whose time is remembered. At the shortest period of 1 ms this is four times the lag at which an arm
-# is no longer commanded because its cabinet hears no answers.
+# Number of answers whose time is remembered. At the shortest period of 1 ms, these answers span four times the lag
+# above which an arm is no longer commanded (_LONGEST_LAG in session_state.py).
 _REMEMBERED = 1024
 
 
 class _Move(NamedTuple):
     """The motion from the posture and velocity of one tick to those of the next tick."""
 
-    start: float  # [s]
-    end: float  # [s]
+    start: float  # Time of the start [s].
+    end: float  # Time of the end [s].
     q: tuple[Array, Array]  # Postures at the start and at the end [rad].
     v: tuple[Array, Array]  # Velocities at the start and at the end [rad/s].
     deceleration: Array  # Deceleration of the certified stop from the end [rad/s^2].
@@ -60,10 +63,10 @@ class _Move(NamedTuple):
 class _Stop(NamedTuple):
     """The certified stop from a posture and a velocity."""
 
-    start: float  # [s]
-    q: Array  # [rad]
-    v: Array  # [rad/s]
-    deceleration: Array  # [rad/s^2]
+    start: float  # Time at which the braking starts [s].
+    q: Array  # Posture at the start (n,) [rad].
+    v: Array  # Velocity at the start (n,) [rad/s].
+    deceleration: Array  # Deceleration of each joint until it rests (n,) [rad/s^2].
 
     def at(self, t: float) -> tuple[Array, Array]:
         ran = np.minimum(max(t - self.start, 0.0), np.abs(self.v) / self.deceleration)
@@ -102,7 +105,7 @@ class ReferencePath:
             q: Posture at its end (n,) [rad].
             v: Velocity at its end (n,) [rad/s].
             deceleration: Deceleration of the stop from its end (n,) [rad/s^2].
-            start: Time at which the motion leaves the earlier stop [s]; by default the beginning of that stop.
+            start: Time at which the motion leaves the earlier stop [s]; by default the start of that stop.
         """
         stop, start = self._stop, max(start, self._stop.start)
         there, speed = stop.at(start)
@@ -113,8 +116,8 @@ class ReferencePath:
     def brake(self, t: float) -> None:
         """Remove all motions after the piece that contains ``t`` [s], so that only the piece's certified stop follows.
 
-        The stop begins at the end of the piece. If it began at ``t``, a joint that nearly stands at the end would
-        hardly brake, because its deceleration is small.
+        The stop begins at the end of the piece. If it began at ``t``, a joint that is nearly at rest at the end of the
+        piece would hardly brake, because the joint's deceleration is small.
         """
         piece = self._piece(t)
         if piece is not self._stop:
@@ -132,8 +135,8 @@ class ReferencePath:
 
 
 class _Answer(NamedTuple):
-    time: float  # The time for which the answer is [s].
-    rate: float  # The difference to the time of the answer before, divided by the period [s/s].
+    time: float  # The answer has the posture of the path at this time [s].
+    rate: float  # The time since the answer before, divided by the period [s/s].
 
 
 class MessageClock:
@@ -144,13 +147,13 @@ class MessageClock:
     """
 
     def __init__(self, arrival: float) -> None:
-        """``arrival`` is the time of the first message."""
+        """``arrival`` is the time at which the first message came [s]."""
         self._taken, self.expected = 1, arrival  # Number of messages so far, and the expected time of the newest one.
 
     def update(self, arrival: float, passed: float) -> None:
         """Update the estimate with a newer message, which came at ``arrival`` [s].
 
-        ``passed`` is the time since the message before by the cabinet's clock [s].
+        ``passed`` is the time between the message before and this message, by the cabinet's clock [s].
         """
         self._taken += 1
         expected = self.expected + passed
@@ -172,8 +175,8 @@ class AnswerTimes:
         self._question = -1  # The counter of the newest question.
         self._answers: dict[int, _Answer] = {}  # The last answers by their counter.
         self._newest: _Answer | None = None  # The answer for the latest time.
-        # The counter of the first answer since the restart, and a virtual answer one period before it. Until the
-        # cabinet has heard the first answer, times continue from the virtual one.
+        # The counter of the first answer since the restart, and a virtual answer one period before it; None if there
+        # was no answer since. Until the cabinet has heard the first answer, times continue from the virtual answer.
         self._begin: tuple[int, _Answer] | None = None
 
     def restart(self) -> None:
@@ -185,7 +188,7 @@ class AnswerTimes:
         return self._answers.get(counter) or self._answers[min(self._answers)]
 
     def at(self, question: int, expected: float, counter: int, heard: int) -> float:
-        """Return the time for which an answer is [s].
+        """Return the time on the path that an answer is for [s]. A repeated question gets the newest time again.
 
         Args:
             question: The counter of the question.
@@ -202,12 +205,11 @@ class AnswerTimes:
         if self._begin is None:
             self._begin = counter, _Answer(wanted - self._period, 1.0)
         first, standing = self._begin
-        # The time goes on from the answer that the cabinet has heard, because the cabinet has not followed any later
-        # answer.
+        # Times go on from the answer that the cabinet has heard, because the cabinet has not followed any later answer.
         before = standing if heard < first or newest is None else self._heard(heard)
         lag = (wanted - before.time) / self._period - 1.0  # The lag as a number of answers.
         ramp = CATCH_UP_RAMP * self._period
-        # The greatest additional rate from which a change by CATCH_UP_RAMP reaches 0 together with the lag.
+        # The greatest additional rate that, if it falls by CATCH_UP_RAMP per second, reaches 0 together with the lag.
         excess = math.copysign(math.sqrt(2.0 * ramp * abs(lag) + 0.25 * ramp * ramp) - 0.5 * ramp, lag)
         excess = min(max(excess, -CATCH_UP), CATCH_UP)
         rate = min(max(1.0 + excess, before.rate - ramp), before.rate + ramp)

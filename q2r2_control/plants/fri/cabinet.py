@@ -1,7 +1,8 @@
 """A simulated Sunrise cabinet: its session, its guards and its arm. The caller passes the time in.
 
-It tests a client, and is not a model of KUKA's controller. The states and their conditions follow the public client
-kits. Where the kits say nothing, such as how many answers a client may miss, the simulation is rather too strict.
+It serves to test clients, and is not a model of KUKA's controller. The states and their conditions follow the public
+client kits. Where the kits say nothing, such as how many answers a client may miss, the simulation is too strict
+rather than too lenient.
 """
 
 from __future__ import annotations
@@ -30,14 +31,14 @@ from q2r2_control.plants.fri.wire import (
 
 _WINDOW = 50  # Number of the newest answers by which the quality of the connection is judged.
 # Least share of answers in time for each quality. KUKA publishes no such numbers. If GOOD needed 0.9, a loss of 1 % in
-# each direction would end a session within minutes, because 6 of 50 answers are missed by chance.
+# each direction would end a session within minutes, because by chance 6 of 50 successive answers would be missed.
 _FAIR, _GOOD, _EXCELLENT = 0.5, 0.8, 0.98
 _MISSES = 10  # Number of successive answers that may be late while the client commands.
 _NEAR = 1e-3  # Largest distance of the first command from the cabinet's own position [rad].
 _ROUNDING = 1e-6  # Relative tolerance of the limits.
 _T1_SPEED = 0.25  # Largest speed of a tool in T1 [m/s].
 _LONGEST_TORQUE_PERIOD = 0.005  # Longest time between two answers to an application that overlays torques [s].
-_LARGEST_LOAD_ERROR = 2.0  # Largest external torque of a joint before torques are overlaid [Nm].
+_LARGEST_LOAD_ERROR = 2.0  # Largest external torque of a joint with which an overlay of torques may begin [Nm].
 
 
 class Trip(StrEnum):
@@ -71,7 +72,7 @@ class CabinetArm(Protocol):
 
     @property
     def external_tau(self) -> Joints:
-        """Torques by contacts [Nm]."""
+        """Torques that contacts cause [Nm]."""
 
     def advance(self, dt: float, q: Joints, tau: Joints | None) -> None:
         """Let ``dt`` [s] pass. The drives move to ``q`` [rad], and ``tau`` [Nm] is added to their impedance."""
@@ -92,7 +93,7 @@ class StillArm:
         self.q = q
 
     def tool_way(self, start: Joints, end: Joints) -> float:
-        """Return the distance by which a tool moves that is one metre from each axis [m]."""
+        """Return the largest change of a joint, times a distance of 1 m from the joint's axis to the tool [m]."""
         return _apart(start, end)
 
 
@@ -107,7 +108,7 @@ class CabinetSettings:
     torque: Joints  # Torque limits of the overlay [Nm].
     version: int = 2
     period: float = 0.005  # Time between two messages [s].
-    multiplier: int = 1  # The cabinet expects one answer after this number of messages.
+    multiplier: int = 1  # The cabinet expects one answer per this number of messages.
     command: CommandKind = CommandKind.POSITION
 
     def __post_init__(self) -> None:
@@ -123,7 +124,10 @@ class CabinetSettings:
 
 
 class Cabinet:
-    """A cabinet. In each period, call :meth:`send`, and then :meth:`receive` for each datagram before the next one."""
+    """A cabinet. In each period, call :meth:`send`, and then :meth:`receive` for each datagram that has come.
+
+    All times are passed in [s].
+    """
 
     def __init__(
         self, settings: CabinetSettings, arm: CabinetArm, outputs: Mapping[str, IoValue] | None = None
@@ -141,19 +145,19 @@ class Cabinet:
         self._sent = 0  # Number of messages so far.
         self._heard: int | None = None  # Counter of the client's newest message.
         self._answer: FriCommand | None = None  # Answer to the newest message that asked for one.
-        self._in_time: deque[bool] = deque(maxlen=_WINDOW)
-        self._misses = 0  # Number of successive misses.
-        # Number of misses while a client commanded and answered again later. Misses after its last answer do not count.
+        self._in_time: deque[bool] = deque(maxlen=_WINDOW)  # Whether each of the newest answers came in time.
+        self._misses = 0  # Number of answers that were missed one after the other until now.
+        # Number of missed answers while a client commanded. Those after the client's last answer do not count.
         self.missed = 0
         self._overlay = False  # True if the application asks for the client's command.
         self._held: Joints = arm.q  # Position that the cabinet's own motion holds.
-        self.commanded: Joints = arm.q  # Position that this motion, or the client, commands.
+        self.commanded: Joints = arm.q  # Position that the client commands, or the held position without a client.
         self._velocity: Joints = (0.0,) * JOINTS
         self._tau: Joints | None = None
 
     @property
     def quality(self) -> Quality:
-        """The quality, judged by the answers that came in time."""
+        """The quality of the connection, judged by the share of the newest answers that came in time."""
         if len(self._in_time) < _WINDOW:
             return Quality.POOR
         share = sum(self._in_time) / len(self._in_time)
@@ -234,13 +238,13 @@ class Cabinet:
 
     @property
     def _commanded_tau(self) -> Joints:
-        """The torques that the motors are commanded: the measured torques plus the client's overlay [Nm]."""
+        """The torques that the motors are commanded to give: the measured torques plus the client's overlay [Nm]."""
         overlay = self._tau or (0.0,) * JOINTS
         return tuple(borne + added for borne, added in zip(self.arm.tau, overlay, strict=True))
 
     @property
     def _bears_the_load(self) -> bool:
-        """True if the load data fit and, before torques are overlaid, the external torques are small."""
+        """True if the client's command may begin: the load data fit and, for torques, external torques are small."""
         torques = self.settings.command is CommandKind.TORQUE
         return self.load_fits and not (torques and max(map(abs, self.arm.external_tau)) > _LARGEST_LOAD_ERROR)
 
@@ -280,13 +284,13 @@ class Cabinet:
             return
         assert answer.q is not None
         moved = (new - old for new, old in zip(answer.q, self.commanded, strict=True))
-        self._velocity = tuple(way / self.settings.answer_period for way in moved)
+        self._velocity = tuple(change / self.settings.answer_period for change in moved)
         self.commanded, self._tau = answer.q, answer.tau
 
     def _guard(self, answer: FriCommand) -> Trip | None:
-        """Return the reason why an answer cannot be followed; None if it can.
+        """Return the reason why an answer cannot be followed; None if it can be followed.
 
-        The allowed change is that of one period, even if the answers before were missed.
+        A position may change only by what is allowed in one period, even if the answers before were missed.
         """
         limits, period = self.settings, self.settings.answer_period
         if answer.q is None:

@@ -1,4 +1,4 @@
-"""Cabinets on real sockets and in real time, with a simulated cell behind them, for rehearsals."""
+"""Simulated cabinets that use real sockets in real time, and move the arms of a simulated cell, for rehearsals."""
 
 from __future__ import annotations
 
@@ -33,15 +33,17 @@ from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Command, CommandMode
 
-# If this process stalls for up to this time, it sends all messages late [s]. The rest of a longer stall counts as a
-# silence of the cabinets.
+# After a stall of this process, a client that commands still gets the messages that are late by up to this time [s].
+# Earlier messages are left out, as if the cabinets had been silent.
 _LONGEST_STALL = 1.0
 _LONGEST_CATCH_UP = 0.05  # Longest time that the simulation catches up at once [s]. More is dropped.
 _LOOK_AGAIN = 2e-4  # Time between two checks for an answer, while the next message waits for it [s].
-_ROUNDING = 1e-6
-_SAG = 1e-3  # The simulated arm may be this far beyond its limits [rad].
+_ROUNDING = 1e-6  # Relative tolerance of durations.
+_SAG = 1e-3  # A cabinet allows positions this far beyond the robot's limits, because the simulated arm sags [rad].
 _DAMPING_RATIO = 0.7  # Damping ratio of the application's joint impedance. It is the cabinet's default.
-_HOLDING = 0.02  # Time constant with which a cabinet holds an arm without an overlay of torques, critically damped [s].
+# Without a torque overlay, a cabinet holds an arm by a critically damped spring. The damping alone would slow the arm
+# down with this time constant [s].
+_HOLDING = 0.02
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,18 +95,18 @@ class SimulatedArm:
         return float(np.linalg.norm(tools[1] - tools[0]))
 
     def wanted(self, t: float) -> tuple[Array, Array]:
-        """Return the wanted position of the drives at ``t`` [s], and their velocity."""
-        share, way = (t - self._began) / self._lasts, np.subtract(self._to, self._from)
-        if share > 1.0 + _ROUNDING:  # A message in time finds a share of 1, at which the drives still move.
+        """Return the wanted position (n,) [rad] and velocity (n,) [rad/s] of the drives at ``t`` [s]."""
+        share, change = (t - self._began) / self._lasts, np.subtract(self._to, self._from)
+        if share > 1.0 + _ROUNDING:  # If the next message is in time, its share is 1, and the drives still move.
             return np.array(self._to), np.zeros(JOINTS)
-        return np.add(self._from, max(share, 0.0) * way), way / self._lasts
+        return np.add(self._from, max(share, 0.0) * change), change / self._lasts
 
 
 class SimulatedArms:
     """All arms of a cell in one simulation."""
 
     def __init__(self, robot: Robot, config: Config, stiffness: float = 0.0) -> None:
-        """Make the arms; ``stiffness`` is that of the joint impedance to which torque commands are added [Nm/rad]."""
+        """Make the arms. Torque commands are added to a joint impedance with this ``stiffness`` [Nm/rad]."""
         self.robot, self.plant, self._stiffness = robot, MujocoPlant(robot, config), stiffness
         self.now, self.openings = 0.0, dict.fromkeys(self.plant.gripper_openings(), 1.0)
         self._simulated, self._step = 0.0, (1.0 - _ROUNDING) * config.mujoco.timestep
@@ -147,14 +149,17 @@ class SimulatedArms:
 
 
 def outputs_of(gripper: GripperIoConfig | None) -> dict[str, IoValue]:
-    """Return outputs that the application of a cabinet registers for ``gripper``, which is open at the start."""
+    """Return the outputs that a cabinet's application registers for ``gripper``, with values for an open gripper."""
     return {} if gripper is None else {gripper.output: True if gripper.digital else 1.0}
 
 
 def settings_of(
     robot: Robot, arm: str, kind: CommandKind, version: int, period: float, multiplier: int = 1
 ) -> CabinetSettings:
-    """Return settings of a cabinet that guards an arm: the robot's limits, plus the accelerations of catching up."""
+    """Return the settings of a cabinet that guards the robot's limits.
+
+    Its limits of acceleration are larger than the robot's, because answers that catch up accelerate the arm more.
+    """
     joints = robot.arms[arm].joints
     acceleration = (1.0 + CATCH_UP) ** 2 * robot.acceleration_limit + CATCH_UP_RAMP * robot.velocity_limit
     return CabinetSettings(
@@ -188,14 +193,14 @@ class CabinetServer:
         Args:
             cell: The simulated arms.
             cabinets: The settings of each arm's cabinet.
-            origins: Address and port of each arm's cabinet. Port 0 stands for any free port.
+            origins: Address and port from which each arm's cabinet sends. Port 0 stands for any free port.
             clients: Address and port of each cabinet's client.
             grippers: The grippers at the cabinets, by arm.
             network: The faults of the network.
             seed: The seed of the random faults.
 
         Raises:
-            ConfigError: If an origin cannot be bound, such as one that another program has.
+            ConfigError: If an origin cannot be bound, for example because another program uses it.
         """
         self.cell, self._clients, self._grippers, self._network = cell, dict(clients), dict(grippers), network
         self.cabinets = {
@@ -211,7 +216,7 @@ class CabinetServer:
     def run(self, until: Callable[[float], bool], tick: Callable[[float], None] = lambda t: None) -> None:
         """Run until ``until``, called with the time since the start [s], returns True.
 
-        ``tick`` is called for each message.
+        ``tick`` is called after each message of a cabinet, with the time at which this message was due [s].
         """
         self._began, now, arms = time.monotonic(), 0.0, {opened: arm for arm, opened in self._sockets.items()}
         for index, (arm, cabinet) in enumerate(self.cabinets.items()):
@@ -246,7 +251,7 @@ class CabinetServer:
 
     def _send(self, arm: str, due: float, tick: Callable[[float], None]) -> None:
         cabinet, opened, client = self.cabinets[arm], self._sockets[arm], self._clients[arm]
-        # A client that commands must not have less time because this process was late.
+        # A client that commands always has a full period for its answer, even if this process was late.
         commands = cabinet.session >= Session.COMMANDING_WAIT
         enough, now = self._sent_at.get(arm, -math.inf) + cabinet.settings.period, time.monotonic() - self._began
         if commands and not cabinet.is_answered and now < enough:
@@ -256,11 +261,11 @@ class CabinetServer:
         if (gripper := self._grippers.get(arm)) is not None:
             self.cell.work_gripper(arm, gripper, cabinet)
         datagram = self._cut(write_monitoring(cabinet.send(due)))
-        for late in self._ways(self._network.duplicate):
+        for late in self._delays(self._network.duplicate):
             self._after(late, due, lambda: _sent(opened, datagram, client))
         self._sent_at[arm] = now = time.monotonic() - self._began
-        # Messages are due on a fixed grid of time. After a moment in which this process was late, the late messages
-        # follow each other at shorter intervals, until they are on the grid again.
+        # Messages are due on a fixed grid of time. If this process was late, the next messages follow each other at
+        # shorter intervals, until they are on the grid again.
         following = max(due + cabinet.settings.period, now - (_LONGEST_STALL if commands else 0.0))
         self._at(following, lambda: self._send(arm, following, tick))
         tick(due)
@@ -272,15 +277,18 @@ class CabinetServer:
             except OSError:  # There are no more datagrams, or no client listens yet.
                 return
             if source[:2] == self._clients[arm]:
-                for late in self._ways(0.0):
+                for late in self._delays(0.0):
                     self._after(late, now, partial(self.cabinets[arm].receive, self._cut(datagram)))
 
     def _cut(self, datagram: bytes) -> bytes:
         is_cut = self._random.random() < self._network.cut
         return datagram[: self._random.integers(len(datagram))] if is_cut else datagram
 
-    def _ways(self, duplicate: float) -> Iterable[float]:
-        """Return the delay of each copy of a datagram [s]. The result is empty if the datagram is lost."""
+    def _delays(self, duplicate: float) -> Iterable[float]:
+        """Return the delay of each copy of a datagram [s]. The result is empty if the datagram is lost.
+
+        ``duplicate`` is the probability that there are two copies.
+        """
         if self._network == _PERFECT:
             return [0.0]
         copies = 0 if self._random.random() < self._network.loss else 1 + (self._random.random() < duplicate)

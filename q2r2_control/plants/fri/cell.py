@@ -1,10 +1,11 @@
 """Turn the ticks of the loop into commands for the sessions of all cabinets.
 
 **The loop's time and the cabinets' time.** Each tick of the loop moves the reference to one period after the tick. If
-ticks took longer lately, or commands came too late, the reference goes farther ahead by as much. The cabinets get their
-answers from it a little later (``DELAY``). If the loop is so late that an answer would pass the end of the reference,
-the cabinets get the certified stop. :meth:`FriCell.due` then lets the reference follow the same stop first. If an
-answer passes the end in the middle of a tick, the sessions refuse the command of this tick, and it is withdrawn.
+ticks took longer lately, or commands came too late, the reference goes farther ahead by as much. The cabinets get each
+posture of the reference ``DELAY`` after the posture's time. If the loop is so late that the time of an answer would be
+after the end of the reference, the cabinets get the certified stop. :meth:`FriCell.due` then lets the reference follow
+the same stop first. If an answer passes the end while a tick is computed, the sessions refuse the command of this tick,
+and it is withdrawn.
 """
 
 from __future__ import annotations
@@ -25,17 +26,18 @@ from q2r2_control.plants.fri.wire import JOINTS, CommandKind, Monitoring, joints
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import ArmTiming, Command, CommandMode, RobotState
 
-# Time that is allowed from the start of a tick until the sessions have its commands [s]: usually, and at most after
-# commands that came too late. The reference then goes farther ahead by the difference.
+# Time that is allowed from the start of a tick until the sessions have its commands [s]. The first value is the usual
+# one. After commands that came too late, it grows up to the second value, and the reference goes farther ahead by the
+# difference.
 _MARGIN, _LONGEST_MARGIN = 0.002, 0.016
-# Shortest step of the reference, as a share of a period.
+# Shortest step of the reference, as a share of the loop's period.
 _SHORTEST = 0.5
 _FORGETTING = 0.01  # Share by which the longest recent tick and the margin become shorter in each tick.
 _PASSING = 0.0015  # Approximate time that a measurement takes through cabinet, network and processes [s].
 _NO_COMMANDS = 0.1  # If all commands come too late for longer than this, it is reported as a fault [s].
 # Time constant with which an arm loses its speed if no overlay comes: several periods of a cabinet [s].
 _BRAKING_TIME = 0.03
-_MISSING = 10  # Number of lost or unreadable messages of a cabinet in a run at which they are reported.
+_MISSING = 10  # If a cabinet's lost and unreadable messages reach this number in a run, they are reported.
 _logger = logging.getLogger(__name__)
 
 
@@ -56,20 +58,20 @@ class FriCell:
             robot: The robot.
             states: The state of each arm's session.
             period: Period of the loop [s].
-            longest: The longest step of the reference with one acceleration [s].
+            longest: The longest step of the reference, whose acceleration is constant [s].
             grippers: The grippers of those arms that have one.
         """
         self.states = {state.arm: state for state in states}
         self._robot, self._period, self._longest, self._grippers = robot, period, longest, dict(grippers or {})
         self._joints = {arm: robot.arms[arm].joints for arm in self.states}
         self._data = robot.model.createData()
-        # The time of the newest tick, and both ends of its piece of the path [s].
+        # The time of the newest tick, and the start and end of the motion that it adds to the path [s].
         self._now = self._start = self._end = -math.inf
         # Whether the newest command is withdrawn, and the time of the last command that was not withdrawn [s].
         self._withdraws, self._in_time = False, -math.inf
         self._margin = _MARGIN  # Margin for the next command [s].
         self._longest_tick = period  # The longest recent tick [s].
-        self._told = self._ends()
+        self._told = self._ends()  # How often each session had ended at the last call of :meth:`fault`, by arm.
         # Time of the first message of each arm whose losses were not reported yet [s].
         self._heard_since: dict[str, float] = {}
 
@@ -93,14 +95,18 @@ class FriCell:
         _logger.warning("%s: %s %s; outputs that its application registers: %s", arm, source, lacks, names)
 
     def due(self, now: float) -> tuple[float, float]:
-        """Return the durations for which the reference brakes first, and moves then, in the tick at ``now`` [s]."""
+        """Return two durations for the tick at ``now`` [s]: the reference brakes first, and then moves [s].
+
+        In the first duration, the reference follows the certified stop. It is 0 if no answer passes the path's end.
+        """
         following = [state for state in self.states.values() if state.following]
         sent = now + self._margin
         latest = max([sent - DELAY, *(state.latest(sent) for state in following)])
         late, self._now, before = now - self._now if following else 0.0, now, self._end
         longest = max(late, (1.0 - _FORGETTING) * self._longest_tick)
         self._longest_tick = max(self._period, min(longest, self._longest))
-        # While no arm follows, a session may have begun that is not known yet. Each tick therefore adds a step.
+        # While no arm follows, a session may have begun of which the loop does not know yet. Each tick therefore moves
+        # the reference by one period.
         ahead = self._ahead if following else self._period
         if not following or latest <= before:
             braked, self._start = 0.0, before if following else now
@@ -161,9 +167,9 @@ class FriCell:
 
     @property
     def _ahead(self) -> float:
-        """The time from a tick to the end of its piece of the path [s].
+        """The time from a tick to the end of the motion that it adds to the path [s].
 
-        If no tick and no command is later than the recent ones, no answer passes this end.
+        If no tick and no command is later than the recent ones, the time of no answer is after this end.
         """
         return self._longest_tick + self._margin - _MARGIN
 
@@ -172,10 +178,10 @@ class FriCell:
         return self._withdraws
 
     def delay(self) -> float:
-        """Return the time from the end of a command until a tick finds the arm there [s].
+        """Return the time from the end of a command until a tick measures the arm at the command's posture [s].
 
-        A cabinet begins to move the arm there with its next message, and takes one period for this motion. The newest
-        message is half a period old on average. Torques act at once.
+        A cabinet begins to move the arm to this posture with its next message, and takes one period for this motion.
+        The newest message is half a period old on average. With torques the result is 0, because they act at once.
         """
         states = self.states.values()
         is_torque = any(state.wanted is CommandKind.TORQUE for state in states)
@@ -208,7 +214,11 @@ class FriCell:
         return all(state.newest is not None for state in self.states.values())
 
     def state(self) -> RobotState:
-        """Return the measurements of the cabinets, with the stamp of the oldest message."""
+        """Return the measurements in the cabinets' newest messages. The stamp is the earliest arrival of these.
+
+        The held posture of an arm that can be commanded by positions is the end of its path. Other arms have the
+        measured posture there.
+        """
         q, v, tau, external, held = np.zeros((5, self._robot.model.nv))
         knows_external = True
         for arm, state in self.states.items():

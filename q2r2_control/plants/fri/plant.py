@@ -24,13 +24,13 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import ArmTiming, Array, Command, CommandMode, RobotState
 from q2r2_control.wording import sentence
 
-# Number of answers whose times are kept. It is bounded, because the garbage collector visits all of them during a run.
+# Number of answers whose times are kept. It is bounded, because the garbage collector visits all these times in a run.
 _KEPT = 100_000
 _KINDS = {CommandMode.POSITION: CommandKind.POSITION, CommandMode.TORQUE: CommandKind.TORQUE}
 
 
 class FriPlant:
-    """A plant whose arms start where they stand, even after a cabinet has ended a session."""
+    """Arms behind KUKA's cabinets. They start where they stand, also after a cabinet has ended a session."""
 
     modes: tuple[CommandMode, ...] = (CommandMode.POSITION, CommandMode.TORQUE)
     realtime_only = True
@@ -82,7 +82,7 @@ class FriPlant:
         self._mode, self._stopped = mode, stopped
 
     def reset(self, q: Array | None = None) -> None:
-        """Begin to hear the cabinets.
+        """Start the process that answers the cabinets, and wait for their sessions.
 
         Raises:
             PlantError: If a cabinet says nothing, or if ``q`` is given, because real arms cannot be placed.
@@ -159,7 +159,7 @@ class FriPlant:
         return self.cell.states
 
     def due(self, now: float) -> tuple[float, float]:
-        """See :meth:`FriCell.due`; raises :class:`PlantError` if nothing answers the cabinets any more."""
+        """See :meth:`FriCell.due`; raises :class:`PlantError` if the process that answers the cabinets has ended."""
         self.states()
         return self.cell.due(now)
 
@@ -201,7 +201,7 @@ class FriPlant:
         return self.cell.state()
 
     def gripper_openings(self) -> dict[str, float]:
-        """See :meth:`Plant.gripper_openings`. Before a run, grippers that will be measured count as open."""
+        """See :meth:`Plant.gripper_openings`. Before a run, each gripper that the run will measure counts as open."""
         if self._answering is None:
             its = {arm: cabinet.gripper for arm, cabinet in self._cabinets.items()}
             return {arm: 1.0 for arm, one in its.items() if one is not None and getattr(one, "input", True) is not None}

@@ -1,7 +1,7 @@
 """Messages of KUKA's Fast Robot Interface, FRI 1 and 2, as classes of the package ``protobuf``.
 
-``_MESSAGES`` was written for interoperation from the field numbers of the public client kits 1.15 and 2.7. Enumerations
-are plain integers here, so that a value of a newer version does not make a message unreadable.
+``_MESSAGES`` was written for interoperation, with the field numbers of the public client kits 1.15 and 2.7. Here,
+enumerations are plain integers, so that a message with an unknown value of a newer version can still be parsed.
 """
 
 from __future__ import annotations

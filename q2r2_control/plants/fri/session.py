@@ -1,4 +1,4 @@
-"""Keep the session with one cabinet: a datagram goes in, and its answer comes out. The caller gives the time."""
+"""Keep the session with one cabinet: a datagram goes in, and its answer comes out. The caller passes the time in."""
 
 from __future__ import annotations
 
@@ -29,22 +29,23 @@ DELAY = 0.004
 _AT_REST = 1e-9  # Greatest distance from the end of the path at which the arm counts as resting [rad].
 _RESTARTED = 1000  # A counter that goes back by more shows that the session has begun again.
 _COUNTERS = 1 << 32
-_MOST_AHEAD = 20  # Number of messages that may come at once after a gap.
-# Times after which a torque that is not updated is replaced [s]. A torque that nobody updates would push for ever. It
-# is replaced by a torque that brakes, and later by no answer, so that the cabinet ends the session.
+# A message's counter may have grown by twice the number of periods that have passed, plus this number.
+_MOST_AHEAD = 20
+# A torque that nobody updates would push for ever. After the first time, it is replaced by a torque that brakes [s].
+# After the second time, the cabinet gets no answer, so that it ends the session [s].
 _TORQUE_LASTS, _TORQUE_GONE = 0.02, 0.1
 # A lower limit of the torques' rate is raised to this value [Nm/s]. With the lower limit, damping would come too late.
 _BRAKING_RATE = 5000.0
-# Greatest distance between a reference at its beginning and the arm [rad]: the position in which the arm is held, or,
-# with torques, its measured position.
+# Greatest distance at which a reference may begin [rad]: with positions, from the position in which the arm is held;
+# with torques, from the arm's measured position.
 _SAME, _NEAR = 1e-6, 0.02
-_FROM_REST = 20.0  # A bound above the acceleration of a joint in the first tick [rad/s^2].
+_FROM_REST = 20.0  # Upper bound on the acceleration of a joint in the first tick from rest [rad/s^2].
 
 
 class ArmSession:
     """The session of one arm.
 
-    While the arm follows the reference, its answers lie on ``path``. Otherwise they hold the arm.
+    While the arm follows the reference, the positions in its answers lie on ``path``. Otherwise they hold the arm.
     """
 
     def __init__(
@@ -61,9 +62,9 @@ class ArmSession:
 
         Args:
             arm: The arm.
-            source: The cabinet in words.
+            source: The cabinet's address and port in words.
             wanted: The kind of commands, positions or torques.
-            version: The version of FRI; None for either.
+            version: The version of FRI that is allowed, 1 or 2; None if both are.
             torque_limit: Greatest torque of an overlay (n,) [Nm].
             velocity_limit: Greatest plausible measured velocity (n,) [rad/s]. Faster measurements are clipped. If a
                 measured position jumps once, the damping then pushes the joint back by at most the distance that it
@@ -86,8 +87,8 @@ class ArmSession:
         self._answers = 0
         self._times: AnswerTimes | None = None
         self._clock = MessageClock(-math.inf)
-        self.waits = 0.0  # The answers are for times that are earlier by this much, because other arms are behind [s].
-        self._begun = False  # Whether the cabinet's own position is known, at which the path begins.
+        self.waits = 0.0  # By this much the times of answers are earlier, to wait for other arms that are behind [s].
+        self._begun = False  # Whether the path begins at the cabinet's own position, which is then known.
 
     def is_still(self, now: float) -> bool:
         """Return whether nothing moves the arm at ``now`` [s] if no more commands come."""
@@ -126,17 +127,17 @@ class ArmSession:
             self._damping, self._tau_came = np.array(command.damping), command.now
 
     def _begins(self, command: ArmCommand) -> bool:
-        """Return whether the reference was at rest one tick ago, at the position of the arm."""
+        """Return whether the reference can have been at rest at the position of the arm one tick ago."""
         state, step = self.state, command.end - command.start
         torques = state.wanted is CommandKind.TORQUE and state.newest
         if not torques and not self._rests(state.answered):
             return False
         there, allowed = (torques.q, _NEAR) if torques else (self.path.rest, _SAME)
-        way, speed = np.abs(np.subtract(command.q, there)), np.abs(command.v)
-        return bool((speed <= _FROM_REST * step).all() and (way <= speed * step + allowed).all())
+        distance, speed = np.abs(np.subtract(command.q, there)), np.abs(command.v)
+        return bool((speed <= _FROM_REST * step).all() and (distance <= speed * step + allowed).all())
 
     def answer(self, datagram: bytes, now: float) -> bytes | None:
-        """Take a message that came at ``now`` [s]; returns the datagram of the answer, or None if none is due."""
+        """Take a message that came at ``now`` [s]; returns the answer's datagram, or None if it gets no answer."""
         try:
             message = read_monitoring(datagram)
             self._check(message, now)
@@ -201,7 +202,7 @@ class ArmSession:
         return True
 
     def _lasts(self, message: Monitoring, before: Monitoring) -> bool:
-        """Return whether a session goes on after a silence."""
+        """Return whether ``message`` shows that the session of ``before`` goes on after a silence."""
         active = Session.COMMANDING_ACTIVE
         same = message.version == before.version and message.session is before.session is active
         return self._begun and same and _ahead(message, before) > 0
@@ -215,7 +216,7 @@ class ArmSession:
                 self.state.rest = joints_of(self.path.rest)
 
     def _begin_anew(self) -> None:
-        """Let the path begin again, at the position that the next message of the cabinet has."""
+        """Let the path begin again, at the position in the cabinet's next message."""
         self._cease()
         self._begun = False
         self._times = None
@@ -231,7 +232,7 @@ class ArmSession:
             self._begin_anew()
             if message.session is Session.IDLE:
                 return None
-            mirrored = message.commanded_q or message.q  # FRI 1 expects this, and FRI 2 does not need it.
+            mirrored = message.commanded_q or message.q  # FRI 1 expects these positions; FRI 2 does not need them.
             return FriCommand(counter, reflected, mirrored if message.version == 1 else None, io=self._io(message))
         if self._times is None:
             self._times = AnswerTimes(message.period * message.multiplier, DELAY)
@@ -262,7 +263,7 @@ class ArmSession:
         return {name: value for name, value in fitting.items() if value is not None}
 
     def _torque(self, message: Monitoring, now: float) -> FriCommand | None:
-        """Return an answer with the newest torque overlay, or with an overlay that brakes; None if no answer is due.
+        """Return an answer with the newest torque overlay, or with an overlay that brakes; None for no answer.
 
         The answer repeats the cabinet's own position, as in KUKA's examples.
         """
@@ -282,7 +283,8 @@ class ArmSession:
 def follow(sessions: Mapping[str, ArmSession], commands: Mapping[str, ArmCommand]) -> bool:
     """Let every arm take its command, and return True.
 
-    If one of the commands came too late, no arm takes its command, all arms brake, and the function returns False.
+    If a command came too late, no arm takes its command, and False is returned. The arms then follow the certified stop
+    of the command before.
     """
     if any(sessions[arm].has_passed(command) for arm, command in commands.items()):
         return False
@@ -292,9 +294,9 @@ def follow(sessions: Mapping[str, ArmSession], commands: Mapping[str, ArmCommand
 
 
 def answer(sessions: Mapping[str, ArmSession], arm: str, datagram: bytes, now: float) -> bytes | None:
-    """Answer a message of one arm as :meth:`ArmSession.answer` does, and let the arm wait for arms that are behind.
+    """Answer a cabinet's message as :meth:`ArmSession.answer` does, and let its arm wait for arms that are behind.
 
-    The arm waits for half of the largest lag of the other arms. These arms catch up meanwhile, until no arm is behind.
+    The wait is half the largest lag of the other arms. They catch up meanwhile, until no arm is behind.
     """
     lags = [other.state.timing(now).lag for name, other in sessions.items() if name != arm and other.state.following]
     sessions[arm].waits = 0.5 * max(0.0, *lags, 0.0)

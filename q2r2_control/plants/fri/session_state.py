@@ -27,7 +27,7 @@ class SessionState:
     """
 
     arm: str
-    source: str  # The cabinet in words.
+    source: str  # The cabinet's address and port in words.
     wanted: CommandKind = CommandKind.POSITION  # TORQUE stands for an overlay of torques.
     newest: Monitoring | None = None
     arrival: float = -math.inf  # Arrival of the newest message.
@@ -35,10 +35,10 @@ class SessionState:
     rest: Joints = (0.0,) * JOINTS  # Positions at the end of the arm's path [rad].
     following: bool = False  # True while the arm follows the reference.
     ended: int = 0  # Number of times that the arm ceased to follow because its cabinet ended the session.
-    answered: float = -math.inf  # The latest time for which there was an answer.
-    expected: float = -math.inf  # The time at which the message of that answer would have come without delay.
+    answered: float = -math.inf  # The latest time on the path for which an answer was sent.
+    expected: float = -math.inf  # The time at which the question of the newest answer would have come without delay.
     lag: float = 0.0  # By how much the time of the newest answer is too early, judged by the arrival of its question.
-    # The same, judged by the expected time of the question, so that delays of the network do not count.
+    # By how much that time is too early, judged by ``expected``, so that delays of the network do not count.
     behind: float = 0.0
     took: float | None = None  # Time from the newest message until its answer was sent; None if it got no answer.
     lost: int = 0  # Number of lost messages of the cabinet.
@@ -57,7 +57,7 @@ class SessionState:
 
     @property
     def words(self) -> str:
-        """The state of the cabinet in words, by its own messages."""
+        """The state of the cabinet in words, as its newest message tells it."""
         newest = self.newest
         if newest is None:
             return "not heard"
@@ -71,7 +71,10 @@ class SessionState:
         return ArmTiming(self.behind, now - self.arrival, self.period)
 
     def latest(self, t: float) -> float:
-        """Return an upper bound on the times for which answers are sent until ``t`` [s]."""
+        """Return an upper bound on the times on the path for which answers are sent until ``t`` [s].
+
+        It is -inf if no answer was sent yet.
+        """
         if self.period == 0.0 or self.answered == -math.inf:
             return -math.inf
         messages = max(math.floor((t + _EARLY - self.expected) / self.period), 0)
@@ -87,7 +90,7 @@ class SessionState:
         if self.is_too_slow:
             period, allowed = 1e3 * self.period, 1e3 * TORQUE_PERIOD
             return Reason.of(FriReason.FRI_TOO_SELDOM, arm=self.arm, period=period, allowed=allowed)
-        # After some stops of the safety controller the session goes on for a while. Our own stop has to begin at once.
+        # The session goes on for a while after some stops of the safety controller. Our own stop has to begin at once.
         if newest.session is not Session.COMMANDING_ACTIVE or newest.safety is not Safety.NORMAL:
             states = newest.session, newest.quality, newest.safety, newest.drives
             doing, quality, safety, drives = map(in_words, states)

@@ -1,4 +1,4 @@
-"""Wait for cabinets that a person has to start, and log what this person has to do and how long it has taken."""
+"""Wait for cabinets that a person has to start, and log what this person has to do and how long the wait has lasted."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from collections.abc import Callable, Iterable
 from q2r2_control.plants.fri.session_state import SessionState
 from q2r2_control.plants.fri.wire import Session
 
-_LOOKS = 0.01  # Time between two checks of the cabinets [s].
-_FIRST_LINE, _BETWEEN_LINES = 3.0, 10.0  # Delay of the first line, and time between two lines [s].
+_CHECK_PERIOD = 0.01  # Time between two checks of the cabinets [s].
+_FIRST_LINE, _BETWEEN_LINES = 3.0, 10.0  # Delay of the first line in the log, and time between two lines [s].
 _START = (
     "start its FRI application at the smartPAD: choose it, in T1 or T2 hold the enabling switch, press the play key"
 )
@@ -30,7 +30,7 @@ _logger = logging.getLogger(__name__)
 class CabinetWait:
     """Waits for cabinets, and logs what is missing after three seconds and then every ten seconds.
 
-    The time begins when an instance is created.
+    The waiting time counts from the creation of the instance.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class CabinetWait:
                 still = "" if now - self._began < _BETWEEN_LINES else f" still, for {now - self._began:.0f} s"
                 missing = "; ".join(what_is_missing(state, now) for state in states() if state.fault(now) is not None)
                 _logger.info("waits%s: %s; Ctrl-C ends the wait", still, missing)
-            time.sleep(_LOOKS)
+            time.sleep(_CHECK_PERIOD)
         return True
 
 

@@ -47,7 +47,7 @@ class Session(IntEnum):
 
 
 class Quality(IntEnum):
-    """Quality of the connection, which the cabinet judges by answers in time. A client may command from GOOD on."""
+    """Quality of the connection, judged by the share of answers in time. Only GOOD and EXCELLENT allow commands."""
 
     POOR = 0
     FAIR = 1
@@ -110,13 +110,13 @@ class Monitoring:
     session: Session
     quality: Quality
     period: float  # Time between two messages of the cabinet [s].
-    multiplier: int  # The cabinet expects one answer after this number of messages.
+    multiplier: int  # The cabinet expects one answer per this number of messages.
     q: Joints  # Measured positions.
     stamp: float = 0.0  # Time of the cabinet's clock [s].
     tau: Joints | None = None  # Measured torques.
     external_tau: Joints | None = None  # Torques that contacts cause, as the cabinet estimates them.
     commanded_q: Joints | None = None  # Commanded positions, only in FRI 1.
-    ipo_q: Joints | None = None  # Position of the cabinet's own motion, which a client's command overlays.
+    ipo_q: Joints | None = None  # Position of the cabinet's own motion (ipo), which a client's command overlays.
     command: CommandKind = CommandKind.NONE
     safety: Safety = Safety.NORMAL
     operation: Operation = Operation.AUTOMATIC
@@ -128,7 +128,7 @@ class Monitoring:
     commanded_tau: Joints | None = None
 
     def output(self, name: str, value: IoValue) -> IoValue | None:
-        """Return ``value`` in the type of the cabinet's output ``name``; None if it has no such output of that kind.
+        """Return ``value`` in the type of the cabinet's output ``name``; None if there is no such output of this kind.
 
         KUKA's own clients raise an exception for an output that the cabinet does not list.
         """
@@ -144,7 +144,7 @@ class FriCommand:
 
     counter: int  # Counter of the client's messages, from 0.
     reflected: int  # Counter of the message that is answered.
-    q: Joints | None = None  # Positions that are due after one answer's period [rad].
+    q: Joints | None = None  # Positions that the arm has to reach after one answer period [rad].
     tau: Joints | None = None  # Torques that are added to the cabinet's own joint impedance [Nm].
     io: dict[str, IoValue] = field(default_factory=dict)
 
@@ -266,7 +266,7 @@ def _set_header(message: Any, identifier: int, counter: int, reflected: int) -> 
 
 
 def _joints(message: Any, name: str) -> Joints | None:
-    """Return seven finite numbers, or None if the message has none."""
+    """Return the seven numbers of a field, or None if it is empty; raises ProtocolError for other contents."""
     values = tuple(getattr(message, name).value)
     if not values:
         return None
@@ -280,7 +280,7 @@ def _set_joints(message: Any, name: str, values: Joints | None) -> None:
         getattr(message, name).value.extend(values)
 
 
-# A call of an enum takes ten times as long as a look-up in this dictionary, and each message needs six look-ups.
+# Calling an enum takes ten times as long as a look-up in this dictionary, and each message needs six look-ups.
 _ENUMS: tuple[type[IntEnum], ...] = (Session, Quality, CommandKind, Safety, Operation, Drives)
 _MEMBERS = {kind: {one.value: one for one in kind} for kind in _ENUMS}
 
@@ -293,7 +293,7 @@ def _member(kind: type[IntEnum], value: int) -> Any:
 
 
 def _io_of(values: Any) -> dict[str, IoValue]:
-    """Return values by name: a bool, an int of several bits, or a float for an analog value."""
+    """Return the values by name: a bool, an int for a value of several bits, or a float for an analog value."""
     kinds: tuple[Any, ...] = (lambda io: bool(io.digital), lambda io: io.digital, lambda io: io.analog)
     return {_name_of(io.name): kinds[io.type](io) for io in values if 0 <= io.type < len(kinds)}
 

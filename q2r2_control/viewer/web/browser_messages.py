@@ -56,7 +56,7 @@ class GuiUpdateMessage(_Sent):
 
 
 class TransformControlsUpdateMessage(_Sent):
-    """A gizmo was dragged."""
+    """A gizmo (arrows and rings at a tool) was dragged."""
 
     name: str
     wxyz: _Four
@@ -75,7 +75,7 @@ class TransformControlsDragEndMessage(_Sent):
 
 
 class LocalStorageGetItemResponseMessage(_Sent):
-    """The answer of a page to the question whether it is alive."""
+    """The answer of a page to the question whether its script still runs."""
 
     value: str | None
     error: str | None
@@ -106,9 +106,9 @@ class BrowserMessages:
         self._gui = gui
 
     def take_over(self, button: viser.GuiButtonHandle, action: Callable[[], None]) -> None:
-        """Do ``action`` at each press of ``button``. These presses are not passed on to viser.
+        """Call ``action`` at each press of ``button``. These presses are not passed on to viser.
 
-        Therefore a press counts in any state of viser's widgets, even if the threads for their callbacks are busy.
+        A press therefore counts in any state of viser's widgets, even if the threads for their callbacks are busy.
         """
         self._actions[button._impl.uuid] = action
 

@@ -18,7 +18,7 @@ from q2r2_control.inputs.page_door import PageDoor, protect, text_response
 from q2r2_control.viewer.web.browser_messages import LONGEST_MESSAGE, BrowserMessages, FilteredConnection
 from q2r2_control.viewer.web.page_file import PageFile
 
-_MOST_CLIENTS = 12  # Greatest number of open pages.
+_MOST_CLIENTS = 12  # Greatest number of pages that may be open at one time.
 # viser's page is one file with its scripts and styles. It compiles WebAssembly, and starts workers from blobs.
 # Its sorter of Gaussian splats evaluates text as code. The policy forbids this, because this page shows no splats.
 _POLICY = (
@@ -56,7 +56,7 @@ class Door(PageDoor):
     def guards(self, name: str) -> Iterator[None]:
         """Check all requests to the servers that the package websockets starts in this context, such as viser's server.
 
-        The browser's tab shows ``name``, the name of a cell, as the title of their page.
+        The title of the served page becomes ``name``, the name of a cell.
 
         Raises:
             ConfigError: If no server was started, because then nothing would check requests.
@@ -76,7 +76,7 @@ class Door(PageDoor):
                 if response is not None:
                     page.change(response)
                     protect(response, _POLICY)
-                    response.headers["X-Frame-Options"] = "DENY"  # A page that frames this one could steal a click.
+                    response.headers["X-Frame-Options"] = "DENY"  # A foreign page around this one could steal a click.
                 return response
 
             async def counted(connection: ServerConnection) -> None:

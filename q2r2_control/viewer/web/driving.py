@@ -1,4 +1,4 @@
-"""Gizmos at the tools. One page at a time moves the tools with them, in place of a hand."""
+"""Gizmos at the tools: arrows and rings. One page at a time moves the tools by dragging them, in place of a hand."""
 
 from __future__ import annotations
 
@@ -18,39 +18,41 @@ from q2r2_control.viewer.web.figure import place
 from q2r2_control.viewer.web.pace import BrowserPace
 
 _SIZE = 0.22  # Size of a gizmo [m].
-_PERIOD = 0.02  # Time between samples [s].
+_PERIOD = 0.02  # Shortest time between two samples of a dragged hand [s].
 _ANSWER = 60.0  # A page without an answer for this time loses control. The gate stops the arms long before [s].
 _Gizmos = dict[str, viser.TransformControlsHandle]  # By arm.
 
 
 class Driving:
-    """The page that drags first drives until it lets go. Until then the other pages only watch, and show no gizmos.
+    """Lets pages drag the tools. The page that drags first drives until it lets go.
 
-    A browser sends nothing while the mouse rests. Therefore the page that drives is asked again and again for an
-    answer, which its own script gives. Each answer is a sample of the hands. Without answers the gate stops the arms.
+    Until then the other pages only watch, and show no gizmos. A browser sends nothing while the mouse rests. Therefore
+    the page that drives is asked again and again for an answer, which its script gives. At each answer, a sample of
+    each dragged hand is sent. Without answers, the teleop layer's gate stops the arms.
     """
 
     def __init__(self, server: viser.ViserServer, setup: PageSetup, answer: Callable[[Any], None]) -> None:
         self._server, self._arms, self._answer = server, tuple(setup.joints), answer
         self._pace = BrowserPace(setup.config.teleop.gate.timeout)
         self._lock = RLock()
-        self._gizmos: dict[int, tuple[viser.ClientHandle, _Gizmos]] = {}  # By page.
-        self._driver: int | None = None
-        self._dragged: dict[str, tuple[tuple[float, ...], tuple[float, ...]]] = {}  # By arm: position, x y z w.
+        self._gizmos: dict[int, tuple[viser.ClientHandle, _Gizmos]] = {}  # By page: its connection and its gizmos.
+        self._driver: int | None = None  # The page that drives; None if no page drives.
+        # By dragged arm, the pose of the gizmo in the world frame: position [m] and quaternion x y z w.
+        self._dragged: dict[str, tuple[tuple[float, ...], tuple[float, ...]]] = {}
         self._spent: set[str] = set()  # Arms whose last drag cannot engage them any more.
         self._gizmo_count = 0
-        self._tools: dict[str, tuple[float, ...]] = {}  # By arm: x y z qx qy qz qw.
+        self._tools: dict[str, tuple[float, ...]] = {}  # By arm, the tool pose x y z [m] qx qy qz qw (world frame).
         server.on_client_connect(self._connect)
         server.on_client_disconnect(self._disconnect)
 
     @property
     def words(self) -> str:
-        """The page that drives, in words."""
+        """The page that drives, in words; instructions if no page drives."""
         driver = self._driver
         return "drag a tool's arrows or rings to move it" if driver is None else f"page {driver + 1} drives"
 
     def next_step(self, arm: str, moves: bool) -> str:
-        """Return what to do next with an arm that does not move although it is dragged; empty otherwise."""
+        """Return what to do next with an arm that is dragged but does not move; empty for other arms."""
         return "let go, then drag again to engage" if not moves and arm in {*self._dragged, *self._spent} else ""
 
     def slowness(self, silent: bool) -> str:
@@ -69,7 +71,7 @@ class Driving:
                             self._send(arm, pressed)
 
     def follow(self, frame: Frame) -> None:
-        """End each drag whose arm has stopped or was not engaged, because only a new drag can engage it."""
+        """End each drag whose arm has stopped or was refused, because only a new drag can engage the arm."""
         with self._lock:
             for arm in {event.arm for event in frame.events if _ends_drag(event)} & self._dragged.keys():
                 self._send(arm, drag=False)
@@ -78,7 +80,7 @@ class Driving:
                 self._forget_drag(arm)
 
     def show(self, frame: Frame) -> None:
-        """Put the gizmos that nobody drags at the tools."""
+        """Move all gizmos that nobody drags to the poses of their tools."""
         with self._lock:
             self._tools = {arm: tuple(pin.SE3ToXYZQUATtuple(tool)) for arm, tool in frame.tick.tools.items()}
             for page, (_, gizmos) in self._gizmos.items():
@@ -96,20 +98,20 @@ class Driving:
             self._gizmos[page] = client, gizmos
 
     def _add_gizmo(self, client: viser.ClientHandle, arm: str) -> viser.TransformControlsHandle:
-        # Each gizmo has a name of its own. Under a known name, a browser would go on with the drag of the last one.
+        # Each gizmo has a new name. If an earlier gizmo had the same name, a browser would go on with its drag.
         self._gizmo_count += 1
         name = f"/gizmos/{arm}_{self._gizmo_count}"
         gizmo = client.scene.add_transform_controls(name, scale=_SIZE, depth_test=False, visible=False)
 
         async def drag(event: viser.TransformControlsEvent) -> None:
-            # There is no await, so that the pose belongs to this event.
+            # The function contains no await. Otherwise, the pose could be that of a later event.
             self._drag(client.client_id, arm, event)
 
         gizmo.on_update(drag)
         return gizmo
 
     def _replace_gizmo(self, arm: str) -> None:
-        """Take the gizmo of a dragged arm away from the mouse, which ends the drag in the browser."""
+        """Replace the gizmo of a dragged arm by a new gizmo, which ends the drag in the browser."""
         if self._driver is not None:
             client, gizmos = self._gizmos[self._driver]
             gizmos[arm].remove()
@@ -127,7 +129,7 @@ class Driving:
                 begins, self._driver = self._driver is None, page
                 self._dragged[arm] = _pose_of(event.target)
                 self._spent.discard(arm)
-                for held in (False, True):  # A control has to be released before a press counts.
+                for held in (False, True):  # A press counts only if the control was released before.
                     self._send(arm, drag=held)
                 if begins:
                     self._pace.begin()
@@ -147,7 +149,7 @@ class Driving:
             self._pace.end()
 
     def _ask(self, page: int) -> None:
-        """Ask the page that drives for answers, each of which is a sample."""
+        """Ask the page that drives for answers, until it no longer drives. At each answer, samples are sent."""
         while True:
             with self._lock:
                 if self._driver != page:
@@ -183,11 +185,11 @@ class Driving:
 
 
 def _ends_drag(event: Event) -> bool:
-    """Return whether the drag of the event's arm cannot engage it any more."""
+    """Return whether the present drag of the event's arm cannot engage the arm any more."""
     if event.kind is TeleopReason.NOT_ENGAGED:
         return True
     stops = event.source != event.destination and event.destination in HOLDING | {ArmState.HOMING}
-    return stops and event.kind is not TeleopReason.DEAD_MAN_RELEASED  # That is the end of an earlier drag.
+    return stops and event.kind is not TeleopReason.DEAD_MAN_RELEASED  # A release is the end of an earlier drag.
 
 
 def _pose_of(gizmo: viser.TransformControlsHandle) -> tuple[tuple[float, ...], tuple[float, ...]]:

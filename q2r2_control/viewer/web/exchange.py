@@ -25,7 +25,7 @@ class PageSetup(ShownRobot):
     addresses: tuple[str, ...]  # Addresses at which other computers reach the server.
     certificate: str | None  # A PEM file with a certificate and its key; None for plain HTTP.
     title: str
-    tools: Mapping[str, int]  # By arm, the index of its tool's frame in ``model``.
+    tools: Mapping[str, int]  # By arm, the index of its tool frame in ``model``.
     home: Array  # Joint positions at home (nv,) [rad].
     lower: Array  # Lower position limits (nv,) [rad].
     upper: Array  # Upper position limits (nv,) [rad].
@@ -41,19 +41,19 @@ class PageSetup(ShownRobot):
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """What the run sends to the page: the newest tick, and everything that has happened since the last frame."""
+    """What the run sends to the page: the newest tick, and the events of all ticks since the last frame."""
 
     tick: Tick
     events: tuple[Event, ...]
-    binding: tuple[ActiveLimit, ...]  # Limits that held a step back.
+    binding: tuple[ActiveLimit, ...]  # Limits that held a step back since the last frame.
     ticks: int  # Number of ticks since the last frame.
     slowest: float  # Computing time of the slowest of these ticks [s].
     moved: Array | None  # MuJoCo's positions (qpos) of everything that moves.
     end: float = 0.0  # In a replay, the time up to which frames exist [s].
     ages: Mapping[str, float] = field(default_factory=dict)  # By arm, the age of the newest pose of its hand [s].
-    why: Mapping[str, str] = field(default_factory=dict)  # By arm, why it is in its state, if another program knows it.
+    why: Mapping[str, str] = field(default_factory=dict)  # By arm, the reason for its state that another program gives.
     driver: str = ""  # The person or page that drives, in words; empty if not known.
-    notice: str = ""  # The result of a request.
+    notice: str = ""  # The result of a request of a button, in words; empty if there is none.
     pictures: Mapping[str, bytes] = field(default_factory=dict)  # The newest pictures by camera, JPEG or PNG.
 
 

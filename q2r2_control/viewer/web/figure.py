@@ -50,7 +50,7 @@ class RobotFigure:
 
 
 class CapsuleFigure:
-    """The shapes of a collision model, which the controller keeps apart. They are hidden until ``root`` is visible."""
+    """The bodies of a collision model, which the controller keeps apart. They are hidden until ``root`` is visible."""
 
     def __init__(self, scene: viser.SceneApi, name: str, model: pin.GeometryModel) -> None:
         self.root = scene.add_frame(name, show_axes=False, visible=False)
@@ -72,7 +72,7 @@ class ObstacleFigure:
 
     def __init__(self, scene: viser.SceneApi, name: str) -> None:
         self._scene, self._name = scene, name
-        # By obstacle: its shape, size and colour, and its node.
+        # By obstacle: a tuple of its shape, size and colour; and its node in the scene.
         self._drawn: dict[str, tuple[object, viser.SceneNodeHandle]] = {}
 
     def show(self, reports: Mapping[str, ObstacleReport]) -> None:

@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable
 
-_TOLD = 10.0  # After a pause of the browser, the advice is shown for this time [s].
+_TOLD = 10.0  # After a time without positions that was too long, the advice is shown for this time [s].
 _CURE = (
     "Let go, then drag again. If it happens often, make the window smaller, close other programs, or open the page on "
     "another computer."
@@ -25,7 +25,7 @@ class BrowserPace:
 
     def begin(self) -> None:
         """Forget all times, because a drag begins."""
-        self._heard: float | None = self._clock()  # Time of the newest position [s]; None after the drag.
+        self._heard: float | None = self._clock()  # Time at which the newest position came [s]; None after the drag.
         self._silence, self._ended = 0.0, -math.inf  # The longest recent time without a position, and its end [s].
 
     def note(self) -> None:
@@ -41,10 +41,10 @@ class BrowserPace:
         self._heard = None
 
     def advice(self, silent: bool) -> str:
-        """Return the cause and the cure of positions that come too late; empty if they come in time.
+        """Return why positions come too late and what to do; empty if they come in time.
 
-        ``silent`` says whether an arm is lost because its hand's data did not come in time. As long as it is, the
-        advice stays.
+        ``silent`` says whether an arm is lost because its hand's data did not come in time. As long as the arm is lost,
+        the advice stays.
         """
         now, allowed = self._clock(), self._allowed
         silence = max(self._silence, 0.0 if self._heard is None else now - self._heard)

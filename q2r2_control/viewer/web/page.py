@@ -52,7 +52,7 @@ class Page:
             ConfigError: If viser is not installed, or if the port is not free.
         """
         check_viser()
-        listening_socket(host, port, "--web").close()  # A port in use is found before slow work, such as compiling.
+        listening_socket(host, port, "--web").close()  # If the port is in use, this fails before slow work is done.
         self._host, self._port, self._on_request = host, port, on_answer
         self._ready = Flag()
         self.urls: tuple[str, ...] = ()  # One URL for each address of this computer; empty before :meth:`open`.
@@ -79,7 +79,11 @@ class Page:
         driven: bool = False,
         replayed: bool = False,
     ) -> str:
-        """Serve the page of a cell, and return its URL; raises :class:`ConfigError`. See :class:`PageSetup`."""
+        """Serve the page of a cell, and return its first URL. The arguments are fields of :class:`PageSetup`.
+
+        Raises:
+            ConfigError: If the process fails, or is not ready in time.
+        """
         addresses = reachable_addresses(self._host)
         certificate, notes = self._certified(addresses)
         setup = PageSetup(
@@ -112,7 +116,10 @@ class Page:
         return self.urls[0]
 
     def _certified(self, addresses: Sequence[str]) -> tuple[str | None, tuple[str, ...]]:
-        """Return the PEM file for HTTPS and lines about it. The file is None if only this computer reaches the page."""
+        """Return the PEM file for HTTPS, and lines about it for people. Without HTTPS, the file is None.
+
+        A page that only this computer reaches needs no HTTPS.
+        """
         if is_loopback(self._host):
             return None, ()
         if self._certificate is not None:
@@ -133,7 +140,7 @@ class Page:
         return self._process.fault
 
     def send(self, frame: Frame) -> bool:
-        """Show a frame. Return False, and do nothing, if the page is still busy with the last frame."""
+        """Show a frame. Return False, and show nothing, if the page is still busy with the last frame."""
         pictures, self._pictures = self._pictures, {}
         sent = self._process.send(replace(frame, pictures=pictures) if pictures else frame, 1)
         if not sent:
@@ -141,7 +148,7 @@ class Page:
         return sent
 
     def show_picture(self, camera: str, picture: bytes) -> None:
-        """Show a JPEG or PNG with the next frame. Any thread may call this."""
+        """Show a camera's ``picture`` (JPEG or PNG) with the next frame. Any thread may call this."""
         self._pictures = self._pictures | {camera: picture}
 
     def _on_answer(self, answer: Any) -> None:

@@ -8,7 +8,8 @@ from html import escape
 from websockets.http11 import Response
 
 _TITLE = b"<title>Viser</title>"
-# On a phone, viser's panel covers the scene. This style gives it the lower half of the screen, and the scene the rest.
+# On a phone, viser's panel covers the scene. This style gives the panel the lower half of the screen, and the scene the
+# upper half.
 _SHEET = '.mantine-Paper-root[style*="position: fixed"][style*="bottom: 0"]'
 _PHONE = (
     f"<style>@media (max-width: 576px) {{{_SHEET} {{width: 100% !important; max-height: 50vh !important}} "
@@ -16,8 +17,9 @@ _PHONE = (
     'div[style*="flex-grow: 1; height: 100%"]:has(canvas) '
     "{height: 50vh !important; flex: none !important; width: 100vw !important}}</style>"
 )
-# viser's notices, such as that about drawing without a graphics card, stand above the arms otherwise. On a phone they
-# cover the whole picture, so that only their titles are shown there.
+# This style moves viser's notices to the lower edge, because they would hide the arms at the upper edge. An example is
+# the notice that the browser draws without a graphics card. On a phone, only the titles of the notices are shown,
+# because their texts would cover the whole picture.
 _NOTICES = (
     "<style>.mantine-Notifications-root {top: auto !important; bottom: 1em !important} "
     "@media (max-width: 576px) {.mantine-Notifications-root {bottom: calc(50vh + 0.5em) !important} "
@@ -30,10 +32,10 @@ class PageFile:
 
     def __init__(self, name: str) -> None:
         self._head = f"<title>{escape(name)}</title>{_PHONE}{_NOTICES}".encode()
-        self._made: dict[bytes, bytes] = {}  # The changed page by viser's page, plain and compressed.
+        self._made: dict[bytes, bytes] = {}  # The changed page, by viser's page. Both are plain or both are compressed.
 
     def change(self, response: Response) -> None:
-        """Put the cell's page into ``response``, if it carries viser's page."""
+        """Replace viser's page in ``response`` by the changed page. Responses that report an error stay as they are."""
         if response.status_code != 200:
             return
         is_compressed = response.headers.get("Content-Encoding") == "gzip"

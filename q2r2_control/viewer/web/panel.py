@@ -1,4 +1,4 @@
-"""The panel beside the scene: the arms' states with reasons, numbers of the loop, and joints in their ranges."""
+"""The panel beside the scene: the arms' states with reasons, figures of the loop, and joints within their ranges."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ from q2r2_control.viewer.web.panel_html import (
 )
 from q2r2_control.wording import sentence
 
-_PERIOD = 0.2  # Period at which the table is drawn [s].
-_NEAR_LIMIT = 0.05  # A joint is near a limit within this share of its range.
+_PERIOD = 0.2  # Time between two drawings of the table [s].
+_NEAR_LIMIT = 0.05  # A joint counts as near a limit if its distance to the limit is less than this share of its range.
 _EPISODES = 12  # Greatest number of lines about episodes that are shown.
 _OF_EPISODES = (
     *(
@@ -90,9 +90,10 @@ class Panel:
         self._binding: dict[ActiveLimit, None] = {}
         self._told: list[tuple[str, str]] = []  # Time and text of each line about episodes.
         self._ticks, self._slowest = 0, 0.0  # Since the last table: number of ticks, and longest computing time [s].
-        self._rates, self._times = deque[float](maxlen=HISTORY), deque[float](maxlen=HISTORY)  # [Hz], [us]
-        self._moved: dict[PageSetting, float] = {}  # New values of moved sliders.
-        self._shown = time.monotonic()
+        # Values of the plots: rates of the loop [Hz], and computing times of the slowest ticks [us].
+        self._rates, self._times = deque[float](maxlen=HISTORY), deque[float](maxlen=HISTORY)
+        self._moved: dict[PageSetting, float] = {}  # New values of moved sliders, which are not sent yet.
+        self._shown = time.monotonic()  # Time of the last table [s].
         self._newest: Frame | None = None
         self._buttons: list[viser.GuiInputHandle[Any]] = []  # Buttons and sliders that are hidden when the run is over.
         self._drawn_last: tuple[float, Mapping[str, pin.SE3]] = 0.0, {}  # Time [s] and tool poses of the last table.
@@ -171,7 +172,10 @@ class Panel:
         numbers: tuple[float, float, float, float],
         unit: float,
     ) -> None:
-        """Add a slider. ``numbers`` are minimum, maximum, step and first value, in the ``unit`` of the setting."""
+        """Add a slider. ``numbers`` are its minimum, maximum, step and first value.
+
+        The value of the setting is the slider's value times ``unit``.
+        """
         slider = gui.add_slider(label, *numbers)
 
         def move(_: object) -> None:
@@ -182,12 +186,14 @@ class Panel:
 
     def follow(self, frame: Frame) -> None:
         """Keep the contents of a frame, which may be shown later. This is called with every frame, shown or not."""
-        if self._setup.replayed:  # Each frame has all events that say why, since the time line can go back.
+        # In a replay, each frame has all events that say why the arms are in their states, since the time line can go
+        # back.
+        if self._setup.replayed:
             self._words.told = {}
         self._words.follow(frame.events)
         for event in frame.events:
             line = f"{event.t:.1f} s", sentence(event.reason)
-            if event.kind in _OF_EPISODES and line not in self._told[-2:]:  # Both arms have the same event.
+            if event.kind in _OF_EPISODES and line not in self._told[-2:]:  # Each arm has an event.
                 self._told.append(line)
         self._binding |= dict.fromkeys(frame.binding)
         if frame.pictures:
@@ -208,7 +214,7 @@ class Panel:
             self._table.content = self._drawn(self._newest, [], over=True)
 
     def show(self, frame: Frame) -> None:
-        """Draw the table, and send the values of sliders that were moved. This is done only once in ``_PERIOD``."""
+        """Draw the table, and send the values of sliders that were moved. Both are done only once per ``_PERIOD``."""
         self._newest = frame
         passed = time.monotonic() - self._shown
         if passed >= _PERIOD:
@@ -234,7 +240,7 @@ class Panel:
                 self._answer(PageChange(setting, value))
 
     def _drawn(self, frame: Frame, binding: list[ActiveLimit], over: bool = False) -> str:
-        """Return the table of a frame. After a run that is ``over``, rows that need a running loop are left out."""
+        """Return the table of a frame as HTML. If the run is ``over``, rows that need a running loop are left out."""
         tick, arms = frame.tick, list(frame.tick.tools)
         rows = [
             ("", [f"<b>{escape(arm)}</b>" for arm in arms]),
@@ -268,7 +274,7 @@ class Panel:
         return dragged or self._words.next_press(tick, arm)
 
     def _below(self, frame: Frame, over: bool) -> str:
-        """Return lines and plots about the whole robot."""
+        """Return, as HTML, lines and plots about the whole robot and the loop."""
         tick, report = frame.tick, frame.tick.reference.report
         certified = coloured("certified", GREEN) if report.certified else coloured("not certified", RED)
         pair = escape(" | ".join(report.tightest_pair))

@@ -41,7 +41,7 @@ def share(opening: float | None) -> str:
 
 
 def plot(label: str, values: Sequence[float], top: float) -> str:
-    """Return a plot of the last values as a line, from 0 up to ``top``."""
+    """Return the HTML of a plot of ``values`` as a line. The vertical axis goes from 0 to ``top``."""
     points = " ".join(f"{100.0 * i / HISTORY:.0f},{20.0 * (1.0 - min(y / top, 1.0)):.1f}" for i, y in enumerate(values))
     return (
         f"<div style='color:#777'>{label}</div><svg viewBox='0 0 100 21' preserveAspectRatio='none'"

@@ -1,4 +1,4 @@
-"""Replay a recorded run on a page with a time line. The frames are kept, and shown at the recorded speed."""
+"""Replay a recorded run on a page with a time line. The frames are kept in memory, and shown at the recorded speed."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ class Playback:
         self._view = view
         self._frames: list[Frame] = []
         self._times: list[float] = []  # Times of the frames [s].
-        self._told: dict[str, Told] = {}  # By arm.
+        self._told: dict[str, Told] = {}  # By arm, the events that say why it is in its state.
         self._ticks, self._slowest = 0, 0.0
         self._position, self._playing, self._complete = 0.0, True, False
         self._ended = Flag()
 
     def begin(self, pipeline: Pipeline, title: str) -> str:
-        """Serve the page before the replay begins, and return its URL; raises :class:`ConfigError` if it cannot."""
+        """Serve the page before the replay begins, and return its URL; raises :class:`ConfigError` if this fails."""
         url = self._view.serve(pipeline, title, replayed=True, on_request=self._on_request)
         pipeline.listeners.append(self)
         Thread(target=self._play, daemon=True).start()

@@ -16,23 +16,25 @@ from q2r2_control.viewer.web.exchange import Frame, PageSetup
 from q2r2_control.viewer.web.figure import CapsuleFigure, ObstacleFigure, RobotFigure, place
 
 _TRAIL_COLOURS: tuple[Colour, ...] = ((60, 120, 216), (150, 80, 190))
-_TRAIL = 90  # Points of a trail.
-_TRAIL_PERIOD = 0.05  # Time between the points, in the run's time [s].
-_BREAK = 1.0  # After a longer gap than this, a new trail begins [s].
+_TRAIL = 90  # Number of points of a trail.
+_TRAIL_PERIOD = 0.05  # Time between the points of a trail, in the run's time [s].
+_BREAK = 1.0  # If the time between two points would be longer than this, a new trail begins [s].
 _AWAY = 0.01  # The ghost is shown if a joint is farther from its reference than this [rad].
 _SHORT = 0.01  # Lines up to this length are not drawn [m].
 _PER_NEWTON = 0.005  # Drawn length per force [m/N].
-_SINGULAR = 0.05  # Least ratio of a singular value to the largest one. Directions below it do not count.
+# Forces are computed only in directions in which the ratio of the Jacobian's singular value to the largest one is above
+# this.
+_SINGULAR = 0.05
 _NEAR = 0.1  # A pair with this margin or more is green [m].
-_CAMERA = np.array([-1.8, 0.35, 1.5])  # Position of the camera from the middle of the arms [m].
+_CAMERA = np.array([-1.8, 0.35, 1.5])  # Vector from the middle of the arms to the first position of the camera [m].
 FIELD_OF_VIEW = math.radians(40.0)  # Vertical angle of the camera's view [rad].
 _BACKGROUND: Colour = (238, 241, 244)
 
 
 def first_view(model: pin.Model, home: Array) -> tuple[Array, Array]:
-    """Return the first position (3,) of the camera, from which it sees both arms, and the point (3,) in its centre [m].
+    """Return the first position of the camera, and the point that it looks at (3,) [m], in the world frame.
 
-    The position is behind the arms and above them, where an operator stands: the left arm is on the left.
+    The position is behind the arms and above them. As for an operator who stands there, the left arm is on the left.
     """
     data = model.createData()
     pin.forwardKinematics(model, data, home)
@@ -42,7 +44,7 @@ def first_view(model: pin.Model, home: Array) -> tuple[Array, Array]:
 
 
 class CellScene:
-    """Draws frames. After the start, only :meth:`show` may be called, and only by one thread."""
+    """Draws frames. After the scene is built, only :meth:`show` may be called, and only by one thread."""
 
     def __init__(self, server: viser.ViserServer, setup: PageSetup) -> None:
         scene, config = server.scene, setup.config
@@ -51,7 +53,7 @@ class CellScene:
         self._tightest = TightestPair(setup.model, setup.collision_model)
         self._tree = JointTree(setup)
         scene.set_up_direction("+z")
-        scene.configure_default_lights(cast_shadow=False)  # Without a GPU, browsers are ten times as fast then.
+        scene.configure_default_lights(cast_shadow=False)  # A browser without a GPU is then ten times as fast.
         scene.set_background_image(np.full((2, 2, 3), _BACKGROUND, dtype=np.uint8))
         scene.add_grid(
             "/floor",
@@ -81,7 +83,7 @@ class CellScene:
             first = self._data.oMi[self._model.getJointId(setup.joint_names[joints[0]])].translation
             scene.add_label(f"/names/{arm}", arm, position=first, anchor="top-center")
         nothing = np.zeros((_TRAIL - 1, 2, 3), dtype=np.float32)
-        # The trail of each tool, and as a thinner line the trail of its target, which shows the hand.
+        # The trail of each tool; and, as a thinner line, the trail of its target, which shows the hand's motion.
         self._trails = {
             (arm, kind): scene.add_line_segments(f"/trails/{arm}_{kind}", nothing, _faded(colour), line_width=width)
             for arm, colour in zip(arms, _TRAIL_COLOURS, strict=False)
@@ -111,7 +113,10 @@ class CellScene:
         camera.fov = FIELD_OF_VIEW
 
     def _add_choices(self, server: viser.ViserServer) -> viser.GuiInputHandle[bool]:
-        """Add checkboxes for things that are drawn on request; return the one that always shows the ghost."""
+        """Add checkboxes for things that are drawn on request.
+
+        Return the checkbox with which the ghost, which shows the reference, is always drawn.
+        """
         with server.gui.add_folder("View", order=1e9, expand_by_default=False):
             shadows = server.gui.add_checkbox("shadows", False, hint="slow without a graphics card")
             capsules = server.gui.add_checkbox("shapes that are kept apart", False)
@@ -153,14 +158,14 @@ class CellScene:
                 box.position, box.wxyz = frame.moved[at : at + 3], frame.moved[at + 3 : at + 7]
                 box.visible = True
 
-    def _show_line(self, line: viser.LineSegmentsHandle, tool: pin.SE3, way: Array | None) -> None:
-        """Draw a line from a ``tool`` along the vector ``way`` (3,) [m], if it is long enough to be seen."""
-        line.visible = way is not None and float(np.linalg.norm(way)) > _SHORT
+    def _show_line(self, line: viser.LineSegmentsHandle, tool: pin.SE3, vector: Array | None) -> None:
+        """Draw a line from a ``tool`` along the ``vector`` (3,) [m]. If this is None or very short, hide the line."""
+        line.visible = vector is not None and float(np.linalg.norm(vector)) > _SHORT
         if line.visible:
-            line.points = np.array([[tool.translation, tool.translation + way]])
+            line.points = np.array([[tool.translation, tool.translation + vector]])
 
     def _force(self, arm: str, state: RobotState) -> Array | None:
-        """Return the force on a tool as a vector (3,) to draw [m]; None if the plant does not measure it."""
+        """Return the vector (3,) with which the force on a tool is drawn [m]; None if the plant measures no torques."""
         if state.tau_external is None:
             return None
         frame, joints = self._setup.tools[arm], self._setup.joints[arm]
@@ -174,7 +179,7 @@ class CellScene:
         if 0.0 <= tick.t - self._trail_time < _TRAIL_PERIOD:
             return
         if not 0.0 <= tick.t - self._trail_time < _BREAK:
-            self._trail_points.clear()  # The time line of a replay was moved.
+            self._trail_points.clear()  # The user has moved the time line of a replay.
         self._trail_time = tick.t
         for (arm, kind), trail in self._trails.items():
             target = tick.targets[arm].pose

@@ -18,9 +18,11 @@ from q2r2_control.viewer.web.exchange import Frame, PageLost, PageRequest, PageS
 from q2r2_control.viewer.web.panel import Panel
 from q2r2_control.viewer.web.scene import CellScene
 
-_NICENESS = 10  # The loop has priority.
-_LAST_WORDS = 0.5  # Time for browsers to learn that the run is over, before their connections are closed [s].
-_RATE, _BURST = 500.0, 50.0  # Allowed answers per second, and at once. Two hands that a page moves need 220 per second.
+_NICENESS = 10  # The process gets a low priority, since the loop comes first.
+_LAST_WORDS = 0.5  # Time in which browsers are told that the run is over, before their connections are closed [s].
+# Number of answers that are allowed per second, and number that are allowed at once. A page that moves two hands sends
+# 220 per second.
+_RATE, _BURST = 500.0, 50.0
 
 
 class _Newest:
@@ -55,20 +57,28 @@ class LimitedAnswers:
 
     def __init__(self, answer: Callable[[Any], None], clock: Callable[[], float] = time.monotonic) -> None:
         self._answer, self._clock, self._lock = answer, clock, Lock()
-        self._room, self._then = _BURST, clock()
+        self._allowed, self._then = _BURST, clock()  # Number of answers that are allowed, at this time [s].
 
     def __call__(self, answer: Any) -> None:
         with self._lock:
             now = self._clock()
-            self._room, self._then = min(self._room + _RATE * (now - self._then), _BURST), now
-            if self._room < 1.0 and answer is not PageRequest.STOP and not isinstance(answer, PageLost):
+            self._allowed, self._then = min(self._allowed + _RATE * (now - self._then), _BURST), now
+            if self._allowed < 1.0 and answer is not PageRequest.STOP and not isinstance(answer, PageLost):
                 return
-            self._room = max(self._room - 1.0, 0.0)
+            self._allowed = max(self._allowed - 1.0, 0.0)
         self._answer(answer)
 
 
 def main(requests: Iterator[Any], answer: Callable[[Any], None]) -> None:
-    """Answer :class:`Ready`, then the requests of browsers; raises :class:`ConfigError` if the address is in use."""
+    """Run the process. It answers with :class:`Ready`, and then with the requests of browsers.
+
+    Args:
+        requests: The setup, and then the frames. When they end, the run is over.
+        answer: Sends data to the run.
+
+    Raises:
+        ConfigError: If the address is in use.
+    """
     setup: PageSetup | None = next(requests, None)
     if setup is None:
         return

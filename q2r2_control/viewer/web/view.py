@@ -41,8 +41,9 @@ _logger = logging.getLogger(__name__)
 class PageView(Page):
     """Shows one run on a page: a listener of the run, and a context around it. No browser can keep the loop waiting.
 
-    At each tick, references to the newest data are stored. A thread sends them 30 times a second. If this thread is
-    still busy with the last data, it sends newer data later. If the page fails, one line is logged and the run goes on.
+    At each tick, references to the newest data are stored. 30 times a second, a thread of the page sends them to the
+    page's process. If this thread is still busy with the last data, it sends newer data later. If the page fails, one
+    line is logged and the run goes on.
     """
 
     def __init__(self, host: str, port: int, certificate: Path | None = None) -> None:
@@ -106,7 +107,7 @@ class PageView(Page):
             self._on_request = on_request
         config, plant = pipeline.config, pipeline.plant
         source: object = pipeline.input
-        while (operator := getattr(source, "operator", None)) is not None:  # A policy has an operator's input.
+        while (operator := getattr(source, "operator", None)) is not None:  # A policy's input has an operator's input.
             source = operator
         self._input = source if isinstance(source, WebInput) else None
         self._source, self._nobody = source, pipeline.input.controls.words.nobody
@@ -187,7 +188,7 @@ class PageView(Page):
         if isinstance(answer, PageRequest):
             self._requests[answer]()
         elif isinstance(answer, PageChange):
-            with suppress(ConfigError):  # The number may be one that no slider has.
+            with suppress(ConfigError):  # A browser may send a number that no slider allows.
                 self._changes[answer.setting](answer.value)
         elif self._input is not None and isinstance(answer, PageHand):
             controls = {"drag": float(answer.drag), "gripper": float(answer.gripper)}

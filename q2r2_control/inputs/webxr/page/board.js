@@ -1,19 +1,19 @@
-// The place of the board: above the direction in which the operator looks. It stays where it is while the head turns a
-// little. After a larger turn it follows.
+// Computes the pose of the board, which is above the direction in which the operator looks. The board rests while the
+// head turns a little, and follows a larger turn.
 
 export const [BOARD_WIDTH, BOARD_DISTANCE] = [1.3, 1.5]; // width of the board, and its distance from the head [m]
 const ABOVE = 0.35; // angle of the board above the direction in which the operator looks [rad]
 const [LOWEST, HIGHEST] = [-0.3, 0.8]; // least and greatest elevation of the board [rad]
-const [FAR, NEAR] = [0.35, 0.03]; // the board begins to follow at the first angle, and stops at the second one [rad]
-const SHARE = 0.08; // share of the remaining angle that the board moves in a frame
+const [FAR, NEAR] = [0.35, 0.03]; // the board begins to follow at the first angle, and stops at the second angle [rad]
+const SHARE = 0.08; // share of the remaining angle by which the board turns in a frame
 
-/** @param {number} angle */
+/** @param {number} angle [rad]; the result is the same angle between -pi and pi */
 const wrapped = (angle) => Math.atan2(Math.sin(angle), Math.cos(angle));
 
 export class Board {
   constructor() {
-    this.known = false; // whether the pose of the head has come
-    this.yaw = 0; // direction of the board [rad]
+    this.known = false; // whether a pose of the head has come
+    this.yaw = 0; // direction of the board about the vertical, from forward to the right [rad]
     this.pitch = 0; // elevation of the board [rad]
     this.glides = false; // whether the board follows the head now
     /** @type {number[]} */
@@ -37,7 +37,7 @@ export class Board {
   }
 
   /**
-   * Return the matrix that turns a square from -1 to 1 into the board, which faces the operator.
+   * Return the matrix that turns a square with corners from -1 to 1 into the board, which faces the operator.
    * @param {number} aspect height of the board's picture divided by its width
    */
   place(aspect) {

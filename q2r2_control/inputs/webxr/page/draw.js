@@ -22,7 +22,9 @@ const BEHIND = new Float32Array([
   1, 0, 0, 0, 0, ACROSS, DOWN, 0, 0, -DOWN, ACROSS, 0,
   0, -1.6 * ACROSS + 1.2 * DOWN, -1.6 * DOWN - 1.2 * ACROSS, 1,
 ]);
-const [COARSER, COARSEST] = [0.8, 0.3]; // factor of the pixels along a side each time drawing is slow, and the least one
+// Each time that drawing is slow, the number of pixels along a side is multiplied by the first factor. The second
+// number is the least share of pixels that remains.
+const [COARSER, COARSEST] = [0.8, 0.3];
 const [AR_OPACITY, GHOST_OPACITY] = [0.45, 0.35]; // opacity of the robot in AR, and of the gripper at a target
 
 const SHAPES = {
@@ -46,7 +48,7 @@ const BOARDS = {
 };
 
 /**
- * @typedef {{ array: WebGLVertexArrayObject, count: number }} Mesh on the graphics card
+ * @typedef {{ array: WebGLVertexArrayObject, count: number }} Mesh a shape on the graphics card; number of corners
  * @typedef {{ program: WebGLProgram, view: WebGLUniformLocation | null, model: WebGLUniformLocation | null, colour: WebGLUniformLocation | null }} Program
  * @typedef {{ x: number, y: number, width: number, height: number, view: Float32Array }} Eye
  */
@@ -74,7 +76,7 @@ export class Drawing {
     /** @type {ShownScene | null} */
     this.scene = null;
     const gl = canvas.getContext("webgl2", { xrCompatible: true, antialias: true });
-    this.gl = /** @type {WebGL2RenderingContext} */ (gl); // null without WebGL 2: the hands are sent all the same
+    this.gl = /** @type {WebGL2RenderingContext} */ (gl); // null without WebGL 2; the hands are sent nevertheless
     this.shapes = this.program(SHAPES);
     this.boards = this.program(BOARDS);
     const half = THICKNESS / 2;
@@ -92,7 +94,7 @@ export class Drawing {
     this.grid = null;
     /** @type {WebGLSync | null} */
     this.busy = null; // signals that the last picture on the page is finished
-    this.sharpness = 1; // pixels of the picture per pixel of the page, along a side
+    this.sharpness = 1; // number of the picture's pixels per pixel of the page, along a side
   }
 
   /**
@@ -163,8 +165,8 @@ export class Drawing {
   }
 
   /**
-   * Draw the run on the page, as seen from behind the robot, and return whether it was drawn. While the last picture is
-   * not finished, nothing is drawn, because the page could not react to keys meanwhile. The texts are beside the picture.
+   * Draw the run on the page, as seen from behind the robot, without the board. Return whether it was drawn: while the
+   * last picture is not finished, nothing is drawn, because otherwise the page could not react to keys.
    * @param {ShownState | null} state
    */
   drawOnPage(state) {
@@ -181,7 +183,7 @@ export class Drawing {
     return true;
   }
 
-  // Draw fewer pixels from now on, because a picture took long. A computer without a graphics card may be drawing.
+  // Draw fewer pixels from now on, because a picture took long, for example on a computer without a graphics card.
   coarsen() {
     this.sharpness = Math.max(COARSER * this.sharpness, COARSEST);
   }
@@ -190,7 +192,7 @@ export class Drawing {
    * @param {WebGLFramebuffer | null} framebuffer
    * @param {Eye[]} eyes
    * @param {ShownState | null} state
-   * @param {import("./panel.js").Panel | null} panel whose picture is on the board; null for no board
+   * @param {import("./panel.js").Panel | null} panel the panel whose picture the board shows; null for no board
    * @param {Float32Array[]} hands poses of the hands, as matrices in the operator's room
    * @param {boolean} transparent whether the operator sees the real room, as in AR
    */
@@ -268,7 +270,7 @@ export class Drawing {
 
   /**
    * Draw a translucent gripper at the target.
-   * @param {number[]} joints whose shapes move with the tool
+   * @param {number[]} joints indices of the joints whose shapes move with the tool
    * @param {Float32Array[]} places poses of all joints, as matrices
    * @param {Seven} tool
    * @param {Seven} target
@@ -283,8 +285,8 @@ export class Drawing {
 
   /**
    * @param {Mesh} mesh
-   * @param {Float32Array} space the pose of the frame in which `place` is given
-   * @param {Float32Array} place the pose of the shape, as a matrix
+   * @param {Float32Array} space matrix of the pose of the frame in which `place` is given, in the operator's room
+   * @param {Float32Array} place matrix of the shape's pose and size
    * @param {number[]} colour
    */
   shape(mesh, space, place, colour, opacity = 1) {

@@ -1,18 +1,18 @@
-// Hands without a headset: keys or a gamepad move ("fly") them, one hand at a time. The run gets them like the hands of
+// Virtual hands without a headset. Keys or a gamepad move ("fly") one hand at a time. The run gets the same data as from
 // a headset.
 
 const [SPEED, TURNING] = [0.15, 0.6]; // linear and angular speed of a hand [m/s], [rad/s]
 const SLOWLY = 0.25; // factor of both speeds while Shift is held
-const LONGEST = 0.05; // longest time between two readings for which a hand moves [s]
-// A key counts as held for these times after its press, and after each of its repeats. Browsers do not always report that
-// a key was released. Chromium on X repeats a key after 660 ms, and then every 40 ms. A page that draws slowly hears of
-// it later.
+const LONGEST = 0.05; // a hand moves for at most this time between two readings [s]
+// A key counts as held for these times after its press, and after each of its repeats, because browsers do not always
+// report that a key was released. Chromium on X repeats a key after 660 ms, and then every 40 ms. A page that draws
+// slowly gets these events later.
 const [PRESSED, REPEATED] = [750, 600]; // [ms]
 // A button that was pressed between two messages is pressed in the next message, even if it is released by then. But an
-// arm whose hand sends nothing for 150 ms stops. The press is forgotten before that, or it would engage the arm again
-// that the operator wanted to pause.
+// arm whose hand sends nothing for 150 ms stops. The press is therefore forgotten before that time. Otherwise, a press
+// that was to pause the arm would engage it again.
 const TAPPED = 140; // [ms]
-const DEAD = 0.12; // displacements of a stick below this count as 0
+const DEAD = 0.12; // smaller displacements of a stick, which has the range -1 to 1, count as 0
 /** @type {Record<string, Seven>} */
 const START = { left: [0.3, 0.2, 1.1, 0, 0, 0, 1], right: [0.3, -0.2, 1.1, 0, 0, 0, 1] }; // x forward, y left, z up [m]
 // By key: the index of a velocity and its sign. Indices 0 to 2 are motions along x y z, 3 to 5 are turns about x y z.
@@ -24,8 +24,9 @@ const KEYS = {
 const [LOWER, UPPER] = ["Space", "KeyG"];
 /** @type {Record<string, string>} */
 const HANDS = { Digit1: "left", Digit2: "right" };
-const BUTTONS = [LOWER, UPPER];
+const BUTTONS = [LOWER, UPPER]; // keys that act as the buttons of a controller
 const MODIFIERS = ["Control", "Meta", "Alt"];
+// Indices of the gamepad's buttons. For a button that tilts the hand: its index, the index of the velocity, the sign.
 const PAD = { a: 0, b: 1, bumpers: { left: 4, right: 5 }, tilt: [[12, 4, 1], [13, 4, -1], [14, 3, -1], [15, 3, 1]] };
 
 /** @param {KeyboardEvent} event */
@@ -70,8 +71,8 @@ export class Flying {
 
   /** @param {KeyboardEvent} event */
   press(event) {
-    // A key with a modifier is for the browser. During its dialogs, and while Cmd is held on a Mac, the page does not
-    // hear that keys are released.
+    // A key with a modifier is a command to the browser. During the browser's dialogs, and while Cmd is held on a Mac,
+    // the page gets no event when a key is released.
     if (isModified(event)) return this.forget();
     if (!(event.code in KEYS || event.code in HANDS || BUTTONS.includes(event.code))) return;
     this.device = "keys";
@@ -80,14 +81,14 @@ export class Flying {
     const until = performance.now() + (event.repeat ? REPEATED : PRESSED);
     this.until.set(event.code, until);
     if (BUTTONS.includes(event.code) && !event.repeat) this.taps.set(event.code, performance.now() + TAPPED);
-    // Of several held keys only the last one repeats, and the others count as released after a while. The buttons are an
-    // exception: they count as held as long as any key repeats, since a button may be a dead man's switch.
+    // If several keys are held, only the last one repeats, and the others count as released after a while. BUTTONS are
+    // an exception: they count as held as long as any key repeats, since a button may be a dead man's switch.
     for (const code of BUTTONS) if (this.holds(code)) this.until.set(code, until);
     this.choose(HANDS[event.code] ?? this.hand);
   }
 
   /**
-   * Choose the hand that moves. Buttons that are pressed for one hand do not count for the other hand.
+   * Choose the hand that moves. Buttons that were pressed for the hand before are released.
    * @param {string} hand
    */
   choose(hand) {
@@ -114,7 +115,10 @@ export class Flying {
     this.taps.clear();
   }
 
-  /** @param {string} code */
+  /**
+   * Return whether a key counts as held.
+   * @param {string} code
+   */
   holds(code) {
     return (this.until.get(code) ?? 0) > performance.now();
   }
@@ -153,6 +157,7 @@ export class Flying {
   }
 
   /**
+   * Return the displacement of a stick along one axis, from -1 to 1; 0 without a gamepad.
    * @param {Gamepad | null | undefined} pad
    * @param {number} index
    */

@@ -1,13 +1,14 @@
 // Reads both hands from WebXR, in the form that the run expects.
 // In WebXR x points right, y up and z back. In the run x points forward, y left and z up.
 
-const STRONGEST = 1000; // duration with which a vibration is started; the run ends it earlier [ms]
+const STRONGEST = 1000; // duration with which a vibration is started; the run ends it earlier, by amplitude 0 [ms]
 // A hand that gets another input source counts as untracked for this time, which is twice the time after which an arm
 // pauses [ms].
 const SWAPPED = 300;
 
 /**
- * @param {XRRigidTransform} transform
+ * Return a pose in the axes of the run.
+ * @param {XRRigidTransform} transform the pose in the axes of WebXR
  * @returns {Seven}
  */
 export function poseOf(transform) {
@@ -22,8 +23,8 @@ const isTransient = (source) => source.targetRayMode !== "tracked-pointer";
 /** @param {XRInputSource} source */
 const isBare = (source) => Boolean(source.hand) || isTransient(source);
 
-// Whether a hand has got another device, such as bare fingers after its controller was laid down. The pinch of fingers
-// that were tracked before, or its end, does not count.
+// Whether a hand has got another device, such as bare fingers after its controller was laid down. If tracked fingers
+// begin or end a pinch, their source changes too, but this does not count.
 /**
  * @param {XRInputSource} known
  * @param {XRInputSource} source
@@ -59,7 +60,7 @@ export class Hands {
     /** @type {Map<string, number>} */
     this.swapped = new Map(); // hand -> time until which it counts as untracked [ms]
     /** @type {Map<string, any>} */
-    this.actuators = new Map(); // hand -> the actuator that vibrates
+    this.actuators = new Map(); // hand -> the actuator that vibrates; undefined if there is none
     /** @type {Float32Array[]} */
     this.places = []; // poses of the hands in the last frame, as matrices in the operator's room
   }
@@ -69,7 +70,7 @@ export class Hands {
   }
 
   /**
-   * Read the hands of a frame. A hand that was there before and is missing now is reported as untracked.
+   * Read the hands of a frame. A hand that was in an earlier frame and is missing now is reported as untracked.
    * @param {XRFrame} frame
    * @param {XRReferenceSpace} space
    * @param {boolean} moved whether the reference space has moved just now
@@ -95,7 +96,7 @@ export class Hands {
   }
 
   /**
-   * Whether a hand has got another device just now. Its arm must then be engaged again.
+   * Return whether a hand has got another device in the last SWAPPED ms. Its arm must then be engaged again.
    * @param {string} hand
    * @param {XRInputSource} source
    */
@@ -120,6 +121,6 @@ export class Hands {
   }
 }
 
-// The actuator that vibrates in a hand. Browsers use different names for it.
+// The actuator that lets a hand's controller vibrate. Browsers use different names for it.
 /** @param {any} gamepad */
 const actuatorOf = (gamepad) => gamepad?.hapticActuators?.[0] ?? gamepad?.vibrationActuator;

@@ -1,10 +1,10 @@
-// The socket to the run. Only the newest hands are sent: if hands would have to wait in the browser, they are left out,
-// and not sent late.
+// The socket to the run. Only the newest data of the hands are sent. If they would have to wait in the browser, they
+// are left out instead of sent late.
 
-const [RETRY, SELDOM] = [2000, 10000]; // time until the next attempt, if a socket was closed and if the run is over [ms]
+const [RETRY, SELDOM] = [2000, 10000]; // time until the next attempt: during a run, and after the run is over [ms]
 const ALIVE = 500; // time without a message after which a message without hands is sent [ms]
 const AGAIN = 10; // time until a message that must not be left out is tried again [ms]
-const REMEMBERED = 64; // number of messages whose time of sending is kept
+const REMEMBERED = 64; // number of newest messages whose times of sending are kept
 const [REFUSED, OVER, FREE] = [4001, 4003, 4004]; // codes that say why the run's server has closed a socket
 
 // The number of this page. It stays the same after a reload, so that the run recognises the page.
@@ -22,7 +22,7 @@ function pageNumber() {
  * @property {(state: ShownState) => void} state
  * @property {(vibration: ShownVibration) => void} vibration
  * @property {(jpeg: Blob) => void} picture
- * @property {() => void} closed
+ * @property {() => void} closed called when a connection is closed, unless the page watches or may drive at once
  * @property {() => boolean} drives whether this page's operator wants to drive
  */
 
@@ -32,10 +32,10 @@ export class Link {
     this.handlers = handlers;
     this.text = "connecting"; // the state of the connection, for people
     this.age = NaN; // time from sending a message until the run has acknowledged it [ms]; NaN if not known
-    this.loss = 0; // share of the last messages that were left out
+    this.loss = 0; // recent share of messages that were left out
     this.over = false; // whether the run has ended
     this.watching = false; // whether this page only watches, because another page drives
-    this.sequence = 0;
+    this.sequence = 0; // number of the last message
     /** @type {Map<number, number>} */
     this.sent = new Map(); // number of a message -> when it was sent [ms]
     this.last = 0; // when the last message was sent [ms]
@@ -79,8 +79,8 @@ export class Link {
    */
   close(code, reason) {
     this.over ||= code === OVER;
-    // A page that may not drive watches. But a page with hands tries again, because it may drive if the other page sends
-    // no poses.
+    // A page that was refused watches. But a page whose operator wants to drive tries again, because it may drive if
+    // the other page sends no poses.
     this.watching = code === REFUSED && !this.watching && !this.handlers.drives();
     if (this.over) this.text = "The run is over. The picture is its last moment. The next run at this address shows up here.";
     else this.text = reason || "not connected; the run may have ended, or its URL is an old one";
@@ -89,16 +89,16 @@ export class Link {
     this.retry = setTimeout(() => this.connect(), this.watching ? 0 : this.over ? SELDOM : RETRY);
   }
 
-  // The operator wants to drive. A page that watches connects again for this, as a page that drives.
+  // Let this page drive, because the operator wants to. If it watches, it connects again as a page that drives.
   drive() {
     if (this.watching) this.socket.close();
   }
 
   /**
-   * Send the hands, unless earlier data still wait in the browser. Return whether they are sent.
-   * @param {Record<string, HeadsetHand>} hands
+   * Send a message, unless earlier data still wait in the browser. Return whether it is sent.
+   * @param {Record<string, HeadsetHand>} hands poses and controls of the hands
    * @param {boolean} virtual whether keys or a gamepad move the hands
-   * @param {HeadsetRequest | null} request what a button requests
+   * @param {HeadsetRequest | null} request the request of a button; null if there is none
    */
   send(hands, virtual = false, request = null) {
     const now = performance.now();
@@ -117,8 +117,9 @@ export class Link {
   }
 
   /**
-   * Report that hands are lost. No later message repeats this, so it is never left out, but sent as soon as possible.
-   * @param {Record<string, HeadsetHand>} hands
+   * Report that hands are lost. No later message repeats this report. It is therefore never left out, but tried again
+   * until it is sent.
+   * @param {Record<string, HeadsetHand>} hands the lost hands, without poses
    * @param {boolean} virtual
    */
   sendLost(hands, virtual = false) {
@@ -126,7 +127,7 @@ export class Link {
   }
 
   /**
-   * Send what a button requests, as soon as possible, in a message without hands.
+   * Send the request of a button as soon as possible, in a message without hands.
    * @param {HeadsetRequest} request
    * @param {WebSocket} socket the connection at the time of the press; if it has been replaced, nothing is sent
    */

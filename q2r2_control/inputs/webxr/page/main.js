@@ -1,4 +1,4 @@
-// The page: enters VR or AR or flies a hand by keys, sends the hands, shows what the run says.
+// The page: enters VR or AR or lets keys or a gamepad move ("fly") a hand, sends the hands, and shows the run's state.
 
 import { Drawing, eyesOf } from "./draw.js";
 import { Flying } from "./fly.js";
@@ -8,8 +8,9 @@ import { Pace } from "./pace.js";
 import { Panel } from "./panel.js";
 import { nextOf, worded } from "./words.js";
 
-const SENDING = 16; // between flown hands, however slowly the page draws [ms]
-const MOVED = 300; // a frame that moved is told for this long, twice the time that pauses an arm [ms]
+const SENDING = 16; // time between two messages about flown hands, however slowly the page draws [ms]
+// Time for which a move of the reference space is reported. It is twice the time after which an arm pauses [ms].
+const MOVED = 300;
 /** @type {XRSessionMode[]} */
 const MODES = ["immersive-ar", "immersive-vr"];
 
@@ -24,10 +25,10 @@ let hands = new Hands();
 let session = null;
 /** @type {Flying | null} */
 let flying = null; // hands that keys or a gamepad move
-let pace = new Pace(); // of flying
+let pace = new Pace(); // times of the pictures and messages while hands are flown
 /** @type {ShownState | null} */
-let state = null; // of the run, as it came last
-let movedUntil = 0;
+let state = null; // newest state of the run
+let movedUntil = 0; // until this time, the hands' frame is reported as moved [ms]
 
 const link = new Link({
   scene: (scene) => {
@@ -45,14 +46,15 @@ const link = new Link({
     panel.picture = picture;
   },
   closed: () => {
-    if (link.over) land(); // the last picture stays
+    if (link.over) land(); // the last picture remains visible
     else state = null;
   },
   drives: () => session !== null || flying !== null,
 });
 
 /**
- * Where the operator stands and looks when the session begins: origin and forward of the hands.
+ * Return the reference space of the hands. Its origin is on the floor below the operator's head, and its forward axis
+ * is the direction in which the operator looks now. The result is null if the head is not tracked.
  * @param {XRFrame} frame
  * @param {XRReferenceSpace} floor
  */
@@ -61,7 +63,7 @@ function facing(frame, floor) {
   if (!pose) return null;
   const m = pose.transform.matrix;
   const { x, z } = pose.transform.position;
-  const turn = Math.atan2(m[8], m[10]) / 2; // of the way that the operator looks, about y
+  const turn = Math.atan2(m[8], m[10]) / 2; // half the angle about y from forward to the operator's direction [rad]
   const orientation = { x: 0, y: Math.sin(turn), z: 0, w: Math.cos(turn) };
   return floor.getOffsetReferenceSpace(new XRRigidTransform({ x, y: 0, z }, orientation));
 }
@@ -125,15 +127,16 @@ function fly() {
     const now = performance.now();
     if (kept.isTired(now) || !drawing.drawOnPage(state)) return;
     kept.noteDrawn(now);
-    // The browser finishes the picture before this task. Where a processor draws, nothing else is done meanwhile.
+    // The browser finishes the picture before it runs this task. If a processor draws the picture, it does nothing else
+    // meanwhile.
     setTimeout(() => {
       kept.noteTook(performance.now());
       if (kept.isSlow()) drawing.coarsen();
     });
   };
   requestAnimationFrame(onFrame);
-  // A page that draws slowly sends as often as any other one. A page that is hidden, has no focus, or stands still sends
-  // nothing, so that its arms stop.
+  // A page that draws slowly sends as often as any other page. A page that is hidden, has no focus, or has drawn no
+  // picture for a while sends nothing, so that its arms stop.
   const sending = setInterval(() => {
     if (flying !== begun) {
       clearInterval(sending);
@@ -149,7 +152,7 @@ function fly() {
   show();
 }
 
-// No hand is flown any more, which stops the arms.
+// End flying. The run then stops the arms.
 function land() {
   if (!flying) return;
   link.sendLost(flying.lost(), true);
@@ -158,7 +161,7 @@ function land() {
 }
 
 /**
- * A row of the table: an arm's state in its colour, why, and what to do next.
+ * Return a row of the table: an arm's state in its colour, the reason for the state, and what its operator can do next.
  * @param {string} name
  * @param {ShownArm} arm
  */
@@ -178,7 +181,7 @@ function rowOf(name, arm) {
   return row;
 }
 
-// Why keys move nothing, although the page flies.
+// Return why keys or a gamepad move nothing, although they fly a hand; empty if there is no such reason.
 function slowness() {
   if (!document.hasFocus()) return "Keys do not reach this page: click on it, then engage again.";
   if (!link.open || !drawing.scene) return "";
@@ -229,7 +232,7 @@ button("leave").onclick = () => session?.end();
 button("fly").onclick = fly;
 /** @type {HeadsetRequest[]} */ (["stop", "pause", "home"]).forEach((request) => {
   button(request).onclick = () => {
-    button(request).blur(); // or Space, which engages, would press it again
+    button(request).blur(); // otherwise Space, which engages an arm, would press this button again
     link.ask(request);
   };
 });

@@ -1,7 +1,7 @@
 // 4 x 4 matrices for WebGL, whose 16 numbers are listed column by column.
 
 /**
- * The matrix product a b.
+ * Return the matrix product a b.
  * @param {ArrayLike<number>} a
  * @param {ArrayLike<number>} b
  */
@@ -14,7 +14,7 @@ export function times(a, b) {
 }
 
 /**
- * The matrix of a pose x y z qx qy qz qw.
+ * Return the matrix of a pose x y z qx qy qz qw.
  * @param {Seven} pose
  */
 export function matrixOf([px, py, pz, x, y, z, w]) {
@@ -27,7 +27,7 @@ export function matrixOf([px, py, pz, x, y, z, w]) {
 }
 
 /**
- * The inverse of a pose's matrix.
+ * Return the inverse of a pose's matrix.
  * @param {ArrayLike<number>} m
  */
 export function inverseOf(m) {
@@ -36,13 +36,13 @@ export function inverseOf(m) {
 }
 
 /**
- * The matrix that stretches a shape along each axis by a factor.
- * @param {ArrayLike<number>} size
+ * Return the matrix that stretches a shape along each axis by a factor.
+ * @param {ArrayLike<number>} size the factors along x y z
  */
 export const scaleOf = ({ 0: x, 1: y, 2: z }) => new Float32Array([x, 0, 0, 0, 0, y, 0, 0, 0, 0, z, 0, 0, 0, 0, 1]);
 
 /**
- * The matrix that turns a cube with edges of 1 into a beam from one point to another.
+ * Return the matrix that turns a cube with edges of 1 into a beam from one point to another.
  * @param {Point} from
  * @param {Point} to
  * @param {number} thickness
@@ -51,7 +51,7 @@ export function beamOf(from, to, thickness) {
   const way = to.map((value, axis) => value - from[axis]);
   const length = Math.max(Math.hypot(...way), 1e-6);
   const [x, y, z] = way.map((value) => value / length);
-  const side = Math.abs(z) < 0.9 ? [y, -x, 0] : [0, z, -y]; // across the beam
+  const side = Math.abs(z) < 0.9 ? [y, -x, 0] : [0, z, -y]; // a direction across the beam
   const scale = thickness / Math.hypot(...side);
   const [a, b, c] = side.map((value) => value * scale);
   const up = [y * c - z * b, z * a - x * c, x * b - y * a];
@@ -60,7 +60,7 @@ export function beamOf(from, to, thickness) {
 }
 
 /**
- * The perspective projection of a camera.
+ * Return the matrix of a camera's perspective projection.
  * @param {number} aspect width of the picture divided by its height
  * @param {number} angle vertical angle of view [rad]
  */

@@ -1,14 +1,15 @@
-// How often this browser sends flown hands and draws the arms, and what to do if that is not often enough.
+// Measures how often this browser sends flown hands and draws the arms, and gives advice if that is not often enough.
 
 const CURE = "Make this window smaller, close other programs, or open the page on another computer.";
 const LATE =
   "The hands came too late, although this browser sent them in time: the network or the run's computer is too busy. " +
   "Close other programs there, then engage again.";
 
-const SLOW = 30; // that a picture takes; they get fewer pixels then [ms]
-const LONGEST_REST = 100; // between two pictures [ms]
-const KEPT = 4000; // of times that are counted [ms]
-export const BLIND = 500; // a hand is not sent if no picture was drawn for so long: its operator would not see the arms [ms]
+const SLOW = 30; // if a picture takes longer than this, the next pictures have fewer pixels [ms]
+const LONGEST_REST = 100; // longest pause after a picture, in which keys and hands are handled [ms]
+const KEPT = 4000; // times are kept for this long [ms]
+// If no picture was drawn for this long, hands are not sent, because the operator could not see the arms [ms].
+export const BLIND = 500;
 
 export class Pace {
   constructor() {
@@ -16,11 +17,11 @@ export class Pace {
     this.sent = []; // when hands were sent [ms]
     /** @type {number[]} */
     this.drawn = []; // when a picture was drawn [ms]
-    this.took = 0; // by the last picture, in which the page does nothing else [ms]
+    this.took = 0; // time that the last picture took, in which the page does nothing else [ms]
     this.rested = 0; // when the next picture may be drawn [ms]
-    this.kept = ""; // advice while an arm is lost
+    this.kept = ""; // the advice from when an arm was lost, while it is lost; otherwise empty
     /** @type {{ now: number, silence: number }[]} */
-    this.silences = []; // between two sent hands [ms]
+    this.silences = []; // times between two sent hands, and when each of these times ended [ms]
   }
 
   /** @param {number} now [ms] */
@@ -43,30 +44,34 @@ export class Pace {
   }
 
   /**
-   * Whether pictures have to wait, because keys and hands get at least as much time as pictures.
+   * Return whether the next picture has to wait, because keys and hands get at least as much time as pictures (up to
+   * LONGEST_REST).
    * @param {number} now [ms]
    */
   isTired(now) {
     return now < this.rested;
   }
 
-  // The page sends nothing on purpose, which is no fault of the browser.
+  // Forget when hands were sent, because the page now sends nothing on purpose, which is no fault of the browser.
   rest() {
     this.sent = [];
   }
 
-  // The last picture has taken long.
+  // Return whether the last picture has taken too long.
   isSlow() {
     return this.took > SLOW;
   }
 
-  /** @param {number} now [ms] */
+  /**
+   * Return whether no picture was drawn for so long that the operator cannot see the arms move.
+   * @param {number} now [ms]
+   */
   isBlind(now) {
     return now - (this.drawn[this.drawn.length - 1] ?? now) > BLIND;
   }
 
   /**
-   * The cause and the cure of arms that stop because this browser is slow; empty if it is fast enough.
+   * Return why arms stop because this browser is slow, and what to do; empty if it is fast enough.
    * @param {number} now [ms]
    * @param {number} allowed the longest time without a hand [s]
    * @returns {string}
@@ -84,7 +89,8 @@ export class Pace {
   }
 
   /**
-   * The same, but as long as an arm is lost for missing hands, the advice of when it stopped stays.
+   * Return the advice as above. But as long as an arm is lost because its hand did not come in time, the advice from
+   * the time when it was lost stays.
    * @param {number} now [ms]
    * @param {number} allowed the longest time without a hand [s]
    * @param {boolean} silent whether an arm is lost because its hand did not come in time

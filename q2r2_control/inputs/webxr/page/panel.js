@@ -1,4 +1,4 @@
-// Draws the texts of the run as a picture, for the board that an operator in VR sees.
+// Draws the texts of the run as a picture, which the board shows to an operator in VR or AR.
 
 import { nextOf, worded } from "./words.js";
 
@@ -12,7 +12,7 @@ const [DIM, BRIGHT, WARNING] = ["#9aa4ae", "#e8ecf0", "#ff7070"];
 
 /**
  * Split a text into lines that fit a width [pixels].
- * @param {CanvasRenderingContext2D} context in which the font of the text is set
+ * @param {CanvasRenderingContext2D} context the context, in which the font of the text is already set
  * @param {string} text
  * @param {number} width
  */
@@ -36,7 +36,7 @@ export class Panel {
     /** @type {ImageBitmap | null} */
     this.picture = null; // the newest picture of a camera
     this.drawn = -PERIOD; // when the panel was drawn last [ms]
-    this.changed = true; // whether the panel was drawn anew since it was put on the board
+    this.changed = true; // whether the panel was drawn again since its picture was put on the board
   }
 
   /**
@@ -71,7 +71,7 @@ export class Panel {
   }
 
   /**
-   * Return the text, the colour and the size of each row.
+   * Return the text, the colour and the size of the letters [pixels] of each row.
    * @param {ShownState | null} state
    * @param {import("./link.js").Link} link
    * @param {boolean} bare

@@ -1,11 +1,12 @@
-// Makes shapes: vertices, and triangles that have these vertices as corners.
+// Makes shapes. `vertices` has x y z of all vertices one after the other [m]. `faces` has three indices of vertices for
+// each triangle.
 
 const [CELLS, CELL] = [12, 0.5]; // number of cells along a side of the floor's grid, and the width of a cell [m]
 
 /**
  * Make a box between two opposite corners.
- * @param {number[]} low
- * @param {number[]} high
+ * @param {number[]} low the corner with the least x y z
+ * @param {number[]} high the corner with the greatest x y z
  */
 export function boxOf(low, high) {
   /** @type {number[]} */

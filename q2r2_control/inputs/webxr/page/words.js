@@ -17,17 +17,17 @@ const WORDS = {
 
 /**
  * Replace the names in braces by the words of a device.
- * @param {string} text of the run
- * @param {string} device that the operator uses: left or right (a controller), fingers, keys, gamepad
+ * @param {string} text a text from the run
+ * @param {string} device the operator's device: left or right (a controller), fingers, keys, gamepad
  */
 export function worded(text, device) {
   return text.replace(/\{(\w+)\}/g, (_, control) => WORDS[device]?.[control] ?? `${control} (not on this device)`);
 }
 
 /**
- * What an operator can do next with an arm.
+ * Return what an operator can do next with an arm; empty on a page that only watches.
  * @param {ShownArm} arm
- * @param {{ flying: { hand: string, device: string } | null, inSession: boolean, bare: boolean, watching: boolean }} way
+ * @param {{ flying: { hand: string, device: string } | null, inSession: boolean, bare: boolean, watching: boolean }} ui
  */
 export function nextOf(arm, { flying, inSession, bare, watching }) {
   if (watching) return "";
