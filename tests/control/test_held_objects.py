@@ -24,7 +24,7 @@ def robot() -> Robot:
 
 @pytest.fixture(scope="module")
 def controller(robot: Robot) -> CartesianController:
-    return CartesianController(robot, CELL.control)
+    return CartesianController(robot, CELL.control.timed(realtime=False))
 
 
 @pytest.fixture(scope="module")
@@ -96,7 +96,7 @@ def test_the_margin_of_a_report_refers_to_the_distances_kept_at_that_tick(
 @pytest.mark.slow
 def test_an_object_that_overlaps_the_table_when_gripped_never_overlaps_it_more(robot: Robot) -> None:
     large = cell({"box": (0.04, 0.04, 0.08), "at": (0.0, 0.0, 0.013)})
-    controller = CartesianController(Robot.from_config(large), large.control)
+    controller = CartesianController(Robot.from_config(large), large.control.timed(realtime=False))
     run = Driven(controller)
     start = run.drive(2.5, {"left": at(GRIP)}).q
     controller.set_holding("left", True)
@@ -138,7 +138,7 @@ def test_an_object_gripped_in_motion_keeps_its_new_distances_during_the_known_st
 @pytest.mark.slow
 def test_a_hand_that_moves_a_held_bar_into_the_other_arm_stops_at_the_kept_distance() -> None:
     long = cell({"box": (0.03, 0.25, 0.03)})
-    controller = CartesianController(Robot.from_config(long), long.control)
+    controller = CartesianController(Robot.from_config(long), long.control.timed(realtime=False))
     others = np.array([any("right_" in name for name in pair) for pair in controller.robot.objects.pair_names()])
     nearest = []
     for holds in (False, True):
@@ -162,7 +162,7 @@ def test_two_held_blocks_are_kept_apart_unless_they_overlap_when_the_second_is_g
     reference = run.drive(3.0, {"left": at(0.45, 0.0), "right": at(0.45, 0.0)})
     assert object_distances(controller, reference.q)[both].min() > -1e-6
     bar = cell({"box": (0.02, 0.2, 0.02)}, {"box": (0.02, 0.2, 0.02)})
-    controller = CartesianController(Robot.from_config(bar), bar.control)
+    controller = CartesianController(Robot.from_config(bar), bar.control.timed(realtime=False))
     run = Driven(controller)
     tilted = {
         arm: pin.SE3(pin.exp3(np.array([tilt, 0.0, 0.0])) @ at(0.0).rotation, np.array([0.5, y, 0.45]))

@@ -94,7 +94,7 @@ def test_a_user_program_adds_a_task_and_a_constraint_and_solves_the_qp_with_its_
 def test_a_user_program_with_its_own_solver_keeps_every_distance(cell: Config) -> None:
     robot, solver = Robot.from_config(cell), OwnSolver()
     typed: Solver = solver
-    controller = CartesianController(robot, cell.control, solver=typed)
+    controller = CartesianController(robot, cell.control.timed(realtime=False), solver=typed)
     left, right = controller.tool_pose("left"), controller.tool_pose("right")
     left.translation, right.translation = right.translation.copy(), left.translation.copy()
     for _ in range(300):

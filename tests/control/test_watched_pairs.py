@@ -35,7 +35,7 @@ def test_a_prediction_finds_the_margin_of_the_report_beside_a_moving_hand() -> N
 def test_a_prediction_includes_the_distances_of_a_held_box() -> None:
     config = cell(BLOCK)
     robot = Robot.from_config(config)
-    settings = config.control.model_copy(update={"moving_obstacles": ("hand",)})
+    settings = config.control.timed(realtime=False).model_copy(update={"moving_obstacles": ("hand",)})
     geometry, plain = with_obstacle_bodies(robot, ("hand",)), with_obstacle_bodies(robot, ())
     assert plain is robot.objects.geometry
     hull = [item for item in geometry.geometryObjects if "hull" in item.name]

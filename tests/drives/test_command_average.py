@@ -123,7 +123,7 @@ def test_a_drive_is_at_rest_only_when_its_last_command_is_the_reference(mode: Co
     drive.average(H)
     drive.reset(state_at(robot.home))
     moved = robot.home + 1e-4
-    reference = replace(CartesianController(robot, config.control).step({}, H), q=moved)
+    reference = replace(CartesianController(robot, config.control.timed(realtime=False)).step({}, H), q=moved)
     commands: list[Array] = []
     while not drive.at_rest(state_at(moved)) or not commands:
         commands.append(drive.command(reference, state_at(moved), {}, H).q)

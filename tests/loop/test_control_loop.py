@@ -28,7 +28,7 @@ class Arms:
     def __init__(self, owns_plant: bool, obstacles: tuple[str, ...] = ()) -> None:
         config, robot = cell(), cell_robot()
         drive, watch = make_drive(CommandMode.POSITION, robot, config), watch_settings(config.supervision, False)
-        settings = config.control.model_copy(update={"moving_obstacles": obstacles})
+        settings = config.control.timed(realtime=False).model_copy(update={"moving_obstacles": obstacles})
         controller = CartesianController(robot, settings)
         self.loop = ControlLoop(controller, drive, DT, StreamSettings(), watch, owns_plant=owns_plant)
         self.home, self.now = robot.home, 0.0

@@ -68,7 +68,7 @@ class Pushing:
 
 
 def limited(robot: Robot, solver: Solver | None = None) -> CartesianController:
-    settings = load_config("config/dual_iiwa7.yaml").control
+    settings = load_config("config/dual_iiwa7.yaml").control.timed(realtime=False)
     return CartesianController(robot, settings.model_copy(update={"tool_speed_limit": LIMIT}), solver=solver)
 
 
