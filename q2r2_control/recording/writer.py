@@ -74,7 +74,7 @@ class TickEncoder:
     def __init__(
         self, robot: RecordedRobot, topics: dict[str, Topic], epoch: int, topic_rate: float | None = None
     ) -> None:
-        """``topic_rate`` [Hz] is the rate of the standard topics, which repeat numbers of ticks; None for every tick."""
+        """``topic_rate`` [Hz] is the rate of the standard topics, which repeat numbers of ticks; None: every tick."""
         self._robot, self._topics, self._epoch, self._topic_rate = robot, topics, epoch, topic_rate
         self._slot = -1.0  # The newest tick is in this period of the standard topics; periods are counted from 0.
         self._type = tick_type(len(robot.arms), len(robot.joints))
