@@ -116,7 +116,10 @@ class RobosuiteCell:
             self._env.step(np.concatenate(action))
 
     def _delta(self, side: str, tool: pin.SE3, target: pin.SE3) -> Array:
-        """Return OSC's action (6,) for ``target``, as a share of its largest step in the frame of the arm's base."""
+        """Return the action (6,) with which robosuite's controller OSC moves a tool to ``target``.
+
+        Each number is a share of the largest step, along or about an axis of the arm's base frame.
+        """
         way, turn = target.translation - tool.translation, pin.log3(target.rotation @ tool.rotation.T)
         base = self._env.robots[list(self.arms).index(side)].base_ori
         return np.clip(np.concatenate([base.T @ way / 0.05, base.T @ turn / 0.5]), -1.0, 1.0)

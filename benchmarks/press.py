@@ -1,8 +1,8 @@
 """Which forces does a finger exert that presses on the table on purpose, in torque mode?
 
-The left tool is asked to go straight down to :data:`COMMANDED_DEPTH` below the table's surface, much faster than
-contact allows. It stays there, slides away from the arm's base or towards it while it presses, and is then lifted. The
-slide has one of these two directions because they are the hardest: the arm then moves in its own plane, where its
+The target of the left tool goes straight down to :data:`COMMANDED_DEPTH` below the table's surface, much faster than
+contact allows. It stays there, slides away from the arm's base or towards it while the tool presses, and rises again.
+The slide has one of these two directions because they are the hardest: the arm then moves in its own plane, where its
 masses couple pressing and sliding. The controller and the impedance are those of a usual run. Forces are read from
 MuJoCo's contacts at every tick.
 """
