@@ -29,8 +29,8 @@ PATIENCE = 3.0  # Longest computing time that a controller may take, as a multip
 JOLT = 5.0  # A larger change of a joint's acceleration in one tick is a jolt [rad/s^2].
 _TAIL = 0.5  # The acceleration at rest is computed over this last part of a motion [s].
 _SHORTEST_DT = 1e-9  # Duration of a tick in which no joint can move [s].
-# First, distances are computed only in every fourth tick. Then they are computed in all ticks around that one of these
-# ticks in which a pair is nearest.
+# First, distances are computed only in every fourth tick. Then they are computed in all ticks around the tick with the
+# smallest of these distances.
 _DISTANCE_TICKS = 4
 
 

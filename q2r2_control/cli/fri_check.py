@@ -88,7 +88,10 @@ class Heard:
 
 
 def listen(plant: FriPlant, duration: float, asked: Callable[[], bool] = lambda: False) -> Heard:
-    """Listen to the cabinets of a plant that was reset, for ``duration`` [s] or until ``asked`` returns True."""
+    """Listen to the cabinets of a plant that was reset, and return the figures of their messages.
+
+    It listens for ``duration`` [s], or until ``asked`` returns True, for example after Ctrl-C.
+    """
     heard: dict[str, list[tuple[Monitoring, float]]] = {arm: [] for arm in plant.states()}
     end = time.monotonic() + duration
     while (now := time.monotonic()) < end and not asked():

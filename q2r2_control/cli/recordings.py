@@ -151,7 +151,7 @@ def judge(
 
 
 def _print_verdicts(judged: Sequence[Judgement], unreadable: Sequence[Unreadable]) -> None:
-    # If a figure exists for several hands or arms, its column shows the worst one.
+    # If a figure exists for several hands or arms, its column shows the worst number.
     columns = [column for column in COLUMNS if column.name in _SHOWN]
     console = Console()
     kept = sum(one.verdict.keep for one in judged)
@@ -212,7 +212,10 @@ def _cameras_with_depth(files: Iterable[Path]) -> tuple[str, ...]:
 
 
 def _thresholds(config: str | None) -> JudgeSettings | None:
-    """Return the thresholds of the cell ``config``. If it is None, return None: each recorded cell has its own ones."""
+    """Return the thresholds of the cell ``config``; None if ``config`` is None.
+
+    With None, each recording is judged by the thresholds of its own cell.
+    """
     return None if config is None else load_config(config).judge
 
 

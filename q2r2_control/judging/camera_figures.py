@@ -25,8 +25,8 @@ _ODD, _ODD_RATIO = 10.0, 3.0
 # A view is divided into 4 x 4 parts of 6 x 8 pixels. The numbers are in the order in which a view is reshaped: rows of
 # parts, pixel rows of each part, columns of parts, pixel columns of each part.
 _PARTS = (4, 6, 4, 8)
-# Damaged parts are looked for in the pictures of cameras with at least this rate [Hz]. At a lower rate, a moving body
-# may be in a part in one picture only, and would look like damage.
+# Damaged parts are searched for only if the camera's rate is at least this [Hz]. At a lower rate, a moving body may be
+# in a part in one picture only. The part would then wrongly count as damaged.
 _QUICK = 10.0
 LARGEST_LAG = 0.4  # The largest lag that is searched for [s].
 _LAG_STEP = 0.02  # The step between two lags that are compared [s].
@@ -47,8 +47,8 @@ _CORRELATES = 0.4  # Each camera's correlation with the other camera's arm must 
 # arms.
 _OTHER_ARM = 0.2
 _STILL = 3.0  # A pixel of a view stands still if its brightness changes by less than this.
-# A camera seems to be fixed if the share of its view that stands still is above the first number. It seems to be on an
-# arm if this share is below the second number.
+# A camera seems to be fixed if the share of its view that stands still is larger than the first number. It seems to be
+# on an arm if this share is smaller than the second number.
 _MOSTLY, _HARDLY = 0.5, 0.35
 
 
@@ -86,13 +86,13 @@ def camera_figures(episode: Episode) -> dict[str, CameraFigures]:
 
 
 class _CameraLook:
-    """Compares the pictures of a camera with the motion of the arms."""
+    """Compares the k pictures of a camera with the motion of the arms."""
 
     def __init__(self, episode: Episode, name: str, pictures: Pictures) -> None:
         camera = episode.config.cameras[name]
         t = episode.ticks.t[episode.ticks.following]
         self._start, self._end = float(t[0]), float(t[-1])
-        self._rate = min(camera.rate, episode.config.nominal_rate_hz)  # At most one picture in a tick.
+        self._rate = min(camera.rate, episode.config.nominal_rate_hz)  # There is at most one picture per tick.
         self._pictures = pictures.between(self._start, self._end, 0.0)
         # It is not known whether a real camera without a link is fixed, so it does not count as fixed.
         self.fixed = camera.is_simulated and camera.link is None

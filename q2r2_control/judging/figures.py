@@ -110,9 +110,9 @@ class TimingFigures:
     lost_ticks: int  # The number of ticks that are missing in the file, up to its last tick.
     lost_share: float | None
     longest_lost_s: float  # The longest time span that has no tick in the file.
-    late_ticks: int  # The number of ticks that come more than 1.5 periods after the one before.
+    late_ticks: int  # The number of ticks that come more than 1.5 periods after the tick before.
     missed_ticks: int  # The number of whole periods that passed without a tick.
-    missed_share: float | None  # The share of missed ticks among those that were due.
+    missed_share: float | None  # The number of missed ticks divided by the number of ticks that were due.
     longest_tick_s: float | None  # The longest time between two ticks of the loop.
     compute_time_us_p99: float | None
     ended: bool  # True if the run came to its planned end, or if the operator ended the episode.
@@ -160,7 +160,7 @@ class EpisodeFigures:
     arms: dict[str, ArmFigures]
     measured: dict[str, MeasuredFigures]  # By arm.
     cameras: dict[str, CameraFigures]
-    empty_topics: list[str]  # The topics without a message among those that should have one.
+    empty_topics: list[str]  # The topics that should have a message and have none.
     faults: list[Fault]
     fallback_ticks: int
     fallback_share: float | None

@@ -81,7 +81,7 @@ def verdict_of(figures: EpisodeFigures, settings: JudgeSettings) -> Verdict:
     for threshold in THRESHOLDS:
         limit = getattr(settings, threshold.name)
         for whose, found in groups[threshold.of].items():
-            # Only the first reason about a camera tells the number of its missing pictures.
+            # The first reason about a camera also states the number of its missing pictures. Later reasons do not.
             missing = 0 if whose in told else getattr(found, "missing_pictures", 0)
             says = f"{whose}{missing} pictures missing, " if missing else whose
             if (reason := threshold.reason(getattr(found, threshold.figure), limit, says)) is not None:
@@ -217,7 +217,7 @@ def judge_all(files: Sequence[Path], settings: JudgeSettings | None = None) -> I
 
     Args:
         files: The files of recordings, as ``recordings_in`` returns them.
-        settings: The thresholds; None for those of each recording's own cell.
+        settings: The thresholds; None for the thresholds of each recording's own cell.
 
     Yields:
         The verdict on each episode, in the order of the files. A file that cannot be read gives an :class:`Unreadable`.

@@ -18,7 +18,7 @@ _SPEED_FRAMES = 10  # The number of frames over which a joint's speed is average
 _MOVES = 0.02
 _LONGEST_GAP = 0.05  # A slope of the positions is computed from frames that are at most this far apart [s].
 _LARGEST_LAG = 0.35  # The largest lag that is searched for [s].
-_STEP = 0.005  # The step of lags, and of the times that are compared [s].
+_STEP = 0.005  # The step between two lags, and between the times at which velocities are compared [s].
 
 
 @dataclass(frozen=True, slots=True)

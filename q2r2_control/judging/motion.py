@@ -15,16 +15,19 @@ from q2r2_control.judging.episode import FRAME, Episode, stretches
 from q2r2_control.teleop.relative import RelativeMotion
 from q2r2_control.types import Array, Flags
 
-PIECE = 1.0  # The duration of a piece of a motion, for which smoothness is computed [s].
+# Smoothness is computed for short, overlapping time spans of a motion, which are called pieces. This is their
+# duration [s].
+PIECE = 1.0
 _HOP = 0.25  # The time from the start of one piece to the start of the next [s].
-_FEWEST = 8  # The least number of pieces.
-_SLOWEST = 0.02  # The least mean speed of a piece that counts [m/s].
-_LONGEST_GAP = 0.05  # The longest time between two frames of a piece [s].
-# The standard deviation of the Gaussian that smooths positions before the jerk [s]. It halves the power at 6.6 Hz.
+_FEWEST = 8  # Without at least this number of pieces, no smoothness is computed.
+_SLOWEST = 0.02  # Pieces with a lower mean speed of the tool do not count [m/s].
+_LONGEST_GAP = 0.05  # If two frames are farther apart than this, no piece may contain both [s].
+# Positions are smoothed by a Gaussian with this standard deviation before the jerk is computed [s]. It halves the power
+# at 6.6 Hz.
 _SMOOTHING = 0.02
 LONGEST = 0.5  # The longest delay that is searched for [s].
-_STEP = 0.005  # The step of delays, and of the times that are compared [s].
-_DIFFERENCE = 0.025  # A velocity is a difference of positions over this time before and after [s].
+_STEP = 0.005  # The step between two delays, and between the times at which velocities are compared [s].
+_DIFFERENCE = 0.025  # A velocity is computed from the positions this much earlier and this much later [s].
 _LEAST_MOTION = 0.01  # No delay is computed for a hand whose RMS speed is lower [m/s].
 _LEAST_FIT = 0.5  # The least share of the tool's motion that the hand's motion has to explain.
 # If a motion repeats itself, several delays explain it. A longer delay is therefore chosen only if the share of the
@@ -45,16 +48,16 @@ def smoothness(t: Array, position: Array, engaged: Flags) -> float | None:
         moving += _pieces(t[begin:end], position[begin:end])
     if len(moving) < _FEWEST:
         return None
-    # In real time many ticks come a millisecond late. If a tool moves at 0.3 m/s, its position then has an error of
-    # 0.3 mm. The third derivative of that error is larger than that of the motion, so positions are smoothed. The
-    # smoothing falsifies both ends of a piece, so the ends are cut off.
+    # In real time many ticks come a millisecond late. If a tool moves at 0.3 m/s, its recorded position then has an
+    # error of 0.3 mm. The third derivative of this error is larger than the jerk of the motion itself, so positions are
+    # smoothed. The smoothing falsifies both ends of a piece, so the ends are cut off.
     cut = round(2.0 * _SMOOTHING / FRAME)
     smoothed = [gaussian_filter1d(piece, _SMOOTHING / FRAME, axis=0)[cut:-cut] for piece in moving]
     return float(np.median([ldlj(piece, FRAME) for piece in smoothed]))
 
 
 def _pieces(t: Array, position: Array) -> list[Array]:
-    """Return the positions (k, 3) of each piece that moves, at even times that are :data:`FRAME` apart."""
+    """Return, for each piece in which the tool moves, positions (k, 3) [m] at times that are :data:`FRAME` apart."""
     count, hop = round(PIECE / FRAME) + 1, round(_HOP / FRAME)
     if len(t) < count // 2 or t[-1] - t[0] < PIECE:
         return []
@@ -96,7 +99,7 @@ class Track(NamedTuple):
     def velocity(self, when: Array) -> Array:
         """Return the velocity (m, 3) [m/s], or (m, joints) [rad/s], at times ``when`` (m,) [s].
 
-        The velocity is a difference of positions over 50 ms. The positions before and after the track are constant.
+        It is computed from two positions that are 50 ms apart. Before and after the track, positions count as constant.
         """
         ahead, behind = (
             np.stack([np.interp(when + shift, self.t, column) for column in self.position.T], axis=1)

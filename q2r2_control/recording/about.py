@@ -40,7 +40,7 @@ class About:
     plant_modes: tuple[str, ...]  # All command modes that the plant can follow.
     epoch: int  # The time of day at which the run began [ns].
     realtime: bool
-    cell: str  # The YAML of the cell with all its defaults.
+    cell: str  # The YAML of the cell, with all default values written out.
     robot: str  # The URDF of the robot.
     cameras: tuple[str, ...] = ()  # The cameras whose pictures are recorded.
     notes: dict[str, str] = field(default_factory=dict)  # Texts for people, such as program, machine and task.
@@ -51,7 +51,7 @@ class About:
     def of(cls, pipeline: Pipeline, realtime: bool, notes: Mapping[str, str], cameras: Sequence[str] = ()) -> About:
         """Describe a run that is about to begin.
 
-        In real time the pipeline chooses its rate here, because a replay reads the rate from the recorded cell.
+        In real time the pipeline chooses its rate here, so that the recorded cell has the rate that a replay needs.
 
         Args:
             pipeline: The pipeline that is about to run.
