@@ -203,7 +203,7 @@ def report(
 def _cameras_with_depth(files: Iterable[Path]) -> tuple[str, ...]:
     """Return the cameras with depth in the first file that can be read.
 
-    The other files have the same cameras, since all recordings of a dataset must have the same.
+    The other files have the same cameras, because all recordings of a dataset must have the same cameras.
     """
     for file in files:
         with suppress(RecordingError):

@@ -44,7 +44,10 @@ def _is_vector(feature: Mapping[str, Any]) -> bool:
 
 
 def _numbers(feature: str, labels: Sequence[str]) -> str:
-    """Return the ``labels`` with their units as one text. Successive labels with the same unit share it."""
+    """Return the ``labels`` with their units as one text.
+
+    If successive labels have the same unit, the unit stands only once, after the last of these labels.
+    """
     plain = tuple(label.removesuffix(POSITION) for label in labels)
     units = units_of({feature: plain})[feature]
     runs = groupby(zip(labels, units, strict=True), key=lambda pair: pair[1])

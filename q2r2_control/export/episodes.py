@@ -65,7 +65,7 @@ class EpisodeVectors:
     cell: str
     task: str
     fps: int
-    names: Names  # The names of the numbers of each feature.
+    names: Names  # By feature, the names of its numbers.
     notes: dict[str, str]  # The recorded notes, such as program, machine and operator.
     vectors: Vectors
     success: bool | None = None  # Whether the episode succeeded; None if that is not known.
@@ -178,6 +178,8 @@ _LONGEST_REASON = 300  # The longest text of a reason [characters].
 
 @dataclass(frozen=True, slots=True)
 class _Job:
+    """One episode to store; see :func:`keep_episodes`."""
+
     file: Path
     sampling: FrameSampling
     span: EpisodeSpan
@@ -224,7 +226,7 @@ def keep_episodes(
         progress: Called with the number of finished episodes.
 
     Returns:
-        The stored episodes, and those that were left out.
+        The paths of the stored episodes, and one line for each episode or recording that was left out.
 
     Raises:
         ConfigError: If nothing can be written, or if a worker process of this computer was killed.
@@ -325,7 +327,7 @@ class Output:
             self._partial.rmdir()
 
     def write(self, write: Callable[[Path], None]) -> None:
-        """Let ``write`` make the output under another name. When the output is complete, give it its own name."""
+        """Let ``write`` make the folder under another name. When the folder is complete, rename it to OUT."""
         made = self._partial / "output"
         try:
             shutil.rmtree(made, ignore_errors=True)

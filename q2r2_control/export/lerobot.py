@@ -132,9 +132,9 @@ def check_alike(infos: Sequence[dict[str, Any]], sources: Sequence[dict[str, Any
 
 
 def _renounce_real_time() -> None:
-    """Prevent that threads of the AV1 encoder get the priority SCHED_FIFO, even if root runs them.
+    """Prevent threads of the AV1 encoder from getting the priority SCHED_FIFO, even if root runs them.
 
-    With SCHED_FIFO, they could delay a control loop on the same computer.
+    With SCHED_FIFO, the encoder could delay a control loop on the same computer.
     """
     if sys.platform != "linux":
         return

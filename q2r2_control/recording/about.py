@@ -25,7 +25,7 @@ FORMAT = "4"  # The version of topics and fields. A recording of another version
 LOOP, ROS = "loop", "ros"  # What a recording was made from: the ticks of one loop, or the messages of ROS nodes.
 ABOUT, CONCLUSION = "q2r2_control", "q2r2_control_end"  # Names of the file's metadata records.
 CELL, ROBOT, FIELDS = "cell.yaml", "robot.urdf", "fields.json"  # Names of the file's attachments.
-# Notes that may name a person or a computer. The note on the certificate is the path of a file.
+# Notes that may contain the name of a person or of a computer. The note on the certificate is the path of a file.
 _PERSONAL = ("operator", "host", "certificate")
 _GIT_TIME = 2.0  # The longest time that git may take [s].
 
@@ -84,7 +84,8 @@ class About:
     def from_texts(cls, texts: Mapping[str, str], cell: str, robot: str) -> About:
         """Read the result of :meth:`texts`.
 
-        Raises :class:`KeyError`, :class:`ValueError` and :class:`TypeError` for other texts.
+        ``cell`` and ``robot`` are the texts of these fields, which the file stores separately. Raises
+        :class:`KeyError`, :class:`ValueError` or :class:`TypeError` if ``texts`` are of another kind.
         """
         notes = dict(texts)
         if notes.pop("format") != FORMAT:

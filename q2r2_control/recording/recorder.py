@@ -73,7 +73,7 @@ class BaseRecorder:
     def _open(
         self, about: About, robot: RecordedRobot | None, topics: tuple[Topic, ...], topic_rate: float | None = None
     ) -> bool:
-        """Let the writer begin the file of a run that begins at ``about.epoch``. Return whether it has a folder."""
+        """Let the writer begin the file of a run that begins at ``about.epoch``. Return whether that was possible."""
         if self.writer is None:
             return False
         try:
