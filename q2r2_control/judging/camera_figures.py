@@ -33,10 +33,10 @@ _LAG_STEP = 0.02  # The step between two lags that are compared [s].
 _IN_TIME = 0.1  # A lag up to this is preferred if it explains the motion nearly as well as the best lag [s].
 # A larger lag is chosen only if two conditions hold. The first condition: the share of the pictures' motion that the
 # larger lag explains exceeds the share that the best small lag explains by more than this number.
-_NEARLY = 0.05
+_CLEARLY = 0.05
 # The second condition: the share that the larger lag leaves unexplained, divided by the share that the best small lag
 # leaves unexplained, is at most this number.
-_LEFT = 0.65
+_UNEXPLAINED = 0.65
 _LEAST_FIT = 0.35  # Least share of the pictures' motion that the arms' motion must explain, or else the lag is unknown.
 _FEWEST = 20  # With fewer pictures, no lag is computed and no swap of cameras is found.
 # A camera on an arm is compared with fixed cameras if the joints of its arm travel more than this in all [rad].
@@ -179,7 +179,7 @@ class _CameraLook:
             speeds = np.stack([*(self.travel(arm, lag) for arm in self._joints), np.ones(len(change))], axis=1)
             fits[index] = 1.0 - nnls(speeds, change)[1] ** 2 / energy
         near = np.where(np.abs(lags) <= _IN_TIME, fits, -np.inf)
-        is_clear = near.max() < fits.max() - _NEARLY and 1.0 - fits.max() <= _LEFT * (1.0 - near.max())
+        is_clear = near.max() < fits.max() - _CLEARLY and 1.0 - fits.max() <= _UNEXPLAINED * (1.0 - near.max())
         best = fits if is_clear else near
         return float(lags[np.argmax(best)]) if fits.max() >= _LEAST_FIT else None
 
