@@ -57,7 +57,7 @@ TREMOR_FREQUENCIES = (8.0, 10.0, 12.0)  # Frequencies of tremors [Hz].
 TREMOR_AMPLITUDE = 0.5e-3  # Amplitude of a tremor [m].
 SLOW_SPEED = 0.03  # Speed of a hand that moves and trembles [m/s].
 SENSOR_NOISE = 2e-4  # Standard deviation of the sensor's noise along each axis [m].
-# Standard deviations of the sensor's noise for a hand at rest [mm], and number of pauses of its arm.
+# For a hand at rest: standard deviations of the sensor's noise [mm], and number of times that its arm is paused.
 RESTING_NOISES, PAUSES = (0.2, 0.6, 1.0), 100
 STOP_SPEED, STOP_TIME = 0.3, 0.1  # Speed of a hand that stops [m/s], and time from that speed to rest [s].
 # Length [m] and time [s] of each reach, and the rest after it [s]. The hand moves to and fro, with a rest after each.
@@ -329,9 +329,9 @@ def stop(speed: float, ramp: float, cruises: float) -> Way:
 
 
 def reaches(lengths_and_times: Sequence[tuple[float, float]], rest: float) -> Way:
-    """Return minimum-jerk reaches (Flash and Hogan 1985) of these lengths [m] and times [s], each to and fro.
+    """Return minimum-jerk reaches (Flash and Hogan 1985) of these lengths [m] and times [s].
 
-    A ``rest`` [s] follows each motion.
+    The hand makes each reach and moves back. It rests for ``rest`` [s] after each of these motions.
     """
 
     def way(t: float) -> float:
