@@ -2,8 +2,8 @@
 
 **The loop's time and the robots' time.** The robots' states count the time of the reference: with each state, one
 millisecond of it passes, and the robot gets the command for the next millisecond. Clocks do not matter. Each tick of
-the loop extends the reference. It extends it so far that no robot reaches its end before the next tick has come, unless
-the next tick is later than usual. If the loop is so late that a robot reaches the end of the reference, the robots get
+the loop extends the reference so far that no robot reaches the end of the reference before the next tick has come,
+unless the next tick is later than usual. If the loop is so late that a robot reaches the end of the reference, the robots get
 the certified stop. In the next tick, :meth:`FrankaCell.due` lets the reference follow the same stop first. If a robot
 reaches the end while a tick is computed, the sessions refuse the command of this tick, and it is withdrawn.
 """
@@ -24,8 +24,8 @@ from q2r2_franka.state import ArmCommand, SessionState
 from q2r2_franka.stream import SMOOTHING_DELAY
 
 # Time that is allowed from the start of a tick until the sessions have its commands [s]. The first number is the usual
-# time. After commands that came too late, the time is longer, but at most the second number. The reference is then
-# extended by the difference.
+# time. After commands that came too late, the time is longer, but at most the second number. Each tick then extends the
+# reference farther by the difference.
 _MARGIN, _LONGEST_MARGIN = 0.002, 0.016
 # Shortest step of the reference in a tick, as a share of a period. Steps are shorter than a period if the robots' time
 # passes more slowly than the loop's time.

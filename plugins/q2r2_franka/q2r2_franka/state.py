@@ -49,7 +49,7 @@ class Measured:
 
 @dataclass(slots=True)
 class SessionState:
-    """The session of one arm, as the process that answers its robot knows it. Times are of the monotonic clock [s]."""
+    """The session of one arm, as the process that answers its robot knows it. Times are by the monotonic clock [s]."""
 
     arm: str
     address: str
