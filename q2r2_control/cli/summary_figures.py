@@ -43,7 +43,7 @@ def verdict_line(summary: RunSummary, failed: Iterable[str] = (), stopped: str |
 def _last_faults(summary: RunSummary) -> dict[str, Event]:
     """Return, by arm, the arm's last event if it is a fault.
 
-    A fault is an event in which something other than the arm's button paused it or kept it from engaging.
+    A fault is an event in which something other than a button paused the arm or kept the arm from engaging.
     """
     between = (ArmState.PAUSING, ArmState.ALIGNING)
     last = {event.arm: event for event in summary.events if event.destination not in between}

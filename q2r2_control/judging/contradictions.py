@@ -22,7 +22,7 @@ _GRASPS = re.compile(
 def contradictions(figures: EpisodeFigures, settings: JudgeSettings) -> Iterator[Rejection]:
     """Yield the contradictions of an episode as reasons to discard it.
 
-    Unlike other reasons, they have no threshold. The only setting that matters here is ``needs_task``.
+    Unlike other reasons, contradictions have no thresholds. The only setting that matters here is ``needs_task``.
     """
     if figures.timing.repeated_stamps:
         count = figures.timing.repeated_stamps

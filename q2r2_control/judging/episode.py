@@ -29,23 +29,23 @@ SPEED_OVER = 0.02  # A measured speed is an average over at least this time, sin
 class Ticks:
     """One row for each of n ticks that are in the file."""
 
-    number: npt.NDArray[np.int64]  # (n,) Numbers from 0 on, without those of lost ticks.
+    number: npt.NDArray[np.int64]  # (n,) Number of the tick. Ticks are counted from 0, and lost ticks count too.
     t: Array  # (n,) Time since the run began [s].
-    dt: Array  # (n,) Time since the loop's last tick, even if that one is not in the file [s].
-    compute_time: Array  # (n,) [s].
+    dt: Array  # (n,) Time since the loop's last tick, even if the last tick is not in the file [s].
+    compute_time: Array  # (n,) Computing time of the tick [s].
     following: Flags  # (n,) False while the run ends and the arms come to rest.
-    certified: Flags  # (n,) A certified stop is known.
-    fallback: Flags  # (n,) The certified stop was executed.
+    certified: Flags  # (n,) True if the controller had a certified stop.
+    fallback: Flags  # (n,) True if the certified stop was executed.
     distance: Array  # (n,) Distance of the nearest pair [m].
     margin: Array  # (n,) Distance of the tightest pair minus the distance that it has to keep [m].
-    engaged: Flags  # (n, arms).
-    by_policy: Flags  # (n, arms) The arm is engaged, and a policy moves it.
-    rejected: Flags  # (n, arms) The target was not usable.
+    engaged: Flags  # (n, arms) True if the arm is engaged.
+    by_policy: Flags  # (n, arms) True if the arm is engaged and a policy moves it.
+    rejected: Flags  # (n, arms) True if the controller could not use the arm's target.
     slip: Array  # (n, arms) Distance by which the leash has dragged the target since engaging [m].
-    slip_angle: Array  # (n, arms) The same as an angle [rad].
+    slip_angle: Array  # (n, arms) Angle by which the leash has dragged the target since engaging [rad].
     gripper: Array  # (n, arms) The gripper's opening that the operator wants, 0 closed .. 1 open.
-    now: Array  # (n,) Time of the loop's own clock [s].
-    unmeasured: Flags  # (n, arms) A measured number, or a number of the reference, is not finite.
+    now: Array  # (n,) Time of the tick by the loop's own clock [s].
+    unmeasured: Flags  # (n, arms) True if a measured number, or a number of the reference, is not finite.
     joint_speed: Array  # (n, arms) Largest ratio of a measured joint speed and the speed limit of that joint.
 
 
@@ -58,7 +58,7 @@ class Frames:
     target: Array  # (m, arms, 7) The operator's targets, or ``reference`` where there is no target.
     reference: Array  # (m, arms, 7) Tool poses at the controller's reference.
     v: Array  # (m, joints) Measured velocities [rad/s].
-    reference_q: Array  # (m, joints) The controller's reference [rad].
+    reference_q: Array  # (m, joints) Joint positions of the controller's reference [rad].
     opening: Array  # (m, arms) Measured openings of grippers, 0 closed .. 1 open; -inf if not measured.
     commanded: Array  # (m, arms) Commanded openings of grippers, 0 closed .. 1 open; -inf without a command.
 
