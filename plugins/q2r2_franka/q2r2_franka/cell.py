@@ -3,9 +3,9 @@
 **The loop's time and the robots' time.** The robots' states count the time of the reference: with each state, one
 millisecond of it passes, and the robot gets the command for the next millisecond. Clocks do not matter. Each tick of
 the loop extends the reference so far that no robot reaches the end of the reference before the next tick has come,
-unless the next tick is later than usual. If the loop is so late that a robot reaches the end of the reference, the robots get
-the certified stop. In the next tick, :meth:`FrankaCell.due` lets the reference follow the same stop first. If a robot
-reaches the end while a tick is computed, the sessions refuse the command of this tick, and it is withdrawn.
+unless the next tick is later than usual. If the loop is so late that a robot reaches the end of the reference, the
+robots get the certified stop. In the next tick, :meth:`FrankaCell.due` lets the reference follow the same stop first.
+If a robot reaches the end while a tick is computed, the sessions refuse the command of this tick, and it is withdrawn.
 """
 
 from __future__ import annotations
