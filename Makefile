@@ -1,4 +1,4 @@
-# Everything runs from one virtual environment, .venv, which is made on first use.
+# Most commands use one virtual environment, .venv, which is made when it is first needed.
 PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
@@ -43,13 +43,13 @@ demo: $(VENV)/.installed
 
 TESTABLE := $(VENV)/.installed-dev $(VENV)/.compiled
 
-# Each worker gets consecutive tests, so one worker makes all recordings and robots of a file.
+# Each worker gets consecutive tests. Thus the recordings and robots that the tests of a file share are made only once.
 LOCAL_TESTS := $(BIN)/python -m pytest -n auto --dist worksteal --ignore tests/ros --ignore tests/lerobot --ignore tests/web
 
 test: $(TESTABLE)
 	$(LOCAL_TESTS) -m 'not slow and not soak'
 
-# These tests play minutes of motion, or repeat whole runs.
+# These tests simulate minutes of motion, or repeat whole runs.
 test-slow: $(TESTABLE)
 	$(LOCAL_TESTS) -m 'slow and not soak'
 
@@ -59,7 +59,7 @@ test-ros: $(VENV)/.installed-ros $(TESTABLE)
 	$(BIN)/python -m pytest tests/ros tests/test_project.py -n 2 --dist loadfile -m 'not alone and not slow and not soak'; failed=$$?; \
 		$(BIN)/python -m pytest tests/ros -m 'alone and not slow and not soak' && exit $$failed
 
-# These tests play minutes of motion with all nodes, or build packages.
+# These tests run all nodes for minutes of motion, or build packages.
 test-ros-slow: $(VENV)/.installed-ros $(TESTABLE)
 	$(BIN)/python -m pytest tests/ros -m 'slow and not soak'
 
@@ -124,7 +124,8 @@ test-lerobot: lerobot
 test-lerobot-ros: lerobot-ros
 	$(IN_LEROBOT) -m pytest tests/lerobot -k behind_ros
 
-# Real client library of Franka, and simulated robots, which need older packages in an environment of their own.
+# The tests of Franka's plant use Franka's real client library and simulated robots. These need older packages, so the
+# tests have an environment of their own.
 FRANKA := .venv-franka
 FRANKA_SIM := .venv-franka-sim
 
@@ -185,7 +186,7 @@ $(VENV)/.installed-bench: $(VENV)/.installed
 
 # This environment has public environments with two arms. robosuite pins mink 0.0.5 for other robots. That version allows
 # no numpy that pinocchio 4 runs on, but robosuite also works without mink. The second call of pip reports this conflict
-# and goes on. robosuite calls MuJoCo in the way of versions before 3.10.
+# and goes on. robosuite calls functions of MuJoCo as they were before version 3.10.
 ARENA := .venv-arena
 ARENA_PYTHON ?= $(PYTHON)
 
@@ -206,7 +207,7 @@ docs: $(VENV)/.installed
 	$(BIN)/python docs/make_reference.py
 	$(BIN)/mkdocs build --strict
 
-# This draws the README's moving picture, docs/demo.webp.
+# This makes the animated picture of the README, docs/demo.webp.
 picture: $(VENV)/.installed
 	MUJOCO_GL=$${MUJOCO_GL:-egl} $(BIN)/python docs/moving_picture.py
 

@@ -2,7 +2,7 @@
 
     make arena  # makes a virtual environment with robosuite and runs this file there
 
-The same scripted hands ask both controllers for the same tool poses. The hands know the true state of the simulation.
+The same scripted hands give all controllers the same target poses. The hands read the true state of the simulation.
 The environment itself judges whether an episode succeeds. Contacts, distances and limits are measured in MuJoCo,
 whatever a controller reports about itself.
 """
@@ -50,7 +50,7 @@ NOTES = (
 
 
 class Cell(Protocol):
-    """A task with one controller, which plays one episode after the other."""
+    """A task of an environment with one controller. It plays one episode after the other."""
 
     PERIOD: float  # Period of the hands' targets [s].
     judge: Judge
@@ -67,7 +67,7 @@ class Episode:
     """The figures of one episode."""
 
     seed: int
-    succeeded_after: float | None  # Time until success, None if the episode did not succeed [s].
+    succeeded_after: float | None  # Time until success [s]; None if the episode did not succeed.
     contacts: int  # Number of contacts that began between the arms.
     nearest: float  # Least distance between the arms [m].
     beyond_position: float  # Largest excess over a position limit [rad].
@@ -77,7 +77,10 @@ class Episode:
 
 
 def cells() -> Iterator[tuple[str, str, Callable[[], Cell]]]:
-    """Yield task, controller and the function that makes their cell. Prints to stderr what is left out, and why."""
+    """Yield the names of a task and of a controller, and the function that makes their cell.
+
+    If a task or a controller is left out, print the reason on stderr.
+    """
     try:
         from arena_robosuite import CONTROLLERS, TASKS, RobosuiteCell
     except ImportError as error:
@@ -115,7 +118,7 @@ def play(cell: Cell, seed: int) -> Episode:
 
 
 def row(task: str, controller: str, episodes: list[Episode]) -> tuple[str | int | float | None, ...]:
-    """Return a row of the table."""
+    """Return the row of the printed table for one task and one controller."""
     times = [episode.succeeded_after for episode in episodes if episode.succeeded_after is not None]
     return (
         task,

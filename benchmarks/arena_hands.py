@@ -32,7 +32,7 @@ class Ask:
 
 
 class ScriptedHands:
-    """Targets that move from one ask to the next in straight lines at :data:`TARGET_SPEED`.
+    """Targets that move straight from the poses of one :class:`Ask` to those of the next, at :data:`TARGET_SPEED`.
 
     Each of the ``asks`` is computed when it is due, so it may depend on the state of the simulation at that time.
     """
@@ -69,7 +69,7 @@ class ScriptedHands:
 
 
 def _moved(start: pin.SE3, goal: pin.SE3, dt: float) -> float:
-    """Return the share of the way to ``goal`` that a target moves in ``dt`` [s]."""
+    """Return the share of the path from ``start`` to ``goal`` that a target covers in ``dt`` [s]."""
     difference = start.actInv(goal)
     time = max(
         float(np.linalg.norm(difference.translation)) / TARGET_SPEED,
@@ -94,13 +94,13 @@ def shifted(pose: pin.SE3, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> pi
 
 
 def backed(pose: pin.SE3, way: float) -> pin.SE3:
-    """Return the pose that is ``way`` [m] behind ``pose``, along the hand's z axis."""
+    """Return ``pose`` moved back along its own z axis by ``way`` [m]."""
     return pose * pin.SE3(np.eye(3), np.array([0.0, 0.0, -way]))
 
 
 @dataclass
 class Judge:
-    """The contacts, distances and broken limits of one episode, as MuJoCo has them."""
+    """The contacts, distances and broken limits of one episode, measured in MuJoCo."""
 
     model: mujoco.MjModel
     arms: Mapping[str, ArmModel]
@@ -126,7 +126,7 @@ class Judge:
         self._velocity = np.concatenate([arm.velocity_limit for arm in self.arms.values()])
 
     def look(self, data: mujoco.MjData) -> None:
-        """Take one step of the physics into account."""
+        """Measure the state after one step of the physics."""
         sides = self._sides[data.contact.geom[: data.ncon]]
         touching = bool((sides[:, 0] * sides[:, 1] < 0).any())
         self.contacts += touching and not self._touching
@@ -139,7 +139,7 @@ class Judge:
         self._looks += 1
 
     def _measure(self, data: mujoco.MjData) -> None:
-        """Measure distances with Coal at MuJoCo's poses. MuJoCo 3.8 gives 0 for some boxes that are far apart."""
+        """Compute distances between the arms by Coal. MuJoCo 3.8 would return 0 for some boxes that are far apart."""
         apart = np.linalg.norm(np.subtract(*data.geom_xpos[self._pairs.T]), axis=1) - self._reach
         for pair in np.argsort(apart):
             if apart[pair] >= self.nearest:

@@ -38,13 +38,13 @@ _JOINT_CONTROL |= {"input_max": 7, "input_min": -7, "output_max": 7, "output_min
 _MEETING_PLACE = np.array([0.0, -0.15, 1.12])  # Position at which the right hand takes the hammer, in the world [m].
 _MIN_GRASP_Y = -0.5  # Least y at which the left hand can grasp while it points down [m].
 _RIGHT_HAND_LEAN = 0.9  # Angle by which the right hand leans towards its own base [rad].
-_CLOSING_SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)  # Shares of the fingers' way from open to closed.
+_CLOSING_SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)  # Shares of the fingers' stroke from open to closed.
 
 logging.getLogger("robosuite_logs").setLevel(logging.ERROR)
 
 
 class RobosuiteCell:
-    """One of the tasks with one of the controllers, which plays one episode after the other."""
+    """One of robosuite's tasks with one of the controllers. It plays one episode after the other."""
 
     PERIOD = PERIOD
 
@@ -116,13 +116,16 @@ class RobosuiteCell:
             self._env.step(np.concatenate(action))
 
     def _delta(self, side: str, tool: pin.SE3, target: pin.SE3) -> Array:
-        """Return OSC's action (6,) for ``target``, as a share of its largest step in the frame of the arm's base."""
+        """Return the action (6,) with which robosuite's controller OSC moves a tool to ``target``.
+
+        Each number is a share of the largest step, along or about an axis of the arm's base frame.
+        """
         way, turn = target.translation - tool.translation, pin.log3(target.rotation @ tool.rotation.T)
         base = self._env.robots[list(self.arms).index(side)].base_ori
         return np.clip(np.concatenate([base.T @ way / 0.05, base.T @ turn / 0.5]), -1.0, 1.0)
 
     def asks(self) -> Iterator[Ask]:
-        """Yield everything that the hands ask for. Poses are read from the simulation when they are due."""
+        """Yield the target poses and gripper states of the hands, which are computed when they are due."""
         return self._lift() if self._task == "TwoArmLift" else self._handover()
 
     def _lift(self) -> Iterator[Ask]:
@@ -146,7 +149,8 @@ class RobosuiteCell:
         axis = _towards_right(handle.xmat)
         closing = np.cross(axis, [0.0, 0.0, 1.0])
         closing *= np.sign(closing @ tools["left"].rotation[:, 0])
-        # The left hand cannot point down if it is nearer to its base than this.
+        # Distance from the handle's middle to the left grasp [m]. It keeps the grasp at y >= _MIN_GRASP_Y, because the
+        # left hand cannot point down nearer to its base.
         way = min(half, max((handle.xpos[1] - _MIN_GRASP_Y) / max(axis[1], 1e-6), 0.0))
         grasp = pin.SE3(looking_down(closing), handle.xpos - way * axis)
         brought = pin.SE3(looking_down(np.array([np.sign(closing[0]) or 1.0, 0.0])), _MEETING_PLACE - [0.0, way, 0.0])

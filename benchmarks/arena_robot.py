@@ -34,10 +34,14 @@ class ArmModel:
 
 
 def robot_of(model: mujoco.MjModel, arms: Mapping[str, ArmModel], closing: Sequence[Array]) -> Robot:
-    """Return the robot that consists of the ``arms`` of ``model``, which are given by name.
+    """Return the robot that consists of some arms of a MuJoCo ``model``.
 
-    ``closing`` are at least two positions (nq,) of the whole model. The arms are at home, and the grippers go from open
-    to closed. One capsule encloses what a finger's shape sweeps from one position to the next.
+    Args:
+        model: The model.
+        arms: The names of each arm's parts, by the name of the arm.
+        closing: At least two positions (nq,) of the whole model. In all of them, the arms are at home. The grippers are
+            open in the first one and closed in the last one. One capsule encloses everything that a finger's shape
+            sweeps from one position to the next.
     """
     urdf = ET.Element("robot", name="arena")
     ET.SubElement(urdf, "link", name=WORLD)

@@ -32,7 +32,7 @@ from q2r2_control.recording.device_pictures import DevicePictures
 from q2r2_control.recording.recorder import ROOM_WITH_PICTURES, Recorder
 from q2r2_control.viewer.tables import record_table
 
-WIDTH, HEIGHT, RATE = 640, 480, 30  # [pixels], [pictures/s]
+WIDTH, HEIGHT, RATE = 640, 480, 30  # Size of the pictures [pixels], and pictures per second.
 POLICY = "examples.policy:Circles"
 _SECONDS = 4  # Duration of the video, which is repeated [s].
 NOTES = (
@@ -55,7 +55,7 @@ class RunFigures:
     cpu_p50: float
     cpu_p99: float
     missed: int
-    tracking_mm: float | None  # None if no arm was engaged.
+    tracking_mm: float | None  # RMS error of the tool with the larger error; None if no arm was engaged.
     pictures: int
     dropped: int
 

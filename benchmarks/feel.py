@@ -3,8 +3,9 @@
 A scripted hand oscillates at single frequencies, reaches, trembles, rests, and moves and stops. The tool is measured
 through the whole chain: samples at a headset's rate, teleoperation, the controller, and an arm in MuJoCo. A tone is a
 sine motion of one frequency. Its delay and gain come from least-squares fits of a sine and a cosine to the paths of
-hand and tool. Real hands do not move in tones, so reaches are measured, too. Their delay is the one with the highest
-correlation of velocities. The figures for a tremor within a band count all motion of the tool, also outside the band.
+hand and tool. Real hands do not move in tones, so reaches are measured, too. The delay of a reach is the delay at which
+the velocities of hand and tool have their highest correlation. The figures for a tremor within a band count all motion
+of the tool, also outside the band.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ TREMOR_FREQUENCIES = (8.0, 10.0, 12.0)  # Frequencies of tremors [Hz].
 TREMOR_AMPLITUDE = 0.5e-3  # Amplitude of a tremor [m].
 SLOW_SPEED = 0.03  # Speed of a hand that moves and trembles [m/s].
 SENSOR_NOISE = 2e-4  # Standard deviation of the sensor's noise along each axis [m].
-# Standard deviations of the sensor's noise for a hand at rest [mm], and number of pauses of its arm.
+# For a hand at rest: standard deviations of the sensor's noise [mm], and number of times that its arm is paused.
 RESTING_NOISES, PAUSES = (0.2, 0.6, 1.0), 100
 STOP_SPEED, STOP_TIME = 0.3, 0.1  # Speed of a hand that stops [m/s], and time from that speed to rest [s].
 # Length [m] and time [s] of each reach, and the rest after it [s]. The hand moves to and fro, with a rest after each.
@@ -192,7 +193,7 @@ class _Log:
         self._asked: list[float] = []
 
     def take(self, tick: Tick) -> None:
-        """Keep the positions of hand and tool at a tick."""
+        """Store the positions of hand and tool at a tick."""
         way = self.hands.hand_pose(HAND, tick.now).translation - HANDS_AT_REST[HAND].translation
         self._t.append(tick.t - _MOTION_BEGINS_S)
         self._asked.append(float(way[self._axis]))
@@ -219,16 +220,19 @@ class _Log:
         return float(np.array(self._tool)[chosen].std(axis=0).max())
 
     def delay(self, begin: float, end: float) -> float:
-        """Return the tool's delay for the hand's motion between these times, NaN if there is none [s]."""
+        """Return the delay of the tool behind the hand, over their motion from ``begin`` to ``end`` [s].
+
+        The delay is NaN if the tool does not follow.
+        """
         t, asked, tool = self._from(-math.inf)
         hand, follower = (Track(t, way[:, None]) for way in (asked, tool))
         (found,) = delays_behind(hand, [follower], t[(t >= begin) & (t < end)])
         return math.nan if found is None else found
 
     def attenuation(self, period: float) -> float:
-        """Return the RMS of the tool's motion divided by that of the hand's [dB], over a ``period`` [s].
+        """Return the RMS of the tool's motion over a ``period`` [s], divided by the RMS of the hand's motion [dB].
 
-        A steady motion does not count.
+        A steady motion of both does not count.
         """
         t, asked, tool = self._from(SETTLING_S)
         within = t < SETTLING_S + period
@@ -240,7 +244,7 @@ class _Log:
         return 20.0 * math.log10(tool_rms / asked_rms)
 
     def stop(self) -> tuple[float, float]:
-        """Return the delay of the tool's rest behind the hand's [s], and the tool's overshoot [m].
+        """Return the time from the hand's rest to the tool's rest [s], and the tool's overshoot [m].
 
         The tool rests when it stays within 2 mm of its last position.
         """
@@ -254,7 +258,10 @@ class _Log:
         return float(np.linalg.norm(self._tool[-1] - self._tool[0]))
 
     def _from(self, begin: float) -> tuple[Array, Array, Array]:
-        """Return times [s], and the paths of hand and tool along the axis [m], each (n,)."""
+        """Return, from the time ``begin`` [s] on, times [s] and the positions of hand and tool along the axis [m].
+
+        Each array is (n,).
+        """
         t = np.array(self._t)
         chosen = t >= begin
         return t[chosen], np.array(self._asked)[chosen], np.array(self._tool)[chosen, self._axis]
@@ -322,9 +329,9 @@ def stop(speed: float, ramp: float, cruises: float) -> Way:
 
 
 def reaches(lengths_and_times: Sequence[tuple[float, float]], rest: float) -> Way:
-    """Return minimum-jerk reaches (Flash and Hogan 1985) of these lengths [m] and times [s], each to and fro.
+    """Return minimum-jerk reaches (Flash and Hogan 1985) of these lengths [m] and times [s].
 
-    A ``rest`` [s] follows each motion.
+    The hand makes each reach and moves back. It rests for ``rest`` [s] after each of these motions.
     """
 
     def way(t: float) -> float:

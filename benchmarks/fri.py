@@ -34,7 +34,7 @@ from q2r2_control.types import CommandMode
 from q2r2_control.viewer.tables import figure_table
 
 _CONFIG = "config/dual_iiwa7_fri.yaml"
-_MAX_DELAY_S = 0.1  # Longest delay of the tools that is looked for [s].
+_MAX_DELAY_S = 0.1  # Longest delay of the tools behind their reference that is searched for [s].
 _WATCH_PRIORITY = 90  # Real-time priority of the watching threads, above all others.
 # A watching thread sleeps for the first of these times. If it wakes up late by more than the second time, its processor
 # stood still. The thread usually sleeps when a standstill begins, so each standstill of at least the sum of both times
@@ -66,9 +66,9 @@ def stand_stills(processor: int) -> list[tuple[float, float]]:
 
 
 def held_up(late: list[tuple[float, float]], stills: list[tuple[float, float]]) -> int:
-    """Return the number of late answers that waited for a standstill, or for an earlier answer that did.
+    """Return the number of late answers that were delayed by a standstill, or by an earlier answer of this kind.
 
-    Both lists have start and end [s].
+    Both lists have pairs of a start and an end [s].
     """
     count, until = 0, -math.inf
     for begin, end in sorted(late):
@@ -80,7 +80,7 @@ def held_up(late: list[tuple[float, float]], stills: list[tuple[float, float]]) 
 def undisturbed(answers: list[tuple[float, float]], stills: list[tuple[float, float]]) -> list[float]:
     """Return the durations [s] of the answers during which no processor stood still.
 
-    Both lists have start and end [s].
+    Both lists have pairs of a start and an end [s].
     """
     return [end - begin for begin, end in answers if not any(start < end and stop > begin for start, stop in stills)]
 
@@ -91,8 +91,8 @@ class ToolWay:
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
         # Arrays of plain numbers are used here, because the garbage collector would search a list of arrays for more
-        # than 100 ms during the run. The commanded positions are computed after the run, because that takes a twentieth
-        # of the run's time.
+        # than 100 ms during the run. The commanded positions of the tools are computed only after the run, because this
+        # takes a twentieth of the run's time.
         self._postures, self._tools = array("d"), array("d")
 
     def __call__(self, tick: Tick) -> None:
@@ -117,7 +117,11 @@ class ToolWay:
 
 
 def measure_directly(mode: CommandMode, duration: float) -> tuple[float, dict[str, float | None]]:
-    """Return the errors [mm RMS] without cabinets in simulated time: from the reference, and by arm from the hands."""
+    """Run without cabinets in simulated time, and return two errors of the measured tools [mm RMS].
+
+    The first error is the distance from the reference, over all arms. The second is the distance from the targets, by
+    arm; None if the arm was not engaged.
+    """
     config = load_config(_CONFIG)
     robot = Robot.from_config(config)
     pipeline = Pipeline(config, robot, ScriptedInput("circle"), MujocoPlant(robot, config), mode)
@@ -173,7 +177,7 @@ def measure(mode: CommandMode, duration: float, rt: bool, options: list[str]) ->
     late = [its for its in answers if its[1] - its[0] > period]
     calm = undisturbed(answers, moments)
     errors = way.errors(range(round(_MAX_DELAY_S * config.nominal_rate_hz)))
-    # The circles repeat, so a short run is enough.
+    # The circles repeat, so a short run without cabinets is enough.
     direct_error, direct_errors = measure_directly(mode, min(duration, 30.0))
     return {
         "delay_ms": 1e3 * int(np.argmin(errors)) / config.nominal_rate_hz,

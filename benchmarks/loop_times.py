@@ -1,9 +1,10 @@
 """Where does the time of a tick of the whole live loop go, stage by stage, with each plant and mode?
 
-Ticks come at the loop's rate, because a tick that directly follows another one finds warmer caches. Time in the run is
-still simulated, so every round moves the same way whatever the machine does. The cases run in turns. Rounds that time
-each stage alternate with rounds that time only the whole tick. In other rounds each tick directly follows the last one.
-They show the time of the program itself, whatever else the machine does while a loop sleeps.
+Ticks come at the loop's rate, because a tick would find warmer caches if it followed the last tick at once. Time in the
+run is still simulated, so the arms make the same motion in every round, on a busy machine too. The cases run in turns.
+Rounds that time each stage alternate with rounds that time only the whole tick. In a third kind of round, each tick
+follows the last tick at once. Such rounds show the time of the program itself, because no other program can change the
+caches while the loop sleeps.
 """
 
 from __future__ import annotations
@@ -58,10 +59,14 @@ class Times:
 
 
 class StageClock:
-    """A clock that adds each moment of a run to the stage of the innermost watched method, or else to the rest."""
+    """Measures how long each stage of a tick takes.
+
+    While a watched method runs, the time counts for the stage of this method. If one watched method calls another, the
+    time counts for the inner method. All other time counts for the stage :data:`REST`.
+    """
 
     def __init__(self, period: float) -> None:
-        """A tick begins at the earliest a ``period`` [s] after the last one. If it is 0, no tick waits."""
+        """``period`` is the least time between the starts of two ticks [s]. If it is 0, no tick waits."""
         self._period = period
         self._due = self._last = time.perf_counter()
         self._stage = STAGES.index(REST)
@@ -70,12 +75,12 @@ class StageClock:
 
     @property
     def times(self) -> Array:
-        """The times (ticks, stages) [s]."""
+        """The time of each stage in each tick (ticks, stages) [s]."""
         return np.array(self._rows)
 
     @contextmanager
     def watching(self, pipeline: Pipeline, stages: bool) -> Iterator[None]:
-        """Watch the plant, whose physics end a tick. If ``stages`` is True, also watch all other stages."""
+        """Watch the plant's physics, with which a tick ends. If ``stages`` is True, also watch all other stages."""
         plant = type(pipeline.plant)
         watched: list[tuple[type, str, str]] = [(plant, "advance", PHYSICS)]
         if stages:
@@ -137,7 +142,10 @@ class Case:
         self._to_command: list[float] = []
 
     def run_round(self, record: bool) -> None:
-        """Run once with every stage timed, once without, once back to back, and once recorded if ``record`` is True."""
+        """Run once with every stage timed, once with only the whole tick timed, and once without pauses between ticks.
+
+        If ``record`` is True, run once more with a recording.
+        """
         self._add("stages", self._run(stages=True))
         self._add("whole", self._run())
         self._add("back to back", self._run(paced=False))

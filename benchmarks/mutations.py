@@ -27,12 +27,15 @@ from xml.etree import ElementTree
 ROOT = Path(__file__).resolve().parents[1]
 # Operators of this kind are not changed, because almost every | in this project stands in a type hint.
 _SKIPPED_OPERATOR = "BitOr"
-_PYTEST_STARTUP_S = 60.0  # Longest time that pytest takes beside its tests [s].
+_PYTEST_STARTUP_S = 60.0  # Longest time that pytest takes in addition to its tests [s].
 
 
 @dataclass(frozen=True)
 class Mutant:
-    """A place that can be changed: the place with number ``occurrence`` of an ``operator`` in a file."""
+    """One change of a file. cosmic-ray's ``operator`` can change several places of the file, which are counted from 0.
+
+    The mutant has the change at the place with the number ``occurrence``.
+    """
 
     path: str
     operator: str
@@ -41,7 +44,7 @@ class Mutant:
 
 
 def mutants_of(root: Path, room: str) -> Iterator[Mutant]:
-    """Yield all mutants of the modules under ``room``."""
+    """Yield all mutants of the modules in the folder ``room``."""
     from cosmic_ray.ast import ast_nodes, get_ast_from_path
     from cosmic_ray.plugins import get_operator, operator_names
 
@@ -173,7 +176,7 @@ def main() -> None:
         with ThreadPoolExecutor(options.jobs) as pool:
             for result in pool.map(ask, chosen):
                 results.append(result)
-                mutant, outcome = result  # Each result is shown at once, because all of them take hours.
+                mutant, outcome = result  # Each result is shown at once, because all together take hours.
                 place = f"{mutant.path}:{mutant.line} {mutant.operator.rpartition('/')[2]} {mutant.occurrence}"
                 print(f"{len(results)} of {len(chosen)}: {outcome}: {place}", file=sys.stderr, flush=True)
     counts = Counter(outcome for _mutant, outcome in results)

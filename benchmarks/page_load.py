@@ -2,7 +2,8 @@
 
 The command q2r2 run --web runs twice in real time, while scripted hands move both arms round circles. In the second run
 the watchers read everything that the page sends. A hostile client sends messages that no browser sends, and connects
-again whenever it is disconnected. All these clients use the same machine as the run, which remote clients would not.
+again whenever it is disconnected. All these clients use the processors of the same machine as the run. Remote clients
+would not.
 """
 
 from __future__ import annotations

@@ -39,7 +39,7 @@ from q2r2_control.viewer.tables import figure_table
 FILE = Path("build/qp_problems.parquet")
 TICKS, SOLVED_PROBLEMS = 2000, 200
 DT = 0.002  # Period of a tick [s].
-_TICKS_PER_RECOVERY = 50  # Number of ticks of one recovery.
+_TICKS_PER_RECOVERY = 50  # Number of ticks from one posture outside the limits to the next.
 Targets = dict[str, pin.SE3]
 Motion = Callable[[float, Mapping[str, pin.SE3]], Targets]
 
@@ -56,7 +56,7 @@ class QpProblems(ParquetTestSet):
 
 
 def moved(start: Mapping[str, pin.SE3], *by: float) -> Targets:
-    """Return the tools' poses at the start, shifted in the world frame [m]."""
+    """Return the tool poses at the start, each shifted along the world's x, y and z by the three numbers ``by`` [m]."""
     return {arm: pin.SE3(pose.rotation, pose.translation + np.array(by)) for arm, pose in start.items()}
 
 
@@ -66,7 +66,7 @@ def freely(t: float, start: Mapping[str, pin.SE3]) -> Targets:
 
 
 def pressing(t: float, start: Mapping[str, pin.SE3]) -> Targets:
-    """Return targets that swing up and down where the other tool was at the start."""
+    """Return targets that swing up and down around the position of the other tool at the start."""
     left, right = start["left"], start["right"]
     swing = np.array([0.0, 0.0, 0.1 * math.sin(math.tau * t)])
     return {
@@ -76,7 +76,7 @@ def pressing(t: float, start: Mapping[str, pin.SE3]) -> Targets:
 
 
 def out_of_reach(t: float, start: Mapping[str, pin.SE3]) -> Targets:
-    """Return targets that jump every quarter of a second, often to places beyond the reach."""
+    """Return targets that jump every quarter of a second, often to positions that the tools cannot reach."""
     random = np.random.default_rng(int(4.0 * t))
     places = {arm: random.uniform([-0.5, -1.5, -0.6], [2.0, 1.5, 1.5]) for arm in start}
     turns = {arm: pin.exp3(random.normal(size=3)) for arm in start}
@@ -87,7 +87,7 @@ MOTIONS: dict[str, Motion] = {"free": freely, "contact": pressing, "limits": out
 
 
 def outside(robot: Robot, random: np.random.Generator) -> Array:
-    """Return a random posture (nv,) in which arms may overlap and one joint is 0.05 rad beyond its limit [rad]."""
+    """Return a random posture (nv,) [rad]. One joint is 0.05 rad beyond its limit, and links may overlap."""
     q = random.uniform(robot.position_lower, robot.position_upper)
     joint = random.integers(robot.model.nv)
     q[joint] = robot.position_upper[joint] + 0.05
@@ -110,7 +110,7 @@ def problems(ticks: int) -> Iterator[qpbenchmark.Problem]:
 
 
 def write(path: Path, ticks: int) -> None:
-    """Write the problems of ``ticks`` as a file for :class:`QpProblems`."""
+    """Write the problems of a number of ``ticks`` into a file that :class:`QpProblems` can read."""
     found = ProblemList()
     for problem in problems(ticks):
         found.append(problem)

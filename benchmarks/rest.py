@@ -1,7 +1,8 @@
 """Do the arms come to rest, and how smoothly, at constant targets that they cannot reach or that bring them together?
 
-Each tool gets a random constant target, in the space where both arms work or on the other arm's side. Most targets
-cannot be reached with every distance kept. The arms then slide along each other for seconds until they rest.
+Each tool gets a random constant target. In one kind of runs, targets are anywhere in the space that both arms share. In
+the other kind, each target is on the other arm's side. Most targets cannot be reached with every distance kept. The
+arms then slide along each other for seconds until they rest.
 """
 
 from __future__ import annotations
@@ -24,9 +25,10 @@ from q2r2_control.viewer.tables import record_table
 RUNS_PER_KIND = 50  # Number of runs of each kind.
 DURATION_S = 30.0  # Duration of a run [s].
 DT = 0.001  # Period of a tick [s].
-# Largest acceleration of arms at rest: RMS over the last 0.5 s of the norm over the joints [rad/s^2].
+# Arms count as resting if this acceleration is not larger: the RMS, over the last 0.5 s, of the norm of all joints'
+# accelerations [rad/s^2].
 MAX_REST_ACCELERATION = 0.1
-# Time after which the jump of the targets no longer has an effect, and slides have begun [s].
+# Jolts are counted after this time [s]. By then, the jump of the targets has no more effect, and the arms slide.
 JOLTS_COUNT_AFTER_S = 2.0
 NOTES = (
     f"Targets stay constant for {DURATION_S:g} s. Most of them cannot be reached with every distance kept.",
@@ -37,13 +39,14 @@ NOTES = (
     "fallback ticks: Number of ticks of all runs in which the certified stop was executed.",
 )
 
-# Range of the left tool's target, measured from the middle between both tools at home [m]. For the right tool, y has
-# the opposite sign.
+# By the kind of runs, the lower and upper bounds of the left tool's target (x, y, z), measured from the middle between
+# both tools at home [m]. For the right tool, y has the opposite sign.
 KINDS: dict[str, tuple[Array, Array]] = {
     "anywhere": (np.array([-0.25, -0.35, -0.3]), np.array([0.25, 0.35, 0.3])),
     "other side": (np.array([-0.2, -0.35, -0.15]), np.array([0.2, 0.0, 0.3])),
 }
-_ROTATION_DEVIATION = 0.4  # Standard deviation of each component of the rotation from home [rad].
+# Standard deviation of each component of the rotation vector from the tool's rotation at home to the target [rad].
+_ROTATION_DEVIATION = 0.4
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,8 +56,9 @@ class RestFigures:
     kind: str
     runs: int
     at_rest: int  # Number of runs whose arms rest at the end.
-    median_acceleration: float  # Median of the runs' RMS over the last 0.5 s of the norm over the joints [rad/s^2].
-    worst_acceleration: float  # Largest of these accelerations [rad/s^2].
+    # The acceleration of a run is the RMS, over the last 0.5 s, of the norm of all joints' accelerations [rad/s^2].
+    median_acceleration: float  # Median over the runs [rad/s^2].
+    worst_acceleration: float  # Largest of all runs [rad/s^2].
     # Mean number of ticks of a run after JOLTS_COUNT_AFTER_S in which an acceleration changes by more than JOLT.
     jolts: float
     most_jolts: int  # Largest number of such ticks in one run.
@@ -94,7 +98,7 @@ def run_rest(config: Config, seed: int, runs: int = RUNS_PER_KIND) -> list[RestF
 
 
 def draw_targets(robot: Robot, kind: str, random: np.random.Generator) -> dict[str, pin.SE3]:
-    """Return a random target for each tool, turned a little from its rotation at home."""
+    """Return a random target pose for each tool. Its rotation differs a little from the tool's rotation at home."""
     home = {arm: robot.tool_pose(robot.home, arm) for arm in robot.arms}
     middle = np.mean([pose.translation for pose in home.values()], axis=0)
     targets = {}

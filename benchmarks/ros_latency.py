@@ -1,8 +1,8 @@
 """How long does it take from a message on an input topic to the joint command that answers it, through real nodes?
 
 The simulated robot, the controller, and the teleoperation of one arm run as real processes on this machine. They have a
-ROS domain of their own. The input steps up and down by millimetres at random times. The command that answers a step is
-the first one after it whose acceleration only a step can cause.
+ROS domain of their own. The input steps up and down by millimetres at random times. The first command after a step
+whose acceleration only a step can cause counts as the answer to this step.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ _PRESS_S, _AFTER_PRESS_S = 0.3, 0.3  # Duration of a press of the lower button, 
 _SHORTEST_FILTER = {"interpolation_delay": 0.005, "smoothing_delay": 0.0, "min_cutoff": 100.0, "beta": 1000.0}
 
 
-# Share of the acceleration limit that marks an answer. A step asks for the whole limit. The motion that is left of the
-# step before it asks for a tenth of the limit by then.
+# A command with more than this share of the acceleration limit is an answer. A step causes an acceleration at the whole
+# limit. The rest of the motion that the step before has caused needs only a tenth of the limit by then.
 _ANSWER_SHARE = 0.4
 
 

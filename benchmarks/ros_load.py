@@ -186,8 +186,8 @@ class _Watcher:
 def times_of_a_robot(times: Array) -> Array:
     """Return the times at which a robot follows commands that were sent at ``times`` (n,) [s].
 
-    The robot takes the newest command once in each of its own periods, so small differences of their times do not
-    matter. If a command is missing, the robot waits for two periods.
+    The robot takes the newest command once in each of its own periods. Therefore small differences between the times of
+    commands do not matter. If a command is missing, the robot follows the next command after two periods.
     """
     gaps = np.diff(times)
     period = float(np.median(gaps))

@@ -257,7 +257,7 @@ def _times(recording: PressRecording) -> tuple[float, float, float] | None:
 
 
 def _first(times: Array, press: float) -> float | None:
-    """Return the time from the press to the first of ``times`` after it, None if that is later than WATCHED_S [s]."""
+    """Return the time from the press to the first of ``times`` after it [s]; None if none is within WATCHED_S."""
     after = times[(times >= press) & (times <= press + WATCHED_S)]
     return float(after[0] - press) if len(after) else None
 

@@ -1,9 +1,10 @@
 """Does each line that keeps a promise of the controller matter? Break it, and see a hostile soak or a test fail.
 
 Every row names a claim and one line that keeps it. The file safety_claims.py has the lines of the certificate, and
-guard_claims.py has those beside it. Each line is broken in a copy of the package. For a line of the controller,
-`q2r2 soak` runs there. If it finds nothing, the tests of the line's folder run. If nothing finds a broken line, this
-program exits with 1. For a line of a kernel, all kernels are compiled again, which takes a minute or two.
+guard_claims.py has all other lines. Each line is broken in a copy of the package. If the line belongs to the
+controller, `q2r2 soak` runs in this copy first. If the soak finds nothing, the tests of the line's folder run. If no
+test fails either, this program exits with 1. For a line of a kernel, all kernels are compiled again, which takes a
+minute or two.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from safety_claims import CERTIFICATE, SAFETY, Mutation
 
 ROOT = Path(__file__).resolve().parents[1]
 MUTATIONS = (*CERTIFICATE, *CONTROL, *AGES, *WATCHES, *TWO_ARMS, *COMMANDS)
-TESTS = {  # Tests that run for a row, by the folder of its line.
+TESTS = {  # By the folder of a row's line, the tests that run for the row.
     SAFETY: (
         "tests/control/safety",
         "tests/control/test_contract.py",

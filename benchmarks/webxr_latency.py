@@ -1,8 +1,9 @@
 """How long does it take from a controller's motion to the joint command, through a browser and its page?
 
 Meta's iwer emulates a headset in Chromium, and the run is that of q2r2 run --input webxr. A controller jumps by 5 mm
-at random times, which the page's clock measures. The time ends with the first joint command that differs. Both clocks
-are those of one computer. The time includes the wait for the headset's next frame, which takes half a frame on average.
+at random times. The latency is the time from a jump to the first joint command that differs from the command before the
+jump. The page measures the time of the jump, and the run measures the time of the command, on the same computer. The
+latency includes the wait for the headset's next frame, which takes half a frame on average.
 """
 
 from __future__ import annotations
@@ -80,7 +81,7 @@ class PageLatency:
 
 
 class CommandTimes:
-    """A listener that keeps each command of the left arm and its time by the wall clock."""
+    """A listener that stores each command of the left arm, and its time by the wall clock."""
 
     def __init__(self, joints: Array) -> None:
         self._joints = joints

@@ -1,8 +1,8 @@
 """The hands of an operator who moves the arms through a work motion, as a headset would send them.
 
-Both hands rest and press the lower button to engage, the right one a little later. Then they move so that relative
-motion asks for the tool poses of the work motion. The same effects as in real work disturb these poses. Samples are
-noisy, uneven and late, and filter, leash and gate stand between the samples and the targets.
+Both hands rest and press the lower button to engage, the right hand a little later. Then they move so that exact
+samples would give the tool poses of the work motion as targets. The targets of the arms differ from these poses for the
+same reasons as in real work: samples are noisy, uneven and late, and they pass through filter, leash and gate.
 """
 
 from __future__ import annotations
@@ -29,8 +29,9 @@ _SENSOR_NOISE = 2e-4  # Standard deviation of the sensor's noise along each axis
 class WorkHands(PlayedInput):
     """An :class:`Input` with both hands in one work motion, which begins :data:`MOTION_BEGINS_S` after the first poll.
 
-    ``start`` has the tool poses at which the arms are engaged, in the world frame. ``settings`` say how hands move
-    arms. ``seed`` decides the noise and the uneven times of the samples. If it is None, the samples are exact and even.
+    ``start`` has the tool poses at which the arms are engaged, in the world frame, by arm. ``settings`` say how hands
+    move arms. ``seed`` decides the noise and the uneven times of the samples. If ``seed`` is None, the samples are
+    exact and even.
     """
 
     def __init__(

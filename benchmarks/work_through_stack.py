@@ -1,9 +1,9 @@
 """How well do two arms work when hand samples drive them through the whole stack, to arms in MuJoCo?
 
-Everything is as in ``q2r2 run``, but time is simulated, and the cell has no loose objects, because no motion knows of
-them. An error is the distance from the pose that the hand asks for at that instant to the measured tool. It includes
-the delays of samples, filter, loop and arm. Each motion also runs with the same samples in free air, where no pair is
-monitored. The difference between both runs is the cost of the monitored pairs.
+Everything is as in ``q2r2 run``, but time is simulated, and the cell has no loose objects, because the motions do not
+consider them. An error is the distance between the measured tool and the position that the hand asks for at the same
+time. It includes the delays of samples, filter, loop and arm. Each motion also runs with the same samples in free air,
+where no pair is monitored. The difference between both runs is the cost of the monitored pairs.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from work_hands import MOTION_BEGINS_S, WorkHands
 
 _TAIL_S = 0.5  # Duration of the end of a motion in which the arms should rest [s].
 _TIME_ROUNDING_S = 1e-9  # Largest rounding error of a tick's time [s].
-_TICKS_PER_MARGIN = 4  # Number of ticks from one posture whose margins are measured to the next.
+_TICKS_PER_MARGIN = 4  # The margins of all pairs are measured once in this number of ticks.
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +55,7 @@ class StackFigures:
     # motion has no goal.
     arrival_s: float | None = None
     fallback_percent: float | None = None  # Percentage of ticks in which the certified stop was executed.
-    measured_distance_mm: float | None = None  # Least distance of a monitored pair at measured postures, by Coal.
+    measured_distance_mm: float | None = None  # Least distance of a monitored pair at measured postures, from Coal.
     measured_pair: tuple[str, str] | None = None  # The pair with that distance.
     measured_margin_mm: float | None = None  # Least difference between a pair's measured and kept distance.
     reference_distance_mm: float | None = None  # Least distance of a monitored pair at the reference's postures.
@@ -75,7 +75,7 @@ class StackFigures:
 
 
 class Stack:
-    """A cell in MuJoCo whose arms hands move through one work motion after another, in one ``mode``.
+    """A cell in MuJoCo. Hands move its arms through one work motion after another, in one command ``mode``.
 
     If ``free`` is True, no pair is monitored, and all bodies pass through each other.
     """
@@ -151,7 +151,7 @@ class Stack:
 
 
 class _Log:
-    """A listener that keeps the data of the figures. If ``checked`` is True, it checks the contract at every tick."""
+    """A listener that stores the data for the figures. If ``checked`` is True, it checks the contract at every tick."""
 
     def __init__(self, pipeline: Pipeline, checked: bool) -> None:
         self._pipeline, self._checked = pipeline, checked
@@ -167,7 +167,7 @@ class _Log:
 
     def __call__(self, tick: Tick) -> None:
         if self._checked:
-            # The contract is made at the first tick, because a run may make a controller of its own.
+            # The contract is made at the first tick, because the pipeline may replace its controller when a run begins.
             self._contract = self._contract or Contract(self._pipeline.controller)
             self._contract.observe(tick.reference, tick.step)
         self.t.append(tick.t)
@@ -180,7 +180,7 @@ class _Log:
 
     @property
     def broken(self) -> dict[str, int]:
-        """Return the promises that the controller broke, with the number of ticks of each."""
+        """Return the promises that the controller broke, with the number of ticks in which it broke each promise."""
         margins = self._contract.margins.values() if self._contract is not None else ()
         return {margin.name: margin.violations for margin in margins if margin.violations}
 
@@ -192,9 +192,10 @@ class _Log:
 
 
 def _errors(log: _Log, hands: WorkHands, delay: float, end: float) -> tuple[Array, Array, Array]:
-    """Return three distances (n, arms) [m] of the measured tools from the positions that the hands ask for.
+    """Return three arrays (n, arms) with distances of the measured tools from positions that the hands ask for [m].
 
-    The hands ask for these positions at the tick itself, ``delay`` [s] before it, and at the ``end`` [s].
+    The hands ask for these positions at the time of the tick, ``delay`` [s] before the tick, and at the time ``end``
+    [s].
     """
     tools = np.array(log.tools)
     asked = (

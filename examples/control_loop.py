@@ -11,7 +11,7 @@ robot = Robot.from_config(load_config("config/dual_iiwa7.yaml"))
 controller = CartesianController(robot, ControllerSettings(acceleration_limit=10.0, min_distance=0.02))
 controller.reset(robot.home)
 
-# The left tool is asked to go 10 cm up and to turn. The right arm has no target, so it holds its reference.
+# The target of the left tool is 10 cm higher and turned. The right arm has no target, so it holds its reference.
 start = controller.tool_pose("left")
 goal = pin.SE3(start.rotation @ pin.rpy.rpyToMatrix(0.0, 0.3, 0.0), start.translation + np.array([0.0, 0.0, 0.1]))
 

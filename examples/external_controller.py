@@ -1,6 +1,6 @@
-"""Your own controller of an arm in ROS 2, which follows the targets that q2r2's controller has made safe.
+"""Your own controller of an arm in ROS 2. It follows the safe targets that the controller of q2r2 publishes.
 
-Start ``q2r2 ros up CELL.yaml`` beside it, with ``output:=none`` for its node ``cartesian_controller``.
+Also start ``q2r2 ros up CELL.yaml``, with the parameter ``output:=none`` for its node ``cartesian_controller``.
 """
 
 import numpy as np
@@ -21,7 +21,7 @@ commands = node.create_publisher(JointState, "/joint_commands", 1)
 
 
 def follow(message: PoseStamped) -> None:
-    """Go half of the way to the target, by one step of inverse kinematics with damped least squares."""
+    """Move the tool half of the distance to the target, by one step of inverse kinematics (damped least squares)."""
     at, turn = message.pose.position, message.pose.orientation
     target = pin.XYZQUATToSE3(np.array([at.x, at.y, at.z, turn.x, turn.y, turn.z, turn.w]))
     jacobian = pin.computeFrameJacobian(robot.model, data, q, frame, pin.LOCAL)

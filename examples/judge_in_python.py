@@ -1,4 +1,4 @@
-"""Judge recordings in Python: python examples/judge_in_python.py [RECORDINGS...]. Without any, it records one."""
+"""Judge recordings in Python: python examples/judge_in_python.py [RECORDINGS...]. Without RECORDINGS, it makes one."""
 
 import subprocess
 import sys
@@ -10,7 +10,7 @@ from q2r2_control.recording import recordings_in
 
 
 def record(folder: str) -> Path:
-    """Record two seconds of scripted hands, as fast as the machine can, and return the folder."""
+    """Record two seconds of scripted hands in simulated time, and return the folder of the recording."""
     command = [sys.executable, "-m", "q2r2_control", "run", "config/dual_iiwa7.yaml", "--headless", "--fast"]
     subprocess.run([*command, "--duration", "2", "--record", folder], check=True, stdout=subprocess.DEVNULL)
     return Path(folder)
@@ -18,7 +18,7 @@ def record(folder: str) -> Path:
 
 with tempfile.TemporaryDirectory() as folder:
     given = [Path(path) for path in sys.argv[1:]] or [record(folder)]
-    # These are thresholds of your own. Without them, those of the recorded cell count.
+    # These are thresholds of your own. Without this argument, the thresholds of the recorded cell count.
     settings = JudgeSettings(max_position_error_rms=0.02, max_idle_share=0.95)
     for judged in judge_all(recordings_in(given), settings):
         if isinstance(judged, Unreadable):

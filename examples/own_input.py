@@ -1,4 +1,4 @@
-"""Your own input device, which can be anything that knows where two hands are. docs/extending.md installs one."""
+"""Your own input device, which can be anything that measures two hands. docs/extending.md shows how to install it."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Your own plant, such as a robot behind your own driver. This one follows positions with a lag of 5 ms."""
+"""Your own plant, such as a robot behind your own driver. The plant here follows positions with a lag of 5 ms."""
 
 import numpy as np
 

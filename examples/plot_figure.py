@@ -11,7 +11,7 @@ import matplotlib.pyplot as plt
 
 from q2r2_control import CartesianController, Robot, load_config
 
-DT, PERIOD = 0.001, 4.0  # Period of a tick, and time of one figure [s].
+DT, PERIOD = 0.001, 4.0  # Period of a tick, and time in which the figure is drawn once [s].
 
 config = load_config("config/dual_iiwa7.yaml")
 robot = Robot.from_config(config)
@@ -20,7 +20,7 @@ controller.reset(robot.home)
 starts = {arm: controller.tool_pose(arm) for arm in robot.arms}
 
 phase = 2.0 * np.pi * np.arange(0.0, PERIOD, DT) / PERIOD
-# Offsets of the targets from the start (n, 3) [m].
+# Displacements of the targets from the tools' positions at the start (n, 3) [m].
 figure = np.column_stack([np.zeros_like(phase), 0.04 * np.sin(2.0 * phase), 0.08 * np.sin(phase)])
 drawn: dict[str, list[np.ndarray]] = {arm: [] for arm in robot.arms}
 for offset in figure:

@@ -1,4 +1,4 @@
-"""A policy drives the arms, and every promise holds. A trained policy would compute its actions from observations."""
+"""A policy drives the arms, and all promises are kept. A trained policy would compute its actions from observations."""
 
 import numpy as np
 import pinocchio as pin
@@ -9,7 +9,7 @@ from q2r2_control import Array, Observation, Pipeline, PolicyInput, load_config
 class Circles:
     """A policy that moves both tools round circles.
 
-    The numbers of an action are those of a dataset's action.tool: x y z qx qy qz qw of each arm.
+    An action has the same numbers as the feature action.tool of a dataset: x y z qx qy qz qw of each arm.
     """
 
     space = "action.tool"

@@ -24,8 +24,8 @@ targets = {"left": pin.SE3(left.rotation, right.translation), "right": pin.SE3(r
 
 speeds, differences, margins = [], [], []
 for _ in range(1000):  # Each tool is sent to the position of the other tool.
-    problem = controller.problem(targets, DT)  # Its variable is x = [v; s]: joint velocities, and a slack for each row.
-    own_row = -np.eye(1, len(problem.q), joint)  # The row -v <= 0.1 lets left_A1 turn back at 0.1 rad/s at most.
+    problem = controller.problem(targets, DT)  # The QP's variable is x = [v; s]: joint velocities, a slack per row.
+    own_row = -np.eye(1, len(problem.q), joint)  # The row -v <= 0.1: left_A1 turns back at 0.1 rad/s at most.
     problem.G = own_row if problem.G is None else np.vstack([problem.G, own_row])
     problem.h = np.append([] if problem.h is None else problem.h, 0.1)
     problem.P[joint, joint] += 0.01  # This cost lets left_A1 turn as slowly as the tools allow.

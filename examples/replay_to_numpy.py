@@ -1,4 +1,4 @@
-"""Read a recording as NumPy arrays: python examples/replay_to_numpy.py [RECORDING]. Without one, it makes one."""
+"""Read a recording as NumPy arrays: python examples/replay_to_numpy.py [RECORDING]. Without RECORDING, it makes one."""
 
 import subprocess
 import sys
@@ -10,7 +10,7 @@ from q2r2_control.recording import recordings_in
 
 
 def record(folder: str) -> Path:
-    """Record two seconds of scripted hands, as fast as the machine can, and return the recording."""
+    """Record two seconds of scripted hands in simulated time, and return the path of the recording."""
     command = [sys.executable, "-m", "q2r2_control", "run", "config/dual_iiwa7.yaml", "--headless", "--fast"]
     subprocess.run(
         [*command, "--duration", "2", "--record", folder, "--task", "swing"], check=True, stdout=subprocess.DEVNULL

@@ -2,9 +2,9 @@
 
     python examples/learning/ahead.py datasets/circle datasets/circle_ahead [--frames 1]
 
-This is for datasets of lerobot-record, which has no such option. For q2r2 export, use --ahead instead. The first
-actions of an episode are dropped and its last action is repeated. As only these few rows change, the statistics of the
-dataset are kept as they are.
+This is for datasets of lerobot-record, which has no option for it. For q2r2 export, use its option --ahead instead. The
+first actions of an episode are dropped, and its last action is repeated. Only these few actions differ, so the
+statistics of the dataset are not computed again.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ ACTION, EPISODE = "action", "episode_index"
 
 
 def shifted(table: pa.Table, frames: int) -> pa.Table:
-    """Return the ``table`` whose row k has the action of row k + ``frames``. An episode's last action is repeated."""
+    """Return the ``table`` with the action of row k + ``frames`` in row k. An episode's last action is repeated."""
     episodes = np.asarray(table[EPISODE])
     last = np.searchsorted(episodes, episodes, side="right") - 1
     later = np.minimum(np.arange(len(episodes)) + frames, last)

@@ -3,8 +3,8 @@
     .venv-lerobot/bin/python examples/learning/grasp.py FOLDER [--episodes 50] [--steps 3000] [--seeds 20]
 
 The block lies at a different position in each attempt, and the policy gets this position as an input. The policy is a
-small ACT of lerobot, which is trained from scratch on a CPU. It is compared with a policy that always plays the mean
-episode. The actions of both policies go through the same policy input of the control loop.
+small ACT of lerobot, which is trained from scratch on a CPU. It is compared with a second policy, which always plays
+the mean of all episodes. The actions of both policies go through the same policy input of the control loop.
 """
 
 from __future__ import annotations
@@ -35,20 +35,20 @@ from q2r2_control.recording import About, Recorder
 
 TASK = tasks_named(["grasp"])[0]
 BLOCK, MAX_DISPLACEMENT = "flat_block", 0.03  # Block, and its largest displacement along x and y [m].
-FPS, CHUNK = 10, 100  # Actions per second [Hz], and number of actions in a chunk, which is the whole motion.
+FPS, CHUNK = 10, 100  # Actions per second [Hz], and actions in a chunk. One chunk is the whole motion.
 PLACE = "observation.environment_state"  # lerobot's name for the input with the block's displacement, x y [m].
 STATE, ACTION = "observation.state", "action"
 ACT_SETTINGS: dict[str, Any] = {"dim_model": 64, "n_heads": 4, "dim_feedforward": 256, "n_encoder_layers": 2}
 ACT_SETTINGS |= {"use_vae": False, "dropout": 0.0, "chunk_size": CHUNK, "n_action_steps": CHUNK, "device": "cpu"}
 BATCH_SIZE, LEARNING_RATE = 16, 1e-3  # Batch size and learning rate.
-# Least standard deviation by which an action is scaled [m or 1]. Numbers that vary less are mostly tremor, which the
-# policy would otherwise learn.
+# Each number of an action is divided by its standard deviation, but at least by this [m or 1]. Numbers that vary less
+# contain mostly tremor, which the policy must not learn.
 MIN_DEVIATION = 0.02
 MIN_SUCCESS_SHARE = 0.5  # Least share of attempts that must succeed.
 
 
 class Whole:
-    """A policy that returns the whole motion at its first call, and the rest of this motion at later calls."""
+    """A policy that computes the whole motion at its first call. Later calls return the part that is still to come."""
 
     space, rate = ActionSpace.TOOL, float(FPS)
 
@@ -62,7 +62,7 @@ class Whole:
 
 
 def learned(folder: Path, place: Array) -> Callable[[Observation], Array]:
-    """Return a function that asks the policy in ``folder`` for a motion. The block is displaced by ``place`` [m]."""
+    """Return a function that computes a motion by the policy in ``folder``. The block is displaced by ``place`` [m]."""
     policy = ACTPolicy.from_pretrained(folder)
     before, after = make_pre_post_processors(policy.config, str(folder))
 
@@ -78,7 +78,7 @@ def learned(folder: Path, place: Array) -> Callable[[Observation], Array]:
 
 
 def coarse(cell: Config) -> Config:
-    """Return the cell with a slow control loop of 100 Hz, which needs a tenth of the work."""
+    """Return the cell with a slow control loop of 100 Hz, which needs a tenth of the computing time."""
     control = cell.control.model_copy(update={"max_substep": 0.01})
     return cell.model_copy(update={"loop_rate_hz": 100.0, "control": control})
 
@@ -123,7 +123,7 @@ def record(cell: Config, episodes: int, folder: Path) -> None:
 
 
 def export(recordings: Path, folder: Path) -> LeRobotDataset:
-    """Return the dataset of q2r2 export lerobot, to which the block's displacement in each episode is added."""
+    """Return a dataset made by q2r2 export lerobot, with the block's displacement in each episode added."""
     plain = folder.with_name("exported")
     command = [sys.executable, "-m", "q2r2_control", "export", "lerobot", recordings, "--output", plain]
     subprocess.run([*map(str, command), "--fps", str(FPS), "--trim", "--no-pictures"], check=True)
@@ -136,7 +136,10 @@ def export(recordings: Path, folder: Path) -> LeRobotDataset:
 
 
 def train(dataset: LeRobotDataset, steps: int, folder: Path) -> Path:
-    """Train an ACT on tensors in memory, because the loader takes longer than the policy. Returns its folder."""
+    """Train an ACT policy, and return the folder into which it is saved.
+
+    All data is in memory, because lerobot's data loader would take longer than the policy itself.
+    """
     actions = actions_of(dataset)
     columns = {name: torch.from_numpy(column(dataset, name)) for name in (STATE, PLACE)}
     columns[ACTION] = torch.from_numpy(actions)
@@ -173,9 +176,9 @@ def train(dataset: LeRobotDataset, steps: int, folder: Path) -> Path:
 
 
 def actions_of(dataset: LeRobotDataset) -> Array:
-    """Return the targets of the tools and the openings of both grippers.
+    """Return the dataset's actions: target poses of the tools, and openings of both grippers.
 
-    Unlike errors of joints, errors of these targets do not add up along an arm.
+    If joint positions were learned instead, their errors would add up along an arm.
     """
     return np.hstack((column(dataset, ActionSpace.TOOL), column(dataset, ACTION)[:, -2:]))
 
@@ -185,7 +188,7 @@ def column(dataset: LeRobotDataset, name: str) -> Array:
 
 
 def mean_episode(dataset: LeRobotDataset) -> Array:
-    """Return the mean of all episodes, as many actions (n, size) as a chunk of the policy has."""
+    """Return the mean of all episodes as actions (n, size). Their number n is that of a chunk of the policy."""
     actions, frames = actions_of(dataset), column(dataset, "frame_index")
     return np.array([actions[frames == frame].mean(axis=0) for frame in range(CHUNK)])
 

@@ -1,1 +1,1 @@
-"""Comparison of the controller with public controllers: times of a tick, and work motions of two arms."""
+"""Comparison of our controller with public controllers: computing times of a tick, and errors in work motions."""

@@ -1,8 +1,8 @@
-"""Run one controller in one work motion and compute its figures, and run the bench of our controller and its peers.
+"""Run one controller in one work motion and compute its figures, or run our controller and its peers in all motions.
 
-All controllers get the same cell, limits, targets and ticks, in one process. Peers run open loop like our controller,
-and their targets are moved ahead of time by their lag. Our controller also runs in free air. The difference between
-its two runs is the cost of the monitored pairs.
+All controllers run in one process, and get the same cell, limits, targets and ticks. Peers run open loop, as our
+controller does. A peer gets its targets earlier by its lag. Our controller also runs in free air, where no pairs are
+monitored. The difference between its two runs is the cost of the monitored pairs.
 """
 
 from __future__ import annotations
@@ -23,20 +23,21 @@ from q2r2_control.control.controller import CartesianController
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
-DT = 0.001  # [s]
+DT = 0.001  # Duration of a tick [s].
 ARRIVED = 0.01  # A tool within this distance of its goal has arrived [m].
-PATIENCE = 3.0  # Longest time that a controller may take, as a multiple of the motion's own time.
+PATIENCE = 3.0  # Longest computing time that a controller may take, as a multiple of the motion's duration.
 JOLT = 5.0  # A larger change of a joint's acceleration in one tick is a jolt [rad/s^2].
-_TAIL = 0.5  # Duration at the end over which the acceleration at rest is computed [s].
-_SHORTEST_DT = 1e-9  # Duration of a tick that moves nothing [s].
-# Distances are measured at one posture in so many ticks. Around the nearest of these postures, all are measured.
+_TAIL = 0.5  # The acceleration at rest is computed over this last part of a motion [s].
+_SHORTEST_DT = 1e-9  # Duration of a tick in which no joint can move [s].
+# First, distances are computed only in every fourth tick. Then they are computed in all ticks around the tick with the
+# smallest of these distances.
 _DISTANCE_TICKS = 4
 
 
 class OwnController:
-    """:class:`CartesianController` as a :class:`BenchController`.
+    """Our :class:`CartesianController` with the interface of a :class:`BenchController`.
 
-    It has the settings of a cell without the time limit, so that a slow machine computes the same motion.
+    It has the settings of a cell, but no time limit for the solver. Thus a slow machine computes the same motion.
     """
 
     limitations = ""
@@ -44,7 +45,7 @@ class OwnController:
     def __init__(self, robot: Robot, config: Config, name: str = "q2r2_control") -> None:
         self.name = name
         self._controller = CartesianController(robot, config.control.timed(realtime=False))
-        # For each tick since the reset, whether the certified stop was executed, and whether some QP was not solved.
+        # For each tick since the reset: whether the certified stop was executed, and whether any QP was not solved.
         self.stopped: list[bool] = []
         self.unsolved: list[bool] = []
 
@@ -60,31 +61,31 @@ class OwnController:
         return reference.q, reference.v
 
     def hold(self) -> tuple[Array, Array]:
-        """Return the same positions at rest. This follows only a step that raised, which the contract forbids."""
+        """Return the same positions at rest. It is called only after a step that raised, which the contract forbids."""
         reference = self._controller.step({}, _SHORTEST_DT)
         return reference.q, np.zeros_like(reference.v)
 
 
 def without_pairs(config: Config) -> Robot:
-    """Return the robot of a cell in free air: no pair is monitored, so that the arms can move through everything."""
+    """Return the robot of a cell without monitored pairs, so that its arms can move through everything."""
     robot = Robot.from_config(config)
     robot.collision_model.removeAllCollisionPairs()
     return robot
 
 
 def rest_acceleration(v: Array, dt: float) -> float:
-    """Return the RMS of the acceleration's norm over the joints [rad/s^2] in the last 0.5 s.
+    """Return the RMS, over the last 0.5 s, of the norm of all joints' accelerations [rad/s^2].
 
-    ``v`` (n, nv) are the velocities [rad/s].
+    ``v`` (n, nv) are the velocities [rad/s] in ticks of ``dt`` [s].
     """
     a = np.diff(v, axis=0, prepend=0.0)[-round(_TAIL / dt) :] / dt
     return float(np.sqrt(np.mean(np.sum(a**2, axis=1))))
 
 
 def count_jolts(v: Array, dt: float, since: float) -> int:
-    """Count the ticks after ``since`` [s] in which an acceleration changes by more than :data:`JOLT`.
+    """Count the ticks after ``since`` [s] in which a joint's acceleration changes by more than :data:`JOLT`.
 
-    ``v`` (n, nv) are the velocities [rad/s].
+    ``v`` (n, nv) are the velocities [rad/s] in ticks of ``dt`` [s].
     """
     a = np.diff(v, axis=0, prepend=0.0) / dt
     changes = np.abs(np.diff(a, axis=0)).max(axis=1)
@@ -93,36 +94,40 @@ def count_jolts(v: Array, dt: float, since: float) -> int:
 
 @dataclass(frozen=True, slots=True)
 class MotionFigures:
-    """Figures of one controller in one motion after the approach. A figure is None if the run ended before it."""
+    """Figures of one controller in one motion. The approach is left out.
+
+    A figure is None if the run ended too early for it.
+    """
 
     motion: str
     controller: str
-    done: float  # Share of the ticks; less than 1 if the controller was too slow.
+    done: float  # Share of the motion's ticks that were run; less than 1 if the controller was too slow.
     ticks: int = 0  # Measured ticks.
     failures: int = 0  # Measured ticks with an exception, no solution, or numbers that are not finite.
-    rms_error_mm: float | None = None  # RMS error of the tool with the larger error, until the rest begins.
-    max_error_mm: float | None = None  # Largest error of either tool until the rest begins.
-    end_error_mm: float | None = None  # Largest error of either tool at the end.
+    # Errors are distances between the tools and their targets. The first two do not count the rest at the end.
+    rms_error_mm: float | None = None  # RMS error of the tool whose RMS error is larger.
+    max_error_mm: float | None = None  # Largest error of either tool.
+    end_error_mm: float | None = None  # Error in the last tick, of the tool whose error is larger.
     # Time from the beginning of the motion until both tools stay within 10 mm of the goal. None if they do not stay
     # there until the end, or if the motion has no goal.
     arrival_s: float | None = None
     fallback_percent: float | None = None  # Share of ticks with the certified stop; None for a peer, which has none.
-    min_distance_mm: float | None = None  # Least distance of the monitored pairs, by Coal.
+    min_distance_mm: float | None = None  # Least distance of the monitored pairs, computed by Coal.
     closest_pair: tuple[str, str] | None = None
     max_acceleration: float | None = None  # Largest acceleration of a joint [rad/s^2].
     rest_acceleration: float | None = None  # See :func:`rest_acceleration` [rad/s^2].
-    times_us: tuple[float, float, float] | None = None  # Median, p99 and maximum of a tick.
+    times_us: tuple[float, float, float] | None = None  # Median, p99 and maximum of the computing time of a tick.
 
 
 @dataclass(frozen=True, slots=True)
 class MotionRun:
     """The recorded ticks of a run. The ticks of the approach come first."""
 
-    times: Array  # (n,) [s]
-    q: Array  # (n, nv) [rad]
-    v: Array  # (n, nv) [rad/s]
-    asked: list[dict[str, pin.SE3]]  # The targets of each tick.
-    failed: Array  # (n,) bool, whether the tick had no solution
+    times: Array  # (n,) The computing times [s].
+    q: Array  # (n, nv) The positions that the controller returned [rad].
+    v: Array  # (n, nv) The velocities that the controller returned [rad/s].
+    asked: list[dict[str, pin.SE3]]  # The targets of each tick, by arm.
+    failed: Array  # (n,) bool, True if the tick had no usable solution.
 
 
 def run_motion(
@@ -133,9 +138,9 @@ def run_motion(
 
 
 def play_motion(controller: BenchController, robot: Robot, motion: WorkMotion, patience: float, dt: float) -> MotionRun:
-    """Run ``motion`` from home. A tick without a solution leaves the arms where they are.
+    """Run ``motion`` from home in ticks of ``dt`` [s]. In a tick without a solution, the arms stay where they are.
 
-    The run ends early if the process has used ``patience`` times the motion's own time.
+    The run ends early if the process has computed for longer than ``patience`` times the motion's duration.
     """
     start = {arm: robot.tool_pose(robot.home, arm) for arm in robot.arms}
     asked = [motion.targets(tick * dt, start) for tick in range(round(motion.ends / dt))]
@@ -168,7 +173,8 @@ def figures_of(
 ) -> MotionFigures:
     """Return the figures of the ticks after the approach.
 
-    ``robot`` defines the measured pairs, and may differ from the controller's. Its arms have to be left and right.
+    The monitored pairs of ``robot`` are measured, even if the controller has a robot with other pairs. The arms of
+    ``robot`` have to be called left and right.
     """
     began, rests, ends = (round(time / dt) for time in (motion.begins, motion.rests, motion.ends))
     ticks, finished = len(run.q), len(run.q) == ends
@@ -200,9 +206,10 @@ def figures_of(
 
 
 def _errors(run: MotionRun, robot: Robot, motion: WorkMotion, began: int) -> tuple[Array, Array]:
-    """Return two distances (n, arms) of the tools in the n measured ticks [m]: from their targets, and from the goal.
+    """Return two arrays (n, arms) for the n ticks from ``began`` on [m].
 
-    The goal is the last target.
+    The first array has the tools' distances from their targets. The second array has their distances from their goals,
+    which are the last targets.
     """
     start = {arm: robot.tool_pose(robot.home, arm) for arm in robot.arms}
     goal = motion.targets(motion.ends, start)
@@ -213,16 +220,20 @@ def _errors(run: MotionRun, robot: Robot, motion: WorkMotion, began: int) -> tup
 
 
 def arrival_time(to_goal: Array, dt: float) -> float | None:
-    """Return the time after which both tools stay at the goal [s]; None if they are not there at the end."""
+    """Return the time after which both tools stay at their goals [s]; None if one is away from its goal at the end.
+
+    ``to_goal`` (n, arms) are their distances from the goals in ticks of ``dt`` [s].
+    """
     away = np.flatnonzero((to_goal >= ARRIVED).any(axis=1))
     first = int(away[-1]) + 1 if len(away) else 0
     return first * dt if first < len(to_goal) else None
 
 
 def nearest_pair(q: Array, robot: Robot) -> tuple[float | None, tuple[str, str] | None]:
-    """Return the least distance [mm] over postures (n, nv), and its pair.
+    """Return the least distance of any monitored pair over the postures ``q`` (n, nv) [mm], and the names of the pair.
 
-    Every few postures are measured first, then all postures around the nearest one.
+    Both are None if no pair is monitored. At first, only every fourth posture is measured. Then all postures around the
+    posture with the least distance are measured.
     """
     if not len(robot.collision_model.collisionPairs):
         return None, None
@@ -236,13 +247,13 @@ def nearest_pair(q: Array, robot: Robot) -> tuple[float | None, tuple[str, str] 
 
 @dataclass(frozen=True, slots=True)
 class BenchRow:
-    """The figures of one motion: of our controller in free air and in the cell, and of the peers in the cell."""
+    """The figures of all controllers in one motion. Only our controller also runs in free air."""
 
     motion: str
     about: str
     reachable: bool  # Whether both arms can reach all targets with every distance kept.
     free_air: MotionFigures
-    figures: list[MotionFigures]  # Ours comes first.
+    figures: list[MotionFigures]  # The figures of our controller come first.
 
 
 @dataclass(frozen=True, slots=True)
@@ -259,10 +270,11 @@ class BenchReport:
 def run_bench(
     config: Config, motions: Sequence[WorkMotion], peers: Sequence[str], rounds: int, progress: Callable[[str], None]
 ) -> BenchReport:
-    """Run ``motions``, which are made for ``config/dual_iiwa7.yaml``, with our controller and installed ``peers``.
+    """Run ``motions`` with our controller and with those ``peers`` that are installed.
 
-    All controllers take turns for ``rounds`` rounds, because the speed of a machine varies. Figures are those of the
-    last round. Times are the medians over the rounds.
+    The ``motions`` have to be made for the cell ``config``, such as ``config/dual_iiwa7.yaml``. The speed of a machine
+    varies, so the controllers run one after the other, and this is repeated for ``rounds`` rounds. Computing times are
+    the medians over the rounds. All other figures are those of the last round.
     """
     robot = Robot.from_config(config)
     free = OwnController(without_pairs(config), config, "free air")
@@ -282,7 +294,7 @@ def run_bench(
 
 
 def _over_rounds(runs: Sequence[MotionFigures]) -> MotionFigures:
-    """Return the figures of the last round, with the medians of all times."""
+    """Return the figures of the last round, but with the medians of the computing times over all rounds."""
     times = [run.times_us for run in runs if run.times_us is not None]
     if not times:
         return runs[-1]

@@ -1,7 +1,7 @@
-"""Run the same motion with one QP solver after another, in one process, and compare times and motions with DAQP's.
+"""Run the same motion with one QP solver after another, in one process. Compare times and motions with those of DAQP.
 
-The motion is the contact motion of the bench. Both tools are sent to places that they cannot reach, so that rows and
-box bind at nearly every tick. Every solver gets the same cell, targets and ticks. No solver has a time limit.
+The motion is the contact motion of the bench. Both tools are sent to positions that they cannot reach. Therefore rows
+and box of the QP are active at nearly every tick. All solvers get the same cell, targets and ticks, and no time limit.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from q2r2_control.robot.robot import Robot
 
 SOLVERS = (DAQP, "osqp", "quadprog", "proxqp", "piqp", "clarabel", "scs", "highs")
 CONTACT = TIMED_MOTIONS[1]
-DT = 0.002  # [s]
+DT = 0.002  # Duration of a tick [s].
 INSTALL = "pip install 'qpsolvers[open-source-solvers]'"
-_PATIENCE = 3.0  # Longest time that a solver may take, as a multiple of the motion's own time.
+_PATIENCE = 3.0  # Longest computing time of a solver's run, as a multiple of the motion's duration.
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +31,8 @@ class SolverFigures:
 
     solver: str
     unsolved_percent: float  # Share of ticks with an unsolved QP.
-    off_daqp_mm: float | None  # Largest distance of a tool from its position with DAQP; None without any tick.
+    # Largest distance, in any tick, between a tool's positions with this solver and with DAQP; None without ticks.
+    off_daqp_mm: float | None
     motion: MotionFigures
 
 
@@ -41,8 +42,8 @@ class SolverReport:
 
     cell: str
     motion: str
-    dt: float  # [s]
-    figures: list[SolverFigures]  # DAQP's come first.
+    dt: float  # Duration of a tick [s].
+    figures: list[SolverFigures]  # The figures of DAQP come first.
     missing: list[str]  # Names of solvers that are not installed.
 
 
@@ -52,7 +53,14 @@ def run_solvers(
     progress: Callable[[str], None] = lambda what: None,
     motion: WorkMotion = CONTACT,
 ) -> SolverReport:
-    """Run ``motion``, made for ``config/dual_iiwa7.yaml``, with DAQP and each solver of ``names`` that is installed."""
+    """Run ``motion`` with DAQP, and with each solver in ``names`` that is installed.
+
+    Args:
+        config: The cell for which ``motion`` is made, such as ``config/dual_iiwa7.yaml``.
+        names: The names of solvers.
+        progress: Called with a text before each run.
+        motion: The motion to run.
+    """
     robot = Robot.from_config(config)
     figures: list[SolverFigures] = []
     missing: list[str] = []
@@ -83,7 +91,7 @@ def _with_solver(config: Config, name: str) -> Config:
 
 
 def _apart_mm(run: MotionRun, other: MotionRun, robot: Robot) -> float | None:
-    """Return the largest distance between a tool's positions in this run and in the ``other`` one, at a tick [mm]."""
+    """Return the largest distance, in any tick, between a tool's positions in the two runs [mm]; None without ticks."""
     ticks = min(len(run.q), len(other.q))
     if not ticks:
         return None

@@ -1,12 +1,12 @@
-"""Work motions of two arms near each other, near the table and at the end of their reach.
+"""Work motions of two arms: near each other, near the table, and as far away as the arms can reach.
 
 The motions are made for ``config/dual_iiwa7.yaml``. Targets depend only on time and on the tool poses at the start, so
-every controller can get the same targets. Each motion begins with an approach from home, and ends with still targets
-for :data:`REST`. Tools keep their rotation, in which they point straight down, unless the motion says otherwise.
+every controller can get the same targets. Each motion begins with an approach from home, and ends with constant targets
+for :data:`REST`. Tools point straight down and keep this rotation, unless the motion says otherwise.
 
-With both tools pointing down at one height, the wrists are 20 mm apart when the tools are 0.18 m apart. A tool that
-points down can get 0.73 m away from its arm's mount (0.38 m above it). In this rotation, no arm reaches the home of the
-other arm's tool.
+If both tools point down at equal heights, 0.18 m apart, the wrists are 20 mm apart. A tool that points down can reach
+0.73 m from its arm's mount, at a height of 0.38 m above the mount. If its tool points down, no arm reaches the home
+position of the other arm's tool.
 """
 
 from __future__ import annotations
@@ -23,14 +23,15 @@ from q2r2_control.inputs.way_points import minimum_jerk
 from q2r2_control.types import Array
 
 ARMS = ("left", "right")
-REST = 2.0  # Time with still targets at the end, unless a motion has its own [s].
-_LEG = 2.0  # Time of an approach from one position to the next [s].
+REST = 2.0  # Duration of the constant targets at the end, if a motion does not set its own ``rest`` [s].
+_LEG = 2.0  # Time in which an approach moves from one position to the next [s].
 _SETTLE = 0.5  # Time between the approach and the motion [s].
 
-# A function of the time since the motion began [s] and of the tools' positions at home. It returns the positions of
-# both tools in the world frame, (2, 3) [m], with the left one first.
+# A function that returns the target positions of both tools in the world frame (2, 3) [m], with the left tool first.
+# Its arguments are the time since the motion began [s], and the tools' positions at home (2, 3) [m].
 Path = Callable[[float, Array], Array]
-Stop = Array | Callable[[Array], Array]  # Positions (2, 3) [m], or a function of the tools' positions at home.
+# The positions at which a motion stops (2, 3) [m], or a function that computes them from the tools' positions at home.
+Stop = Array | Callable[[Array], Array]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,13 +40,15 @@ class WorkMotion:
 
     name: str
     about: str
-    duration: float  # Time between approach and rest [s].
+    duration: float  # Time between the approach and the rest at the end [s].
     path: Path
-    approach: tuple[Array, ...] = ()  # Positions (2, 3) on the way from home to the start of the motion [m].
-    tilt: tuple[float, float] = (0.0, 0.0)  # Turn of each tool about the world's x, kept after the approach [rad].
+    # Positions (2, 3) through which the tools move from home [m]. The motion starts at the last of them.
+    approach: tuple[Array, ...] = ()
+    # The angle by which each tool turns about the world's x axis during the approach [rad]. It keeps this angle.
+    tilt: tuple[float, float] = (0.0, 0.0)
     has_goal: bool = False  # Whether the purpose is to arrive at the last targets.
     reachable: bool = True  # Whether both arms can reach all targets with every distance kept.
-    rest: float = REST  # Time with still targets at the end [s].
+    rest: float = REST  # Duration of the constant targets at the end [s].
 
     @property
     def begins(self) -> float:
@@ -54,16 +57,19 @@ class WorkMotion:
 
     @property
     def rests(self) -> float:
-        """The time after which the targets are still [s]."""
+        """The time after which the targets are constant [s]."""
         return self.begins + self.duration
 
     @property
     def ends(self) -> float:
-        """The total time [s]."""
+        """The total duration [s]."""
         return self.rests + self.rest
 
     def targets(self, t: float, start: Mapping[str, pin.SE3]) -> dict[str, pin.SE3]:
-        """Return the target poses of the tools at ``t`` [s]; ``start`` has their first poses. Both are in the world."""
+        """Return the tools' target poses in the world, at ``t`` [s] since the start of the approach, by arm.
+
+        ``start`` has the tool poses at home in the world, by arm.
+        """
         home = np.array([start[arm].translation for arm in ARMS])
         turned = 1.0
         if t >= self.begins:
@@ -82,7 +88,9 @@ class WorkMotion:
 
 
 def motions_named(names: Iterable[str]) -> tuple[WorkMotion, ...]:
-    """Return the motions of :data:`WORK_MOTIONS` with these names, in its order; ``carry`` means all ``carry-...``.
+    """Return the motions of :data:`WORK_MOTIONS` with these ``names``, in the order of :data:`WORK_MOTIONS`.
+
+    A name also stands for all motions whose names begin with it and a hyphen: ``carry`` means all ``carry-...``.
 
     Raises :class:`ConfigError` for an unknown name.
     """
@@ -103,7 +111,10 @@ def _to(
     tilt: tuple[float, float] = (0.0, 0.0),
     reachable: bool = False,
 ) -> WorkMotion:
-    """Return a motion with a goal, straight from stop to stop. Each stop has the time of travel to it [s]."""
+    """Return a motion with a goal, in which both tools move straight from stop to stop.
+
+    Each item of ``stops`` is the time of travel to the stop [s], and the stop.
+    """
 
     def path(t: float, home: Array) -> Array:
         here = approach[-1] if approach else home
@@ -118,28 +129,29 @@ def _to(
     return WorkMotion(name, about, duration, path, approach, tilt, has_goal=True, reachable=reachable)
 
 
-def _uniform(t: float, way: float, speed: float, ramp: float) -> float:
-    """Return the distance that was covered at ``t`` [s], on a path of the length ``way``, at the speed ``speed``.
+def _uniform(t: float, length: float, speed: float, ramp: float) -> float:
+    """Return the distance [m] that a point has covered at ``t`` [s] on a path. It is an angle [rad] on a circular path.
 
-    Speeding up and stopping take the time ``ramp`` [s] each.
+    The path has this ``length`` [m or rad], and the point has this ``speed`` [m/s or rad/s]. Speeding up and stopping
+    take the time ``ramp`` [s] each.
     """
-    duration = way / speed + ramp
+    duration = length / speed + ramp
     if t < ramp:
         return 0.5 * speed * t**2 / ramp
     if t > duration - ramp:
-        return way - 0.5 * speed * (duration - t) ** 2 / ramp
+        return length - 0.5 * speed * (duration - t) ** 2 / ramp
     return speed * (t - 0.5 * ramp)
 
 
 _CARRY_CENTRE, _CARRY_RADIUS, _CARRY_RISE = (0.52, 0.36), 0.08, 0.04  # Centre x and z, radius in x, rise in z [m].
-_CARRY_RAMP = 0.5  # Time to reach the speed, and to stop [s].
-_LEAST_GAP = 0.18  # Distance between tools at one height at which wrists are 20 mm apart [m].
+_CARRY_RAMP = 0.5  # Time to reach the speed, and time to stop [s].
+_LEAST_GAP = 0.18  # If tools are at equal heights and this far apart, the wrists are 20 mm apart [m].
 
 
 def carry(gap: float, speed: float, shortest: float = 3.0) -> WorkMotion:
-    """Return a motion of both tools in laps at ``speed`` [m/s], ``gap`` [m] apart.
+    """Return a motion in which both tools run laps at ``speed`` [m/s], and stay ``gap`` [m] apart.
 
-    The number of laps is the least whole number that takes ``shortest`` [s] or more.
+    The number of laps is whole. It is the smallest number of laps that take at least ``shortest`` [s].
     """
     rate = speed / _CARRY_RADIUS
     turn = 2.0 * math.pi * max(1, math.ceil(shortest * rate / (2.0 * math.pi)))
@@ -161,7 +173,7 @@ def carry(gap: float, speed: float, shortest: float = 3.0) -> WorkMotion:
 
 
 def _between_tools(home: Array, gap: float) -> Array:
-    """Return the positions of both tools moved sideways to the middle, ``gap`` [m] apart."""
+    """Return the ``home`` positions of both tools (2, 3) [m], moved sideways to ``gap`` [m] around the middle."""
     return np.column_stack((home[:, 0], 0.5 * gap * np.sign(home[:, 1]), home[:, 2]))
 
 
@@ -174,19 +186,20 @@ def _swapped(home: Array) -> Array:
 
 
 def _ahead(home: Array) -> Array:
-    """Return positions 0.80 m straight ahead, of which 0.73 m can be reached."""
+    """Return positions (2, 3) that are 0.80 m straight ahead. The tools can reach only 0.73 m."""
     return np.column_stack((np.full(2, 0.80), home[:, 1:]))
 
 
 def _met(home: Array) -> Array:
-    """Return positions in the middle, 30 mm nearer than each tool can get."""
+    """Return positions (2, 3) near the middle. Each tool would have to get 30 mm nearer to the middle than it can."""
     return _between_tools(home, 0.12)
 
 
-# Side by side, and past each other. The left tool is then behind the right arm, above the path of the right elbow.
+# The tools are side by side at the first positions, and have passed each other at the second positions. The left tool
+# is then behind the right arm, above the path of the right elbow.
 _APART = np.array([(0.30, 0.25, 0.40), (0.58, -0.25, 0.26)])
 _PAST = np.array([(0.30, -0.05, 0.40), (0.58, 0.05, 0.26)])
-# At the same x, so that the tools cannot pass each other.
+# Both tools have the same x, so that they cannot pass each other.
 _FACING = np.array([(0.44, 0.25, 0.33), (0.44, -0.25, 0.33)])
 _CROSSED = np.array([(0.44, -0.05, 0.33), (0.44, 0.05, 0.33)])
 _BEFORE_REACHING = np.array([(0.50, 0.05, 0.47), (0.50, -0.25, 0.30)])
@@ -196,20 +209,22 @@ _THROUGH = ((_PASSING, _CROSSED), (_PASSING, _PAST))
 
 
 def _oscillate(t: float, home: Array) -> Array:
-    """Return targets that swing sideways at 0.5 Hz between home and positions 0.06 m apart."""
+    """Return targets that swing sideways at 0.5 Hz, between home and positions that are 0.06 m from each other."""
     share = 0.5 * (1.0 - math.cos(math.pi * t))
     return home + share * (_between_tools(home, 0.06) - home)
 
 
-_SLIDING_HEIGHT = 0.2045  # 10 mm lower than allowed: fingers keep 1 mm from the table [m].
-_SLIDE_FROM = (0.50, 0.40)  # Start x and y [m].
-_SLIDE_WAY, _SLIDE_SPEED, _SLIDE_RAMP = 0.3, 0.2, 0.2  # Distance [m], speed [m/s], time to speed up and to stop [s].
+# The height of the sliding target [m]. It is 10 mm lower than the tool may get, since fingers keep 1 mm from the table.
+_SLIDING_HEIGHT = 0.2045
+_SLIDE_FROM = (0.50, 0.40)  # x and y at which the slide begins [m].
+# Length of the path [m], speed [m/s], and time to speed up, which is also the time to stop [s].
+_SLIDE_LENGTH, _SLIDE_SPEED, _SLIDE_RAMP = 0.3, 0.2, 0.2
 _RIGHT_ASIDE = (0.50, -0.25, 0.38)
 
 
 def _slide(t: float, home: Array) -> Array:
-    """Return a left target that slides sideways over the table, and a right target that stays aside."""
-    y = _SLIDE_FROM[1] - _uniform(t, _SLIDE_WAY, _SLIDE_SPEED, _SLIDE_RAMP)
+    """Return a left target that slides sideways over the table, and a right target that rests away from it (2, 3)."""
+    y = _SLIDE_FROM[1] - _uniform(t, _SLIDE_LENGTH, _SLIDE_SPEED, _SLIDE_RAMP)
     return np.array([(_SLIDE_FROM[0], y, _SLIDING_HEIGHT), _RIGHT_ASIDE])
 
 
@@ -233,7 +248,7 @@ _ALL = (
     WorkMotion(
         name="slide",
         about="the left tool slides 0.3 m over the table, asked to be 10 mm lower than it may",
-        duration=_SLIDE_WAY / _SLIDE_SPEED + _SLIDE_RAMP,
+        duration=_SLIDE_LENGTH / _SLIDE_SPEED + _SLIDE_RAMP,
         path=_slide,
         approach=(_slide(0.0, np.empty((2, 3))),),
         reachable=False,
@@ -248,7 +263,7 @@ def _circle(t: float, home: Array) -> Array:
     return home + np.array([0.0, 0.1 * math.sin(phase), 0.1 * (1.0 - math.cos(phase))])
 
 
-# The motions in which ticks are timed.
+# The motions in which the computing time of ticks is measured.
 TIMED_MOTIONS = (
     WorkMotion("free motion", "circles of 0.1 m radius at 0.5 Hz in free space", 3.0, _circle, rest=0.0),
     WorkMotion(

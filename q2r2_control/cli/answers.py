@@ -1,4 +1,4 @@
-"""Ask the questions of a command. Answers are kept until the command succeeds, and the next try offers them again."""
+"""Ask the questions of a command. Answers are stored until the command succeeds, and the next try offers them."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ Answer = TypeVar("Answer", float, str)
 
 
 class RememberedAnswers:
-    """Asks at a terminal, and keeps the answers that differ from the proposed ones in a ``file``.
+    """Asks questions at a terminal, and stores in ``file`` the answers that differ from the proposed answers.
 
-    ``about`` names the subject of the questions, such as models. Kept answers about another subject are not offered.
-    With ``yes``, each proposed answer is taken, and nothing is asked, offered or kept.
+    ``about`` is the subject of the questions, such as the models. Stored answers about another subject are not offered.
+    With ``yes``, each proposed answer is taken: nothing is asked, and no answer is stored.
     """
 
     def __init__(self, file: Path, about: Mapping[str, str], yes: bool = False) -> None:
         self.file, self._about, self._yes = file, dict(about), yes
         self._answers: dict[str, float | str] = {}
         if not yes:
-            with suppress(OSError, ValueError, TypeError, KeyError):  # The file may be missing or useless.
+            with suppress(OSError, ValueError, TypeError, KeyError):  # The file may be missing or damaged.
                 kept = json.loads(file.read_text(encoding="utf-8"))
                 if kept["about"] == self._about:
                     self._answers = dict(kept["answers"])
@@ -35,7 +35,7 @@ class RememberedAnswers:
         return bool(self._answers)
 
     def ask(self, question: str, usual: Answer) -> Answer:
-        """Ask a question, and return its answer. The answer of the earlier try is offered, or else ``usual``."""
+        """Ask a question, and return the answer. Enter alone takes the answer of the earlier try, or else ``usual``."""
         if self._yes:
             return usual
         earlier = self._answers.get(question)
@@ -43,18 +43,18 @@ class RememberedAnswers:
         offered = earlier if isinstance(earlier, kind) else usual
         answer: Any = typer.prompt(question, default=offered, type=kind)
         self._answers.pop(question, None)
-        if answer != usual:  # An answer equal to ``usual`` need not be kept: the next try finds it again.
+        if answer != usual:  # The next try proposes ``usual`` again, so it need not be stored.
             self._answers[question] = answer
         self._keep()
         return cast(Answer, answer)
 
     def drop(self, question: str) -> None:
-        """Do not offer the answer to a question again, because it was refused."""
+        """Remove the stored answer to a question, because the command refused the answer."""
         if self._answers.pop(question, None) is not None:
             self._keep()
 
     def forget(self) -> None:
-        """Remove the file, because the command succeeded. With ``yes`` it stays, because its answers were not used."""
+        """Remove the file, because the command succeeded. With ``yes`` it stays, because it was not used."""
         if not self._yes:
             with suppress(OSError):
                 self.file.unlink(missing_ok=True)
@@ -63,6 +63,6 @@ class RememberedAnswers:
         if not self._answers:
             self.forget()
             return
-        with suppress(OSError):  # Without the file, the answers are still valid for this try.
+        with suppress(OSError):  # If the file cannot be written, the answers are still valid for this try.
             kept = {"about": self._about, "answers": self._answers}
             self.file.write_text(json.dumps(kept, indent=4, ensure_ascii=False), encoding="utf-8")

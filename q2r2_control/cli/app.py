@@ -1,4 +1,4 @@
-"""The ``q2r2`` command, with everything that all commands of the table in ``commands`` share."""
+"""The ``q2r2`` command, with everything that its subcommands share. The module ``commands`` has their table."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from q2r2_control.errors import Q2R2Error
 # Depending on its version, typer raises click's exceptions or its own copy of them. This is the base class of both.
 _BadUsage: type[Exception] = typer.BadParameter.__mro__[2]
 
-_PARTS = "q2r2_control."  # Beginning of the names of modules, some of which an installation may leave out.
+_PARTS = "q2r2_control."  # The names of this package's modules begin with this. An installation may lack some of them.
 _INTERRUPTED = 130  # Exit code after Ctrl-C.
 
 
 class ErrorHandlingGroup(TyperGroup):
-    """All commands. Ctrl-C ends a command with exit code 130, and bad usage or a :class:`Q2R2Error` with 2.
+    """The group of all subcommands, which turns their errors into lines on stderr and exit codes.
 
-    Each fault is one line on stderr.
+    Ctrl-C ends a command with exit code 130. Bad usage and a :class:`Q2R2Error` end it with 2. Each fault is one line.
     """
 
     def __init__(self, **attributes: Any) -> None:
@@ -43,7 +43,7 @@ class ErrorHandlingGroup(TyperGroup):
                 formatter.write_dl([(command.name, command.about) for command in commands])
 
     def main(self, *args: Any, **extra: Any) -> Any:
-        """Run the command line; leaves by :class:`SystemExit`."""
+        """Run the command line. It always ends by raising :class:`SystemExit` with the exit code."""
         extra["standalone_mode"] = False
         messages: tuple[str, ...] = ("interrupted",)
         try:
@@ -51,7 +51,7 @@ class ErrorHandlingGroup(TyperGroup):
             if code != _INTERRUPTED:
                 sys.exit(code if isinstance(code, int) else 0)
         except (KeyboardInterrupt, typer.Abort):
-            code = _INTERRUPTED  # Newer versions of typer return it.
+            code = _INTERRUPTED  # Newer versions of typer return this code instead of raising an error.
         except Q2R2Error as error:
             code, messages = 2, error.faults
         except ModuleNotFoundError as error:
@@ -68,7 +68,7 @@ class ErrorHandlingGroup(TyperGroup):
 
 
 def _usage_fault(error: Any) -> str:
-    """Return what is wrong with an option or an argument, in the form that messages about a cell have."""
+    """Return a message about a wrong option or argument, in the same form as messages about a cell."""
     if not hasattr(error.__cause__, "errors"):  # Only pydantic's errors about values have this method.
         return str(error.format_message())
     from q2r2_control.config.strict import allowed_instead  # This import would double the time of the help.
@@ -89,7 +89,7 @@ app = typer.Typer(
 
 
 class _StderrHandler(logging.Handler):
-    """Writes to the current ``sys.stderr``, so that lines appear above a live table and not across it."""
+    """Writes the log to the current ``sys.stderr``. Thus lines appear above a live table, and not within the table."""
 
     def emit(self, record: logging.LogRecord) -> None:
         with suppress(OSError):  # The terminal may be closed.

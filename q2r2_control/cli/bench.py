@@ -194,7 +194,7 @@ def _seeds_of(report: SoakReport) -> str:
 
 
 def _soak_rows(report: SoakReport) -> Iterator[tuple[Cell, ...]]:
-    """Yield the worst margin of every promise, and how often it was broken."""
+    """Yield a row for every promise: its worst margin, and how often it was broken."""
     for margin in report.margins:
         name = Text(margin.name, style="red" if margin.violations else "")
         worst = "" if math.isinf(margin.worst) and not margin.violations else f"{margin.worst:.2g} {margin.unit}"
@@ -205,7 +205,10 @@ def _soak_rows(report: SoakReport) -> Iterator[tuple[Cell, ...]]:
 
 
 def _soak_notes(report: SoakReport, options: str) -> Iterator[str]:
-    """Yield counts, each promise's first violation, and the command with ``options`` that repeats the earliest one."""
+    """Yield lines below the table: counts, each promise's first violation, and a command.
+
+    The command, which has these ``options``, repeats the earliest violation.
+    """
     counted = COUNTED if "resets" in report.counts else POLICY_COUNTED
     yield ", ".join(f"{report.counts[name]} {what}" for name, what in counted.items())
     for found in report.broken:

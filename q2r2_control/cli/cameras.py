@@ -23,17 +23,17 @@ from q2r2_control.process.helper_process import reason_of
 from q2r2_control.process.scheduling import check_folder
 
 _MEASURED = 1.0  # Time over which the rate of a camera is measured [s].
-_LONGEST = 5.0  # Longest time to wait for the pictures of the time ``_MEASURED`` [s].
+_LONGEST = 5.0  # Longest time to wait for the last picture of this measurement [s].
 
 
 @dataclass(frozen=True, slots=True)
 class FoundDevice:
     """A V4L2 device or a RealSense camera of this computer."""
 
-    path: str  # The value for cameras.NAME.device.
+    path: str  # The value to write into the YAML as cameras.NAME.device.
     name: str
     formats: list[str]
-    fault: str | None  # Why it cannot be opened.
+    fault: str | None  # The reason why the device cannot be opened; None if it can.
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,11 +42,11 @@ class TriedCamera:
 
     name: str
     device: str
-    picture: str | None = None  # The file with its picture.
-    width: int | None = None  # [pixels]
-    height: int | None = None  # [pixels]
-    rate: float | None = None  # [pictures/s], from the times of their capture.
-    fault: str | None = None  # Why there is no picture.
+    picture: str | None = None  # The path of the file with the picture.
+    width: int | None = None  # Width of the picture [pixels].
+    height: int | None = None  # Height of the picture [pixels].
+    rate: float | None = None  # Pictures per second, computed from the times at which they were captured.
+    fault: str | None = None  # The reason why there is no picture; None if there is one.
 
     @property
     def line(self) -> str:

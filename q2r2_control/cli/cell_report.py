@@ -32,25 +32,26 @@ from q2r2_control.supervision.preflight import preflight_faults
 from q2r2_control.types import DeviceControls
 
 _NEAREST = 8
-_TICKS = 300  # Number of timed ticks.
+_TICKS = 300  # Number of ticks whose computing time is measured.
 
 
-# Figures of a joint: positions in rad, velocity in rad/s, torque in Nm; for a sliding joint m, m/s and N.
+# Figures of a joint: positions [rad], velocity [rad/s] and torque [Nm]. For a sliding joint, units are m, m/s and N.
 _JOINT = ("name", "lower", "home", "upper", "velocity", "torque")
 
 
 @dataclass(frozen=True, slots=True)
 class ArmCheck:
-    """One arm. ``tool_position`` [m] is in the world frame, at home."""
+    """The parts and limits of one arm. ``tool_position`` [m] is in the world frame, with the arm at home."""
 
     name: str
     model: str
-    flange: str | None  # Model or sizes of the flange.
+    flange: str | None  # The flange's model or its sizes; None without a flange.
     tool_model: str | None
     tool_frame: str
     tool_position: list[float]
     joints: list[dict[str, Any]]  # The figures of _JOINT by name.
-    object: str | None  # The object that counts as part of the tool while the gripper holds it.
+    # A text about the held object that counts as part of the tool while the gripper holds it; None if there is none.
+    object: str | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,35 +63,38 @@ class KeptPair(PairDistance):
 
 @dataclass(frozen=True, slots=True)
 class CellCheck:
-    """A cell as the controller sees it. Distances are those at home [m]. A good cell has no ``faults``."""
+    """The parts of a cell, as the controller uses them, and its faults. Distances are those at home [m].
+
+    A cell without faults has an empty tuple ``faults``.
+    """
 
     name: str
     arms: list[ArmCheck]
     obstacles: dict[str, ObstacleConfig]
     floor: float | None  # Height of the floor [m].
     monitored_pairs: int
-    ignored_pairs: tuple[tuple[str, str], ...]  # Pairs that overlap by construction.
+    ignored_pairs: tuple[tuple[str, str], ...]  # Pairs that are not monitored because they overlap by construction.
     min_distance: float
     contacts: tuple[ContactPair, ...]  # Pairs that may touch in torque mode.
-    nearest: list[KeptPair]  # The nearest pairs, the nearest first.
+    nearest: list[KeptPair]  # Some pairs with the smallest distances at home, in the order of their distances.
     faults: tuple[str, ...]
-    remedies: list[str]  # Lines for pairs that are too close at home: what to paste, and into which file.
-    stop_torques: tuple[StopTorque, ...]  # One for each arm.
+    remedies: list[str]  # For pairs that are too close at home: lines to paste, and the file to paste them into.
+    stop_torques: tuple[StopTorque, ...]  # The torques in a full stop, for each arm.
     driven: dict[str, str]  # The output to each arm's external controller; empty for the built-in controller.
-    controls: dict[str, str]  # The actions of each hand's controls.
-    notes: list[str]  # Lines that a user should know, but that are not faults.
+    controls: dict[str, str]  # By control of a hand, the action that the control causes.
+    notes: list[str]  # Lines that a user should read, but that are not faults.
     verdict: str  # One line that says whether the cell can run.
 
 
 def check_cell(config: Config) -> CellCheck:
-    """Build the cell and check it at home; raises :class:`Q2R2Error` if it cannot be built."""
+    """Build the cell, and check it with its arms at home. Raises :class:`Q2R2Error` if it cannot be built."""
     controls = getattr(load_class(INPUTS, config.input), "controls", None)
-    if isinstance(controls, DeviceControls):  # Other devices know their controls only when they are connected.
+    if isinstance(controls, DeviceControls):  # The controls of other devices are known only when they are connected.
         config.teleop.bindings.check_device(controls)
     load_class(PLANTS, config.plant)
     robot = Robot.from_config(config)
-    # The settings are checked with their pairs that may touch, so that each name and number is checked. The kept
-    # distances below are those of position mode, in which these pairs must not touch.
+    # Here the settings still contain the pairs that may touch, so that their names and numbers are checked too. The
+    # kept distances below are those of position mode, in which these pairs must not touch.
     check_settings(robot, config.control)
     settings = config.control.without_contact()
     kept = kept_distances(robot, settings)
@@ -110,7 +114,8 @@ def check_cell(config: Config) -> CellCheck:
     for allowed in config.control.contact_allowed:
         inside = f"the reference gets inside by up to {1e3 * allowed.depth:g} mm at {1e3 * allowed.speed:g} mm/s"
         notes.append(f"{' and '.join(allowed.pair)} may touch in torque mode: {inside}")
-    # No controller is built, because its kernels take minutes to compile. At rest its certificate would add nothing.
+    # No controller is built, because its kernels take minutes to compile. For arms at rest, its certificate would find
+    # no other faults.
     faults = (*preflight_faults(robot, settings, None), *_plant_faults(config, robot))
     return CellCheck(
         name=config.name,
@@ -138,7 +143,7 @@ def verdict_on(faults: Sequence[str]) -> str:
 
 
 def _plant_faults(config: Config, robot: Robot) -> list[str]:
-    """Return why the simulation cannot be built, for example because of an impossible inertia."""
+    """Return the reasons why the simulation cannot be built, for example an impossible inertia; empty if it can."""
     if config.plant != "mujoco":  # Other plants may open a device, which a check must not do.
         return []
     try:
@@ -157,10 +162,14 @@ def _notes_on_models(config: Config) -> list[str]:
 
 
 def _capsules_note(config: Config, robot: Robot) -> str:
-    """Return a note about links with several shapes: their number, and what they cost in pairs and in time."""
+    """Return a note about links with several shapes.
+
+    It has the number of shapes, the number of monitored pairs and the time of a tick, with and without these shapes.
+    """
     names = [link_of(item.name) for item in robot.collision_model.geometryObjects]
     shapes = ", ".join(f"{link} {names.count(link)}" for link in config.capsules)
-    settings = config.control.model_copy(update={"pairs": ()})  # Some pairs exist only with the shapes.
+    # Without the additional shapes, some pairs of ``control.pairs`` would not exist, so all of them are left out.
+    settings = config.control.model_copy(update={"pairs": ()})
     costs = []
     for its in (robot, Robot.from_config(config.model_copy(update={"capsules": {}, "control": settings}))):
         with notice_of_compiling():
@@ -174,7 +183,9 @@ def _capsules_note(config: Config, robot: Robot) -> str:
 
 
 def _stop_note(stop: StopTorque, shared: bool) -> str:
-    """Return a note: which joint of an arm needs more torque than its limit, how often, and how to change that.
+    """Return a note on the joint of an arm that exceeds its torque limit most.
+
+    It says how often a joint needs too much torque in random postures, and how to change that.
 
     ``shared`` is True if one model contains all arms. The names of joints then do not begin with the arm.
     """

@@ -49,7 +49,8 @@ if TYPE_CHECKING:
 
 _SHOWS_PICTURES = "show_picture"  # An input has this method if its device can show the run, as a headset can.
 _PERIOD = 1.0 / 30.0  # Period at which the window is drawn [s].
-_ON_PAGE, _IN_HEADSET = 5.0, 30.0  # Pictures per second: of all cameras together on a page; of one in a headset.
+# Most pictures per second: on a page, of all cameras together; in a headset, of the one camera that it shows.
+_ON_PAGE, _IN_HEADSET = 5.0, 30.0
 
 
 def check_window(plant: str | None) -> None:
@@ -83,19 +84,19 @@ def show_window(pipeline: Pipeline) -> None:
     pipeline.listeners.append(show)
 
 
-_EARLY = 0.1  # A run counts as stopped if it ends more than this before its planned end [s].
+_EARLY = 0.1  # If a run ends earlier than its planned end by more than this, somebody stopped it [s].
 
 
 @dataclass(frozen=True, slots=True)
 class RunOptions:
     """The choices of the user on the command line."""
 
-    name: str  # Name of the run, for the folder of its recording and for titles.
+    name: str  # Name of the run. It is used in titles and in the name of the recording's folder.
     input: str
     plant: str
     mode: str
     duration: float | None  # Duration of the run [s]; None for a run until Ctrl-C.
-    fast: bool  # Whether simulated time runs as fast as possible, not paced by the clock.
+    fast: bool  # Whether simulated time runs as fast as possible. Otherwise it is not faster than real time.
     input_options: Mapping[str, object]  # The options of the input, by name.
     table: bool  # Whether a live table is shown.
     window: bool  # Whether the plant's window is opened.
@@ -106,12 +107,13 @@ class RunOptions:
     record: Path | None = None  # Folder of recordings; None for no recording.
     notes: Mapping[str, str] = field(default_factory=dict)  # Notes for the recording, by name.
     anonymous: bool = False  # Whether the recording leaves out the operator and the computer's name.
-    longest_wait: float = SCRIPTS_WAIT_S  # Longest wait of a plant for a person, such as one at a cabinet [s].
-    page: tuple[str, int, Path | None] | None = None  # Host and port of the page in the browser, and its certificate.
+    longest_wait: float = SCRIPTS_WAIT_S  # Longest time for which a plant waits for a person at a cabinet [s].
+    # For a page in the browser: its host, its port, and the path of its certificate or None. None for no page.
+    page: tuple[str, int, Path | None] | None = None
 
     @property
     def simulated_time(self) -> bool:
-        """True if the run needs no real time, because neither a person's hands nor a real plant take part."""
+        """True if the run can be in simulated time, because it needs neither a person's hands nor a real plant."""
         inputs = filter(None, (self.input, self.input_options.get("takeover")))
         is_simulated_plant = bool(getattr(load_class(PLANTS, self.plant), "simulated", False))
         return self.fast or (is_simulated_plant and all(is_simulated(str(name)) for name in inputs))
@@ -138,30 +140,30 @@ class CellRun:
 
 
 def run_cell(config: Config, options: RunOptions) -> CellRun:
-    """Run a cell and report on stderr; raises :class:`Q2R2Error` if it cannot run with these options."""
+    """Run a cell, and print lines about the run on stderr. Raises :class:`Q2R2Error` if ``options`` do not allow it."""
     if config.controller is ControllerKind.EXTERNAL:
         builtin = "this command runs controller: builtin only"
         raise ConfigError(f"{config.name}: controller: external is driven by q2r2 ros up; {builtin}")
     if options.window:
         check_window(options.plant)
-    # The processes start before the pipeline is built, because building it takes longer than their start.
+    # The processes of the cameras start first. They start up while the pipeline is built, which takes longer.
     with _opened_devices(config, options) as streams:
         if options.page is None:
             return _run_recorded(config, options, None, streams)
-        from q2r2_control.viewer.web.view import PageView  # A run without a page needs no files of pages.
+        from q2r2_control.viewer.web.view import PageView  # A run without a page does not need this module.
 
         with PageView(*options.page) as page:
             return _run_recorded(config, options, page, streams)
 
 
 def _opened_devices(config: Config, options: RunOptions) -> AbstractContextManager[CameraStreams | None]:
-    """Open the real cameras whose pictures are recorded, shown or observed; None if there are none."""
+    """Open all real cameras if pictures are recorded, shown or given to the input; otherwise return None for them."""
     source = load_class(INPUTS, options.input)
     sees = any(hasattr(source, method) for method in (_SHOWS_PICTURES, PolicySource.observe.__name__))
     used = not options.fast and (options.record is not None or options.page is not None or sees)
     if not (used and config.device_cameras):
         return nullcontext()
-    from q2r2_control.cameras.camera_streams import CameraStreams  # Other runs need no files of cameras.
+    from q2r2_control.cameras.camera_streams import CameraStreams  # Other runs do not need this module.
 
     return CameraStreams(config.device_cameras)
 
@@ -169,7 +171,7 @@ def _opened_devices(config: Config, options: RunOptions) -> AbstractContextManag
 def _run_recorded(config: Config, options: RunOptions, page: PageView | None, streams: CameraStreams | None) -> CellRun:
     if options.record is None:
         return _run_cell(config, options, None, page, streams)
-    from q2r2_control.cli.run_recording import RunRecording  # A run without --record needs no files of recordings.
+    from q2r2_control.cli.run_recording import RunRecording  # A run without --record does not need this module.
 
     devices = () if streams is None else tuple(streams.streams)
     with RunRecording(options.record, options, config, devices) as recording:
@@ -190,7 +192,7 @@ def _run_cell(
     try:
         plant = make_plant(options.plant, robot, config)
     except PlantError as error:
-        if options.plant != "mujoco":  # For the simulation only, q2r2 check reports the same fault.
+        if options.plant != "mujoco":  # The message below is that of q2r2 check, which checks only the simulation.
             raise
         raise PlantError(f"{config.name}: FAULT plant {options.plant}: {error}") from error
     if isinstance(plant, WaitingPlant):
@@ -203,11 +205,11 @@ def _run_cell(
             faults = pipeline.preflight_faults()
         return _run_pipeline(pipeline, faults, options, recording, page, streams, console)
     finally:
-        plant.close()  # This is necessary even if no run began: an open window would crash the process at its end.
+        plant.close()  # It is necessary even if no run began: an open window would crash the ending process.
 
 
 def _open_window(plant: Plant) -> None:
-    """Show the arms at home before the controller is built, which takes long if its kernels have to be compiled."""
+    """Show the arms at home while the controller is built, which takes minutes if its kernels have to be compiled."""
     if isinstance(plant, MujocoPlant):
         plant.launch_viewer()
         plant.viewer_say("preparing the controller")
@@ -257,7 +259,10 @@ def _run_pipeline(
 
 
 def print_summary(run: CellRun, json: bool, verbose: bool = False) -> None:
-    """Print the verdicts on a run, its tasks and its recording, and the summary, on stdout; or one JSON object."""
+    """Print on stdout the verdicts on a run, its tasks and its recording, and the summary.
+
+    With ``json``, print all of them as one JSON object.
+    """
     if json:
         data = run.summary.as_json()
         if run.tasks:
@@ -311,7 +316,7 @@ def _run(
             pipeline.listeners.append(table)
             stack.enter_context(table.shown(console))
         else:
-            # On a slow computer, the run may take minutes, in which nothing else is printed.
+            # Without this line, nothing would be printed during the run, which may take minutes on a slow computer.
             kind = "simulated time" if options.simulated_time else "real time"
             lasts = "until Ctrl-C" if options.duration is None else f"{options.duration:g} s"
             is_shown = options.window or page is not None or options.input == "webxr"
@@ -345,9 +350,11 @@ def _run(
 def _lookers(
     pipeline: Pipeline, page: PageView | None, names: Sequence[str]
 ) -> Iterator[tuple[str, float, Callable[[bytes], object], Callable[[], bool]]]:
-    """Yield, for each view: camera, most pictures per second, function that shows one, and whether somebody looks.
+    """Yield four items for each camera that a headset or a page shows.
 
-    ``names`` are the names of all cameras with pictures. A headset shows only the first camera.
+    The items are: the camera's name; the largest number of pictures per second; a function that shows a picture; and a
+    function that returns whether somebody looks. ``names`` are the names of all cameras with pictures. A headset shows
+    only the first camera.
     """
     source: Any = pipeline.input
     if hasattr(source, _SHOWS_PICTURES):

@@ -12,7 +12,7 @@ from q2r2_control.robot.robot import Robot
 
 
 def commented_yaml(data: Mapping[str, Any], robot: Robot) -> str:
-    """Return the YAML of a cell's ``data``, from which ``robot`` was built."""
+    """Return the ``data`` of a cell as YAML with comments. ``robot`` is the robot of this cell."""
     lines = [
         "# Written by q2r2 new-cell; change what is not true. config/dual_iiwa7.yaml explains every key.",
         f"name: {_flow(data['name'])}",
@@ -54,5 +54,5 @@ def commented_yaml(data: Mapping[str, Any], robot: Robot) -> str:
 
 
 def _flow(value: Any) -> str:
-    """Return a value as YAML on one line."""
+    """Return a value as YAML in one line."""
     return str(yaml.safe_dump([value], default_flow_style=True, sort_keys=False, width=math.inf)).strip()[1:-1]

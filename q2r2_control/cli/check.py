@@ -24,19 +24,19 @@ from q2r2_control.viewer.tables import figure_table, print_table
 
 @dataclass(frozen=True, slots=True)
 class PairsWritten:
-    """Sampled nearest approaches of the monitored pairs of links. Distances are in metres."""
+    """The smallest distances of the monitored pairs of links in random postures [m]."""
 
     file: str
     samples: int
     clearance: float
-    never: tuple[PairReach, ...]  # Pairs that stay farther apart than the clearance, the farthest last.
-    watched: tuple[PairReach, ...]  # The other pairs, the nearest first.
+    never: tuple[PairReach, ...]  # The pairs that stay farther apart than ``clearance``, with the farthest pair last.
+    watched: tuple[PairReach, ...]  # All other pairs, with the nearest pair first.
 
 
 def write_pairs(
     config: Config, file: Path, samples: int, clearance: float, progress: Progress | None = None
 ) -> PairsWritten:
-    """Sample which pairs of a cell can meet, and write those that cannot as an SRDF to a new ``file``.
+    """Find, in random postures, which pairs of a cell can meet. Write the other pairs as an SRDF into a new ``file``.
 
     Raises :class:`ConfigError` if the file exists, or if the clearance is not above all distances in ``control``.
     """
@@ -93,7 +93,7 @@ def check(
 
 @contextmanager
 def _verdict_on_refusal(file: str, json: bool) -> Iterator[None]:
-    """Print the faults of a cell that cannot even be built, and the verdict. The exit code is 2, as for all errors."""
+    """If the cell cannot be built, print its faults and the verdict. The exit code is 2, as for all errors."""
     try:
         yield
     except Q2R2Error as error:
@@ -105,7 +105,7 @@ def _verdict_on_refusal(file: str, json: bool) -> Iterator[None]:
 
 
 def _print_cell(cell: CellCheck) -> None:
-    """Print the arms, their torques in a stop, obstacles, the nearest pairs, and the actions of the hands' controls."""
+    """Print the arms, their torques in a stop, the obstacles, the nearest pairs, and what each hand's controls do."""
     console = Console(highlight=False, soft_wrap=True)
     console.print(f"cell {cell.name}")
     for table in _cell_tables(cell):

@@ -14,7 +14,7 @@ class ListedCommand(NamedTuple):
     """A command as the help of ``q2r2`` lists it, and where its function is."""
 
     name: str
-    at: str  # Module in this package, and the name of the function or Typer in it.
+    at: str  # The command's module in this package, and the name of its function or Typer in that module.
     about: str  # First sentence of the function's docstring.
     group: str = ""  # Heading in the help.
     example: str = ""  # Example of a call, for a command without subcommands.
@@ -158,14 +158,14 @@ COMMANDS = (
 
 
 class CommandOnDemand(TyperCommand):
-    """A command whose module is imported only to parse its arguments. The help needs only its line in the table."""
+    """A command whose module is imported only when it is called. The help of ``q2r2`` does not need the module."""
 
     def __init__(self, command: ListedCommand) -> None:
         super().__init__(command.name, help=command.about)
         self._command = command
 
     def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
-        """Parse ``args`` by the command itself, and return a context that calls it."""
+        """Let the command itself parse ``args``. Return a context that calls the command."""
         return load(self._command).make_context(info_name, args, parent, **extra)
 
 

@@ -35,25 +35,28 @@ from q2r2_control.types import SIDES, Array, CommandMode
 from q2r2_control.viewer.tables import figure_table, print_table, record_table
 
 _MOST_LOST = 0.01  # Largest share of a cabinet's messages that may be lost.
-_POINTS = 3  # Number of points that both tips touch.
+_POINTS = 3  # Number of points that both tools' tips touch.
 _GUIDED = 1.0  # A joint counts as guided by hand if it has moved by more than this [deg].
 _Measured = TypeVar("_Measured")
 
 
 class _Commissioning:
-    """The dialogue with the operator. Each step returns its figures, or raises :class:`Q2R2Error` if it fails."""
+    """The steps of commissioning, with their questions to the operator.
+
+    Each step returns its figures, or raises :class:`Q2R2Error` if it is not passed.
+    """
 
     def __init__(self, file: Path, duration: float, tip: tuple[float, float, float]) -> None:
         self.file, self.config = file, load_config(file)
         self._duration, self._tip, self._console = duration, np.array(tip), Console(stderr=True)
         self._robot = Robot.from_config(self.config)
         self._plant = FriPlant(self._robot, self.config)
-        self.step = ""  # The current step.
+        self.step = ""  # The name of the current step.
         self.seen: dict[str, Any] = {}
-        self._repeats = 0  # Count of repeated measurements.
+        self._repeats = 0  # Number of measurements that the operator repeated.
 
     def run(self, stack: ExitStack) -> None:
-        """Do all steps. ``stack`` closes the connection to the cabinets at the end."""
+        """Do all steps. Closing ``stack`` also closes the connection to the cabinets."""
         self._plant.begin(CommandMode.POSITION)
         stack.callback(self._plant.close)
         self._do("cabinets", f"listens for {self._duration:g} s, and moves nothing", self._cabinets)
@@ -73,7 +76,7 @@ class _Commissioning:
         self._do("kill", "both tools go up for two seconds, and the program that leads them is killed", self._kill)
 
     def signed(self) -> dict[str, Any]:
-        """Ask for the operator's name, and return the sign-off."""
+        """Ask for the operator's name, and return the content of the sign-off."""
         self.step = "sign-off"
         name = ""
         while not name:
@@ -114,7 +117,10 @@ class _Commissioning:
         return {arm: self._guided(arm) for arm in self._robot.arms}
 
     def _guided(self, arm: str) -> dict[str, Any]:
-        """Let the operator guide an arm by hand and confirm its joints; return the changes."""
+        """Let the operator guide an arm by hand, and confirm the joints that changed.
+
+        Return whether a joint moved, the change of each joint [deg], and the displacement of the tool [mm].
+        """
         joints = self._robot.arms[arm].joints
         names = [self._robot.joint_names[joint] for joint in joints]
         start = postures_over(self._plant, 0.1)[-1]
@@ -211,7 +217,10 @@ class _Commissioning:
         return [asdict(report) for report in reports]
 
     def _resting(self) -> Array:
-        """Return the posture (nv,) [rad] of arms without commands; raises :class:`PlantError` if they move."""
+        """Return the measured posture (nv,) [rad] while no commands are sent.
+
+        Raises :class:`PlantError` if the arms move.
+        """
         self._plant.reset()
         try:
             seen = postures_over(self._plant, REST)
@@ -222,7 +231,10 @@ class _Commissioning:
         return np.asarray(seen[-1])
 
     def _tried(self, measure: Callable[[], _Measured], run: SlowRun | None = None) -> _Measured:
-        """Return the result of ``measure``. If it fails, for example by a lost session, the operator may repeat it."""
+        """Return the result of ``measure``. If it raises an error, the operator may repeat it.
+
+        If the error has ended ``run``, it is raised again.
+        """
         while True:
             try:
                 return measure()
@@ -235,7 +247,7 @@ class _Commissioning:
                 self._repeats += 1
 
     def _ask(self, question: str, *allowed: str) -> str:
-        """Ask the operator a question, and return the answer: one of ``allowed``, or any line if none is given."""
+        """Ask the operator a question, and return the answer. Without ``allowed`` answers, any line is an answer."""
         say(f"{question} [{'/'.join(allowed)}]" if allowed else question, self._console)
         while line := sys.stdin.readline():
             answer = line.strip()

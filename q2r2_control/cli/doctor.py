@@ -1,4 +1,4 @@
-"""``q2r2 doctor``: report what this computer lacks, with the command that helps."""
+"""``q2r2 doctor``: report what this computer lacks, and the command that installs or corrects it."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from q2r2_control.ros.watching.findings import Finding, error
 
 _PACKAGE = "q2r2_control"
 
-# What does not work without the packages of each extra. The extra ros has findings of its own.
+# By the name of an extra, what does not work without its packages. The extra ros has its own function, _ros.
 _NEEDS_EXTRA = {
     "web": "no --web, no --input webxr",
     "export": "no q2r2 export hdf5 and lerobot-v2.1",
@@ -78,14 +78,14 @@ def doctor(
 
 
 def _packages(required: Iterable[str]) -> Iterator[Finding]:
-    """Yield the requirements in ``required`` that are not met. Requirements of extras do not count."""
+    """Yield a finding for each requirement in ``required`` that is not met. Requirements of extras do not count."""
     for requirement, found in _unmet(required):
         what = f"{requirement.name}: {found} is installed; needed: {requirement.specifier}"
         yield error(what, f"{sys.executable} -m pip install '{requirement.name}{requirement.specifier}'")
 
 
 def _extras(required: Iterable[str]) -> Iterator[Finding]:
-    """Yield the extras whose requirements in ``required`` are not all met."""
+    """Yield a finding for each extra that has an unmet requirement in ``required``."""
     required = tuple(required)
     for extra, lacks in _NEEDS_EXTRA.items():
         if names := [requirement.name for requirement, _ in _unmet(required, extra)]:
@@ -93,7 +93,7 @@ def _extras(required: Iterable[str]) -> Iterator[Finding]:
 
 
 def _unmet(required: Iterable[str], extra: str = "") -> Iterator[tuple[Requirement, str]]:
-    """Yield each unmet requirement of the package, or of its ``extra``, with the installed version."""
+    """Yield each unmet requirement of the package, or of its ``extra``, with the installed version or "none"."""
     for requirement in map(Requirement, required):
         marker = requirement.marker
         needed_by = [name for name in ("", extra) if marker is None or marker.evaluate({"extra": name})]
@@ -108,7 +108,7 @@ def _unmet(required: Iterable[str], extra: str = "") -> Iterator[tuple[Requireme
 
 
 def _ros() -> Iterator[Finding]:
-    """Yield what is missing for the ROS nodes. Nothing else needs ROS."""
+    """Yield a finding if something is missing for the ROS nodes. All other parts work without ROS."""
     if importlib.util.find_spec("rclpy") is None:
         cure = f"{install_line('ros')}, or source a ROS 2 Jazzy, if you want them"
         yield Finding(False, "rclpy cannot be imported: no ROS nodes", cure)
@@ -117,7 +117,7 @@ def _ros() -> Iterator[Finding]:
 
 
 def _ports(cell: Config) -> Iterator[Finding]:
-    """Yield the ports of the cell's input and plant on which this computer cannot listen."""
+    """Yield a finding for each port of the cell's input and plant on which this computer cannot listen."""
     wanted = [("headset", socket.SOCK_STREAM, cell.headset.host, cell.headset.port)]
     wanted += [(f"fri.{arm}", socket.SOCK_DGRAM, "0.0.0.0", its.port) for arm, its in cell.fri.items()]
     for key, kind, host, port in wanted:

@@ -32,14 +32,19 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import CommandMode
 from q2r2_control.viewer.tables import figure_table
 
-_JUDGED_EVERY = 0.005  # Time between two judgements of tasks. They are too rare to make a cabinet late [s].
-_LOOKS, _LONGEST_LINES = 0.05, 1 << 16  # Time between two reads of printed lines [s], largest size of these [B].
+# Time between two judgements of tasks [s]. At this rate, they do not make a cabinet late.
+_JUDGED_EVERY = 0.005
+# The lines that the cabinets print: time between two readings [s], and the largest size of all lines [bytes].
+_LOOKS, _LONGEST_LINES = 0.05, 1 << 16
 _SAFETY_STOP = 1.0  # Duration of a safety stop [s].
 _KINDS = {CommandMode.POSITION: CommandKind.POSITION, CommandMode.TORQUE: CommandKind.TORQUE}
 
 
 class Pendant:
-    """The operator at the cabinets: starts the overlays, sometimes stops the first cabinet, and prints the states."""
+    """Acts as the operator at the pendants of the cabinets, and prints the states of the sessions.
+
+    It starts the overlays. After the given times in a session, it ends the session of the first cabinet.
+    """
 
     def __init__(
         self,
@@ -91,7 +96,7 @@ class Pendant:
 
 
 def _enter_pressed() -> bool:
-    """Return whether a line was entered. A background process must not read: the terminal would stop it."""
+    """Return whether Enter was pressed. A background process does not read, because the terminal would stop it."""
     try:
         is_ours = os.tcgetpgrp(0) == os.getpgrp()
     except OSError:  # There is no terminal.
@@ -144,10 +149,10 @@ def fri_cabinet(
 ) -> None:
     """Simulate the Sunrise cabinets of a cell, whose arms q2r2 run --plant fri can drive.
 
-    Start q2r2 run CONFIG --plant fri in another terminal.     Like a real one, each cabinet goes through the states of
-    a session, guards the limits of its arm, and ends the session of a client that breaks a limit. The Enter key stands
-    for the key of the pendant: it stops and starts the overlays. This is only a rehearsal, because KUKA's own
-    controller and its safety functions are not simulated.
+    Start q2r2 run CONFIG --plant fri in another terminal. As a real cabinet does, each simulated cabinet goes through
+    the states of a session, guards the limits of its arm, and ends the session of a client that breaks a limit. The
+    Enter key stands for the key of the pendant: it stops and starts the overlays. This is only a rehearsal, because
+    KUKA's own controller and its safety functions are not simulated.
     """
     cell, console, stop = load_config(config), Console(stderr=True), StopRequest()
     if mode not in _KINDS:
@@ -161,7 +166,7 @@ def fri_cabinet(
         every = right_period if arm == "right" and right_period is not None else period
         cabinets[str(arm)] = settings_of(robot, arm, _KINDS[mode], its.version or fri, 1e-3 * every, multiplier)
         client = clients[str(arm)] = address_for(its.address) or "127.0.0.1", its.port
-        # KUKA's cabinet sends from the port of its client. At one address, two programs cannot have the same port.
+        # A cabinet of KUKA sends from the same port as its client has. At one address, this is not possible.
         port = 0 if its.address == client[0] else its.port
         origins[str(arm)] = its.address, port if source_port is None else source_port
     grippers = {str(arm): its.gripper for arm, its in cell.fri.items() if isinstance(its.gripper, GripperIoConfig)}
@@ -204,11 +209,11 @@ def fri_cabinet(
 
 
 def wait_for_states(child: subprocess.Popen[str], lines: int, count: int) -> None:
-    """Wait until the process of the cabinets has printed, for ``count`` arms, that it sends messages.
+    """Wait until the process ``child`` has printed, for ``count`` arms, that their cabinets send messages.
 
-    ``lines`` is the descriptor of the file into which it prints. Raises :class:`PlantError` if the process ends before.
+    ``lines`` is the descriptor of the file into which the process prints. Raises :class:`PlantError` if it ends before.
     """
-    said = ""  # The file is read at position 0: a normal read would move the position at which the process writes.
+    said = ""  # All printed lines. They are read by ``pread``, because ``read`` would move the process's own position.
     while said.count(in_words(Session.MONITORING_WAIT)) < count:
         if child.poll() is not None:
             raise PlantError(f"the cabinets that stand in have ended: {said.strip() or 'without a word'}")
@@ -220,10 +225,10 @@ def wait_for_states(child: subprocess.Popen[str], lines: int, count: int) -> Non
 def rehearsal(
     config: str, mode: CommandMode, tasks: Sequence[AssemblyTask], period: float, rt: bool
 ) -> Iterator[list[TaskResult]]:
-    """Run the cabinets of a cell in a separate process. The context begins when all of them send messages.
+    """Run the simulated cabinets of a cell in a separate process. The context begins when all of them send messages.
 
-    At the end, the yielded list contains the results of the ``tasks``, which the cabinets measured. ``period`` is the
-    time between two messages [ms].
+    Yield an empty list. When the context ends, the results of the ``tasks`` are added to the list. The process of the
+    cabinets has measured them. ``period`` is the time between two messages [ms].
 
     Raises:
         PlantError: If the cabinets cannot begin, ended a session or gave no result.
@@ -259,7 +264,7 @@ def rehearsal(
     except ValueError:
         raise PlantError("the cabinets that stand in have failed; q2r2 fri-cabinet says why") from None
     for arm, cabinet in told["cabinets"].items():
-        # The last trip may be LATE, because the cabinet gets no more answers after the end of our run.
+        # The last entry may be LATE, because the cabinet gets no more answers after the end of our run.
         if cabinet["trips"][:-1] or cabinet["trips"][-1:] not in ([], [Trip.LATE]):
             raise PlantError(f"{arm}: the cabinet ended the session: {', '.join(cabinet['trips'])}")
     results += [TaskResult(**result) for result in told["tasks"]]

@@ -29,26 +29,29 @@ _LARGE_JITTER = 0.5  # Jitter that causes a note, as a share of the period.
 
 @dataclass(frozen=True, slots=True)
 class CabinetReport:
-    """Figures of one cabinet's messages, and the states in its newest message, in words."""
+    """Figures of one cabinet's messages, and the states that its newest message has, in words."""
 
     arm: str
     fri_version: int
     period_ms: float
     messages: int
     lost: int
-    jitter_ms_p99: float  # Deviation of the time between two messages from the cabinet's period.
+    jitter_ms_p99: float  # Absolute deviation of the time between two messages from the cabinet's period.
     jitter_ms_max: float
     session: str
     quality: str
     safety: str
     operation: str
     drives: str
-    joints_deg: list[float]  # Measured positions.
-    external_torque_nm: float | None  # The largest external torque of a joint.
+    joints_deg: list[float]  # Measured joint positions.
+    external_torque_nm: float | None  # The largest absolute external torque of a joint; None if it is not sent.
 
 
 def cabinet_report(arm: str, heard: Sequence[tuple[Monitoring, float]], lost: int) -> CabinetReport:
-    """Return the report on the messages ``heard``: at least one, each with its time of arrival [s], in their order."""
+    """Return the report on the messages ``heard``, in their order, each with its time of arrival [s].
+
+    There must be at least one message. ``lost`` is the number of lost messages.
+    """
     newest = heard[-1][0]
     counters = np.array([message.counter for message, _ in heard])
     late = np.abs(np.diff([came for _, came in heard]) - np.diff(counters) * newest.period)
@@ -75,8 +78,8 @@ class Heard:
     """Messages of the cabinets over some seconds, and the delays of the answers."""
 
     cabinets: list[CabinetReport]
-    answers: Array  # Time from the arrival of each message until its answer was sent [s].
-    fault: Reason | None  # The reason why the arms could not be commanded at the end.
+    answers: Array  # (n,) Time from the arrival of each message until its answer was sent [s].
+    fault: Reason | None  # The reason why the arms could not be commanded at the end; None if they could.
     notes: list[str]
 
     def table(self, duration: float) -> Table:
@@ -85,7 +88,10 @@ class Heard:
 
 
 def listen(plant: FriPlant, duration: float, asked: Callable[[], bool] = lambda: False) -> Heard:
-    """Listen to the cabinets of a plant that was reset, for ``duration`` [s] or until ``asked`` returns True."""
+    """Listen to the cabinets of a plant that was reset, and return the figures of their messages.
+
+    It listens for ``duration`` [s], or until ``asked`` returns True, for example after Ctrl-C.
+    """
     heard: dict[str, list[tuple[Monitoring, float]]] = {arm: [] for arm in plant.states()}
     end = time.monotonic() + duration
     while (now := time.monotonic()) < end and not asked():

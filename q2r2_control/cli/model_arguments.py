@@ -15,7 +15,10 @@ SPEEDS = 0.01, 10.0  # Allowed range of a joint's speed limit [rad/s].
 
 
 def named_values(given: list[str]) -> dict[str, str]:
-    """Return the values of texts NAME=VALUE, by name; raises :class:`ConfigError` if a text has another form."""
+    """Split texts NAME=VALUE, and return the values by name.
+
+    Raises :class:`ConfigError` if a text has another form.
+    """
     for text in given:
         if not text.partition("=")[0].strip() or "=" not in text:
             raise ConfigError(f"--xacro-arg {text!r:.80}: allowed: NAME=VALUE")
@@ -25,7 +28,18 @@ def named_values(given: list[str]) -> dict[str, str]:
 def without_mjcf(
     models: dict[str, str], name: str, velocity: float | None, yes: bool, answers: RememberedAnswers
 ) -> dict[str, str]:
-    """Write a URDF for each MJCF file; return the models with the URDF in its place; raises :class:`Q2R2Error`."""
+    """Convert each MJCF file among the models to a URDF file, and return the models with these URDF files.
+
+    Args:
+        models: The models, by side or "robot".
+        name: The name of the cell, with which the names of the URDF files begin.
+        velocity: The speed limit of all joints [rad/s], which MJCF does not have; None to ask for it.
+        yes: True if no question may be asked.
+        answers: Asks the question.
+
+    Raises:
+        Q2R2Error: If a file cannot be converted, or if an argument is missing or wrong.
+    """
     sides = {model: side for side, model in reversed(models.items()) if model.endswith(MJCF_ENDS)}
     files = {model: Path(f"{name}_{side}.urdf") for model, side in sides.items()}
     for model, file in files.items():

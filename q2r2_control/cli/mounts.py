@@ -26,9 +26,9 @@ from q2r2_control.viewer.tables import figure_table
 from q2r2_control.wording import sentence
 
 Tip = Annotated[tuple[float, float, float], Option(help="Point of each tool that touches, in the tool's frame [m].")]
-_FEWEST = 3  # Least number of points.
-_MOST_APART = 5.0  # Largest distance after the fit between tips that touched the same point [mm].
-_BEYOND = 0.1  # A joint farther beyond its limits than this was probably not written in radians [rad].
+_FEWEST = 3  # Least number of points that both tips have to touch.
+_MOST_APART = 5.0  # Largest allowed distance, after the fit, between two tips that touched the same point [mm].
+_BEYOND = 0.1  # If a joint is farther beyond its limits than this, it was probably not written in radians [rad].
 _STILL, _LISTENS = 2e-3, 0.5  # Joints at rest move less than this angle [rad] in this time [s].
 
 
@@ -36,15 +36,15 @@ _STILL, _LISTENS = 2e-3, 0.5  # Joints at rest move less than this angle [rad] i
 class MountReport:
     """The mount of the right arm that fits best, and the errors of the fit."""
 
-    position: list[float]  # [m]
-    rpy: list[float]  # [rad]
-    moved_mm: float  # Distance from the mount in the cell.
-    turned_deg: float  # Angle from the mount in the cell.
-    off_mm: list[float]  # Distance between the tips at each point.
+    position: list[float]  # Position of the mount in the world frame [m].
+    rpy: list[float]  # Roll, pitch and yaw of the mount in the world frame [rad].
+    moved_mm: float  # Distance between this mount and the mount in the cell.
+    turned_deg: float  # Angle between this mount and the mount in the cell.
+    off_mm: list[float]  # Distance that remains between the tips at each point.
 
     @property
     def fault(self) -> str | None:
-        """The reason why this mount must not be used, or None."""
+        """The reason why this mount must not be used; None if it may be used."""
         if (worst := max(self.off_mm)) <= _MOST_APART:
             return None
         cure = "see to --tip, and touch points that do not move"
@@ -64,9 +64,12 @@ class MountReport:
 
 
 def mount_report(config: Config, points: Array, touched: Array) -> MountReport:
-    """Fit the right arm's mount. With it, the positions ``touched`` of the right tip match ``points`` of the left tip.
+    """Find the mount of the right arm with which both tips touched the same points, as nearly as possible.
 
-    Both arrays (n, 3) are in the world frame of the cell [m].
+    Args:
+        config: The cell, with the mounts that were used to compute the positions.
+        points: Positions of the left tip in the world frame of the cell (n, 3) [m].
+        touched: Positions of the right tip at the same points, in the same frame (n, 3) [m].
     """
     move, off = fit_move(points, touched)
     before = next(arm.mount for side, arm in config.arms.items() if side == SIDES[1])
@@ -135,7 +138,10 @@ def _print(report: MountReport, json: bool) -> None:
 def measure_mount(
     plant: FriPlant, config: Config, robot: Robot, points: int, tip: Array, console: Console
 ) -> MountReport:
-    """Let the operator touch ``points`` with both tips, and fit the mount; ``tip`` (3,) is in each tool's frame [m]."""
+    """Let the operator touch a number of ``points`` with both tips, and fit the right arm's mount.
+
+    ``tip`` (3,) is the position of the tip in each tool's frame [m].
+    """
     tips: dict[str, list[Array]] = {arm: [] for arm in SIDES}
     for number in range(1, points + 1):
         for arm in SIDES:
@@ -145,7 +151,7 @@ def measure_mount(
 
 
 def _written(file: Path, robot: Robot) -> Array:
-    """Read the postures (n, nv) [rad] from a text file; raises :class:`ConfigError`."""
+    """Read the postures (n, nv) [rad] from a text file. Raises :class:`ConfigError` if the file is not usable."""
     joints = np.concatenate([robot.arms[arm].joints for arm in SIDES])
     allowed = f"lines of {len(joints)} numbers in radians: {', '.join(robot.joint_names[joint] for joint in joints)}"
     try:
@@ -182,7 +188,10 @@ def _written(file: Path, robot: Robot) -> Array:
 
 
 def _resting(plant: FriPlant, arm: str, robot: Robot, console: Console) -> Array:
-    """Wait until Enter is pressed while ``arm`` is at rest, and return the mean posture (nv,) of all arms [rad]."""
+    """Wait until Enter is pressed while ``arm`` is at rest. Return the mean measured posture of all arms (nv,) [rad].
+
+    If ``arm`` moves, the operator has to press Enter again.
+    """
     while True:
         if not sys.stdin.readline():
             raise ConfigError("no more input; allowed: Enter for each point")
@@ -194,7 +203,10 @@ def _resting(plant: FriPlant, arm: str, robot: Robot, console: Console) -> Array
 
 
 def postures_over(plant: FriPlant, duration: float) -> Array:
-    """Measure postures (n, nv) [rad] over ``duration`` [s]; raises :class:`PlantError` if a cabinet is silent."""
+    """Return the postures (n, nv) [rad] that are measured during ``duration`` [s].
+
+    Raises :class:`PlantError` if a cabinet is silent.
+    """
     seen, end = [], time.monotonic() + duration
     while time.monotonic() < end:
         plant.due(time.monotonic())

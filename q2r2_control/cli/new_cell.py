@@ -1,4 +1,4 @@
-"""``q2r2 new-cell``: write the YAML of a cell for new models, with a home that passes the check."""
+"""``q2r2 new-cell``: write the YAML of a cell for new models, with home postures that pass ``q2r2 check``."""
 
 from __future__ import annotations
 
@@ -40,11 +40,12 @@ from q2r2_control.robot.urdf_parts import mimic_of
 from q2r2_control.types import Array
 from q2r2_control.viewer.tables import figure_table, print_table
 
-_ANSWERS = Path("new-cell.answers.json")  # File of the answers, in the folder of the new cell.
+_ANSWERS = Path("new-cell.answers.json")  # The file that stores the answers, in the folder of the new cell.
 _FITS = 8  # Largest number of rows in the printed table of capsules.
 _LEAST_JOINTS = 3  # Least number of joints of an arm.
-_OFF_FLOOR = 0.03  # In some posture, each link must be at least this far from the floor [m].
-_BARELY = 0.003  # A pair that cannot get this much farther apart than its kept distance gets an exception [m].
+_OFF_FLOOR = 0.03  # For each link there must be a posture in which it is at least this far from the floor [m].
+# If a pair's distance cannot exceed its kept distance by at least this, the pair gets an exception [m].
+_BARELY = 0.003
 
 Model = Annotated[str | None, Option(metavar="MODEL", help="URDF, xacro, MJCF, package:// or example-robot-data:NAME.")]
 Tip = Annotated[str | None, Option(metavar="LINK", help="Last link of that arm, where the model leaves a doubt.")]
@@ -52,17 +53,17 @@ Tip = Annotated[str | None, Option(metavar="LINK", help="Last link of that arm, 
 
 @dataclass
 class _Draft:
-    """The unfinished cell: the data of its YAML, and notes."""
+    """The unfinished cell: the data of its YAML, and what was found out about its models."""
 
     file: Path
     data: dict[str, Any]
     notes: list[str] = field(default_factory=list)  # Notes about guessed values.
-    fits: dict[str, list[CapsuleFit]] = field(default_factory=dict)  # Capsules around the meshes of each model.
+    fits: dict[str, list[CapsuleFit]] = field(default_factory=dict)  # By model, capsules around its meshes.
     always: list[tuple[str, str]] = field(default_factory=list)  # Pairs of links that overlap by construction.
-    xacro_args: dict[str, str] = field(default_factory=dict)  # Arguments of each xacro model.
+    xacro_args: dict[str, str] = field(default_factory=dict)  # Arguments that every xacro model gets, by name.
 
     def part(self, model: str) -> dict[str, Any]:
-        """Return the YAML block of a model. Its mount is still at the world's origin."""
+        """Return the data of a model's block in the YAML. Its mount is at the world's origin until it is known."""
         args = {"xacro_args": self.xacro_args} if self.xacro_args and model.endswith(".xacro") else {}
         return {"model": model, **args, "mount": {"position": [0.0, 0.0, 0.0]}}
 
@@ -153,7 +154,10 @@ def new_cell(
 
 
 def _survey(draft: _Draft, models: dict[str, str], tips: dict[str, str | None], shared: str | None) -> None:
-    """Find arms, tips and grippers; raises :class:`ConfigError` with everything that the models lack."""
+    """Find the arms, tips and grippers in the models, and add them to the draft.
+
+    If the models lack something, raise one :class:`ConfigError` that names everything that is missing.
+    """
     described = {}
     for side, model in models.items():
         try:
@@ -194,7 +198,7 @@ def _survey(draft: _Draft, models: dict[str, str], tips: dict[str, str | None], 
             driven, key = ", ".join(gripper["joints"]), f"arms.{side}.gripper"
             taken = "are taken for joints" if len(gripper["joints"]) > 1 else "is taken for the joint"
             draft.notes.append(f"{side} arm: {driven} beyond its tip, {found[side]}, {taken} of a gripper, see {key}")
-    # The shape of a finger covers its whole stroke. Finer shapes would hardly make it smaller.
+    # Fingers are left out. A finger's shape covers its whole stroke, so several capsules would hardly make it smaller.
     moved = {
         side: links_moved_by(tree, [joint.get("name", "") for joint in chains[side]])
         - links_moved_by(tree, arms[side].get("gripper", {}).get("joints", ()))
@@ -213,7 +217,7 @@ def _survey(draft: _Draft, models: dict[str, str], tips: dict[str, str | None], 
 
 
 def _enclose_drawings(draft: _Draft, yes: bool) -> None:
-    """Put capsules around the visual shapes of links that have a mass and no collision shape."""
+    """If the user agrees, put capsules around the visual shapes of links that have a mass and no collision shape."""
     moving = moving_links(Robot.from_config(draft.config()))
     links = [link for link in moving if link.is_unchecked and link.drawn and not link.shaped]
     names = ", ".join(link.name for link in links)
@@ -231,7 +235,10 @@ def _enclose_drawings(draft: _Draft, yes: bool) -> None:
 
 
 def _mount(draft: _Draft, distance: float | None, height: float | None, answers: RememberedAnswers) -> None:
-    """Set the positions of the bases, which only the user knows."""
+    """Set the positions of the arms' bases from ``distance`` and ``height`` [m].
+
+    Only the user knows these two numbers, so they are asked for if they are None.
+    """
     arms, shared = draft.data["arms"], draft.data.get("robot")
     length = max(compose(draft.config()).arm_lengths().values())
     usual = round(min(max(length, 0.3), 1.0), 1)
@@ -247,7 +254,10 @@ def _mount(draft: _Draft, distance: float | None, height: float | None, answers:
 
 
 def _stand(robot: Robot, has_feet: bool) -> float:
-    """Return the height of the root link [m] at which feet stand on the floor and each link can leave the floor."""
+    """Return the least height of the root link at which each link can get 0.03 m away from the floor [m].
+
+    If the robot ``has_feet``, no fixed shape may be below the floor.
+    """
     lowest = [0.0]
     # The collision shapes of the file are used, because a capsule around a pedestal reaches far below it.
     drawn = pin.buildGeomFromUrdfString(robot.model, robot.urdf, pin.GeometryType.COLLISION)
@@ -263,7 +273,10 @@ def _stand(robot: Robot, has_feet: bool) -> float:
 
 
 def _place(draft: _Draft, answers: RememberedAnswers) -> None:
-    """Find a home for each arm. Pairs that never get far enough apart get their own kept distance, or are ignored."""
+    """Find a home posture for each arm, and let the user change it.
+
+    Pairs that can never get far enough apart get their own kept distance. If they overlap, they are not monitored.
+    """
     config = draft.config()
     robot = Robot.from_config(config)
     least = config.control.min_distance
@@ -306,7 +319,7 @@ def _place(draft: _Draft, answers: RememberedAnswers) -> None:
 
 
 def _limit_acceleration(draft: _Draft, robot: Robot, config: Config) -> None:
-    """Set an acceleration limit that the torques of a full stop allow, for models that have no limit."""
+    """If the models have no acceleration limits, set one with which a full stop stays within the torque limits."""
     cap = config.control.acceleration_limit
     if np.isfinite(robot.acceleration_limit).all():
         return

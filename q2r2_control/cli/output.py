@@ -28,11 +28,12 @@ if TYPE_CHECKING:
     from q2r2_control.judging.judge import Verdict
     from q2r2_control.recording.recorder import RecordingSummary
 
-# A task may fail because the loop was late: once by _LATE [us], or by more than a period in a share _OFTEN of ticks.
+# A late loop may be the reason why a task failed. It counts as late if one tick was late by at least _LATE [us], or if
+# more than this share of the ticks, _OFTEN, were late by more than a period.
 _LATE, _OFTEN = 2e4, 0.2
-# Time until the first line about compiled kernels, and time between two such lines [s].
+# Time until the first line about the compilation of kernels, and time between two such lines [s].
 _SILENT_S, _BETWEEN_LINES_S = 3.0, 5.0
-SCRIPTS_WAIT_S = 60.0  # Longest wait for cabinets if nobody at a terminal can end it.
+SCRIPTS_WAIT_S = 60.0  # Longest wait for cabinets if no person at a terminal can end the wait.
 DEMO_CONFIG = "config/dual_iiwa7.yaml"
 
 ConfigFile = Annotated[str, Argument(metavar="CONFIG", help="The cell's YAML, such as config/dual_iiwa7.yaml.")]
@@ -73,7 +74,10 @@ def as_json_text(value: Any) -> str:
 
 
 def with_solver(config: Config, name: str | None) -> Config:
-    """Return the cell with the QP solver ``name``, or with its own if None; raises :class:`ConfigError`."""
+    """Return the cell with the QP solver ``name``. If it is None, the cell keeps its own solver.
+
+    Raises :class:`ConfigError` if the solver is not installed.
+    """
     if name is not None:
         check_installed(name)
     return config.model_copy(update={"control": config.control.with_solver(name)})
@@ -96,7 +100,7 @@ def say(line: str, console: Console | None = None, style: str = "") -> None:
 
 @contextmanager
 def counting(what: str = "") -> Iterator[Callable[[str, int, int], None]]:
-    """Show the progress of long work: a bar if stderr is a terminal, or else a line every few seconds.
+    """Show the progress of long work: as a bar if stderr is a terminal, otherwise as a line every few seconds.
 
     The yielded function takes a text, the number of finished items, and the number of all items.
     """
@@ -118,7 +122,10 @@ def counting(what: str = "") -> Iterator[Callable[[str, int, int], None]]:
 
 
 def print_progress(what: str) -> None:
-    """Print a line on stderr if it is a terminal. A live line would need a thread, which would distort timings."""
+    """Print a line on stderr if stderr is a terminal.
+
+    No live progress bar is used, because its thread would distort the measured times.
+    """
     console = Console(stderr=True)
     if console.is_terminal:
         console.print(what, highlight=False)
@@ -132,7 +139,7 @@ class _CompilingLines:
         self._due = 0.0
 
     def __call__(self, done: int, total: int) -> None:
-        """Print a line if it is due. Its remaining time assumes that all kernels take equally long."""
+        """Print a line if it is due. It has an estimate of the remaining time, as if all kernels took equally long."""
         now = time.monotonic()
         if self._start is None:
             self._start, self._due = now, now + _SILENT_S
@@ -151,7 +158,10 @@ def notice_of_compiling() -> Iterator[None]:
 
 
 def notes_of(task: str | None, operator: str | None, record: object, anonymous: bool) -> dict[str, str]:
-    """Return the notes for a recording; raises :class:`ConfigError` for an empty note, or if nothing is recorded."""
+    """Return the notes for a recording, by name: the ``task`` and the ``operator`` unless they are None.
+
+    Raises :class:`ConfigError` if a note is empty, or if a note or ``anonymous`` is given although nothing is recorded.
+    """
     if anonymous and record is None:
         raise ConfigError("--anonymous needs --record")
     notes = {name: text for name, text in (("task", task), ("operator", operator)) if text is not None}
@@ -164,19 +174,25 @@ def notes_of(task: str | None, operator: str | None, record: object, anonymous: 
 
 
 def counted(number: int, noun: str, plural: str | None = None) -> str:
-    """Return ``number`` and ``noun``, or its ``plural`` unless the number is one. None adds an s."""
+    """Return a text with ``number`` and ``noun``. Unless the number is 1, the noun is the ``plural``, or gets an s."""
     return f"{number} {noun if number == 1 else plural or noun + 's'}"
 
 
 def positive(option: str, value: float | None) -> float | None:
-    """Return the ``value`` [s] of ``option``; raises :class:`ConfigError` if it is not positive and finite."""
+    """Return ``value``, the value of ``option`` [s]; it may be None.
+
+    Raises :class:`ConfigError` if it is not positive and finite.
+    """
     if value is not None and not (math.isfinite(value) and value > 0.0):
         raise ConfigError(f"{option} {value:g}: allowed: a positive number of seconds")
     return value
 
 
 def longest_wait(asked: float | None) -> float:
-    """Return the longest wait for cabinets [s]: ``asked``, or without end if a person at a terminal can end it."""
+    """Return the longest wait for cabinets [s], which is ``asked`` if the user gave it.
+
+    Otherwise the wait is endless if a person at a terminal can end it, and :data:`SCRIPTS_WAIT_S` if not.
+    """
     if asked is not None:
         return asked
     return math.inf if sys.stderr.isatty() else SCRIPTS_WAIT_S
@@ -193,7 +209,7 @@ def task_line(task: TaskResult) -> str:
 
 
 def late_line(summary: RunSummary, tasks: Iterable[TaskResult]) -> str | None:
-    """Return one line of markup if a task failed in a run whose loop was late, else None."""
+    """Return one line of markup if a task failed and the loop was late; otherwise None."""
     late, often = summary.lateness_us.max, summary.overruns > _OFTEN * summary.ticks
     if late is None or not (late >= _LATE or often) or all(task.succeeded for task in tasks):
         return None
@@ -208,7 +224,7 @@ def print_lines(console: Console, lines: Iterable[str]) -> None:
 
 
 def recording_line(recording: RecordingSummary) -> str:
-    """Return one line of markup with the file of a recording and the data that it lacks."""
+    """Return one line of markup with the file of a recording, and with the data that is missing in it."""
     if recording.fault is not None:
         ended = f"[red]recording ended[/]: {escape(recording.fault)}"
         return f"{ended}; {recording.ticks} ticks recorded, {recording.lost_ticks} not"
@@ -224,7 +240,10 @@ def recording_line(recording: RecordingSummary) -> str:
 
 
 def verdict_markup(verdict: Verdict) -> str:
-    """Return markup that says whether an episode is kept, and why not. Each of several reasons has its own line."""
+    """Return markup that says whether an episode is kept, and the reasons if it is not.
+
+    If there are several reasons, each has its own line.
+    """
     word = f"[{'green' if verdict.keep else 'red'}]{verdict.word}[/]"
     found = [escape(finding) for finding in verdict.findings]
     return f"{word}: {found[0]}" if len(found) == 1 else "\n    ".join([f"{word}:" if found else word, *found])

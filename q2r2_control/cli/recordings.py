@@ -151,7 +151,7 @@ def judge(
 
 
 def _print_verdicts(judged: Sequence[Judgement], unreadable: Sequence[Unreadable]) -> None:
-    # If a figure exists for several hands or arms, its column shows the worst one.
+    # If a figure exists for several hands or arms, its column shows the worst number.
     columns = [column for column in COLUMNS if column.name in _SHOWN]
     console = Console()
     kept = sum(one.verdict.keep for one in judged)
@@ -201,7 +201,10 @@ def report(
 
 
 def _cameras_with_depth(files: Iterable[Path]) -> tuple[str, ...]:
-    """Return the cameras with depth in the first readable file. All recordings of a dataset have the same cameras."""
+    """Return the cameras with depth in the first file that can be read.
+
+    The other files have the same cameras, because all recordings of a dataset must have the same cameras.
+    """
     for file in files:
         with suppress(RecordingError):
             return Recording(file).about.depth
@@ -209,12 +212,15 @@ def _cameras_with_depth(files: Iterable[Path]) -> tuple[str, ...]:
 
 
 def _thresholds(config: str | None) -> JudgeSettings | None:
-    """Return the thresholds of the cell ``config``; None for those of each recorded cell."""
+    """Return the thresholds of the cell ``config``; None if ``config`` is None.
+
+    With None, each recording is judged by the thresholds of its own cell.
+    """
     return None if config is None else load_config(config).judge
 
 
 def _split(found: Sequence[_Judgement | Unreadable]) -> tuple[list[_Judgement], list[Unreadable]]:
-    """Return the judgements, and the files that cannot be read, each in the order of the files."""
+    """Return two lists in the order of the files: the judgements, and the files that cannot be read."""
     bad = [one for one in found if isinstance(one, Unreadable)]
     return [one for one in found if not isinstance(one, Unreadable)], bad
 

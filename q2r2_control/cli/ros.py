@@ -42,12 +42,12 @@ from q2r2_control.viewer.web.page import check_viser
 
 _COLOURS = {"ok": "green", "warn": "yellow", "error": "red"}
 _ROS_ARGUMENTS = "--ros-args"
-_ONCE = 3.0  # Time in which a running set of nodes is found, and each node sends several messages [s].
-_TIME = 4.0  # Time in which a running set of nodes is found, and a second publisher of a topic as well [s].
+_ONCE = 3.0  # This is long enough to find a running set of nodes, and to get several messages of each node [s].
+_TIME = 4.0  # This is long enough to find a running set of nodes, and a second publisher of a topic [s].
 
 
 def set_tables(view: SetView, domain: str) -> Group:
-    """Return tables with each arm's state and its reason, each node's message, and each topic's rate."""
+    """Return tables with the state of each arm and its reason, the message of each node, and the rate of each topic."""
     title = f"ROS domain {domain}: {len(view.nodes)} nodes of a set"
     arms = figure_table(title, ("arm", "state", "controller", "why"), map(_arm_cells, view.arms))
     if not view.nodes:
@@ -195,7 +195,11 @@ app.command(epilog="Example: q2r2 ros doctor config/dual_iiwa7.yaml")(doctor)
 
 
 class RobotSource(StrEnum):
-    """Which robot starts: MuJoCo's, none because the user's own one runs already, or the one that the cell needs."""
+    """Which robot ``q2r2 ros up`` starts.
+
+    MUJOCO starts the simulation. NONE starts no robot, because the user's own robot already runs. AUTO starts the
+    simulation if the cell needs it.
+    """
 
     AUTO = "auto"
     MUJOCO = "mujoco"
@@ -219,10 +223,10 @@ def build_interfaces_command(
 
 
 class _WithRosArguments(TyperCommand):
-    """A command with arguments for ROS, which stand between ``--ros-args`` and ``--`` or the end."""
+    """A command with arguments for ROS. They begin after ``--ros-args``, and end at ``--`` or at the line's end."""
 
     def parse_args(self, context: typer.Context, args: list[str]) -> list[str]:  # type: ignore[override]
-        """Store the arguments for ROS in the context, and parse the others."""
+        """Store the arguments for ROS in the context, and parse all other arguments."""
         first = args.index(_ROS_ARGUMENTS) if _ROS_ARGUMENTS in args else len(args)
         last = args.index("--", first) if "--" in args[first:] else len(args)
         context.meta[_ROS_ARGUMENTS] = args[first + 1 : last]

@@ -67,7 +67,7 @@ from q2r2_control.teleop.crossed_hands import CrossedHands
 from q2r2_control.types import CommandMode
 from q2r2_control.viewer.headset_table import headset_display, headset_table
 
-LARGEST_SPREAD = 0.03  # Largest displacement of the parts with which the arms reach them in all tasks [m].
+LARGEST_SPREAD = 0.03  # Largest displacement of the parts at which the arms still reach the parts in all tasks [m].
 _PORT = 8080  # The port of the page, unless an option names another port.
 _FRI_CONFIG = "config/dual_iiwa7_fri.yaml"
 _TASKS = f"[{'|'.join((*TASKS, ALL_TASKS))}]..."

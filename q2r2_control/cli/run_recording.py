@@ -87,7 +87,7 @@ class RunRecording(AbstractContextManager["RunRecording"]):
 
 
 def judge_recording(recording: RecordingSummary | None) -> list[Judged]:
-    """Judge the written file, and keep the verdicts beside it. A failure is one line on stderr."""
+    """Judge the recording's file, and write the verdicts into a file beside it. A failure is one line on stderr."""
     if recording is None or recording.file is None or not Path(recording.file).exists():
         return []
     try:

@@ -1,4 +1,4 @@
-"""The summary of a run: its verdict, the figures of its result, and with ``--verbose`` all other figures."""
+"""The summary of a run that is printed: the verdict and the most important figures; with ``--verbose``, all figures."""
 
 from __future__ import annotations
 
@@ -17,10 +17,13 @@ from q2r2_control.wording import sentence
 
 
 def verdict_line(summary: RunSummary, failed: Iterable[str] = (), stopped: str | None = None) -> str:
-    """Return one line of markup that says whether the promises were kept and the arms followed, or else the faults.
+    """Return one line of markup. It says that all promises were kept and which arms followed, or else names the faults.
 
-    ``failed`` names further failures, such as tasks. ``stopped`` is given if the run was stopped before its tasks were
-    over; it is the returned line unless there is a failure.
+    Args:
+        summary: The summary of the run.
+        failed: Further failures in words, such as failed tasks.
+        stopped: The line to return if the run was stopped before its tasks were over and there is no failure; otherwise
+            None.
     """
     wrong = [*summary.broken, *failed]
     if wrong:
@@ -38,7 +41,10 @@ def verdict_line(summary: RunSummary, failed: Iterable[str] = (), stopped: str |
 
 
 def _last_faults(summary: RunSummary) -> dict[str, Event]:
-    """Return the last event of each arm, if something other than its button paused it or kept it from engaging."""
+    """Return, by arm, the arm's last event if it is a fault.
+
+    A fault is an event in which something other than a button paused the arm or kept the arm from engaging.
+    """
     between = (ArmState.PAUSING, ArmState.ALIGNING)
     last = {event.arm: event for event in summary.events if event.destination not in between}
     return {name: event for name, event in last.items() if is_fault(event)}

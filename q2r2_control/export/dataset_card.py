@@ -11,13 +11,19 @@ from q2r2_control.export.sampling import units_of
 
 CARD = "README.md"
 POSITION = ".pos"
-"""The end of the names of numbers in the state and the action of a LeRobotDataset, as lerobot expects it."""
+"""lerobot expects that the name of each number in the state and the action of a LeRobotDataset ends with this."""
 SOURCES = "meta/recordings.json"
 """The file in a LeRobotDataset with the recording and the notes of each episode. lerobot does not read it."""
 
 
 def write_card(info: Mapping[str, Any], sources: Sequence[Mapping[str, Any]], folder: Path) -> None:
-    """Write the README of the dataset in ``folder``, which has ``info`` in its ``info.json`` and these ``sources``."""
+    """Write the README of the dataset in ``folder``.
+
+    Args:
+        info: The content of the dataset's ``info.json``.
+        sources: The entries of its episodes in :data:`SOURCES`.
+        folder: The folder of the dataset.
+    """
     vectors = {name: feature["names"] for name, feature in info["features"].items() if _is_vector(feature)}
     ahead = sources[0].get("action_ahead_frames", 0)
     later = f" The row of frame k has `action` and `action.tool` of frame k + {ahead}." if ahead else ""
@@ -38,7 +44,10 @@ def _is_vector(feature: Mapping[str, Any]) -> bool:
 
 
 def _numbers(feature: str, labels: Sequence[str]) -> str:
-    """Return the labels as a text. After neighbouring labels with the same unit, that unit stands once."""
+    """Return the ``labels`` with their units as one text.
+
+    If successive labels have the same unit, the unit stands only once, after the last of these labels.
+    """
     plain = tuple(label.removesuffix(POSITION) for label in labels)
     units = units_of({feature: plain})[feature]
     runs = groupby(zip(labels, units, strict=True), key=lambda pair: pair[1])

@@ -1,6 +1,6 @@
 """Converts episodes of recordings to vectors and pictures at a fixed rate.
 
-Several processes or machines do the work. Finished episodes are kept until all are finished.
+Several processes or machines can share the work. Each finished episode is stored in a folder until all are finished.
 """
 
 from __future__ import annotations
@@ -33,22 +33,21 @@ from q2r2_control.recording.ros_recording import open_recording
 
 FASTEST = 1000  # The highest rate of frames [Hz].
 _OUTPUT = "allowed: a new folder where you may write"
-SUBTASK = "subtask_index"  # The name of the column with the index of a frame's subtask, as lerobot names it.
-_FORMAT = 9  # The version of kept episodes. Episodes of another version are made again.
+SUBTASK = "subtask_index"  # lerobot's name of the column with the index of each frame's subtask.
+_FORMAT = 9  # The version of stored episodes. Episodes of another version are made again.
 
 
 @dataclass(frozen=True)
 class FrameSampling:
     """Settings for the frames that are made from the ticks, and for the data that is exported with them.
 
-    ``fps`` is the number of frames per second, and ``ahead`` the number of frames by which actions come earlier. Raises
-    :class:`ConfigError` unless ``fps`` is 1 to 1000 and ``ahead`` is 0 to ``fps``.
+    Raises :class:`ConfigError` unless ``fps`` is 1 to 1000 and ``ahead`` is 0 to ``fps``.
     """
 
-    fps: int = 30
-    trim: bool = False  # Only the time in which arms are engaged or moving is exported.
-    pictures: bool = False
-    anonymous: bool = False  # Notes that identify a person or a computer are left out.
+    fps: int = 30  # The number of frames per second.
+    trim: bool = False  # Whether frames before the first and after the last motion or engagement are left out.
+    pictures: bool = False  # Whether pictures are exported.
+    anonymous: bool = False  # Whether notes that identify a person or a computer are left out.
     ahead: int = 0  # Number of frames by which position actions are shifted to earlier rows.
 
     def __post_init__(self) -> None:
@@ -62,21 +61,21 @@ class FrameSampling:
 class EpisodeVectors:
     """One episode with n frames, as vectors: for each feature, an array (n, size) of float32."""
 
-    recording: str  # The name of the file.
+    recording: str  # The name of the recording's file.
     cell: str
     task: str
     fps: int
-    names: Names  # The names of the numbers of each feature.
+    names: Names  # By feature, the names of its numbers.
     notes: dict[str, str]  # The recorded notes, such as program, machine and operator.
     vectors: Vectors
-    success: bool | None = None  # None if it is not known.
+    success: bool | None = None  # Whether the episode succeeded; None if that is not known.
     # Number of frames by which position actions are shifted. Row k contains the position action of frame k + ahead.
     ahead: int = 0
     part: int = 0  # The number of the episode in the file, from 1 on; 0 for the whole file.
     cameras: Mapping[str, CameraFrames] = field(default_factory=dict)  # By camera, one picture for each frame.
-    depths: Mapping[str, CameraFrames] = field(default_factory=dict)  # The same for each camera with recorded depth.
-    subtasks: tuple[str, ...] = ()  # The names of its subtasks, in their order; empty if it has no subtasks.
-    subtask: tuple[int, ...] = ()  # The index in ``subtasks`` of each frame; empty if there are no subtasks.
+    depths: Mapping[str, CameraFrames] = field(default_factory=dict)  # The same for cameras with recorded depth.
+    subtasks: tuple[str, ...] = ()  # The names of the episode's subtasks, in their order; empty if it has none.
+    subtask: tuple[int, ...] = ()  # For each frame, the index of its subtask in ``subtasks``; empty without subtasks.
 
     @property
     def units(self) -> Names:
@@ -88,7 +87,10 @@ class EpisodeVectors:
         return len(next(iter(self.vectors.values())))
 
     def outcome(self) -> dict[str, npt.NDArray[np.bool_]]:
-        """Return flags (n,) that are True for the last frame, and for the last frame of a success."""
+        """Return two columns of flags (n,) by name.
+
+        ``next.done`` is True at the last frame. ``next.success`` is True at the last frame if the episode succeeded.
+        """
         done = np.arange(self.frames) == self.frames - 1
         return {"next.done": done, "next.success": done & bool(self.success)}
 
@@ -115,7 +117,7 @@ def make_episode(file: Path, sampling: FrameSampling, span: EpisodeSpan | None =
         vectors, labels = features(frames, robot)
     except RecordingError as error:
         raise RecordingError(f"{recording.file}: {error}") from error
-    # Actions that are motions already lead to the next frame, so they are not moved.
+    # Actions that are motions already lead to the next frame, so they are not shifted.
     for action in (ActionSpace.JOINTS, ActionSpace.TOOL):
         vectors[action] = _earlier(vectors[action], sampling.ahead)
     notes = dict(recording.about.notes)
@@ -127,7 +129,7 @@ def make_episode(file: Path, sampling: FrameSampling, span: EpisodeSpan | None =
         shown = names if sampling.pictures else ()
         return {name: CameraFrames(recording, name, cell.cameras[name], stamps, is_depth) for name in shown}
 
-    # These times are since the run began, as those of ``subtask_starts`` are.
+    # These times are since the run began, as are the times in ``subtask_starts``.
     passed = (frames["stamp"] - recording.about.epoch) / NANOSECONDS
     subtasks = subtask_names(cell.recording.subtasks, len(span.subtask_starts))
     number = np.searchsorted(np.array(span.subtask_starts), passed, side="right")
@@ -150,28 +152,34 @@ def make_episode(file: Path, sampling: FrameSampling, span: EpisodeSpan | None =
 
 
 def _earlier(rows: npt.NDArray[np.float32], frames: int) -> npt.NDArray[np.float32]:
-    """Return ``rows`` (n, size) moved by ``frames`` to an earlier time; the last row is repeated at the end."""
+    """Return ``rows`` (n, size) shifted by ``frames`` to earlier frames. The last row is repeated at the end."""
     return rows[np.minimum(np.arange(len(rows)) + frames, len(rows) - 1)]
 
 
 def spans_to_export(file: Path) -> list[EpisodeSpan]:
-    """Return the episodes of a recording that its operator did not discard, or the whole file if it cannot be read."""
+    """Return the episodes of a recording that its operator did not discard.
+
+    If the file cannot be read, return the whole recording as one episode.
+    """
     try:
         return [span for span in read_spans(open_recording(file)) if not span.discarded]
     except RecordingError:
-        return [WHOLE]  # The error of make_episode tells later why the file cannot be read.
+        return [WHOLE]  # Later, make_episode raises the error that says why.
 
 
-# Writes an episode as a new file or folder. It is a function of a module, so that other processes can import it.
+# A function that writes an episode as a new file or folder. It is a module's function, so that other processes can
+# import it.
 Write = Callable[[EpisodeVectors, Path], None]
-# Returns why episodes of a file are discarded, by the numbers of these episodes. The flag tells whether the pictures
-# are judged too. It is also a function of a module.
+# A function that returns the discarded episodes of a file: by the episode's number, the reason. The second argument
+# says whether the pictures are judged too. It is a module's function as well.
 Verdicts = Callable[[Path, bool], Mapping[int, str]]
 _LONGEST_REASON = 300  # The longest text of a reason [characters].
 
 
 @dataclass(frozen=True, slots=True)
 class _Job:
+    """One episode to store; see :func:`keep_episodes`."""
+
     file: Path
     sampling: FrameSampling
     span: EpisodeSpan
@@ -181,13 +189,15 @@ class _Job:
 
     @property
     def name(self) -> str:
-        """Return the name of the recording, with the number of an episode in it."""
+        """Return the path of the recording, followed by the number of the episode if it is not the whole recording."""
         return str(self.file) + (f" #{self.span.number}" if self.span.number else "")
 
 
 @dataclass(frozen=True)
 class Exported:
-    kept: list[Path]  # The episodes, in the order of their recordings.
+    """The result of :func:`keep_episodes`."""
+
+    kept: list[Path]  # The files or folders of the stored episodes, in the order of their recordings.
     left_out: list[str]  # One line for each discarded episode, with the reasons.
     unreadable: list[str]  # One line for each recording that cannot be exported, with the reason.
 
@@ -202,11 +212,24 @@ def keep_episodes(
     verdicts: Verdicts | None = None,
     progress: Callable[[int], None] = lambda done: None,
 ) -> Exported:
-    """Call ``write`` for each episode of recordings, into ``folder``; episodes that exist are not made again.
+    """Store each episode of some recordings in ``folder``. Episodes that are already in the folder are not made again.
 
-    Episodes that ``verdicts`` discards are left out, and so are recordings that cannot be read. The result is the same
-    at any ``place``. ``progress`` is called with the number of finished episodes. Raises :class:`ConfigError` if
-    nothing can be written, or if a worker of this computer was killed.
+    Recordings that cannot be read are left out.
+
+    Args:
+        files: The recordings.
+        sampling: The rate of the frames, and what they contain.
+        write: Writes one episode.
+        folder: The folder for the episodes.
+        place: The processes or machines that do the work. The result does not depend on it.
+        verdicts: Returns the episodes to leave out; None to leave out none.
+        progress: Called with the number of finished episodes.
+
+    Returns:
+        The paths of the stored episodes, and one line for each episode or recording that was left out.
+
+    Raises:
+        ConfigError: If nothing can be written, or if a worker process of this computer was killed.
     """
     jobs = [
         _Job(file, sampling, span, write, folder / _name(file, sampling, span, write, verdicts), verdicts)
@@ -227,9 +250,9 @@ def keep_episodes(
 
 
 def _keep(job: _Job) -> tuple[str | None, str | None]:
-    """Write one episode unless it exists; only a complete episode is ever stored under its name.
+    """Write one episode, unless it exists. An episode gets its name only when it is complete.
 
-    Returns two texts: the verdict if the episode is discarded, otherwise None; and the reason why the recording cannot
+    Return two texts: the verdict if the episode is discarded, otherwise None; and the reason why the recording cannot
     be exported, or None if it can.
     """
     target = job.target
@@ -249,7 +272,7 @@ def _keep(job: _Job) -> tuple[str | None, str | None]:
         for path in (unfinished, *unfinished.rglob("*")):
             if path.is_file():
                 with path.open("rb") as stream:
-                    os.fsync(stream.fileno())  # Thus a power failure leaves no incomplete episode.
+                    os.fsync(stream.fileno())  # After a power failure, no episode under its name is incomplete.
         if not target.exists():
             unfinished.replace(target)
     except RecordingError as error:  # Pictures are read from the recording only while they are written to the dataset.
@@ -264,7 +287,7 @@ def _reason(error: Exception, job: _Job) -> str:
 
 
 def _name(file: Path, sampling: FrameSampling, span: EpisodeSpan, write: Write, verdicts: Verdicts | None) -> str:
-    """Return the name of a kept episode; it changes with the recording and with the settings of the export."""
+    """Return the name under which an episode is stored. It depends on the recording and the settings of the export."""
     try:
         status = file.stat()
     except OSError as error:
@@ -276,7 +299,9 @@ def _name(file: Path, sampling: FrameSampling, span: EpisodeSpan, write: Write, 
 
 
 class Output:
-    """The new folder of an export. Episodes of an interrupted export stay in ``OUT.partial`` for the next one.
+    """The new folder OUT of an export. If an export is interrupted, its finished episodes stay in ``OUT.partial``.
+
+    The next export uses them.
 
     Raises :class:`ConfigError` if the output exists or cannot be written.
     """
@@ -287,7 +312,7 @@ class Output:
         self._partial = path.with_name(f"{path.name}.partial")
 
     def episodes(self) -> Path:
-        """Make and return the folder in which episodes are kept until the output is complete."""
+        """Make the folder in which episodes are stored until the output is complete, and return its path."""
         folder = self._partial / "episodes"
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -296,13 +321,13 @@ class Output:
         return folder
 
     def tidy(self) -> None:
-        """Remove the folder of kept episodes if it is empty."""
+        """Remove the folder of stored episodes if it is empty."""
         with suppress(OSError):
             (self._partial / "episodes").rmdir()
             self._partial.rmdir()
 
     def write(self, write: Callable[[Path], None]) -> None:
-        """Let ``write`` make the folder under another name. When it is complete, rename it to the output."""
+        """Let ``write`` make the folder under another name. When the folder is complete, rename it to OUT."""
         made = self._partial / "output"
         try:
             shutil.rmtree(made, ignore_errors=True)

@@ -1,7 +1,7 @@
-"""The formats of ``q2r2 export``: CSV, HDF5 and two LeRobotDatasets, and those that other packages declare.
+"""The formats of ``q2r2 export``: CSV, HDF5, two versions of LeRobotDataset, and formats that other packages declare.
 
-CSV and HDF5 have a file for each episode. HDF5 has the layout of ``record_sim_episodes.py`` in
-https://github.com/tonyzhaozh/act. A further file links to all episodes in the layout of
+CSV and HDF5 have a file for each episode. An HDF5 file has the layout of ``record_sim_episodes.py`` in
+https://github.com/tonyzhaozh/act. One more HDF5 file links to the data of all episodes. It has the layout of
 https://github.com/ARISE-Initiative/robomimic.
 """
 
@@ -25,7 +25,7 @@ from q2r2_control.export.sampling import CameraFrames, units_of
 from q2r2_control.extras import install_line
 from q2r2_control.plugins import EXPORTS, load_class, names_of
 
-# The names of data in the HDF5 file, and of the features that the data comes from.
+# Pairs of names: of data in the HDF5 file, and of the feature from which the data comes.
 _DATA = (
     ("observations/qpos", "observation.state"),
     ("observations/qvel", "observation.velocity"),
@@ -35,7 +35,7 @@ _AXES = ("frame", "row", "column")
 _COMPRESSION = 1  # The fastest level of gzip.
 ROBOMIMIC = "robomimic.h5"  # The name does not end with .hdf5, because some trainers of ACT read all such files.
 UNITS = "units.json"  # The file beside the CSV files, with the unit of each column of numbers.
-# The names that robomimic reads in a demonstration, and the data that they link to, which is stored once.
+# By the names that robomimic reads in a demonstration, the names of the data to which they link.
 _LINKS = {
     **{"actions": "action", "rewards": "rewards", "dones": "dones"},
     **{"obs/qpos": "observations/qpos", "obs/qvel": "observations/qvel"},
@@ -63,7 +63,9 @@ def write_table(episode: EpisodeVectors, path: Path) -> None:
 
 
 def gather_tables(files: Sequence[Path], folder: Path) -> None:
-    """Move CSV files into a new ``folder``, under the names of their recordings, and write the units of their columns.
+    """Move CSV files into a new ``folder``, and write the units of their columns into :data:`UNITS`.
+
+    Each CSV file gets the name of its recording.
 
     Raises :class:`RecordingError` if two recordings have the same name.
     """
@@ -94,7 +96,7 @@ def write_hdf5(episode: EpisodeVectors, path: Path) -> None:
     """Write one episode as HDF5."""
     with require_h5py().File(path, "w") as file:
         file.attrs["sim"] = True  # With this value, trainers pair an observation with the action of the same row.
-        file.attrs["compress"] = False  # HDF5 compresses the pictures, but readers get plain pixels and no JPEG.
+        file.attrs["compress"] = False  # Trainers read plain pixels, not JPEG; HDF5 itself compresses them.
         file.attrs["fps"] = episode.fps
         file.attrs["action_ahead_frames"] = episode.ahead
         for name in ("recording", "cell", "task"):
@@ -122,7 +124,7 @@ def write_hdf5(episode: EpisodeVectors, path: Path) -> None:
 
 
 def _write_pictures(group: Any, camera: str, pictures: CameraFrames, frames: int) -> Any:
-    """Write the pictures of a camera into a group of an HDF5 file, and return the dataset."""
+    """Write the pictures of a camera into a group of an HDF5 file, and return the HDF5 dataset."""
     # Each picture is compressed by itself, so that a reader can decode a single picture.
     packing = {"chunks": (1, *pictures.size), "compression": "gzip", "compression_opts": _COMPRESSION}
     data = group.create_dataset(camera, (frames, *pictures.size), pictures.dtype, **packing)
@@ -132,7 +134,10 @@ def _write_pictures(group: Any, camera: str, pictures: CameraFrames, frames: int
 
 
 def gather_hdf5(files: Sequence[Path], folder: Path) -> None:
-    """Move HDF5 files into a new ``folder``, as ``episode_0.hdf5`` and so on, and write the file of links to them."""
+    """Move HDF5 files into a new ``folder``, and write the file :data:`ROBOMIMIC` with links to them.
+
+    The files are renamed to ``episode_0.hdf5``, ``episode_1.hdf5`` and so on.
+    """
     h5py, total = require_h5py(), 0
     folder.mkdir()
     with h5py.File(folder / ROBOMIMIC, "w") as joined:
@@ -163,7 +168,10 @@ FORMATS = {
 
 
 def format_named(name: str) -> ExportFormat:
-    """Return the format called ``name``, of this package or another one. Raises :class:`ConfigError` if none exists."""
+    """Return the format called ``name``, of this package or another package.
+
+    Raises :class:`ConfigError` if no format has this name.
+    """
     if (own := FORMATS.get(name)) is not None:
         return own
     others = names_of(EXPORTS)

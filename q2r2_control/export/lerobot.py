@@ -22,7 +22,8 @@ from q2r2_control.export.lerobot_subtasks import add_subtasks, read_subtasks, wr
 from q2r2_control.extras import install_line
 from q2r2_control.inputs.policy import ActionSpace
 
-_NAME = "q2r2/recordings"  # The package needs a name on the hub, but the datasets are never sent there.
+# The package lerobot needs the name of a dataset on the Hugging Face hub. The datasets are never sent there.
+_NAME = "q2r2/recordings"
 # With these variables, the package makes no requests to the hub. Neither the package nor the video encoder prints its
 # progress.
 _ENVIRONMENT = {"HF_HUB_OFFLINE": "1", "TQDM_DISABLE": "1", "SVT_LOG": "1"}
@@ -30,7 +31,7 @@ _CAP_SYS_NICE, _CAPABILITY_VERSION = 23, 0x20080522  # From linux/capability.h.
 
 
 def require_lerobot() -> None:
-    """Raises :class:`ConfigError` if lerobot is not installed; does not import it, since that takes seconds."""
+    """Raise :class:`ConfigError` if lerobot is not installed. It is not imported, since that takes seconds."""
     if find_spec("lerobot") is None:
         raise ConfigError(f"export lerobot needs lerobot: {install_line('lerobot')}")
 
@@ -52,7 +53,7 @@ def write_sources(sources: Sequence[dict[str, Any]], folder: Path) -> None:
 
 
 def write_shard(episode: EpisodeVectors, folder: Path) -> None:
-    """Write a dataset of one episode into a new ``folder``; an old folder is removed."""
+    """Write a dataset of one episode into ``folder``. A folder of an earlier attempt is removed first."""
     shutil.rmtree(folder, ignore_errors=True)
     os.environ.update(_ENVIRONMENT)
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -108,9 +109,11 @@ def join_shards(shards: Sequence[Path], folder: Path) -> None:
 
 
 def check_alike(infos: Sequence[dict[str, Any]], sources: Sequence[dict[str, Any]]) -> None:
-    """Raises :class:`RecordingError` if episodes differ in their cells or features.
+    """Raise :class:`RecordingError` if episodes differ in their cells or features.
 
-    ``infos`` are the contents of their files ``info.json``, and ``sources`` their entries in :data:`SOURCES`.
+    Args:
+        infos: For each episode, the content of its ``info.json``.
+        sources: For each episode, its entry in :data:`SOURCES`.
     """
     first, first_recording = infos[0], sources[0]["recording"]
     for info, source in zip(infos, sources, strict=True):
@@ -129,7 +132,10 @@ def check_alike(infos: Sequence[dict[str, Any]], sources: Sequence[dict[str, Any
 
 
 def _renounce_real_time() -> None:
-    """Prevent SCHED_FIFO for threads of the AV1 encoder, also for root: a control loop must not wait for a video."""
+    """Prevent threads of the AV1 encoder from getting the priority SCHED_FIFO, even if root runs them.
+
+    With SCHED_FIFO, the encoder could delay a control loop on the same computer.
+    """
     if sys.platform != "linux":
         return
     import resource
@@ -137,7 +143,7 @@ def _renounce_real_time() -> None:
     resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0))
     libc = ctypes.CDLL(None)
     header = (ctypes.c_uint32 * 2)(_CAPABILITY_VERSION, 0)
-    # The effective, permitted and inheritable sets, of capabilities 0 to 31 and then of the others.
+    # The effective, permitted and inheritable sets for the capabilities 0 to 31, and then the same sets for the others.
     sets = (ctypes.c_uint32 * 6)()
     if libc.capget(header, sets) == 0:
         sets[0] &= ~(1 << _CAP_SYS_NICE)

@@ -1,8 +1,8 @@
-"""Adds the subtasks of episodes to a LeRobotDataset, in both forms that versions of the package lerobot read.
+"""Adds the subtasks of episodes to a LeRobotDataset, in two forms: for older and for newer versions of lerobot.
 
-Up to lerobot 0.5, the column ``subtask_index`` has the index of each frame's subtask in ``meta/subtasks.parquet``. From
-lerobot 0.6 on, the column ``language_persistent`` has, at each frame, all subtasks of the episode and the times at
-which they begin.
+lerobot up to 0.5 reads the column ``subtask_index``. It has the index of each frame's subtask in
+``meta/subtasks.parquet``. lerobot from 0.6 on reads the column ``language_persistent``. At each frame, it has all
+subtasks of the episode and the times at which they begin.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ SHARD_FILE = "meta/subtasks_of_episode.json"  # The subtasks of one episode unti
 TABLE = "meta/subtasks.parquet"
 _INFO = "meta/info.json"
 _LANGUAGE = ("language_persistent", "language_events")
-_ROLE, _STYLE = "assistant", "subtask"  # The package's words for a subtask in its language column.
+_ROLE, _STYLE = "assistant", "subtask"  # lerobot marks a subtask in its language column by these words.
 
 
 def write_subtasks(episode: EpisodeVectors, folder: Path) -> None:
-    """Keep the subtasks of an episode in its own dataset, which is in ``folder``."""
+    """Write the subtasks of one episode into the dataset of this episode, which is in ``folder``."""
     content = {"names": episode.subtasks, "index": episode.subtask}
     (folder / SHARD_FILE).write_text(json.dumps(content), encoding="utf-8")
 
 
 def read_subtasks(shards: Sequence[Path]) -> list[dict[str, Any]]:
-    """Return what :func:`write_subtasks` has kept in the ``shards``."""
+    """Return, for each of the ``shards``, the data that :func:`write_subtasks` has written into it."""
     return [json.loads((shard / SHARD_FILE).read_text(encoding="utf-8")) for shard in shards]
 
 
@@ -65,19 +65,22 @@ def add_subtasks(episodes: Sequence[dict[str, Any]], folder: Path) -> None:
 
 
 def _with_subtasks(table: Any, told: Sequence[dict[str, Any]], names: Sequence[str]) -> Any:
-    """Return the frames of a ``table`` with the index of their subtask in ``names``."""
+    """Return the ``table`` of frames with one more column: the index of each frame's subtask in ``names``.
+
+    ``told`` has the subtasks of each episode, by the episode's number.
+    """
     import pyarrow as pa
 
     found = []
     for number, frame in _places(table):
         own = told[number]
         found.append(names.index(own["names"][own["index"][frame] if own["index"] else 0]))
-    # The table's metadata is removed: it lists the columns for the package ``datasets``, and would lack the new ones.
+    # The table's metadata is removed, because it lists the columns for the package ``datasets`` without the new column.
     return table.replace_schema_metadata(None).append_column(SUBTASK, pa.array(found, pa.int64()))
 
 
 def _with_language(table: Any, told: Sequence[dict[str, Any]]) -> Any:
-    """Return the frames of a ``table`` with both language columns. Every frame has all subtasks of its episode."""
+    """Return the ``table`` of frames with both language columns added. Every frame has all subtasks of its episode."""
     import pyarrow as pa
 
     row = {"role": pa.string(), "content": pa.string(), "style": pa.string(), "timestamp": pa.float32()}

@@ -1,6 +1,6 @@
-"""Writes LeRobotDataset v2.1, the layout on which openpi and Isaac GR00T train. lerobot itself writes a newer layout.
+"""Writes LeRobotDataset v2.1, the layout that openpi and Isaac GR00T read. lerobot itself writes a newer layout.
 
-Cameras have the names of openpi. GR00T needs ``meta/modality.json`` and the column of task descriptions.
+Cameras have the names that openpi expects. GR00T needs ``meta/modality.json`` and the column of task descriptions.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from q2r2_control.export.lerobot import check_alike, source_of, video_key, write
 from q2r2_control.export.sampling import CameraFrames, Names
 from q2r2_control.extras import install_line
 
-DESCRIPTION = "annotation.human.action.task_description"  # GR00T's name of the column with the number of the task.
-# The same for the subtask: subtasks are in the list of tasks too.
+DESCRIPTION = "annotation.human.action.task_description"  # GR00T's name of the column with the index of the task.
+# The name of the column with the index of the subtask. Subtasks are in the list of tasks too.
 SUBTASK_DESCRIPTION = "annotation.human.action.subtask_description"
 OPENPI_CAMERAS = ("cam_high", "cam_left_wrist", "cam_right_wrist")
 _ANNOTATION = "annotation."
@@ -32,23 +32,23 @@ _CHUNK = 1000  # The number of episodes in a folder.
 _DATA = "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
 _VIDEO = "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4"
 _COUNTED = ("frame_index", "episode_index", "index", "task_index", DESCRIPTION)
-_PACKED, _ABOUT = "frames.parquet", "about.json"  # The files of one episode before it has a number.
-# The decoders of all trainers know H.264. Every second picture is a key frame, so each picture is found quickly.
+_PACKED, _ABOUT = "frames.parquet", "about.json"  # The files of one episode before the episode has a number.
+# All trainers can decode H.264. Every second picture is a key frame, so any single picture is decoded quickly.
 _CODEC, _CODING = "libx264", {"crf": "20", "g": "2", "bf": "0"}
 
 
 def require_v21() -> None:
-    """Raises :class:`ConfigError` if pyarrow or av is not installed."""
+    """Raise :class:`ConfigError` if pyarrow or av is not installed."""
     if find_spec("pyarrow") is None or find_spec("av") is None:
         raise ConfigError(f"export lerobot-v2.1 needs pyarrow and av: {install_line('export')}")
 
 
 def openpi_names(cameras: Mapping[str, CameraFrames]) -> dict[str, str]:
-    """Return the name of each camera in the dataset.
+    """Return, by the name of each camera, its name in the dataset.
 
-    One camera on each arm and one other camera get the names of openpi. All others keep their names. A camera is on an
-    arm if the name of its link begins with the arm's name. For a camera on a ROS topic, which has no link, its own name
-    counts.
+    One camera on each arm and one other camera get the names of openpi. All further cameras keep their names. A camera
+    is on an arm if the name of its link begins with the arm's name. A camera on a ROS topic has no link. It is on an
+    arm if its own name begins with the arm's name.
     """
     names = {name: name for name in cameras}
     for name, frames in cameras.items():
@@ -61,7 +61,7 @@ def openpi_names(cameras: Mapping[str, CameraFrames]) -> dict[str, str]:
 
 
 def write_v21(episode: EpisodeVectors, folder: Path) -> None:
-    """Write the numbers and videos of one episode into a new ``folder``; an old folder is removed."""
+    """Write the numbers and videos of one episode into ``folder``. A folder of an earlier attempt is removed first."""
     import pyarrow as pa
     from pyarrow import parquet
 
@@ -187,7 +187,7 @@ data = SimpleDataConfig(
 
 
 def _annotation(column: str) -> str:
-    """Return the name that GR00T gives to a column of annotations; empty for another column."""
+    """Return the name that GR00T gives to a column of annotations. The name is empty for any other column."""
     return column.removeprefix(_ANNOTATION) if column.startswith(_ANNOTATION) else ""
 
 
@@ -201,7 +201,7 @@ def _scalar(dtype: str) -> dict[str, Any]:
 
 
 def _column(values: npt.NDArray[Any]) -> Any:
-    """Return rows (n, size) as a column of lists, or of plain numbers if size is 1."""
+    """Return ``values`` (n, size) as a column of lists, or as a column of plain numbers if size is 1."""
     import pyarrow as pa
 
     flat = pa.array(values.ravel())
@@ -215,12 +215,15 @@ def _stats(values: npt.NDArray[Any]) -> dict[str, list[float]]:
 
 
 def _runs(values: Sequence[Any]) -> list[tuple[Any, list[int]]]:
-    """Return each run of equal values that follow each other, with the indices of the run."""
+    """Return each group of successive equal values, as the value and the indices of the group."""
     return [(value, list(places)) for value, places in groupby(range(len(values)), key=values.__getitem__)]
 
 
 def _modality(names: Names, cameras: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Return which numbers of state and action belong to which part of the robot, as in GR00T's ``modality.json``."""
+    """Return the content of GR00T's ``modality.json`` without annotations.
+
+    It says which numbers of state and action belong to which part of the robot, and names the videos.
+    """
 
     def part(label: str) -> str:
         arm = next((arm for arm in names.get("intervention", ()) if label.startswith(f"{arm}_")), None)
@@ -244,7 +247,7 @@ def _video_feature(height: int, width: int, fps: int) -> dict[str, Any]:
 
 
 def _write_video(shown: CameraFrames, fps: int, path: Path) -> dict[str, Any]:
-    """Encode the pictures of one camera; returns the statistics of each colour, from 0 to 1."""
+    """Encode the pictures of one camera as a video. Return the statistics of each colour, whose values are 0 .. 1."""
     import av
 
     height, width, _ = shown.size

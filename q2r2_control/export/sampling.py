@@ -1,8 +1,8 @@
 """Samples frames at a fixed rate from the ticks of a recording, and makes the features of a dataset from them.
 
-Frame k is at t_k = t_0 + k / fps, to the nanosecond, where t_0 is the time of the first tick. Observations are those of
-the newest tick at or before t_k. Commands are those of the first tick at or after t_k. Thus an observation never
-contains the future, and a command was not made before the observation.
+Frame k is at the time t_k = t_0 + k / fps, rounded to a nanosecond, where t_0 is the time of the first tick. Its
+observations are from the newest tick at or before t_k. Its commands are from the first tick at or after t_k. Thus an
+observation never contains the future, and a command was not made before the observation.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from q2r2_control.types import Array
 Columns = dict[str, npt.NDArray[Any]]
 Vectors = dict[str, npt.NDArray[np.float32]]
 Names = dict[str, tuple[str, ...]]
-Pixels = npt.NDArray[np.uint8 | np.uint16]  # (height, width, 3) r g b, or depth (height, width).
+Pixels = npt.NDArray[np.uint8 | np.uint16]  # (height, width, 3) r g b 0 .. 255, or (height, width) of depth.
 
 OBSERVED = ("position", "velocity", "effort", "opening")
 COMMANDED = ("reference", "gripper", "target", "reference_tool", "intervention")
@@ -44,19 +44,25 @@ _JOINT_UNITS = {
 }
 _FLAGS = ("intervention",)
 OPENING_UNIT = "0 closed .. 1 open"
-_MOVING = 0.01  # A reference moves if its fastest joint is faster than this [rad/s].
-_OLDEST = 2  # The largest age of a picture in periods of the camera, so that one picture may be lost.
+_MOVING = 0.01  # The reference counts as moving if its fastest joint is faster than this [rad/s].
+# The largest age of a picture, in periods of the camera. With 2 periods, one picture may be lost.
+_OLDEST = 2
 
 
 def sample(recording: Recording, fps: int, trim: bool = False, span: EpisodeSpan = WHOLE) -> dict[str, Array]:
-    """Return the observations and commands at each of n frames of the ``span``. Its first tick is at t_0.
+    """Return the observations and commands at each of n frames of the ``span``, by name.
 
-    Measured are ``position``, ``velocity``, ``effort`` (n, joints) [rad, rad/s, Nm] and ``opening`` (n, arms), 0 closed
-    .. 1 open, or -inf if not measured. Commanded are ``reference`` (n, joints) [rad] and ``gripper`` (n, arms).
-    ``reference_tool`` and ``target`` are poses x y z [m] qx qy qz qw in the world (n, arms, 7). Without a target of the
-    operator, ``target`` is ``reference_tool``. ``intervention`` (n, arms) is 1 where a hand moves the arm instead of a
-    policy. ``time`` (n,) [s] is since t_0, and ``stamp`` (n,) is the time of day [ns]. With ``trim``, frames are from
-    the first to the last tick at which an arm is engaged or the reference moves.
+    The time t_0 is that of the first tick in the ``span``. With ``trim``, it is that of the first tick at which an arm
+    is engaged or the reference moves, and frames end with the last such tick. The result contains:
+
+    - ``position``, ``velocity``, ``effort`` (n, joints): measured numbers [rad, rad/s, Nm].
+    - ``opening`` (n, arms): measured openings of grippers, 0 closed .. 1 open; -inf if not measured.
+    - ``reference`` (n, joints): the controller's reference [rad].
+    - ``gripper`` (n, arms): commanded openings of grippers; -inf if not commanded.
+    - ``reference_tool``, ``target`` (n, arms, 7): the tool pose at the reference, and the operator's target, as
+      x y z [m] qx qy qz qw in the world. Without a target of the operator, ``target`` is ``reference_tool``.
+    - ``intervention`` (n, arms): 1 where a hand moves the arm instead of a policy, otherwise 0.
+    - ``time``, ``stamp`` (n,): the time since t_0 [s], and the time of day [ns].
 
     Raises :class:`RecordingError` if the file is damaged, if it has no usable tick, if ticks were lost for longer than
     a frame, or if a clock was set in the ``span``.
@@ -103,9 +109,9 @@ def _times_until(last: int, start: int, fps: int, first_frame: int) -> npt.NDArr
 
 
 def _ticks(recording: Recording, fps: int, span: EpisodeSpan) -> Iterator[Columns]:
-    """Yield the columns of the ticks in chunks.
+    """Yield the columns of all ticks, chunk by chunk.
 
-    Check that no ticks are missing for longer than a frame, and that no clock was set within the ``span``.
+    Raises :class:`RecordingError` if ticks are missing for longer than a frame, or if a clock was set in the ``span``.
     """
     numbers = times = np.empty(0, dtype=np.int64)
     dts = np.empty(0)
@@ -140,7 +146,7 @@ def _ticks(recording: Recording, fps: int, span: EpisodeSpan) -> Iterator[Column
 
 
 def _check_clock(recording: Recording, span: EpisodeSpan, numbers: npt.NDArray[np.int64], t: Array, dt: Array) -> None:
-    """Raises :class:`RecordingError` if a clock was set in the ``span``, or set back to a time in it."""
+    """Raise :class:`RecordingError` if a clock was set in the ``span``, or was set back to a time in it."""
     steps = clock_steps(numbers, t, dt)
     for at in np.flatnonzero(steps):
         first, last = sorted(t[at - 1 : at + 1])
@@ -152,10 +158,11 @@ def _check_clock(recording: Recording, span: EpisodeSpan, numbers: npt.NDArray[n
 
 
 def features(frames: Mapping[str, Array], robot: Robot) -> tuple[Vectors, Names]:
-    """Return the vectors (n, size) of the n ``frames`` of :func:`sample` by feature, and the names of their numbers.
+    """Return two dicts by feature: the vectors (n, size) of the n ``frames``, and the names of the vectors' numbers.
 
-    Grippers that the plant does not measure, or that are not commanded, are left out. Raises :class:`RecordingError`,
-    without the file's name, for numbers that are not finite, and if the robot is not the recorded one.
+    The ``frames`` are those of :func:`sample`. Grippers that the plant does not measure, or that are not commanded, are
+    left out. Raises :class:`RecordingError`, without the file's name, if a number is not finite or if ``robot`` is not
+    the recorded robot.
     """
     arms, joints = tuple(robot.arms), robot.joint_names
     check_tools(frames["reference"][0], frames["reference_tool"][0], robot)
@@ -194,7 +201,7 @@ def features(frames: Mapping[str, Array], robot: Robot) -> tuple[Vectors, Names]
 
 
 def units_of(names: Names) -> Names:
-    """Return the unit of each number of the features, given the ``names`` that :func:`features` returns."""
+    """Return, by feature, the unit of each number. ``names`` are those that :func:`features` returns."""
     return {feature: tuple(_unit(feature, label) for label in labels) for feature, labels in names.items()}
 
 
@@ -210,7 +217,11 @@ def _unit(feature: str, label: str) -> str:
 
 
 def _known(frames: Mapping[str, Array], what: str, arms: tuple[str, ...]) -> list[int]:
-    """Return the arms with a known opening at every frame; an arm without any known opening has no gripper."""
+    """Return the indices of the arms whose opening is known at every frame.
+
+    If an arm's opening is known at no frame, the arm has no gripper. Raises :class:`RecordingError` if an arm's opening
+    is known only at some frames.
+    """
     unknown = frames[what] == NOT_MEASURED
     for index, arm in enumerate(arms):
         if unknown[:, index].any() and not unknown[:, index].all():
@@ -219,10 +230,10 @@ def _known(frames: Mapping[str, Array], what: str, arms: tuple[str, ...]) -> lis
 
 
 def continuous(poses: Array, first: Array | None = None) -> Array:
-    """Return poses (n, arms, 7) whose quaternions do not change sign from frame to frame.
+    """Return the ``poses`` (n, arms, 7) with quaternions whose signs do not change from frame to frame.
 
-    The first quaternion has the same sign as the quaternion in ``first`` (arms, 7). Without ``first``, its largest
-    number is positive.
+    A quaternion and its negative are the same rotation. At the first frame, the sign is chosen so that the quaternion
+    is nearer to that in ``first`` (arms, 7). Without ``first``, its number with the largest absolute value is positive.
     """
     quaternions = poses[..., 3:]
     if first is None:
@@ -251,7 +262,10 @@ def _to_next(poses: Array) -> Array:
 
 @dataclass(frozen=True)
 class CameraFrames:
-    """The pictures of one camera, one for each frame of an episode: colours, or depth, where 0 means unknown."""
+    """The pictures of one camera, one for each frame of an episode.
+
+    They show colours or depth. In depth, the number 0 stands for an unknown depth.
+    """
 
     recording: Recording
     name: str
@@ -274,7 +288,10 @@ class CameraFrames:
         return self.recording.depth_unit(self.name)
 
     def __iter__(self) -> Iterator[Pixels]:
-        """Yield each frame's newest picture. Raises :class:`RecordingError` if it is older than two camera periods."""
+        """Yield, for each frame, the newest picture at that time.
+
+        Raises :class:`RecordingError` if the picture is older than two periods of the camera, or if there is none.
+        """
         pictures = self.recording.depths(self.name) if self.is_depth else self.recording.pictures(self.name)
         newest, coming = None, next(pictures, None)
         pixels: Pixels | None = None

@@ -22,32 +22,39 @@ _TRAVEL = 0.01  # If the joints of an arm move more than this between two pictur
 # A part of a picture is damaged if its brightness differs too much from the pictures before and after. The limit is the
 # first number, plus the second number times the difference between these two pictures.
 _ODD, _ODD_RATIO = 10.0, 3.0
-_PARTS = (4, 6, 4, 8)  # The parts of a view: rows of parts, rows in each; columns of parts, columns in each.
-# Damaged parts are looked for in the pictures of cameras with at least this rate [Hz]. At a lower rate, a moving body
-# may be in a part in one picture only, and would look like damage.
+# A view is divided into 4 x 4 parts of 6 x 8 pixels. The numbers are in the order in which a view is reshaped: rows of
+# parts, pixel rows of each part, columns of parts, pixel columns of each part.
+_PARTS = (4, 6, 4, 8)
+# Damaged parts are searched for only if the camera's rate is at least this [Hz]. At a lower rate, a moving body may be
+# in a part in one picture only. The part would then wrongly count as damaged.
 _QUICK = 10.0
 LARGEST_LAG = 0.4  # The largest lag that is searched for [s].
 _LAG_STEP = 0.02  # The step between two lags that are compared [s].
 _IN_TIME = 0.1  # A lag up to this is preferred if it explains the motion nearly as well as the best lag [s].
-# A larger lag is preferred if two conditions hold. It explains more of the pictures' motion by this share of it:
-_NEARLY = 0.05
-# What it leaves unexplained is at most this share of what the small lags leave unexplained:
-_LEFT = 0.65
+# A larger lag is chosen only if two conditions hold. The first condition: the share of the pictures' motion that the
+# larger lag explains exceeds the share that the best small lag explains by more than this number.
+_CLEARLY = 0.05
+# The second condition: the share that the larger lag leaves unexplained, divided by the share that the best small lag
+# leaves unexplained, is at most this number.
+_UNEXPLAINED = 0.65
 _LEAST_FIT = 0.35  # Least share of the pictures' motion that the arms' motion must explain, or else the lag is unknown.
-_FEWEST = 20  # The least number of pictures from which a lag or an arm can be found.
-_LEAST_TRAVEL = 0.5  # A camera on an arm is compared with fixed ones if the arm's joints travel more than this [rad].
+_FEWEST = 20  # With fewer pictures, no lag is computed and no swap of cameras is found.
+# A camera on an arm is compared with fixed cameras if the joints of its arm travel more than this in all [rad].
+_LEAST_TRAVEL = 0.5
 # Two cameras on different arms are swapped if each camera's pictures change with the motion of the other camera's arm.
-_CORRELATES = 0.4  # The least correlation of each of these two.
-_OTHER_ARM = 0.2  # The sum of these two correlations is larger by this than the sum with the cameras' own arms.
+_CORRELATES = 0.4  # Each camera's correlation with the other camera's arm must be larger than this.
+# The sum of these two correlations must exceed, by more than this, the sum of the correlations with the cameras' own
+# arms.
+_OTHER_ARM = 0.2
 _STILL = 3.0  # A pixel of a view stands still if its brightness changes by less than this.
-# A camera seems to be fixed if the share of its view that stands still is above the first number. It seems to be on an
-# arm if this share is below the second number.
+# A camera seems to be fixed if the share of its view that stands still is larger than the first number. It seems to be
+# on an arm if this share is smaller than the second number.
 _MOSTLY, _HARDLY = 0.5, 0.35
 
 
 @dataclass(frozen=True, slots=True)
 class CameraFigures:
-    """Figures of one camera, without the end of the run, while the arms come to rest.
+    """Figures of one camera. The end of the run, in which the arms come to rest, is left out.
 
     None means that a figure cannot be computed.
     """
@@ -57,16 +64,20 @@ class CameraFigures:
     missing_pictures: int  # The number of pictures that were due and are missing.
     rate_share: float | None  # The number of pictures divided by the number that was due.
     longest_gap_periods: float | None  # The longest time without a picture, in the camera's periods.
-    # Of the pairs of successive pictures between which the arms moved, the share whose two pictures are equal.
+    # The share of frozen pictures among the pictures just before which an arm moved. A picture is frozen if it equals
+    # the picture before it.
     frozen_share: float | None
     black_share: float | None  # The share of the pictures that are black or have one colour only.
     bad_pictures: int  # The number of pictures that are damaged, or have another size than the cell says.
-    lag_ms: float | None  # The delay of the motion in the pictures behind the motion of the joints.
-    swapped_with: str | None  # The camera with which it was swapped; None if it was not swapped.
+    lag_ms: float | None  # The delay of the motion in the pictures behind the motion of the joints [ms].
+    swapped_with: str | None  # The other camera, if these two cameras were swapped; None if not.
 
 
 def camera_figures(episode: Episode) -> dict[str, CameraFigures]:
-    """Return the figures of all cameras whose pictures can be read, by name."""
+    """Return the figures of all cameras whose pictures can be read, by the camera's name.
+
+    The result is empty if the file has no tick before the end of the run.
+    """
     if not episode.ticks.following.any():
         return {}
     looks = {name: _CameraLook(episode, name, pictures) for name, pictures in episode.pictures.items()}
@@ -75,13 +86,13 @@ def camera_figures(episode: Episode) -> dict[str, CameraFigures]:
 
 
 class _CameraLook:
-    """Compares the pictures of a camera with the motion of the arms."""
+    """Compares the k pictures of a camera with the motion of the arms."""
 
     def __init__(self, episode: Episode, name: str, pictures: Pictures) -> None:
         camera = episode.config.cameras[name]
         t = episode.ticks.t[episode.ticks.following]
         self._start, self._end = float(t[0]), float(t[-1])
-        self._rate = min(camera.rate, episode.config.nominal_rate_hz)  # At most one picture in a tick.
+        self._rate = min(camera.rate, episode.config.nominal_rate_hz)  # There is at most one picture per tick.
         self._pictures = pictures.between(self._start, self._end, 0.0)
         # It is not known whether a real camera without a link is fixed, so it does not count as fixed.
         self.fixed = camera.is_simulated and camera.link is None
@@ -119,14 +130,20 @@ class _CameraLook:
         return missing.count
 
     def _frozen_share(self) -> float | None:
-        """Return the share of equal pictures while the camera's own arm moves, or any arm if no arm carries it."""
+        """Return the share of pictures that equal the picture before them, although an arm moved between the two.
+
+        The arm is the arm that carries the camera, or any arm if no arm carries it. Return None if no arm moved.
+        """
         arms: Collection[str] = self._joints if self.arm is None else (self.arm,)
         moved = np.max([self.travel(arm) for arm in arms], axis=0) > _TRAVEL
         same = self._pictures.repeated[1:] | (self._change == 0.0)
         return float(same[moved].mean()) if moved.any() else None
 
     def _odd(self, views: Array) -> Flags:
-        """Return which pictures seem damaged: a part differs from the pictures before and after, which are alike."""
+        """Return which pictures (k,) seem damaged.
+
+        One part of such a picture differs from the pictures before and after, although these two are alike.
+        """
         odd = np.zeros(len(views), dtype=bool)
         if len(views) > 2 and self._rate >= _QUICK:
             change, across = _by_part(np.diff(views, axis=0)), _by_part(views[2:] - views[:-2])
@@ -134,7 +151,7 @@ class _CameraLook:
         return odd
 
     def travel(self, arm: str, lag: float = 0.0) -> Array:
-        """Return how far an arm's joints moved (k - 1,) [rad] from each picture to the next.
+        """Return how far an arm's joints moved (k - 1,) from each picture to the next, as a Euclidean norm [rad].
 
         A picture is assumed to show the arm ``lag`` [s] before the time of the picture.
         """
@@ -150,6 +167,8 @@ class _CameraLook:
         the change clearly better than the lags near zero, since two motions make a wrong lag fit too: An arm that moves
         to and fro has the same speed again later. An arm that moves in a circle looks faster when it is near the
         camera.
+
+        Return None if there are too few pictures, if they do not change, or if the best lag explains too little.
         """
         change, lags = self._change, np.arange(-LARGEST_LAG, LARGEST_LAG + _LAG_STEP, _LAG_STEP)
         energy = float(np.sum((change - change.mean()) ** 2)) if len(change) >= _FEWEST else 0.0
@@ -160,12 +179,15 @@ class _CameraLook:
             speeds = np.stack([*(self.travel(arm, lag) for arm in self._joints), np.ones(len(change))], axis=1)
             fits[index] = 1.0 - nnls(speeds, change)[1] ** 2 / energy
         near = np.where(np.abs(lags) <= _IN_TIME, fits, -np.inf)
-        is_clear = near.max() < fits.max() - _NEARLY and 1.0 - fits.max() <= _LEFT * (1.0 - near.max())
+        is_clear = near.max() < fits.max() - _CLEARLY and 1.0 - fits.max() <= _UNEXPLAINED * (1.0 - near.max())
         best = fits if is_clear else near
         return float(lags[np.argmax(best)]) if fits.max() >= _LEAST_FIT else None
 
     def correlation(self, arm: str) -> float:
-        """Return the correlation of the change of the pictures with the motion of an arm."""
+        """Return the correlation of the change of the pictures with the motion of an arm.
+
+        The result is 0 if there are too few pictures, or if the change or the motion is constant.
+        """
         travel = self.travel(arm)
         if len(travel) < _FEWEST or not (travel.std() > 0.0 and self._change.std() > 0.0):
             return 0.0
@@ -173,12 +195,15 @@ class _CameraLook:
 
     @property
     def moves(self) -> bool:
-        """Return whether the arm that carries the camera moves far enough for a comparison."""
+        """Return whether an arm carries the camera and moves far enough for a comparison with a fixed camera."""
         return self.arm is not None and float(self.travel(self.arm).sum()) > _LEAST_TRAVEL
 
     @property
     def still_share(self) -> float:
-        """Return the share of the view that stands still for nine tenths of the time."""
+        """Return the share of the view's pixels that stand still for nine tenths of the time.
+
+        The result is NaN if there are too few pictures.
+        """
         views = self._pictures.views[~self._pictures.damaged].astype(np.float64)
         if len(views) < _FEWEST:
             return float("nan")
@@ -187,11 +212,11 @@ class _CameraLook:
 
 
 def _swapped(looks: dict[str, _CameraLook]) -> dict[str, str]:
-    """Return the cameras that were swapped, by name, each with the camera with which it was swapped.
+    """Return the cameras that were swapped: by the name of each camera, the name of the other camera.
 
     Two cameras on different arms are swapped if each camera's pictures change with the motion of the other camera's
-    arm. For a fixed camera and a camera on an arm there are two conditions: Hardly anything stands still in the view of
-    the fixed camera. Most things stand still in the view of the camera on the arm.
+    arm. A fixed camera and a camera on an arm are swapped if two conditions hold: Hardly anything stands still in the
+    view of the fixed camera. Most things stand still in the view of the camera on the arm, although the arm moves.
     """
     found: dict[str, str] = {}
     for (one, first), (two, second) in combinations(looks.items(), 2):

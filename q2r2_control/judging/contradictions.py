@@ -20,7 +20,10 @@ _GRASPS = re.compile(
 
 
 def contradictions(figures: EpisodeFigures, settings: JudgeSettings) -> Iterator[Rejection]:
-    """Yield the reasons to discard an episode that have no threshold. Their only setting is ``needs_task``."""
+    """Yield the contradictions of an episode as reasons to discard it.
+
+    Unlike other reasons, contradictions have no thresholds. The only setting that matters here is ``needs_task``.
+    """
     if figures.timing.repeated_stamps:
         count = figures.timing.repeated_stamps
         yield Rejection("repeated_stamps", f"{count} ticks have the time of the tick before")

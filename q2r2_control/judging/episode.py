@@ -29,23 +29,23 @@ SPEED_OVER = 0.02  # A measured speed is an average over at least this time, sin
 class Ticks:
     """One row for each of n ticks that are in the file."""
 
-    number: npt.NDArray[np.int64]  # (n,) Numbers from 0 on, without those of lost ticks.
+    number: npt.NDArray[np.int64]  # (n,) Number of the tick. Ticks are counted from 0, and lost ticks count too.
     t: Array  # (n,) Time since the run began [s].
-    dt: Array  # (n,) Time since the loop's last tick, even if that one is not in the file [s].
-    compute_time: Array  # (n,) [s].
+    dt: Array  # (n,) Time since the loop's last tick, even if the last tick is not in the file [s].
+    compute_time: Array  # (n,) Computing time of the tick [s].
     following: Flags  # (n,) False while the run ends and the arms come to rest.
-    certified: Flags  # (n,) A certified stop is known.
-    fallback: Flags  # (n,) The certified stop was executed.
+    certified: Flags  # (n,) True if the controller had a certified stop.
+    fallback: Flags  # (n,) True if the certified stop was executed.
     distance: Array  # (n,) Distance of the nearest pair [m].
     margin: Array  # (n,) Distance of the tightest pair minus the distance that it has to keep [m].
-    engaged: Flags  # (n, arms).
-    by_policy: Flags  # (n, arms) The arm is engaged, and a policy moves it.
-    rejected: Flags  # (n, arms) The target was not usable.
+    engaged: Flags  # (n, arms) True if the arm is engaged.
+    by_policy: Flags  # (n, arms) True if the arm is engaged and a policy moves it.
+    rejected: Flags  # (n, arms) True if the controller could not use the arm's target.
     slip: Array  # (n, arms) Distance by which the leash has dragged the target since engaging [m].
-    slip_angle: Array  # (n, arms) The same as an angle [rad].
-    gripper: Array  # (n, arms) The wanted opening, 0 closed .. 1 open.
-    now: Array  # (n,) Time of the loop's own clock [s].
-    unmeasured: Flags  # (n, arms) A measured number, or a number of the reference, is not finite.
+    slip_angle: Array  # (n, arms) Angle by which the leash has dragged the target since engaging [rad].
+    gripper: Array  # (n, arms) The gripper's opening that the operator wants, 0 closed .. 1 open.
+    now: Array  # (n,) Time of the tick by the loop's own clock [s].
+    unmeasured: Flags  # (n, arms) True if a measured number, or a number of the reference, is not finite.
     joint_speed: Array  # (n, arms) Largest ratio of a measured joint speed and the speed limit of that joint.
 
 
@@ -58,9 +58,9 @@ class Frames:
     target: Array  # (m, arms, 7) The operator's targets, or ``reference`` where there is no target.
     reference: Array  # (m, arms, 7) Tool poses at the controller's reference.
     v: Array  # (m, joints) Measured velocities [rad/s].
-    reference_q: Array  # (m, joints) The controller's reference [rad].
+    reference_q: Array  # (m, joints) Joint positions of the controller's reference [rad].
     opening: Array  # (m, arms) Measured openings of grippers, 0 closed .. 1 open; -inf if not measured.
-    commanded: Array  # (m, arms) Commanded openings of grippers.
+    commanded: Array  # (m, arms) Commanded openings of grippers, 0 closed .. 1 open; -inf without a command.
 
 
 @dataclass(frozen=True)
@@ -85,14 +85,16 @@ class Episode:
     tools: Array  # (m, arms, 7) Measured tool poses, with one row for each row of ``frames``.
     hands: dict[str, Hand]  # The hands that an arm follows, by name.
     events: list[Event]
-    damage: str | None  # The reason why the file cannot be read to its end.
-    pictures: dict[str, Pictures] = field(default_factory=dict)  # By camera, if its pictures can be read.
-    ended_by: str | None = None  # The fault that ended the run.
-    success: bool | None = None  # The success by the task's own check or the operator; None if it is not known.
+    damage: str | None  # The reason why the file cannot be read to its end; None if it can.
+    # By the name of a camera, its pictures. Cameras whose pictures were not read, or cannot be read, are missing.
+    pictures: dict[str, Pictures] = field(default_factory=dict)
+    ended_by: str | None = None  # The fault that ended the run; None if no fault did.
+    # True if the episode succeeded, as the task's own check or the operator says; None if that is not known.
+    success: bool | None = None
     part: int | None = None  # The number of the episode, from 1 on; None for the whole recording.
-    discarded: bool = False  # The operator discarded it.
-    ended_by_operator: bool = False  # The operator ended it while the run went on.
-    subtask_starts: tuple[float, ...] = ()  # Times at which the operator began another subtask.
+    discarded: bool = False  # True if the operator discarded the episode.
+    ended_by_operator: bool = False  # True if the operator ended the episode while the run went on.
+    subtask_starts: tuple[float, ...] = ()  # Times at which the operator began another subtask [s].
 
     @property
     def arms(self) -> tuple[str, ...]:
@@ -111,14 +113,17 @@ class Episode:
 
     @property
     def ended(self) -> bool:
-        """Return whether the run came to its end and the file was closed, or the operator ended the episode before."""
+        """Return whether the episode is complete.
+
+        Either the operator ended the episode during the run, or the arms came to rest and the file was closed.
+        """
         if self.ended_by_operator:
             return True
         return self.recording.closed and not self.ticks.following[-1:].any()
 
 
 def read_episode(recording: Recording, *, pictures: bool = True) -> Episode:
-    """Read a recording, up to the place where it is damaged, with or without its ``pictures``.
+    """Read a recording, with or without its ``pictures``. A damaged file is read up to the damage.
 
     Raises :class:`RecordingError` if its cell cannot be built, or if the robot is not the recorded one.
     """
@@ -152,7 +157,10 @@ def read_episode(recording: Recording, *, pictures: bool = True) -> Episode:
 
 
 def _pictures(recording: Recording, config: Config, damage: str | None) -> tuple[dict[str, Pictures], str | None]:
-    """Return the pictures of all cameras, and the damage of the file; no pictures if the file is damaged."""
+    """Return the pictures by the camera's name, and the reason why the file is damaged, or None.
+
+    There are no pictures if the file is damaged, either by ``damage`` or within its pictures.
+    """
     chosen = {name: config.cameras[name] for name in recording.about.cameras if name in config.cameras}
     chosen = {name: camera for name, camera in chosen.items() if camera.topic is None or is_compressed(camera.topic)}
     if damage is not None or not chosen:
@@ -181,11 +189,11 @@ class _Read:
         self._origin = 0.0  # Time of the loop's clock at the beginning of the recording [s].
         about = recording.about
         rows, times = np.empty(0, tick_type(len(about.arms), len(about.joints))), np.empty(0, np.int64)
-        # A recording may have no tick. With this empty chunk, its arrays then have the right shapes.
+        # If the recording has no tick, this empty chunk gives its arrays the right shapes.
         self._add(TickChunk(rows, times, np.empty((0, len(SAMPLE_FIELDS))), {}))
 
     def all_chunks(self) -> str | None:
-        """Read all chunks; returns the damage of the file, or None."""
+        """Read all chunks. Return the reason why the file is damaged; None if it is not."""
         try:
             for chunk in self._recording.chunks():
                 self._add(chunk)
@@ -272,6 +280,6 @@ def _joined(kind: type[_Table], parts: list[_Table]) -> _Table:
 
 
 def stretches(flags: Flags) -> list[tuple[int, int]]:
-    """Return the beginning and the end (exclusive) of each run of true ``flags`` (n,)."""
+    """Return the first index and the end index (exclusive) of each group of successive true ``flags`` (n,)."""
     edges = np.flatnonzero(np.diff(np.concatenate(([False], flags, [False]))))
     return [(int(begin), int(end)) for begin, end in edges.reshape(-1, 2)]

@@ -24,9 +24,9 @@ from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.wording import sentence
 
 LONGEST_LINE = 300  # The longest text of a verdict [characters].
-_NICENESS = 10  # The niceness of the process, which is that of the writer. The loop has a higher priority.
-_LOOKS = 0.3  # Time between two readings of the file, which grows twice a second [s].
-_PATIENCE = 30.0  # Time to wait for a recorder that is behind [s].
+_NICENESS = 10  # The niceness of the process that judges. The writer has the same; the loop has a higher priority.
+_LOOKS = 0.3  # Time between two attempts to read the episode from the file, which grows twice a second [s].
+_PATIENCE = 30.0  # Longest time to wait until the recorder has written the episode [s].
 _BEFORE = 1_000_000_000  # Reading begins this long before the episode [ns].
 _TICKS_BETWEEN_LOOKS = 64  # The number of ticks between two checks for a verdict.
 _OF_EPISODES = {
@@ -39,7 +39,11 @@ _logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Question:
-    """An episode of a ``file`` to judge. If ``timed``, the times of its ``span`` are those of ticks in the file."""
+    """An episode of a ``file``, which has to be judged.
+
+    If ``timed`` is True, the times of ``span`` have the same clock as the ticks in the file. Otherwise the episode is
+    found by its number.
+    """
 
     file: str
     span: EpisodeSpan
@@ -61,7 +65,11 @@ def main(requests: Iterator[Question], answer: Callable[[Reason], None]) -> None
 
 
 def _verdict(question: Question, run: int) -> tuple[bool | None, str]:
-    """Return the verdict. ``run`` is the id of the process that asks; its end also ends the waiting for the file."""
+    """Wait until the episode is written. Return True to keep it or False to discard it, and the verdict in one line.
+
+    The first value is None if the episode was not written in time. ``run`` is the id of the process that asks. If that
+    process ends, the waiting ends too.
+    """
     until = time.monotonic() + _PATIENCE
     problem = f"it was not written within {_PATIENCE:g} s"
     while time.monotonic() < until and os.getppid() == run:
@@ -69,7 +77,7 @@ def _verdict(question: Question, run: int) -> tuple[bool | None, str]:
             if (episode := written_episode(question)) is not None:
                 verdict = judge_episode(episode).verdict
                 return verdict.keep, verdict.line
-        except RecordingError as error:  # The beginning of the file may be not written yet.
+        except RecordingError as error:  # Perhaps the beginning of the file is not written yet.
             problem = str(error)
         time.sleep(_LOOKS)
     return None, f"not judged: {problem}"
@@ -90,16 +98,22 @@ def written_episode(question: Question) -> Episode | None:
 
 
 class EpisodeJudge:
-    """A listener of a recorded run, used as a context manager around it. It raises nothing: a failure is logged once.
+    """Judges the episodes of a recorded run, in a process of low priority.
 
-    A caller that has no ticks calls :meth:`record_event` and :meth:`report_verdicts` itself. A process of low priority
-    does the work.
+    It is a listener of the run's pipeline, and a context manager around the run. It raises nothing: a failure is logged
+    once. A caller that has no ticks calls :meth:`record_event` and :meth:`report_verdicts` itself.
     """
 
     def __init__(
         self, file: Callable[[], Path | None], report: Callable[[Reason], None], *, timed: bool = True
     ) -> None:
-        """If ``timed``, times of events are those of ticks in the ``file``, and only the episode's ticks are read."""
+        """Prepare to judge the episodes in a file that is being written.
+
+        Args:
+            file: Returns the path of the file, or None if there is no file.
+            report: Called with each verdict.
+            timed: True if events have the same clock as the ticks in the file. Then only the episode's ticks are read.
+        """
         self._file, self._report, self._timed = file, report, timed
         self._events: list[Event] = []
         self._asked: Question | None = None
@@ -109,7 +123,7 @@ class EpisodeJudge:
         self._started = False
 
     def start(self) -> None:
-        """Start the process, which takes some milliseconds; otherwise the first question starts it."""
+        """Start the process, which takes some milliseconds. Without this call, the first question starts it."""
         self._started = True
         try:
             work = "q2r2_control.judging.episode_judge"

@@ -20,30 +20,34 @@ from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.types import Array, Flags
 from q2r2_control.wording import sentence
 
-# If an arm has a target in more frames than this, for one second, the target's topic has a message at any topic rate.
+# If an arm has a target in more frames than this, which is one second, a message on its target topic is expected. In so
+# much time, even a topic with a low rate gets a message.
 _SURELY = 100
 _SHORTEST = 1e-3  # The shortest time for which an arm counts as engaged [s].
 
 
 @dataclass(frozen=True, slots=True)
 class HandFigures:
-    """Figures of one hand while an engaged arm follows it. Rates, shares and times are None if no arm ever does."""
+    """Figures of one hand while an engaged arm follows it.
+
+    Rates, shares and times are None if no engaged arm ever follows the hand.
+    """
 
     arm: str
-    pose_rate_hz: float | None  # The number of received poses divided by the time.
-    dropouts: int  # The number of times between two poses that are too long.
+    pose_rate_hz: float | None  # The number of received poses divided by the time for which the arm follows.
+    dropouts: int  # The number of dropouts. A dropout is a time between two poses that is too long.
     dropout_share: float | None  # The share of the time that is within dropouts.
     longest_gap_s: float | None  # The longest time between two poses.
     unusable_poses: int  # The number of poses that are not finite numbers.
-    sample_age_ms_p50: float | None  # The time from the receipt of a pose to the tick that took it.
+    sample_age_ms_p50: float | None  # Median of the time from the receipt of a pose to the tick that took it.
     sample_age_ms_p99: float | None
 
 
 def hand_figures(episode: Episode, hand: str, dropout: float) -> HandFigures:
     """Return the figures of a hand's samples. A time between poses is a dropout if it is longer than ``dropout`` [s].
 
-    Times between poses, and the time from the last pose to the end, count while the arm follows the hand and no tick
-    was lost.
+    The time from the last pose to the end counts as a time between poses. Times between poses count only while the arm
+    follows the hand and no tick was lost.
     """
     ticks, samples = episode.ticks, episode.hands[hand]
     engaged = (ticks.engaged & ~ticks.by_policy)[:, episode.arms.index(samples.arm)] & ticks.following
@@ -60,7 +64,7 @@ def hand_figures(episode: Episode, hand: str, dropout: float) -> HandFigures:
     ends = np.concatenate(([ticks.t[engaged][0]], received, [ticks.t[engaged][-1]]))
     ends = np.maximum.accumulate(ends)
     gaps, inside = np.diff(ends), np.diff(np.interp(ends, ticks.t, passed))
-    lost = np.flatnonzero(np.diff(ticks.number) > 1)  # Ticks, and maybe samples, were lost after these.
+    lost = np.flatnonzero(np.diff(ticks.number) > 1)  # Ticks, and perhaps samples, were lost after these rows.
     with_lost = np.searchsorted(ticks.t[lost + 1], ends[:-1]) < np.searchsorted(ticks.t[lost], ends[1:], side="right")
     counting = (inside > _SHORTEST) & ~with_lost
     long = counting & (gaps > dropout)
@@ -100,21 +104,22 @@ class Fault:
 
 @dataclass(frozen=True, slots=True)
 class TimingFigures:
-    """Figures of all ticks, the end of the run included. Shares and maxima are None if there are no ticks."""
+    """Figures of all ticks, also of those at the end of the run. Shares and maxima are None if there are no ticks."""
 
     ticks: int  # The number of ticks that are in the file.
     lost_ticks: int  # The number of ticks that are missing in the file, up to its last tick.
     lost_share: float | None
     longest_lost_s: float  # The longest time span that has no tick in the file.
-    late_ticks: int  # The number of ticks that come more than 1.5 periods after the one before.
+    late_ticks: int  # The number of ticks that come more than 1.5 periods after the tick before.
     missed_ticks: int  # The number of whole periods that passed without a tick.
-    missed_share: float | None  # The share of missed ticks among those that were due.
+    missed_share: float | None  # The number of missed ticks divided by the number of ticks that were due.
     longest_tick_s: float | None  # The longest time between two ticks of the loop.
     compute_time_us_p99: float | None
-    ended: bool  # The arms came to rest and the file was closed.
-    # The number of ticks with the time of the tick before. None for ROS nodes, whose messages may arrive together.
+    ended: bool  # True if the run came to its planned end, or if the operator ended the episode.
+    # The number of ticks that have the same time as the tick before. None for a recording of ROS nodes, because several
+    # of their messages may arrive together.
     repeated_stamps: int | None
-    clock_step_s: float  # The largest step by which a clock was set; negative if back, 0 if no clock was set.
+    clock_step_s: float  # The largest step by which a clock was set: negative if it was set back, 0 if none was set.
     begins_again: bool  # True if the run goes on after its end has begun, so that two runs are in one file.
 
 
@@ -148,14 +153,14 @@ class EpisodeFigures:
     file: str
     part: int | None  # The number of the episode in the file, from 1 on; None for the whole file.
     task: str | None  # The task in words; None if it is not known.
-    duration_s: float  # The time until the end of the run begins, in which the arms come to rest.
-    engaged_s: float  # The time for which any arm is engaged.
+    duration_s: float  # The duration without the end of the run, in which the arms come to rest.
+    engaged_s: float  # The time for which at least one arm is engaged.
     idle_share: float | None
     hands: dict[str, HandFigures]
     arms: dict[str, ArmFigures]
     measured: dict[str, MeasuredFigures]  # By arm.
     cameras: dict[str, CameraFigures]
-    empty_topics: list[str]  # The topics without a message among those that should have one.
+    empty_topics: list[str]  # The topics that should have a message and have none.
     faults: list[Fault]
     fallback_ticks: int
     fallback_share: float | None
@@ -164,10 +169,11 @@ class EpisodeFigures:
     min_distance_mm: float | None  # The distance of the nearest monitored pair, at the controller's reference.
     min_margin_mm: float | None  # The distance of the tightest pair minus the distance that it has to keep.
     timing: TimingFigures
-    damage: str | None  # The reason why the file cannot be read to its end.
-    ended_by: str | None  # The fault that ended the run.
-    discarded: bool  # The operator discarded the episode.
-    success: bool | None  # The success by the task's own check or the operator; None if it is not known.
+    damage: str | None  # The reason why the file cannot be read to its end; None if it can.
+    ended_by: str | None  # The fault that ended the run; None if no fault did.
+    discarded: bool  # True if the operator discarded the episode.
+    # True if the episode succeeded, as the task's own check or the operator says; None if that is not known.
+    success: bool | None
     subtasks: list[SubtaskFigures]  # In the order of time; see :func:`subtask_figures`.
     missing_subtasks: list[str]  # The names of the cell's subtasks that the operator did not begin.
 
@@ -177,7 +183,7 @@ class EpisodeFigures:
 
 
 def figures_of(episode: Episode, dropout: float) -> EpisodeFigures:
-    """Return the numbers of an episode. A time between a hand's poses above ``dropout`` [s] is a dropout."""
+    """Return the numbers of an episode. A time between poses of a hand is a dropout if it exceeds ``dropout`` [s]."""
     ticks, following, count = episode.ticks, episode.ticks.following, len(episode.ticks.t)
     engaged = ticks.engaged.any(axis=1) & following
     duration = float(ticks.t[following][-1]) if following.any() else 0.0
@@ -217,15 +223,15 @@ def figures_of(episode: Episode, dropout: float) -> EpisodeFigures:
 
 
 def _empty_topics(episode: Episode) -> list[str]:
-    """Return the topics without a message that should have one.
+    """Return the topics that should have a message and have none.
 
-    The list is empty for a file without an index, where the counts are not known, and for a recording of ROS nodes,
-    which may have published nothing.
+    The list is empty for a file without an index, because the numbers of its messages are not known. It is also empty
+    for a recording of ROS nodes, because they may have published nothing.
     """
     about, counts = episode.recording.about, episode.recording.counts
     if about.source != LOOP or counts is None or not len(episode.ticks.t):
         return []
-    # The number of frames with a target, by arm.
+    # (arms,) The number of frames in which each arm has a target.
     asked = (episode.frames.target != episode.frames.reference).any(axis=2).sum(axis=0)
     expected = list(loop_topics(about.arms))
     expected += [target(arm) for arm, count in zip(about.arms, asked.tolist(), strict=True) if count > _SURELY]

@@ -50,7 +50,7 @@ class Verdict:
 
     @property
     def findings(self) -> tuple[str, ...]:
-        """The texts of the reasons. Cameras with the same finding share a text, and come after all other reasons."""
+        """The texts of the reasons. Cameras with the same reason share a text, which comes after all other texts."""
         others = list[str]()
         cameras: dict[str, list[str]] = {}
         for reason in self.reasons:
@@ -81,7 +81,7 @@ def verdict_of(figures: EpisodeFigures, settings: JudgeSettings) -> Verdict:
     for threshold in THRESHOLDS:
         limit = getattr(settings, threshold.name)
         for whose, found in groups[threshold.of].items():
-            # Only the first reason about a camera tells the number of its missing pictures.
+            # The first reason about a camera also states the number of its missing pictures. Later reasons do not.
             missing = 0 if whose in told else getattr(found, "missing_pictures", 0)
             says = f"{whose}{missing} pictures missing, " if missing else whose
             if (reason := threshold.reason(getattr(found, threshold.figure), limit, says)) is not None:
@@ -124,7 +124,7 @@ def parts_of(episode: Episode) -> list[Episode]:
 def part_of(episode: Episode, span: EpisodeSpan) -> Episode:
     """Return an episode of a recording. Times are since the episode began, and its first tick has number 0."""
     ticks, frames = episode.ticks, episode.frames
-    # A search in sorted times is not possible, because times repeat after the clock was set back.
+    # ``searchsorted`` cannot be used: if the clock was set back, the times are not in ascending order.
     inside = np.flatnonzero((span.start <= ticks.t) & (ticks.t <= span.end))
     first, end = (int(inside[0]), int(inside[-1]) + 1) if len(inside) else (0, 0)
     cut = {name: values[first:end] for name, values in vars(ticks).items()}
@@ -217,7 +217,7 @@ def judge_all(files: Sequence[Path], settings: JudgeSettings | None = None) -> I
 
     Args:
         files: The files of recordings, as ``recordings_in`` returns them.
-        settings: The thresholds; None for those of each recording's own cell.
+        settings: The thresholds; None for the thresholds of each recording's own cell.
 
     Yields:
         The verdict on each episode, in the order of the files. A file that cannot be read gives an :class:`Unreadable`.
@@ -239,9 +239,9 @@ def judgements_of(settings: JudgeSettings | None, file: Path) -> list[Judgement 
 
 
 def discarded_episodes(file: Path, pictures: bool) -> dict[int, str]:
-    """Return why episodes of a recording are discarded, by their number; 0 is the whole recording.
+    """Return the discarded episodes of a recording: by the number of the episode, the verdict in one line.
 
-    The pictures are judged if ``pictures`` is True.
+    The number 0 stands for the whole recording. The pictures are judged if ``pictures`` is True.
 
     Raises:
         RecordingError: If the recording cannot be opened or judged.
@@ -262,7 +262,9 @@ def _discarded(file: Path, pictures: bool, absolute: Path, changed: int) -> dict
 
 
 def keep_verdicts(judged: Sequence[Judged]) -> Path:
-    """Write the verdicts on a recording's episodes into a file beside it, completely or not at all.
+    """Write the verdicts on a recording's episodes into a file beside the recording, and return the path of that file.
+
+    The file is written completely or not at all.
 
     Raises:
         RecordingError: If the file cannot be written.

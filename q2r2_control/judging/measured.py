@@ -1,6 +1,6 @@
-"""Compute from an arm's measurements whether they are plausible.
+"""Compute figures that show whether an arm's measurements are plausible.
 
-They have to be finite, not faster than the speed limits of the joints, and near the controller's reference.
+The numbers have to be finite. The joints must not be faster than their speed limits, nor far from the reference.
 """
 
 from __future__ import annotations
@@ -14,25 +14,27 @@ from q2r2_control.judging.motion import Track, best_delay
 from q2r2_control.types import Array
 
 _SPEED_FRAMES = 10  # The number of frames over which a joint's speed is averaged.
-_MOVES = 0.02  # The least RMS speed at which a joint's measured velocity is compared with its positions [rad/s].
-_LONGEST_GAP = 0.05  # The longest time between the frames over which a velocity is compared [s].
+# A joint's measured velocity is compared with its positions if the joint's RMS speed is above this [rad/s].
+_MOVES = 0.02
+_LONGEST_GAP = 0.05  # A slope of the positions is computed from frames that are at most this far apart [s].
 _LARGEST_LAG = 0.35  # The largest lag that is searched for [s].
-_STEP = 0.005  # The step of lags, and of the times that are compared [s].
+_STEP = 0.005  # The step between two lags, and between the times at which velocities are compared [s].
 
 
 @dataclass(frozen=True, slots=True)
 class MeasuredFigures:
-    """Figures of one arm, without the end of the run, while the arms come to rest.
+    """Figures of one arm. The end of the run, in which the arms come to rest, counts only for ``unmeasured_ticks``.
 
     None means that a figure cannot be computed.
     """
 
     unmeasured_ticks: int  # The number of ticks with a position, velocity, opening or reference that is not finite.
-    joint_speed_share: float  # Mean speed over 20 ms or 10 frames, divided by the limit; of the worst joint.
-    velocity_mismatch: float | None  # |k - 1|, where velocity = k * slope of the position; of the worst joint.
+    # The largest ratio of a joint's mean speed, over 20 ms or over ten frames, to the speed limit of the joint.
+    joint_speed_share: float
+    velocity_mismatch: float | None  # |k - 1| of the worst joint, where velocity = k * slope of the position.
     reference_lag_ms: float | None  # The lag of the measured joints behind the reference.
-    opening_range: float | None  # The range of measured openings; None if they are not measured.
-    commanded_range: float | None  # The range of commanded openings; None if the arm has no gripper.
+    opening_range: float | None  # The largest measured opening minus the smallest; None if none was measured.
+    commanded_range: float | None  # The largest commanded opening minus the smallest; None if the arm has no gripper.
 
 
 def measured_figures(episode: Episode, arm: str) -> MeasuredFigures:
@@ -54,7 +56,7 @@ def measured_figures(episode: Episode, arm: str) -> MeasuredFigures:
 
 
 def _lasting_speed(t: Array, q: Array, limits: Array) -> float:
-    """Return the largest speed over ten frames, a tenth of a second, divided by the limit of the joint."""
+    """Return the largest ratio of a joint's mean speed, over ten frames (0.1 s), to the ``limits`` of the joints."""
     if len(t) <= _SPEED_FRAMES:
         return 0.0
     passed = np.maximum(t[_SPEED_FRAMES:] - t[:-_SPEED_FRAMES], 1e-9)
@@ -65,7 +67,10 @@ def _lasting_speed(t: Array, q: Array, limits: Array) -> float:
 
 
 def _velocity_mismatch(t: Array, q: Array, v: Array) -> float | None:
-    """Return |k - 1| of the worst joint, where v = k dq/dt fits best; k is -1 for velocities of the wrong sign."""
+    """Return |k - 1| of the worst joint, where v = k dq/dt fits best; k is -1 for velocities of the wrong sign.
+
+    The result is None if no velocity is measured, or if no joint moves.
+    """
     if len(t) < 3 or not np.nan_to_num(v).any():  # Velocities are not measured.
         return None
     slope, measured = (q[2:] - q[:-2]) / np.maximum(t[2:] - t[:-2], 1e-9)[:, None], v[1:-1]
@@ -81,7 +86,7 @@ def _velocity_mismatch(t: Array, q: Array, v: Array) -> float | None:
 def _reference_lag(t: Array, q: Array, reference: Array) -> float | None:
     """Return the lag [ms] of the measured joints behind the reference, as in :func:`delays`.
 
-    It is negative if the measured joints are ahead of the reference.
+    The lag is negative if the measured joints are ahead of the reference. It is None if it cannot be computed.
     """
     usable = np.isfinite(q).all(axis=1) & np.isfinite(reference).all(axis=1)
     t, q, reference = t[usable], q[usable], reference[usable]

@@ -15,45 +15,49 @@ from q2r2_control.judging.episode import FRAME, Episode, stretches
 from q2r2_control.teleop.relative import RelativeMotion
 from q2r2_control.types import Array, Flags
 
-PIECE = 1.0  # The duration of a piece of a motion, for which smoothness is computed [s].
+# Smoothness is computed for short, overlapping time spans of a motion, which are called pieces. This is their
+# duration [s].
+PIECE = 1.0
 _HOP = 0.25  # The time from the start of one piece to the start of the next [s].
-_FEWEST = 8  # The least number of pieces.
-_SLOWEST = 0.02  # The least mean speed of a piece that counts [m/s].
-_LONGEST_GAP = 0.05  # The longest time between two frames of a piece [s].
-# The standard deviation of the Gaussian that smooths positions before the jerk [s]. It halves the power at 6.6 Hz.
+_FEWEST = 8  # Without at least this number of pieces, no smoothness is computed.
+_SLOWEST = 0.02  # Pieces with a lower mean speed of the tool do not count [m/s].
+_LONGEST_GAP = 0.05  # If two frames are farther apart than this, no piece may contain both [s].
+# Positions are smoothed by a Gaussian with this standard deviation before the jerk is computed [s]. It halves the power
+# at 6.6 Hz.
 _SMOOTHING = 0.02
 LONGEST = 0.5  # The longest delay that is searched for [s].
-_STEP = 0.005  # The step of delays, and of the times that are compared [s].
-_DIFFERENCE = 0.025  # A velocity is a difference of positions over this time before and after [s].
+_STEP = 0.005  # The step between two delays, and between the times at which velocities are compared [s].
+_DIFFERENCE = 0.025  # A velocity is computed from the positions this much earlier and this much later [s].
 _LEAST_MOTION = 0.01  # No delay is computed for a hand whose RMS speed is lower [m/s].
 _LEAST_FIT = 0.5  # The least share of the tool's motion that the hand's motion has to explain.
-# A motion that repeats itself fits at several delays. So a delay that is a second longer needs a fit better by this.
+# If a motion repeats itself, several delays explain it. A longer delay is therefore chosen only if the share of the
+# motion that it explains is higher by at least this for each second [1/s].
 _ALIKE = 0.01
-_LOOK = 0.5  # A tool's pose is compared with its poses this much earlier and later [s].
-_MOVED, _TURNED = 2e-3, 0.02  # A tool moves if these poses differ by more than this distance [m] or angle [rad].
+_LOOK = 0.5  # A tool's pose is compared with the poses that the tool has this much earlier and later [s].
+_MOVED, _TURNED = 2e-3, 0.02  # A tool moves if two such poses differ by more than this distance [m] or angle [rad].
 
 
 def smoothness(t: Array, position: Array, engaged: Flags) -> float | None:
-    """Return the median of :func:`ldlj`, of smoothed positions, over the pieces of a tool's motion.
+    """Return how smooth a tool's motion is: the median of :func:`ldlj` over pieces of the motion, which last 1 s.
 
-    ``position`` (n, 3) [m] is at the times ``t`` (n,) [s]. The result is None if fewer than eight pieces have a mean
-    speed above 20 mm/s.
+    The tool has the ``position`` (n, 3) [m] at the times ``t`` (n,) [s]. The positions are smoothed first. The result
+    is None if fewer than eight pieces have a mean speed above 20 mm/s while the arm is ``engaged`` (n,).
     """
     moving = []
     for begin, end in stretches(engaged & np.isfinite(position).all(axis=1)):
         moving += _pieces(t[begin:end], position[begin:end])
     if len(moving) < _FEWEST:
         return None
-    # In real time many ticks come a millisecond late. If a tool moves at 0.3 m/s, its position then has an error of
-    # 0.3 mm. The third derivative of that error is larger than that of the motion, so positions are smoothed. The
-    # smoothing falsifies both ends of a piece, so the ends are cut off.
+    # In real time many ticks come a millisecond late. If a tool moves at 0.3 m/s, its recorded position then has an
+    # error of 0.3 mm. The third derivative of this error is larger than the jerk of the motion itself, so positions are
+    # smoothed. The smoothing falsifies both ends of a piece, so the ends are cut off.
     cut = round(2.0 * _SMOOTHING / FRAME)
     smoothed = [gaussian_filter1d(piece, _SMOOTHING / FRAME, axis=0)[cut:-cut] for piece in moving]
     return float(np.median([ldlj(piece, FRAME) for piece in smoothed]))
 
 
 def _pieces(t: Array, position: Array) -> list[Array]:
-    """Return the positions (k, 3) of each piece that moves, at even times that are :data:`FRAME` apart."""
+    """Return, for each piece in which the tool moves, positions (k, 3) [m] at times that are :data:`FRAME` apart."""
     count, hop = round(PIECE / FRAME) + 1, round(_HOP / FRAME)
     if len(t) < count // 2 or t[-1] - t[0] < PIECE:
         return []
@@ -87,13 +91,15 @@ def ldlj(position: Array, dt: float) -> float:
 
 
 class Track(NamedTuple):
+    """The positions of a moving point, or of joints, over time."""
+
     t: Array  # (n,) Ascending times [s].
     position: Array  # (n, 3) [m], or (n, joints) [rad].
 
     def velocity(self, when: Array) -> Array:
         """Return the velocity (m, 3) [m/s], or (m, joints) [rad/s], at times ``when`` (m,) [s].
 
-        The velocity is a difference of positions over 50 ms. The positions before and after the track are constant.
+        It is computed from two positions that are 50 ms apart. Before and after the track, positions count as constant.
         """
         ahead, behind = (
             np.stack([np.interp(when + shift, self.t, column) for column in self.position.T], axis=1)
@@ -103,7 +109,7 @@ class Track(NamedTuple):
 
 
 def delays(episode: Episode, hand: str) -> list[float | None]:
-    """Return the delays [s] of the target, and of the measured tool, behind a hand's poses as they were received.
+    """Return two delays [s]: of the target, and of the measured tool, behind the poses of a hand as they were received.
 
     A delay is the tau that maximises the squared correlation of v(t) with M v_hand(t - tau) over all times t at which
     the arm is engaged. Here v is the velocity of the target or tool, and M (3, 3) maps the hand's axes to the world, as
@@ -143,15 +149,21 @@ def delays_behind(hand: Track, followers: Sequence[Track], when: Array) -> list[
 def best_delay(leader: Track, follower: Track, when: Array, lags: Array) -> float | None:
     """Return the delay [s] of ``follower`` behind ``leader``, at times ``when`` (n,) [s]; None as in :func:`delays`.
 
-    It is searched for among ``lags`` [s], which are 5 ms apart.
+    The delay is searched for among ``lags`` [s], which are 5 ms apart and may be negative.
     """
     return _best(lags, [leader.velocity(when - lag) for lag in lags], follower.velocity(when))
 
 
 def _best(lags: Array, by_hand: list[Array], moved: Array) -> float | None:
-    """Return the delay with the highest correlation, interpolated between two steps.
+    """Return the delay [s] with the highest correlation, interpolated between two ``lags`` [s].
 
-    Of several delays with nearly the same correlation, the delay nearest to zero is returned.
+    Of several delays with nearly the same correlation, the delay nearest to zero is returned. The result is None if no
+    delay explains enough of the motion, or if the best one is the first or the last of ``lags``.
+
+    Args:
+        lags: The delays to compare (k,) [s].
+        by_hand: For each delay, the velocities of the hand at times that are earlier by that delay.
+        moved: The velocities of the follower (n, 3) or (n, joints).
     """
     energy = float(np.sum(moved * moved))
     fits = np.zeros(len(lags))
@@ -172,7 +184,7 @@ class ArmFigures:
     """Figures of one arm over the time for which it is engaged. None means that a figure cannot be computed."""
 
     engaged_s: float
-    position_error_mm_rms: float | None  # Errors are from the target to the measured tool.
+    position_error_mm_rms: float | None  # Errors are differences between the target and the measured tool pose.
     position_error_mm_p99: float | None
     rotation_error_deg_rms: float | None
     rotation_error_deg_p99: float | None
@@ -250,7 +262,10 @@ def _angles(a: Array, b: Array) -> Array:
 
 
 def _rise(values: Array, engaged: Flags) -> Array:
-    """Return the rise (n,) of ``values`` since the tick before; 0 unless the arm is engaged in both ticks."""
+    """Return the increase (n,) of ``values`` since the tick before.
+
+    It is 0 where the values decrease, and where the arm is not engaged in both ticks.
+    """
     rise = np.diff(values, prepend=values[:1])
     return np.where(engaged & np.concatenate(([False], engaged[:-1])), np.maximum(rise, 0.0), 0.0)[: len(values)]
 

@@ -32,7 +32,7 @@ _LIMIT: dict[str, Any] = {"color": "#b3202c", "linestyle": "--", "linewidth": 1.
 
 @dataclass(frozen=True, slots=True)
 class FigureColumn:
-    """A column of the table of episodes. With several hands or arms, it has the worst of their numbers."""
+    """A column of the table of episodes. If an episode has several hands or arms, it shows the worst number."""
 
     name: str
     unit: str
@@ -84,7 +84,10 @@ def page_of(
     progress: Callable[[int], None] = lambda done: None,
     unreadable: Sequence[Unreadable] = (),
 ) -> str:
-    """Return the page, with ``unreadable`` files at its end. ``progress`` gets the number of episodes drawn so far."""
+    """Return the HTML text of the page. The files that are ``unreadable`` are listed at its end.
+
+    ``progress`` is called with the number of episodes whose plots are drawn so far.
+    """
     rows, sections = [], []
     for number, judged in enumerate(episodes, 1):
         plain, word = escape(judged.figures.name), judged.verdict.word
@@ -142,7 +145,10 @@ def draw_episode(judged: Judged) -> str:
 
 
 def thinned(t: Array, values: Array, extreme: np.ufunc) -> tuple[Array, Array]:
-    """Return at most 500 points of a line. Each point is the extreme value of one of 500 parts of equal length.
+    """Return at most 500 points of a line, as their times and values.
+
+    A longer line is divided into 500 parts with equal numbers of points. Each part becomes one point, at the time at
+    which the part begins, with the part's extreme value.
 
     ``extreme`` is ``np.fmax`` or ``np.fmin``.
     """
@@ -165,7 +171,7 @@ def _draw_speed(axes: Axes, judged: Judged) -> None:
         axes.axvspan(t[begin], t[min(stop, len(t) - 1)], label=None if number else "no arm engaged", **_SHADE)
     for number, fault in enumerate(judged.figures.faults):
         axes.axvline(fault.t, label=None if number else "fault", **_FAULT)
-    axes.set_ylim(0.0, max(10.0, axes.get_ylim()[1]))  # So the rounding errors of arms at rest are not visible.
+    axes.set_ylim(0.0, max(10.0, axes.get_ylim()[1]))  # Then rounding errors of arms at rest are not visible.
 
 
 def _draw_errors(axes: Axes, judged: Judged) -> None:

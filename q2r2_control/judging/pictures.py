@@ -31,9 +31,9 @@ class Pictures:
 
     t: Array  # (k,) The time of the tick that a picture shows, since the recording began [s].
     views: npt.NDArray[np.uint8]  # (k, *VIEW) The averaged brightness; zeros if a picture could not be decoded.
-    repeated: Flags  # (k,) Every pixel is the same as in the picture before.
-    damaged: Flags  # (k,) The picture could not be decoded, or only in part.
-    other_size: Flags  # (k,) The size of the picture is not that of the cell's camera.
+    repeated: Flags  # (k,) True if every pixel is the same as in the picture before.
+    damaged: Flags  # (k,) True if the picture could not be decoded, or only in part.
+    other_size: Flags  # (k,) True if the picture has another size than the cell says for the camera.
 
     def between(self, start: float, end: float, origin: float) -> Pictures:
         """Return the pictures from ``start`` to ``end`` [s], with times since ``origin`` [s]."""
@@ -43,6 +43,8 @@ class Pictures:
 
 
 class _Look(NamedTuple):
+    """What is kept of one picture; see the fields of :class:`Pictures` with the same names."""
+
     t: float
     view: npt.NDArray[np.uint8]
     repeated: bool = False
@@ -75,7 +77,7 @@ def _look_at(picture: Picture, t: float, camera: CameraConfig) -> _Look:
     try:
         image = Image.open(io.BytesIO(picture.jpeg))
         other_size = image.size != (camera.width, camera.height)
-        image.draft("L", (2 * VIEW[1], 2 * VIEW[0]))  # The decoder is several times as fast with few pixels.
+        image.draft("L", (2 * VIEW[1], 2 * VIEW[0]))  # With fewer pixels, the decoder is several times as fast.
         view = image.convert("L").resize(VIEW[::-1], Image.Resampling.BOX)
     except (OSError, SyntaxError, Image.DecompressionBombError, *BROKEN):
         return _Look(t, np.zeros(VIEW, np.uint8), damaged=True)
@@ -84,7 +86,7 @@ def _look_at(picture: Picture, t: float, camera: CameraConfig) -> _Look:
 
 def _has_foreign_marker(jpeg: bytes) -> bool:
     """Return whether the coded pixels of a JPEG were overwritten: they contain a marker that is not allowed there."""
-    scan = jpeg.rfind(_SCAN)  # The last marker, since a preview picture with its own marker may stand before it.
+    scan = jpeg.rfind(_SCAN)  # The last marker counts, since a preview picture may have a marker too.
     if scan < 0:
         return False
     begin = scan + len(_SCAN) + int.from_bytes(jpeg[scan + 2 : scan + 4], "big")

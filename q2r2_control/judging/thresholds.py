@@ -22,9 +22,9 @@ class _Unit(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Threshold:
-    """A limit of a number of an episode, or of each of its hands, arms, cameras or subtasks."""
+    """A limit for one number of an episode, or for one number of each of its hands, arms, cameras or subtasks."""
 
-    name: str  # A name min_... stands for a lower limit, and max_... for an upper limit.
+    name: str  # The name of the setting. It begins with min_ for a lower limit, and with max_ for an upper limit.
     of: Literal["episode", "hand", "arm", "measured", "camera", "subtask", "timing"]
     figure: str
     words: str
@@ -33,7 +33,15 @@ class Threshold:
     size_only: bool = False  # The sign of the number does not matter.
 
     def reason(self, value: float | None, limit: float | None, whose: str) -> Rejection | None:
-        """Return why a value is beyond the limit, or None if it is not. A value or limit of None is not judged."""
+        """Return why a value is beyond the limit, or None if it is not beyond it.
+
+        The result is also None if the value or the limit is None.
+
+        Args:
+            value: The number of the episode, in ``unit`` if ``figure_in_unit`` is True, otherwise in the SI unit.
+            limit: The limit in the SI unit.
+            whose: The words before the message, for example "left arm: ".
+        """
         if value is None or limit is None:
             return None
         scale, at_least = self.unit.scale, self.name.startswith("min_")

@@ -22,10 +22,10 @@ if TYPE_CHECKING:  # The process of the writer does not import these modules.
     from q2r2_control.robot.robot import Robot
 
 FORMAT = "4"  # The version of topics and fields. A recording of another version cannot be read.
-LOOP, ROS = "loop", "ros"  # The sources of a recording: the ticks of one loop, or the messages of ROS nodes.
-ABOUT, CONCLUSION = "q2r2_control", "q2r2_control_end"  # Names of metadata records.
-CELL, ROBOT, FIELDS = "cell.yaml", "robot.urdf", "fields.json"  # Names of attachments.
-# Notes that may name a person or a computer. The note on the certificate is the path of a file.
+LOOP, ROS = "loop", "ros"  # What a recording was made from: the ticks of one loop, or the messages of ROS nodes.
+ABOUT, CONCLUSION = "q2r2_control", "q2r2_control_end"  # Names of the file's metadata records.
+CELL, ROBOT, FIELDS = "cell.yaml", "robot.urdf", "fields.json"  # Names of the file's attachments.
+# Notes that may contain the name of a person or of a computer. The note on the certificate is the path of a file.
 _PERSONAL = ("operator", "host", "certificate")
 _GIT_TIME = 2.0  # The longest time that git may take [s].
 
@@ -36,11 +36,11 @@ class About:
 
     arms: tuple[str, ...]
     joints: tuple[str, ...]
-    mode: str  # The mode in which the pipeline drives the plant.
-    plant_modes: tuple[str, ...]  # The command modes that the plant follows.
+    mode: str  # The command mode in which the pipeline drives the plant.
+    plant_modes: tuple[str, ...]  # All command modes that the plant can follow.
     epoch: int  # The time of day at which the run began [ns].
     realtime: bool
-    cell: str  # The YAML of the cell with all its defaults.
+    cell: str  # The YAML of the cell, with all default values written out.
     robot: str  # The URDF of the robot.
     cameras: tuple[str, ...] = ()  # The cameras whose pictures are recorded.
     notes: dict[str, str] = field(default_factory=dict)  # Texts for people, such as program, machine and task.
@@ -51,7 +51,7 @@ class About:
     def of(cls, pipeline: Pipeline, realtime: bool, notes: Mapping[str, str], cameras: Sequence[str] = ()) -> About:
         """Describe a run that is about to begin.
 
-        In real time the pipeline chooses its rate here, because a replay reads the rate from the recorded cell.
+        In real time the pipeline chooses its rate here, so that the recorded cell has the rate that a replay needs.
 
         Args:
             pipeline: The pipeline that is about to run.
@@ -84,7 +84,8 @@ class About:
     def from_texts(cls, texts: Mapping[str, str], cell: str, robot: str) -> About:
         """Read the result of :meth:`texts`.
 
-        Raises :class:`KeyError`, :class:`ValueError` and :class:`TypeError` for other texts.
+        ``cell`` and ``robot`` are the texts of these fields, which the file stores separately. Raises
+        :class:`KeyError`, :class:`ValueError` or :class:`TypeError` if ``texts`` are of another kind.
         """
         notes = dict(texts)
         if notes.pop("format") != FORMAT:
@@ -101,10 +102,10 @@ class About:
 
 @dataclass(frozen=True)
 class Conclusion:
-    """Facts that a run states at its end. A run that was killed states none."""
+    """Facts that a run states at its end. The recording of a run that was killed has none."""
 
     success: bool | None = None  # The result of the task's own check; None if there was no check.
-    ended_by: str | None = None  # The fault that ended the run.
+    ended_by: str | None = None  # The fault that ended the run; None if no fault did.
 
     def texts(self) -> dict[str, str]:
         success = {} if self.success is None else {"success": json.dumps(self.success)}
@@ -118,12 +119,15 @@ class Conclusion:
 
 
 def as_yaml(config: Config) -> str:
-    """Return the cell with all its defaults, so that other defaults of a later version change nothing."""
+    """Return the cell as YAML with all its defaults, so that new defaults of a later version do not change it."""
     return yaml_of(config.model_dump(mode="json"))
 
 
 def program() -> dict[str, str]:
-    """Return notes on version, machine and libraries, and for a checkout its git revision, marked if it was changed."""
+    """Return notes on the program's version, the machine and the libraries, by name.
+
+    If the program runs from a git checkout, they include its revision, which ends with -dirty if files were changed.
+    """
     notes = {"version": _version("q2r2_control"), "machine": f"{platform.node()}, {platform.platform()}"}
     notes["libraries"] = ", ".join(f"{name} {_version(name)}" for name in ("numpy", "pin", "numba", "daqp", "mujoco"))
     checkout = Path(__file__).resolve().parents[2]
@@ -144,7 +148,13 @@ def anonymous(notes: Mapping[str, str]) -> dict[str, str]:
 
 
 def changes(about: About, config: Config, robot: Robot) -> list[str]:
-    """Return the changes of program, libraries, cell and robot since a run was recorded, one line for each."""
+    """Return the changes of program, libraries, cell and robot since a run was recorded, as one line for each change.
+
+    Args:
+        about: The facts that the recorded run stated.
+        config: The cell now.
+        robot: The robot now.
+    """
     now = program()
     found = [
         f"{name}: {about.notes[name]} when recorded, now {now.get(name, 'unknown')}"

@@ -1,8 +1,8 @@
 """Write a bag of rosbag2: an MCAP file, which the package ``mcap`` writes, and a ``metadata.yaml`` of version 9.
 
-ROS is not needed. The rules are those of metadata_io.cpp in https://github.com/ros2/rosbag2. Message types are from
-rosbags. The writer of rosbags (0.11) is not used: it writes neither the sequence numbers of messages nor attachments,
-and it may end a chunk in the middle of a tick.
+ROS is not needed. The rules are those of metadata_io.cpp in https://github.com/ros2/rosbag2. The package ``rosbags``
+provides the message types. Its writer (0.11) is not used: it writes neither the sequence numbers of messages nor
+attachments, and it may end a chunk between the messages of one tick.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from q2r2_control.recording.about import ABOUT, CELL, CONCLUSION, FIELDS, ROBOT,
 from q2r2_control.recording.messages import STORE, Message, Topic
 
 METADATA_FILE = "metadata.yaml"
-_LARGEST_CHUNK = 4 << 20  # A chunk is written when its messages are larger than this [bytes].
+_LARGEST_CHUNK = 4 << 20  # A chunk is written as soon as its messages are together larger than this [bytes].
 _VERSION = 9
 _FOREVER = {"sec": 9223372036, "nsec": 854775807}
 _QOS = {
@@ -44,10 +44,10 @@ _QOS = {
 class BagWriter(AbstractContextManager["BagWriter"]):
     """Writes a bag, and is a context manager. :meth:`close` completes the file.
 
-    Without :meth:`close` the file has all that was flushed, but no index. If the process is killed, the end record is
-    missing too; ``mcap recover`` repairs such a file. After an error, for example of a full disk, the end record is
-    written without an index. rosbags then reads all of 2,000 messages; without the end record it would read none. The
-    file is removed if no message was written before the error.
+    Without :meth:`close`, the file has all messages that were flushed, but no index. If the process is killed, the end
+    record is missing too; ``mcap recover`` repairs such a file. After an error, for example because the disk is full,
+    the end record is written without an index. rosbags can read such a file, but could not read it without the end
+    record. If no message was written before the error, the file is removed.
     """
 
     def __init__(self, path: Path, topics: Iterable[Topic], about: About) -> None:
@@ -56,7 +56,7 @@ class BagWriter(AbstractContextManager["BagWriter"]):
         self._counts: Counter[int] = Counter()  # The number of messages of each channel.
         self._first = self._last = about.epoch  # Times of the first and the last message [ns].
         self._stream = path.open("xb")
-        self._whole = 0  # The number of bytes that were flushed.
+        self._whole = 0  # The size of the file after the last flush [bytes].
         self._empty = True  # True if no message was flushed.
         # With a smaller limit the writer may end a chunk inside a tick, and a run that is killed would lose that tick.
         self._writer, self._unflushed = Writer(self._stream, chunk_size=sys.maxsize), 0
@@ -67,7 +67,10 @@ class BagWriter(AbstractContextManager["BagWriter"]):
             raise
 
     def _begin(self) -> dict[int, int]:
-        """Write all that comes before the first message. Return the id that each topic's channel has in the file."""
+        """Write all records that come before the first message.
+
+        Return, by the channel of a topic in this program, the id that the channel has in the file.
+        """
         about = self._about
         self._writer.start("ros2", "q2r2_control")
         self._writer.add_metadata(ABOUT, about.texts())
@@ -90,7 +93,10 @@ class BagWriter(AbstractContextManager["BagWriter"]):
             self._path.parent.rmdir()  # The folder was made for this file.
 
     def write(self, messages: Iterable[Message]) -> None:
-        """Add the messages of whole ticks, in the order of time. :meth:`flush` writes them to the file."""
+        """Add the messages of whole ticks, in the order of time.
+
+        They are written to the file by :meth:`flush`, which is called here too when many messages wait.
+        """
         for channel, number, time, sent, payload in messages:
             self._writer.add_message(self._channels[channel], time, payload, sent, number)
             self._first = min(self._first, time) if self._counts else time
@@ -129,12 +135,12 @@ class BagWriter(AbstractContextManager["BagWriter"]):
         DataEnd(0).write(end)
         Footer(summary_start=0, summary_offset_start=0, summary_crc=0).write(end)
         with suppress(OSError):
-            os.truncate(self._path, self._whole)  # A chunk that was written in part is removed.
+            os.truncate(self._path, self._whole)  # This removes a chunk of which only a part was written.
             with self._path.open("ab") as stream:
                 stream.write(end.end() + MCAP0_MAGIC)
 
     def _register(self) -> dict[int, int]:
-        """Declare the topics. Return the id that each topic's channel has in the file."""
+        """Declare the topics. Return, by a topic's channel in this program, the id of that channel in the file."""
         qos = {"offered_qos_profiles": yaml_of([_QOS]).strip()}
         schemas: dict[str, int] = {}
         for kind in dict.fromkeys(topic.type for topic in self._topics):

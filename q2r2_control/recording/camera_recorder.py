@@ -1,4 +1,7 @@
-"""Takes the pictures of a recording in a process of its own; the loop only copies the positions of all bodies."""
+"""Renders the pictures of simulated cameras for a recording, in a process of its own.
+
+The loop only copies the joint positions of the simulation.
+"""
 
 from __future__ import annotations
 
@@ -22,12 +25,14 @@ from q2r2_control.summary.tick import Tick
 if TYPE_CHECKING:
     from q2r2_control.plants.mujoco import MujocoPlant
 
-# Total size of the copied positions that may wait for the process [bytes]. For the shipped cell, these are some seconds
-# of a camera at 30 Hz.
+# Total size of the copied positions that may wait for the process [bytes]. For the shipped cell, they belong to some
+# seconds of a camera at 30 Hz.
 ROOM = 128 << 10
 _NICENESS = 19  # The loop and the writer have a higher priority.
-_QUALITY = 90  # The quality of JPEG.
-_ROUNDING = 1e-6  # Share of a period by which the rounding of times may make a picture seem to be not yet due.
+_QUALITY = 90  # The JPEG quality of the pictures.
+# A picture is already taken if the time until it is due is less than this share of its camera's period. Times are
+# rounded, so a picture that is due now may seem to be due a little later.
+_ROUNDING = 1e-6
 _READY = 10.0  # Longest time to wait before the run until the process is ready [s].
 
 
@@ -35,13 +40,15 @@ _READY = 10.0  # Longest time to wait before the run until the process is ready 
 class CameraSetup:
     """The first request: the model that the pictures show, the cameras, and the channels of their messages."""
 
-    model: bytes  # A pickled mujoco.MjModel.
+    model: bytes  # The pickled mujoco.MjModel that the pictures show.
     cameras: dict[str, CameraConfig]
     channels: dict[str, int]  # By camera, the channel in the file of the recording.
     waited_for: bool  # True if the loop waits for the pictures, as it does in simulated time.
 
 
 class PictureRequest(NamedTuple):
+    """A request for one picture of each of some cameras, at one tick."""
+
     number: int  # The number of the tick.
     time: int  # The time of day [ns].
     cameras: list[str]
@@ -49,7 +56,10 @@ class PictureRequest(NamedTuple):
 
 
 def main(requests: Iterator[Any], answer: Callable[[Message | None], None]) -> None:
-    """Answer None when ready, then the message of each picture. Raises :class:`PlantError` if OpenGL is missing."""
+    """Answer None when this process is ready, and then the message of each requested picture.
+
+    Raises :class:`PlantError` if OpenGL is missing.
+    """
     setup = next(requests, None)
     if setup is None:
         return
@@ -66,10 +76,10 @@ def main(requests: Iterator[Any], answer: Callable[[Message | None], None]) -> N
 
 
 class CameraRecorder:
-    """Starts the process that takes pictures, which :meth:`finish` ends."""
+    """Starts the process that takes pictures. :meth:`finish` ends the process."""
 
     def __init__(self, write: Callable[[Message], None], room: int = ROOM) -> None:
-        """Start the process. ``write`` gets the message of each picture, in another thread.
+        """Start the process. Another thread calls ``write`` with the message of each picture.
 
         ``room`` [bytes] is the total size of the copied positions that may wait. Raises :class:`OSError`.
         """
@@ -99,7 +109,7 @@ class CameraRecorder:
     ) -> None:
         """Prepare to take pictures of ``plant``, and wait until the process is ready, at most 10 s.
 
-        ``topics`` are those of the recording, by name; they tell the channel of each camera's messages.
+        ``topics`` are the recording's topics by name. They contain the channel of each camera's messages.
 
         If ``waits`` is True, the loop will wait for pictures, so their process has the same priority as the loop.
         """
@@ -126,7 +136,7 @@ class CameraRecorder:
         self._next = min((last + 1 - _ROUNDING) / self._rates[name] for name, last in newest.items())
 
     def finish(self, patience: float) -> None:
-        """Let the process take the pictures that wait. It is killed if it does nothing for ``patience`` [s]."""
+        """Wait until the process has taken all requested pictures. Kill it if it does nothing for ``patience`` [s]."""
         if self._plant is not None and patience > 0.0:
             self.process.finish(patience)
         else:

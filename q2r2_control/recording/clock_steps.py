@@ -11,19 +11,20 @@ import numpy.typing as npt
 
 from q2r2_control.types import Array
 
-_NOTED = 0.1  # Messages do not arrive evenly, so a smaller difference between the clock and the loop is no step [s].
-_SHARE = 0.5  # This share of the time of lost ticks is added to ``_NOTED``, because their own dt is not known.
+# A smaller difference between the clock and the loop's own time is not a step, because messages arrive unevenly [s].
+_NOTED = 0.1
+_SHARE = 0.5  # This share of the time of lost ticks is added to ``_NOTED``, because the dt of lost ticks is not known.
 
 
 def clock_steps(numbers: npt.NDArray[np.int64], t: Array, dt: Array) -> Array:
-    """Return by how much the clock was set just before each of n ticks (n,) [s].
+    """Return, for each of n ticks, by how much the clock was set just before the tick (n,) [s].
 
-    The number is negative if the clock was set back, and 0 if it was not set. A controller that stood still, and counts
-    less time than passed, looks the same as a clock that was set forward.
+    The number is negative if the clock was set back, and 0 if it was not set. It is also positive if the controller
+    stood still and counted less time than passed. The data does not show which of the two has happened.
 
     Args:
         numbers: Numbers of the ticks (n,).
-        t: Times of the ticks (n,) [s].
+        t: Times of the ticks by the clock (n,) [s].
         dt: Time since the tick before, as the loop counted it (n,) [s].
     """
     passed, ticks = np.diff(t, prepend=t[:1]), np.diff(numbers, prepend=numbers[:1])

@@ -1,4 +1,4 @@
-"""Makes messages of real cameras' pictures for a recording of the ROS nodes, and reports if a camera stops."""
+"""Makes messages from the pictures of real cameras for a recording of the ROS nodes, and reports stopped cameras."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from q2r2_control.recording.messages import CodedPicture, Message, coding_of_dep
 
 @dataclass(slots=True)
 class DeviceMessages:
-    """The open cameras of a recording. Times are those of the monotonic clock."""
+    """Takes the pictures of a recording's open cameras. Times are by the monotonic clock."""
 
     streams: CameraStreams
     channels: Mapping[str, int]  # By topic, the channel of its messages.
-    day: Callable[[float], int]  # Returns the time of day [ns] at a time [s].
+    day: Callable[[float], int]  # Converts a time [s] to the time of day [ns].
     begin: float  # Time at which the recording begins [s].
     _watches: dict[str, CameraWatch] = field(init=False)
-    _numbers: dict[str, int] = field(init=False)  # By camera, the number of its last picture.
+    _numbers: dict[str, int] = field(init=False)  # By camera, the number of pictures so far.
 
     def __post_init__(self) -> None:
         streams = self.streams.streams
@@ -28,10 +28,11 @@ class DeviceMessages:
         self._numbers = dict.fromkeys(streams, 0)
 
     def take(self, now: float) -> tuple[list[Message], list[Reason]]:
-        """Return the messages of all pictures since the last call, and what has happened to the cameras.
+        """Return the messages of all pictures since the last call, and the events of cameras, such as a stop.
 
-        The field ``sent`` of a message is the time at which its picture was captured. The field ``time``, by which the
-        file is ordered, is the time at which the picture was received.
+        In a message, ``sent`` is the time of day at which its picture was captured. ``time`` is the time of day at
+        which the picture was received, and for depth it is ``now`` [s]. The file's messages are in the order of
+        ``time``.
         """
         messages, reasons = [], []
         for name, stream in self.streams.streams.items():

@@ -20,14 +20,14 @@ from q2r2_control.recording.recorder import Recorder
 from q2r2_control.summary.tick import Tick
 from q2r2_control.wording import sentence
 
-_LAST_PICTURES = 10.0  # Longest time at the end of a run to wait for pictures that were captured in it [s].
+_LAST_PICTURES = 10.0  # Longest wait, at the end of a run, for pictures that were captured during the run [s].
 _logger = logging.getLogger(__name__)
 
 
 class DevicePictures(AbstractContextManager["DevicePictures"]):
-    """A listener of one run, used as a context manager around it. It never waits while the run goes on.
+    """Watches the real cameras of one run, and records their pictures if the run is recorded.
 
-    It reports what happens to the cameras. If the run is recorded, it records their pictures.
+    It is a listener of the run's pipeline, and a context manager around the run. It never waits while the run goes on.
     """
 
     def __init__(
@@ -41,8 +41,8 @@ class DevicePictures(AbstractContextManager["DevicePictures"]):
 
         Args:
             streams: The open cameras.
-            realtime: True if the loop's clock is that of the computer.
-            report: Called with all that happens to the cameras, for the episode and its operator.
+            realtime: True if the loop uses the computer's clock; False in simulated time.
+            report: Called with each event of a camera, for example a stop, which the operator and the episode get.
             recording: The recorder of the run and the facts about it; None if the run is not recorded.
         """
         self._streams, self._realtime, self._report = streams.streams, realtime, report
@@ -70,7 +70,7 @@ class DevicePictures(AbstractContextManager["DevicePictures"]):
             self._tell(self._watches[name].look(now, stream.why_lost))
 
     def __exit__(self, *_: object) -> None:
-        """Add the pictures that were captured in the run and have not come yet."""
+        """Wait for the pictures that were captured during the run and have not come yet, and record them."""
         for name, watch in self._watches.items():
             if self._recording is not None and not watch.stopped:
                 self._streams[name].wait_for_pictures_until(self._end, _LAST_PICTURES)
@@ -80,9 +80,9 @@ class DevicePictures(AbstractContextManager["DevicePictures"]):
             self._recording[0].missing_pictures += sum(watch.missing for watch in self._watches.values())
 
     def _take(self, name: str, until: float = math.inf) -> None:
-        """Take a camera's pictures since the last call, and record those captured in the run up to ``until`` [s].
+        """Take a camera's pictures since the last call. Record those captured from the first tick to ``until`` [s].
 
-        The last picture before the run is recorded too, because it is the newest picture at the first tick.
+        The last picture before the first tick is recorded too, because it is the newest picture at that tick.
         """
         for received, shot in self._streams[name].take():
             if shot.time < self._begin:

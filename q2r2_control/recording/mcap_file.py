@@ -1,7 +1,7 @@
-"""Reads MCAP files of any writer, also files that were cut off at any place.
+"""Reads MCAP files of any writer, also files whose end is missing.
 
-The package ``mcap`` decodes the records. It cannot find them in a file whose end is missing, so this module walks over
-the file from record to record. The rules of the format are in https://mcap.dev/spec.
+The package ``mcap`` decodes the records. In a file whose end is missing, it cannot find them. Therefore this module
+goes through the file from record to record. The rules of the format are in https://mcap.dev/spec.
 """
 
 from __future__ import annotations
@@ -25,27 +25,27 @@ from mcap.writer import MCAP0_MAGIC
 from q2r2_control.recording.messages import Message, Topic
 
 _LARGEST = 1 << 30  # The largest size of a record [bytes].
-_BATCH = 1000  # The number of messages that are read together from a file without chunks.
+_BATCH = 1000  # The number of messages in a list, if the messages are not in chunks.
 _HEADER = struct.Struct("<BQ")  # The kind and the length of a record, before its content.
 _CHUNK_TIMES = struct.Struct("<QQ")  # Times of a chunk's first and last message [ns], at the start of its content.
 
 
 class _Place(NamedTuple):
-    """The place of a record in the file, and the beginning of its content."""
+    """The position of a record in the file, and the first bytes of its content."""
 
-    kind: int
+    kind: int  # The opcode of the record.
     begin: int  # The position of the record in the file [bytes].
-    head: bytes
+    head: bytes  # The first bytes of the content, at most 16.
 
     @property
     def times(self) -> tuple[int, int]:
-        """Times of the first and the last message of a chunk [ns]."""
+        """Times of the first and the last message [ns], if the record is a chunk."""
         first, last = _CHUNK_TIMES.unpack_from(self.head)
         return first, last
 
 
 class McapFile:
-    """One file. Another process may be writing to it; records that are added while it is read are left out."""
+    """One MCAP file. Another process may still be writing it; records that are added during reading are left out."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -84,14 +84,14 @@ class McapFile:
             except OSError as error:
                 if error.errno != errno.EINVAL:
                     raise
-                return None  # The last bytes of an unfinished file may look like an index at an impossible place.
+                return None  # The last bytes of an unfinished file may look like an index at an impossible position.
 
     def messages(self, topics: Collection[str] | None = None, since: int = 0) -> Iterator[list[Message]]:
         """Yield all messages, or those of some ``topics``, in lists.
 
-        A list has the messages of one chunk, or about a thousand messages that are in no chunk. They come in the order
-        of the file. ``mcap sort`` changes that order to the order of time. Chunks that end before ``since`` [ns] are
-        left out. Raises the errors of the package ``mcap`` for a damaged file.
+        A list has the messages of one chunk, or about a thousand messages that are in no chunk. Messages come in the
+        order in which they are in the file. In files of ``mcap sort``, this is the order of time. Chunks that end
+        before ``since`` [ns] are left out. Raises the errors of the package ``mcap`` for a damaged file.
         """
         with self._path.open("rb") as stream:
             yield from self._in_file_order(stream, topics, since)
@@ -116,8 +116,11 @@ class McapFile:
             yield loose
 
     def _wanted(self, stream: BinaryIO, records: list[McapRecord], topics: Collection[str] | None) -> Iterator[Message]:
-        """Yield the messages of ``topics`` among some records, and learn the channels that these records declare."""
-        channels: dict[int, bool] = {}  # By channel, True if it belongs to the topics.
+        """Yield the messages of ``records`` that belong to ``topics``; None stands for all topics.
+
+        Channels that the records declare are stored.
+        """
+        channels: dict[int, bool] = {}  # By channel, True if its topic is among ``topics``.
         for one in records:
             if isinstance(one, McapMessage):
                 channel = one.channel_id
@@ -143,7 +146,9 @@ class McapFile:
 
 
 def _places(stream: BinaryIO) -> Iterator[_Place]:
-    """Yield the place of each record up to the end of the data, or up to the last whole record of an unfinished file.
+    """Yield the place of each record up to the end of the data.
+
+    In an unfinished file, the last record is left out if it is not complete.
 
     Raises :class:`InvalidMagic` for a file that is not MCAP, and :class:`EndOfFile` if a finished file ends inside a
     record.

@@ -1,8 +1,8 @@
 """Topics of recordings and their messages: ROS 2 messages in CDR, made by rosbags.
 
-A recording has the run of one loop, or messages of the ROS nodes. Of a loop's run, the replay, the judge and the export
-read the topics ``tick``, ``hand_samples`` and ``state``, and the pictures. The other topics repeat this data as
-standard messages, for tools that plot and show them.
+A recording contains the run of one loop, or messages of the ROS nodes. The data of a loop's run is on the topics
+``tick``, ``hand_samples`` and ``state``, and on those of the pictures. The replay, the judge and the export read these
+topics. The other topics repeat this data as standard messages, which plotting tools and viewers can show.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ POSE, JOINTS = "geometry_msgs/msg/PoseStamped", "sensor_msgs/msg/JointState"
 TRAJECTORY, HAND_INPUTS = "trajectory_msgs/msg/JointTrajectory", "quest2ros/msg/OVR2ROSInputs"
 NANOSECONDS = 1_000_000_000
 _ENCAPSULATION = 4  # The size of the CDR header, which is before the fields of the message [bytes].
-WORLD = "world"  # The frame of targets.
+WORLD = "world"  # The frame in which targets are given.
 TICK, SAMPLES, STATE = "/q2r2/tick", "/q2r2/hand_samples", "/q2r2/state"
 JOINT_STATES, EXTERNAL_TORQUE = "/joint_states", "/q2r2/external_torque"
 JOINT_COMMANDS, REFERENCE, DESCRIPTION = "/joint_commands", "/q2r2/reference", "/robot_description"
@@ -34,13 +34,14 @@ RECORDER = "/recorder"
 RECORDER_EVENTS = f"{RECORDER}/events"
 _NODES = ("mujoco_robot", "cartesian_controller", "tcp_endpoint", "simulation_input", "hand_input", "recorder")
 
-# `index` counts the ticks that moved the reference, and `dt` is the time since the last such tick. tick_fields() adds a
-# field `rejected_...` for each arm.
+# The numbers of a controller's tick. `index` counts the ticks that moved the reference, and `dt` is the time since the
+# last such tick [s]. tick_fields() adds a field `rejected_...` for each arm.
 TICK_FIELDS = (
     *("index", "now", "dt", "step", "compute_time", "solve_time", "status", "certified", "fallback"),
     *("closest_distance", "margin", "slack"),
 )
-ARM_FIELDS = ("engaged", "slip", "slip_angle", "wanted", "measured")  # The last two are openings, 0 closed .. 1 open.
+# The last two numbers are openings of the arm's gripper, 0 closed .. 1 open: the wanted and the measured opening.
+ARM_FIELDS = ("engaged", "slip", "slip_angle", "wanted", "measured")
 
 _BOOL, _TWIST, _IMAGE = "std_msgs/msg/Bool", "geometry_msgs/msg/Twist", "sensor_msgs/msg/Image"
 _TRANSFORMS, _DIAGNOSTICS = "tf2_msgs/msg/TFMessage", "diagnostic_msgs/msg/DiagnosticArray"
@@ -58,7 +59,14 @@ class Topic:
 def run_topics(
     arms: Sequence[str], joints: Sequence[str], cameras: Sequence[str] = (), depth: Sequence[str] = ()
 ) -> dict[str, Topic]:
-    """Return the topics of a loop's run, by name; ``depth`` are the cameras whose depth is recorded too."""
+    """Return the topics of a loop's run, by name.
+
+    Args:
+        arms: The names of the arms.
+        joints: The names of the joints.
+        cameras: The cameras whose pictures are recorded.
+        depth: The cameras whose depth is recorded too.
+    """
     types = {DESCRIPTION: TEXT, TICK: ARRAY, SAMPLES: ARRAY}
     for hand in SIDES:
         types |= {hand_pose(hand): POSE, hand_buttons(hand): HAND_INPUTS}
@@ -78,7 +86,7 @@ def loop_topics(arms: Sequence[str]) -> tuple[str, ...]:
 
 
 def ros_topics(arms: Sequence[str], pictures: Iterable[str] = ()) -> tuple[Topic, ...]:
-    """Return the topics of a recording of the nodes. ``pictures`` are the topics of the cameras' pictures."""
+    """Return the topics of a recording of the ROS nodes. ``pictures`` are the names of the topics with pictures."""
     types: dict[str, str] = {DESCRIPTION: TEXT, JOINT_STATES: JOINTS, "/mujoco_robot/external_torque": JOINTS}
     types |= {"/tf": _TRANSFORMS, "/tf_static": _TRANSFORMS, "/diagnostics": _DIAGNOSTICS}
     for hand in SIDES:
@@ -124,15 +132,15 @@ def target(arm: str) -> str:
 
 
 def asked_target(arm: str) -> str:
-    """Return the topic that repeats an arm's targets for the recorder.
+    """Return the topic on which an arm's targets are repeated for the recorder.
 
-    If the recorder subscribed to :func:`target`, it would count as the controller of the arm.
+    If the recorder subscribed to :func:`target`, the recorder would count as the controller of the arm.
     """
     return f"/q2r2/{arm}/asked_target"
 
 
 def safe_target(arm: str) -> str:
-    """Return the topic of the pose that an arm's tool has at the controller's reference."""
+    """Return the topic of an arm's tool pose at the controller's reference."""
     return f"/cartesian_controller/safe_target/{arm}"
 
 
@@ -155,7 +163,7 @@ def depth_topic(camera: str) -> str:
 
 
 def coding_of_depth(unit: float) -> str:
-    """Return the ``format`` of a message with depth. Its 16-bit numbers are multiples of ``unit`` [m]."""
+    """Return the ``format`` of a message with depth, whose 16-bit numbers are depths in ``unit`` [m]."""
     return f"16UC1; png; unit {unit:.6g} m"
 
 
@@ -182,9 +190,9 @@ def is_latched(topic: str) -> bool:
 
 
 def is_reliable(topic: Topic) -> bool:
-    """Return whether the recorder asks ROS for reliable delivery, so that all messages of a topic arrive.
+    """Return whether the recorder requests reliable delivery from ROS, so that all messages of a topic arrive.
 
-    It does not ask for that on topics with commands and streams, whose senders must not wait for the recorder.
+    For topics with commands and streams it does not, because their senders must not wait for the recorder.
     """
     return topic.type in (ARRAY, TEXT) or topic.name == REFERENCE or heard_on(topic.name) != topic.name
 
@@ -192,7 +200,7 @@ def is_reliable(topic: Topic) -> bool:
 class Message(NamedTuple):
     channel: int
     number: int  # The number of the message's tick, or the sequence number that the sender gave the message.
-    time: int  # The time of day [ns].
+    time: int  # The time of day at which it was received, or of the tick to which it belongs [ns].
     sent: int  # The time of day at which it was sent, by the sender's clock [ns].
     payload: bytes  # The message in CDR.
 
@@ -223,14 +231,14 @@ class CodedPicture(NamedTuple):
 class MessageTemplate:
     """Makes many messages that differ only in float64 numbers and in the stamp of the header.
 
-    For one tick of two arms, it makes the messages with poses and joints in 3 us. rosbags needs 110 us, which is 11 %
-    of a processor at 1 kHz.
+    For one tick of two arms, it makes the messages with poses and joints in 3 us. rosbags needs 110 us. At 1 kHz, that
+    is 11 % of a processor.
     """
 
     def __init__(self, kind: str, example: Any, count: int) -> None:
         """Make a template from the message ``example``, which contains the numbers 1, 2, ... ``count``.
 
-        :meth:`filled` replaces these numbers in this order.
+        :meth:`filled` replaces the number k by column k - 1 of its argument.
         """
         payload = serialized(kind, example)
         self._size = len(payload)
@@ -241,7 +249,7 @@ class MessageTemplate:
         self._places = [int(np.flatnonzero(floats == number)[0]) for number in range(1, count + 1)]
 
     def filled(self, numbers: Array, stamps: npt.NDArray[np.int64]) -> list[bytes]:
-        """Return n messages with ``numbers`` (n, count) and ``stamps`` (n,) [ns]."""
+        """Return n messages in CDR, with ``numbers`` (n, count) and ``stamps`` (n,) [ns]."""
         made = np.tile(self._bytes, (len(numbers), 1))
         made[:, _ENCAPSULATION:].view("<f8")[:, self._places] = numbers
         stamp = made[:, _ENCAPSULATION : _ENCAPSULATION + 8].view("<u4")
@@ -284,10 +292,10 @@ def joint_state(names: list[str], position: Array, velocity: Array, effort: Arra
 
 
 def measured(field: str, numbers: Array) -> Array:
-    """Return the ``numbers`` of a ``field`` of a JointState, with zeros where NaN means that they are not measured.
+    """Return the ``numbers`` of a JointState's ``field``. NaN becomes 0 if it only means that nothing is measured.
 
-    The broadcaster of ros2_control writes NaN for numbers that the hardware of a robot does not provide. Velocities may
-    be missing for all joints together. A single missing velocity is a fault, and its NaN is kept.
+    The broadcaster of ros2_control writes NaN for numbers that the robot's hardware does not provide. If all velocities
+    are NaN, they are not measured. If only some velocities are NaN, that is a fault, and the NaN stays.
     """
     missing = np.isnan(numbers)
     if field == "effort" or (field == "velocity" and missing.all()):
@@ -296,7 +304,7 @@ def measured(field: str, numbers: Array) -> Array:
 
 
 def joint_trajectory(names: list[str], q: Array, v: Array, a: Array, stamp: int = 0) -> Any:
-    """Return a trajectory_msgs/JointTrajectory of one point that is due at once; ``stamp`` [ns]."""
+    """Return a trajectory_msgs/JointTrajectory with one point, which has to be reached at once; ``stamp`` [ns]."""
     at_once = make("builtin_interfaces/msg/Duration", 0, 0)
     point = make("trajectory_msgs/msg/JointTrajectoryPoint", q, v, a, np.empty(0), at_once)
     return make(TRAJECTORY, header(stamp=stamp), names, [point])
@@ -321,7 +329,7 @@ def data_of(payload: bytes, kind: str) -> Any:
 
 
 def numbers_of(payloads: list[bytes], count: int) -> Array:
-    """Return the numbers (n, count) of n arrays. Raises :class:`ValueError` for arrays of another length."""
+    """Return the numbers (n, count) of n messages with arrays. Raises :class:`ValueError` for another length."""
     arrays = [data_of(payload, ARRAY) for payload in payloads]
     if any(len(array) != count for array in arrays):
         raise ValueError(f"an array that has not {count} numbers")

@@ -39,7 +39,7 @@ from q2r2_control.recording.messages import (
 from q2r2_control.recording.tick_chunks import TickAssembly, TickChunk
 from q2r2_control.teleop.reasons import TeleopReason
 
-# Errors that readers raise for a file that is damaged, or that another program wrote.
+# The errors of the packages that read a file, if the file is damaged or was written by another program.
 BROKEN = (
     *(McapError, ZstdError, SerdeError, ValueError, KeyError, IndexError),
     *(struct.error, TypeError, OverflowError, MemoryError, AssertionError),
@@ -48,18 +48,19 @@ BROKEN = (
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    time: int  # The time of day of the tick that the picture shows [ns].
-    tick: int  # The number of that tick.
-    jpeg: bytes  # The coded picture. If the picture shows depth, it is a PNG with 16 bits for each pixel.
+    # The time of day at which the picture was captured, or was received if a ROS node sent it [ns].
+    time: int
+    tick: int  # The number of the newest tick at that time. In a recording of ROS nodes, it is a sequence number.
+    jpeg: bytes  # The picture as a JPEG file; a picture of depth is a PNG file with 16 bits for each pixel.
 
 
 NO_END = "the recording has no end: its process was killed, or the disk was full"
 
 
 class Recording:
-    """A file that ``q2r2 run --record`` wrote.
+    """A recording that ``q2r2 run --record`` wrote.
 
-    Raises :class:`RecordingError`, with a message of one line, for any other file.
+    If the file is not such a recording, :class:`RecordingError` is raised, with a message of one line.
     """
 
     def __init__(self, path: Path) -> None:
@@ -70,10 +71,10 @@ class Recording:
         self.file = files[0]
         self._mcap = McapFile(self.file)
         self.about = self._read_about()
-        self.since = 0  # The time of day before which chunks of the file are left out [ns].
+        self.since = 0  # Chunks of the file that end before this time of day are left out [ns].
 
     def chunks(self) -> Iterator[TickChunk]:
-        """Yield all ticks in chunks. Ticks that were lost are missing between them."""
+        """Yield all ticks, in groups that follow each other. Ticks that were lost are missing."""
         ticks = TickAssembly(len(self.about.arms), len(self.about.joints))
         try:
             for messages in self.messages(ticks.topics):
@@ -103,7 +104,10 @@ class Recording:
         return (picture for _, picture in self._coded({depth_topic(camera): camera}))
 
     def depth_unit(self, camera: str) -> float:
-        """Return the unit [m] of a camera's depth. Raises :class:`RecordingError` if no depth was recorded."""
+        """Return the unit of the numbers in a camera's depth pictures [m].
+
+        Raises :class:`RecordingError` if no depth was recorded.
+        """
         for messages in self.messages((depth_topic(camera),)):
             for message in messages:
                 with self._faults():
@@ -111,7 +115,7 @@ class Recording:
         raise RecordingError(f"{self.file}: depth of camera {camera}: no picture was recorded")
 
     def _coded(self, names: Mapping[str, str]) -> Iterator[tuple[str, Picture]]:
-        """Yield all pictures on the topics in ``names``, each with the name that ``names`` gives its topic."""
+        """Yield all pictures on the topics in ``names``. Each comes with the name that ``names`` has for its topic."""
         for messages in self.messages(names):
             for message in messages:
                 with self._faults():
@@ -127,7 +131,7 @@ class Recording:
 
     @cached_property
     def declared_topics(self) -> dict[int, Topic]:
-        """Return all topics that are in the file, by channel."""
+        """Return all topics that the file declares, by channel."""
         with self._faults():
             return self._mcap.topics()
 
@@ -137,7 +141,7 @@ class Recording:
             yield from self._mcap.messages(topics, self.since)
 
     def topic(self, message: Message) -> str:
-        """Return the topic of a message that was read."""
+        """Return the name of the topic of a message that was read."""
         return self._mcap.topic(message.channel)
 
     @contextmanager
@@ -170,7 +174,7 @@ class Recording:
 
     @property
     def conclusion(self) -> Conclusion:
-        """Return the facts that the run stated at its end; they are empty if the file has no index."""
+        """Return the facts that the run stated at its end. All are None if the file has no index."""
         if self.closed:
             with self._faults():
                 for record in self._mcap.extras():
@@ -213,13 +217,13 @@ class Recording:
 
 
 def recordings_in(paths: Sequence[Path]) -> list[Path]:
-    """Return files of recordings.
+    """Return the paths of the recordings in some files and folders.
 
     Args:
         paths: Files, and folders in which recordings are looked for at any depth.
 
     Returns:
-        The given files and those of the folders, each once. The files of one folder are in the order of their names.
+        The given files and the recordings in the folders, each once. Those of one folder are sorted by their paths.
 
     Raises:
         RecordingError: If a path does not exist, or if a folder has no recording.
@@ -241,7 +245,7 @@ def recordings_in(paths: Sequence[Path]) -> list[Path]:
 
 @dataclass(frozen=True)
 class EpisodeSpan:
-    """An episode within a run. Times are since the run began [s]."""
+    """The time span of an episode within a run, and the operator's marks on it. Times are since the run began [s]."""
 
     start: float = -math.inf
     end: float = math.inf  # inf stands for the end of the run.
@@ -260,12 +264,12 @@ WHOLE = EpisodeSpan()
 
 
 def spans_of(events: Iterable[Event], run_succeeded: bool | None = None) -> list[EpisodeSpan]:
-    """Return the episodes that an operator has marked, or the whole run if there are none.
+    """Return the episodes that an operator has marked, or the whole run if the operator marked none.
 
-    A mark that discards an episode, or calls it a success or failure, belongs to the episode that is going on. If none
-    is going on, it belongs to the last episode. If an episode was called both a success and a failure, the last mark
-    counts. The success of the whole run is the operator's mark, or else ``run_succeeded``, the result of the task's own
-    check.
+    The operator can discard an episode, or mark it as a success or failure. Such a mark belongs to the episode that is
+    going on. If no episode is going on, it belongs to the last episode. The last mark counts if an episode has both a
+    success and a failure. The whole run has the success that the operator marked. Without such a mark, it has
+    ``run_succeeded``, which is the result of the task's own check.
     """
     whole = replace(WHOLE, success=run_succeeded)
     spans: list[EpisodeSpan] = []
@@ -299,7 +303,10 @@ def read_spans(recording: Recording) -> list[EpisodeSpan]:
 
 
 def _events_of(recording: Recording) -> Iterator[Event]:
-    """Yield all events. A loop's recording has them all on one topic, so the rows of its ticks need not be read."""
+    """Yield all events of a recording.
+
+    In a loop's recording, one topic has all events, so the larger messages with the numbers of ticks are not read.
+    """
     if recording.about.source == LOOP:
         states = (str(data_of(one.payload, TEXT)) for messages in recording.messages({STATE}) for one in messages)
         for state in states:

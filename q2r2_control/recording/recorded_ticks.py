@@ -21,11 +21,13 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.tick import RunStart
 from q2r2_control.types import QUEST_CONTROLS, SIDES, ActionChunk, Array, HandInputs, HandSample, RobotState
 
-_SAME_POSE = 1e-6  # Poses are equal if their positions [m] and quaternions differ by at most this in each number.
+_SAME_POSE = 1e-6  # Two poses are equal if each number of their positions [m] and quaternions differs by at most this.
 
 
 @dataclass(frozen=True, slots=True)
 class RecordedTick:
+    """One tick of a recording, with all data that the loop took in it."""
+
     number: int
     now: float
     dt: float
@@ -47,7 +49,7 @@ class RecordedTicks:
         self._arms = recording.about.arms
         self._ticks = self._all(recording)
         self._starts: list[RunStart] = []
-        self.missing = 0  # The number of lost ticks, just after the last tick that can be read.
+        self.missing = 0  # The number of ticks that are missing just after the last tick that can be read.
         self.current: RecordedTick | None = None
         self.next = next(self._ticks, None)
         if self.next is None or not self._starts:
@@ -56,7 +58,7 @@ class RecordedTicks:
         self.start = self._starts[0]
 
     def advance(self) -> RecordedTick:
-        """Go on to the next tick, and return it. Raises :class:`NoMoreTicksError` after the last tick."""
+        """Make the next tick the current tick, and return it. Raises :class:`NoMoreTicksError` after the last tick."""
         if self.next is None:
             raise NoMoreTicksError
         self.current, self.next = self.next, next(self._ticks, None)
@@ -132,7 +134,7 @@ def _sample(numbers: Array, more: dict[str, float]) -> HandSample:
 
 
 def cell_and_robot_of(recording: Recording, config: Config | None = None) -> tuple[Config, Robot]:
-    """Return the recorded cell, or ``config`` if it is given, with its robot.
+    """Return the recorded cell and its robot, or ``config`` and its robot if ``config`` is given.
 
     Raises :class:`RecordingError` if the recorded cell cannot be built, or if the cell has other arms or joints than
     the recording.
@@ -157,9 +159,10 @@ def _built(text: str) -> tuple[Config, Robot]:
 
 
 def check_tools(positions: Array, tools: Array, robot: Robot) -> None:
-    """Check that recorded tool poses are those of a robot at joint ``positions`` (joints,).
+    """Check that a robot is the recorded robot.
 
-    Raises :class:`RecordingError` if ``robot`` has other tool poses at ``positions`` than ``tools`` (arms, 7).
+    Raises :class:`RecordingError` if its tool poses at ``positions`` (joints,) differ from the recorded poses ``tools``
+    (arms, 7), x y z [m] qx qy qz qw in the world.
     """
     (found,) = tool_poses(positions[None], robot)
     # A quaternion and its negative are the same rotation.

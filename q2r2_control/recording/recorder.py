@@ -34,32 +34,35 @@ if TYPE_CHECKING:  # The ROS node does not import MuJoCo.
     from q2r2_control.plants.mujoco import MujocoPlant
 
 PATIENCE = 10.0  # Time to wait for a disk that hangs at the end of a run [s].
-# Size of the data that may wait to be sent [bytes]. The same size may wait in the writer. A tick of two arms takes
-# 1.6 kB, and the nodes of two arms send some 0.6 MB a second.
+# Size of the data that may wait to be sent [bytes]. As much data may wait in the writer. A tick of two arms has 1.6 kB,
+# and the ROS nodes of two arms send some 0.6 MB a second.
 ROOM = 4 << 20
-# A warning is logged if the file is behind the run by more than the first time. There is no second warning before the
-# file is behind by less than the second time [s].
+# A warning is logged if the file is behind the run by more than the first time [s]. There is no second warning until
+# the file is behind by less than the second time [s].
 _BEHIND, _CAUGHT_UP = 2.0, 1.0
-# ROOM for recordings of nodes with pictures: an uncompressed picture takes a megabyte [bytes].
+# The same as ROOM, for recordings of ROS nodes with pictures [bytes]. An uncompressed picture has a megabyte.
 ROOM_WITH_PICTURES = 64 << 20
 _LAST_NUMBER = 2**32 - 1
 _BATCH = 16  # The number of ticks that are sent at once.
-_LONGEST_FAULT = 500  # Longest text of the fault that ended a run [characters].
+_LONGEST_FAULT = 500  # A longer text of the fault that ended a run is cut off [characters].
 
 _logger = logging.getLogger(__name__)
 
 
 class BaseRecorder:
-    """Sends data to a process that writes it. It raises nothing: a failure is logged once, and the run goes on."""
+    """Sends data to a process that writes it into a file.
+
+    It raises no errors: a failure is logged once, and the run goes on.
+    """
 
     def __init__(self, parent: Path, name: str, room: int) -> None:
         """Start the process; ``room`` [bytes] is the size of the data that may wait to be written."""
         self._parent, self._name = parent, name
-        self.fault: str | None = None  # The reason why nothing more is recorded.
-        self.file: Path | None = None  # The file that is written; None while there is no file.
+        self.fault: str | None = None  # The reason why nothing more is recorded; None without a failure.
+        self.file: Path | None = None  # The path of the recording; None while there is no file.
         self.written = Written()
         self.writer: HelperProcess | None = None
-        self.record_outcome: Callable[[Reason], None] = lambda reason: None  # Informs the operator of a failure.
+        self.record_outcome: Callable[[Reason], None] = lambda reason: None  # Called with a failure, for the operator.
         try:
             module = "q2r2_control.recording.writer"
             on_written = partial(setattr, self, "written")
@@ -70,11 +73,11 @@ class BaseRecorder:
     def _open(
         self, about: About, robot: RecordedRobot | None, topics: tuple[Topic, ...], topic_rate: float | None = None
     ) -> bool:
-        """Let the writer begin the file of a run that begins at ``about.epoch``; returns whether that was possible."""
+        """Let the writer begin the file of a run that begins at ``about.epoch``. Return whether that was possible."""
         if self.writer is None:
             return False
         try:
-            # The name begins with the time of day, so that recordings are listed in their order.
+            # The name begins with the time of day. Recordings that are sorted by name are then in the order of time.
             when = datetime.fromtimestamp(about.epoch * 1e-9)
             folder = new_folder(self._parent, f"{when:%Y%m%d-%H%M%S}-{self._name}", "--record")
         except (ConfigError, OSError) as error:
@@ -85,9 +88,10 @@ class BaseRecorder:
         return True
 
     def _send(self, batch: list[PackedTick] | list[Message] | list[CodedPicture], *, wait: bool = False) -> bool:
-        """Send a batch to the writer, and return whether it was sent: False if there is no room for it now.
+        """Send a batch to the writer. Return whether it was sent.
 
-        If ``wait`` is True, wait until there is room.
+        It is not sent after a failure, or if too much data waits already. If ``wait`` is True, wait until less data
+        waits.
         """
         if self.writer is None or self.fault is not None:
             return False
@@ -96,7 +100,10 @@ class BaseRecorder:
         return sent
 
     def finish(self, conclusion: Conclusion | None = None) -> None:
-        """Write the data that waits and the ``conclusion``, and close the file."""
+        """Let the writer write the data that waits and the ``conclusion``, and close the file.
+
+        After a failure, a file without messages is removed.
+        """
         if self.writer is not None:
             if self.file is not None:
                 self.writer.send(conclusion or Conclusion())
@@ -119,23 +126,23 @@ class BaseRecorder:
 
 
 def is_empty(file: Path) -> bool:
-    """Return whether a file has no message; the file may be that of a writer that was killed."""
+    """Return whether a file has no message. The file may be missing, or its writer may have been killed."""
     if not file.exists():
         return True
     try:
         return not any(McapFile(file).messages())
-    except EndOfFile:  # The file was cut before its first message was whole.
+    except EndOfFile:  # The file ends within its first message, or before it.
         return True
-    except (OSError, *BROKEN):  # The file may hold messages that cannot be read now, so it stays.
+    except (OSError, *BROKEN):  # The file may have messages that cannot be read now, so it must not be removed.
         return False
 
 
 class MessageRecorder(BaseRecorder):
-    """Writes messages into one file. It never waits: messages for which there is no room are lost, and counted."""
+    """Records messages into one file. It never waits: if too much data waits already, messages are lost and counted."""
 
     def __init__(self, parent: Path, name: str, room: int = ROOM) -> None:
         super().__init__(parent, name, room)
-        self.count = self.overflows = 0  # The number of messages that came, and of those for which there was no room.
+        self.count = self.overflows = 0  # The number of all messages, and of the lost messages.
         self._last = 0  # The time of day of the newest message [ns].
         self._begun = False
 
@@ -143,9 +150,10 @@ class MessageRecorder(BaseRecorder):
         self._begun, self._last = self._open(about, None, topics), about.epoch
 
     def record(self, messages: Iterable[Message]) -> None:
-        """Let messages be written, in the order of their receipt.
+        """Send messages to the writer, in the order of the times at which they were received.
 
-        A file is in the order of time. A message that is older than the last one gets the time of the last one.
+        The times in a file never decrease. A message that is older than the message before gets the time of that
+        message.
         """
         batch = []
         for message in sorted(messages, key=lambda one: one.time):
@@ -161,24 +169,24 @@ class MessageRecorder(BaseRecorder):
 class RecordingSummary:
     """The outcome of a recording."""
 
-    file: str | None  # None if no file could be made.
+    file: str | None  # The path of the file; None if no file could be made.
     ticks: int  # The number of ticks that were written.
-    lost_ticks: int  # The number of ticks that came while there was no room, or after the disk had failed.
-    fault: str | None  # The reason why the recording ended before the run.
+    lost_ticks: int  # The number of ticks that were not written, because too much data waited or the disk had failed.
+    fault: str | None  # The reason why the recording ended before the run; None if it did not.
     pictures: int = 0  # The number of pictures that were written.
     lost_pictures: int = 0  # The number of pictures that were due and are missing.
-    pictures_fault: str | None = None  # The reason why the pictures ended before the run.
-    # The longest time span of the run that was not yet in the file. A kill of the writer would have lost it.
+    pictures_fault: str | None = None  # The reason why no more pictures were taken; None if there was no failure.
+    # The longest time by which the file was behind the run. If the writer had been killed, this time would be lost.
     longest_backlog_s: float = 0.0
 
 
 class Recorder(BaseRecorder, AbstractContextManager["Recorder"]):
-    """A listener of one run, used as a context manager around it.
+    """Records one run. It is a listener of the run's pipeline, and a context manager around the run.
 
-    It raises nothing: a failure is logged once, and the run goes on.
+    It raises no errors: a failure is logged once, and the run goes on.
 
-    The process starts in the constructor. Make the recorder before any long preparation, and call :meth:`begin` just
-    before the run begins::
+    The constructor starts the process of the writer. Make the recorder before any long preparation, and call
+    :meth:`begin` just before the run begins::
 
         with Recorder(Path("recordings"), "reach", waits=True) as recorder:
             recorder.begin(About.of(pipeline, False, {"task": "reach for the cup"}), pipeline.robot)
@@ -195,26 +203,26 @@ class Recorder(BaseRecorder, AbstractContextManager["Recorder"]):
 
         Args:
             parent: The folder in which the recording gets a folder of its own.
-            name: The end of the names of that folder and of the file. They begin with the time of day.
-            waits: True if ticks wait for room, as they may in simulated time. Otherwise ticks for which there is no
-                room are lost, and counted.
+            name: The last part of the names of that folder and of the file. The first part is the time of day.
+            waits: What happens if the data that waits to be written is larger than ``room``. If True, the run waits, as
+                it may in simulated time. If False, ticks are lost and counted.
             room: The size of the data that may wait to be written [bytes].
             pictures: True to start one more process, which takes the pictures of the cameras of :meth:`prepare`.
         """
         self._waits = waits
-        self._count = 0  # The number of ticks.
-        self.overflows = 0  # The number of ticks for which there was no room.
+        self._count = 0  # The number of ticks so far.
+        self.overflows = 0  # The number of ticks that were lost because too much data waited.
         self._packer: TickPacker | None = None  # None before :meth:`begin`.
         self._batch: list[PackedTick] = []
-        # For each batch that is not yet written, the number of ticks up to its end and the loop's time then [s].
+        # For each batch that is not yet written, the number of ticks up to its end, and the loop's time at its end [s].
         self._sent: deque[tuple[int, float]] = deque()
         self._longest_backlog, self._said_so = 0.0, False
         self._epoch = 0
-        # The success of the run, set before its end if the task has a check of its own.
+        # Whether the run succeeded. If the task has a check of its own, its result is set here before the run ends.
         self.success: bool | None = None
         self.cameras: CameraRecorder | None = None
         self._pictures_fault: str | None = None
-        # The number of pictures that real cameras gave, and of those that were due and did not come.
+        # For real cameras, the number of pictures that came, and the number that were due and did not come.
         self.device_pictures = self.missing_pictures = 0
         super().__init__(parent, name, room)
         if pictures:
@@ -224,7 +232,7 @@ class Recorder(BaseRecorder, AbstractContextManager["Recorder"]):
                 self._check_cameras(reason_of(error))
 
     def prepare(self, plant: MujocoPlant, robot: Robot, cameras: Mapping[str, CameraConfig]) -> None:
-        """Prepare to take pictures of ``plant``, just before :meth:`begin`. This takes at most some seconds.
+        """Prepare to take pictures of ``plant``. Call it just before :meth:`begin`. It takes at most ten seconds.
 
         Args:
             plant: The simulation that moves the arms.
@@ -257,24 +265,24 @@ class Recorder(BaseRecorder, AbstractContextManager["Recorder"]):
             if len(self._batch) >= _BATCH:
                 self._send_batch()
                 self._watch_backlog(tick.now)
-        except Exception as error:  # The arms go on moving after any error.
+        except Exception as error:  # An error of the recorder must not stop the arms.
             self._check(reason_of(error))
         if self.cameras is not None:
             try:
                 self.cameras.take_pictures(number, tick, self._epoch, wait=self._waits)
-            except Exception as error:  # Ticks are still recorded.
+            except Exception as error:  # After an error of the cameras, ticks are still recorded.
                 self._check_cameras(reason_of(error))
             self._check_cameras()
 
     def _send_batch(self) -> None:
-        """Send all ticks that wait; the ticks are lost if there is no room for them."""
+        """Send all ticks of the batch. They are lost if too much data waits already."""
         batch, self._batch = self._batch, []
         if batch and not self._send(batch, wait=self._waits) and self._packer is not None:
             self.overflows += len(batch)
             self._packer.repeat_state()
 
     def _watch_backlog(self, now: float) -> None:
-        """Warn if the file is far behind the run: a kill of the writer would lose all data of that time.
+        """Warn if the file is far behind the run. If the writer were killed, all data of that time would be lost.
 
         A run in simulated time waits for the writer, so no warning is needed.
         """
@@ -291,12 +299,15 @@ class Recorder(BaseRecorder, AbstractContextManager["Recorder"]):
         self._said_so = behind > (_CAUGHT_UP if self._said_so else _BEHIND)
 
     def _write_picture(self, picture: Message) -> None:
-        """Send a picture to the writer; called in the thread that receives pictures, which may wait for room."""
+        """Send a picture of a simulated camera to the writer, and wait until less data waits if necessary.
+
+        The thread that receives the pictures calls this method, so the loop need not wait.
+        """
         if self.writer is not None:
             self.writer.send([picture], picture.size, wait=True)
 
     def record_picture(self, picture: CodedPicture) -> None:
-        """Send a picture of a real camera to the writer; it is lost, and counted, if there is no room for it."""
+        """Send a picture of a real camera to the writer. It is lost and counted if too much data waits already."""
         self.device_pictures += 1
         self._send([picture])
 

@@ -1,4 +1,4 @@
-"""Runs a recording again: the pipeline's own loop, with the recorded data as its clock, input and plant."""
+"""Runs a recording again, in the pipeline's own loop. The recorded data replaces its clock, input and plant."""
 
 from __future__ import annotations
 
@@ -75,12 +75,16 @@ _REPEATED = {
 
 @dataclass(frozen=True, slots=True)
 class Replay:
-    ticks: int
-    summary: RunSummary | None  # None if the run ended before its first tick.
-    ended_by: str | None  # The fault that ended the replay, or the reason why it ended too early; None if neither.
-    difference: str | None  # The first difference in words; None if there is none, or if nothing was compared.
+    """The result of a replay."""
+
+    ticks: int  # The number of ticks that were replayed.
+    summary: RunSummary | None  # The summary of the replay; None if it ended before its first tick.
+    # The fault that ended the replay, or the reason why it ended earlier than the recorded run; None if neither.
+    ended_by: str | None
+    # The first difference between replay and recording in words; None if there is none or nothing was compared.
+    difference: str | None
     notes: list[str]  # The changes of program, cell and robot since the run was recorded.
-    arms: dict[str, ArmDifference]  # The differences of each arm's tool poses; empty without a plant.
+    arms: dict[str, ArmDifference]  # The differences of each arm's tool poses; empty if no plant moved.
 
 
 def replay(
@@ -95,11 +99,24 @@ def replay(
     """Run a recording again, with its own cell or with another cell.
 
     Without a ``plant``, the loop gets the recorded measurements, whatever it commands. With a ``plant``, that plant
-    moves and is measured. Only a plant of the recorded kind can repeat the run to the bit, so ``compare`` is not
-    allowed with others. ``prepare`` is called with the pipeline before the run. ``paced`` is True if the run must not
-    be faster than it was recorded. Raises :class:`RecordingError` for a file that is not a recording or is damaged.
-    Raises :class:`Q2R2Error` for a cell that cannot be built or has other arms or joints, and for a plant without the
-    recorded mode.
+    moves, and the loop gets its measurements. Only the kind of plant that was recorded can repeat the run to the bit.
+
+    Args:
+        path: The recording, or a folder with one recording.
+        config: The cell; None for the recorded cell.
+        plant: The name of a plant; None for the recorded measurements.
+        compare: Whether to compare each tick with the recorded tick, bit by bit. It has to be False if ``plant`` is of
+            another kind than the recorded plant. Without a ``plant``, ticks are always compared.
+        prepare: Called with the pipeline before the run.
+        paced: True if the replay must not be faster than the recorded run.
+
+    Returns:
+        The result of the replay.
+
+    Raises:
+        RecordingError: If the file is not a recording of a loop, or is damaged.
+        Q2R2Error: If the cell cannot be built or has other arms or joints, or if the plant cannot be driven in the
+            recorded mode.
     """
     recording = Recording(path)
     about = recording.about
@@ -152,7 +169,7 @@ class ReplayPipeline(Pipeline):
     def __init__(self, config: Config, robot: Robot, ticks: RecordedTicks, about: About, plant: str | None) -> None:
         """``plant`` is the name of a plant. If it is None, the loop gets the recorded measurements."""
         recorded = _Recorded(ticks, about.plant_modes, self._ask_again)
-        # A recording does not tell which extra buttons the device had.
+        # A recording does not say which extra buttons the device had. It is assumed to have all bound buttons.
         buttons = QUEST_CONTROLS.buttons + config.teleop.bindings.of_device
         recorded.controls = replace(_Recorded.controls, buttons=buttons)
         moves = recorded if plant is None else make_plant(plant, robot, config)
@@ -163,13 +180,14 @@ class ReplayPipeline(Pipeline):
         return _Clock(1.0 / self.config.nominal_rate_hz, self._recorded, self._pace)
 
     def summary_so_far(self) -> RunSummary:
-        """Return the summary of the ticks up to now. The run must have begun."""
+        """Return the summary of all ticks so far. The run must have begun."""
         return self._recorder.finish(self._clock, self.loop.pacer)
 
     def _ask_again(self, tick: RecordedTick) -> None:
         """Repeat the requests that a program made at this tick.
 
-        Such a request was recorded as an event of each arm that changes no state, so one arm's events are enough.
+        Such a request was recorded as one event for each arm. These events are equal and do not change the state of an
+        arm, so only the events of the first arm are read.
         """
         first = next(iter(self.robot.arms))
         asked = (event for event in tick.events if event.arm == first and event.source == event.destination)
@@ -201,7 +219,7 @@ class _Clock(LoopClock):
 
 
 class _Recorded:
-    """Gives the samples and measured states of the recorded tick. Implements PolicySource and Plant.
+    """The input and the plant of a replay: a PolicySource and a Plant that return the data of the recorded tick.
 
     Commands have no effect.
     """
@@ -242,7 +260,7 @@ class _Recorded:
 
 
 class _Solver:
-    """Returns no solution in the substeps in which the recorded run had no solution in time."""
+    """A solver that returns no solution in the substeps in which the recorded run had no solution in time."""
 
     def __init__(self, solver: Solver, ticks: RecordedTicks) -> None:
         self._solver, self._ticks = solver, ticks
@@ -259,9 +277,9 @@ class _Solver:
 
 
 class _PlantDifference:
-    """A listener of a replay with a plant. It measures the differences of the tool poses from the recorded ones."""
+    """A listener of a replay with a plant. It measures how far the tool poses are from the recorded tool poses."""
 
-    keeps_episodes = True  # It is True in the recorder too, so the marks of episodes have the same effect.
+    keeps_episodes = True  # The recorder has the same value, so the operator's marks have the same effect in a replay.
 
     def __init__(self, robot: Robot, ticks: RecordedTicks) -> None:
         self._robot, self._ticks = robot, ticks
@@ -290,9 +308,12 @@ class _PlantDifference:
 
 
 class _Comparison:
-    """A listener of a replay that compares each tick with the recorded one, bit by bit, except computing times."""
+    """A listener of a replay that compares each tick with the recorded tick, bit by bit.
 
-    keeps_episodes = True  # It is True in the recorder too, so the marks of episodes have the same effect.
+    Computing times are not compared.
+    """
+
+    keeps_episodes = True  # The recorder has the same value, so the operator's marks have the same effect in a replay.
 
     def __init__(self, about: About, ticks: RecordedTicks) -> None:
         self._ticks, self._packer = ticks, TickPacker(about.arms, about.joints)
@@ -312,7 +333,7 @@ class _Comparison:
                 self._difference = f"{tick.now - self._ticks.start.now:.6f} s: {found}"
 
     def finish(self) -> str | None:
-        """Return the first difference, or None, when the replay has ended.
+        """Return the first difference in words, or None if there is none. Call it when the replay has ended.
 
         A recorded tick that was not replayed is a difference too.
         """

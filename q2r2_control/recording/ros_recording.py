@@ -1,7 +1,7 @@
 """Reads a recording of the ROS nodes as if one loop had made it.
 
-A tick is a tick of the controller's node, with the newest joint states, flags of the arms and targets that had been
-received by then. Its reference is the reference with the same time.
+Each tick of the controller's node becomes a tick. It has the newest joint states, flags of the arms and targets that
+had been received by then. Its reference is the reference message with the same time as the tick.
 """
 
 from __future__ import annotations
@@ -31,18 +31,23 @@ from q2r2_control.recording.tick_rows import SAMPLE_FIELDS, Rows, tick_type
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import SIDES, Array
 
-_CLOCK_SET = 0.5  # The times of a reference and a tick differ by this much only if the clock was set between them [s].
-_SAME = 1e-6  # Times that differ by at most this belong to the same tick; they may be rounded differently [s].
+# If the times of a reference and a tick differ by this or more, the clock was set between the two [s].
+_CLOCK_SET = 0.5
+# A reference belongs to a tick if their times differ by at most this, because the times may be rounded differently [s].
+_SAME = 1e-6
 
 
 def open_recording(path: Path) -> Recording:
-    """Open a recording of a loop or of the nodes. Raises :class:`RecordingError`, see :class:`Recording`."""
+    """Open a recording of a loop or of the ROS nodes. Raises :class:`RecordingError`, see :class:`Recording`."""
     recording = Recording(path)
     return RosRecording(path) if recording.about.source == ROS else recording
 
 
 class RosRecording(Recording):
-    """A recording of the ROS nodes. Raises :class:`RecordingError`, also if another controller moved the arms."""
+    """A recording of the ROS nodes, which is read as ticks.
+
+    :meth:`chunks` raises :class:`RecordingError` if another controller than the built-in one moved the arms.
+    """
 
     def chunks(self) -> Iterator[TickChunk]:
         config, robot = cell_and_robot_of(self)
@@ -60,7 +65,7 @@ class RosRecording(Recording):
                 if previous is not None:
                     yield previous
                 previous = chunk
-        if previous is not None and self.closed:  # The recorder ended as planned, so this is the last tick of the run.
+        if previous is not None and self.closed:  # The file is complete, so its last tick is the run's last tick.
             previous.rows["following"][-1] = 0.0
         yield ticks.rest(previous)
 
@@ -76,7 +81,8 @@ class RosRecording(Recording):
         return topic
 
     def _time_of(self, picture: Message) -> int:
-        # The recorder itself reads devices, so it is their sender. Another sender may have another clock.
+        # The recorder itself reads the devices and sends their pictures, so ``sent`` is by its own clock. Other senders
+        # may have other clocks.
         return picture.sent if self.topic(picture) in self._device_topics else picture.time
 
     @cached_property
@@ -87,9 +93,11 @@ class RosRecording(Recording):
 
 @dataclass(slots=True)
 class _Tick:
-    time: int  # The time of day of its receipt [ns].
-    now: float  # The controller's time [s].
-    row: Rows  # (1,), filled with the numbers that were known by then.
+    """A tick of the controller whose reference has not been found yet."""
+
+    time: int  # The time of day at which the tick's message was received [ns].
+    now: float  # The time of the tick by the controller's clock [s].
+    row: Rows  # (1,), filled with the numbers that were known when the tick was received.
     samples: list[Array]  # The samples that were received since the last tick, each with the numbers of SAMPLE_FIELDS.
     events: list[Event]  # The events since the last tick.
 
@@ -98,7 +106,7 @@ class RosTicks:
     """Makes ticks from the messages of a set of nodes."""
 
     def __init__(self, epoch: int, robot: Robot) -> None:
-        """``epoch`` [ns] is the time from which the times of ticks are counted, by the clock of the messages."""
+        """Times of ticks are counted from ``epoch`` [ns], which is a time of the clock of the messages."""
         self._robot, self._epoch, self._joint_names = robot, epoch, robot.joint_names
         self._arms = arms = tuple(robot.arms)
         self._fields, self._type = names.tick_fields(arms), tick_type(len(arms), len(robot.joint_names))
@@ -110,8 +118,10 @@ class RosTicks:
         self._samples: list[Array] = []
         self._events: list[Event] = []
         self._due: deque[_Tick] = deque()  # Ticks that wait for their references.
-        self._references: deque[tuple[float, Array]] = deque()  # The controller's time [s] and the reference.
-        self._last_index, self._number = 0, -1  # The controller's index and the number of the newest tick.
+        # References that wait for their ticks: the controller's time [s], and q, v and a (3, joints).
+        self._references: deque[tuple[float, Array]] = deque()
+        # The newest tick has these two: the index that the controller gave it, and its number in this recording.
+        self._last_index, self._number = 0, -1
         self._handlers: dict[str, Callable[[Any, int], None]] = {
             names.JOINT_STATES: self._on_joints,
             names.REFERENCE: self._on_reference,
@@ -131,14 +141,14 @@ class RosTicks:
         return frozenset(self._handlers)
 
     def add_messages(self, messages: Iterable[tuple[str, Message]]) -> TickChunk:
-        """Take messages with their topics, and return the ticks that are complete now; there may be none."""
+        """Take messages, each with its topic. Return the ticks that are complete now; there may be none."""
         for topic, message in messages:
             if (handle := self._handlers.get(topic)) is not None:
                 handle(STORE.deserialize_cdr(message.payload, self._types[topic]), message.time)
         return self._chunk(list(self._whole_ticks()))
 
     def rest(self, last: TickChunk | None) -> TickChunk:
-        """Return the ``last`` chunk, or a chunk without a tick, with the events after it added."""
+        """Return the ``last`` chunk with all later events added to it. If it is None, return a chunk without ticks."""
         chunk = self._chunk([]) if last is None else last
         if events := [*(event for tick in self._due for event in tick.events), *self._events]:
             number = max(self._number, 0)
@@ -179,7 +189,7 @@ class RosTicks:
 
     def _on_tick(self, message: Any, time: int) -> None:
         if not self._known.all() or np.isnan(self._flags[:, 0]).any():
-            return  # The tick is not complete, since some joints or flags are not known yet.
+            return  # The tick cannot be used, since some joints or flags are not known yet.
         values = dict(zip(self._fields, message.data.tolist(), strict=True))
         row = np.zeros(1, dtype=self._type)
         for name in set(values) & set(self._type.names or ()):
@@ -202,7 +212,7 @@ class RosTicks:
     def _whole_ticks(self) -> Iterator[_Tick]:
         """Yield the ticks whose reference has been received.
 
-        Samples and events of a tick whose reference was lost go to the next tick.
+        A tick whose reference was lost is dropped. Its samples and events go to the next tick.
         """
         while self._due and self._references:
             tick, (now, reference) = self._due[0], self._references[0]
@@ -219,20 +229,20 @@ class RosTicks:
             self._references.popleft()
             row, index = tick.row, int(tick.row["index"][0])
             row["reference_q"], row["reference_v"], row["reference_a"] = reference
-            # The index begins again if the controller was started again.
+            # If the controller was started again, its index begins again and does not show how many ticks are missing.
             self._number += index - self._last_index if 0 < self._last_index < index else 1
             self._last_index = index
             row["index"] = self._number
             yield tick
 
     def _is_older(self, reference: float, tick: float) -> bool:
-        """Return whether the oldest waiting reference belongs to no tick: it is older than the oldest waiting tick.
+        """Return whether the oldest waiting reference belongs to no tick, because the oldest waiting tick is newer.
 
-        ``reference`` and ``tick`` are their times [s].
+        ``reference`` and ``tick`` are the times of these two by the controller's clock [s].
         """
         if abs(reference - tick) < _CLOCK_SET:
             return reference < tick - _SAME
-        # The clock was set between the two, forward or back. Other ticks and references tell which of them is later.
+        # The clock was set between the two, forward or back. Other waiting ticks and references show which is newer.
         return not any(abs(other.now - reference) <= _SAME for other in self._due) and any(
             abs(other - tick) <= _SAME for other, _ in self._references
         )

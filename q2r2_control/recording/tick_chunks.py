@@ -1,4 +1,4 @@
-"""Joins the messages of each tick, also if a chunk of the file ends between them."""
+"""Joins the messages of each tick, even if they are in two chunks of the file."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from q2r2_control.recording.messages import SAMPLES, STATE, TEXT, TICK, Message,
 from q2r2_control.recording.tick_rows import SAMPLE_FIELDS, Rows, tick_type
 from q2r2_control.types import Array
 
-_FEWEST = 200  # Ticks are read in groups of more than this, since NumPy takes as long for one tick as for many.
+# Ticks are decoded in groups with more ticks than this, since NumPy takes as long for one tick as for many.
+_FEWEST = 200
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,7 @@ class TickChunk:
 
 
 class TickAssembly:
-    """Collects messages, and gives the ticks whose messages are complete.
+    """Collects messages, and yields the ticks of which all messages have come.
 
     Messages have the numbers of their ticks and come in the order of time. Therefore a tick is complete when the next
     tick comes. The last tick is complete when there are no more messages.
@@ -66,9 +67,10 @@ class TickAssembly:
             yield self._taken(self._found[TICK][-1].number)
 
     def rest(self, ended: bool) -> Iterator[TickChunk]:
-        """Yield the ticks that are left. A last tick without all its samples is left out unless the file was ``ended``.
+        """Yield the ticks that are left. ``ended`` is True if the file was written to its end.
 
-        Raises :class:`ValueError` if ticks are not in order, and the errors of rosbags for other messages.
+        Otherwise the last tick is left out if some of its samples are missing. Raises :class:`ValueError` if ticks are
+        not in order, and the errors of rosbags if a message has another type.
         """
         if not any(self._found.values()):
             return
@@ -82,7 +84,10 @@ class TickAssembly:
         yield chunk
 
     def _taken(self, border: int | None) -> TickChunk:
-        """Take the messages of ticks with numbers below the ``border``, and keep the others. None takes all."""
+        """Take out the messages of ticks whose numbers are below ``border``, and return these ticks.
+
+        If ``border`` is None, the messages of all ticks are taken out.
+        """
         taken: dict[str, list[Message]] = {}
         for topic, messages in self._found.items():
             end = len(messages)

@@ -26,7 +26,8 @@ Rows = npt.NDArray[np.void]
 NOT_MEASURED = -math.inf  # Stands for the opening of a gripper that the plant does not measure.
 COMMAND_MODES, STATUSES = tuple(CommandMode), tuple(StepStatus)
 HAND_FAULTS = (None, *HandFault)
-UNSOLVED_MAX = 2**53  # The bit mask of unsolved substeps is at most this: a float64 has no more bits for integers.
+# Largest stored bit mask of unsolved substeps. A float64 cannot store all larger integers.
+UNSOLVED_MAX = 2**53
 SAMPLE_FIELDS = (
     *("tick", "hand", "pose_stamp", "inputs_stamp", "x", "y", "z", "qx", "qy", "qz", "qw"),
     *QUEST_CONTROLS.names,
@@ -36,8 +37,9 @@ ARM_FIELDS = (
     *("opening", "engaged", "slip", "slip_angle", "wanted", "commanded", "rejected", "gripper_held", "holding"),
     *("intervention", "policy"),
 )
-ARM_POSES = ("filtered_hand", "target", "tool")  # Zeros stand for no pose. ``tool`` is the tool pose at the reference.
-# A replay does not compare these numbers. The writer, and not the loop, computes ``tool`` from the reference.
+# The poses of each arm in a row. ``tool`` is the tool pose at the reference. Zeros stand for a missing pose.
+ARM_POSES = ("filtered_hand", "target", "tool")
+# A replay does not compare these numbers: computing times vary, and ``tool`` is filled in only by the writer.
 NOT_REPLAYED = ("compute_time", "solve_time", "tool")
 _LOOP = ("index", "now", "dt", "connected", "following", "samples", "state_stamp", "external")
 _MEASURED = ("q", "v", "tau", "tau_external")
@@ -46,11 +48,11 @@ _DECIDED = ("reference_q", "reference_v", "reference_a", "command_q", "command_v
 _LAST = ("command_mode", "compute_time", "solve_time")
 
 _values_of = attrgetter(*QUEST_CONTROLS.names)
-_NO_POSE = (0.0,) * len(POSE_FIELDS)  # Its quaternion has length 0, so it is no pose.
+_NO_POSE = (0.0,) * len(POSE_FIELDS)  # Stands for a missing pose. No pose has a quaternion of length 0.
 
 
 class PackedTick(NamedTuple):
-    """One tick, on its way to the process that writes it."""
+    """One tick, as it is sent to the process that writes it."""
 
     row: bytes  # A row with the dtype that tick_type returns.
     samples: bytes  # The float64 numbers of SAMPLE_FIELDS, sample after sample.
@@ -86,12 +88,15 @@ def tick_labels(arms: Sequence[str], joints: Sequence[str]) -> tuple[str, ...]:
 
 
 def numbers_in(rows: Rows) -> Array:
-    """Return the numbers (n, numbers of a row) of rows (n,)."""
+    """Return the rows (n,) as an array (n, k) of float64, where k is the count of numbers in a row."""
     return np.ascontiguousarray(rows).view(np.float64).reshape(len(rows), rows.dtype.itemsize // 8)
 
 
 def targets_or_tools(rows: Rows) -> Array:
-    """Return the operator's targets (n, arms, 7), or the tool poses at the reference where there is no target."""
+    """Return the operator's targets (n, arms, 7) as x y z [m] qx qy qz qw in the world.
+
+    Where an arm has no target, its tool pose at the reference stands instead.
+    """
     targets, tools = rows["arms"]["target"], rows["arms"]["tool"]
     return np.where(targets.any(axis=2, keepdims=True), targets, tools)
 
@@ -106,7 +111,7 @@ class TickPacker:
         self._state: dict[str, Any] | None = None  # The last state that was packed.
 
     def repeat_state(self) -> None:
-        """Pack the state and the start of the run again with the next tick, since the last packed tick was lost."""
+        """Let the next tick contain the state and the start of the run again. Call it if the last tick was lost."""
         self._state = None
 
     def pack(self, number: int, tick: Tick) -> PackedTick:

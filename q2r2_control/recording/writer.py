@@ -27,10 +27,12 @@ from q2r2_control.types import QUEST_CONTROLS, SIDES, Array
 if TYPE_CHECKING:
     from q2r2_control.robot.robot import Robot
 
-FLUSH_PERIOD = 0.5  # Time between two flushes of the file [s]. If this process is killed, no more than that is lost.
-READ_AHEAD = 4 << 20  # Largest size of the data that was read and waits to be written [bytes].
-_NICENESS = 10  # The loop has a higher priority if there are not enough processors.
-_ROUNDING = 1e-6  # Share of a period by which rounding may make a message seem to come too early.
+FLUSH_PERIOD = 0.5  # Time between two flushes of the file [s]. If this process is killed, at most this time is lost.
+READ_AHEAD = 4 << 20  # Largest size of the requests that were read from the pipe and wait to be written [bytes].
+_NICENESS = 10  # The niceness of this process. With it, the loop has a higher priority.
+# A tick belongs to the next period if that period begins within this share of a period. Times are rounded, so the tick
+# may seem to come a little too early.
+_ROUNDING = 1e-6
 _LAST_TIME = (2**31 - 1) * NANOSECONDS  # The latest time of a stamp [ns].
 _HAND, _POSE_STAMP, _INPUTS_STAMP, _X, _BUTTONS = (
     SAMPLE_FIELDS.index(name) for name in ("hand", "pose_stamp", "inputs_stamp", "x", "button_upper")
@@ -74,10 +76,10 @@ class TickEncoder:
     ) -> None:
         """``topic_rate`` [Hz] is the rate of the standard topics, which repeat numbers of ticks; None: every tick."""
         self._robot, self._topics, self._epoch, self._topic_rate = robot, topics, epoch, topic_rate
-        self._slot = -1.0  # The number of the topics' period in which the newest tick was.
+        self._slot = -1.0  # The newest tick is in this period of the standard topics; periods are counted from 0.
         self._type = tick_type(len(robot.arms), len(robot.joints))
         self._start: float | None = None  # The time of the loop's clock at the start of the run [s].
-        self._stamps: dict[tuple[float, int], float] = {}  # The last stamps of each hand's poses and inputs.
+        self._stamps: dict[tuple[float, int], float] = {}  # By hand and column, the stamp of the last sample.
         self._templates = _templates(list(robot.joints))
         self._poses = {
             frame: MessageTemplate(messages.POSE, messages.pose_stamped(np.arange(1.0, 8.0), frame), 7)
@@ -85,9 +87,9 @@ class TickEncoder:
         }
 
     def encode(self, batch: Sequence[PackedTick]) -> list[Message]:
-        """Return the messages of packed ticks that follow the last batch.
+        """Return the messages of the next packed ticks, in the order of the ticks.
 
-        They are in the order of the ticks, because readers expect that of a file without an index.
+        Readers expect this order in a file without an index.
         """
         rows = np.frombuffer(b"".join(tick.row for tick in batch), dtype=self._type).copy()
         rows["arms"]["tool"] = self._robot.tool_poses(rows["reference_q"])
@@ -128,7 +130,7 @@ class TickEncoder:
     def _due(self, now: Array) -> npt.NDArray[np.int64]:
         """Return the indices of the ticks that get messages on the standard topics.
 
-        They are the first ticks in each period of the topics. The ticks have the times ``now`` (n,) [s].
+        In each period of the topics, the first tick gets messages. The ticks have the times ``now`` (n,) [s].
         """
         if self._topic_rate is None:
             return np.arange(len(now))
@@ -148,7 +150,10 @@ class TickEncoder:
         return np.clip(np.rint(passed).astype(np.int64) + self._epoch, 0, _LAST_TIME)
 
     def _add_samples(self, made: _Batch, at: int, samples: Array) -> None:
-        """Add the samples of a tick as the loop got them. Add each new pose and new inputs as a ROS message too."""
+        """Add messages with the samples of a tick as the loop got them.
+
+        If the pose or the inputs of a sample are new, also add a ROS message with the pose or the inputs.
+        """
         for sample in samples:
             hand = SIDES[int(sample[_HAND])]
             made.add(messages.SAMPLES, [at], [messages.array(sample)])
@@ -157,21 +162,21 @@ class TickEncoder:
                 pose = messages.pose_stamped(sample[_X : _X + len(POSE_FIELDS)], stamp=stamp)
                 made.add(messages.hand_pose(hand), [at], [messages.serialized(messages.POSE, pose)])
             if self._is_new(sample, _INPUTS_STAMP):
-                with np.errstate(over="ignore"):  # An input may send numbers beyond float32.
+                with np.errstate(over="ignore"):  # A device may send numbers that are too large for float32.
                     values = sample[_BUTTONS : _BUTTONS + len(QUEST_CONTROLS.names)].astype(np.float32)
                 upper, lower, *analog = values.tolist()
                 inputs = messages.make(messages.HAND_INPUTS, bool(upper), bool(lower), *analog)
                 made.add(messages.hand_buttons(hand), [at], [messages.serialized(messages.HAND_INPUTS, inputs)])
 
     def _is_new(self, sample: Array, stamp: int) -> bool:
-        """Return whether a sample differs in the column ``stamp`` from the hand's sample before."""
+        """Return whether a sample and the sample before it of the same hand differ in the column ``stamp``."""
         before = self._stamps.get((sample[_HAND], stamp))
         self._stamps[sample[_HAND], stamp] = sample[stamp]
         return bool(before != sample[stamp])
 
 
 class _Batch:
-    """The messages of some ticks, which have the given numbers and times of day [ns]."""
+    """The messages of successive ticks. ``numbers`` and ``times`` are the ticks' numbers and times of day [ns]."""
 
     def __init__(self, topics: dict[str, Topic], numbers: npt.NDArray[np.int64], times: npt.NDArray[np.int64]) -> None:
         self._topics, self._numbers, self.times = topics, numbers.tolist(), times
@@ -198,25 +203,28 @@ def _templates(joints: list[str]) -> dict[str, MessageTemplate]:
 
 @dataclass(frozen=True)
 class RecordingSetup:
+    """The first request to the writer's process: what it needs to begin a file."""
+
     path: Path  # The path of the file, in a folder that exists.
     about: About
     topics: tuple[Topic, ...]  # The topics of the file.
-    robot: RecordedRobot | None = None  # The robot of packed ticks; None if only messages are sent.
-    topic_rate: float | None = None  # The rate of the standard topics that repeat ticks [Hz]; None for every tick.
+    robot: RecordedRobot | None = None  # The robot, which is needed for packed ticks; None if only messages are sent.
+    # The rate of the standard topics, which repeat numbers of ticks [Hz]; None for every tick.
+    topic_rate: float | None = None
 
 
 class Written(NamedTuple):
-    """An answer of the process: how many of the ticks and messages that it got are in the file."""
+    """An answer of the writer's process: how many ticks and messages are in the file so far."""
 
     ticks: int = 0
-    messages: int = 0  # Messages that were sent as messages, not as ticks.
+    messages: int = 0  # The number of messages and pictures that were sent as such, and not within ticks.
 
 
 def read_ahead(requests: Iterator[Any], room: int = READ_AHEAD) -> Iterator[Any]:
-    """Yield the requests, which a thread reads as they come.
+    """Yield the requests. A thread reads them as soon as they come, even while an earlier request is being written.
 
-    Requests that were read are written even if the run is killed. The thread reads at most about ``room`` [bytes]
-    ahead.
+    If the run is killed, all requests that were read are still written. The thread stops reading while requests of more
+    than about ``room`` [bytes] wait.
     """
     waiting: SimpleQueue[tuple[Any, int]] = SimpleQueue()
     free = Condition()
@@ -250,9 +258,9 @@ def main(requests: Iterator[Any], answer: Callable[[Written], None]) -> None:
     requests = read_ahead(requests)
     setup = next((request for request in requests if request is not None), None)
     if not isinstance(setup, RecordingSetup):
-        return  # There was no run.
+        return  # The recorder ended before a run began.
     about = setup.about
-    if about.realtime:  # In simulated time, the loop may wait for this process.
+    if about.realtime:  # In simulated time the loop may wait for this process, so its priority is not reduced.
         with suppress(OSError):
             os.nice(_NICENESS)
     encoder = None

@@ -20,12 +20,13 @@ import com.kuka.roboticsAPI.motionModel.controlModeModel.PositionControlMode;
 import com.kuka.roboticsAPI.uiModel.ApplicationDialogType;
 
 /**
- * Lets q2r2 command one arm by FRI. The cabinet holds the arm at its present posture, and q2r2's commands are added to
- * this hold.
+ * Lets q2r2 command one arm by FRI. The cabinet holds the arm at its present posture, and adds the commands of q2r2 to
+ * this position hold.
  *
- * <p>The only motion of the application itself is this hold. On the smartPAD, it asks for everything that differs
- * between arms and runs. Before each start of the overlay, it asks whether to start. Its authors have neither compiled
- * it nor run it on an arm. Read it, and try it first in T1, without a tool, with the emergency stop in your hand.
+ * <p>The position hold is the only motion that this application starts itself. On the smartPAD, the application asks
+ * for all settings that differ between arms and runs. Before each start of the overlay, it asks whether to start. The
+ * authors have neither compiled this application nor run it on an arm. Read it, and try it first in T1, without a tool,
+ * with the emergency stop in your hand.
  *
  * <p>The names are those of Sunrise 1 with FRI 1.15 or newer. For Sunrise 2 and 3, docs/kuka.md says what to change.
  */
@@ -35,7 +36,7 @@ public class Q2r2Overlay extends RoboticsAPIApplication {
     private static final String[] ADDRESSES = {"172.31.1.148", "192.170.10.1"};
     // These ports are fri.left.port and fri.right.port in the cell.
     private static final String[] PORTS = {"30200", "30201"};
-    // With torques, the cabinet needs an answer every 5 ms or more often.
+    // If q2r2 commands torques, the cabinet needs an answer at least every 5 ms.
     private static final String[] POSITION_PERIODS_MS = {"10", "5", "4", "2"};
     private static final String[] TORQUE_PERIODS_MS = {"5", "4", "2"};
     private static final int CLIENT_WAIT_MINUTES = 10;
@@ -57,12 +58,13 @@ public class Q2r2Overlay extends RoboticsAPIApplication {
         configuration.setSendPeriodMilliSec(periodMs);
         configuration.setReceiveMultiplier(1);
         configuration.setPortOnRemote(port);
-        // Use these lines if the gripper is on inputs and outputs of the cabinet. Workbench generates the I/O group:
+        // Use these lines if the gripper is connected to inputs and outputs of the cabinet. Sunrise.Workbench generates
+        // the class of the I/O group:
         // GripperIOGroup gripper = new GripperIOGroup(lbr.getController());
         // configuration.registerIO(gripper.getOutput("Opening"));   // fri.*.gripper.output: Gripper.Opening
         // configuration.registerIO(gripper.getInput("Measured"));   // fri.*.gripper.input: Gripper.Measured
 
-        // From here on, the cabinet sends messages, and the session is in the state monitoring.
+        // From here on, the cabinet sends messages to q2r2, and the session is in the state monitoring.
         session = new FRISession(configuration);
         ClientCommandMode commands = torques ? ClientCommandMode.TORQUE : ClientCommandMode.POSITION;
         FRIJointOverlay overlay = new FRIJointOverlay(session, commands);
@@ -73,7 +75,7 @@ public class Q2r2Overlay extends RoboticsAPIApplication {
         }
     }
 
-    /** Holds the arm at its present posture, and adds q2r2's commands until the session ends for any reason. */
+    /** Holds the arm at its present posture, and adds the commands of q2r2 until the session ends for any reason. */
     private void overlayOnce(FRIJointOverlay overlay, AbstractMotionControlMode mode) {
         try {
             getLogger().info("Waits for the answers of q2r2 run, up to " + CLIENT_WAIT_MINUTES + " minutes");
@@ -87,7 +89,7 @@ public class Q2r2Overlay extends RoboticsAPIApplication {
         }
     }
 
-    /** Returns a mode without a spring. The cabinet compensates gravity, and all other torques come from q2r2. */
+    /** Returns an impedance mode without stiffness. The cabinet compensates gravity; q2r2 adds all other torques. */
     private static JointImpedanceControlMode softHold() {
         JointImpedanceControlMode mode = new JointImpedanceControlMode(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0);
         mode.setDampingForAllJoints(0.0);

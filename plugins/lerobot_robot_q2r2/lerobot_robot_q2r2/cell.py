@@ -1,6 +1,7 @@
-"""A cell as a robot of lerobot, which records its observations and sends it actions as a policy does.
+"""A cell as a robot of lerobot. lerobot reads observations from it, and sends actions to it, as to other robots.
 
-Its features have the names and order of ``q2r2 export lerobot``, so a policy that was trained on such a dataset fits.
+The features of this robot have the same names and order as those of ``q2r2 export lerobot``. Therefore a policy that
+was trained on such a dataset can drive it.
 """
 
 from __future__ import annotations
@@ -35,25 +36,27 @@ from q2r2_control.recording import About, DevicePictures, Recorder
 
 _logger = logging.getLogger(__name__)
 _ROOM = 64 << 20  # Size of pictures and ticks that may wait to be written [bytes].
-# Longest time to wait for the first tick [s]. Compiling the kernels of a new version takes less.
+# Longest time to wait for the first tick [s]. It is longer than the compilation of the kernels of a new version takes.
 _BEGINS = 60.0
 
 
 @RobotConfig.register_subclass("q2r2_cell")
 @dataclass(kw_only=True)
 class Q2R2CellConfig(RobotConfig):
-    cell: str = "config/dual_iiwa7.yaml"  # Path of a cell's YAML, or of a shipped one. The robot has its cameras.
+    cell: str = "config/dual_iiwa7.yaml"  # Path of a cell's YAML, which may be a shipped one. Its cameras are used.
     plant: str | None = None  # Name of an installed plant, such as fri; None for the cell's own plant.
     rate: float = 30.0  # Rate of the actions [Hz].
-    simulated_time: bool = False  # If true, each action takes 1 / rate of simulated time, however slow lerobot is.
+    simulated_time: bool = False  # If true, time is simulated: it advances by 1 / rate with each action.
     full_speed: bool = False  # If false, real arms move at a tenth of the speed that the cell says.
     record: str | None = None  # Folder for recordings of q2r2; None to record nothing.
 
 
 class Q2R2Cell(Robot):
-    """A robot whose numbers are joint positions [rad], and openings of grippers from 0 closed to 1 open.
+    """A cell as a robot of lerobot.
 
-    A loop of q2r2 runs from ``connect`` to ``disconnect``. An action that is refused moves nothing, and the log says
+    Its features are joint positions [rad], and openings of grippers, 0 closed .. 1 open.
+
+    A loop of q2r2 runs from ``connect`` to ``disconnect``. If an action is refused, it moves nothing, and the log says
     why. If no action comes for half a second, the arms come to rest.
     """
 
@@ -79,13 +82,14 @@ class Q2R2Cell(Robot):
         joints = action_names(self._robot, ActionSpace.JOINTS)
         self._measured = tuple(arm for arm in self._robot.arms if arm in self._plant.gripper_openings())
         self._seen = (*joints, *(f"{arm}_gripper" for arm in self._measured))
-        self._names = (*joints, *(f"{arm}_gripper" for arm in self._robot.arms))  # Names of the numbers of an action.
+        self._names = (*joints, *(f"{arm}_gripper" for arm in self._robot.arms))  # Names of an action's numbers.
         self.pipeline.listeners.append(self._see)
         self._tick: Tick | None = None  # The newest tick.
         self._begun = Event()
         self._thread: Thread | None = None
         self._fault: Q2R2Error | None = None
-        self._steps, self._start = 0, 0.0  # Number of actions since the start, and time of the start [s], if simulated.
+        # In simulated time, the number of actions since the start, and the time of the start [s].
+        self._steps, self._start = 0, 0.0
         self._pictures: CellPictures | None = None
         self._open = ExitStack()  # The open cameras and the recording.
         Q2R2Cell.newest = self
@@ -188,7 +192,10 @@ class Q2R2Cell(Robot):
         return seen
 
     def send_action(self, action: dict[str, Any]) -> dict[str, Any]:
-        """Send an action. If it does not come from the hands, the policy sent it, and takes the arms from the hands."""
+        """Send an action. An action that does not come from the hands comes from the policy.
+
+        With such an action, the policy takes over the arms if the hands had them.
+        """
         self._check()
         before, self._by_policy = self._by_policy, not self._asked
         if self._by_policy and self.hands.open:
@@ -208,11 +215,14 @@ class Q2R2Cell(Robot):
             _logger.info("the policy has the arms")
         return action
 
-    _asked = False  # True if the next action comes from the hands, because lerobot has just asked them for it.
+    _asked = False  # True if the next action comes from the hands, because lerobot has just called hands_action.
     _by_policy = False  # True if the last action came from the policy.
 
     def hands_action(self) -> dict[str, Any]:
-        """Return the reference as an action. The hands drive it from now on, until the policy sends an action."""
+        """Return the controller's reference as an action.
+
+        From now on the hands move the reference, until the policy sends an action.
+        """
         tick = self._check()
         self._asked = self.hands.open = True
         return _named(self._names, (*tick.reference.q, *map(tick.command.grippers.__getitem__, self._robot.arms)))

@@ -1,6 +1,6 @@
-"""The hands of a teleoperator as an input of a cell that lerobot runs.
+"""The hands of a lerobot teleoperator as the input of a cell.
 
-The hands move the arms only while lerobot asks for the hands' actions.
+The hands move the arms only while lerobot requests actions of the teleoperator.
 """
 
 from __future__ import annotations
@@ -10,9 +10,12 @@ from q2r2_control.inputs import WebInput
 
 
 class HandsDoor:
-    """The operator of a cell's policy: the hands of the device that is attached. Implements :class:`Input`."""
+    """An :class:`Input` with the samples of the device that is attached, or without samples if the policy has the arms.
 
-    # The controls of all devices, because the device is not known yet when the cell is created.
+    It is the input with which a person can take over from the cell's policy.
+    """
+
+    # All controls that a device may have, because the device is not known yet when the cell is created.
     controls = DeviceControls(QUEST_CONTROLS.buttons + WebInput.controls.buttons, QUEST_CONTROLS.axes)
 
     def __init__(self) -> None:
@@ -25,18 +28,18 @@ class HandsDoor:
         return not self.open or (self.operator is not None and self.operator.connected)
 
     def start(self) -> None:
-        """Do nothing. The device has started when it was attached, and stays attached from run to run."""
+        """Do nothing. The device was started when it was attached, and it stays attached after a run."""
 
     def poll(self, now: float) -> list[HandSample]:
         open, was_open, self._was_open = self.open, self._was_open, self.open
         if self.operator is None or not open:
             return []
         samples = self.operator.poll(now)
-        return samples if was_open else []  # Samples that came before the hands were asked are dropped.
+        return samples if was_open else []  # Samples from the time before lerobot requested actions are dropped.
 
     def send_haptic(self, feedback: HapticFeedback) -> None:
         if self.operator is not None and self.open:
             self.operator.send_haptic(feedback)
 
     def close(self) -> None:
-        """See :meth:`start`."""
+        """Do nothing; see :meth:`start`."""

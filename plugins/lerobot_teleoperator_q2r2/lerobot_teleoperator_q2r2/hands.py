@@ -1,7 +1,7 @@
-"""The hands of a headset, of a page or of a script, for a cell that lerobot runs in the same program.
+"""A teleoperator of lerobot: the hands of a headset, of a page or of a script. They move a cell in the same program.
 
-The hands drive the cell's own loop, with its clutch, leash and vibrations. lerobot gets the controller's reference as
-the action.
+The samples of the hands go to the cell's own loop, with its clutch, leash and vibrations. As the action, lerobot gets
+the controller's reference.
 """
 
 from __future__ import annotations

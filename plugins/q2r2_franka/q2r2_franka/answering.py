@@ -1,8 +1,8 @@
-"""Answer the robots in a process of its own, so that no tick of the loop makes a robot wait.
+"""Answer the robots in a process of its own, so that a robot need not wait for a tick of the loop.
 
-The loop sends commands to this process, and gets back whether they came in time. After each state of a robot the loop
-gets the state of the session. If the loop ends in any way, the process goes on until the arms rest on their certified
-stop.
+The loop sends commands to this process. The process replies whether they came in time. After each state of a robot, it
+sends the state of the robot's session to the loop. Whatever ends the loop, the process goes on until the arms have come
+to rest by their certified stops.
 """
 
 from __future__ import annotations
@@ -37,16 +37,16 @@ from q2r2_franka.state import Mode, SessionState
 
 _RESERVED = 0.0006, 0.001  # Processor time that is reserved for answers, and the interval in which it is reserved [s].
 _POLL = 0.01  # Longest time between two checks of all sessions [s].
-# Longest time that the loop waits for the reply to its commands [s]. A robot may be connected or recovered meanwhile.
+# Longest time that the loop waits for the reply to its commands [s]. The process may be busy connecting a robot.
 _LONGEST_WORD = 5.0
-_AGAIN = 0.5  # Time from the end of a motion, or from a failed attempt, until the next attempt [s].
+_AGAIN = 0.5  # Time from the end of a motion, or from a failed start, until the robots are started again [s].
 
 
 class RobotAnswers(AnsweringProcess):
-    """The loop's end of the connection to the process that answers the robots."""
+    """Starts the process that answers the robots, and exchanges messages with it. The loop uses this class."""
 
     def __init__(self, settings: FrankaSettings, mode: CommandMode, torque_limits: Mapping[str, Array]) -> None:
-        """Start the process. It connects to the robots afterwards.
+        """Start the process, which connects to the robots later.
 
         Raises:
             PlantError: If the process cannot begin.
@@ -64,7 +64,7 @@ class RobotAnswers(AnsweringProcess):
 
 
 def main(commands: int, states: int) -> None:
-    """Run in the process: answer until the loop has ended and the arms stand still."""
+    """Answer the robots until the loop has ended and the arms are at rest. This is what the process runs."""
     leave_signals_to_the_run()
     with socket.socket(fileno=commands) as from_loop, socket.socket(fileno=states) as to_loop:
         try:
@@ -81,10 +81,12 @@ def main(commands: int, states: int) -> None:
         except Exception as error:
             with suppress(OSError):
                 from_loop.send(reason_of(error).encode())
-    os._exit(0)  # The library's destructors would wait for robots that have gone.
+    os._exit(0)  # The library's destructors would wait for robots that are no longer connected.
 
 
 class _Answering:
+    """Receives the loop's commands and the robots' states, and sends each robot its command."""
+
     def __init__(
         self,
         commands: socket.socket,
@@ -102,7 +104,7 @@ class _Answering:
             arm: ArmSession(arm, its.address, mode, torque_limits[arm]) for arm, its in settings.arms.items()
         }
         self._next_attempt = 0.0
-        # Arms whose robots refused a motion, such as because of an error of an earlier motion.
+        # Arms whose robots refused a motion, for example because of an error in an earlier motion.
         self._refused: set[str] = set()
         self._loop_ended = False
 
@@ -122,7 +124,7 @@ class _Answering:
                 return
 
     def _take_commands(self) -> bool:
-        """Take all commands that have come; returns True if the loop has not ended."""
+        """Take all commands that have come, and reply to them. Return False if the loop has ended."""
         try:
             while said := self._commands.recv(RobotAnswers.LARGEST):
                 self._commands.send(
@@ -151,7 +153,7 @@ class _Answering:
         self._tell(arm)
 
     def _write(self, arm: str, values: Array, begins: bool = False) -> None:
-        """Add a command to the record, or the values that a robot holds at the beginning of a motion."""
+        """Add ``values`` to the record: a command, or, if ``begins``, the values that the robot holds at the start."""
         newest = self._sessions[arm].state.newest
         if self._record is not None and newest is not None:
             is_torque = self._mode is CommandMode.TORQUE
@@ -159,11 +161,11 @@ class _Answering:
             write_entry(self._record, entry)
 
     def _tell(self, arm: str) -> None:
-        with suppress(OSError):  # If the loop stands still, there is no space for this state. It gets a later one.
+        with suppress(OSError):  # If the loop reads nothing, the socket is full. The loop gets a later state.
             self._states.send(bytes([self._arms.index(arm)]) + pickle.dumps(self._sessions[arm].state))
 
     def _lost(self, arm: str, error: Exception) -> None:
-        """Take note that the robot has ended the motion, or that its connection is lost."""
+        """Note that a robot has ended its motion, or that its connection is lost. Then brake all arms."""
         link, session = self._links[arm], self._sessions[arm]
         session.end(reason_of(error))
         link.drop_motion()
@@ -172,7 +174,10 @@ class _Answering:
         self._brake_all()
 
     def _lose(self, arm: str) -> None:
-        """Forget a lost connection. The last state stays, because the loop needs a state at every tick."""
+        """Drop a lost connection. The last state stays, because the loop needs a state at every tick.
+
+        Its mode becomes ABSENT.
+        """
         self._links[arm].lose()
         if (newest := self._sessions[arm].state.newest) is not None:
             newest.mode = Mode.ABSENT
@@ -184,10 +189,10 @@ class _Answering:
             session.brake(now)
 
     def _tend(self, now: float) -> bool:
-        """End silent sessions and the motions of arms that rest, and begin motions again.
+        """End sessions whose robots are silent, end the motions of arms at rest, and start the robots again.
 
         Returns:
-            True if the loop has ended and all arms rest.
+            True if the loop has ended and all arms are at rest.
         """
         for arm, session in self._sessions.items():
             if session.state.controlled and session.state.is_silent(now):
@@ -207,7 +212,7 @@ class _Answering:
         return False
 
     def _finish(self) -> None:
-        """End the motions of arms that rest, so that their robots hold them."""
+        """End the motions of all arms, which are at rest. Afterwards their robots hold them."""
         for arm, session in self._sessions.items():
             if session.state.controlled:
                 try:
@@ -222,13 +227,13 @@ class _Answering:
                 self._tell(arm)
 
     def _begin(self, now: float) -> None:
-        """Connect, recover and start robots. Nothing moves meanwhile, so that these calls may wait."""
+        """Connect, recover and start the robots. These calls may wait, because no arm moves meanwhile."""
         self._next_attempt = now + _AGAIN
         try:
             for arm, link in self._links.items():
                 session = self._sessions[arm]
                 if link.is_open and session.state.is_silent(now) and not select.select([link.file], (), (), 0)[0]:
-                    self._lose(arm)  # The robot's control has lost its power, or its network.
+                    self._lose(arm)  # The robot's control has no power or no network any more.
                 if not link.is_open:
                     link.open()
                     session.hear(link.read(), time.monotonic())

@@ -1,11 +1,11 @@
 """Turn the ticks of the loop into commands for the sessions of all arms.
 
-**The loop's time and the robots' time.** The time of the reference passes with the states of the robots, so that each
-robot gets a command for the next millisecond with every state, whatever the clocks are. Each tick of the loop moves the
-reference so far ahead that no robot passes its end before the next tick has come, unless this tick is later than usual.
-If the loop is so late that a robot would pass the end of the reference, the robots get the certified stop.
-:meth:`FrankaCell.due` then lets the reference follow the same stop first. If a robot passes the end in the middle of a
-tick, the sessions refuse the command of this tick, and it is withdrawn.
+**The loop's time and the robots' time.** The robots' states count the time of the reference: with each state, one
+millisecond of it passes, and the robot gets the command for the next millisecond. Clocks do not matter. Each tick of
+the loop extends the reference so far that no robot reaches the end of the reference before the next tick has come,
+unless the next tick is later than usual. If the loop is so late that a robot reaches the end of the reference, the
+robots get the certified stop. In the next tick, :meth:`FrankaCell.due` lets the reference follow the same stop first.
+If a robot reaches the end while a tick is computed, the sessions refuse the command of this tick, and it is withdrawn.
 """
 
 from __future__ import annotations
@@ -23,35 +23,36 @@ from q2r2_franka.reasons import FrankaReason
 from q2r2_franka.state import ArmCommand, SessionState
 from q2r2_franka.stream import SMOOTHING_DELAY
 
-# Time that is allowed from the start of a tick until the sessions have its commands [s]: usually, and at most after
-# commands that came too late. The reference then goes farther ahead by the difference.
+# Time that is allowed from the start of a tick until the sessions have its commands [s]. The first number is the usual
+# time. After commands that came too late, the time is longer, but at most the second number. Each tick then extends the
+# reference farther by the difference.
 _MARGIN, _LONGEST_MARGIN = 0.002, 0.016
-# Shortest step of the reference, as a share of a period. The steps are shorter than a period if the robots' time passes
-# more slowly than the loop's.
+# Shortest step of the reference in a tick, as a share of a period. Steps are shorter than a period if the robots' time
+# passes more slowly than the loop's time.
 _SHORTEST = 0.1
 _FORGETTING = 0.01  # Share by which the longest recent tick and the margin become shorter in each tick.
-_NO_COMMANDS = 0.1  # If all commands come too late for longer than this, it is reported as a fault [s].
+_NO_COMMANDS = 0.1  # If all commands have come too late for longer than this, a fault is reported [s].
 _BRAKING_TIME = 0.03  # Time constant with which an arm loses its speed if no torques come [s].
-_PASSING = 0.0015  # Approximate time that a measurement takes through network and processes [s].
+_PASSING = 0.0015  # Approximate time that a measurement takes to pass through network and processes [s].
 
 
 class FrankaCell:
-    """The loop's side of all sessions: their states, and the commands for them."""
+    """The states of all sessions as the loop knows them. It computes the commands for the sessions from them."""
 
     def __init__(self, robot: Robot, states: Iterable[SessionState], period: float, longest: float) -> None:
-        """Make the loop's side.
+        """Take the first states of the sessions.
 
         Args:
             robot: The robot.
             states: The state of each arm's session.
             period: Period of the loop [s].
-            longest: The longest step of the reference with one acceleration [s].
+            longest: The longest step of the reference in one tick [s]. A step has one acceleration.
         """
         self.states = {state.arm: state for state in states}
         self._robot, self._period, self._longest = robot, period, longest
         self._joints = {arm: robot.arms[arm].joints for arm in self.states}
         self._data = robot.model.createData()
-        # The time of the newest tick, and both ends of its piece of the path [s].
+        # The time of the newest tick by the loop's clock, and start and end of its step in the reference's time [s].
         self._now = self._start = self._end = -math.inf
         self._withdraws, self._in_time = False, -math.inf
         self._margin, self._longest_tick = _MARGIN, period
@@ -61,7 +62,11 @@ class FrankaCell:
         self.states[state.arm] = state
 
     def due(self, now: float) -> tuple[float, float]:
-        """Return two durations for the tick at ``now`` [s]: of braking along the stop, and of the motion after it."""
+        """Return two durations of the reference's motion in the tick at ``now`` [s].
+
+        During the first time, the reference follows the earlier certified stop; it may be 0. During the second time, it
+        moves on.
+        """
         following = [state for state in self.states.values() if state.following]
         late = now - self._now if following else 0.0
         self._now, before = now, self._end
@@ -80,16 +85,16 @@ class FrankaCell:
         return braked, step
 
     def apply(self, command: Command) -> dict[str, ArmCommand]:
-        """Return the command for the session of each arm: the reference at the end of the tick of :meth:`due`."""
+        """Return the command for each arm's session: the reference at the end of the newest tick's step."""
         sent = {}
         is_torque = command.mode is CommandMode.TORQUE
         if is_torque:
             model, data, measured = self._robot.model, self._data, self.state().q
-            overlay = command.tau - pin.computeGeneralizedGravity(model, data, measured)  # The robot bears gravity.
+            overlay = command.tau - pin.computeGeneralizedGravity(model, data, measured)  # The robot adds gravity.
             damping = pin.crba(model, data, measured).diagonal() / _BRAKING_TIME
         for arm, joints in self._joints.items():
             deceleration = command.deceleration
-            # A reference at rest has no deceleration.
+            # The deceleration is None if the reference is at rest.
             stop = (1.0,) * JOINTS if deceleration is None else tuple(deceleration[joints].tolist())
             q, v = tuple(command.q[joints].tolist()), tuple(command.v[joints].tolist())
             its = sent[arm] = ArmCommand(self._now, self._start, self._end, q, v, stop)
@@ -99,9 +104,9 @@ class FrankaCell:
         return sent
 
     def fault(self) -> Reason | None:
-        """Return why the arms cannot be commanded at the newest tick.
+        """Return why the arms cannot be commanded now, or could not be commanded at some time since the last call.
 
-        The result is also a reason if they could not be commanded at some time since the last call; otherwise None.
+        Return None if they could be commanded all the time.
         """
         told, self._told = self._told, self._ends()
         for arm, state in self.states.items():
@@ -118,7 +123,7 @@ class FrankaCell:
         return {arm: state.ended for arm, state in self.states.items()}
 
     def sent(self, taken: bool) -> None:
-        """Record whether the sessions have ``taken`` the commands of a tick, or one of them came too late."""
+        """Record whether the sessions have ``taken`` the commands of a tick. They refuse all if one came too late."""
         self._withdraws = not taken
         if taken:
             self._in_time, self._margin = self._now, max(_MARGIN, (1.0 - _FORGETTING) * self._margin)
@@ -126,11 +131,14 @@ class FrankaCell:
             self._end, self._margin = self._start, min(2.0 * self._margin, _LONGEST_MARGIN)
 
     def withdraws(self) -> bool:
-        """Return whether the newest command came too late. The arms then follow the stop of the command before it."""
+        """Return whether the newest commands came too late. The arms then follow the stop after the commands before."""
         return self._withdraws
 
     def delay(self) -> float:
-        """Return the time from the end of a command until a tick finds the arm there [s]. Torques act at once."""
+        """Return the time from the end of a command until a tick measures the arm there [s].
+
+        It is 0 for torques, which act at once.
+        """
         if any(state.wanted is CommandMode.TORQUE for state in self.states.values()):
             return 0.0
         return self.lead() + SMOOTHING_DELAY + _PASSING + PERIOD - self._period
@@ -149,7 +157,7 @@ class FrankaCell:
         return all(state.newest is not None for state in self.states.values())
 
     def state(self) -> RobotState:
-        """Return the measurements of the robots, with the stamp of the oldest state."""
+        """Return the measurements of the robots. Its stamp is the arrival time of the oldest state."""
         q, v, tau, external, held = np.zeros((5, self._robot.model.nv))
         for arm, state in self.states.items():
             joints, newest = self._joints[arm], state.newest

@@ -1,7 +1,7 @@
 """Check recorded commands against the published limits: ``python -m q2r2_franka.check FILE``.
 
 Velocities, accelerations and jerks are differences of commands that are 1 ms apart, as the robot computes them. In a
-period without a command, the robot goes on with the last acceleration, and so does the check.
+period without a command, the robot goes on with the last acceleration. The check assumes the same motion.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from q2r2_franka.limits import PERIOD
 from q2r2_franka.record import Entry, entries_of
 
 ARMS = "left", "right"
-# A robot rounds positions to doubles; the third difference of this rounding is far below this share of a limit.
+# A share of a limit may exceed 1 by this, because a robot rounds positions to doubles. The third difference of this
+# rounding is far smaller.
 _ROUNDING = 1e-3
 
 
@@ -30,7 +31,7 @@ class Checked:
     commands: int = 0
     motions: int = 0
     lost: int = 0  # Number of periods without a command.
-    # The greatest share of each limit. A share above 1 violates the limit.
+    # By the name of a limit, the greatest ratio of a number to its limit. A ratio above 1 violates the limit.
     shares: dict[str, float] = field(default_factory=dict)
 
     @property
@@ -42,7 +43,7 @@ class Checked:
 
 
 def check_commands(entries: Iterable[Entry]) -> dict[str, Checked]:
-    """Return the result for each arm that has commands."""
+    """Return the result for each arm that has commands, by the arm's name."""
     checked: dict[str, Checked] = {}
     histories: dict[str, list[Array]] = {}
     for entry in entries:
@@ -80,7 +81,7 @@ def _check_positions(result: Checked, history: list[Array]) -> None:
 
 
 def main(arguments: list[str]) -> int:
-    """Print the greatest share of each limit; returns 1 if one is violated."""
+    """Print the greatest share of each limit. Return 1 if a limit is violated, 2 if ``arguments`` are wrong, else 0."""
     if len(arguments) != 1 or not Path(arguments[0]).is_file():
         print("usage: python -m q2r2_franka.check FILE, a file of plant_settings.franka.record", file=sys.stderr)
         return 2

@@ -1,8 +1,9 @@
 """A Franka Hand in a process of its own, because a call of its library waits until the fingers have arrived.
 
-The hand takes whole motions, not a stream: ``move`` to a width, and ``grasp`` with a force. A command is an opening,
-from 0 to 1. When a motion has ended, the fingers move to the newest commanded opening, so that they follow a trigger in
-steps. A command to close is a grasp, which holds with its force whatever is between the fingers.
+The library has calls for whole motions, not for a stream of positions: ``move`` to a width, and ``grasp`` with a force.
+The loop commands openings, from 0 for closed to 1 for open. When a motion has ended, the fingers move to the newest
+commanded opening. Thus they follow a trigger in steps. A command to close is a grasp, which holds with its force
+whatever is between the fingers.
 """
 
 from __future__ import annotations
@@ -18,16 +19,19 @@ from q2r2_control.process import leave_signals_to_the_run, start_python
 from q2r2_franka.settings import HandSettings
 
 _LARGEST = 1 << 10  # Largest datagram between the processes [bytes].
-_CLOSED = 0.02  # A command of a smaller opening is a grasp.
-_SAME = 0.02  # A smaller change of the opening moves nothing.
-_MEASURES = 0.1  # Time between two measurements while nothing moves [s].
+_CLOSED = 0.02  # If the commanded opening is smaller than this, the fingers grasp.
+_SAME = 0.02  # If the commanded opening changes by less than this, the fingers do not move.
+_MEASURES = 0.1  # Time between two measurements while the fingers do not move [s].
 _KNOWN = 5.0  # A measured opening counts as known for this time [s]. During a motion there are no measurements.
 _AGAIN = 1.0  # Time between two attempts to connect [s].
-_PATIENCE = 2.0  # Time to wait until the process ends [s].
+_PATIENCE = 2.0  # The process is killed if it has not ended after this time [s].
 
 
 class Hand:
-    """The loop's end of the connection to the process of one hand. Nothing here waits."""
+    """Starts the process of one hand, and exchanges messages with it. The loop uses this class.
+
+    Only :meth:`close` waits.
+    """
 
     def __init__(self, arm: str, address: str, settings: HandSettings) -> None:
         self._arm, self._commanded = arm, 1.0
@@ -48,7 +52,7 @@ class Hand:
 
     @property
     def opening(self) -> float | None:
-        """The measured opening, from 0 to 1; None if it is not known."""
+        """The measured opening, from 0 for closed to 1 for open; None if it is not known."""
         with suppress(OSError):
             while said := self._socket.recv(_LARGEST):
                 self._opening, self._measured = pickle.loads(said), time.monotonic()
@@ -65,7 +69,10 @@ class Hand:
 
 
 def main(file: int, address: str, settings: dict[str, Any]) -> None:
-    """Run in the process: connect again and again, and move the fingers, until the loop has ended."""
+    """Connect to the hand, and again after an error, and move the fingers until the loop has ended.
+
+    This is what the process runs.
+    """
     import pylibfranka
 
     leave_signals_to_the_run()
@@ -84,7 +91,10 @@ def main(file: int, address: str, settings: dict[str, Any]) -> None:
 
 
 def _move(loop: socket.socket, gripper: Any, settings: HandSettings) -> bool:
-    """Move the fingers until the loop has ended, and return False then."""
+    """Move the fingers to the commanded openings. Return False when the loop has ended.
+
+    Raises an error of the library if a call fails.
+    """
     there = wanted = gripper.read_once().width / settings.width
     while True:
         with suppress(BlockingIOError):
@@ -102,7 +112,10 @@ def _move(loop: socket.socket, gripper: Any, settings: HandSettings) -> bool:
 
 
 def _newest(loop: socket.socket, before: float, wait: float) -> tuple[float, bool]:
-    """Return the newest commanded opening within ``wait`` [s], and True if the loop has not ended."""
+    """Wait at most ``wait`` [s] for a command. Return the newest commanded opening, or ``before`` if there is none.
+
+    The second value is False if the loop has ended.
+    """
     loop.settimeout(wait)
     try:
         while said := loop.recv(_LARGEST):

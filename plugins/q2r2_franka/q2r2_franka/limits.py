@@ -12,13 +12,13 @@ from q2r2_control import Array
 
 JOINTS = 7
 PERIOD = 0.001  # Time between two states of a robot, and between two commands [s].
-LOWER = np.array([-2.7501, -1.7918, -2.9065, -3.0481, -2.8101, 0.54092, -3.0196])  # [rad]
-UPPER = np.array([2.7501, 1.7918, 2.9065, -0.1458, 2.8101, 4.5205, 3.0196])  # [rad]
-VELOCITY = np.array([2.62, 2.62, 2.62, 2.62, 5.26, 4.18, 5.26])  # [rad/s]
+LOWER = np.array([-2.7501, -1.7918, -2.9065, -3.0481, -2.8101, 0.54092, -3.0196])  # Least positions [rad].
+UPPER = np.array([2.7501, 1.7918, 2.9065, -0.1458, 2.8101, 4.5205, 3.0196])  # Greatest positions [rad].
+VELOCITY = np.array([2.62, 2.62, 2.62, 2.62, 5.26, 4.18, 5.26])  # Greatest velocities [rad/s].
 ACCELERATION = 10.0  # Limit of every joint [rad/s^2].
 JERK = 5000.0  # Limit of every joint [rad/s^3].
-TORQUE = np.array([87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0])  # [Nm]
-TORQUE_RATE = 1000.0  # Limit of every joint [Nm/s].
+TORQUE = np.array([87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0])  # Greatest torques [Nm].
+TORQUE_RATE = 1000.0  # Limit of every joint's torque rate [Nm/s].
 # Near a position limit, a joint at the distance d may have the velocity sqrt(_SLOPE d) - _OFFSET towards it.
 _OFFSET = np.array([0.30, 0.20, 0.20, 0.30, 0.35, 0.35, 0.35])  # [rad/s]
 _SLOPE = np.array([12.0, 5.17, 7.00, 8.00, 34.0, 11.0, 34.0])  # [rad/s^2]

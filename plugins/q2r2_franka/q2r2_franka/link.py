@@ -1,8 +1,8 @@
 """The connection to one robot by pylibfranka. Only this module and hand.py call this library.
 
-pylibfranka keeps Python's global lock while it waits for a state. Two threads with an arm each would make each other
-late. The process therefore waits for the sockets of all robots at once by ``select``, and reads a state only when it
-has come. pylibfranka does not tell which socket it uses. The socket is therefore found among the files that a
+pylibfranka keeps Python's global lock while it waits for a state. With one thread for each arm, the threads would delay
+each other. The process therefore waits for the sockets of all robots at once by ``select``, and reads a state only when
+it has come. pylibfranka does not say which socket it uses. The socket is therefore found among the files that a
 connection opens.
 """
 
@@ -22,9 +22,10 @@ from q2r2_franka.state import Measured, Mode
 
 ERRORS = (RuntimeError, pylibfranka.FrankaException)
 _FILES = "/proc/self/fd"
-# The robot's own controller of joint positions. Desk's settings may let it filter the commands. Its stiffness stays.
+# The robot's own controller of joint positions. Settings in Desk may let it filter the commands. Its stiffness is not
+# changed here.
 _CONTROLLER = pylibfranka.ControllerMode.JointImpedance
-# Objects of lost connections. They may not be destroyed, because that would end the process.
+# Python objects of lost connections. They must not be destroyed, because that would end the process.
 _kept: list[Any] = []
 
 
@@ -64,7 +65,7 @@ class ArmLink:
         self._robot, self.file = robot, opened.pop()
 
     def lose(self) -> None:
-        """Forget a connection that is lost."""
+        """Drop a connection that is lost."""
         _kept.extend(one for one in (self._motion, self._robot) if one is not None)
         self._robot = self._motion = None
         self.file = -1
@@ -86,7 +87,7 @@ class ArmLink:
         )
 
     def start(self, mode: CommandMode) -> Measured:
-        """Begin a motion, and return the first state of it."""
+        """Begin a motion, and return the robot's first state in this motion."""
         if mode is CommandMode.TORQUE:
             self._motion = self._robot.start_torque_control()
         else:
@@ -95,7 +96,10 @@ class ArmLink:
         return self.read()
 
     def write(self, values: Sequence[float], finished: bool = False) -> None:
-        """Send positions [rad] or torques [Nm]. With ``finished`` the motion ends, and the robot holds the arm."""
+        """Send positions (7,) [rad] or torques (7,) [Nm].
+
+        With ``finished``, the motion ends, and the robot holds the arm from then on.
+        """
         kind = pylibfranka.Torques if self._mode is CommandMode.TORQUE else pylibfranka.JointPositions
         command = kind(list(values))
         command.motion_finished = finished
@@ -104,13 +108,13 @@ class ArmLink:
             self._motion = None
 
     def drop_motion(self) -> None:
-        """Take note that the robot has ended the motion."""
+        """Drop the motion, because the robot has ended it."""
         if self._motion is not None:
             _kept.append(self._motion)
             self._motion = None
 
     def recover(self) -> None:
-        """Clear the errors of a reflex. The robot holds the arm."""
+        """Clear the errors of a reflex. Afterwards the robot holds the arm."""
         _kept.clear()
         self._robot.automatic_error_recovery()
 

@@ -1,4 +1,4 @@
-"""One or two Franka arms. A process answers the robots, and gets the arms' motion from the loop."""
+"""One or two Franka arms as a plant. Its own process answers the robots, and gets the arms' motion from the loop."""
 
 from __future__ import annotations
 
@@ -21,21 +21,22 @@ _LOOKS = 0.01  # Time between two checks of the robots during a wait [s].
 
 
 class FrankaPlant:
-    """A plant whose arms start where they stand, even after a robot has ended a motion."""
+    """A plant of real arms. They start where they are, also after a robot has ended a motion."""
 
     modes: tuple[CommandMode, ...] = (CommandMode.TORQUE, CommandMode.POSITION)
     realtime_only = True
-    averages = True  # Each position is the mean of MEANS positions of the path, and so control.jerk_limit is kept here.
-    # Longest times that a reset waits for a state of each robot, and for all motions to begin [s]. If some motions do
-    # not begin, the run begins nevertheless.
+    # Each commanded position is the mean of MEANS positions of the path, so the plant itself keeps control.jerk_limit.
+    averages = True
+    # Longest times that a reset waits for a state of each robot, and until all motions have begun [s]. If some motions
+    # have not begun by then, the run begins nevertheless.
     longest_wait = longest_session_wait = 10.0
 
     def __init__(self, robot: Robot, config: Config) -> None:
         """Make the plant.
 
         Raises:
-            ConfigError: If an arm lacks a robot or does not have seven joints, if a late tick would be split into
-                steps, or if the limit of jerk is too low.
+            ConfigError: If an arm has no robot in the settings or does not have seven joints, if a late tick would be
+                split into several steps, or if the limit of jerk is too low.
         """
         self._settings = franka_settings(config)
         for arm, its in robot.arms.items():
@@ -99,7 +100,7 @@ class FrankaPlant:
             raise
 
     def _wait(self) -> None:
-        """Wait for the robots; raises :class:`PlantError` if one is not reached."""
+        """Wait for the robots. Raises :class:`PlantError` if a robot cannot be reached."""
         began = time.monotonic()
         while not self.cell.is_heard or self._looks_for_fault() is not None:
             passed = time.monotonic() - began
@@ -116,7 +117,7 @@ class FrankaPlant:
         return next((why for its in self.cell.states.values() if (why := its.fault(time.monotonic()))), None)
 
     def due(self, now: float) -> tuple[float, float]:
-        """See :meth:`SessionPlant.due`; raises :class:`PlantError` if nothing answers the robots any more."""
+        """See :meth:`SessionPlant.due`. Raises :class:`PlantError` if the process that answers the robots has ended."""
         assert self._answering is not None
         for state in self._answering.receive():
             self.cell.update(state)

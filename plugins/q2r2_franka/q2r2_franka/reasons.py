@@ -1,4 +1,4 @@
-"""The kinds of reasons that the connection to Franka arms gives."""
+"""The kinds of reasons why Franka arms cannot be commanded."""
 
 from __future__ import annotations
 

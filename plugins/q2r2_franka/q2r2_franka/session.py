@@ -1,4 +1,4 @@
-"""Keep the session with one robot: a state goes in, and its command comes out. The caller gives the time."""
+"""The session with one robot: it computes the command that answers each state. The caller passes the time."""
 
 from __future__ import annotations
 
@@ -14,28 +14,31 @@ from q2r2_franka.state import ArmCommand, Joints, Measured, SessionState
 from q2r2_franka.stream import PositionStream, TorqueStream
 
 _AT_REST = 1e-9  # Greatest distance from the end of the path at which the arm counts as resting [rad].
-_STILL = 0.02  # Greatest velocity of an arm with torques that counts as resting [rad/s].
-# Greatest distance between a reference at its beginning and the arm [rad]: the position in which the arm is held, or,
-# with torques, its measured position.
+_STILL = 0.02  # In torque mode, an arm counts as resting if all joints are slower than this [rad/s].
+# An arm may begin to follow a reference if each joint is nearer to it than this [rad]. The first number is for position
+# mode, in which the position that the arm holds counts. The second is for torque mode, with the measured position.
 _SAME, _NEAR = 1e-6, 0.02
-_FROM_REST = 20.0  # A bound above the acceleration of a joint in the first tick [rad/s^2].
-_TORQUE_LASTS = 0.02  # A torque that is not updated for longer is replaced by one that brakes [s].
-_BRAKES = 1.0  # Longest time that an arm with torques is braked. Then its robot holds it [s].
-# An arm whose time is ahead of the other arm's waits: its time passes more slowly by the share _WAITING at most, and
-# the share changes by _WAITING_RAMP in a second. The robot sees at most the acceleration a + _WAITING_RAMP v. The
-# wanted share is _WAITING_GAIN [1/s] times the time by which the arm is ahead.
+# No joint has a greater acceleration in the first tick after rest [rad/s^2]. A faster reference was not at rest before.
+_FROM_REST = 20.0
+_TORQUE_LASTS = 0.02  # If the commanded torque is older than this, a torque that brakes the arm replaces it [s].
+_BRAKES = 1.0  # In torque mode, an arm is braked for at most this time. Then its robot holds it [s].
+# If one arm is ahead of the other arm on the reference, its time passes more slowly. _WAITING is the largest share by
+# which it does, and _WAITING_RAMP is the change of this share in a second [1/s]. So the robot's acceleration is at most
+# a + _WAITING_RAMP v, where a and v are those of the reference. The wanted share is _WAITING_GAIN [1/s] times the time
+# by which the arm is ahead.
 _WAITING, _WAITING_RAMP, _WAITING_GAIN = 0.1, 0.4, 10.0
-_MOST_CYCLES = 100  # After more lost periods than this, the robot has ended the motion anyway.
+_MOST_CYCLES = 100  # If more periods than this are lost, the robot has surely ended the motion itself.
 
 
 class ArmSession:
     """The session of one arm.
 
-    While the arm follows the reference, its commands lie on ``path``. Otherwise they hold the arm.
+    The commands of the arm lie on ``path``. While the arm follows the reference, each tick extends the path. Otherwise
+    the path ends with a stop, and the arm is held at its end.
     """
 
     def __init__(self, arm: str, address: str, wanted: CommandMode, torque_limit: Array) -> None:
-        """Make the session of one arm; ``torque_limit`` is the greatest torque of its joints (7,) [Nm]."""
+        """Make the session of one arm without commands. ``torque_limit`` is each joint's greatest torque (7,) [Nm]."""
         self.state, self._torque_limit = SessionState(arm, address, wanted), torque_limit
         self._tau: Array | None = None
         self._tau_came = self._ceased = -math.inf
@@ -44,7 +47,7 @@ class ArmSession:
         self.state.controlled = False
 
     def begin(self, q: Array, now: float) -> None:
-        """Let commands begin at ``now`` [s]. The robot holds the arm at ``q`` (7,) [rad]."""
+        """Let commands begin at ``now`` [s]. At this time, the robot holds the arm at ``q`` (7,) [rad]."""
         self.path, self._positions = ReferencePath(now, q), PositionStream(q)
         self._torques = TorqueStream(self._torque_limit)
         self._rate, self._tau = 1.0, None
@@ -54,20 +57,20 @@ class ArmSession:
         state.rest = tuple(map(float, q))
 
     def end(self, problem: str) -> None:
-        """Take note that commands no longer move the arm, because of ``problem``."""
+        """Note that commands no longer move the arm. ``problem`` says why."""
         self.state.ended += self.state.following
         self.state.controlled = self.state.following = False
         self.state.problem = problem
 
     def brake(self, now: float) -> None:
-        """From ``now`` [s] on, let the arm follow its certified stop, or let a damping brake it in torque mode."""
+        """Let the arm brake from ``now`` [s] on: along its certified stop, or by a damping in torque mode."""
         if self.state.following:
             self.state.following, self._ceased = False, now
             self.path.brake(self.state.answered)
             self.state.rest = tuple(map(float, self.path.rest))
 
     def is_still(self, now: float) -> bool:
-        """Return whether nothing moves the arm at ``now`` [s] if no more commands come."""
+        """Return whether the arm counts as resting at ``now`` [s], and stays at rest if no more commands come."""
         if not self.state.controlled or self.state.is_silent(now):
             return True
         if self.state.wanted is CommandMode.TORQUE:
@@ -77,13 +80,14 @@ class ArmSession:
         return not self.state.following and self._rests(self.state.answered)
 
     def _rests(self, t: float) -> bool:
-        """Return whether the path has come to its end at ``t`` [s]."""
+        """Return whether the arm has reached the end of its path at ``t`` [s]."""
         return bool(np.abs(self.path.at(t) - self.path.rest).max() <= _AT_REST)
 
     def has_passed(self, command: ArmCommand) -> bool:
-        """Return whether a command was already sent for a time after the start of ``command``.
+        """Return whether ``command`` has come too late.
 
-        It lay on the earlier stop, so that ``command`` has come too late.
+        It has come too late if the robot already got a position for a time after the start of ``command``. This
+        position was on the earlier stop.
         """
         return self.state.following and self.state.answered > command.start
 
@@ -113,15 +117,15 @@ class ArmSession:
         return bool((speed <= _FROM_REST * step).all() and (way <= speed * step + allowed).all())
 
     def hear(self, measured: Measured, now: float) -> None:
-        """Take a state that came at ``now`` [s]."""
+        """Store a state of the robot that came at ``now`` [s]."""
         self.state.hear(measured, now)
 
     def answer(self, now: float, ahead: float) -> Array:
-        """Return the command for the newest state: positions [rad] or torques [Nm] (7,).
+        """Return the command that answers the newest state: positions (7,) [rad] or torques (7,) [Nm].
 
         Args:
-            now: The time [s].
-            ahead: Time by which this arm is ahead of the other one [s].
+            now: The time by the monotonic clock [s].
+            ahead: Time by which this arm is ahead of the other arm on the reference [s].
         """
         state = self.state
         assert state.newest is not None
@@ -146,7 +150,7 @@ class ArmSession:
 def follow(sessions: Mapping[str, ArmSession], commands: Mapping[str, ArmCommand]) -> bool:
     """Let every arm take its command, and return True.
 
-    If one of the commands came too late, no arm takes its command, and the function returns False.
+    If at least one of the commands came too late, no arm takes its command, and the result is False.
     """
     if any(sessions[arm].has_passed(command) for arm, command in commands.items()):
         return False
@@ -156,16 +160,16 @@ def follow(sessions: Mapping[str, ArmSession], commands: Mapping[str, ArmCommand
 
 
 def ahead_of_others(sessions: Mapping[str, ArmSession], arm: str, now: float) -> float:
-    """Return the time by which an arm is ahead of the slowest other arm that follows [s]; at least 0.
+    """Return the time by which an arm is ahead, on the reference, of the last other arm that follows [s]; at least 0.
 
-    It also writes into the arm's state how far the arm is behind the fastest other arm [s].
+    Also store in the arm's state the time by which the arm is behind the first other arm [s].
     """
     state = sessions[arm].state
     others = [session.state for name, session in sessions.items() if name != arm and session.state.following]
     if not state.following or not others:
         state.behind = 0.0
         return 0.0
-    # Between two states, the time of an arm is assumed to go on, for one period at most.
+    # After an arm's newest state, its time on the reference is assumed to go on for at most one period.
     times = [other.answered + min(max(now - other.arrival, 0.0), PERIOD) for other in others]
     own = state.answered + min(now - state.arrival, PERIOD)
     state.behind = max(max(times) - own, 0.0)

@@ -29,7 +29,7 @@ class CollisionSettings(StrictModel):
 
 
 class LoadSettings(StrictModel):
-    """What the arm carries besides the end effector that is set in Desk."""
+    """The load that the arm carries in addition to the end effector that is set in Desk."""
 
     mass: float = Field(0.0, ge=0, le=10, description="mass [kg]")
     centre: tuple[_Metres, _Metres, _Metres] = Field(
@@ -41,7 +41,7 @@ class LoadSettings(StrictModel):
 
 
 class HandSettings(StrictModel):
-    """The Franka Hand of an arm."""
+    """The settings of an arm's Franka Hand."""
 
     width: float = Field(0.08, gt=0, le=0.1, description="width when it is open [m]")
     speed: float = Field(0.1, gt=0, le=0.1, description="speed of the width [m/s]")
@@ -50,7 +50,7 @@ class HandSettings(StrictModel):
 
 
 class FrankaArmSettings(StrictModel):
-    """One arm."""
+    """The settings of one arm and its robot."""
 
     address: str = Field(min_length=1, description="address or host name of the robot's control")
     collision: CollisionSettings = CollisionSettings()
@@ -59,7 +59,7 @@ class FrankaArmSettings(StrictModel):
 
 
 class FrankaSettings(StrictModel):
-    """All arms."""
+    """The settings of all arms."""
 
     left: FrankaArmSettings | None = None
     right: FrankaArmSettings | None = None
@@ -75,7 +75,7 @@ class FrankaSettings(StrictModel):
 
 
 def is_loopback(address: str) -> bool:
-    """Return whether ``address``, an address or a host name, certainly means this computer."""
+    """Return whether ``address``, which is an IP address or a host name, surely belongs to this computer."""
     try:
         return ip_address(address).is_loopback
     except ValueError:  # It is a host name.

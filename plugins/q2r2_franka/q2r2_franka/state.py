@@ -14,9 +14,9 @@ from q2r2_franka.reasons import FrankaReason
 Joints = tuple[float, ...]
 NONE: Joints = (0.0,) * JOINTS
 _SILENT = 0.1  # A robot that sends no state for longer than this counts as silent [s].
-# The usual time between two states is the longest recent one. _LONGEST_USUAL bounds it [s], and each state shortens it
-# by the share _FORGETTING. One arm may be ahead of the other for this time, and so the controller keeps them farther
-# apart.
+# The longest recent time between two states is called the usual time. It is at most _LONGEST_USUAL [s], and each state
+# shortens it by the share _FORGETTING. One arm may be ahead of the other arm by the usual time. Therefore the
+# controller keeps the arms farther apart.
 _LONGEST_USUAL, _FORGETTING = 0.02, 0.002
 
 
@@ -39,7 +39,7 @@ class Measured:
 
     mode: Mode
     errors: str  # Names of the present errors; "" if there are none.
-    cycles: int  # Number of periods since the state that was read before.
+    cycles: int  # Number of periods since the last state that was read.
     q: Joints  # Measured positions [rad].
     v: Joints  # Measured velocities [rad/s].
     tau: Joints  # Measured torques [Nm].
@@ -49,7 +49,7 @@ class Measured:
 
 @dataclass(slots=True)
 class SessionState:
-    """The session of one arm, as the process that answers its robot knows it. Times are of the monotonic clock [s]."""
+    """The session of one arm, as the process that answers its robot knows it. Times are by the monotonic clock [s]."""
 
     arm: str
     address: str
@@ -61,29 +61,32 @@ class SessionState:
     following: bool = False  # True while the arm follows the reference.
     ended: int = 0  # Number of times that the arm ceased to follow because the robot ended the motion.
     rest: Joints = NONE  # Positions at the end of the arm's path [rad].
-    # The time of the reference for which the newest command is [s]. This time passes with the states of the robot.
+    # The newest command belongs to this time of the reference [s]. The robot's states advance this time.
     answered: float = -math.inf
-    behind: float = 0.0  # Time by which ``answered`` is behind that of the other arm [s].
+    behind: float = 0.0  # Time by which ``answered`` is behind the other arm's ``answered`` [s].
     took: float | None = None  # Time from the newest state until its command was sent; None without a command [s].
-    lost: int = 0  # Number of periods without a command in time.
+    lost: int = 0  # Number of periods in which the robot got no command in time.
     problem: str = ""  # Why there is no connection, or why the robot ended the last motion.
 
     def is_silent(self, now: float) -> bool:
         return now - self.arrival > _SILENT
 
     def hear(self, measured: Measured, now: float) -> None:
-        """Take a state that came at ``now`` [s]."""
+        """Store a state of the robot that came at ``now`` [s]."""
         passed = min(now - self.arrival, _LONGEST_USUAL)
         self.usual = max(passed, (1.0 - _FORGETTING) * self.usual, PERIOD)
         self.newest, self.arrival, self.took = measured, now, None
 
     def timing(self, now: float) -> ArmTiming:
-        """Return the timing of the arm relative to its reference, at ``now`` [s]."""
+        """Return the timing of the arm at ``now`` [s].
+
+        It has the arm's delay behind the other arm, the age of the newest state, and the usual time between states.
+        """
         behind = self.behind if self.wanted is CommandMode.POSITION else 0.0
         return ArmTiming(behind, now - self.arrival, self.usual)
 
     def latest(self, t: float) -> float:
-        """Return an upper bound on the times of the reference for which commands are sent until ``t`` [s]."""
+        """Return an upper bound on ``answered`` at ``t`` [s], if the robot goes on sending states."""
         return self.answered + max(t - self.arrival, 0.0) + PERIOD
 
     @property
@@ -95,7 +98,7 @@ class SessionState:
         return f"mode {self.newest.mode}{errors}"
 
     def fault(self, now: float) -> Reason | None:
-        """Return why the arm cannot be commanded at ``now`` [s], or None."""
+        """Return why the arm cannot be commanded at ``now`` [s]; None if it can."""
         arm, address = self.arm, self.address
         newest = self.newest
         if newest is None or newest.mode is Mode.ABSENT:
@@ -116,13 +119,16 @@ class SessionState:
 
 @dataclass(slots=True)
 class ArmCommand:
-    """The command of one tick for one arm: its reference at the end of the tick, and the certified stop from there."""
+    """The command of one tick for one arm.
 
-    now: float  # Time of the tick [s].
-    start: float  # Time of the reference at which it leaves the earlier stop [s].
-    end: float  # Time of the reference's end [s].
-    q: Joints  # Posture at the end [rad].
-    v: Joints  # Velocity at the end [rad/s].
+    It has the arm's reference at the end of the tick, and the certified stop that begins there.
+    """
+
+    now: float  # Time of the tick by the monotonic clock [s].
+    start: float  # The reference leaves the earlier stop at this time of the reference [s].
+    end: float  # The step of this tick ends at this time of the reference [s].
+    q: Joints  # Posture at the time ``end`` [rad].
+    v: Joints  # Velocity at the time ``end`` [rad/s].
     deceleration: Joints  # Deceleration of the stop [rad/s^2].
     tau: Joints | None = None  # Torques without gravity [Nm]; None with positions, or if the damping brakes.
     damping: Joints | None = None  # Damping that brakes if no torques come [Nm s/rad]; None with positions.

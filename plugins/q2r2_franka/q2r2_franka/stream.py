@@ -1,14 +1,15 @@
-"""Compute what an arm gets every millisecond, within the limits of its motion. Nothing here knows a robot or a clock.
+"""Compute the command of an arm in each millisecond, within the limits of its motion. No robot and no clock is used.
 
-**Jerk.** Between two ticks the reference has a constant acceleration, and the certified stop has one as well. Where one
-follows the other, the acceleration jumps by up to twice its limit, and a robot that compares commands 1 ms apart sees a
-jerk of 2 a / 1 ms. :class:`PositionStream` therefore sends the mean of the last n positions on the path. The third
-difference of these means is the difference of two second differences of the path, divided by n. So the jerk is at most
-2 a / (n 1 ms), whatever the path does and wherever its ticks are: with a = 10 rad/s^2 and n = 5, 4,000 rad/s^3.
+**Jerk.** Between two ticks the reference has a constant acceleration, and so has the certified stop. Let a be the limit
+of the acceleration. Where one motion follows the other, the acceleration jumps by up to 2 a. A robot computes the jerk
+from commands that are 1 ms apart, so this jump would be a jerk of 2 a / 1 ms. :class:`PositionStream` therefore sends
+the mean of the last n positions on the path. The third difference of these means is the difference of two second
+differences of the path, divided by n. So the jerk is at most 2 a / (n 1 ms), whatever the path does and wherever its
+ticks are. With a = 10 rad/s^2 and n = 5, it is 4,000 rad/s^3.
 
-**Lost commands.** If a command does not arrive in time, the robot goes on with the last acceleration, and is then away
-from the path. The difference goes to zero by a polynomial of fifth degree, which begins with the difference's own
-velocity and acceleration.
+**Lost commands.** If a command does not arrive in time, the robot goes on with the last acceleration, and leaves the
+path. The difference between the robot and the path then goes to zero by a polynomial of fifth degree. The polynomial
+begins with the position, velocity and acceleration that the difference has at that time.
 """
 
 from __future__ import annotations
@@ -23,19 +24,21 @@ from q2r2_franka.limits import JOINTS, PERIOD, TORQUE_RATE
 
 MEANS = 5  # Number of positions of which each command is the mean.
 SMOOTHING_DELAY = 0.5 * (MEANS - 1) * PERIOD  # Time by which a mean is behind the path [s].
-_RETURN = 0.1  # Time in which a difference to the path goes to zero [s].
-_RATE_MARGIN = 0.999  # A robot computes the rate of torques from rounded numbers.
+_RETURN = 0.1  # After lost commands, the arm returns to the path within this time [s].
+# This share of the limit of the torque rate is used, because a robot computes the rate from rounded numbers.
+_RATE_MARGIN = 0.999
 
 
 class PositionStream:
-    """The positions that one arm is sent to."""
+    """Computes the positions that are sent to one arm."""
 
     def __init__(self, q: Array) -> None:
         """Make the stream of an arm that rests at ``q`` (7,) [rad]."""
         self._path = deque([q] * MEANS, maxlen=MEANS)
-        self._means = deque([q] * 3, maxlen=3)  # The last three means, and the last three positions at the robot.
+        self._means = deque([q] * 3, maxlen=3)  # Here the last three means, below the robot's last three positions.
         self._sent = deque([q] * 3, maxlen=3)
-        # Coefficients of the difference, a polynomial over the time since it began.
+        # The coefficients (6, 7) of the polynomial by which the difference between robot and path goes to zero. Its
+        # variable is the time since the polynomial began [s].
         self._difference = np.zeros((6, JOINTS))
         self._since = _RETURN
 
@@ -43,8 +46,8 @@ class PositionStream:
         """Return the position to send now (7,) [rad].
 
         Args:
-            path: Positions on the path, 1 ms apart, since the last call. If there are several, the robot got no command
-                for all but the last.
+            path: Positions on the path since the last call, which are 1 ms apart. If there are several, the robot got
+                no command in the periods of all positions before the last one.
         """
         for q in path[:-1]:
             self._advance(q)
@@ -71,7 +74,7 @@ class PositionStream:
         return difference
 
     def _begin_return(self) -> None:
-        """Let the difference between robot and means go to zero from now on."""
+        """Begin the polynomial by which the difference between the robot's positions and the means goes to zero."""
         d = [sent - mean for sent, mean in zip(self._sent, self._means, strict=True)]
         acceleration = (d[2] - 2.0 * d[1] + d[0]) / PERIOD**2
         velocity = (d[2] - d[1]) / PERIOD + 0.5 * PERIOD * acceleration
@@ -83,16 +86,17 @@ class PositionStream:
 
 
 class TorqueStream:
-    """The torques that one arm gets."""
+    """Computes the torques that are sent to one arm."""
 
     def __init__(self, limit: Array) -> None:
-        """``limit`` is the greatest torque of each joint (7,) [Nm]."""
+        """``limit`` is the greatest absolute torque of each joint (7,) [Nm]."""
         self._limit, self._sent = limit, np.zeros(JOINTS)
 
     def next(self, wanted: Array) -> Array:
-        """Return the torque to send now (7,) [Nm]: ``wanted`` as far as the limits allow.
+        """Return the torques to send now (7,) [Nm]: as near to ``wanted`` as the limits allow.
 
-        A robot that got no command for some time has kept the last torque, so that this time permits no larger change.
+        The torque may change only by the limit of one period, even after periods without a command, because the robot
+        keeps the last torque in them.
         """
         change = _RATE_MARGIN * TORQUE_RATE * PERIOD
         wanted = np.clip(wanted, -self._limit, self._limit)

@@ -1,6 +1,7 @@
-"""The format ``zarr`` of ``q2r2 export``, which is one store that diffusion_policy's ReplayBuffer reads.
+"""The format ``zarr`` of ``q2r2 export``. Its output is one zarr store, which diffusion_policy's ReplayBuffer reads.
 
-The arrays under ``data`` contain all episodes one after the other, and ``meta/episode_ends`` has the end of each. See
+The arrays under ``data`` contain all episodes one after the other. For each episode, ``meta/episode_ends`` has the
+index of the row after its last row. See
 https://github.com/real-stanford/diffusion_policy, diffusion_policy/common/replay_buffer.py.
 """
 
@@ -25,7 +26,7 @@ def array_name(feature: str) -> str:
 
 
 def write_episode(episode: EpisodeVectors, path: Path) -> None:
-    """Write one episode as a store of its own at ``path``. Anything that exists there is removed."""
+    """Write one episode as a store of its own at ``path``. A store that exists there is removed first."""
 
     root = zarr.open_group(str(path), mode="w", zarr_format=_ZARR_FORMAT)
     root.attrs.update(
@@ -50,7 +51,7 @@ def write_episode(episode: EpisodeVectors, path: Path) -> None:
 
 
 def _append_pictures(data: Any, name: str, pictures: Any) -> Any:
-    """Append the pictures of a camera to a new array, and return it."""
+    """Create an array with the pictures of a camera, and return it."""
     made = _create(data, name, np.empty(pictures.size, dtype=pictures.dtype))
     for pixels in pictures:
         made.append(pixels[None])

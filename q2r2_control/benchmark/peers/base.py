@@ -1,4 +1,4 @@
-"""The interface of a controller in the bench, and the settings that all peers get."""
+"""The interface of a controller in the bench, and the settings for all peers, which are other public controllers."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from q2r2_control.robot.kept_distances import kept_distances
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
-# By peer, the package that it needs. Its module and its class here have the name of the package.
+# By the name of a peer, the package that it needs. The peer's module and class here have the name of the package.
 PEERS = {
     "roboplan": "roboplan",
     "roboplan, 10 nearest": "roboplan",
@@ -26,41 +26,47 @@ PEERS = {
 }
 WITHOUT_ACCELERATION_LIMIT = ("mink",)
 INSTALL = install_line("bench")
-NEAREST_ROWS = 10  # Number of separation rows of a peer that gets only the nearest pairs.
+NEAREST_ROWS = 10  # Number of pairs for which a peer has separation rows, if it considers only the nearest pairs.
 DETECTION_DISTANCE = 0.25  # Pairs farther apart than this need no exact distance [m].
 
 
 class BenchController(Protocol):
-    """A controller that runs open loop: it integrates its own configuration."""
+    """A controller that runs open loop: it starts each tick at the positions that it returned in the last tick."""
 
     name: str
     limitations: str  # The parts of our contract that it cannot keep, in a few words.
 
     def reset(self, q: Array) -> None:
-        """Start at rest at ``q`` (nv,) [rad], in the order of ``Robot.joint_names``."""
+        """Start at rest at the posture ``q`` (nv,) [rad], in the order of ``Robot.joint_names``."""
 
     def step(self, targets: Mapping[str, pin.SE3], dt: float) -> tuple[Array, Array]:
-        """Do one tick; return positions [rad] and velocities [rad/s], (nv,) each. Raises if it has no solution."""
+        """Compute one tick of ``dt`` [s]. Return positions (nv,) [rad] and velocities (nv,) [rad/s].
+
+        ``targets`` are the target poses of the tools in the world, by arm. Without a solution, an exception is raised.
+        """
 
     def hold(self) -> tuple[Array, Array]:
-        """Return the same positions at rest, as the tick after a failure."""
+        """Return the last positions (nv,) [rad] and zero velocities (nv,), as the result of a tick that failed."""
 
 
 class PeerSettings:
-    """Our settings in the units of the peers, for ticks of ``dt`` [s]: gains per tick, and limits with our margins."""
+    """Our settings in the units of the peers, for ticks of ``dt`` [s].
+
+    Gains are per tick, and limits are reduced by our margins.
+    """
 
     def __init__(self, robot: Robot, config: Config, dt: float) -> None:
         control = config.control
         self.robot, self.config, self.dt = robot, config, dt
         self.position_gain = control.position_gain * dt  # Share of the tool's position error that a tick removes.
         self.posture_gain = control.posture_gain * dt  # Share of the posture error that a tick removes.
-        self.posture_cost = float(control.posture_weight**0.5)  # Square root of its weight; the cost of a tool is 1.
+        self.posture_cost = float(control.posture_weight**0.5)  # A tool's cost is 1. A weight is a squared cost.
         self.velocity = robot.velocity_limit * control.velocity_scale  # (nv,) [rad/s]
         self.acceleration = robot.capped_acceleration(control.acceleration_limit)  # (nv,) [rad/s^2]
         self.lower = robot.position_lower + control.position_margin  # (nv,) [rad]
         self.upper = robot.position_upper - control.position_margin  # (nv,) [rad]
-        # The smallest distance that we keep for any pair [m]. Peers have one distance for all pairs. Therefore no peer
-        # has to avoid postures that our controller may take.
+        # The smallest distance that our controller keeps for any pair [m]. Peers have only one distance for all pairs.
+        # With the smallest distance, peers may take all postures that our controller may take.
         self.min_distance = float(kept_distances(robot, control).values.min(initial=control.min_distance))
         home = compose(config).home.items()
         # Home positions of joints that move no tool, such as fingers.
@@ -68,7 +74,7 @@ class PeerSettings:
 
 
 def make_peer(name: str, setup: PeerSettings) -> BenchController:
-    """Build a peer of ``PEERS``; raises any exception of its package."""
+    """Build the peer that has this ``name`` in ``PEERS``. Raises any exception of its package."""
     module = importlib.import_module(f"q2r2_control.benchmark.peers.{PEERS[name]}")
     peer: BenchController = getattr(module, PEERS[name].capitalize())(setup, name)
     return peer
@@ -80,7 +86,10 @@ def is_installed(name: str) -> bool:
 
 
 def build_peers(names: Sequence[str], setup: PeerSettings) -> tuple[list[BenchController], list[str]]:
-    """Return the peers that can be built, and a line for each name with its limitations or why it is missing."""
+    """Return the peers that can be built, and one line of text for each of the ``names``.
+
+    The line has the limitations of the peer, or the reason why the peer is missing.
+    """
     peers, notes = list[BenchController](), list[str]()
     for name in names:
         if not is_installed(name):
@@ -95,10 +104,10 @@ def build_peers(names: Sequence[str], setup: PeerSettings) -> tuple[list[BenchCo
 
 
 class Leading:
-    """A peer whose targets are moved ahead of time along their paths, to compensate for the peer's lag."""
+    """A peer that gets targets from farther ahead on their paths, to compensate for the peer's lag."""
 
     def __init__(self, peer: BenchController, gain: float) -> None:
-        """Wrap ``peer``, whose tools have the ``gain`` [1/s]."""
+        """Wrap ``peer``. Its tools follow their targets with this ``gain`` [1/s], so their lag is 1 / gain [s]."""
         self.name, self.limitations = peer.name, peer.limitations
         self._peer, self._gain = peer, gain
         self._last: Mapping[str, pin.SE3] = {}
@@ -108,7 +117,7 @@ class Leading:
         self._peer.reset(q)
 
     def step(self, targets: Mapping[str, pin.SE3], dt: float) -> tuple[Array, Array]:
-        """Do the peer's tick with targets moved on by 1 / gain [s] at their speed since the last tick."""
+        """Compute the peer's tick. Each target is first moved on for 1 / gain [s], at its speed since the last tick."""
         before, self._last = self._last or targets, targets
         share, ahead = 1.0 / (self._gain * dt), {}
         for arm, pose in targets.items():

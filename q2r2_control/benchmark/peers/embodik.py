@@ -1,13 +1,16 @@
 """embodiK: prioritised differential inverse kinematics in C++, on Pinocchio and Coal.
 
-embodiK has position, velocity and acceleration limits, and keeps the nearest pairs apart. There is no QP: joints and
-rows are held at their limits one by one. Limits can contradict each other, and it reports that. Braking distances are
-not considered. It gets the same URDF as roboplan, with our bodies as its collision shapes, and the same pairs. It has
-rows for the ten nearest pairs at any distance. By default it has rows only within five times the kept distance, which
-is 5 mm here. Tools get as near to their targets as limits allow (MIN_ERROR). By default it reduces a tool's whole
-velocity until all limits hold (SCALE), and then stopped 47 mm from a target in free air. Both tools have the first
-priority and the posture the second one, because weights are gains here: a posture cannot have a small weight against a
-tool. Fingers, which are joints in its model, must not move.
+embodiK has position, velocity and acceleration limits, and keeps the nearest pairs apart. It solves no QP: it fixes
+joints and rows at their limits one by one. Limits can contradict each other; embodiK then reports an error. It does not
+consider braking distances. embodiK gets the same URDF as roboplan, with our bodies as collision shapes, and the same
+pairs.
+
+Three of its settings are not the defaults. First, it has rows for the ten nearest pairs at any distance. By default, it
+has rows only for pairs within five times the kept distance, which is 5 mm here. Second, its mode is MIN_ERROR: tools
+get as near to their targets as limits allow. In the default mode SCALE, it reduces a tool's whole velocity until all
+limits hold. A tool then stopped 47 mm from its target in free air. Third, both tools have the first priority, and the
+posture has the second one. In embodiK, weights are gains, so a small weight cannot make the posture less important than
+a tool. The fingers are joints of its model, and their velocity limit is 0.
 """
 
 from __future__ import annotations
@@ -61,7 +64,7 @@ class Embodik:
         self.reset(robot.home)
 
     def _limit_joints(self, setup: PeerSettings) -> None:
-        """Set our limits, and 0 rad/s for the fingers. Position limits are those of the URDF."""
+        """Set our velocity and acceleration limits, and 0 rad/s for fingers. The URDF has the position limits."""
         solver = self._solver
         velocity, acceleration = np.zeros(self._model.nv), np.full(self._model.nv, setup.acceleration.max())
         velocity[self._indices], acceleration[self._indices] = setup.velocity, setup.acceleration

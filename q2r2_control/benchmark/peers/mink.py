@@ -1,9 +1,10 @@
 """mink: differential inverse kinematics as one QP, on MuJoCo.
 
 mink has position and velocity limits and collision avoidance for chosen pairs of geometries, but no acceleration limit.
-Its collision bound divides a distance by dt, and is compared with a displacement of one tick. Therefore the gain with
-which a pair closes in at our rate is our gain times dt squared. mink drops pairs of a body and its parent. It gets the
-MuJoCo model of the simulation, with every monitored capsule. The fingers are joints there, and equalities freeze them.
+Its collision bound is a distance divided by dt, but mink compares the bound with the displacement in one tick.
+Therefore it gets our gain times dt squared, so that its pairs approach each other as fast as ours. mink ignores pairs
+of a body and its parent. It gets the MuJoCo model of the simulation, with every monitored capsule. The fingers are
+joints in that model; equality constraints keep them still.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ class Mink:
         control, robot = setup.config.control, setup.robot
         bare = setup.config.model_copy(update={"mujoco": setup.config.mujoco.model_copy(update={"objects": {}})})
         self._model = build_model(robot, bare)
-        # Pairs that may pass through each other in the simulation have to be avoided here too.
+        # In the simulation, the bodies of some pairs do not collide. mink has to keep all monitored pairs apart.
         self._model.geom_contype[:] = self._model.geom_conaffinity[:] = 1
         joints = [self._model.joint(name) for name in robot.joint_names]
         self._q_index = np.array([joint.qposadr[0] for joint in joints])
@@ -94,7 +95,7 @@ class Mink:
 
 
 def _mujoco_names(urdf: str) -> dict[str, str]:
-    """Return MuJoCo's names of collision shapes by Pinocchio's names LINK_0, LINK_1, ...
+    """Return the names of collision shapes in MuJoCo, by their names LINK_0, LINK_1, ... in Pinocchio.
 
     MuJoCo has the names of the URDF, except for the floor.
     """

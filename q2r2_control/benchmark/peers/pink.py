@@ -1,10 +1,10 @@
 """pin-pink: differential inverse kinematics as one QP, on Pinocchio and Coal.
 
-Pink has position, velocity and acceleration limits and a barrier on the nearest pairs. All of them are hard constraints
-that can contradict each other. Pink then raises an exception. The barrier does not consider braking distances. Pink
-gets the same Pinocchio model, capsules and pairs as our controller, and rows for the ten nearest pairs. With all pairs
-it takes six times as long. Its damping towards a safe displacement, with the default gain 1, is off, because it slows
-the tools at ticks of 1 ms.
+Pink has position, velocity and acceleration limits and a barrier on the nearest pairs. All of them are hard
+constraints. If they contradict each other, Pink raises an exception. The barrier does not consider braking distances.
+Pink gets the same Pinocchio model, capsules and pairs as our controller, and rows for the ten nearest pairs. With rows
+for all pairs, it would take six times as long. Its damping towards a safe displacement has the default gain 1. It is
+switched off here, because it slows down the tools at ticks of 1 ms.
 """
 
 from __future__ import annotations

@@ -1,14 +1,16 @@
 """roboplan: OInK, differential inverse kinematics as one QP in C++, on Pinocchio, Coal and ProxQP.
 
 roboplan has position, velocity and acceleration limits and a barrier on the nearest pairs. All of them are hard
-constraints that can contradict each other. roboplan then raises an exception. By default its solver looks for the
-nearest feasible problem instead. This follows some targets more closely, but took up to a minute in one tick, so it is
-switched off. The iterations are limited to a tenth of the default, because single ticks still took minutes. The barrier
-does not consider braking distances. roboplan gets the same URDF, with our margins in its position limits, and with our
-bodies instead of its collision shapes. It has the same pairs, the smallest distance that we keep, and rows for every
-pair or for the ten nearest pairs. The tolerance of its solver is the default (1e-6 rad per tick), because smaller
-tolerances took up to two minutes in one tick. The damping towards a safe displacement, with the default gain 1, is off,
-because with it the tools hardly follow at ticks of 1 ms.
+constraints. If they contradict each other, roboplan raises an exception. The barrier does not consider braking
+distances. roboplan gets the same URDF as our controller, with our margins in its position limits, and with our bodies
+instead of its collision shapes. It has the same pairs, the smallest distance that we keep, and rows for all pairs or
+for the ten nearest pairs.
+
+By default, its solver looks for the nearest feasible problem if limits contradict each other. Tools then follow some
+targets more closely, but one tick took up to a minute, so this is switched off. The limit of iterations is a tenth of
+the default, because single ticks still took minutes. The tolerance of the solver is the default (1e-6 rad per tick),
+because with smaller tolerances a tick took up to two minutes. The damping towards a safe displacement has the default
+gain 1. It is switched off here, because with it the tools hardly follow at ticks of 1 ms.
 """
 
 from __future__ import annotations
@@ -55,7 +57,7 @@ class Roboplan:
         posture = optimal_ik.ConfigurationTask(
             self._ik,
             robot.home,
-            np.full(nv, control.posture_weight),  # A plain weight. The others square a cost.
+            np.full(nv, control.posture_weight),  # This is a weight. Other tasks square a cost.
             optimal_ik.ConfigurationTaskOptions(task_gain=setup.posture_gain),
         )
         self._tasks = [*self._frame_tasks.values(), posture]
@@ -104,7 +106,7 @@ class Roboplan:
 
 
 def _watch_pairs(scene: core.Scene, robot: Robot) -> None:
-    """Let the scene check the links of our pairs, and no others."""
+    """Let the scene check the pairs of links that belong to our monitored pairs, and no others."""
     links = sorted({link_of(geometry.name) for geometry in robot.collision_model.geometryObjects})
     watched = {frozenset((link_of(a), link_of(b))) for a, b in pair_names(robot.collision_model)}
     pairs = list(combinations(links, 2))
