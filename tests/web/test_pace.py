@@ -22,7 +22,10 @@ class Browser:
 
 @pytest.fixture
 def browser() -> Browser:
-    return Browser()
+    """Return a browser in which a drag has just begun."""
+    begun = Browser()
+    begun.pace.begin()
+    return begun
 
 
 def test_a_browser_that_sends_in_time_gets_no_advice_even_after_the_drag(browser: Browser) -> None:
@@ -49,7 +52,13 @@ def test_the_advice_for_a_slow_browser_has_its_rate_the_needed_rate_and_the_cure
     assert browser.pace.advice(silent=False) == ""
 
 
-def test_a_browser_that_sends_nothing_at_all_gets_advice_while_it_is_silent(browser: Browser) -> None:
+def test_before_the_first_drag_there_is_no_advice() -> None:
+    browser = Browser()
+    browser.now += 60.0
+    assert browser.pace.advice(silent=False) == ""
+
+
+def test_a_browser_that_sends_nothing_after_the_start_of_a_drag_gets_advice(browser: Browser) -> None:
     browser.now += 0.4
     assert "no position for 0.40 s" in browser.pace.advice(silent=False)
 

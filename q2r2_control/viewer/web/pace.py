@@ -21,12 +21,12 @@ class BrowserPace:
 
     def __init__(self, allowed: float, clock: Callable[[], float] = time.monotonic) -> None:
         self._allowed, self._clock = allowed, clock
-        self.begin()
+        self._heard: float | None = None  # Time at which the newest position came [s]; None outside of a drag.
+        self._silence, self._ended = 0.0, -math.inf  # The longest recent time without a position, and its end [s].
 
     def begin(self) -> None:
         """Forget all times, because a drag begins."""
-        self._heard: float | None = self._clock()  # Time at which the newest position came [s]; None after the drag.
-        self._silence, self._ended = 0.0, -math.inf  # The longest recent time without a position, and its end [s].
+        self._heard, self._silence, self._ended = self._clock(), 0.0, -math.inf
 
     def note(self) -> None:
         """Note that a position has come."""
