@@ -3,10 +3,13 @@
 Also start ``q2r2 ros up CELL.yaml``, with the parameter ``output:=none`` for its node ``cartesian_controller``.
 """
 
+from contextlib import suppress
+
 import numpy as np
 import pinocchio as pin
 import rclpy
 from geometry_msgs.msg import PoseStamped
+from rclpy.executors import ExternalShutdownException
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import JointState
 
@@ -31,5 +34,8 @@ def follow(message: PoseStamped) -> None:
     print(f"target {1e3 * np.linalg.norm(error[:3]):.1f} mm away", flush=True)
 
 
-node.create_subscription(PoseStamped, "/cartesian_controller/safe_target/left", follow, qos_profile_sensor_data)
-rclpy.spin(node)
+TOPIC = "/cartesian_controller/safe_target/left"
+node.create_subscription(PoseStamped, TOPIC, follow, qos_profile_sensor_data)
+print(f"waits for targets on {TOPIC}", flush=True)
+with suppress(KeyboardInterrupt, ExternalShutdownException):  # These end the node.
+    rclpy.spin(node)

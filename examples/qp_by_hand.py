@@ -42,4 +42,5 @@ print(f"{' and '.join(SOLVERS)} both solved {len(differences)} of 1000, apart by
 plt.plot(DT * np.arange(len(speeds)), speeds, label="left_A1 [rad/s]")
 plt.plot(DT * np.arange(len(margins)), 10.0 * np.array(margins), label="least margin of a pair [dm]")
 plt.legend()
-plt.savefig(sys.argv[1] if len(sys.argv) > 1 else "qp_by_hand.png")
+if len(sys.argv) > 1:
+    plt.savefig(sys.argv[1])
