@@ -51,7 +51,7 @@ def write_table(episode: EpisodeVectors, path: Path) -> None:
         for at, label in enumerate(labels)
     }
     columns |= episode.outcome()
-    columns |= {"timestamp": (frames / episode.fps).astype(np.float32), "frame_index": frames}
+    columns |= {"timestamp": frames / episode.fps, "frame_index": frames}
     columns["task"] = np.full(episode.frames, episode.task, dtype=object)
     if episode.subtasks:
         columns[SUBTASK] = np.array(episode.subtask)
