@@ -33,8 +33,9 @@ class RateFit:
         used = f"99 of 100 ticks take at most {1e6 * self.p99_s:.0f} us, {100 * self.p99_s * self.rate_hz:.0f} %"
         if self.leaves_room:
             return f"loop rate {self.rate_hz:.0f} Hz: {used} of the period (loop_rate_hz: auto)"
-        most = f"more than {100 * (1.0 - _FREE_SHARE):.0f} %"
-        return f"loop rate {self.rate_hz:.0f} Hz, the lowest: {used} of the period, {most}; close other programs"
+        allowed = f"{1e6 * (1.0 - _FREE_SHARE) / self.rate_hz:.0f} us"
+        late = f"ticks may come late, since only {allowed} would leave time for other programs; close some"
+        return f"loop rate {self.rate_hz:.0f} Hz, the lowest: {used} of the period: {late}"
 
 
 def largest_usual_time(durations_s: Iterator[float]) -> float:
