@@ -13,6 +13,7 @@ from rich.console import Console
 
 from q2r2_control.cli.output import (
     SCRIPTS_WAIT_S,
+    ProgressLines,
     as_json_text,
     late_line,
     notice_of_compiling,
@@ -320,8 +321,10 @@ def _run(
             kind = "simulated time" if options.simulated_time else "real time"
             lasts = "until Ctrl-C" if options.duration is None else f"{options.duration:g} s"
             is_shown = options.window or page is not None or options.input == "webxr"
-            unseen = "" if is_shown else "; --web shows the arms in a browser"
+            unseen = "" if is_shown or options.fast else "; --web shows the arms in a browser"
             say(f"{options.name}: begins, {lasts}, in {kind}{unseen}", console)
+            if options.duration is not None:
+                pipeline.listeners.append(ProgressLines(options.name, options.duration, console))
         if streams is not None:
             streams.wait_until_ready()
         pipeline.cameras = streams

@@ -22,6 +22,7 @@ from q2r2_control.control.solvers.registry import check_installed
 from q2r2_control.demo.assembly_tasks import TaskResult
 from q2r2_control.errors import ConfigError
 from q2r2_control.summary.run_summary import RunSummary
+from q2r2_control.summary.tick import Tick
 from q2r2_control.viewer.tables import print_table
 
 if TYPE_CHECKING:
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 _LATE, _OFTEN = 2e4, 0.2
 # Time until the first line about the compilation of kernels, and time between two such lines [s].
 _SILENT_S, _BETWEEN_LINES_S = 3.0, 5.0
+_BETWEEN_TIMES_S = 10.0  # Time between two lines about how much of a run is over [s].
 SCRIPTS_WAIT_S = 60.0  # Longest wait for cabinets if no person at a terminal can end the wait.
 DEMO_CONFIG = "config/dual_iiwa7.yaml"
 
@@ -215,6 +217,20 @@ def late_line(summary: RunSummary, tasks: Iterable[TaskResult]) -> str | None:
         return None
     line = f"the loop was late by up to {1e-3 * late:.0f} ms, in {summary.overruns} ticks by more than a period"
     return f"[yellow]{line}[/]: close other programs, or give it priority with --rt"
+
+
+class ProgressLines:
+    """A listener of a run without a table. It prints how much of the run is over, some seconds apart."""
+
+    def __init__(self, name: str, duration: float, console: Console) -> None:
+        """``name`` is the run's name. ``duration`` is how long the run lasts [s]."""
+        self._name, self._duration, self._console = name, duration, console
+        self._due = time.monotonic() + _BETWEEN_TIMES_S  # When the next line is printed [s].
+
+    def __call__(self, tick: Tick) -> None:
+        if (now := time.monotonic()) >= self._due:
+            self._due = now + _BETWEEN_TIMES_S
+            say(f"{self._name}: {tick.t:.1f} of {self._duration:g} s", self._console)
 
 
 def print_lines(console: Console, lines: Iterable[str]) -> None:

@@ -205,7 +205,9 @@ def demo(
     period: Annotated[
         float, Option(min=1, max=10, help="With --plant fri: time between two messages of a cabinet [ms].")
     ] = 10.0,
-    duration: Annotated[float | None, Option(help="End the run earlier, after this time [s].")] = None,
+    duration: Annotated[
+        float | None, Option(help="End the run after this time [s], if the tasks are not over before.")
+    ] = None,
     fast: Fast = False,
     viewer: Viewer = False,
     headless: Headless = False,
@@ -272,12 +274,13 @@ def demo(
     work = trajectory_named(trajectory, place)
     work = hurried(work, seed) if shaky else work
     table = _shows_table(headless, viewer)
-    usual_port = _PORT
+    usual_port, unseen = _PORT, ""
     if table and plant == "mujoco" and not (viewer or web or fast):
         viewer = window_fault() is None
         web, usual_port = not viewer and find_spec("viser") is not None, 0  # Another program may use the usual port.
         if not (viewer or web):
-            say(f"--web shows the arms in a browser: {install_line('web')}")
+            unseen = f"no display: to see the arms in a browser, type {install_line('web')}"
+            say(unseen)
     given: dict[str, object] = {"trajectory": trajectory, "human": human or hands is not None, "seed": seed}
     given |= {"shaky": shaky, "spread": spread}
     options = RunOptions(
@@ -285,7 +288,7 @@ def demo(
         input="scripted",
         plant=plant,
         mode=mode.value,
-        duration=positive("--duration", duration) or work.duration,
+        duration=min(positive("--duration", duration) or work.duration, work.duration),
         fast=fast,
         input_options=given,
         table=table,
@@ -308,6 +311,8 @@ def demo(
         cell = with_parts_at(with_controls(load_config(DEMO_CONFIG)), chosen, place)
         done = run_cell(with_solver(cell, solver), options)
     print_summary(done, json, verbose)
+    if unseen:  # Kernels may have been compiled for a minute since the first time.
+        say(unseen)
     if not all(task.succeeded for task in done.tasks):
         raise Exit(1)
     if not done.was_recorded:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 
 import pytest
 from rich.console import Console
@@ -12,7 +13,7 @@ from rich.table import Table
 
 from q2r2_control import Pipeline, RunSummary
 from q2r2_control.cli.cell_run import CellRun, print_summary
-from q2r2_control.cli.output import late_line, verdict_markup
+from q2r2_control.cli.output import ProgressLines, late_line, verdict_markup
 from q2r2_control.cli.summary_figures import summary_table, verdict_line
 from q2r2_control.demo.assembly_tasks import TaskResult, held_to_promises
 from q2r2_control.events import CommonReason, Event, Reason
@@ -224,3 +225,14 @@ def test_a_tool_that_did_not_follow_is_printed(summary: RunSummary) -> None:
     assert "did not follow" not in text_of(summary)
     away = replace(summary, arms=summary.arms | {"left": replace(summary.arms["left"], end_error_mm=256.4)})
     assert "256 mm from its reference: the tool did not follow" in text_of(away)
+
+
+def test_a_run_without_a_table_tells_every_ten_seconds_how_much_of_it_is_over(monkeypatch: pytest.MonkeyPatch) -> None:
+    now, console = [100.0], Console(file=io.StringIO(), width=80, color_system=None)
+    monkeypatch.setattr("q2r2_control.cli.output.time.monotonic", lambda: now[0])
+    lines = ProgressLines("demo", 12.8, console)
+    for second in range(25):  # The computer is so slow that 0.1 s of the run take a second.
+        now[0] = 100.0 + second
+        lines(SimpleNamespace(t=0.1 * second))  # type: ignore[arg-type]
+    assert isinstance(console.file, io.StringIO)
+    assert console.file.getvalue() == "demo: 1.0 of 12.8 s\ndemo: 2.0 of 12.8 s\n"

@@ -145,6 +145,7 @@ def test_with_rt_one_line_names_the_refusals_of_the_system_and_the_run_goes_on(m
     told = q2r2(*options).stderr
     assert "real time" not in told
     assert "dual_iiwa7: begins, 0.1 s, in simulated time; --web shows the arms in a browser\n" in told
+    assert "dual_iiwa7: begins, 0.1 s, in simulated time\n" in q2r2(*options, "--fast").stderr
 
 
 CAMERAS = ["above", "left_wrist", "right_wrist"]
