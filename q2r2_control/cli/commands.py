@@ -83,7 +83,7 @@ COMMANDS = (
         "recordings:export",
         "Make a training dataset from recordings of q2r2 run --record, with one episode for each recording.",
         "Data to learn from",
-        "q2r2 export lerobot recordings --output datasets/circle --fps 30 --ahead 1",
+        "q2r2 export lerobot recordings --output dataset --fps 30 --ahead 1",
     ),
     ListedCommand(
         "evaluate",
