@@ -127,13 +127,13 @@ def fastest_tool(model: SafetyModel, data: SafetyData, i: int, h: float) -> floa
             j = parent[j]
         fastest = max(fastest, size_of(data.tools.total))
         k = parent[k]
-    fastest += h * _drift(model, i, data.state.v, v_next)
-    gained = longest * _drift(model, i, v_next, v_next)
+    fastest += h * drift(model, i, data.state.v, v_next)
+    gained = longest * drift(model, i, v_next, v_next)
     return fastest if gained <= fastest else (fastest + gained) ** 2 / (4.0 * gained)
 
 
 @kernel
-def _drift(model: SafetyModel, i: int, v: Array, v_next: Array) -> float:
+def drift(model: SafetyModel, i: int, v: Array, v_next: Array) -> float:
     """Return c of tool ``i`` for joints that have ``v``, ``v_next`` (nv,) or a speed in between [m/s^2]."""
     parent, total = model.collision.chain.parent, 0.0
     j = model.tools.joint[i]

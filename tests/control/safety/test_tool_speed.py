@@ -9,7 +9,7 @@ import pytest
 from q2r2_control import CartesianController, QpProblem, QpSolution, Robot, Solver
 from q2r2_control.config.cell_file import load_config
 from q2r2_control.control.safety.stop_rollout import SHAPES
-from q2r2_control.control.safety.tool_speed import fastest_tool
+from q2r2_control.control.safety.tool_speed import drift, fastest_tool
 from q2r2_control.types import Array, LimitKind
 from q2r2_control.verification.contract import Contract
 from q2r2_control.verification.tool_speeds import MeasuredToolSpeeds
@@ -52,6 +52,24 @@ def test_no_tool_is_faster_than_the_bound_in_a_step_and_in_any_kind_of_stop(name
         assert fastest <= max(before, bound) * (1.0 + 1e-12)
         shares.append(fastest / bound)
     assert max(shares) > 0.9, "a bound that nothing comes near would make arms slow"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_drift_bounds_the_acceleration_of_a_tool_whose_joints_keep_their_speeds(name: str) -> None:
+    random, robot, shares = np.random.default_rng(73), cell(name).robot, []
+    data = robot.model.createData()
+    for _ in range(100):
+        # In many draws, few joints move before the step, and few others after it.
+        moves = random.random((2, robot.model.nv)) < random.choice([0.05, 0.2, 0.8], (2, 1))
+        v, v_next = random.uniform(-1.0, 1.0, (2, robot.model.nv)) * moves
+        between = v + random.choice([0.0, 0.5, 1.0]) * (v_next - v)
+        pin.forwardKinematics(robot.model, data, random_posture(robot, random), between, np.zeros_like(v))
+        for i, arm in enumerate(robot.arms.values()):
+            tool = pin.getFrameClassicalAcceleration(robot.model, data, arm.frame_id, pin.LOCAL_WORLD_ALIGNED)
+            bound = drift(kernel_model(name).safety, i, v, v_next)
+            assert np.linalg.norm(tool.linear) <= bound * (1.0 + 1e-9) + 1e-12
+            shares.append(np.linalg.norm(tool.linear) / max(bound, 1e-12))
+    assert max(shares) > 0.3, "a bound that nothing comes near would make arms slow"
 
 
 class Pushing:
