@@ -39,3 +39,15 @@ def test_no_joint_was_farther_away_in_the_window_than_the_bounds_say(name: str) 
         assert (history.travel >= travel - 1e-12).all()
         assert (history.off >= off - 1e-12).all()
         assert (history.travel <= 3.0 * travel + 1e-6).all(), "the bound is not far too large"
+
+
+def test_a_window_that_was_off_knows_only_the_past_since_it_is_on_again() -> None:
+    robot, data = cell(NAMES[0]).robot, kernel_data(NAMES[0], cell(NAMES[0]).robot.home).safety
+    history, still = data.history, np.zeros(robot.model.nv)
+    history.window[1] = WINDOW
+    rest_always(history, robot.home)
+    assert history.window[0] == WINDOW
+    for window, known in ((0.0, 0.0), (WINDOW, H), (WINDOW, 2.0 * H)):
+        history.window[1] = window
+        remember(history, robot.home, still, still, H)
+        assert history.window[0] == known
