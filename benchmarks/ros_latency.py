@@ -1,8 +1,8 @@
 """How long does it take from a message on an input topic to the joint command that answers it, through real nodes?
 
 The simulated robot, the controller, and the teleoperation of one arm run as real processes on this machine. They have a
-ROS domain of their own. The input steps up and down by millimetres at random times. The first command after a step
-whose acceleration only a step can cause counts as the answer to this step.
+ROS domain of their own. The input steps up and down by millimetres at random times. The answer to a step is the first
+command after it that has a high acceleration. Without a new step, no command has such an acceleration.
 """
 
 from __future__ import annotations

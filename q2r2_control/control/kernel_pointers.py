@@ -60,7 +60,8 @@ class KernelPointer:
         self.numba_type = numba_type
 
     def __reduce__(self) -> Any:
-        return pointer_to, (self.value,)  # A copy has its own address.
+        # A copied or unpickled pointer is made anew, because the copied value lies at another address.
+        return pointer_to, (self.value,)
 
 
 class KernelPointers:
@@ -75,7 +76,8 @@ class KernelPointers:
         self.numba_type = _Pointers(pointers[0].numba_type.pointee)
 
     def __reduce__(self) -> Any:
-        return pointers_to, ([pointer.value for pointer in self.pointers],)  # A copy has its own addresses.
+        # Copied or unpickled pointers are made anew, because the copied values lie at other addresses.
+        return pointers_to, ([pointer.value for pointer in self.pointers],)
 
 
 @extending.typeof_impl.register(KernelPointer)

@@ -119,7 +119,7 @@ class TcpListener:
         self._socket.setblocking(False)
         self.port = int(self._socket.getsockname()[1])  # The port that was bound.
         self.log = log
-        self.accepts = RateLimit(ACCEPTS, ACCEPTS_PERIOD)  # While it is not open, no connection is accepted.
+        self.accepts = RateLimit(ACCEPTS, ACCEPTS_PERIOD)  # While this limit is reached, no connection is accepted.
         self._answers: dict[str, RateLimit] = {}
         self._answers_since = -math.inf
 

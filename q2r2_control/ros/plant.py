@@ -54,7 +54,8 @@ class RosPlant:
 
     modes: tuple[CommandMode, ...] = (CommandMode.POSITION,)
     realtime_only = True
-    standstill = JOINTS  # The arms' controller is another process, which may stand still.
+    # The arms' controller is another process, which can freeze. The plant notices that the arms then do not follow.
+    standstill = JOINTS
 
     def __init__(self, robot: Robot, config: Config) -> None:
         self._robot, self._period = robot, 1.0 / config.nominal_rate_hz
