@@ -38,7 +38,7 @@ class About:
     joints: tuple[str, ...]
     mode: str  # The command mode in which the pipeline drives the plant.
     plant_modes: tuple[str, ...]  # All command modes that the plant can follow.
-    epoch: int  # The time of day at which the run began [ns].
+    epoch: int  # The Unix time at which the run began [ns].
     realtime: bool
     cell: str  # The YAML of the cell, with all default values written out.
     robot: str  # The URDF of the robot.

@@ -95,7 +95,7 @@ class RosRecording(Recording):
 class _Tick:
     """A tick of the controller whose reference has not been found yet."""
 
-    time: int  # The time of day at which the tick's message was received [ns].
+    time: int  # The Unix time at which the tick's message was received [ns].
     now: float  # The time of the tick by the controller's clock [s].
     row: Rows  # (1,), filled with the numbers that were known when the tick was received.
     samples: list[Array]  # The samples that were received since the last tick, each with the numbers of SAMPLE_FIELDS.
