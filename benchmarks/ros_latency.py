@@ -117,7 +117,8 @@ class _Probe:
         self._node = rclpy.create_node("latency_probe", context=self._context)
         self._commands: list[tuple[float, float, list[float]]] = []
         self._tool: PoseStamped | None = None
-        listen: Any = self._on_command  # rclpy's type hints do not know callbacks that get the message's stamps.
+        # Its type is Any, because rclpy's type hints do not know callbacks that get the message's stamps.
+        listen: Any = self._on_command
         self._node.create_subscription(JointTrajectory, "/joint_trajectory", listen, 1000)
         self._node.create_subscription(PoseStamped, "/cartesian_controller/safe_target/left", self._on_tool, 1)
         self._target = self._node.create_publisher(PoseStamped, "/q2r2/left/target_frame", COMMAND_QOS)

@@ -164,7 +164,8 @@ def _words(value: Any) -> list[int]:
     if isinstance(value, tuple):
         return [word for part in value for word in _words(part)]
     if isinstance(value, np.ndarray):
-        # The owner of the pointer keeps the array. No reference is counted, and Numba's two pointers to owners are 0.
+        # The owner of the pointer keeps the array, so no reference is counted, and Numba's two pointers to owners are
+        # 0.
         owners = [0, 0]
         return [*owners, value.size, value.itemsize, value.ctypes.data, *value.shape, *value.strides]
     if isinstance(value, KernelPointer | KernelPointers):

@@ -186,7 +186,7 @@ def start_python(
         stderr=subprocess.DEVNULL,
         env=environment | os.environ | paths,
         pass_fds=files,
-        process_group=0,  # Ctrl-C of a terminal is only for the run.
+        process_group=0,  # In its own group, the process does not get Ctrl-C of a terminal, which is only for the run.
     )
 
 

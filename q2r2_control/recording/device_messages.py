@@ -30,9 +30,8 @@ class DeviceMessages:
     def take(self, now: float) -> tuple[list[Message], list[Reason]]:
         """Return the messages of all pictures since the last call, and the events of cameras, such as a stop.
 
-        In a message, ``sent`` is the Unix time at which its picture was captured. ``time`` is the Unix time at
-        which the picture was received, and for depth it is ``now`` [s]. The file's messages are in the order of
-        ``time``.
+        In a message, ``sent`` is the Unix time at which its picture was captured. ``time`` is the Unix time at which
+        the picture was received, and for depth it is ``now`` [s]. The file's messages are in the order of ``time``.
         """
         messages, reasons = [], []
         for name, stream in self.streams.streams.items():

@@ -30,7 +30,7 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.tick import Tick
 from q2r2_control.teleop.reasons import TeleopReason
 
-if TYPE_CHECKING:  # The ROS node does not import MuJoCo.
+if TYPE_CHECKING:  # The module is not imported at run time, because the ROS node does not need MuJoCo.
     from q2r2_control.plants.mujoco import MujocoPlant
 
 PATIENCE = 10.0  # Time to wait for a disk that hangs at the end of a run [s].

@@ -177,7 +177,8 @@ class RosTicks:
         self._flags[place] = message.data
 
     def _on_event(self, message: Any, time: int) -> None:
-        told = json.loads(message.data) | {"t": (time - self._epoch) / NANOSECONDS}  # The sender has another clock.
+        # The time of receipt replaces the sender's time, because the sender has another clock.
+        told = json.loads(message.data) | {"t": (time - self._epoch) / NANOSECONDS}
         self._events.append(Event.from_json(told))
 
     def _on_hand(self, side: int, message: Any, time: int) -> None:
