@@ -236,7 +236,7 @@ def latency_report(rate: float, acceleration_limit: Array, recordings: Mapping[s
 
 
 def _row(path: str, recording: CommandRecording, acceleration_limit: Array) -> LatencyRow:
-    """Find the first command after each step whose acceleration only a step can cause, and return the latencies."""
+    """Find the answer to each step, as the module's docstring defines it, and return the latencies."""
     times = np.asarray(recording.sent)
     # Ticks may be early or late, so each change of velocity is compared with its own dt, at least half the usual dt.
     dt = np.diff(times)

@@ -209,7 +209,8 @@ def _run_cell(
             faults = pipeline.preflight_faults()
         return _run_pipeline(pipeline, faults, options, recording, page, streams, console)
     finally:
-        plant.close()  # It is necessary even if no run began: an open window would crash the ending process.
+        # The plant is closed even if no run began, because an open window would crash the ending process.
+        plant.close()
 
 
 def _open_window(plant: Plant) -> None:

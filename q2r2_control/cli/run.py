@@ -313,7 +313,8 @@ def demo(
         cell = with_parts_at(with_controls(load_config(DEMO_CONFIG)), chosen, place)
         done = run_cell(with_solver(cell, solver), options)
     print_summary(done, json, verbose)
-    if unseen:  # Kernels may have been compiled for a minute since the first time.
+    # This line is printed again, because the compilation of kernels may have taken a minute since the first time.
+    if unseen:
         say(unseen)
     if not all(task.succeeded for task in done.tasks):
         raise Exit(1)

@@ -149,7 +149,8 @@ class MujocoPlant:
         if self._velocity is not None:
             self._next, self._velocity = (self._end[0] + dt * self._velocity, self._velocity), None
         if self._next is None:
-            self._start = self._end = self._at_rest(self._end[0])  # A commanded velocity ends with its tick.
+            # Without a new command, the arms stop, because a commanded velocity ends with its tick.
+            self._start = self._end = self._at_rest(self._end[0])
         else:
             self._start, self._end, self._next = self._end, self._next, None
         self._grippers.advance(dt)

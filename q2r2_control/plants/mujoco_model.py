@@ -268,7 +268,7 @@ def _add_objects(spec: mujoco.MjSpec, config: MujocoConfig) -> None:
                 condim=4,
                 friction=(thing.friction, TORSION, ROLLING),
             )
-            # Parts that slide into each other are hard. With MuJoCo's usual contacts, light parts would sink in by
-            # millimetres.
+            # Slippery parts, which slide into each other, get hard contacts. With MuJoCo's usual contacts, light parts
+            # would sink in by millimetres.
             if thing.friction < _PAD_FRICTION[0]:
                 geom.solref = _PAD_STIFFNESS

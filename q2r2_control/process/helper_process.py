@@ -203,7 +203,7 @@ def run_helper(module: str) -> None:
     """
     leave_signals_to_the_run()
     stream, sys.stdout = sys.stdout.buffer, sys.stderr  # What a library prints must not be taken for an answer.
-    lock = Lock()  # Several threads may send answers.
+    lock = Lock()  # Answers are sent one after the other, although several threads may send them.
 
     def answer(content: Any) -> None:
         with lock, suppress(BrokenPipeError):  # The run was killed.

@@ -90,7 +90,7 @@ class TickExecutor(SingleThreadedExecutor):
         for one, arguments in self._streams:
             for _ in range(_MOST_MESSAGES):
                 if self._changed:
-                    return  # This subscription may have been destroyed.
+                    return  # The list is out of date, and this subscription may have been destroyed.
                 if (taken := one.handle.take_message(one.msg_type, one.raw)) is None:
                     break
                 one.callback(*taken[:arguments])
