@@ -107,8 +107,7 @@ def certify_bodies(model: SafetyModel, data: SafetyData, grown: IntArray) -> int
     for p in range(pairs.first.shape[0]):
         if grown[pairs.first[p]] == 1 or grown[pairs.second[p]] == 1:
             any_grown = True
-            # No rounding is tolerated, because the growth of a body can be refused.
-            if data.distance[p] < model.min_distance[p]:
+            if data.distance[p] < model.min_distance[p]:  # No rounding is tolerated, because growth can be refused.
                 return p
     stay_with_stop(data)
     if not any_grown or certify(model, data, 0.0):
