@@ -1,8 +1,8 @@
 """How long does it take from a message on an input topic to the joint command that answers it, through real nodes?
 
 The simulated robot, the controller, and the teleoperation of one arm run as real processes on this machine. They have a
-ROS domain of their own. The input steps up and down by millimetres at random times. The first command after a step
-whose acceleration only a step can cause counts as the answer to this step.
+ROS domain of their own. The input steps up and down by millimetres at random times. The answer to a step is the first
+command after it that has a high acceleration. Without a new step, no command has such an acceleration.
 """
 
 from __future__ import annotations
@@ -117,7 +117,8 @@ class _Probe:
         self._node = rclpy.create_node("latency_probe", context=self._context)
         self._commands: list[tuple[float, float, list[float]]] = []
         self._tool: PoseStamped | None = None
-        listen: Any = self._on_command  # rclpy's type hints do not know callbacks that get the message's stamps.
+        # Its type is Any, because rclpy's type hints do not know callbacks that get the message's stamps.
+        listen: Any = self._on_command
         self._node.create_subscription(JointTrajectory, "/joint_trajectory", listen, 1000)
         self._node.create_subscription(PoseStamped, "/cartesian_controller/safe_target/left", self._on_tool, 1)
         self._target = self._node.create_publisher(PoseStamped, "/q2r2/left/target_frame", COMMAND_QOS)
@@ -235,7 +236,7 @@ def latency_report(rate: float, acceleration_limit: Array, recordings: Mapping[s
 
 
 def _row(path: str, recording: CommandRecording, acceleration_limit: Array) -> LatencyRow:
-    """Find the first command after each step whose acceleration only a step can cause, and return the latencies."""
+    """Find the answer to each step, as the module's docstring defines it, and return the latencies."""
     times = np.asarray(recording.sent)
     # Ticks may be early or late, so each change of velocity is compared with its own dt, at least half the usual dt.
     dt = np.diff(times)

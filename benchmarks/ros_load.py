@@ -122,7 +122,8 @@ class _Watcher:
         rclpy.init(context=self._context)
         self._node = rclpy.create_node("load_watcher", context=self._context)
         # Messages are read after the run, because reading them at once would take as much time as a node takes.
-        listen: Any = self._on_command  # rclpy's type hints do not know callbacks that get the message's stamps.
+        # Its type is Any, because rclpy's type hints do not know callbacks that get the message's stamps.
+        listen: Any = self._on_command
         qos = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
         node: Any = self._node
         node.tick_group = TickGroup()

@@ -118,7 +118,7 @@ class _Hand:
         self._context = rclpy.Context()
         rclpy.init(context=self._context)
         self._node = rclpy.create_node("press_probe", context=self._context)
-        # rclpy's type hints do not know callbacks that get the message's stamps.
+        # Its type is Any, because rclpy's type hints do not know callbacks that get the message's stamps.
         listen: Any = self._node.create_subscription
         listen(Float64MultiArray, arm_flags("left"), self._on_flags, RECORDED_QOS)
         listen(PoseStamped, asked_target("left"), self._on_target, RECORDED_QOS)
@@ -250,7 +250,7 @@ def _times(recording: PressRecording) -> tuple[float, float, float] | None:
     if target is None or motion is None:
         return None
     ticks = np.asarray(recording.ticks)
-    # The delay that the press causes begins at the tick before the press.
+    # The tick before the press counts too, because the delay that the press causes begins there.
     begin, end = np.searchsorted(ticks, [press, press + WATCHED_S])
     longest = float(np.diff(ticks[max(begin - 1, 0) : end + 1]).max(initial=0.0))
     return longest, target, motion

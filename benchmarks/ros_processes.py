@@ -50,6 +50,6 @@ def started(nodes: Sequence[NodeProcess]) -> Iterator[dict[str, int]]:
 
 def processor_time(pid: int) -> float:
     """Return the processor time of a process since its start, from Linux's /proc [s]."""
-    # The process name in parentheses may contain spaces.
+    # The fields are counted after the process name in parentheses, because this name may contain spaces.
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")

@@ -48,7 +48,8 @@ _TIMEOUT_S = 1800.0  # Timeout for a soak or the tests [s].
 
 def broken_copy(mutation: Mutation, folder: Path) -> None:
     """Write the package with one broken line into ``folder``, with its tests, cells and compiled kernels."""
-    for name in ("q2r2_control", "tests", "config", "robots", "docs"):  # Some tests compare a page with the code.
+    # The docs are copied too, because some tests compare a page with the code.
+    for name in ("q2r2_control", "tests", "config", "robots", "docs"):
         shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copy(ROOT / "pyproject.toml", folder)
     kernels = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "q2r2_control"

@@ -115,7 +115,7 @@ def main(
     json: Json = False,
 ) -> None:
     """Measure the time from a controller's motion in a browser to the joint command."""
-    from playwright.sync_api import sync_playwright  # Only this function needs playwright.
+    from playwright.sync_api import sync_playwright  # The import is here, because only this function needs playwright.
 
     config = WebXrInput.cell(load_config(DEMO_CONFIG))
     # A browser without a graphics card may pause longer than an arm waits. This timeout lets such pauses be measured.

@@ -7,8 +7,8 @@ import sys
 
 def main() -> None:
     """Run the command. Until the command begins, Ctrl-C ends the program at once, without a traceback."""
-    # Matrices are small here. With several threads, most of the time is spent on waiting: the computation takes ten
-    # times as long.
+    # One thread is enough, because matrices are small here. With several threads, most of the time is spent on waiting,
+    # and the computation takes ten times as long.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     handler = signal.signal(signal.SIGINT, signal.SIG_DFL)
     from q2r2_control.cli.app import app

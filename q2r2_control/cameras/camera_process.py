@@ -17,8 +17,8 @@ from q2r2_control.cameras.opening import open_device
 from q2r2_control.config.recording import CameraConfig
 from q2r2_control.errors import CameraError
 
-# The loop has priority, also over ten of these processes together. On a computer that is too busy, a picture without a
-# stamp of its own is received late, and gets a late time.
+# Niceness of a camera's process. The loop has priority, also over ten of these processes together. On a computer that
+# is too busy, a picture without a stamp of its own is therefore received late, and gets a late time.
 _NICENESS = 15
 _QUALITY = 90  # The quality of JPEG.
 _RETRY = 0.5  # Time between two attempts to open a camera that was lost [s].
@@ -89,7 +89,8 @@ def main(requests: Iterator[Any], answer: Callable[[Answer], None]) -> None:
             answer(CameraLost(str(error)))
         device.close()
         if camera.device_kind == "file":
-            threading.Event().wait()  # A video that has ended does not begin again.
+            # This process then only waits, because a video that has ended does not begin again.
+            threading.Event().wait()
         device = _opened_anew(camera)
 
 

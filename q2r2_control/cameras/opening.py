@@ -14,7 +14,8 @@ def open_device(camera: CameraConfig) -> CameraDevice:
     """
     check_installed(camera)
     if camera.device_kind == "file":
-        from q2r2_control.cameras.video_file import VideoFile  # OpenCV is imported in the process of a camera only.
+        # This import is not at the top of the file, so that only the process of a camera imports OpenCV.
+        from q2r2_control.cameras.video_file import VideoFile
 
         return VideoFile(camera)
     if camera.device_kind == "realsense":

@@ -112,7 +112,7 @@ class RealSense:
             raise CameraError(f"no {' and no '.join(silent) or 'frame'} within {_PATIENCE_MS / 1e3:g} s")
         stamp_ms = 0.0  # It stays 0 if the stamp is by the camera's own clock, whose offset is not known.
         if frame.get_frame_timestamp_domain() != self._rs.timestamp_domain.hardware_clock:
-            stamp_ms = frame.get_timestamp() + 1e3 * _monotonic_less_day()
+            stamp_ms = frame.get_timestamp() + 1e3 * _monotonic_minus_unix_time()
         captured = capture_time(received, stamp_ms, self._camera.delay)
         pixels = turned(np.array(frame.get_data()), self._camera)  # A copy, because the library uses the memory again.
         if frame.is_depth_frame():
@@ -143,8 +143,8 @@ class RealSense:
         return sensor, profile
 
 
-def _monotonic_less_day() -> float:
-    """Return the monotonic time minus the time of day [s].
+def _monotonic_minus_unix_time() -> float:
+    """Return the monotonic time minus the Unix time [s].
 
     The clocks are read one after the other. The readings between which the least time has passed are used.
     """

@@ -50,7 +50,7 @@ def capture_devices() -> dict[str, str]:
         path = f"/dev/{folder.name}"
         with suppress(OSError):
             name = (folder / "name").read_text(encoding="utf-8", errors="replace").strip()
-            # A camera may have further devices that give no pictures, such as a device for metadata.
+            # A camera may have further devices that give no pictures, such as a device for metadata. They are left out.
             if fault_of(path) != _NO_PICTURES:
                 found[path] = name
     return found

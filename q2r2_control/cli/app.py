@@ -71,7 +71,8 @@ def _usage_fault(error: Any) -> str:
     """Return a message about a wrong option or argument, in the same form as messages about a cell."""
     if not hasattr(error.__cause__, "errors"):  # Only pydantic's errors about values have this method.
         return str(error.format_message())
-    from q2r2_control.config.strict import allowed_instead  # This import would double the time of the help.
+    # The import is here, because at the top of the file it would double the time of the help.
+    from q2r2_control.config.strict import allowed_instead
 
     fault = error.__cause__.errors()[0]
     _, is_choice, choices = fault["msg"].partition(" is not one of ")
@@ -98,7 +99,8 @@ class _StderrHandler(logging.Handler):
 
 def _print_version(asked: bool) -> None:
     if asked:
-        from importlib.metadata import version  # This import would double the time of the help.
+        # The import is here, because at the top of the file it would double the time of the help.
+        from importlib.metadata import version
 
         print(f"q2r2 {version('q2r2_control')}")
         raise typer.Exit

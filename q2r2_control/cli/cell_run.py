@@ -147,11 +147,12 @@ def run_cell(config: Config, options: RunOptions) -> CellRun:
         raise ConfigError(f"{config.name}: controller: external is driven by q2r2 ros up; {builtin}")
     if options.window:
         check_window(options.plant)
-    # The processes of the cameras start first. They start up while the pipeline is built, which takes longer.
+    # The processes of the cameras start first, so that they start up while the pipeline is built, which takes longer.
     with _opened_devices(config, options) as streams:
         if options.page is None:
             return _run_recorded(config, options, None, streams)
-        from q2r2_control.viewer.web.view import PageView  # A run without a page does not need this module.
+        # The import is here, because a run without a page does not need this module.
+        from q2r2_control.viewer.web.view import PageView
 
         with PageView(*options.page) as page:
             return _run_recorded(config, options, page, streams)
@@ -164,7 +165,8 @@ def _opened_devices(config: Config, options: RunOptions) -> AbstractContextManag
     used = not options.fast and (options.record is not None or options.page is not None or sees)
     if not (used and config.device_cameras):
         return nullcontext()
-    from q2r2_control.cameras.camera_streams import CameraStreams  # Other runs do not need this module.
+    # The import is here, because other runs do not need this module.
+    from q2r2_control.cameras.camera_streams import CameraStreams
 
     return CameraStreams(config.device_cameras)
 
@@ -172,7 +174,8 @@ def _opened_devices(config: Config, options: RunOptions) -> AbstractContextManag
 def _run_recorded(config: Config, options: RunOptions, page: PageView | None, streams: CameraStreams | None) -> CellRun:
     if options.record is None:
         return _run_cell(config, options, None, page, streams)
-    from q2r2_control.cli.run_recording import RunRecording  # A run without --record does not need this module.
+    # The import is here, because a run without --record does not need this module.
+    from q2r2_control.cli.run_recording import RunRecording
 
     devices = () if streams is None else tuple(streams.streams)
     with RunRecording(options.record, options, config, devices) as recording:
@@ -206,7 +209,8 @@ def _run_cell(
             faults = pipeline.preflight_faults()
         return _run_pipeline(pipeline, faults, options, recording, page, streams, console)
     finally:
-        plant.close()  # It is necessary even if no run began: an open window would crash the ending process.
+        # The plant is closed even if no run began, because an open window would crash the ending process.
+        plant.close()
 
 
 def _open_window(plant: Plant) -> None:

@@ -276,7 +276,7 @@ def commission(
     try:
         with ExitStack() as stack:
             stack.callback(logger.setLevel, logger.level)
-            logger.setLevel(logging.ERROR)  # The steps report what went wrong.
+            logger.setLevel(logging.ERROR)  # Warnings are not logged, because the steps report what went wrong.
             # With an ordinary priority, this thread could hold Python's global lock while the loop waits for the lock.
             stack.enter_context(real_time())
             work.run(stack)

@@ -45,7 +45,8 @@ def evaluate(
     A trial takes as long as the scripted hands of the task. Lines on stdout say which seeds failed, and why.
     """
     cell, chosen = load_config(config), tasks_named(tasks)
-    PolicyInput.from_config(cell, policy, named="MODULE:NAME")  # One line says here what is wrong with the policy.
+    # The policy is made once here, so that one line says what is wrong with it.
+    PolicyInput.from_config(cell, policy, named="MODULE:NAME")
     spec = find_spec(policy.partition(":")[0])
     module = None if spec is None or not spec.has_location else Path(str(spec.origin))
     trial = partial(try_policy, cell, mode, policy, spread)

@@ -134,7 +134,8 @@ def _watch_live(cell: Config, domain: str, duration: float | None) -> SetView:
         def tell(view: SetView) -> None:
             for arm in view.arms:
                 line = f"{arm.name}: {arm.state or 'no node'}: {arm.why}"
-                if said.get(arm.name) != (words := re.sub(r"[\d.]+", "", line)):  # Ages change all the time.
+                # Numbers are not compared, because ages change all the time.
+                if said.get(arm.name) != (words := re.sub(r"[\d.]+", "", line)):
                     said[arm.name] = words
                     say(line, console)
 

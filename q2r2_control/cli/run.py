@@ -277,7 +277,8 @@ def demo(
     usual_port, unseen = _PORT, ""
     if table and plant == "mujoco" and not (viewer or web or fast):
         viewer = window_fault() is None
-        web, usual_port = not viewer and find_spec("viser") is not None, 0  # Another program may use the usual port.
+        # Port 0 is any free port, because another program may use the usual one.
+        web, usual_port = not viewer and find_spec("viser") is not None, 0
         if not (viewer or web):
             unseen = f"no display: to see the arms in a browser, type {install_line('web')}"
             say(unseen)
@@ -302,7 +303,8 @@ def demo(
         notes=notes_of(None, None, record, anonymous) | {"task": "; ".join(task.about for task in chosen)},
     )
     if plant == "fri":
-        from q2r2_control.cli.fri import rehearsal  # Only this demo needs the simulated cabinets.
+        # The import is here, because only this demo needs the simulated cabinets.
+        from q2r2_control.cli.fri import rehearsal
 
         with rehearsal(_FRI_CONFIG, mode, chosen, period, rt=True) as results:
             done = run_cell(with_solver(with_controls(load_config(_FRI_CONFIG)), solver), options)
@@ -311,7 +313,8 @@ def demo(
         cell = with_parts_at(with_controls(load_config(DEMO_CONFIG)), chosen, place)
         done = run_cell(with_solver(cell, solver), options)
     print_summary(done, json, verbose)
-    if unseen:  # Kernels may have been compiled for a minute since the first time.
+    # This line is printed again, because the compilation of kernels may have taken a minute since the first time.
+    if unseen:
         say(unseen)
     if not all(task.succeeded for task in done.tasks):
         raise Exit(1)

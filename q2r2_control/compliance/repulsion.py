@@ -25,14 +25,14 @@ pairs is scaled down together if sum k / m would exceed 0.25 / T^2, and the damp
 These values are a quarter of the stable bounds. That suffices for one period of delay, and for masses that are wrong by
 a factor of two. Then c > h k / 2 for every pair, as long as no more than 16 pairs are scaled down together. The only
 exception is the first hundredths of a millimetre, in which c is still rising. A pair begins to count in the sums two
-millimetres outside its kept distance, with a share that rises from 0 to 1, so that the scale does not jump. The scale
+millimetres outside its kept distance, with a weight that rises from 0 to 1, so that the scale does not jump. The scale
 only makes the wall softer. If it is below 1 (never for two iiwa 7 with the default stiffness), the elastic torque also
 lacks the part of the gradient of U that comes from the scale.
 
 **The greatest load.** d_min is the distance that a pair keeps. At rest, the wall withstands a force of k d_min or
-F_max, whichever is less. In motion, it takes up at most the energy F_max d_min for each pair, besides the share of the
-joints. Bodies that meet with more energy are slowed down, but touch. Fingers that may come within a millimetre
-therefore touch at a push of 10 N.
+F_max, whichever is less. In motion, it takes up at most the energy F_max d_min for each pair. The impedance of the
+joints takes up further energy. Bodies that meet with more energy are slowed down, but touch. Fingers that may come
+within a millimetre therefore touch at a push of 10 N.
 
 **Fingers** have the same bodies as in the controller, for the openings that the controller has accepted. With bodies
 that cover all openings, the wall would push the arms out of postures that the reference may take. If a body has grown,
@@ -73,7 +73,7 @@ _LONGEST_PERIOD = 0.002  # T [s]
 _STIFFEST = 0.25 / _LONGEST_PERIOD**2  # Largest sum k / m [1/s^2].
 _MOST_DAMPED = 0.5 / _LONGEST_PERIOD  # Largest sum c / m [1/s].
 # The shell of a pair is its kept distance. Inside the shell, the damping rises from 0 to its value over this distance.
-# Outside the shell, the share of the pair in the sums rises from 0 to 1 over the same distance [m].
+# Outside the shell, the weight of the pair in the sums rises from 0 to 1 over the same distance [m].
 _BAND = 0.002
 _IMMOBILE = 1e-9  # A pair with a smaller mobility 1 / m cannot be moved by the joints [1/kg].
 # Smoothing length of distances, relative to the sum of the radii and the kept distance. The error is at most 0.3 mm.

@@ -91,7 +91,8 @@ _DRIVER_MARGIN = 0.105
 # and T = 40 ms, the share is an eighth. A command that was late by d adds (d / T)^2 / 2. The driver also closes the
 # connection if a joint is beyond its velocity limit.
 _DRIVER_SPEED = 0.85
-# If answers catch up with a cabinet's clock, the cabinet sees 1.05 times the reference's speeds (plants.fri.answers).
+# While the times of answers catch up with a cabinet's clock, the cabinet sees up to 1.05 times the reference's speeds
+# (plants.fri.answers).
 _CABINET_SPEED = 0.95
 
 

@@ -188,7 +188,7 @@ def check_external(kind: ControllerKind, external: ExternalConfig | None, arms: 
         raise ConfigError(f"external.arms: without {', '.join(sorted(missing))}; needed: {', '.join(arms)}")
     if surplus := set(external.arms) - set(arms):
         raise ConfigError(f"external.arms.{sorted(surplus)[0]}: the cell has no such arm; allowed: {', '.join(arms)}")
-    # Two arms that share a topic would get the targets of both in turn.
+    # No two arms may have the same topic, because each arm would then get the targets of both in turn.
     topics = [external.topic(arm) for arm in external.arms]
     frames = [made.tool_frame for made in external.arms.values() if made.tool_frame is not None]
     for what, values in (("commands", topics), ("tool_frame", frames)):

@@ -101,7 +101,8 @@ _ALL = (
     Preset(
         "lbr_position",
         "the first command equals the measured positions",
-        topic="{robot}/command/lbr_joint_position_command",  # The driver resolves its topic in its node's namespace.
+        # The topic begins with {robot}, because the driver resolves its topic in its node's namespace.
+        topic="{robot}/command/lbr_joint_position_command",
         message="lbr_fri_idl/msg/LBRJointPositionCommand",
         rate=200.0,
         lowest_rate=100.0,

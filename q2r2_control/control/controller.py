@@ -131,7 +131,8 @@ class CartesianController(WatchedPairs):
         self._move = bound(move_reference, model, data, self._solution, False, self.settings.max_substep, 1.0)
         self.step({arm: self.tool_pose(arm) for arm in self._arms}, self.settings.max_substep)
         problem = self._qp.problem
-        problem.minimum = None  # At home the minimum may be the solution. The solver would then not be set up.
+        # The minimum is left out, because at home it may be the solution, and the solver would then not be set up.
+        problem.minimum = None
         self._solver.solve(problem)
 
     def reset(self, q: Array, v: Array | None = None) -> None:
@@ -206,7 +207,8 @@ class CartesianController(WatchedPairs):
         Raises:
             RobotError: If ``targets`` is not a mapping, or ``dt`` is not allowed.
         """
-        from q2r2_control.control.solvers.qpsolvers import slack_problem  # This import is slow: it loads every solver.
+        # The import is here, because the import is slow: it loads every solver.
+        from q2r2_control.control.solvers.qpsolvers import slack_problem
 
         check_kind("targets", targets, Mapping, _TARGETS, RobotError)
         if not _passes(dt) or dt > LONGEST_DT:
@@ -406,8 +408,8 @@ class CartesianController(WatchedPairs):
         summary.slack = max(summary.slack, slack)
         summary.solve_time += solution.solve_time
         was_apart, self._apart = self._apart, self._observed[-1] >= -ROUNDING
-        # The remaining part of a certified stop stays certified. Any other step was certified in this call. Its proof
-        # is complete only if all pairs kept their distance before the step.
+        # If the arms have stopped along a certified stop, its remaining part stays certified. Any other step was
+        # certified in this call, but its proof is complete only if all pairs kept their distance before the step.
         self._certified = self._apart and (self._certified if outcome == STOPPED else was_apart)
         return solved
 

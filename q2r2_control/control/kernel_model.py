@@ -47,7 +47,8 @@ def kernel_model_of(robot: Robot, settings: ControllerSettings) -> KernelModel:
     check_priority(settings.priority, tuple(robot.arms))
     kept, geometry = kept_distances(robot, settings), with_obstacle_bodies(robot, settings.moving_obstacles)
     more = len(geometry.collisionPairs) - len(kept.values)
-    min_distance = np.append(kept.values, np.full(more, -np.inf))  # No object is held, and no obstacle is known yet.
+    # These pairs do not count yet, because no object is held and no obstacle is known.
+    min_distance = np.append(kept.values, np.full(more, -np.inf))
     contact_speed = np.append(kept.contact_speed, np.full(more, np.inf))
     depth = np.append(-kept.values, np.zeros(more))
     collision = with_rounded_boxes(collision_model_of(robot, geometry), depth)

@@ -60,7 +60,8 @@ class KernelPointer:
         self.numba_type = numba_type
 
     def __reduce__(self) -> Any:
-        return pointer_to, (self.value,)  # A copy has its own address.
+        # A copied or unpickled pointer is made anew, because the copied value lies at another address.
+        return pointer_to, (self.value,)
 
 
 class KernelPointers:
@@ -75,7 +76,8 @@ class KernelPointers:
         self.numba_type = _Pointers(pointers[0].numba_type.pointee)
 
     def __reduce__(self) -> Any:
-        return pointers_to, ([pointer.value for pointer in self.pointers],)  # A copy has its own addresses.
+        # Copied or unpickled pointers are made anew, because the copied values lie at other addresses.
+        return pointers_to, ([pointer.value for pointer in self.pointers],)
 
 
 @extending.typeof_impl.register(KernelPointer)
@@ -162,7 +164,8 @@ def _words(value: Any) -> list[int]:
     if isinstance(value, tuple):
         return [word for part in value for word in _words(part)]
     if isinstance(value, np.ndarray):
-        # The owner of the pointer keeps the array. No reference is counted, and Numba's two pointers to owners are 0.
+        # The owner of the pointer keeps the array, so no reference is counted, and Numba's two pointers to owners are
+        # 0.
         owners = [0, 0]
         return [*owners, value.size, value.itemsize, value.ctypes.data, *value.shape, *value.strides]
     if isinstance(value, KernelPointer | KernelPointers):

@@ -233,9 +233,11 @@ class LiveSettings:
             self._stop_from(self._stops)
 
     def _stop_from(self, before: Array) -> None:
-        """Let the QP stop pairs at their buffer, or where they are if they are within it already.
+        """Set the distances at which the QP stops the pairs.
 
-        ``before`` (p,) are the distances at which the QP has stopped the pairs so far [m]. These distances do not fall.
+        Such a distance is the pair's kept distance plus its buffer, or less if the pair is within its buffer already.
+        ``before`` (p,) are the distances so far [m]. A new distance is smaller only if the kept distance plus buffer is
+        smaller.
         """
         wanted = self.kept + stop_buffer(self.kept, self.settings)
         least = np.maximum(before, self.kept + LEAST_BUFFER)

@@ -31,7 +31,7 @@ from q2r2_control.types import Array
 SOFTNESS = 1e-5  # If the minimum of the cost violates one row, this share of the violation remains in the solution.
 
 
-@dataclass(slots=True)  # A frozen class would cost a microsecond a tick.
+@dataclass(slots=True)  # The class is not frozen, because a frozen class would cost a microsecond a tick.
 class QpProblem:
     """The problem of one step, for nv joints.
 

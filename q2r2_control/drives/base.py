@@ -202,7 +202,8 @@ class VelocityDrive(PositionDrive):
         return Command(self.mode, q, bounded, np.zeros_like(q), grippers)
 
     def last_command(self, state: RobotState, grippers: Openings) -> Command | None:
-        # Many plants continue at the last velocity after the program that sent it has ended.
+        # The last command is the velocity 0, because many plants continue at the last velocity after the program that
+        # sent it has ended.
         zero = np.zeros_like(self._limit)
         return Command(self.mode, np.nan_to_num(state.q), zero, zero, grippers)
 

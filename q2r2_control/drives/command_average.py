@@ -56,7 +56,8 @@ class CommandAverage:
             del self._path[:oldest]
         self.settled = all((sample[0] == q).all() for sample in samples)
         if self.settled:
-            return q, v  # By rounding, the mean of equal numbers may differ from them.
+            # The reference itself is returned, because by rounding the mean of equal numbers may differ from them.
+            return q, v
         mean_q, mean_v = (np.mean([sample[i] for sample in samples], axis=0) for i in (0, 1))
         return mean_q, mean_v
 

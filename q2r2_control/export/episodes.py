@@ -265,14 +265,16 @@ def _keep(job: _Job) -> tuple[str | None, str | None]:
         episode = make_episode(job.file, job.sampling, job.span)
     except (RecordingError, *BROKEN) as error:
         return None, _reason(error, job)
-    # If a worker loses its scheduler, another machine gets the same episode, and both may write it at the same time.
+    # The name contains machine and process. If a worker loses its scheduler, another machine gets the same episode, and
+    # both may write it at the same time.
     unfinished = target.with_name(f"{target.name}.unfinished-{platform.node()}-{os.getpid()}")
     try:
         job.write(episode, unfinished)
         for path in (unfinished, *unfinished.rglob("*")):
             if path.is_file():
                 with path.open("rb") as stream:
-                    os.fsync(stream.fileno())  # After a power failure, no episode under its name is incomplete.
+                    # Thus no episode under its final name is incomplete after a power failure.
+                    os.fsync(stream.fileno())
         if not target.exists():
             unfinished.replace(target)
     except RecordingError as error:  # Pictures are read from the recording only while they are written to the dataset.

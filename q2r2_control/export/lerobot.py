@@ -76,7 +76,8 @@ def write_shard(episode: EpisodeVectors, folder: Path) -> None:
         values: dict[str, Any] = {name: rows[frame] for name, rows in (episode.vectors | outcome).items()}
         values |= {name: next(shown) for name, shown in pictures.items()}
         dataset.add_frame({**values, "task": episode.task})
-    dataset.save_episode(parallel_encoding=False)  # The export already uses several processes.
+    # Parallel encoding is not needed, because the export already uses several processes.
+    dataset.save_episode(parallel_encoding=False)
     dataset.finalize()
     (folder / SOURCES).write_text(json.dumps([source_of(episode)]), encoding="utf-8")
     write_subtasks(episode, folder)

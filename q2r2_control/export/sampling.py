@@ -62,7 +62,7 @@ def sample(recording: Recording, fps: int, trim: bool = False, span: EpisodeSpan
     - ``reference_tool``, ``target`` (n, arms, 7): the tool pose at the reference, and the operator's target, as
       x y z [m] qx qy qz qw in the world. Without a target of the operator, ``target`` is ``reference_tool``.
     - ``intervention`` (n, arms): 1 where a hand moves the arm instead of a policy, otherwise 0.
-    - ``time``, ``stamp`` (n,): the time since t_0 [s], and the time of day [ns].
+    - ``time``, ``stamp`` (n,): the time since t_0 [s], and the Unix time [ns].
 
     Raises :class:`RecordingError` if the file is damaged, if it has no usable tick, if ticks were lost for longer than
     a frame, or if a clock was set in the ``span``.
@@ -270,7 +270,7 @@ class CameraFrames:
     recording: Recording
     name: str
     config: CameraConfig
-    stamps: Sequence[int]  # Ascending times of day of the frames [ns].
+    stamps: Sequence[int]  # Ascending Unix times of the frames [ns].
     is_depth: bool = False
 
     @property

@@ -121,7 +121,8 @@ def watch_headset(
     missing = tuple(last_data)
     while True:
         now = time.monotonic()
-        ends = stopping() or (duration is not None and now - start >= duration)  # Decided before the last poll.
+        # The end is decided before the last poll, so that this poll takes all data up to the end.
+        ends = stopping() or (duration is not None and now - start >= duration)
         for sample in server.poll(now):
             hands[sample.hand].add(sample)
             watch.add(sample)
@@ -132,7 +133,7 @@ def watch_headset(
         missing = tuple(name for name in missing if name not in statistics.topics)
         silent = tuple(name for name, last in last_data.items() if now - last > SILENCE)
         if ends and not silent:
-            silent = missing  # There is no time left to wait for these topics.
+            silent = missing  # Missing topics then count as silent, because there is no time left to wait for them.
         nothing_comes = len(silent) == len(last_data)
         warning = watch.warning(now)
         check = HeadsetCheck(

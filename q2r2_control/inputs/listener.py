@@ -115,11 +115,12 @@ class TcpListener:
     def __init__(self, host: str, port: int, log: HostLog) -> None:
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         both = family == socket.AF_INET6 and socket.has_dualstack_ipv6()
-        self._socket = socket.create_server((host, port), family=family, dualstack_ipv6=both)  # It sets SO_REUSEADDR.
+        # The option SO_REUSEADDR is set by create_server itself.
+        self._socket = socket.create_server((host, port), family=family, dualstack_ipv6=both)
         self._socket.setblocking(False)
         self.port = int(self._socket.getsockname()[1])  # The port that was bound.
         self.log = log
-        self.accepts = RateLimit(ACCEPTS, ACCEPTS_PERIOD)  # While it is not open, no connection is accepted.
+        self.accepts = RateLimit(ACCEPTS, ACCEPTS_PERIOD)  # While this limit is reached, no connection is accepted.
         self._answers: dict[str, RateLimit] = {}
         self._answers_since = -math.inf
 

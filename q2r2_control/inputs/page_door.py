@@ -23,7 +23,8 @@ _PORT = re.compile(r":\d{1,5}$")
 def text_response(status: http.HTTPStatus, text: str, kind: str = "text/plain") -> Response:
     body = text.encode()
     headers = Headers({"Content-Type": f"{kind}; charset=utf-8", "Content-Length": str(len(body))})
-    headers["X-Frame-Options"] = "DENY"  # A foreign page that contains this page could steal a click.
+    # No page may contain this one, because a foreign page could then steal a click.
+    headers["X-Frame-Options"] = "DENY"
     return Response(status.value, status.phrase, headers, body)
 
 
@@ -31,7 +32,8 @@ def protect(response: Response, policy: str) -> None:
     """Add the headers of a page: its content security ``policy``, no caching, and no referrer for other sites."""
     response.headers["Content-Security-Policy"] = policy
     response.headers["Cache-Control"] = "no-store"
-    response.headers["Referrer-Policy"] = "no-referrer"  # The page's URL contains the token.
+    # No other site gets the page's URL, because it contains the token.
+    response.headers["Referrer-Policy"] = "no-referrer"
 
 
 def tls_context(certificate: str | None) -> ssl.SSLContext | None:

@@ -250,7 +250,8 @@ def timing_figures(episode: Episode) -> TimingFigures:
     if not count:
         return TimingFigures(0, 0, None, 0.0, 0, 0, None, None, None, episode.ended, 0, 0.0, False)
     period = 1.0 / episode.config.nominal_rate_hz
-    lost = np.diff(ticks.number, prepend=-1) - 1  # The first tick of a run has number 0.
+    # The first tick of a run has number 0, so a tick -1 is assumed before it.
+    lost = np.diff(ticks.number, prepend=-1) - 1
     gaps = np.diff(ticks.t, prepend=0.0) - ticks.dt
     steps = clock_steps(ticks.number, ticks.t, ticks.dt)
     missed = int(np.maximum(np.round(ticks.dt / period) - 1, 0).sum())

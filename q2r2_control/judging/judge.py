@@ -250,7 +250,7 @@ def discarded_episodes(file: Path, pictures: bool) -> dict[int, str]:
     return _discarded(file, pictures, file.absolute(), changed)
 
 
-@lru_cache(maxsize=1)  # The episodes of one file are requested one after the other.
+@lru_cache(maxsize=1)  # One result is enough, because the episodes of one file are requested one after the other.
 def _discarded(file: Path, pictures: bool, absolute: Path, changed: int) -> dict[int, str]:
     """Return the result of :func:`discarded_episodes`.
 

@@ -71,7 +71,7 @@ def _velocity_mismatch(t: Array, q: Array, v: Array) -> float | None:
 
     The result is None if no velocity is measured, or if no joint moves.
     """
-    if len(t) < 3 or not np.nan_to_num(v).any():  # Velocities are not measured.
+    if len(t) < 3 or not np.nan_to_num(v).any():  # All numbers are 0 or NaN if velocities are not measured.
         return None
     slope, measured = (q[2:] - q[:-2]) / np.maximum(t[2:] - t[:-2], 1e-9)[:, None], v[1:-1]
     usable = np.isfinite(slope).all(axis=1) & np.isfinite(measured).all(axis=1) & (t[2:] - t[:-2] < _LONGEST_GAP)

@@ -45,7 +45,8 @@ def measure_kill(config: Config, posture: Callable[[], Array], led: float = LED)
     process = HelperProcess("leads the arms", __name__, moments.append)
     process.send(config)
     try:
-        # After a late loop, an arm may move up too slowly for a measurement of its stop.
+        # The kill waits until the arms move up. After a late loop, an arm may move up too slowly for a measurement of
+        # its stop.
         while _led(moments) < led or not _goes_up(robot, moments[-1]):
             if not process.alive:
                 raise PlantError(process.fault or "the arms did not follow the hands")
@@ -58,7 +59,8 @@ def measure_kill(config: Config, posture: Callable[[], Array], led: float = LED)
             raise PlantError(f"a run that was killed still holds the cabinets' ports after {_PATIENCE:g} s")
         time.sleep(_LOOKS)
     took = time.monotonic() - killed
-    # Arms that waited for each other may have begun to brake just before the process was killed.
+    # Arms that waited for each other may have begun to brake just before the process was killed. The stop is therefore
+    # measured from the last moment at which they moved up.
     last, rest = next(moment for moment in reversed(moments) if _goes_up(robot, moment)), posture()
     reports = [stop_report(robot, arm, "program killed", last, last.q, rest, took) for arm in robot.arms]
     return [replace(report, allowed_s=report.allowed_s + _FREEING) for report in reports]

@@ -134,7 +134,8 @@ class OperatorSide:
             pulses.grasps(self._grips[arm].look(commanded, opening, tick.now))
 
     def _fulfil(self, now: float) -> None:
-        for _ in range(len(self._requests)):  # Requests that come meanwhile wait for the next tick.
+        # Only the requests that are there now count. Requests that come meanwhile wait for the next tick.
+        for _ in range(len(self._requests)):
             request = self._requests.popleft()
             if isinstance(request, TeleopSettings):
                 request = change_of(self._teleop.settings, request)

@@ -108,7 +108,8 @@ class Pipeline(RequestedRun):
         check_kind("plant", plant, Plant, "an object with all methods of Plant")
         config.teleop.bindings.check_device(input.controls)
         self.config, self.robot, self.input, self.plant = config, robot, input, plant
-        # A session has one mode: if torques are not safe, its arms cannot change to position commands.
+        # Arms of a session do not count. If torques are not safe, they cannot change to position commands, because a
+        # session has one mode.
         has_servos = CommandMode.POSITION in plant.modes and not isinstance(plant, SessionPlant)
         self.drive = make_drive(check_mode(mode, plant), robot, config, has_servos)
         if config.control.jerk_limit is not None and not keeps_jerk_limit(plant, self.drive.mode):
@@ -272,7 +273,8 @@ class Pipeline(RequestedRun):
         """
         if self.config.loop_rate_hz != AUTO or isinstance(self.plant, SessionPlant):
             return None
-        listeners, self.listeners = self.listeners, []  # These ticks are not part of the run.
+        # The listeners do not get these ticks, which are not part of the run.
+        listeners, self.listeners = self.listeners, []
         try:
             for rate in FITTING_RATES_HZ:
                 self.config = self.config.model_copy(update={"loop_rate_hz": rate})
@@ -332,7 +334,7 @@ class Pipeline(RequestedRun):
         self._turns = TurnCounter(self.robot)
         self._turns.counted(self._state.q, self._clock.now)
         self.controller.pass_time(self._clock.since(self._ticked))
-        # If the first tick is late, the reports age more.
+        # The reports are aged up to the time at which the first tick is due. If that tick is late, they age more.
         self.loop.age_obstacles(self._clock.now + self._clock.period)
         self._start = RunStart(self._clock.now, self._state)
         self._plant_clock = PlantClock(self._state)

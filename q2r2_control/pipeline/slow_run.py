@@ -203,7 +203,7 @@ class SlowRun:
         )
         self._newest = moment
         if self._moments is not None:
-            # The session may be back before the main thread notices its loss.
+            # The fault is stored, because the session may be back before the main thread notices its loss.
             if self._phase is not Phase.ACTIVE and self._lost is None:
                 self._lost = self._pipeline.supervisor.fault
             self._moments.append(moment)

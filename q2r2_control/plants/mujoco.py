@@ -128,7 +128,8 @@ class MujocoPlant:
             self._torque = command.tau.copy()
         else:
             if self._torque is not None:
-                # After torque mode there is no last commanded posture from which the reference could start.
+                # After torque mode, there is no last commanded posture from which the reference could start. It starts
+                # at the new command, or at the measured posture if a velocity is commanded.
                 self._end = self._at_rest(command.q if self._velocity is None else self._qpos[self._q_index])
                 self._next = self._torque = None
             if self._velocity is None:
@@ -148,7 +149,8 @@ class MujocoPlant:
         if self._velocity is not None:
             self._next, self._velocity = (self._end[0] + dt * self._velocity, self._velocity), None
         if self._next is None:
-            self._start = self._end = self._at_rest(self._end[0])  # A commanded velocity ends with its tick.
+            # Without a new command, the arms stop, because a commanded velocity ends with its tick.
+            self._start = self._end = self._at_rest(self._end[0])
         else:
             self._start, self._end, self._next = self._end, self._next, None
         self._grippers.advance(dt)
@@ -157,7 +159,7 @@ class MujocoPlant:
         self._acceleration[self._v_index] = (self._end[1] - self._start[1]) / max(dt, self._timestep)
         due = math.floor(self._clock / self._timestep + _STEP_ROUNDING)
         while self._steps < due:
-            # A step may begin before the tick in which it ends.
+            # A step may begin before the tick in which it ends. It then counts from the start of the tick.
             self._step(max(self._steps * self._timestep - start, 0.0) / dt)
         if not math.isfinite(self._qvel.dot(self._qvel)):
             raise PlantError(f"the simulation diverged at {self._clock:.3f} s; reset it")
@@ -175,7 +177,8 @@ class MujocoPlant:
 
     def picture_of(self, camera: str) -> Callable[[], npt.NDArray[np.uint8]]:
         """See :meth:`PicturedPlant.picture_of`."""
-        return partial(self._pictures.take, camera, self.observed_qpos)  # Each ``state`` makes a new array.
+        # The array does not change later, because each ``state`` makes a new one.
+        return partial(self._pictures.take, camera, self.observed_qpos)
 
     def gripper_openings(self) -> dict[str, float]:
         return {side: fingers.opening(self._qpos) for side, fingers in self._fingers.items()}

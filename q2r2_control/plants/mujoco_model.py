@@ -217,7 +217,7 @@ def _set_grippers(spec: mujoco.MjSpec, robot: Robot, config: Config) -> None:
             for geom in spec.joint(name).parent.geoms:
                 geom.condim, geom.friction, geom.solref = 4, _PAD_FRICTION, _PAD_STIFFNESS
                 geom.priority = PAD_PRIORITY
-        # The joint limits already keep the fingers apart.
+        # Contacts between fingers are left out, because the joint limits already keep the fingers apart.
         for first, second in combinations(moved, 2):
             _exclude(spec, spec.joint(first).parent.name, spec.joint(second).parent.name)
 
@@ -237,7 +237,8 @@ def _exclude_contacts(spec: mujoco.MjSpec, robot: Robot) -> None:
         if frozenset((first, second)) not in watched:
             _exclude(spec, first, second)
     for name in robot.joint_names:
-        # MuJoCo leaves out contacts of a body with its parent only if that parent can move.
+        # MuJoCo itself leaves out contacts of a body with its parent only if that parent can move. The others are left
+        # out here, unless they are watched.
         link = spec.joint(name).parent
         if frozenset((link.parent.name, link.name)) not in watched:
             _exclude(spec, link.parent.name, link.name)
@@ -267,7 +268,7 @@ def _add_objects(spec: mujoco.MjSpec, config: MujocoConfig) -> None:
                 condim=4,
                 friction=(thing.friction, TORSION, ROLLING),
             )
-            # Parts that slide into each other are hard. With MuJoCo's usual contacts, light parts would sink in by
-            # millimetres.
+            # Slippery parts, which slide into each other, get hard contacts. With MuJoCo's usual contacts, light parts
+            # would sink in by millimetres.
             if thing.friction < _PAD_FRICTION[0]:
                 geom.solref = _PAD_STIFFNESS

@@ -144,7 +144,7 @@ def let_objects_yield(spec: mujoco.MjSpec, config: Config) -> None:
 
 
 def _add_pair(spec: mujoco.MjSpec, one: mujoco.MjsGeom, other: mujoco.MjsGeom, friction: float) -> mujoco.MjsPair:
-    for shape in (one, other):  # A pair refers to its shapes by their names.
+    for shape in (one, other):  # Both shapes need a name, because a pair refers to its shapes by their names.
         number = next(i for i, geom in enumerate(shape.parent.geoms) if geom == shape)
         shape.name = shape.name or f"{shape.parent.name}_shape_{number}"
     pair = spec.add_pair(geomname1=one.name, geomname2=other.name)

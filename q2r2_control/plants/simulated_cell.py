@@ -97,7 +97,8 @@ class SimulatedCell:
         self.dropped = 0.0  # Total time that the simulation fell behind, or waited for torques [s].
         self._hold_after, self._max_jump = hold_after, max_jump
         self._columns = {name: index for index, name in enumerate(robot.joint_names)}
-        self._select = lru_cache(maxsize=16)(self._find)  # Senders name the same joints again and again.
+        # Results are kept, because senders name the same joints again and again.
+        self._select = lru_cache(maxsize=16)(self._find)
         self._timestep = config.mujoco.timestep
         self._follower = JointFollower(
             robot.home, robot.capped_acceleration(config.control.acceleration_limit), robot.velocity_limit

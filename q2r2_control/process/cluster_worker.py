@@ -41,7 +41,7 @@ class Call:
             raise ConfigError(f"worker on {platform.node()}: {fault}")
         if self.needs.folder is None:
             return platform.node(), self.work(self.job)
-        with chdir(self.needs.folder):  # The worker has a single thread for jobs.
+        with chdir(self.needs.folder):  # This disturbs no other job, because the worker has a single thread for jobs.
             return platform.node(), self.work(self.job)
 
 

@@ -186,7 +186,7 @@ def start_python(
         stderr=subprocess.DEVNULL,
         env=environment | os.environ | paths,
         pass_fds=files,
-        process_group=0,  # Ctrl-C of a terminal is only for the run.
+        process_group=0,  # In its own group, the process does not get Ctrl-C of a terminal, which is only for the run.
     )
 
 
@@ -203,7 +203,7 @@ def run_helper(module: str) -> None:
     """
     leave_signals_to_the_run()
     stream, sys.stdout = sys.stdout.buffer, sys.stderr  # What a library prints must not be taken for an answer.
-    lock = Lock()  # Several threads may send answers.
+    lock = Lock()  # Answers are sent one after the other, although several threads may send them.
 
     def answer(content: Any) -> None:
         with lock, suppress(BrokenPipeError):  # The run was killed.

@@ -90,7 +90,8 @@ class Processes:
                 " with what is made"
             ) from error
         except (KeyboardInterrupt, GeneratorExit):
-            for process in set(active_children()).difference(others):  # A job may take minutes.
+            # The processes are killed, because a job may take minutes.
+            for process in set(active_children()).difference(others):
                 process.kill()
             raise
         finally:
@@ -102,7 +103,8 @@ def chosen_place(workers: int, cluster: str | None) -> JobPlace:
     if cluster is not None:
         if workers != 1:
             raise ConfigError("--workers cannot be used with --cluster, whose scheduler has the workers")
-        from q2r2_control.process.cluster import Cluster  # Work on this computer needs no cluster.
+        # The import is here, because work on this computer needs no cluster.
+        from q2r2_control.process.cluster import Cluster
 
         return Cluster(cluster)
     return HERE if workers == 1 else Processes(workers)

@@ -95,7 +95,7 @@ def _lock_memory() -> str | None:
     """Lock the memory; returns why this is not possible, or None."""
     if sys.platform != "linux":
         return "memory is not locked: only done on Linux"
-    import resource  # Not every system has this module.
+    import resource  # The import is here, because not every system has this module.
 
     # If the size of locked memory is limited, the flag _FUTURE would let later requests for memory fail during the run.
     # Without this flag, such memory is merely not locked.
@@ -138,7 +138,8 @@ def new_folder(parent: Path, name: str, what: str) -> Path:
             folder.mkdir(parents=True)
             return folder
         except OSError as error:
-            if not (isinstance(error, FileExistsError) and folder.exists()):  # A parent may be a file.
+            # Any other error is final, for example if a parent is a file.
+            if not (isinstance(error, FileExistsError) and folder.exists()):
                 raise ConfigError(f"{what} {folder}: {error.strerror}") from error
     raise ConfigError(f"{what} {parent / name}: exists, and so do 98 numbered ones")
 

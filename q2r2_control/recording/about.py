@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from q2r2_control.config.yaml_text import read_yaml, yaml_of
 from q2r2_control.recording.messages import Topic, run_topics
 
-if TYPE_CHECKING:  # The process of the writer does not import these modules.
+if TYPE_CHECKING:  # These modules are not imported at run time, because the process of the writer does not need them.
     from q2r2_control.config.cell import Config
     from q2r2_control.pipeline.pipeline import Pipeline
     from q2r2_control.robot.robot import Robot
@@ -38,7 +38,7 @@ class About:
     joints: tuple[str, ...]
     mode: str  # The command mode in which the pipeline drives the plant.
     plant_modes: tuple[str, ...]  # All command modes that the plant can follow.
-    epoch: int  # The time of day at which the run began [ns].
+    epoch: int  # The Unix time at which the run began [ns].
     realtime: bool
     cell: str  # The YAML of the cell, with all default values written out.
     robot: str  # The URDF of the robot.

@@ -50,7 +50,7 @@ class PictureRequest(NamedTuple):
     """A request for one picture of each of some cameras, at one tick."""
 
     number: int  # The number of the tick.
-    time: int  # The time of day [ns].
+    time: int  # The Unix time [ns].
     cameras: list[str]
     qpos: bytes  # The model's qpos as float64: the positions of all joints and loose bodies.
 

@@ -17,7 +17,7 @@ class DeviceMessages:
 
     streams: CameraStreams
     channels: Mapping[str, int]  # By topic, the channel of its messages.
-    day: Callable[[float], int]  # Converts a time [s] to the time of day [ns].
+    day: Callable[[float], int]  # Converts a time [s] to the Unix time [ns].
     begin: float  # Time at which the recording begins [s].
     _watches: dict[str, CameraWatch] = field(init=False)
     _numbers: dict[str, int] = field(init=False)  # By camera, the number of pictures so far.
@@ -30,9 +30,8 @@ class DeviceMessages:
     def take(self, now: float) -> tuple[list[Message], list[Reason]]:
         """Return the messages of all pictures since the last call, and the events of cameras, such as a stop.
 
-        In a message, ``sent`` is the time of day at which its picture was captured. ``time`` is the time of day at
-        which the picture was received, and for depth it is ``now`` [s]. The file's messages are in the order of
-        ``time``.
+        In a message, ``sent`` is the Unix time at which its picture was captured. ``time`` is the Unix time at which
+        the picture was received, and for depth it is ``now`` [s]. The file's messages are in the order of ``time``.
         """
         messages, reasons = [], []
         for name, stream in self.streams.streams.items():

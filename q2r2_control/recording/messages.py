@@ -200,8 +200,8 @@ def is_reliable(topic: Topic) -> bool:
 class Message(NamedTuple):
     channel: int
     number: int  # The number of the message's tick, or the sequence number that the sender gave the message.
-    time: int  # The time of day at which it was received, or of the tick to which it belongs [ns].
-    sent: int  # The time of day at which it was sent, by the sender's clock [ns].
+    time: int  # The Unix time at which it was received, or of the tick to which it belongs [ns].
+    sent: int  # The Unix time at which it was sent, by the sender's clock [ns].
     payload: bytes  # The message in CDR.
 
     @property
@@ -214,7 +214,7 @@ class CodedPicture(NamedTuple):
 
     channel: int
     number: int  # The number of the newest tick when the picture was captured.
-    time: int  # The time of day at which the picture was captured [ns].
+    time: int  # The Unix time at which the picture was captured [ns].
     camera: str
     data: bytes
     coding: str = JPEG

@@ -48,7 +48,7 @@ BROKEN = (
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    # The time of day at which the picture was captured, or was received if a ROS node sent it [ns].
+    # The Unix time at which the picture was captured, or was received if a ROS node sent it [ns].
     time: int
     tick: int  # The number of the newest tick at that time. In a recording of ROS nodes, it is a sequence number.
     jpeg: bytes  # The picture as a JPEG file; a picture of depth is a PNG file with 16 bits for each pixel.
@@ -71,7 +71,7 @@ class Recording:
         self.file = files[0]
         self._mcap = McapFile(self.file)
         self.about = self._read_about()
-        self.since = 0  # Chunks of the file that end before this time of day are left out [ns].
+        self.since = 0  # Chunks of the file that end before this Unix time are left out [ns].
 
     def chunks(self) -> Iterator[TickChunk]:
         """Yield all ticks, in groups that follow each other. Ticks that were lost are missing."""
@@ -126,7 +126,7 @@ class Recording:
         return picture_topic(camera)
 
     def _time_of(self, picture: Message) -> int:
-        """Return the time of day at which a picture was captured [ns]."""
+        """Return the Unix time at which a picture was captured [ns]."""
         return picture.time
 
     @cached_property

@@ -165,7 +165,7 @@ def check_tools(positions: Array, tools: Array, robot: Robot) -> None:
     (arms, 7), x y z [m] qx qy qz qw in the world.
     """
     (found,) = tool_poses(positions[None], robot)
-    # A quaternion and its negative are the same rotation.
+    # A quaternion and its negative are the same rotation, so the nearer one of both is compared.
     near = np.minimum(np.abs(found - tools), np.abs(found + tools))[:, 3:].max() < _SAME_POSE
     if not near or np.abs(found - tools)[:, :3].max() > _SAME_POSE:
         raise RecordingError("the robot that its cell names now is not the recorded one: tools are elsewhere")

@@ -30,7 +30,7 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.tick import Tick
 from q2r2_control.teleop.reasons import TeleopReason
 
-if TYPE_CHECKING:  # The ROS node does not import MuJoCo.
+if TYPE_CHECKING:  # The module is not imported at run time, because the ROS node does not need MuJoCo.
     from q2r2_control.plants.mujoco import MujocoPlant
 
 PATIENCE = 10.0  # Time to wait for a disk that hangs at the end of a run [s].
@@ -77,7 +77,7 @@ class BaseRecorder:
         if self.writer is None:
             return False
         try:
-            # The name begins with the time of day. Recordings that are sorted by name are then in the order of time.
+            # The name begins with the date and time. Recordings that are sorted by name are then in the order of time.
             when = datetime.fromtimestamp(about.epoch * 1e-9)
             folder = new_folder(self._parent, f"{when:%Y%m%d-%H%M%S}-{self._name}", "--record")
         except (ConfigError, OSError) as error:
@@ -143,7 +143,7 @@ class MessageRecorder(BaseRecorder):
     def __init__(self, parent: Path, name: str, room: int = ROOM) -> None:
         super().__init__(parent, name, room)
         self.count = self.overflows = 0  # The number of all messages, and of the lost messages.
-        self._last = 0  # The time of day of the newest message [ns].
+        self._last = 0  # The Unix time of the newest message [ns].
         self._begun = False
 
     def begin(self, about: About, topics: tuple[Topic, ...]) -> None:
@@ -203,7 +203,7 @@ class Recorder(BaseRecorder, AbstractContextManager["Recorder"]):
 
         Args:
             parent: The folder in which the recording gets a folder of its own.
-            name: The last part of the names of that folder and of the file. The first part is the time of day.
+            name: The last part of the names of that folder and of the file. The first part is the date and time.
             waits: What happens if the data that waits to be written is larger than ``room``. If True, the run waits, as
                 it may in simulated time. If False, ticks are lost and counted.
             room: The size of the data that may wait to be written [bytes].

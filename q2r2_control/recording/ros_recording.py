@@ -95,7 +95,7 @@ class RosRecording(Recording):
 class _Tick:
     """A tick of the controller whose reference has not been found yet."""
 
-    time: int  # The time of day at which the tick's message was received [ns].
+    time: int  # The Unix time at which the tick's message was received [ns].
     now: float  # The time of the tick by the controller's clock [s].
     row: Rows  # (1,), filled with the numbers that were known when the tick was received.
     samples: list[Array]  # The samples that were received since the last tick, each with the numbers of SAMPLE_FIELDS.
@@ -177,7 +177,8 @@ class RosTicks:
         self._flags[place] = message.data
 
     def _on_event(self, message: Any, time: int) -> None:
-        told = json.loads(message.data) | {"t": (time - self._epoch) / NANOSECONDS}  # The sender has another clock.
+        # The time of receipt replaces the sender's time, because the sender has another clock.
+        told = json.loads(message.data) | {"t": (time - self._epoch) / NANOSECONDS}
         self._events.append(Event.from_json(told))
 
     def _on_hand(self, side: int, message: Any, time: int) -> None:

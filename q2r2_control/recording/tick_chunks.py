@@ -23,7 +23,7 @@ class TickChunk:
     """A group of n ticks that follow each other; n may be 0."""
 
     rows: Rows  # (n,) Rows with the dtype that tick_type returns.
-    times: npt.NDArray[np.int64]  # (n,) The times of day [ns].
+    times: npt.NDArray[np.int64]  # (n,) The Unix times [ns].
     samples: Array  # (m, len(SAMPLE_FIELDS)) The m samples that the n ticks took.
     states: dict[int, str]  # By the number of a tick, its state as JSON.
 

@@ -18,7 +18,8 @@ import pinocchio as pin
 
 from q2r2_control.types import POSE_FIELDS, QUEST_CONTROLS, SIDES, Array, CommandMode, HandFault, HandSample, StepStatus
 
-if TYPE_CHECKING:  # The process of the writer does not import the modules of the loop.
+# The module is not imported at run time, because the process of the writer does not need the modules of the loop.
+if TYPE_CHECKING:
     from q2r2_control.summary.tick import Tick
 
 Rows = npt.NDArray[np.void]

@@ -68,7 +68,7 @@ class RecordedRobot:
 class TickEncoder:
     """Makes messages from ticks, in the order of the ticks.
 
-    ``epoch`` [ns] is the time of day at which the run began.
+    ``epoch`` [ns] is the Unix time at which the run began.
     """
 
     def __init__(
@@ -141,7 +141,7 @@ class TickEncoder:
         return np.flatnonzero(np.diff(newest) > 0.0)
 
     def _times(self, seconds: Array) -> npt.NDArray[np.int64]:
-        """Convert times of the loop's clock [s] to times of day [ns].
+        """Convert times of the loop's clock [s] to Unix times [ns].
 
         NaN becomes the start of the run. Times that do not fit into a stamp become the nearest time that does.
         """
@@ -176,7 +176,7 @@ class TickEncoder:
 
 
 class _Batch:
-    """The messages of successive ticks. ``numbers`` and ``times`` are the ticks' numbers and times of day [ns]."""
+    """The messages of successive ticks. ``numbers`` and ``times`` are the ticks' numbers and Unix times [ns]."""
 
     def __init__(self, topics: dict[str, Topic], numbers: npt.NDArray[np.int64], times: npt.NDArray[np.int64]) -> None:
         self._topics, self._numbers, self.times = topics, numbers.tolist(), times

@@ -50,7 +50,7 @@ def default_tip(tree: LinkTree, gripper_joints: Collection[str], key: str) -> st
 def arm_ends(tree: LinkTree) -> list[str]:
     """Return the last link of each chain that is long enough for an arm."""
     ends, links = [], [tree.root]
-    for link in links:  # The list grows in the loop.
+    for link in links:  # The loop also visits the links that it adds to the list.
         onwards = [joint_end(joint, "child") for joint in _onwards(tree, link, ())]
         links += onwards
         ends += [link] if not onwards and len(tree.chain(link)) >= _LEAST_JOINTS else []
@@ -81,7 +81,7 @@ def end_of(tree: LinkTree, link: str, key: str) -> str:
     """
 
     def is_side_branch(end: str) -> bool:
-        # A fixed joint with a <mimic> belongs to a gripper that is not used.
+        # A fixed joint with a <mimic> belongs to a gripper that is not used, so it begins a side branch.
         beyond = tree.path(end)[len(tree.path(link)) :]
         return any(_SIDE_BRANCH.search(name) or tree.joint_to[name].find("mimic") is not None for name in beyond)
 

@@ -54,7 +54,7 @@ class Model:
         self.exclusions = [] if description.srdf is None else [*description.srdf]
 
     def name_in_cell(self, name: str) -> str:
-        # The root link of the cell already has the name WORLD.
+        # The root link of the cell already has the name WORLD, so a link with this name gets another one.
         return f"robot_{name}" if not self.prefix and name == WORLD else self.prefix + name
 
     def urdf(self, mount: PoseConfig) -> list[ET.Element]:

@@ -15,7 +15,8 @@ class CoalDistances:
         self.model, self.geometry = model, geometry
         self.data: pin.Data = model.createData()
         self.geometry_data: pin.GeometryData = geometry.createData()
-        # Pinocchio keeps these results in place. To look each of them up again would take longer than to measure.
+        # This list is made once, because looking up each result again would take longer than measuring. Pinocchio keeps
+        # the results in place.
         self._results = list(self.geometry_data.distanceResults)
 
     def at(self, q: Array) -> Array:

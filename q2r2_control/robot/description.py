@@ -134,7 +134,8 @@ def parse_urdf(
     Raises:
         RobotError: If the text cannot be used.
     """
-    root = parse_srdf(text, where)  # URDF and SRDF begin in the same way.
+    # A URDF may be parsed by this function too, because both formats begin in the same way.
+    root = parse_srdf(text, where)
     _check_numbers(root, where)
     unify(root, where)
     # If the parser ignored a shape, the distance from this body to others would not be kept.
@@ -206,7 +207,7 @@ class LinkTree:
     def fixed_to(self, link: str) -> list[str]:
         """Return ``link`` and all links that are fixed to it."""
         found = [link]
-        for carrier in found:  # The list grows in the loop.
+        for carrier in found:  # The loop also visits the links that it adds to the list.
             found += [
                 child
                 for child, joint in self.joint_to.items()

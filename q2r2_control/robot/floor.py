@@ -111,7 +111,8 @@ def _lowest(model: pin.Model, data: pin.Data, item: pin.GeometryObject) -> float
     reach += getattr(item.geometry, "halfLength", 0.0)
     for joint in list(model.supports[item.parentJoint])[1:]:
         index = model.joints[joint].idx_v
-        # The Jacobian of the joint's origin. Pinocchio's binding drops the column dimension of a model with one joint.
+        # The Jacobian of the joint's origin. It is reshaped, because Pinocchio's binding drops the column dimension of
+        # a model with one joint.
         twist = np.reshape(pin.getJointJacobian(model, data, joint, world_axes), (6, model.nv))[:, index]
         slides = np.linalg.norm(twist[:3]) > 0.5
         if height is None:

@@ -85,7 +85,7 @@ def narrow_limits(joints: Collection[ET.Element], where: str = "") -> None:
             continue
         first, last = sorted((end - follower.offset) / follower.multiplier for end in (lower, upper))
         low, high = max(least, first), min(most, last)
-        mirrored = not low < high  # The follower's limits have the wrong sign.
+        mirrored = not low < high  # If no position is left, the follower's limits may have the wrong sign.
         if mirrored:
             first, last = sorted((-end - follower.offset) / follower.multiplier for end in (lower, upper))
             low, high = max(least, first), min(most, last)

@@ -110,7 +110,7 @@ class _HomeSearch:
         below = [FLOOR in map(link_of, pair) and bool(last & {*pair}) for pair in pair_names(robot.collision_model)]
         self._rooms = (counts, _ROOM), (np.array(below, bool), _BELOW)
         self._reach = 1.0  # [m]
-        # In most arms the first joint turns the arm and the second one lifts it. The shoulder is at the second joint.
+        # In most arms, the first joint turns the arm and the second one lifts it, so the shoulder is taken to be there.
         self._shoulder = int(self._joints[min(1, len(self._joints) - 1)]) + 1
 
     def best(self, random: np.random.Generator) -> Array:

@@ -117,7 +117,7 @@ def _tool_of(robot: Robot, arm: str) -> tuple[pin.SE3, pin.Inertia]:
         and role.part in (LinkClass.TOOL, LinkClass.FINGER)
         and arm in role.arms
     ]
-    # Pinocchio keeps the inertia of a link in the frame of the fixed joint before it.
+    # These frames are needed, because Pinocchio keeps the inertia of a link in the frame of the fixed joint before it.
     mounts = [frames[frame.parentFrame] for frame in carried]
     names = {frame.name for frame in carried}
     bases = [frames[mount.parentFrame] for mount in mounts if frames[mount.parentFrame].name not in names]

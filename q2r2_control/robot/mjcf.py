@@ -43,7 +43,7 @@ def urdf_of_mjcf(file: Path, folder: Path, velocity: float) -> ET.Element:
         if (kind := ET.parse(file).getroot().tag) != "mujoco":
             raise RobotError(f"{file}: the root element is <{kind}>; an MJCF starts with <mujoco>")
         spec = mujoco.MjSpec.from_file(str(file.resolve()))
-        spec.compiler.fusestatic = False  # The base stays one of the robot's links.
+        spec.compiler.fusestatic = False  # With this value, the base stays one of the robot's links.
         model = spec.compile()
     except (ValueError, OSError, ET.ParseError) as error:
         raise RobotError(f"{file}: MuJoCo cannot read it: {' '.join(str(error).split())}") from error
@@ -79,7 +79,7 @@ class _Writer:
             raise RobotError("no joint that turns or slides")
         if len(roots) > 1 or self._joints(next(iter(roots))):
             self._add_link(0, self._new_name("mjcf_world"), pin.SE3.Identity())
-        for body in range(1, model.nbody):  # Parents come before their children.
+        for body in range(1, model.nbody):  # In this order, parents come before their children.
             if int(model.body_rootid[body]) in roots:
                 self._add_body(body)
         self._add_mimics()
@@ -197,7 +197,8 @@ class _Writer:
         touching = [g for g in geoms if model.geom_contype[g] or model.geom_conaffinity[g] or g in paired]
         for g in geoms:
             at = within.inverse() * _pose(model.geom_pos[g], model.geom_quat[g])
-            # A body without a shape that may touch something would not be watched. All its shapes then count.
+            # If none of a body's shapes may touch anything, all of them count, because otherwise the body would not be
+            # watched.
             if g in touching or not touching:
                 self._add_shape(link, "collision", g, at)
             if g not in touching:
@@ -217,7 +218,7 @@ class _Writer:
         geometry = ET.SubElement(shape, "geometry")
         if form == _Geom.mjGEOM_MESH:
             mesh = int(model.geom_dataid[g])
-            # MuJoCo moves a mesh that it reads to its centre of mass and principal axes.
+            # MuJoCo moves a mesh that it reads to its centre of mass and principal axes. This motion is undone here.
             at = at * _pose(model.mesh_pos[mesh], model.mesh_quat[mesh]).inverse()
             scale = numbers(model.mesh_scale[mesh])
             ET.SubElement(geometry, "mesh", filename=self._mesh_file(mesh), scale=scale)

@@ -111,7 +111,8 @@ def lines_to_paste(robot: Robot, config: Config, near: Iterable[NearPair]) -> li
     entries = [f"    - {_pair_entry(links, least)}" for links, least in nearer.items() if links not in disabled]
     lines = []
     if entries:
-        # A block that the file already has cannot be written a second time.
+        # If the file already has one of these blocks, the user must add lines to it, because a block cannot occur
+        # twice.
         above = [
             key for key in ("control", "pairs") if key in config.model_fields_set | config.control.model_fields_set
         ]
@@ -163,10 +164,12 @@ def warning_at_home(
     more = f"; and {len(lines) - _NAMED} more" if len(lines) > _NAMED else ""
     text = f"{robot.name}: at home, with min_distance {1e3 * kept:g} mm: {'; '.join([*lines.values()][:_NAMED])}{more}"
     if elsewhere := len(never) < len(lines):
-        # Pairs that overlap at this home are not watched. With a home at which they do not overlap, they are watched.
+        # Pairs that overlap at this home are not watched. With a home at which they do not overlap, they are watched,
+        # so their lines are needed too.
         hardly = [links for links, (least, greatest) in spreads.items() if least < 0.0 <= greatest < kept]
         never += [links for links in hardly if links not in never]
-    # With an SRDF, links that overlap at home are no longer left out automatically.
+    # With an SRDF, links that overlap at home are no longer left out automatically. The lines for it therefore name
+    # them too.
     disabled = [_srdf_line(links) for links, (_, greatest) in spreads.items() if greatest < kept]
     remedies = []
     if never:

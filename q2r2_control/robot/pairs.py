@@ -217,7 +217,8 @@ def _not_among(pairs: Collection[tuple[str, str]]) -> Callable[[str, str], bool]
 
 def pair_names(geometry: pin.GeometryModel) -> tuple[tuple[str, str], ...]:
     """Return the names of both objects of each pair, in Pinocchio's order."""
-    names = [item.name for item in geometry.geometryObjects]  # Looking each of them up again would take longer.
+    # This list is made once, because looking up each name again would take longer.
+    names = [item.name for item in geometry.geometryObjects]
     return tuple((names[pair.first], names[pair.second]) for pair in geometry.collisionPairs)
 
 

@@ -319,7 +319,8 @@ class Robot:
             remove_disabled_pairs(self.collision_model, exclusions)
         postures = [self.home]
         if exclusions is not None:
-            # The SRDF is trusted. Only pairs that overlap in all postures are dropped: no motion separates them.
+            # The SRDF decides which pairs are watched. In addition, pairs that overlap in all postures are dropped,
+            # because no motion separates them.
             random = np.random.default_rng(0)
             postures += [random.uniform(self.position_lower, self.position_upper) for _ in range(50)]
         return remove_overlapping_own_pairs(self.model, self.collision_model, own_links, postures)
@@ -343,7 +344,7 @@ class Robot:
         for arm in self.arms:
             frame, tool = config.external.arm(arm).tool_frame, self.arms[arm].tool_frame
             if frame is None or not self.model.existFrame(frame, pin.FrameType.BODY):
-                continue  # Only /tf has this frame, and the arm's node compares it there.
+                continue  # Only /tf has this frame, so the arm's node compares it there.
             at_home = self.tool_pose(self.home, arm)
             frame_id = self.model.getFrameId(frame, pin.FrameType.BODY)
             between = at_home.actInv(pin.updateFramePlacement(self.model, self._data, frame_id))

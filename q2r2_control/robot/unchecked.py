@@ -129,7 +129,7 @@ def _lack_of(robot: Robot, arm: str) -> str | None:
     joints = robot.arms[arm].joints
     # The index of a joint in Pinocchio's model is one more than its index in vectors, because the world comes first.
     of_body = {index: item.parentJoint - 1 for index, item in enumerate(robot.collision_model.geometryObjects)}
-    before_tool = joints[:-1] if len(joints) > 1 else joints  # The last joint moves the tool.
+    before_tool = joints[:-1] if len(joints) > 1 else joints  # The last joint is left out, because it moves the tool.
     if not np.isin(before_tool, list(of_body.values())).any():
         return "no link between its base and its tool has a collision shape"
     pairs = robot.collision_model.collisionPairs

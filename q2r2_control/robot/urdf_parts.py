@@ -50,7 +50,8 @@ def shape_from_drawings(links: Sequence[ET.Element], names: Collection[str]) -> 
             for drawing in link.findall("visual"):
                 shape = ET.SubElement(link, "collision")
                 shape.extend(copy.deepcopy(part) for part in drawing if part.tag in ("origin", "geometry"))
-                scale_to_metres(shape.iter("mesh"))  # Drawings keep the units of their files, as RViz expects.
+                # Only these shapes are scaled: drawings keep the units of their files, as RViz expects.
+                scale_to_metres(shape.iter("mesh"))
 
 
 def name_shapes(links: Sequence[ET.Element]) -> None:

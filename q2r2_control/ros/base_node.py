@@ -267,7 +267,7 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):
         before, self.lifecycle_state = self.lifecycle_state, meanwhile
         try:
             problem = act()
-        except Exception as error:  # rclpy would hide the exception.
+        except Exception as error:  # The exception is caught and logged here, because rclpy would hide it.
             problem = f"{type(error).__name__}: {error}"
         self.lifecycle_state = done if problem is None else before
         if problem is None:
@@ -321,7 +321,7 @@ def run_node(*makes: Callable[[], BaseNode]) -> int:
         asked = time.monotonic()
         for node in reversed(nodes):
             node.close()
-        # No arm waits for this process any more. The middleware may end slowly: without priority, but within a time
+        # No arm waits for this process any more, so the middleware may end slowly: without priority, but within a time
         # limit.
         schedule_thread_as_others()
         global _deadline
@@ -350,7 +350,9 @@ def _take_priority(nodes: Sequence[BaseNode]) -> None:
     if problem := schedule_thread_first(priority):
         log.info(f"real time: {problem}")
         return
-    import resource  # This module exists on Linux. Only there can a process have a real-time priority.
+    # The import is here, because not every system has this module. Linux has it, and only there can a process have a
+    # real-time priority.
+    import resource
 
     def give_up(*_: object) -> None:
         schedule_thread_as_others()

@@ -77,7 +77,7 @@ class TickExecutor(SingleThreadedExecutor):
                 timer.callback()
         if (now := time.monotonic()) - self._served_at >= _SERVED:
             self._served_at, self._streams, self._simulated = now, self._subscriptions, self._is_simulated()
-            self.take_messages()  # A publisher may have come and gone meanwhile.
+            self.take_messages()  # This also takes messages of a publisher that has come and gone meanwhile.
             if not self._changed:
                 self._streams = [one for one in self._streams if one[0].handle.get_publisher_count()]
             if self._changed or self._tasks or self._rest.is_ready():
@@ -90,7 +90,7 @@ class TickExecutor(SingleThreadedExecutor):
         for one, arguments in self._streams:
             for _ in range(_MOST_MESSAGES):
                 if self._changed:
-                    return  # This subscription may have been destroyed.
+                    return  # The list is out of date, and this subscription may have been destroyed.
                 if (taken := one.handle.take_message(one.msg_type, one.raw)) is None:
                     break
                 one.callback(*taken[:arguments])
@@ -135,7 +135,7 @@ class _RestOfNodes:
 
         self._subscriptions, self._timers = others("subscriptions"), others("timers")
         self._clients, self._services, self._waitables = others("clients"), others("services"), others("waitables")
-        # A wait for a guard condition would clear its trigger, and rclpy would not see it.
+        # Guard conditions are not waited for, because a wait would clear their trigger, and rclpy would not see it.
         self._has_guards = any(list(node.guards) for node in nodes)
         self._wait_set: Any = None
         if nodes:

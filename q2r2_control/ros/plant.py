@@ -54,12 +54,14 @@ class RosPlant:
 
     modes: tuple[CommandMode, ...] = (CommandMode.POSITION,)
     realtime_only = True
-    standstill = JOINTS  # The arms' controller is another process, which may stand still.
+    # The arms' controller is another process, which can freeze. The plant notices that the arms then do not follow.
+    standstill = JOINTS
 
     def __init__(self, robot: Robot, config: Config) -> None:
         self._robot, self._period = robot, 1.0 / config.nominal_rate_hz
         self._fingers, self._kind = Fingers(robot, config), TrajectoryOutput(self._period, robot)
-        self._openings = dict.fromkeys(self._fingers.arms, 1.0)  # No opening is measured before a run.
+        # Grippers count as open before a run, because no opening is measured yet.
+        self._openings = dict.fromkeys(self._fingers.arms, 1.0)
         self._context: Context | None = None
         self._stopped: Callable[[], bool] = lambda: False  # Returns whether the wait for the robot should end.
 

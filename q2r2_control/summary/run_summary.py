@@ -172,7 +172,7 @@ class RunSummary:
             broken.append(f"measured {met} met: {self.torque.min_measured_distance_mm:.1f} mm")
         if self.uncertified_ticks:
             broken.append(f"{self.uncertified_ticks} ticks without a certificate")
-        # Both arms report the same error of a policy. The error is named only once.
+        # Both arms report the same error of a policy, so equal errors are named only once.
         roots = (event.reason.root for event in self.events)
         broken += dict.fromkeys(sentence(root) for root in roots if root.kind is CommonReason.POLICY_UNUSABLE)
         if not self.at_rest:
@@ -256,7 +256,7 @@ class RunStatistics:
         self._ticks += 1
         self._duration += tick.dt
         self._compute_times.add(tick.compute_time)
-        # Reports of obstacles come many times a second, and would fill the list.
+        # Reports of obstacles are left out, because they come many times a second and would fill the list.
         self.events.extend(event for event in tick.events if event.kind is not TeleopReason.OBSTACLE_REPORTED)
         # Numbers that are not finite do not count.
         np.fmax(self._speed, np.abs(reference.v), out=self._speed)

@@ -56,7 +56,7 @@ class GripperLimiter:
         self.changed = False
         granted = dict(wanted)
         for arm, gripper in self._grippers.items():
-            # The plant refuses a number outside 0 .. 1.
+            # A number outside 0 .. 1 is passed on as it is, because the plant refuses it.
             if arm in wanted and 0.0 <= wanted[arm] <= 1.0:
                 if _BELIEVABLE[0] <= measured.get(arm, math.nan) <= _BELIEVABLE[1]:
                     self._go_on(arm, gripper, wanted[arm], measured[arm], now)
@@ -124,7 +124,9 @@ class _Gripper:
     def note(self, wanted: float, measured: float, now: float) -> bool:
         """Take the openings of a tick. Return whether a time span has ended; a smaller interval may then be enough."""
         if self.granted is None:
-            self.granted = wanted  # The certificate still assumes fingers anywhere between closed and open.
+            # Any opening is granted at first, because the certificate still assumes fingers anywhere between closed and
+            # open.
+            self.granted = wanted
         if wanted != self._wanted:
             self._wanted, self._step, self.asks_at = wanted, 1.0, now
         spread = min(measured, self.granted), max(measured, self.granted)

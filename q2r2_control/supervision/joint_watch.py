@@ -127,8 +127,8 @@ class JointWatch:
         """Return the present fault, or None. A state that is too old becomes a fault here."""
         if self.fault is not None:
             return self.fault
-        # After a clock was set back, the newest state seems to come from the future, and would look fresh for a long
-        # time.
+        # An age below -timeout is a fault too. After a clock was set back, the newest state seems to come from the
+        # future, and would otherwise look fresh for a long time.
         timeout, age = self._settings.timeout, now - self._stamp
         if not -timeout <= age <= timeout:
             self._fail(Reason.of(SupervisionReason.STATES_SILENT, age=age, timeout=timeout, source=self._source()))
@@ -187,7 +187,8 @@ class JointWatch:
 
     def _fail(self, fault: Reason) -> None:
         self._still_since, self._lost = math.inf, False
-        # The first fault says most about the cause. Before the first good state, the newest fault says most.
+        # The first fault is kept, because it says most about the cause. Before the first good state, the newest fault
+        # says most, and replaces it.
         if self.fault is None or self.state is None:
             self.fault = fault
 
@@ -218,7 +219,8 @@ def settings_for_external_arms(config: Config) -> Config:
     distances.
     """
     control = config.control.model_copy(update=_FOLLOW)
-    stiff = config.admittance.model_copy(update={"enabled": False})  # The other controller is the compliant one.
+    # The admittance is off, because the other controller is the compliant one.
+    stiff = config.admittance.model_copy(update={"enabled": False})
     supervision = config.supervision
     lagging = supervision.model_copy(update={"max_deviation": supervision.max_deviation_external})
     return config.model_copy(update={"control": control, "admittance": stiff, "supervision": lagging})

@@ -96,7 +96,7 @@ class StandstillWatch:
         _, asked_then, path_then = self._seen[0]
         way, moved = _largest_change(asked, asked_then), _largest_change(self._seen[-1][2], path_then)
         if max(way, moved) < self._limits.least:
-            self._follows = False  # The arm is at rest.
+            self._follows = False  # Neither command nor arm has moved: the arm is at rest, and may need time to begin.
         elif moved > _FOLLOWS_ABOVE * way:
             self._follows = True
         ahead = _largest_change(asked_then, measured)

@@ -151,7 +151,9 @@ class PoseRateLimiter:
         gap = now - self._now
         if self.pose is None or not gap > 0.0:
             return self.pose
-        if gap > LONGEST_DT:  # Whatever follows the pose has come to rest meanwhile, or will soon do so.
+        # The pose starts again from rest, because the arm that follows it has come to rest meanwhile, or will soon do
+        # so.
+        if gap > LONGEST_DT:
             self._linear.velocity = self._angular.velocity = np.zeros(3)
         dt = gap
         if gap > self._period:
@@ -163,7 +165,7 @@ class PoseRateLimiter:
             shift, turn = (motion.towards(np.zeros(3), dt)[0] for motion in (self._linear, self._angular))
         else:
             last, self._target = self._target or at, target
-            # In a late step the pose follows only a share of the target's motion now. The rest counts as lag.
+            # In a late step, the pose follows only this fraction of the target's motion now. The rest counts as lag.
             share = dt / gap
             lag, moved = last.translation - at.translation, target.translation - last.translation
             shift, slow = self._linear.follow(lag + (1.0 - share) * moved, share * moved, dt)

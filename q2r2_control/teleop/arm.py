@@ -133,7 +133,8 @@ class ArmTeleop:
         if usable and fault is None and self._gate.pose is not None:
             self.motion.add(self._gate.pose, self._gate.stamp, now, self.state is ArmState.ENGAGED)
         if usable and self.state is ArmState.ALIGNING:
-            return None  # Aligning makes the pose jump, and the arm does not follow it.
+            # A jump is no fault here, because aligning makes the pose jump, and the arm does not follow it.
+            return None
         return fault
 
     def watchdog(self, now: float) -> Reason | None:
@@ -141,7 +142,7 @@ class ArmTeleop:
         timeout = self._settings.gate.timeout
         if self._gate.stale(now):
             return Reason.of(TeleopReason.POSE_SILENT, timeout=timeout)
-        if now - self._inputs_stamp > timeout:  # Now the operator could not stop the arm by a button.
+        if now - self._inputs_stamp > timeout:  # Without readings, the operator could not stop the arm by a button.
             return Reason.of(TeleopReason.INPUTS_SILENT, timeout=timeout)
         return None
 

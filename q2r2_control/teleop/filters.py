@@ -95,7 +95,8 @@ class Interpolator:
             x, y, z = x + dt * linear[0], y + dt * linear[1], z + dt * linear[2]
             turn = dt * angular[0], dt * angular[1], dt * angular[2]
             rotation = turned_by(rotation, turn)
-        # The present line now starts at the output. If a new sample replaces the line's end, the output does not step.
+        # The present line now starts at the output, so that the output does not step if a new sample replaces the
+        # line's end.
         knots[0] = playhead, (x, y, z), rotation
         return (x, y, z), rotation, turn_between(last, rotation) if passed else turn
 
@@ -164,7 +165,8 @@ class PoseFilter:
 
     def add(self, pose: Pose, stamp: float, now: float) -> None:
         """Add a sample received at ``stamp`` [s]."""
-        # Rounding errors of quaternion products add up. It is enough to normalise once per sample.
+        # The quaternion is normalised, because rounding errors of quaternion products add up. Once per sample is
+        # enough.
         self._out = self._out[0], normalized(self._out[1])
         self._interpolator.add(*pose, stamp, now)
 

@@ -69,7 +69,7 @@ class PoseGate:
             self._recent.clear()
             return False, self._problem or Reason(TeleopReason.POSE_UNUSABLE)
         if jump := None if previous is None else self._jump(previous, pose, gap):
-            self._recent.clear()  # No speed is measured across the jump.
+            self._recent.clear()  # Earlier poses are forgotten, so that no speed is measured across the jump.
         return True, jump or self._speed(pose, stamp)
 
     def _jump(self, previous: Pose, pose: Pose, gap: float) -> Reason | None:

@@ -22,7 +22,7 @@ class Pulse(NamedTuple):
     strongest: float | None = None  # Greatest amplitude, if the amplitude grows with a quantity; otherwise None.
 
     def grown(self, share: float) -> Pulse:
-        """Return the vibration with the amplitude for ``share``: its own at 0, and :attr:`strongest` at 1 or more."""
+        """Return the vibration with an amplitude between its own (``share`` 0) and :attr:`strongest` (1 or more)."""
         most = self.amplitude if self.strongest is None else self.strongest
         return self._replace(amplitude=self.amplitude + (most - self.amplitude) * min(share, 1.0))
 
@@ -115,7 +115,8 @@ class HapticPulses:
     def slip(self, slip: float, slip_angle: float) -> None:
         """Take the slip: how far leash and workspace have held the target back since the last anchor [m], [rad]."""
         position, rotation = self._slipped
-        if position.grew(slip) | rotation.grew(slip_angle):  # Both have to be updated.
+        # The operator | calls both, because both have to be updated.
+        if position.grew(slip) | rotation.grew(slip_angle):
             self._want(SLIP)
 
     def notice(self, condition: ArmCondition) -> None:
@@ -142,7 +143,8 @@ class HapticPulses:
         """
         if self._ends is not None and now >= self._ends:
             self._ends, self._next = None, now + _PAUSE
-            return HapticFeedback(self._felt_by, 0.0, 0.0)  # This hand may not drive the arm any more.
+            # The vibration ends in the hand that felt it, which may not drive the arm any more.
+            return HapticFeedback(self._felt_by, 0.0, 0.0)
         pulse = self._waiting
         if pulse is None or (self._ends is None and now < self._next and pulse is not FAULT):
             return None

@@ -60,7 +60,8 @@ class ComponentLeash:
 
         Args:
             shift: Displacement from the tool to the target [m or rad].
-            by_hand: Motion of the unslipped target since the last tick, by the unfiltered hand [m or rad].
+            by_hand: How far the unfiltered hand would have moved the target since the last tick [m or rad], if no leash
+                and no workspace had held the target back.
             by_tool: Motion of the tool since the last tick [m or rad].
             dt: Duration of the tick [s].
         """

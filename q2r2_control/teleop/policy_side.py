@@ -60,7 +60,9 @@ class PolicySide:
         faults: dict[str, Reason] = {}
         for name, motion in self._motions.items():
             if motion.following and self._arms[name].state is not ArmState.POLICY:
-                motion.forget()  # The arm was stopped or taken over by a hand. It may follow the next chunk.
+                # The arm was stopped or taken over by a hand, so its chunk is forgotten. The arm may follow the next
+                # chunk.
+                motion.forget()
         for chunk in chunks:
             self._asked = {*chunk.tools, *chunk.motions} or self._asked
             for name, motion in self._motions.items():

@@ -24,11 +24,12 @@ from q2r2_control.verification.tool_speeds import MeasuredToolSpeeds
 
 _NEWEST = 5000  # Number of ticks whose accelerations are kept.
 _ROUNDING = 4.0 * np.finfo(np.float64).eps  # Rounding error of a difference, relative to the numbers.
-# In a random share of the ticks, this number of postures between the last tick and this one is measured.
+# Postures between two ticks: probability that they are measured at a tick, and the number of measured postures.
 _BETWEEN_SHARE, _BETWEEN_SAMPLES = 0.02, 4
-# In a random share of the ticks, this number of postures during a full stop is measured.
+# Postures during a full stop: probability that they are measured at a tick, and the number of measured postures.
 _STOP_SHARE, _STOP_SAMPLES = 0.005, 41
-_NEAR, _NEAR_SHARE = 1e-3, 10.0  # If the margin is below the first number [m], both shares are larger by this factor.
+# If the margin is below the first number [m], both probabilities are larger by this factor.
+_NEAR, _NEAR_SHARE = 1e-3, 10.0
 
 
 def time_of(dt: Any) -> float:

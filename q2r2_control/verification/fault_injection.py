@@ -72,10 +72,10 @@ class WorstSolver:
 STOPPING_FAULTS = ("none", "nan", "one_nan", "infinite", "late")
 FAULTS = (*STOPPING_FAULTS, "absurd", "noise")
 _ATTACK_SHARES = (0.6, 0.15, 0.1, 0.15)  # Probabilities of ATTACKS in a segment whose solver attacks.
-_FAULTY, _ATTACKED = 0.2, 0.3  # Shares of the segments whose solver fails, or works against the arms.
+_FAULTY, _ATTACKED = 0.2, 0.3  # Probabilities that the solver of a segment fails, or works against the arms.
 # Kinds of tick durations in a segment.
 _TIMINGS = ("1 ms", "1 ms, jittering", "a few ms", "any", "tiny", "long", "partly invalid")
-_TIMING_SHARES = (0.42, 0.20, 0.15, 0.08, 0.05, 0.04, 0.06)  # Shares of the segments with each kind.
+_TIMING_SHARES = (0.42, 0.20, 0.15, 0.08, 0.05, 0.04, 0.06)  # Probability of each of the _TIMINGS in a segment.
 _INVALID_DT: tuple[Any, ...] = (0.0, -0.001, math.nan, math.inf, -math.inf, None, "soon", 0.2, 5.0)
 _STARTS = ("home", "apart", "anywhere", "outside", "at limits", "moving", "too fast", "in penetration")
 LATE = 1.0  # Solve time of a late solution [s].

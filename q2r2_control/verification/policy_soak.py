@@ -171,7 +171,8 @@ class PolicySoak:
                 progress(f"tick {self._ticks} of {ticks}")
 
         self._pipeline.listeners.append(show)
-        log = logging.getLogger("q2r2_control.pipeline.operator_side")  # This logger would print every provoked fault.
+        # This logger is switched off, because it would print every provoked fault.
+        log = logging.getLogger("q2r2_control.pipeline.operator_side")
         log.disabled = True
         try:
             self._pipeline.run(ticks * self._period, realtime=False)
@@ -188,7 +189,8 @@ class PolicySoak:
             simulated_s=self._ticks * self._period,
             counts=dict(self._counts),
             margins=[*self._contract.margins.values(), self._rest],
-            memory_growth_mb=None,  # The summary's bounded list of events would count as growth.
+            # The growth is not measured, because it would include the summary's bounded list of events.
+            memory_growth_mb=None,
             broken=list(self._broken.values()),
         )
 

@@ -109,7 +109,7 @@ class MeasuredDistances:
         self._at_corners = deeper_at_corners(collision_model_of(robot), kept)
         self._fingers: CoalDistances | None = None  # None if fingers may be anywhere between open and closed.
         objects = robot.objects.geometry.copy()
-        for pair in robot.collision_model.collisionPairs:  # Only the pairs of objects remain.
+        for pair in robot.collision_model.collisionPairs:  # All pairs are removed except those of objects.
             objects.removeCollisionPair(pair)
         self._of_objects = CoalDistances(robot.model, objects)
         self.forget()

@@ -186,7 +186,7 @@ class Soak:
         self._change_cell()
         try:
             reference = self._controller.step(request.targets, dt)
-        except Exception as error:  # The contract promises that ``step`` raises nothing.
+        except Exception as error:  # Any exception breaks the contract, which promises that ``step`` raises nothing.
             self._contract.raised()
             self._keep(tick, segment, since, request, dt, ["exceptions"], f"{type(error).__name__}: {error}")
             self._reset(self._controller.robot.home, np.zeros_like(self._q))

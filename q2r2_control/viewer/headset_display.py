@@ -48,7 +48,8 @@ class RunDisplay:
 
     def scene(self) -> ShownScene:
         """Return the meshes, each in the frame of a joint, and the loose parts."""
-        from q2r2_control.viewer.joint_tree import JointTree, colour_of  # It needs trimesh, which may be missing.
+        # The import is here, because it needs trimesh, which may be missing.
+        from q2r2_control.viewer.joint_tree import JointTree, colour_of
 
         self._tree, self._tightest = JointTree(self._run), TightestPair(self._model, self._pairs)
         self._data = self._tree.model.createData()

@@ -73,7 +73,8 @@ def print_table(table: Table, console: Console) -> None:
 def record_table(title: str, records: Sequence[Any], notes: Sequence[str] = ()) -> Table:
     """Return a table with a row for each field of ``records``, dataclasses of one type, and a column for each record.
 
-    The values of the first field are the headings of the columns. A field with several numbers has one cell for all.
+    The values of the first field are the headings of the columns. If a field of a record has several numbers, they are
+    all in one cell.
     """
     name, *others = (field.name for field in fields(records[0]))
     columns = (name, *(str(getattr(record, name)) for record in records))

@@ -73,7 +73,7 @@ def address() -> Iterator[str]:
     server.server_close()
 
 
-def test_pictures_of_a_network_camera_were_captured_the_delay_before_their_receipt(address: str) -> None:
+def test_the_capture_time_of_a_network_cameras_picture_is_its_receipt_minus_the_delay(address: str) -> None:
     delay = 1.5
     device = open_device(CameraConfig(device=address, width=WIDTH, height=HEIGHT, delay=delay))
     shots = [device.read() for _ in range(5)]

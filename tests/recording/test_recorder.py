@@ -98,7 +98,7 @@ def test_standard_topics_may_come_with_every_tick(tmp_path: Path) -> None:
 def test_a_clock_that_is_set_back_during_a_run_changes_no_time_in_the_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # Each call returns a time of day that is an hour before the time of the last call.
+    # Each call returns a Unix time that is an hour before the time of the last call.
     hours = count(1_700_000_000_000_000_000, -3_600_000_000_000)
     monkeypatch.setattr(time, "time_ns", lambda: next(hours))
     file = file_of(record(tmp_path, pipeline(), 0.5))

@@ -105,7 +105,7 @@ def test_a_replay_of_a_run_in_real_time_is_identical(tmp_path: Path) -> None:
     assert result.ticks > 10
     recording = Recording(file)
     first = next(chunk.times[0] for chunk in recording.chunks() if len(chunk.rows))
-    assert 0 <= first - recording.about.epoch < 1_000_000_000, "times of day, whatever the loop's clock is"
+    assert 0 <= first - recording.about.epoch < 1_000_000_000, "Unix times, whatever the loop's clock is"
 
 
 def test_a_gripper_that_held_an_object_holds_it_in_the_replay(tmp_path: Path) -> None:

@@ -61,7 +61,9 @@ def test_every_moving_link_of_the_hand_has_a_body_that_contains_its_shape(hand: 
             assert -0.05 < beyond <= 0.0, (name, interval)
 
 
-def test_at_one_opening_a_body_equals_its_shape_and_a_narrow_interval_adds_little(hand: Hand) -> None:
+def test_at_one_opening_a_capsule_equals_its_finger_and_over_a_narrow_interval_of_openings_it_is_little_thicker(
+    hand: Hand,
+) -> None:
     _, real, bodies = hand
     for name in real.fingers:
         body = bodies[name]

@@ -246,7 +246,9 @@ def test_a_bad_parameter_is_refused_with_one_line(given: str, context: Any) -> N
     assert len(str(error.value).splitlines()) == 1
 
 
-def test_without_time_an_arm_is_neither_engaged_nor_paused(rig: ArmRig, node: Any, processes: Processes) -> None:
+def test_without_a_running_clock_an_arm_is_neither_engaged_nor_ready(
+    rig: ArmRig, node: Any, processes: Processes
+) -> None:
     diagnostics: list[DiagnosticStatus] = []
     node.create_subscription(DiagnosticArray, "/diagnostics", lambda message: diagnostics.extend(message.status), 10)
     rig.start(processes, {"use_sim_time": True})

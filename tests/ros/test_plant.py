@@ -113,7 +113,7 @@ def test_arms_rest_when_the_robot_ends_and_go_on_without_a_jump_from_the_posture
 def test_a_new_receiver_gets_no_commands_while_the_arms_are_elsewhere(
     node: Any, robot: Robot, config: Config, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(RosPlant, "standstill", None)  # These arms stand still.
+    monkeypatch.setattr(RosPlant, "standstill", None)  # These arms never move, so the check is off.
     states = node.create_publisher(JointState, "joint_states", 10)
     still = joint_state_message(robot.joint_names, robot.home, 0.0 * robot.home, 0.0 * robot.home, 0.0)
     timer = node.create_timer(0.01, lambda: states.publish(still))

@@ -96,7 +96,7 @@ def test_the_page_of_a_set_shows_its_arms_and_its_buttons_reach_the_nodes(
         page.press("Take a stop back")
         page.wait_until(lambda: all("waits for its operator" in why for why in page.row("why")))
         assert "engaged" not in page.row("state")
-        page.press("Engage both")  # The scripted hands do not engage again.
+        page.press("Engage both")  # The scripted hands do not press again, so the page engages the arms.
         page.wait_until(lambda: page.row("state") == ["engaged", "engaged"])
 
         for label, told in (("Begin or end", "episode begins"), ("Mark", "mark"), ("Begin or end", "episode ends")):

@@ -168,7 +168,7 @@ def test_if_the_clock_goes_back_a_little_the_target_stays(back: float) -> None:
 
 
 @pytest.mark.parametrize("now", [math.nan, math.inf, -math.inf, -1e9, 0.0, 1e12], ids=str)
-def test_an_unusable_clock_stops_the_arms_and_a_press_by_the_new_clock_engages_them(now: float) -> None:
+def test_an_unusable_time_stops_the_arms_and_a_later_press_engages_them(now: float) -> None:
     driver = engaged()
     driver.run(0.2, waving(driver))
     targets = driver.teleop.update(driver.samples(), driver.tools, now)

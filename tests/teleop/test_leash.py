@@ -179,7 +179,7 @@ def test_the_target_is_not_put_at_a_tool_that_still_follows() -> None:
         assert target.translation[0] - tied.tool.translation[0] > 0.02  # The target was never put at the tool.
 
 
-def test_the_target_is_put_at_the_tool_only_in_a_tick_too_short_for_the_step_to_count_as_motion() -> None:
+def test_the_target_jumps_to_the_tool_only_in_a_tick_so_short_that_the_jumps_velocity_is_ignored() -> None:
     tied = Tied(RelativeMotion(), distance=0.1, angle=0.5)
     tied.go(along(0.001), 300)
     for _ in range(4):

@@ -48,7 +48,7 @@ def token_of(door: Door) -> str:
 
 
 def connected(door: Door, origin: str, token: str) -> ClientConnection:
-    """Connect like viser's page, to the path that it came from."""
+    """Connect as viser's page does, to the path of the page's URL, which is the token."""
     protocol = [Subprotocol(f"viser-v{viser.__version__}")]
     return connect(f"ws://127.0.0.1:{door.port}/{token}", origin=Origin(origin), subprotocols=protocol)
 

@@ -81,7 +81,8 @@ def main(commands: int, states: int) -> None:
         except Exception as error:
             with suppress(OSError):
                 from_loop.send(reason_of(error).encode())
-    os._exit(0)  # The library's destructors would wait for robots that are no longer connected.
+    # The process ends without destructors, because the library's would wait for robots that are no longer connected.
+    os._exit(0)
 
 
 class _Answering:

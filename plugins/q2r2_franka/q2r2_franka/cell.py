@@ -90,11 +90,12 @@ class FrankaCell:
         is_torque = command.mode is CommandMode.TORQUE
         if is_torque:
             model, data, measured = self._robot.model, self._data, self.state().q
-            overlay = command.tau - pin.computeGeneralizedGravity(model, data, measured)  # The robot adds gravity.
+            # Gravity is subtracted, because the robot adds it.
+            overlay = command.tau - pin.computeGeneralizedGravity(model, data, measured)
             damping = pin.crba(model, data, measured).diagonal() / _BRAKING_TIME
         for arm, joints in self._joints.items():
             deceleration = command.deceleration
-            # The deceleration is None if the reference is at rest.
+            # The deceleration is None if the reference is at rest. Any positive number will then do.
             stop = (1.0,) * JOINTS if deceleration is None else tuple(deceleration[joints].tolist())
             q, v = tuple(command.q[joints].tolist()), tuple(command.v[joints].tolist())
             its = sent[arm] = ArmCommand(self._now, self._start, self._end, q, v, stop)

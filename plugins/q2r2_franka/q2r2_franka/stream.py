@@ -52,7 +52,8 @@ class PositionStream:
         for q in path[:-1]:
             self._advance(q)
             newest, before, oldest = self._sent[-1], self._sent[-2], self._sent[-3]
-            self._sent.append(3.0 * newest - 3.0 * before + oldest)  # The robot goes on with the last acceleration.
+            # Without a command, the robot goes on with the last acceleration.
+            self._sent.append(3.0 * newest - 3.0 * before + oldest)
         if len(path) > 1:
             self._begin_return()
         mean = self._advance(path[-1])

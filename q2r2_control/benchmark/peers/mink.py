@@ -33,7 +33,8 @@ class Mink:
         control, robot = setup.config.control, setup.robot
         bare = setup.config.model_copy(update={"mujoco": setup.config.mujoco.model_copy(update={"objects": {}})})
         self._model = build_model(robot, bare)
-        # In the simulation, the bodies of some pairs do not collide. mink has to keep all monitored pairs apart.
+        # All bodies collide here, because mink has to keep all monitored pairs apart. In the simulation, the bodies of
+        # some of these pairs do not collide.
         self._model.geom_contype[:] = self._model.geom_conaffinity[:] = 1
         joints = [self._model.joint(name) for name in robot.joint_names]
         self._q_index = np.array([joint.qposadr[0] for joint in joints])
@@ -104,4 +105,5 @@ def _mujoco_names(urdf: str) -> dict[str, str]:
         for link in ET.fromstring(urdf).iterfind("link")
         for index, shape in enumerate(link.findall("collision"))
     }
-    return shapes | {f"{FLOOR}_0": FLOOR}  # The floor is a plane in the simulation.
+    # The floor has another name, because it is a plane in the simulation.
+    return shapes | {f"{FLOOR}_0": FLOOR}

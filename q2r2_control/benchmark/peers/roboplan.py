@@ -57,7 +57,8 @@ class Roboplan:
         posture = optimal_ik.ConfigurationTask(
             self._ik,
             robot.home,
-            np.full(nv, control.posture_weight),  # This is a weight. Other tasks square a cost.
+            # Here roboplan takes a weight. The costs of its other tasks are roots of weights, because it squares them.
+            np.full(nv, control.posture_weight),
             optimal_ik.ConfigurationTaskOptions(task_gain=setup.posture_gain),
         )
         self._tasks = [*self._frame_tasks.values(), posture]

@@ -107,7 +107,7 @@ def collision_model_of(robot: Robot, geometry: pin.GeometryModel | None = None) 
     travel = np.maximum(np.abs(robot.position_lower), np.abs(robot.position_upper))
     extent = farthest_of(bodies)
     # A turning finger has one capsule for each interval of openings. The capsule of a part of the whole interval may
-    # reach beyond the capsule of the whole interval.
+    # reach beyond the capsule of the whole interval. The bound therefore covers the capsules of all intervals.
     for number, finger in turning_bodies(robot):
         extent[number] = max(extent[number], finger.extent)
     return CollisionModel(chain, bodies, pairs_of(geometry, chain, bodies, travel, extent))

@@ -59,7 +59,7 @@ def chain_of(model: pin.Model) -> Chain:
         joint = model.joints[i]
         if joint.nq != 1 or joint.nv != 1 or joint.idx_v != i - 1:
             raise RobotError(f"joint {model.names[i]}: only one-axis revolute and prismatic joints are supported")
-        # Pinocchio's binding drops the column dimension of a model with one joint.
+        # The Jacobian is reshaped, because Pinocchio's binding drops the column dimension of a model with one joint.
         column = np.reshape(pin.getJointJacobian(model, data, i, pin.LOCAL), (6, model.nv))[:, joint.idx_v]
         slides, turns = np.linalg.norm(column[:3]) > _ANY_MOTION, np.linalg.norm(column[3:]) > _ANY_MOTION
         if slides and turns:

@@ -39,7 +39,8 @@ def append_following_row(
     pairs, history, v, row = model.collision.pairs, data.history, data.state.v, data.rows.matrix[count]
     distance = measure(model.collision, data.collision, p)
     if distance < model.min_distance[p] or history.counted[0] == 0:
-        return count  # A pair that is too close has to open, whichever arm is in front.
+        # Such a row does not apply to a pair that is too close: it has to open, whichever arm is in front.
+        return count
     distance_row(model.collision, data.collision, p, row)
     first, second = 0.0, 0.0
     for k in range(pairs.joint.shape[1]):

@@ -63,7 +63,8 @@ def apply_safety_filter(
         brake(q, v, data.certified, h, candidate.q, candidate.v)
     remember(data.history, q, v, candidate.v, h)
     for j in range(q.shape[0]):
-        # The velocities keep the acceleration limit. Their difference divided by a tiny h may exceed it by rounding.
+        # The velocities keep the acceleration limit, but their difference divided by a tiny h may exceed it by
+        # rounding. The quotient is therefore clamped.
         limit = model.limits.acceleration[j]
         data.state.a[j] += share * clamp((candidate.v[j] - v[j]) / h, -limit, limit)
         q[j] = candidate.q[j]
@@ -106,7 +107,7 @@ def certify_bodies(model: SafetyModel, data: SafetyData, grown: IntArray) -> int
     for p in range(pairs.first.shape[0]):
         if grown[pairs.first[p]] == 1 or grown[pairs.second[p]] == 1:
             any_grown = True
-            if data.distance[p] < model.min_distance[p]:  # No rounding is tolerated: a body's growth can be refused.
+            if data.distance[p] < model.min_distance[p]:  # No rounding is tolerated, because growth can be refused.
                 return p
     stay_with_stop(data)
     if not any_grown or certify(model, data, 0.0):
@@ -137,7 +138,9 @@ def _largest_certified(model: SafetyModel, data: SafetyData, h: float) -> int:
         return FOLLOWED
     unproven = data.unproven[0]
     if unproven >= 0 and is_too_close(model, data, unproven) and not data.state.v.any():
-        return STOPPED  # From rest, a smaller motion would bring the pair closer too. To try it would take long.
+        # No mixture is tried, because from rest a smaller motion would bring the pair closer too, and trying takes
+        # long.
+        return STOPPED
     low, high = 0.0, 1.0
     for _ in range(_BISECTIONS):
         share = 0.5 * (low + high)

@@ -41,16 +41,16 @@ from q2r2_control.types import Array
 
 
 class Gap(NamedTuple):
-    """What a corner contributes to the gap between the bodies along the normal, in a piece of motion and the next one.
+    """What a corner contributes to the gap between the bodies along the normal [m], in two pieces of motion.
 
-    From its start, a piece changes this share by rate t + change t^2 / 2, and by ``loose`` or more. Fields that begin
-    with ``then_`` belong to the next piece.
+    At the time t after the start of the first piece, this contribution has changed by rate t + change t^2 / 2, and in
+    addition by ``loose`` or more. Fields whose names begin with ``then_`` say the same about the second piece.
     """
 
-    now: float  # Share of the corner in the gap at the start of the piece [m].
+    now: float  # The corner's contribution at the start of the first piece [m].
     rate: float  # [m/s]
     change: float  # [m/s^2]
-    loose: float  # Least change by joints that come to rest in the piece; 0 or negative [m].
+    loose: float  # Lower bound of the change by joints that come to rest in the piece; 0 or negative [m].
     then_rate: float
     then_change: float
     then_loose: float
@@ -132,7 +132,11 @@ def _gap(
     piece: QuadraticPiece,
     then: QuadraticPiece,
 ) -> Gap:
-    """Return the share of a ``corner`` (3,) in the gap. ``side`` is -1 for a corner of the first body, else 1."""
+    """Return what a ``corner`` (3,) contributes to the gap along the normal, and how this contribution changes.
+
+    The contribution is that at the start of ``piece``. Its changes are those during ``piece`` and ``then``; see
+    :class:`Gap`. ``side`` is -1 for a corner of the first body, else 1.
+    """
     chain, pairs, placements, normal = model.chain, model.pairs, data.placements, data.contact.normal
     nx, ny, nz = side * normal[0], side * normal[1], side * normal[2]
     x, y, z = corner[0], corner[1], corner[2]

@@ -94,7 +94,8 @@ class _SizedOsqp:
         answer = self._solver.solve(raise_error=False)
         time = answer.info.update_time + answer.info.solve_time
         if answer.info.status_val != osqp.SolverStatus.OSQP_SOLVED:
-            self._solver.warm_start(x=self._cold, y=self._cold)  # The last iterate may be far from any solution.
+            # The next solve starts cold, because the last iterate may be far from any solution.
+            self._solver.warm_start(x=self._cold, y=self._cold)
             return QpSolution(None, time)
         v: Array = answer.x[: self._nv] @ inverse
         return QpSolution(v, time)

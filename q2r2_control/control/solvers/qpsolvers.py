@@ -75,7 +75,8 @@ class QpSolversSolver:
     def __init__(self, name: str, **options: Any) -> None:
         self._name, self._options = name, _DEFAULTS.get(name, {}) | options
         self._sparse = name not in qpsolvers.dense_solvers
-        # The wrappers of qpsolvers warn if a problem is not solved. The report of the step already says so.
+        # The wrappers of qpsolvers warn if a problem is not solved. These warnings are ignored, because the report of
+        # the step already says so.
         warnings.filterwarnings("ignore", module=r"qpsolvers\.solvers\.")
 
     def solve(self, problem: QpProblem) -> QpSolution:

@@ -42,7 +42,8 @@ def make_solver(
     try:
         with printing_to_stderr():
             solver = _made(name, nv, time_limit, given)
-            solver.solve(_smallest_problem(nv))  # An unknown option raises an exception here, and not during motion.
+            # A small problem is solved here, so that an unknown option raises an exception now and not during motion.
+            solver.solve(_smallest_problem(nv))
     except Exception as error:
         reason = " ".join(str(error).split())
         raise ConfigError(f"control.solver_options = {shown(given)}: {name} refuses: {reason:.120}") from error

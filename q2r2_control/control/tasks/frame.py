@@ -237,7 +237,7 @@ def accumulate_tool_cost(J: Array, twist: Array, weight: Array, priority: float,
     nv = g.shape[0]
     square = priority * ROTATION_LENGTH * ROTATION_LENGTH
     for i in range(nv):
-        # Joints of other arms do not move this tool. The other joints all have an entry other than 0.
+        # Columns of zeros are left out. They belong to joints of other arms, which do not move this tool.
         if J[0, i] == J[1, i] == J[2, i] == J[3, i] == J[4, i] == J[5, i] == 0.0:
             continue
         for k in range(6):

@@ -110,7 +110,8 @@ class _Answering:
         files = [*self._lines, self._commands.fileno()]
         for _, opened in self._lines.values():
             with suppress(OSError):
-                while True:  # Messages that came while this process started are too old to be answered.
+                # Messages that came while this process started are dropped, because they are too old to be answered.
+                while True:
                     opened.recv(LONGEST + 1)
         self._commands.send(CabinetAnswers.BEGUN)
         ended = False

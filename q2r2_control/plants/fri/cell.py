@@ -123,12 +123,12 @@ class FriCell:
         is_torque = command.mode is CommandMode.TORQUE
         if is_torque:
             model, data, measured = self._robot.model, self._data, self.state().q
-            # The cabinet itself bears gravity.
+            # Gravity is subtracted, because the cabinet itself bears it.
             overlay = command.tau - pin.computeGeneralizedGravity(model, data, measured)
             damping = pin.crba(model, data, measured).diagonal() / _BRAKING_TIME
         for arm, joints in self._joints.items():
             deceleration = command.deceleration
-            # A reference at rest has no deceleration.
+            # A reference at rest has no deceleration, so any positive number will do.
             stop = (1.0,) * JOINTS if deceleration is None else joints_of(deceleration[joints])
             q, v = joints_of(command.q[joints]), joints_of(command.v[joints])
             its = sent[arm] = ArmCommand(self._now, self._start, self._end, q, v, stop)

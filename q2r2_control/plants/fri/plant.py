@@ -97,7 +97,7 @@ class FriPlant:
             self._answering = CabinetAnswers(lines)
         finally:
             for line in lines:
-                socket.close(line.file)  # The process has a copy of the socket.
+                socket.close(line.file)  # The socket is closed here, because the process has a copy of it.
         self.grippers = self._modbus_grippers()
         for gripper in self.grippers.values():
             gripper.start()

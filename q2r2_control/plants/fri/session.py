@@ -172,7 +172,8 @@ class ArmSession:
         if before is None or state.is_silent(now):
             passed = 0
             if before is not None and self._lasts(message, before):
-                self._brake()  # If the session began anew here, the arm would stop abruptly.
+                # The arm brakes on its path, because it would stop abruptly if the session began anew here.
+                self._brake()
             else:
                 self._begin_anew()
         else:
@@ -251,7 +252,8 @@ class ArmSession:
         time, state = self._times.at(*question), self.state
         wanted = self._clock.expected - self.waits - DELAY
         if abs(wanted - time) > message.period and self._rests(min(time, wanted)):
-            self._times.restart()  # While nothing moves, an answer may be for any time.
+            # The times may begin anew, because an answer may be for any time while nothing moves.
+            self._times.restart()
             time = self._times.at(*question)
         state.answered, state.lag = max(state.answered, time), now - DELAY - time
         state.expected, state.behind = self._clock.expected, self._clock.expected - DELAY - time

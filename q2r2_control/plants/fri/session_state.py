@@ -90,7 +90,8 @@ class SessionState:
         if self.is_too_slow:
             period, allowed = 1e3 * self.period, 1e3 * TORQUE_PERIOD
             return Reason.of(FriReason.FRI_TOO_SELDOM, arm=self.arm, period=period, allowed=allowed)
-        # The session goes on for a while after some stops of the safety controller. Our own stop has to begin at once.
+        # Both are checked, because the session goes on for a while after some stops of the safety controller, and our
+        # own stop has to begin at once.
         if newest.session is not Session.COMMANDING_ACTIVE or newest.safety is not Safety.NORMAL:
             states = newest.session, newest.quality, newest.safety, newest.drives
             doing, quality, safety, drives = map(in_words, states)

@@ -171,7 +171,8 @@ class ArmOutputs:
         if not self._relaying and engaged:
             self._relaying, fault = self._safe_problem is None and tool is not None, self._safe_problem
         self._relaying = self._relaying and safe is not None
-        # A stream starts at the measured tool, and the safe target may differ from it by the arm's steady-state offset.
+        # The stream starts at the measured tool, because the safe target may differ from it by the arm's steady-state
+        # offset.
         self._relay.step(safe if self._relaying else None, tool, base, now, decided, start=tool)
         return _refused(fault)
 

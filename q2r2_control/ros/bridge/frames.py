@@ -94,7 +94,7 @@ class FrameTree:
                 place = self._found[frame, within] = Placement(pose, received)
                 self._used.update(up, (name for name, _ in self.upwards(frame)))
                 self._all = False
-                return place  # The next transform clears the placements that were found.
+                return place  # The placement is remembered until the next transform, which clears all of them.
         self._all = True
         return None
 

@@ -135,7 +135,7 @@ class GripperClient:
             self.problem = f"no gripper server at {self._name}"
             self._ask_to_stay()
             return
-        self._goals += 1  # The results of earlier goals are ignored.
+        self._goals += 1  # With a new number, the results of earlier goals are ignored.
         if self._client is not None:
             self._goal_closed = opening < 0.5
         self._begins, self._waits = True, self._grants is not None and self._grants.answered
@@ -236,6 +236,6 @@ class GripperClient:
 
     def _end(self, problem: str | None) -> None:
         self._goal_closed, self.problem, self._waits = None, problem, False
-        self._goals += 1  # Later answers to this goal are ignored.
+        self._goals += 1  # With a new number, later answers to this goal are ignored.
         if problem is not None:
             self._node.get_logger().warning(problem)

@@ -289,7 +289,7 @@ class JointIntake:
     def _part(self, topic: str, given: tuple[str, ...]) -> tuple[list[str], list[int]]:
         """Return the names and indices of a topic's joints that a message has. Each arm may have its own publisher."""
         if (part := self._parts.get((topic, given))) is None:
-            if len(self._parts) >= _PARTS:  # A publisher sends new names each time.
+            if len(self._parts) >= _PARTS:  # The cache fills only if a publisher sends other names each time.
                 self._parts.clear()
             pairs = zip(self._names[topic], self._joints[topic], strict=True)
             found = [(name, int(joint)) for name, joint in pairs if name in given]

@@ -110,7 +110,8 @@ class LbrDrivers:
             release = STATE_TOPICS[topic.rpartition("/")[2]]
             self._node.get_logger().info(f"{topic}: the driver of the {arm} arm, with the topics of releases {release}")
         elif now - self._newest[arm][1] > _RESTART:
-            self._held[joints] = np.nan  # The driver may have been restarted without a report.
+            # The posture is forgotten, because the driver may have been restarted without a report.
+            self._held[joints] = np.nan
         if not active:
             self._held[joints] = np.nan
             self.withheld.add(self._namespaces[arm])

@@ -16,7 +16,9 @@ from q2r2_control.robot.pairs import CLEARANCE
 from q2r2_control.ros.base_node import BaseNode
 from q2r2_control.ros.bridge.parameters import may_be_none, range_of, stance_of
 
-if TYPE_CHECKING:  # The nodes of arms have no controller, and must not wait for its kernels.
+# These modules are not imported at run time, because the nodes of arms have no controller, and must not wait for its
+# kernels.
+if TYPE_CHECKING:
     from q2r2_control.compliance.impedance import ImpedanceController
     from q2r2_control.control.controller import CartesianController
     from q2r2_control.supervision.joint_watch import ExternalSettings, WatchSettings
@@ -77,7 +79,8 @@ def make_control_live(node: BaseNode, controller: CartesianController) -> None:
         field = ControllerSettings.model_fields[name]
         value, within = getattr(controller.settings, name), range_of(field)
         if name == "min_distance":
-            within = 0.0, max(CLEARANCE, value)  # The field does not contain the bounds of this type.
+            # The range is written here, because the field does not contain the bounds of this type.
+            within = 0.0, max(CLEARANCE, value)
         node.parameter(f"control.{name}", value, field.description or name, read_only=False, within=within)
 
     def on_set(parameters: Sequence[Parameter]) -> SetParametersResult:
@@ -94,7 +97,7 @@ def make_impedance_live(node: BaseNode, impedance: ImpedanceController) -> None:
         field = ImpedanceSettings.model_fields[name]
         value, bounds = getattr(impedance.settings, name), range_of(field)
         assert bounds is not None
-        # The ends of a parameter's range are allowed values, and no such parameter may be 0.
+        # The range begins above 0, because its ends are allowed values, and no such parameter may be 0.
         within = max(bounds[0], min(0.1, value)), bounds[1]
         node.parameter(name, value, f"{field.description}; changes over ramp_time", read_only=False, within=within)
 

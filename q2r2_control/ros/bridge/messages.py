@@ -215,7 +215,7 @@ def _stem_and_number(name: str) -> tuple[str, str]:
     return stem, name[len(stem) :]
 
 
-@lru_cache(maxsize=64)  # Publishers send the same names again and again.
+@lru_cache(maxsize=64)  # Results are kept, because publishers send the same names again and again.
 def order_of(given: tuple[str, ...], names: tuple[str, ...]) -> Array | str:
     """Return the index of each of ``names`` in ``given``, or one line that says what is wrong with ``given``."""
     if len(set(given)) != len(given):

@@ -82,7 +82,8 @@ def build_interfaces(report: Callable[[str], None], force: bool = False) -> None
             raise BuildError(f"{package.name} was built into {prefix} but cannot be imported, see {log}")
         report(f"{package.name}: built in {time.monotonic() - began:.0f} s (log: {log})")
     sourced = _sourced()
-    if held and sourced and prefix not in sourced:  # The sourced ROS does not find the packages' libraries.
+    # A further file has to be sourced, because the sourced ROS does not find the packages' libraries.
+    if held and sourced and prefix not in sourced:
         report(f"before use: source {prefix}/share/{held[0]}/local_setup.bash")
 
 
@@ -100,7 +101,7 @@ def build_missing(report: Callable[[str], None]) -> None:
 def missing_tools(prefix: Path) -> list[str]:
     """Return one text for each thing that a build into ``prefix`` lacks. The text says where to get it."""
     missing = []
-    # Debian's own Python imports from another folder.
+    # Python's own folder is compared with this one, because Debian's own Python imports from another folder.
     packages = prefix / "lib" / f"python{sys.version_info.major}.{sys.version_info.minor}" / "site-packages"
     if Path(sysconfig.get_path("purelib")) != packages or not os.access(packages, os.W_OK):
         missing.append(f"a virtual environment that can be written to, since {prefix} is none")

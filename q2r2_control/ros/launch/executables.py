@@ -31,7 +31,8 @@ def _executable(name: str) -> Callable[[], int]:
     def run() -> int:
         sys.argv[0] = name
         signal.signal(signal.SIGINT, signal.SIG_DFL)
-        # q2r2 ros up blocks the signal, so that it does not interrupt the start of the interpreter either.
+        # The signal is allowed only now. q2r2 ros up has blocked it, so that it does not interrupt the start of the
+        # interpreter either.
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
         module, made = NODES[name]
         imported = import_module(f"q2r2_control.ros.nodes.{module}")
@@ -42,7 +43,7 @@ def _executable(name: str) -> Callable[[], int]:
         from q2r2_control.ros.base_node import end_in_time, run_node
 
         code = run_node(node_or_run) if isinstance(node_or_run, type) else int(node_or_run())
-        end_in_time()  # The middleware may still work while the process ends.
+        end_in_time()  # The time is limited, because the middleware may still work while the process ends.
         return code
 
     return run

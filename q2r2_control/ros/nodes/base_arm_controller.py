@@ -90,8 +90,8 @@ class BaseArmController(BaseNode):
         except BaseException:
             self.destroy_node()  # A half-made node could keep the process from ending.
             raise
-        # For its first log line rclpy takes some 60 ms, because it searches all modules for the line's origin. An
-        # operator's press must not wait for that.
+        # For its first log line, rclpy takes some 60 ms, because it searches all modules for the line's origin. This
+        # line is logged now, so that an operator's press does not wait for that.
         self.get_logger().info(f"the {self.hand} hand moves the target on {self.outputs.first.topic}")
 
     def setup_parameters(self) -> ArmParameters:
@@ -233,7 +233,7 @@ class BaseArmController(BaseNode):
         if (held := self.outputs.gripper_held) is not None:
             return WARN, held, values
         if self.state in AT_REST:
-            # An earlier press may have been refused, but for a reason that no longer exists.
+            # The last pause is shown, because the last event may be a refused press, whose reason no longer exists.
             return OK, f"ready to engage ({self.feedback.paused})", values
         return OK, self.feedback.last_line, values
 
@@ -259,8 +259,8 @@ class BaseArmController(BaseNode):
         if base is None:
             return WARN, Reason.of(RosReason.NO_TRANSFORM, frame=values.base_frame, world=values.world_frame)
         unready = self.outputs.unready
-        # An arm that follows may lag behind the safe target. An arm that holds would be engaged and stopped again at
-        # every press.
+        # Only an arm that holds is unready for this reason, because it would be engaged and stopped again at every
+        # press. An arm that follows may lag behind the safe target.
         if self.outputs.builtin and self.state in HOLDING and (away := self.outputs.away(controlled, tool)):
             unready = unready or Reason(RosReason.CONTROLLER_REFUSES, cause=away)
             if self.state is ArmState.IDLE:

@@ -83,8 +83,7 @@ class CartesianControllerNode(ManagedNode):
             self._output.withheld = told.withheld
         streams, external = StreamSettings(linked=config.teleop.linked), ExternalSettings()
         watch = watch_settings(config.supervision, self._output.drive.yields)
-        # If single joint states have numbers that are not finite, another publisher sends them. They are a fault at
-        # once.
+        # Joint states with numbers that are not finite are a fault at once, because they come from another publisher.
         watch.unusable_time = 0.0
         make_watching_live(self, streams, watch, external)
         self._watch = watch
@@ -115,7 +114,8 @@ class CartesianControllerNode(ManagedNode):
         self._clock_of_ticks = TickClock(self._period)
         self._reference: Reference | None = None
         self._commanding, self._advances = False, 0  # ``_advances`` counts the ticks in which time has passed.
-        # Another controller follows every safe target. Nodes that only listen need the newest one.
+        # Every safe target is sent if another controller follows them. Nodes that only listen get one at intervals,
+        # because they need only the newest one.
         every = 1 if self._is_external else max(round(_SAFE_TARGET_PERIOD * rate), 1)
         self._feedback = ControllerFeedback(self, self._controller, self._targets, every)
         self._last_tick = self.now
@@ -271,7 +271,7 @@ class CartesianControllerNode(ManagedNode):
         settle = float(self.get_parameter("settle_time").value)
         active = self._tick_until(lambda: self._supervisor.phase is Phase.ACTIVE, settle + _LONGEST_ACTIVATION)
         problem = None if active else self._supervisor.fault or Reason(RosReason.ARMS_MOVE)
-        # Commands begin with the next tick.
+        # This check comes last, because commands begin with the next tick.
         if (problem := self._others.commander(_QUIET) or problem) is not None:
             self._supervisor.let_go(problem, self.now)
             self._supervisor.stop(self._deactivated)

@@ -73,7 +73,8 @@ class GripperServer:
             node,
             GripperCommand,
             topic,
-            execute_callback=lambda _: GripperCommand.Result(),  # Each goal gets its own result at its end.
+            # This result is not used, because each goal gets its own result at its end.
+            execute_callback=lambda _: GripperCommand.Result(),
             goal_callback=self._check,
             handle_accepted_callback=self._accept,
             cancel_callback=lambda _: CancelResponse.ACCEPT,
@@ -178,7 +179,8 @@ class MujocoRobot(BaseNode):
         self._tf_static.publish(fixed.at(self._cell.plant.data, self.now))
 
     def _make_subscriptions(self) -> None:
-        # Each arm may have its own sender, and one sender's message must not replace the other sender's message.
+        # The queue has two messages per arm. Each arm may have its own sender, and one sender's message must not
+        # replace the other sender's message.
         commands = QoSProfile(depth=2 * len(self._robot.arms), reliability=ReliabilityPolicy.RELIABLE)
         names, move, push = self._robot.joint_names, self._cell.command_velocities, self._cell.command_torques
         kinds: tuple[tuple[type, str, Callable[[Any], str | None]], ...] = (
@@ -190,7 +192,8 @@ class MujocoRobot(BaseNode):
         )
         for kind, topic, command in kinds:
             take = partial(self._take, topic, command)
-            if kind is JointTrajectory:  # These messages come at every tick.
+            # These messages are read without rclpy's conversion, because they come at every tick.
+            if kind is JointTrajectory:
                 take = partial(self._take_serialized, trajectory_reader(), take)
             self.create_subscription(kind, topic, take, commands, raw=kind is JointTrajectory)
 
@@ -205,7 +208,8 @@ class MujocoRobot(BaseNode):
         take(message, info)
 
     def _take(self, topic: str, command: Callable[[Any], str | None], message: Any, info: Mapping[str, Any]) -> None:
-        # Two controllers, each of one arm, may send on one topic from hosts with different clocks.
+        # Delays are watched by topic and first joint. Two controllers, each of one arm, may send on one topic from
+        # hosts with different clocks.
         names = message.joint_names if topic == _TRAJECTORY else getattr(message, "name", ())
         delays = self._delays.setdefault((topic, *names[:1]), DelayWatch(STREAM_TIMEOUT))
         if late := delays.take(delay(info), time.monotonic()):
@@ -243,7 +247,8 @@ class MujocoRobot(BaseNode):
         stamp = self.now
         q = np.concatenate([state.q, cell.finger_positions()])
         v = np.concatenate([state.v, cell.finger_velocities()])
-        tau = np.concatenate([state.tau, np.zeros(len(q) - len(state.tau))])  # Efforts of fingers are not measured.
+        # Fingers get the effort 0, because it is not measured.
+        tau = np.concatenate([state.tau, np.zeros(len(q) - len(state.tau))])
         self._joint_states.publish(self._measured.fill([*q.tolist(), *v.tolist(), *tau.tolist()], stamp))
         if state.tau_external is not None and now >= self._external_due:
             # The due times are on a grid, half a tick early, so that a tick that comes early by jitter counts.

@@ -115,7 +115,7 @@ class RecorderNode(BaseNode):
             about = replace(about, notes=anonymous(about.notes))
         streams.wait_until_ready()
         channels = {topic.name: topic.channel for topic in topics}
-        self._devices = DeviceMessages(streams, channels, self._day_at, time.monotonic())
+        self._devices = DeviceMessages(streams, channels, self._unix_time_at, time.monotonic())
         self._recorder.begin(about, topics)
         taken = [topic for topic in topics if topic.name not in of_devices]
         self._listen(taken, {arm_events(arm) for arm in robot.arms}, heard.values())
@@ -137,7 +137,7 @@ class RecorderNode(BaseNode):
 
     def _take(self, topic: Topic, told: bool, payload: bytes, info: Mapping[str, Any]) -> None:
         """Keep a message until :meth:`_write`. ``told`` is True for an arm's event, which may be about an episode."""
-        received = self._day() - round(age(info) * 1e9)
+        received = self._unix_time() - round(age(info) * 1e9)
         number, sent = info["publication_sequence_number"] or 0, info["source_timestamp"]
         self._waiting.append(Message(topic.channel, number, received, max(sent, 0), bytes(payload)))
         if told:
@@ -151,12 +151,12 @@ class RecorderNode(BaseNode):
             self._judge.record_event(self._event(event.reason))
             self.report_health()
 
-    def _day(self) -> int:
-        """Return the time of day [ns]. It does not jump if the computer's clock is set."""
+    def _unix_time(self) -> int:
+        """Return the Unix time [ns]. It does not jump if the computer's clock is set."""
         return self._epoch + time.monotonic_ns() - self._begun
 
-    def _day_at(self, monotonic: float) -> int:
-        """Return the time of day [ns] at a time of the monotonic clock [s]."""
+    def _unix_time_at(self, monotonic: float) -> int:
+        """Return the Unix time [ns] at a time of the monotonic clock [s]."""
         return self._epoch + round(monotonic * 1e9) - self._begun
 
     def _write(self) -> None:
@@ -170,7 +170,7 @@ class RecorderNode(BaseNode):
         for reason in reasons:
             self.get_logger().warning(sentence(reason))
             self._tell(reason)
-        until, self._looked = self._looked, self._day()
+        until, self._looked = self._looked, self._unix_time()
         self._recorder.record([one for one in self._waiting if one.time <= until])
         self._waiting = [one for one in self._waiting if one.time > until]
         self._judge.report_verdicts()
@@ -193,7 +193,7 @@ class RecorderNode(BaseNode):
         return response
 
     def _event(self, reason: Reason) -> Event:
-        return Event(self._day() * 1e-9, "", "", "", reason)
+        return Event(self._unix_time() * 1e-9, "", "", "", reason)
 
     def _tell(self, reason: Reason) -> None:
         """Record an event that comes from no hand, and tell both hands of it through the arms' nodes."""

@@ -59,7 +59,8 @@ class SimulationInput(BaseNode):
         self._starts = True  # Whether presses may still engage the arms.
         self._pressed = False  # Whether the buttons were pressed once to engage the arms.
         self._moves = False  # Whether the hands move.
-        self._until = math.inf  # Time until which arms are engaged again [s].
+        # Until this time, the script starts again and presses again if the arms do not follow [s].
+        self._until = math.inf
         self._not_to_press: set[str] | None = None  # Hands that do not press; None if that is not decided yet.
         self._rewind(self.now)
         self._timer = self.create_tick(_LONGEST, self._tick)

@@ -110,7 +110,7 @@ class TcpEndpoint(BaseNode):
         self._hand_publishers.publish(reception.topic, message, frame, self.now)
 
     def _pass_on(self, record: logging.LogRecord) -> None:
-        # rclpy allows one severity for each line of code.
+        # Each severity has a line of its own, because rclpy allows only one severity for each line of code.
         if record.levelno >= logging.WARNING:
             self.get_logger().warning(self._log.format(record))
         else:

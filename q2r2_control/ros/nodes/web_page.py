@@ -159,7 +159,8 @@ class WebPage(BaseNode):
             case PageRequest.RESET:
                 return [f"{self._controller}/reset", *(f"{arm}/reset" for arm in arms)]
             case PageRequest.RECORD:
-                # The node's state comes twice a second, later than the marks of episodes that the page shows.
+                # The marks of episodes that the page shows come first, because the node's state comes only twice a
+                # second.
                 told = self._marks.open if self._marks.any else states.get(self._recorder, {}).get("episode_open")
                 return [f"{self._recorder}/{'stop' if told else 'start'}"]
             case PageRequest.MARK | PageRequest.SUBTASK:
@@ -198,7 +199,8 @@ class WebPage(BaseNode):
             self._slowest = max(self._slowest, float(chunk.rows["compute_time"].max()))
         if self._row is None:
             return
-        # A controller that is stopped has no ticks. The positions of the joints are still shown.
+        # A controller that is stopped has no ticks. The newest positions of the joints are therefore written into the
+        # last row.
         self._row["now"] = (time.monotonic_ns() - self._begun) / NANOSECONDS
         self._row["q"], self._row["v"], self._row["tau"] = self._ticks.joints
         nodes = node_views(self._states)

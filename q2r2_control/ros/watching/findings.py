@@ -27,7 +27,8 @@ from q2r2_control.teleop.arm_states import ArmState
 _ONE = "end all but one (a killed one counts for some seconds)"
 _START_CONTROLLER = "start the arm's controller, or set preset or ctrl_prefix to the one that runs"
 _START_HANDS = "start tcp_endpoint and connect the headset, or SimulationInput"
-# The driver's controllers keep their last command, and its hardware cannot be activated again.
+# The launch file has to be started anew, because the driver's controllers keep their last command, and its hardware
+# cannot be activated again.
 FRI_CURE = "start the application on the pendant, and the driver's launch file anew: it ends with each session"
 _BAD_STATES = (
     *(
@@ -111,7 +112,7 @@ def _senders(view: SetView) -> Iterator[Finding]:
             continue
         arms = [controllers[name].arms for name in topic.publishers if name in controllers]
         if len(arms) == len(topic.publishers) and len(set().union(*arms)) == sum(map(len, arms)):
-            continue  # Each of these controllers has its own arm.
+            continue  # This is no fault, because each of these controllers has its own arm.
         yield error(f"{len(topic.publishers)} publishers of {topic.name}: {', '.join(topic.publishers)}", _ONE)
     for robot in (node.name for node in view.nodes if node.is_robot):
         topics = [topic for topic in view.topics if robot in topic.subscribers and topic.publishers]

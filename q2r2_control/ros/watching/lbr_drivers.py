@@ -121,7 +121,9 @@ def _compare_limits(view: DriverView, cell: Config, robot: Robot) -> Iterator[Fi
     low, high, fastest = (
         np.array([float(limits[theirs[name]].get(key, "0")) for name in ours]) for key in ("lower", "upper", "velocity")
     )
-    if view.state is not None:  # The driver's safe_stop allows no position from which one step leads beyond a limit.
+    # The limits are narrower by one step, because the driver's safe_stop allows no position from which one step leads
+    # beyond a limit.
+    if view.state is not None:
         low, high = low + fastest * view.state.sample_time, high - fastest * view.state.sample_time
     lower, upper = robot.position_lower[joints], robot.position_upper[joints]
     margin = np.maximum(low - lower, upper - high)

@@ -19,8 +19,9 @@ from q2r2_control.viewer.web.browser_messages import LONGEST_MESSAGE, BrowserMes
 from q2r2_control.viewer.web.page_file import PageFile
 
 _MOST_CLIENTS = 12  # Greatest number of pages that may be open at one time.
-# viser's page is one file with its scripts and styles. It compiles WebAssembly, and starts workers from blobs.
-# Its sorter of Gaussian splats evaluates text as code. The policy forbids this, because this page shows no splats.
+# The content security policy allows what viser's page needs. The page is one file with its scripts and styles, compiles
+# WebAssembly, and starts workers from blobs. Its sorter of Gaussian splats evaluates text as code. The policy forbids
+# this, because this page shows no splats.
 _POLICY = (
     "default-src 'self'; script-src 'self' 'unsafe-inline' 'wasm-unsafe-eval' blob:; style-src 'self' 'unsafe-inline'; "
     "connect-src 'self' blob: data:; img-src 'self' blob: data:; font-src 'self' data:; worker-src 'self' blob: data:; "
@@ -71,12 +72,13 @@ class Door(PageDoor):
             def checked(connection: ServerConnection, request: Request) -> Response | None:
                 if (reason := self.refusal(request)) is not None:
                     return text_response(http.HTTPStatus.FORBIDDEN, f"{reason}\n")
-                request.path = "/"  # viser serves nothing but the page.
+                request.path = "/"  # Every path means the page, because viser serves nothing else.
                 response: Response | None = answer(connection, request)
                 if response is not None:
                     page.change(response)
                     protect(response, _POLICY)
-                    response.headers["X-Frame-Options"] = "DENY"  # A foreign page around this one could steal a click.
+                    # No page may contain this one, because a foreign page could then steal a click.
+                    response.headers["X-Frame-Options"] = "DENY"
                 return response
 
             async def counted(connection: ServerConnection) -> None:

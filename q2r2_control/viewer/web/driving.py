@@ -98,7 +98,8 @@ class Driving:
             self._gizmos[page] = client, gizmos
 
     def _add_gizmo(self, client: viser.ClientHandle, arm: str) -> viser.TransformControlsHandle:
-        # Each gizmo has a new name. If an earlier gizmo had the same name, a browser would go on with its drag.
+        # Each gizmo gets a new name, because a browser would go on with the drag of an earlier gizmo that had the same
+        # name.
         self._gizmo_count += 1
         name = f"/gizmos/{arm}_{self._gizmo_count}"
         gizmo = client.scene.add_transform_controls(name, scale=_SIZE, depth_test=False, visible=False)
@@ -135,7 +136,7 @@ class Driving:
                     self._pace.begin()
                     Thread(target=self._ask, args=(page,), daemon=True).start()
             elif self._driver == page and event.phase == "end" and page not in self._server.get_clients():
-                self._lose()  # viser ends the drag of a page that has gone.
+                self._lose()  # The page has gone, so viser has ended its drag.
             elif self._driver == page and arm in self._dragged:
                 self._dragged[arm] = _pose_of(event.target)
                 self._send(arm, drag=event.phase != "end")
@@ -189,7 +190,8 @@ def _ends_drag(event: Event) -> bool:
     if event.kind is TeleopReason.NOT_ENGAGED:
         return True
     stops = event.source != event.destination and event.destination in HOLDING | {ArmState.HOMING}
-    return stops and event.kind is not TeleopReason.DEAD_MAN_RELEASED  # A release is the end of an earlier drag.
+    # A release does not count, because it is the end of an earlier drag.
+    return stops and event.kind is not TeleopReason.DEAD_MAN_RELEASED
 
 
 def _pose_of(gizmo: viser.TransformControlsHandle) -> tuple[tuple[float, ...], tuple[float, ...]]:

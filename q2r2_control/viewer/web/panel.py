@@ -193,7 +193,8 @@ class Panel:
         self._words.follow(frame.events)
         for event in frame.events:
             line = f"{event.t:.1f} s", sentence(event.reason)
-            if event.kind in _OF_EPISODES and line not in self._told[-2:]:  # Each arm has an event.
+            # The line is shown once, although each arm has an event with it.
+            if event.kind in _OF_EPISODES and line not in self._told[-2:]:
                 self._told.append(line)
         self._binding |= dict.fromkeys(frame.binding)
         if frame.pictures:

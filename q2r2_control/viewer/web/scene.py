@@ -179,7 +179,7 @@ class CellScene:
         if 0.0 <= tick.t - self._trail_time < _TRAIL_PERIOD:
             return
         if not 0.0 <= tick.t - self._trail_time < _BREAK:
-            self._trail_points.clear()  # The user has moved the time line of a replay.
+            self._trail_points.clear()  # The trails are dropped, because the user has moved the time line of a replay.
         self._trail_time = tick.t
         for (arm, kind), trail in self._trails.items():
             target = tick.targets[arm].pose

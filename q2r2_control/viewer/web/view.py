@@ -178,7 +178,8 @@ class PageView(Page):
     @property
     def _driver(self) -> str:
         """The device that drives, in words; empty if the input does not know it."""
-        driver = getattr(self._source, "driver", "")  # Another thread may change it.
+        # The attribute is read once, because another thread may change it.
+        driver = getattr(self._source, "driver", "")
         if self._nobody or driver == "":
             return self._nobody
         return "nobody drives" if driver is None else f"the headset at {driver} drives"

@@ -14,7 +14,7 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 from tests.control.cells import NAMES, CellArrays, arrays_of, cell, distances, placed, random_posture
 
-# Coal computes capsule and capsule in closed form, and capsule and box by iteration.
+# Coal computes the distance of two capsules in closed form, and that of a capsule and a box by iteration.
 EXACT, ITERATED = 1e-9, 1e-4
 STEP = 1e-6  # Step of finite differences [rad].
 
