@@ -17,9 +17,9 @@ from q2r2_control.types import SIDES, Array, HandInputs
 from tests.pipeline.loops import pipeline
 from tests.support.processes import Watch, cell
 
-SECONDS, RATE = 110.0, 72.0  # Duration [s], and rate of the hands [Hz].
+SECONDS, RATE = 37.0, 72.0  # Duration [s], and rate of the hands [Hz].
 LET_THROUGH = 1.0  # Time between two delays of the network [s].
-# Delays of the network [s]. Nine of ten delays hold up ten samples. The tenth delay is longer than the gate's timeout.
+# Delays of the network [s]. Six of seven delays hold up ten samples. The seventh is longer than the gate's timeout.
 HELD_UP = 0.13, 0.165
 FROM, BEYOND = -0.15, 0.15  # Range of the targets relative to the edge of reach [m].
 # Longest time in which a target may move while its tool does not, for example where the target reverses [s].
@@ -41,7 +41,7 @@ class Bursts(SampleTiming):
 
     def lateness(self) -> float:
         number, within = divmod(self._t, LET_THROUGH)
-        held_up = HELD_UP[0 if (number + 1) % 10 else 1]
+        held_up = HELD_UP[0 if (number + 1) % 7 else 1]
         return max(held_up - within, 0.0) if number else 0.0
 
 
