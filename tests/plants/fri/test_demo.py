@@ -17,8 +17,11 @@ from tests.plants.fri.virtual_cabinets import VirtualCabinets
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("period", [0.005, 0.002], ids=["every 5 ms", "every 2 ms"])
-def test_both_tasks_succeed_through_cabinets_with_a_jittering_network(period: float) -> None:
+@pytest.mark.parametrize(
+    ("name", "period"),
+    [pytest.param("handover", 0.005, id="every 5 ms"), pytest.param("stack", 0.002, id="every 2 ms")],
+)
+def test_a_task_succeeds_through_cabinets_with_a_jittering_network(name: str, period: float) -> None:
     config = load_config("config/dual_iiwa7_fri.yaml")
     robot = Robot.from_config(config)
     arms = SimulatedArms(robot, config)
@@ -36,12 +39,11 @@ def test_both_tasks_succeed_through_cabinets_with_a_jittering_network(period: fl
     )
     for cabinet in plant.cabinets.values():
         cabinet.start_overlay()
-    names = "handover+stack"
-    pipeline = Pipeline(config, robot, ScriptedInput(names), plant, CommandMode.POSITION)
-    tasks = TaskWatch(tasks_named(names.split("+")), arms.plant, robot, config)
+    pipeline = Pipeline(config, robot, ScriptedInput(name), plant, CommandMode.POSITION)
+    tasks = TaskWatch(tasks_named([name]), arms.plant, robot, config)
     pipeline.listeners.append(tasks)
-    summary = pipeline.run(trajectory_named(names).duration, realtime=False)
-    assert {result.name: result.reason for result in tasks.results()} == {"handover": "", "stack": ""}
+    summary = pipeline.run(trajectory_named(name).duration, realtime=False)
+    assert {result.name: result.reason for result in tasks.results()} == {name: ""}
     assert [trip for cabinet in plant.cabinets.values() for trip in cabinet.trips] == []
     assert sum(cabinet.missed for cabinet in plant.cabinets.values()) == 0
     for arm in summary.arms.values():
