@@ -10,14 +10,10 @@ import numpy as np
 import pytest
 import yaml
 
-from tests.cameras.videos import FPS, HEIGHT, WIDTH, number_in, number_of_jpeg, write_video
+from tests.cameras.videos import FPS, HEIGHT, SLOW_FPS, WIDTH, number_in, number_of_jpeg, write_video
 from tests.cli.command import one_object, q2r2
 
 CELL = Path("config/dual_iiwa7.yaml")
-
-
-# On a busy machine, a picture may come late. One that is late by two periods can be neither judged well nor exported.
-SLOW_FPS = 5.0
 
 
 def cell_with(folder: Path, cameras: dict[str, object], cell: Path = CELL) -> Path:
