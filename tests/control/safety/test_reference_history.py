@@ -14,7 +14,7 @@ DENSE = np.linspace(0.0, H, 21)
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_no_joint_was_farther_away_in_the_window_than_the_bounds_say(name: str) -> None:
+def test_no_joint_was_farther_from_its_present_position_during_the_window_than_the_bounds_say(name: str) -> None:
     random, robot = np.random.default_rng(3), cell(name).robot
     model, limit = kernel_model(name).safety, robot.velocity_limit
     data = kernel_data(name, robot.home).safety

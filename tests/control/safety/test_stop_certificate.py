@@ -22,7 +22,7 @@ MIN_DISTANCE = 0.02
 
 @given(v=st.floats(-3, 3), v_next=st.floats(-3, 3), h=st.floats(1e-5, 0.02))
 @settings(derandomize=True, max_examples=200, deadline=None)
-def test_the_travel_of_a_step_adds_motion_there_and_back(v: float, v_next: float, h: float) -> None:
+def test_the_travel_of_a_step_is_the_sum_of_its_motions_in_both_directions(v: float, v_next: float, h: float) -> None:
     t = np.linspace(0.0, h, 2001)
     q = v * t + 0.5 * (v_next - v) / h * t**2
     way = float(np.abs(np.diff(q)).sum())
@@ -154,7 +154,7 @@ def _swings(random: np.random.Generator, count: int, dip: float) -> Iterator[Mot
             return
 
 
-def test_a_pair_that_comes_too_close_within_a_step_is_refused_even_if_it_is_apart_at_both_ends() -> None:
+def test_a_step_within_which_a_pair_comes_too_close_is_refused_even_if_the_pair_is_apart_at_both_ends() -> None:
     swings = list(_swings(np.random.default_rng(21), 8, dip=5e-4))
     assert len(swings) == 8
     for motion in swings:
@@ -338,7 +338,7 @@ def test_in_a_stop_arm_by_arm_each_arm_takes_the_time_of_its_slowest_joint(seed:
 @pytest.mark.parametrize("shape", range(SHAPES), ids=["together", "arm by arm", "own"])
 @given(seed=SEEDS)
 @settings(derandomize=True, max_examples=200, deadline=None)
-def test_every_shape_of_stop_keeps_position_limits_at_every_moment(shape: int, seed: int) -> None:
+def test_every_kind_of_stop_keeps_position_limits_at_every_moment(shape: int, seed: int) -> None:
     """Each joint starts at, or below, the speed that property P allows at its distance from the limit.
 
     A slow joint that stops together with a fast joint moves for a long time, and must not drift beyond its limit.
