@@ -33,7 +33,9 @@ def measured(model: CollisionModel, q: Array) -> tuple[Array, Array]:
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_only_pairs_with_a_depth_get_rounded_boxes_and_no_rounded_box_is_larger(seed: int) -> None:
+def test_only_pairs_with_an_allowed_depth_get_rounded_boxes_and_no_rounded_box_is_larger_than_its_box(
+    seed: int,
+) -> None:
     q = random_posture(ROBOT, np.random.default_rng(seed))
     (distance, _), (rounded, bound) = measured(MODEL, q), measured(ROUNDED, q)
     np.testing.assert_array_equal(rounded[~TOUCHING], distance[~TOUCHING])
@@ -51,7 +53,7 @@ def test_rounded_boxes_do_not_change_distances_above_the_face_of_a_box() -> None
     np.testing.assert_allclose(rounded[TOUCHING], distance[TOUCHING], atol=1e-12)
 
 
-def test_a_rounded_box_has_the_depth_of_its_pair_as_its_radius() -> None:
+def test_a_box_is_rounded_with_the_allowed_depth_of_its_pair_as_the_radius() -> None:
     first, second = ((model.bodies.radius[model.pairs.second])[TOUCHING] for model in (MODEL, ROUNDED))
     np.testing.assert_allclose(second - first, DEPTH)
 
