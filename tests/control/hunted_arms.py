@@ -1,4 +1,4 @@
-"""Arms that are chased by a moving hand. Their distances from the hand are measured by Coal, not by our kernels."""
+"""Arms that are chased by a moving obstacle called hand. Coal, and not our kernels, measures the distances."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 from q2r2_control.verification.fault_injection import FaultySolver, WorstSolver, untimed
 
-RADIUS = 0.1  # Radius of a hand [m].
+RADIUS = 0.1  # Radius of the sphere that represents a hand [m].
 
 
 @cache
@@ -114,7 +114,7 @@ class Hunt:
         self.nearest_moving, self.touched, self.moved, self.retreats = np.inf, 0, 0, 0
 
     def run(self, seconds: float, speed: float, period: float, acceleration: float | None = None) -> None:
-        """Run the hunt. A report comes every ``period`` [s]."""
+        """Run the hunt. The controller gets a report on the obstacle every ``period`` [s]."""
         controller, robot = self.controller, self.controller.robot
         targets = {arm: robot.tool_pose(robot.home, arm) for arm in robot.arms}
         q, v, t, due, change = robot.home, np.zeros(robot.model.nv), 0.0, 0.0, 0.0

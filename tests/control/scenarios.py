@@ -62,7 +62,7 @@ def into_the_table(t: float, start: Mapping[str, pin.SE3]) -> Targets:
 
 
 def one_arm_frozen(t: float, start: Mapping[str, pin.SE3]) -> Targets:
-    """The left arm holds, and the target of the right arm is at the start position of the left tool."""
+    """The left arm has no target, and the target of the right arm is at the start position of the left tool."""
     return {"left": None, "right": pin.SE3(start["right"].rotation, start["left"].translation)}
 
 

@@ -35,7 +35,7 @@ def _double(values: Array) -> None:
         values[i] *= 2.0
 
 
-def test_bound_machine_code_belongs_to_the_kernel_and_has_run_once() -> None:
+def test_the_function_bound_runs_a_kernel_once_and_returns_its_machine_code() -> None:
     values = np.ones(3)
     double = bound(_double, values)
     np.testing.assert_array_equal(values, [2.0, 2.0, 2.0])

@@ -25,7 +25,7 @@ from tests.control.cells import pandas
 from tests.control.scenarios import SCENARIOS, Scenario, circle, crossing
 
 DURATION = 2.0  # [s]
-# A faulty solver fails in the last part of every period. These are the period [s] and the share of this part.
+# A faulty solver fails in the last part of every period [s]. FAULT_SHARE is this part's fraction of the period.
 FAULT_PERIOD, FAULT_SHARE = 0.2, 0.2
 AGAINST_US = "against us"  # All attacks in turn, each for one period.
 Start = Callable[[Robot], tuple[Array, Array]]

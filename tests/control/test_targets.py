@@ -139,7 +139,9 @@ def test_a_target_has_no_velocity_if_no_time_passes(tracker: TargetTracker, dt: 
 
 
 @pytest.mark.parametrize("absent", [{}, {"left": None}], ids=["missing", "None"])
-def test_a_released_arm_brakes_and_holds_where_it_comes_to_rest(tracker: TargetTracker, absent: dict[str, Any]) -> None:
+def test_an_arm_without_a_target_brakes_and_holds_the_posture_where_it_comes_to_rest(
+    tracker: TargetTracker, absent: dict[str, Any]
+) -> None:
     _update(tracker, {"left": _pose(), "right": _pose()}, 0.001, STILL, STILL)
     left = np.arange(14) < 7
     q = STILL.copy()
@@ -153,7 +155,7 @@ def test_a_released_arm_brakes_and_holds_where_it_comes_to_rest(tracker: TargetT
         np.testing.assert_allclose(_taken(tracker).hold[left], q[left], err_msg="pushed aside it goes back")
 
 
-def test_after_a_reset_every_arm_holds_where_it_is(tracker: TargetTracker) -> None:
+def test_after_a_reset_every_arm_holds_its_posture(tracker: TargetTracker) -> None:
     _update(tracker, {"left": _pose(), "right": _pose()}, 0.001, STILL, STILL)
     tracker.reset(np.linspace(-1, 1, 14))
     assert _taken(tracker).follows.tolist() == [0, 0]
