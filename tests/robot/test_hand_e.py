@@ -57,7 +57,9 @@ def test_envelopes_contain_body_and_fingers_at_every_opening(
             assert outside <= 0, (item.name, placement.act(point))
 
 
-def test_the_tool_frame_lies_between_the_pads_just_behind_the_tips(hand: tuple[pin.Model, pin.GeometryModel]) -> None:
+def test_the_tool_frame_lies_between_the_finger_pads_13_mm_behind_the_tips(
+    hand: tuple[pin.Model, pin.GeometryModel],
+) -> None:
     model, _ = hand
     np.testing.assert_allclose([model.lowerPositionLimit, model.upperPositionLimit], [[0.0] * 2, [0.025] * 2])
     place = model.frames[model.getFrameId("tool_frame")].placement

@@ -137,7 +137,7 @@ def test_a_capsule_stays_a_capsule_and_drawings_count_only_without_collision_sha
     assert 2.0 * shapes["slide"].halfSide == pytest.approx([0.06, 0.1, 0.14])  # The box is that around the ellipsoid.
 
 
-def test_arms_at_an_angle_to_the_world_and_two_arms_in_one_file_get_a_root(arm: Path) -> None:
+def test_a_file_with_two_arms_gets_a_root_link_at_the_origin_of_the_world(arm: Path) -> None:
     text = re.sub(r'<body name="base"', '<body name="other" pos="0 1 0"><joint/><geom size="0.1"/></body>\\g<0>', ARM)
     arm.write_text(text)
     urdf, model, _ = read(arm)

@@ -22,7 +22,7 @@ def test_the_true_displacement_is_found(count: int) -> None:
     assert_allclose(off, 0.0, atol=1e-12)
 
 
-def test_a_point_that_was_touched_elsewhere_has_the_largest_error() -> None:
+def test_a_point_that_was_touched_at_a_wrong_position_has_the_largest_error() -> None:
     touched = np.array([TRUE.actInv(point) for point in POINTS])
     touched[2] += (0.0, 0.01, 0.0)
     _, off = fit_move(POINTS, touched)

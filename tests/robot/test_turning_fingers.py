@@ -91,7 +91,7 @@ def test_the_controller_and_coal_use_the_same_bodies(hand: Hand) -> None:
             assert kernels.size[number] == pytest.approx(item.geometry.halfLength + item.geometry.radius, abs=1e-12)
 
 
-def test_no_interval_reaches_farther_from_a_joint_than_the_bounds_of_the_kernels(hand: Hand) -> None:
+def test_no_capsule_for_any_interval_of_openings_extends_beyond_the_bounds_of_the_kernels(hand: Hand) -> None:
     robot, _, bodies = hand
     model, random = collision_model_of(robot), np.random.default_rng(1)
     names = [item.name for item in robot.collision_model.geometryObjects]
@@ -106,7 +106,7 @@ def test_no_interval_reaches_farther_from_a_joint_than_the_bounds_of_the_kernels
             assert max(np.linalg.norm(start), np.linalg.norm(end)) <= min(reach) + 1e-12
 
 
-# Strategies for any chain of turning and sliding joints with one or two drivers.
+# Hypothesis strategies for any chain of turning and sliding joints with one or two drivers.
 _NUMBERS = st.floats(-0.1, 0.1)
 _VECTORS = st.tuples(_NUMBERS, _NUMBERS, _NUMBERS)
 _AXES = st.sampled_from([(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.6, 0.8), (-0.48, 0.6, 0.64)])
@@ -117,7 +117,7 @@ def joints(draw: st.DrawFn) -> FingerJoint:
     slides = draw(st.booleans())
     size = 0.05 if slides else 1.6
     closed, opened, home = (size * draw(st.floats(-1.0, 1.0)) for _ in range(3))
-    # The travel beyond the stroke is the same share of the stroke for all joints of one driver.
+    # The travel beyond the stroke is the same fraction of the stroke for all joints of one driver.
     beyond = 0.1 * (opened - closed)
     axis, point = np.array(draw(_AXES)), np.array(draw(_VECTORS))
     driver = draw(st.sampled_from("ab"))
@@ -127,7 +127,7 @@ def joints(draw: st.DrawFn) -> FingerJoint:
 def moved(chain: Sequence[FingerJoint], ends: Array, at: dict[str, float], travel: bool = False) -> Array:
     """Return the ends (2, 3) of a shape [m].
 
-    ``at`` has the opening of each driver, from 0 to 1, or with ``travel`` the share of the driver's whole travel.
+    ``at`` has the opening of each driver, from 0 to 1, or with ``travel`` the fraction of the driver's whole travel.
     """
     for joint in reversed(chain):
         first, last = (joint.before, joint.beyond) if travel else (joint.closed, joint.open)
@@ -169,7 +169,7 @@ def test_positions_between_few_samples_are_inside_the_body_too() -> None:
         assert outside(moved(chain, body.ends, at), capsule, body.radius) <= 0.0
 
 
-def test_a_capsule_is_inside_another_one_if_both_of_its_ends_are() -> None:
+def test_a_capsule_is_inside_another_one_if_the_balls_at_both_of_its_ends_are() -> None:
     outer = Capsules(np.zeros((1, 3)), np.array([[0.0, 0.0, 0.1]]), np.array([0.02]))
     inside = Capsules(np.array([[0.005, 0.0, 0.0]]), np.array([[0.0, 0.004, 0.1]]), np.array([0.014]))
     assert not sticks_out(inside, outer).any()
@@ -178,7 +178,7 @@ def test_a_capsule_is_inside_another_one_if_both_of_its_ends_are() -> None:
     assert sticks_out(inside._replace(radius=np.array([0.016])), outer).all()
 
 
-def test_several_bodies_at_once_equal_each_one_alone_within_the_sampling_error(hand: Hand) -> None:
+def test_bodies_that_are_computed_together_equal_single_bodies_within_the_sampling_error(hand: Hand) -> None:
     _, _, bodies = hand
     together = TurningSweeps(list(bodies.values())).capsules((0.1, 0.4))
     for row, body in enumerate(bodies.values()):

@@ -1,4 +1,4 @@
-"""Forms of a URDF that programs read in different ways are unified, refused, or reported."""
+"""Forms of a URDF that programs interpret differently are unified, refused, or reported."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def arm(**parts: str) -> ET.Element:
     return parse_urdf(ARM.format(**(USUAL | parts)), "arm.urdf")
 
 
-def test_an_origin_by_quaternion_equals_that_by_roll_pitch_and_yaw() -> None:
+def test_an_origin_given_by_a_quaternion_equals_the_same_origin_given_by_roll_pitch_and_yaw() -> None:
     turned = pin.Quaternion(pin.rpy.rpyToMatrix(0.3, -0.7, 2.0)).coeffs()
     joint = arm(origin=f'quat_xyzw="{" ".join(map(str, turned))}"').find("joint")
     assert joint is not None
