@@ -80,7 +80,9 @@ def _every(solver: str, name: str) -> pytest.ParameterSet:
 
 
 @pytest.mark.parametrize(("solver", "name"), [_every(solver, name) for solver in NAMES for name in MOTIONS])
-def test_arms_keep_the_contract_come_to_rest_and_follow_as_well_as_with_daqp(solver: str, name: str) -> None:
+def test_with_every_solver_arms_keep_the_contract_come_to_rest_and_follow_as_well_as_with_daqp(
+    solver: str, name: str
+) -> None:
     run = motion(solver, name)
     assert run.rested is not False
     assert run.unsolved <= 0.01 * len(run.references)
