@@ -153,7 +153,7 @@ def test_an_arm_yields_only_to_a_push_at_its_own_tool() -> None:
     assert _away(targets["right"], GOALS["right"])[2] > 0.01
 
 
-def test_an_arm_that_holds_is_not_displaced_and_starts_again_from_its_new_target() -> None:
+def test_an_arm_without_a_target_is_not_displaced_and_later_starts_from_its_new_target() -> None:
     admittance, push = Admittance(ROBOT), _touch(_wrench(0, 20.0))
     assert _displaced(admittance, push, 1000)[-1][0] > 0.015
     for holding in ({"left": None, "right": GOALS["right"]}, {"right": GOALS["right"]}):
@@ -245,7 +245,7 @@ def _loop(goals: dict[str, pin.SE3 | None], dt: float, ticks: int) -> Iterator[A
 
 @pytest.mark.slow
 @AXES
-def test_a_push_in_mujoco_moves_the_tool_by_the_give_of_the_admittance_and_of_the_servos(
+def test_a_push_in_mujoco_moves_the_tool_by_the_sum_of_what_admittance_and_servos_yield(
     axis: int,
 ) -> None:
     push = _wrench(axis, 20.0 if axis < 3 else 5.0)
