@@ -61,7 +61,7 @@ def run(angles: dict[str, float | None], start: Array) -> tuple[ElbowSwivel, Arr
     return ElbowSwivel(robot, angles), run.q, way
 
 
-def test_elbows_turn_to_their_angles_and_the_tools_stay() -> None:
+def test_elbows_turn_to_their_angles_and_the_tools_stay_where_they_are() -> None:
     task, q, way = run({"left": 0.4, "right": -0.3}, cell("dual_iiwa7").robot.home)
     assert task.angle("left", q) == pytest.approx(0.4, abs=0.02)
     assert task.angle("right", q) == pytest.approx(-0.3, abs=0.02)
