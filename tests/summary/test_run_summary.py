@@ -1,4 +1,4 @@
-"""The figures of a run: their meaning, that they are numbers, and that they are right."""
+"""The figures of a run are right, can be written as JSON, and have keys that do not change."""
 
 from __future__ import annotations
 
@@ -68,7 +68,9 @@ def test_the_largest_slip_of_an_engagement_is_reported(statistics: RunStatistics
     assert figures["left"].slip_deg_max == pytest.approx(60.0)
 
 
-def test_the_time_for_which_a_gripper_was_held_is_reported_with_the_last_pair(statistics: RunStatistics) -> None:
+def test_the_time_for_which_a_gripper_was_held_is_reported_with_the_last_pair_that_held_it(
+    statistics: RunStatistics,
+) -> None:
     for held in ({"left": ("left_finger", "table")}, {"left": ("left_finger", "right_link_5")}, {}):
         add(statistics, held_grippers=held, dt=0.25)
     figures = statistics.summary(1.0).arms
@@ -76,7 +78,7 @@ def test_the_time_for_which_a_gripper_was_held_is_reported_with_the_last_pair(st
     assert (figures["right"].gripper_held_s, figures["right"].gripper_held_by) == (0.0, None)
 
 
-def test_the_json_of_a_run_has_every_key_that_others_read() -> None:
+def test_the_json_of_a_run_has_every_key_that_other_programs_read() -> None:
     loop = Pipeline.from_config(cell(), input=ScriptedInput("circle"), plant="kinematic")
     data = json.loads(json.dumps(loop.run(1.0, realtime=False).as_json(), allow_nan=False))
     assert " ".join(data) == KEYS
@@ -160,7 +162,7 @@ def test_the_summary_says_whether_the_run_ended_at_rest(statistics: RunStatistic
     assert statistics.summary(1.0).at_rest is at_rest
 
 
-def test_a_broken_button_cannot_fill_the_memory(statistics: RunStatistics) -> None:
+def test_only_the_newest_events_are_kept_so_a_broken_button_cannot_fill_the_memory(statistics: RunStatistics) -> None:
     statistics.events.extend(
         Event(float(i), "left", "a", "b", Reason(CommonReason.OTHER)) for i in range(EVENTS_KEPT + 10)
     )
@@ -179,7 +181,9 @@ def summary() -> TorqueSummary:
     return TorqueSummary({"left": 0.0, "right": 0.0})
 
 
-def test_extremes_are_kept_and_each_tick_counts_once_for_any_number_of_joints(summary: TorqueSummary) -> None:
+def test_the_torque_summary_keeps_extremes_and_counts_each_tick_once_for_any_number_of_joints(
+    summary: TorqueSummary,
+) -> None:
     pressed = replace(FREE, pressing=(HANDS, ELBOWS), force=30.0, closest_pair=HANDS, closest_distance=0.015)
     summary.add(0.002, replace(QUIET, saturated=("left_A1", "left_A2"), clipped=("right",)), pressed)
     summary.add(0.002, replace(QUIET, rate_limited=("left_A1",), clipped=("right",)), replace(pressed, force=20.0))
@@ -214,7 +218,7 @@ def test_percentiles_equal_those_of_numpy_to_a_thousandth_of_the_unit(size: int)
     assert found.max == pytest.approx(1e6 * values.max(), rel=1e-12)
 
 
-def test_any_number_can_be_added_and_a_number_beyond_the_range_counts_as_the_largest() -> None:
+def test_a_histogram_ignores_numbers_that_are_not_finite_and_counts_numbers_beyond_its_range_as_the_largest() -> None:
     histogram = Histogram(1e-3)
     for value in (float("nan"), float("inf"), float("-inf")):
         histogram.add(value)
