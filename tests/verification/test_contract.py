@@ -81,7 +81,7 @@ def test_a_broken_promise_is_raised_with_its_name_its_value_and_what_is_allowed(
         ("refused", {}, {"rejected": ("left", "right")}),
     ],
 )
-def test_each_promise_is_checked(
+def test_a_breach_of_each_promise_is_found(
     robot: Robot, apart: StepReport, promise: str, changes: dict[str, Any], report: dict[str, Any]
 ) -> None:
     still = Reference(robot.home, np.zeros(14), np.zeros(14), replace(apart, rejected=("left",)))
@@ -111,14 +111,14 @@ def test_a_joint_that_started_too_fast_must_not_become_faster_or_exceed_its_limi
     assert list(contract.observe(moved(slower.q, slower.v, FASTEST, apart), DT)) == ["velocity"]
 
 
-def test_a_joint_that_started_outside_its_limits_must_not_go_further_out(robot: Robot, apart: StepReport) -> None:
+def test_a_joint_that_started_outside_its_limits_must_not_move_farther_out(robot: Robot, apart: StepReport) -> None:
     q = robot.home.copy()
     q[JOINT] = robot.position_upper[JOINT] + 0.05
     assert list(contract_of(robot, q).observe(moved(q, np.zeros(14), 1e-6, apart), DT)) == ["outward"]
     assert not contract_of(robot, q).observe(moved(q, np.zeros(14), -1e-6, apart), DT)
 
 
-def test_a_joint_that_has_returned_into_its_limits_stays_there(robot: Robot, apart: StepReport) -> None:
+def test_a_joint_that_has_returned_into_its_limits_must_stay_there(robot: Robot, apart: StepReport) -> None:
     limit = robot.position_upper[JOINT] - SETTINGS.position_margin
     q = robot.home.copy()
     q[JOINT] = limit + 1e-5
@@ -128,7 +128,7 @@ def test_a_joint_that_has_returned_into_its_limits_stays_there(robot: Robot, apa
     assert "position" in contract.observe(moved(inside.q + one(2e-5), np.zeros(14), 0.0, apart), DT)
 
 
-def test_a_tick_without_duration_moves_nothing(robot: Robot, apart: StepReport) -> None:
+def test_a_tick_of_zero_duration_must_not_move_anything(robot: Robot, apart: StepReport) -> None:
     moves = Reference(robot.home + one(1e-12), one(0.0), one(0.0), apart)
     assert list(contract_of(robot).observe(moves, 0.0)) == ["idle"]
 
@@ -140,7 +140,7 @@ def test_a_joint_that_cannot_stop_before_its_limit_is_found(robot: Robot, apart:
     assert "stop_position" in contract.observe(moved(q, np.zeros(14), FASTEST, apart), DT)
 
 
-def test_recovering_pairs_never_come_closer_again_and_keep_their_distance_once_apart(
+def test_pairs_that_recover_must_not_come_closer_again_and_must_keep_their_distance_once_apart(
     robot: Robot, apart: StepReport
 ) -> None:
     q, v = in_penetration(robot)
@@ -159,7 +159,7 @@ def test_recovering_pairs_never_come_closer_again_and_keep_their_distance_once_a
     assert observed(0.021) == ["uncertified"]
 
 
-def test_pairs_that_were_apart_stay_apart_while_others_recover(robot: Robot, apart: StepReport) -> None:
+def test_pairs_that_were_apart_must_stay_apart_while_other_pairs_recover(robot: Robot, apart: StepReport) -> None:
     q, v = in_penetration(robot)
     contract = contract_of(robot, q, sample_all=True)
     into_the_table = robot.home.copy()
@@ -176,7 +176,7 @@ def test_a_wrong_distance_is_found_by_coal(robot: Robot, apart: StepReport, repo
     assert list(contract.observe(moved(robot.home, np.zeros(14), 0.0, report), DT)) == ["coal"]
 
 
-def test_a_margin_keeps_the_worst_value_and_counts_nan_as_broken() -> None:
+def test_a_margin_keeps_the_worst_value_and_counts_nan_as_a_violation() -> None:
     margin = Margin("distance", "m", ">=", 0.0)
     assert all(margin.note(value, tick) for tick, value in enumerate((0.3, 0.1, 0.2), 1))
     assert (margin.worst, margin.tick, margin.violations) == (0.1, 2, 0)
