@@ -50,7 +50,7 @@ def test_translation_and_rotation_of_an_error_are_each_clipped_in_length_and_kee
 
 class TestASingularPosture:
     @pytest.mark.slow
-    def test_the_tool_inertia_has_no_direction_heavier_than_1000_kg(self) -> None:
+    def test_the_inertia_of_the_tool_is_at_most_1000_kg_in_any_direction(self) -> None:
         J, M = left_arm(ROBOT, STRETCHED)
         assert np.linalg.matrix_rank(J) < 6
         root = np.sqrt(STIFFNESS / STIFFNESS[0])
@@ -142,7 +142,7 @@ def arm_torque(
 
 
 @pytest.mark.parametrize("spread", [0.02, 0.5], ids=["near", "further than the clip"])
-def test_the_torque_of_the_controller_is_that_of_the_written_formulas(spread: float) -> None:
+def test_the_torque_of_the_controller_equals_that_of_the_formulas_in_the_papers(spread: float) -> None:
     random = np.random.default_rng(7)
     settings = ImpedanceSettings(damping_ratio=0.7, limit_distance=1e-3, torque_rate_limit=1e5)
     controller = ImpedanceController(ROBOT, settings)

@@ -78,7 +78,7 @@ def test_the_torque_at_rest_is_the_negative_gradient_of_the_energy_of_the_wall(
         assert np.abs(report.tau).max() > 0.0
 
 
-def test_the_energy_is_that_of_springs_compressed_by_the_depths_that_coal_measures() -> None:
+def test_the_energy_equals_that_of_springs_compressed_by_the_depths_that_coal_measures() -> None:
     stiffness = WallSettings().stiffness
     for q, report in _postures()[:100]:
         depth = np.array([max(SHELL - pair.distance, 0.0) for pair in ROBOT.distances(q)])
@@ -98,7 +98,7 @@ def test_the_report_names_the_pairs_that_the_wall_pushes_apart_and_the_closest_p
         assert all(pair in pressing for pair, distance in distances.items() if distance < SHELL - 4e-4)
 
 
-def test_a_pair_that_may_touch_does_not_hide_a_pair_that_must_not_touch() -> None:
+def test_in_the_report_a_pair_that_may_touch_does_not_hide_a_pair_that_must_not_touch() -> None:
     q = ROBOT.home.copy()
     q[1] = 0.7  # The left fingers are 10 mm inside the table.
     contact = {"pair": ("*_finger_*", "table"), "depth": 0.015, "speed": 0.03}
@@ -163,7 +163,7 @@ def test_the_damping_never_adds_energy() -> None:
 
 
 @pytest.mark.slow
-def test_the_torque_of_the_wall_rises_gradually_while_a_pair_closes_in() -> None:
+def test_the_torque_of_the_wall_rises_gradually_while_a_pair_approaches() -> None:
     crossed = 0
     for q, report in _postures()[:12]:
         # The approach begins outside the wall, and moves against the torque at constant speed in very small steps.
@@ -272,7 +272,7 @@ def _pushed(
         pytest.param(10.0, 0.002, 1e5, 0.01, id="braked, slow loop, ten times the stiffness"),
     ],
 )
-def test_an_arm_pushed_at_the_other_arm_with_40_newtons_never_touches_it_nor_gains_energy(
+def test_an_arm_that_40_newtons_push_towards_the_other_arm_never_touches_it_and_gains_no_energy(
     friction: float, dt: float, stiffness: float, least: float
 ) -> None:
     pressed, released = 0, []
@@ -298,7 +298,7 @@ def test_a_wall_whose_distances_changed_pushes_like_a_wall_made_with_these_dista
     np.testing.assert_array_equal(told.update(q, REST).tau, made.update(q, REST).tau)
 
 
-def test_an_arm_pushed_at_a_new_box_never_touches_it_until_the_box_is_removed() -> None:
+def test_an_arm_that_is_pushed_towards_a_new_box_never_touches_the_box_until_it_is_removed() -> None:
     controller = CartesianController(ROBOT, ControllerSettings(moving_obstacles=("hand", "box")))
     separation, size = MeasuredSeparation(ROBOT, controller.settings), (0.2, 0.05, 0.3)
     at = ROBOT.tool_pose(ROBOT.home, "left").translation + np.array([0.0, 0.14, 0.0])

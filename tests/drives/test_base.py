@@ -89,7 +89,9 @@ def test_without_a_trusted_state_the_command_is_the_gravity_torque(robot: Robot)
     np.testing.assert_allclose(last.tau, gravity, atol=1e-9)
 
 
-def test_without_a_trusted_state_a_plant_with_servos_follows_the_reference(robot: Robot) -> None:
+def test_without_a_trusted_state_a_plant_with_servos_is_commanded_to_the_positions_of_the_reference(
+    robot: Robot,
+) -> None:
     drive, reference, state = pulled(robot, has_servos=True)
     command = drive.command(reference, state, {}, DT, trusted=False)
     assert command.mode is CommandMode.POSITION
