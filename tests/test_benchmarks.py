@@ -34,7 +34,7 @@ def run(script: str, *options: str) -> str:
 
 
 @pytest.mark.parametrize("script", SCRIPTS)
-def test_every_benchmark_says_which_question_it_answers(script: str) -> None:
+def test_every_benchmark_has_the_option_json_and_is_described_in_the_readme(script: str) -> None:
     needed = NEEDED.get(script.split("_")[0], ())
     if absent := [name for name in needed if find_spec(name) is None]:
         pytest.skip(f"not installed: {', '.join(absent)}")

@@ -19,7 +19,7 @@ from tests.support.modules import ROOT, blocks_of
 PACKAGE = "q2r2_control"
 ENTRIES = re.findall(r"^::: (\S+)$", (ROOT / "docs" / "api.md").read_text(encoding="utf-8"), re.MULTILINE)
 PACKAGES = sorted({entry.rpartition(".")[0] for entry in ENTRIES})
-NEEDED = {f"{PACKAGE}.gym": "gymnasium", f"{PACKAGE}.ros": "rclpy"}  # What some of a sub-package's names need.
+NEEDED = {f"{PACKAGE}.gym": "gymnasium", f"{PACKAGE}.ros": "rclpy"}  # The module that some names of a subpackage need.
 HEAVY = ("numba", "pinocchio", "mujoco", "scipy", "rclpy", "numpy", "matplotlib", "pydantic")
 CLIENTS = sorted(file for folder in ("plugins", "examples") for file in (ROOT / folder).rglob("*.py"))
 # Kernels are a part of the package itself, so their page imports inner modules.
@@ -98,7 +98,7 @@ def test_an_inner_import_is_reported_with_file_line_and_what_is_allowed(code: st
 
 
 @EACH_PACKAGE
-def test_the_page_of_the_api_has_every_public_name_once(package: str) -> None:
+def test_the_page_of_the_api_documents_every_public_name_once(package: str) -> None:
     if package == f"{PACKAGE}.gym":
         pytest.importorskip("gymnasium")
     assert names_on_the_page(package) == sorted(import_module(package).__all__)

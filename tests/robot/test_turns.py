@@ -1,4 +1,4 @@
-"""If the angle of a continuous joint is reported within one turn, its turns are counted. Other reports do not change."""
+"""If the angle of a continuous joint is reported within one turn, turns are counted. Other reports do not change."""
 
 from __future__ import annotations
 
