@@ -157,7 +157,9 @@ class NoLess:
         return self.along[None, :], np.array([self.along @ self.along])
 
 
-def test_if_the_certified_part_of_a_solution_breaks_a_hard_row_exactly_the_stop_is_executed(robot: Robot) -> None:
+def test_if_the_certified_part_of_a_solution_breaks_a_hard_row_the_certified_stop_is_executed_exactly(
+    robot: Robot,
+) -> None:
     """The given solutions ignore all pairs, so that often only a part of a solution can be certified.
 
     This part is slower than the row allows. The arms then have to do exactly what they do without a solution.

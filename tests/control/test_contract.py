@@ -55,7 +55,7 @@ def test_arms_with_constant_targets_come_to_rest_whether_the_targets_are_reachab
     assert run(controller, SCENARIOS[name], duration, 0.005).tail_acceleration() < 0.1
 
 
-def test_a_reachable_target_is_reached_and_held(controller: CartesianController) -> None:
+def test_a_tool_moves_to_a_reachable_target_and_stays_there(controller: CartesianController) -> None:
     driven = Driven(controller)
     by = pin.SE3(pin.exp3(np.array([0.2, -0.3, 0.4])), np.array([0.05, 0.05, 0.15]))
     goal = {

@@ -51,7 +51,7 @@ def object_distances(controller: CartesianController, q: Array) -> Array:
     return coal_distances(controller.robot, objects.geometry, q)[-len(objects.holders) :]
 
 
-def test_a_block_on_the_table_is_gripped_and_released_without_a_motion(
+def test_no_arm_moves_when_a_block_on_the_table_is_gripped_or_released(
     controller: CartesianController, at_grip: Array
 ) -> None:
     run = Driven(controller, at_grip)
@@ -154,7 +154,7 @@ def test_an_arm_that_moves_a_held_bar_towards_the_other_arm_stops_at_the_kept_di
 
 
 @pytest.mark.slow
-def test_two_held_blocks_are_kept_apart_unless_they_overlap_when_the_second_is_gripped(
+def test_two_held_blocks_are_kept_apart_unless_they_overlap_when_the_second_block_is_gripped(
     controller: CartesianController,
 ) -> None:
     run = Driven(controller)

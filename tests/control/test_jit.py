@@ -48,7 +48,7 @@ def test_the_function_bound_runs_a_kernel_once_and_returns_its_machine_code() ->
 PAGE = Path(__file__).parents[2] / "docs" / "kernels.md"
 
 
-def test_the_example_of_the_kernels_page_compiles_and_sees_changes_in_the_model(tmp_path: Path) -> None:
+def test_the_example_in_kernels_md_compiles_and_sees_changes_in_the_model(tmp_path: Path) -> None:
     (template,) = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
     source = tmp_path / "spring.py"
     source.write_text(template)

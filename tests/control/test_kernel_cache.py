@@ -119,7 +119,7 @@ def doubled_by(file: Path) -> list[tuple[int, int]]:
     return told
 
 
-def test_a_second_checkout_compiles_nothing(own_cache: Path) -> None:
+def test_kernels_of_a_second_checkout_are_not_compiled_again(own_cache: Path) -> None:
     doubled_by(own_cache / "doubling.py")
     assert doubled_by(own_cache / "elsewhere" / "doubling.py") == []
 

@@ -80,7 +80,7 @@ def test_random_changes_of_settings_during_motion_never_break_the_contract(contr
     assert run.contract.uncertified == 0
 
 
-def test_a_smaller_separation_gain_slows_approaching_arms_without_a_jerk(
+def test_a_smaller_separation_gain_slows_approaching_arms_and_no_velocity_jumps(
     controller: CartesianController,
 ) -> None:
     closing, changes = {}, {}
@@ -183,7 +183,9 @@ def test_arms_within_their_buffer_rest_after_a_reset_and_the_buffer_grows_as_the
     assert left.contract.uncertified == 0
 
 
-def test_an_approaching_pair_keeps_no_more_distance_than_its_stop_keeps(controller: CartesianController) -> None:
+def test_the_kept_distance_of_an_approaching_pair_never_exceeds_its_distance_during_the_certified_stop(
+    controller: CartesianController,
+) -> None:
     run, robot = Driven(controller), controller.robot
     lost = np.zeros(0)
     # The loop ends when a stop would bring some pair closer by more than 4 mm, to a distance clearly below FAR.

@@ -55,7 +55,9 @@ def test_no_moving_body_comes_too_close_to_a_hand_that_chases_it(
 
 
 @pytest.mark.slow
-def test_a_hand_that_is_faster_than_reported_reaches_a_moving_arm(controller: CartesianController) -> None:
+def test_a_hand_that_is_faster_than_reported_can_come_too_close_to_a_moving_arm(
+    controller: CartesianController,
+) -> None:
     hunt = Hunt(controller, controller_and_solver()[1], seed=1, lie=5.0)
     hunt.run(6.0, 0.25, 0.1)
     assert hunt.broken, "or the test above could not fail"
@@ -203,7 +205,7 @@ def test_slower_and_rise_of_an_obstacle_follow_from_its_speeds_and_its_accelerat
     assert hand(np.zeros(3), 1.0, speed_now=0.2).slower == 0.0
 
 
-def test_without_moving_obstacles_the_arrays_of_kernels_have_no_entries_for_them() -> None:
+def test_without_moving_obstacles_the_arrays_of_kernels_have_no_entries_for_such_obstacles() -> None:
     robot = robot_of_cell()
     without, one = (
         kernel_model_of(robot, ControllerSettings(moving_obstacles=names)).safety for names in ((), ("hand",))

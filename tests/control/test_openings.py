@@ -181,7 +181,7 @@ def cell(tmp_path: Path) -> Cell:
     return Cell(turning_cell(tmp_path))
 
 
-def test_an_open_gripper_does_not_close_into_the_table_and_closes_higher_above_it(cell: Cell) -> None:
+def test_an_open_gripper_must_not_close_near_the_table_and_may_close_higher_above_it(cell: Cell) -> None:
     assert cell.set_opening("left", 1.0, 1.0) is None
     cell.drive(1.8, {"left": above_table(0.006)})
     # The tips of the closed fingers would be 8 mm inside the table.

@@ -148,7 +148,7 @@ def ticks_of(dt: float, jitter: bool) -> Iterator[float]:
 @pytest.mark.parametrize(
     ("robot", "dt"), [("iiwa7", 0.001), ("iiwa7", 0.01), pytest.param("panda", 0.01, marks=pytest.mark.slow)]
 )
-def test_the_contract_holds_at_every_tick(name: str, robot: str, dt: float) -> None:
+def test_the_contract_holds_at_every_tick_of_every_hostile_motion(name: str, robot: str, dt: float) -> None:
     case = CASES[name]
     controller, solver = controller_of(robot)
     q, v = case.start(controller.robot)

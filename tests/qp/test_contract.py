@@ -159,7 +159,7 @@ def test_joints_that_are_driven_towards_their_limits_reach_each_limit_and_break_
     np.testing.assert_allclose(references[-1].q[last], limits.upper[last], atol=2e-3)
 
 
-def test_a_reachable_motion_is_followed_within_millimetres() -> None:
+def test_a_target_that_moves_on_a_reachable_circle_is_followed_within_5_mm() -> None:
     assert MOTIONS["circle"].scenario is circle
     assert 1e-3 < motion("daqp", "circle").error < 5e-3
 

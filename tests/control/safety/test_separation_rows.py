@@ -107,8 +107,8 @@ def _least_free(name: str, q: Array, v: Array, duration: float, p: int) -> float
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_velocities_that_keep_the_rows_use_up_free_distance_no_faster_than_the_gain_allows(name: str) -> None:
-    """Velocities that break the rows use up free distance faster: the rows are neither too lax nor too strict."""
+def test_velocities_that_satisfy_the_rows_use_up_free_distance_no_faster_than_the_gain_allows(name: str) -> None:
+    """Velocities that break the rows use up free distance faster, so the rows are neither too lax nor too strict."""
     random, kept, broken = np.random.default_rng(5), 0, 0
     for seed in range(150):
         q, v = _state(name, seed, 0.4)

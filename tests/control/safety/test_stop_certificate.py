@@ -122,7 +122,9 @@ def _aimed_at_the_threshold(name: str, random: np.random.Generator, count: int, 
 
 @pytest.mark.parametrize("shape", range(SHAPES), ids=["together", "arm by arm", "own"])
 @pytest.mark.parametrize("name", ["dual_iiwa7", "dual_panda"])
-def test_motions_just_too_fast_are_refused_and_clearly_slower_ones_are_mostly_certified(name: str, shape: int) -> None:
+def test_motions_that_are_slightly_too_fast_are_refused_and_clearly_slower_motions_are_mostly_certified(
+    name: str, shape: int
+) -> None:
     accepted = total = 0
     for number, motion in enumerate(_aimed_at_the_threshold(name, np.random.default_rng(16), 6, shape)):
         if number % 2 == 0:

@@ -31,7 +31,7 @@ def test_a_known_solver_that_is_not_installed_is_named_with_the_command_that_ins
 
 
 @pytest.mark.parametrize("name", ["daqp", "osqp"])
-def test_an_option_that_a_solver_does_not_have_is_refused_at_the_start(name: str) -> None:
+def test_an_option_that_a_solver_does_not_have_is_refused_when_the_controller_is_made(name: str) -> None:
     with pytest.raises(ConfigError, match=rf"control\.solver_options = \{{'colour': 1\}}: {name} refuses: "):
         CartesianController(ROBOT, ControllerSettings(solver=name, solver_options={"colour": 1}))
 

@@ -90,7 +90,7 @@ def test_a_stretched_arm_with_an_elbow_angle_keeps_the_contract_and_comes_to_res
         ({"angles": {"left": 0.1}, "joints": 5}, "joints = 5: allowed: three, at shoulder, elbow and wrist"),
     ],
 )
-def test_meaningless_settings_are_refused_by_name(settings: dict[str, object], told: str) -> None:
+def test_meaningless_settings_of_the_task_swivel_are_refused_by_name(settings: dict[str, object], told: str) -> None:
     with pytest.raises(ConfigError, match=told):
         CartesianController(cell("dual_iiwa7").robot, ControllerSettings(tasks={"swivel": settings}))
 

@@ -133,7 +133,7 @@ PARTS = {
 
 
 @pytest.mark.parametrize("name", PARTS)
-def test_a_tool_reaches_the_weighted_parts_of_a_pose_and_the_posture_decides_the_rest(name: str) -> None:
+def test_a_tool_moves_to_the_weighted_parts_of_a_target_and_the_posture_decides_the_other_parts(name: str) -> None:
     along, about, reached, upright = PARTS[name]
     settings = ControllerSettings(position_weights=along, rotation_weights=about)
     controller = CartesianController(cell("dual_iiwa7").robot, settings)

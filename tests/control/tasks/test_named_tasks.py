@@ -50,7 +50,7 @@ def test_the_task_look_at_turns_a_tool_towards_a_point_and_does_not_displace_the
     np.testing.assert_allclose(tool.translation, run.start["left"].translation, atol=1e-3)
 
 
-def test_a_tool_stays_near_its_cone_although_its_target_is_tilted_farther() -> None:
+def test_the_task_upright_keeps_a_tool_near_its_cone_although_the_target_is_tilted_farther() -> None:
     tilted = pin.SE3(pin.exp3(np.array([0.6, 0.0, 0.0])), np.zeros(3))
     run = driven({"upright": {"angle": 0.2, "axis": DOWN, "arms": ["left"]}}, {"left": tilted, "right": tilted})
     lean = {arm: math.acos(run.controller.tool_pose(arm).rotation[:, 2] @ DOWN) for arm in run.start}
@@ -58,7 +58,7 @@ def test_a_tool_stays_near_its_cone_although_its_target_is_tilted_farther() -> N
     assert lean["right"] == pytest.approx(0.6, abs=1e-3)
 
 
-def test_a_tool_within_its_cone_has_no_cost() -> None:
+def test_the_task_upright_has_no_cost_for_a_tool_within_its_cone() -> None:
     robot = cell("dual_iiwa7").robot
     H, g = Upright(robot, 0.2, axis=DOWN).cost(robot.home, robot.home)
     assert not H.any()

@@ -79,7 +79,7 @@ def test_arms_that_blocked_each_other_reach_their_targets_when_the_path_is_free(
 
 
 @pytest.mark.parametrize("priority", ["equal", "right"])
-def test_an_arm_without_a_target_holds_and_does_not_give_way(priority: str) -> None:
+def test_an_arm_without_a_target_holds_its_posture_and_does_not_give_way(priority: str) -> None:
     run = Driven(controller_of(priority), dt=0.005)
     run.drive(4.0, SCENARIOS["one arm frozen"])
     assert run.contract.tail_acceleration() < 0.1
