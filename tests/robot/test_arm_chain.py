@@ -85,7 +85,7 @@ def test_an_ambiguous_chain_is_refused_with_the_possible_tips(more: Sequence[str
     assert str(error.value) == f"key: {says}"
 
 
-def test_a_tool_ends_at_its_frame_and_not_at_its_fingers() -> None:
+def test_the_end_of_a_tool_is_its_tool_frame_and_not_one_of_its_fingers() -> None:
     tool = LinkTree(load_description("hand_e").urdf, "hand_e")
     assert end_of(tool, tool.root, "key") == "tool_frame"
 

@@ -23,7 +23,7 @@ def robot() -> Robot:
     return Robot.from_config(load_config("config/dual_iiwa7.yaml"))
 
 
-def test_the_window_is_the_time_that_the_acceleration_needs_from_one_limit_to_the_other(robot: Robot) -> None:
+def test_the_averaging_window_is_the_time_that_the_acceleration_needs_from_one_limit_to_the_other(robot: Robot) -> None:
     assert average_window(robot, ControllerSettings()) == 0.0
     assert average_window(robot, ControllerSettings(jerk_limit=5000.0)) == pytest.approx(0.004)
     slower = ControllerSettings(jerk_limit=5000.0, acceleration_limit=5.0)

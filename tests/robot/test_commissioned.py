@@ -110,7 +110,7 @@ def test_a_commissioned_cell_moves_at_a_tenth_of_its_speed_unless_full_speed_is_
     assert load_commissioned(file, full_speed=True) == load_config(file)
 
 
-def test_a_cell_of_simulated_cabinets_is_loaded_as_it_is() -> None:
+def test_a_cell_with_simulated_cabinets_is_loaded_with_its_full_speed() -> None:
     assert load_commissioned("config/dual_iiwa7_fri.yaml") == load_config("config/dual_iiwa7_fri.yaml")
 
 

@@ -49,7 +49,7 @@ def _clouds() -> dict[str, Array]:
 
 
 @pytest.mark.parametrize("cloud", _clouds().values(), ids=_clouds())
-def test_every_vertex_is_inside_its_capsule(cloud: Array) -> None:
+def test_every_vertex_of_a_mesh_is_inside_the_capsule_around_the_mesh(cloud: Array) -> None:
     points = cloud @ pin.rpy.rpyToMatrix(0.3, -1.1, 2.0).T
     radius, start, end = enclosing_capsule(points)
     assert np.isfinite([radius, *start, *end]).all()

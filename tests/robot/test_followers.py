@@ -50,7 +50,7 @@ def followers(*joints: str, driven: tuple[str, ...] = ()) -> dict[str, Follower]
 CHAIN = (joint("c", "b -2 0.1"), joint("b", "a 0.5 0.2"), joint("a"))
 
 
-def test_a_follower_of_a_follower_follows_the_first_driver_in_any_order_of_the_file() -> None:
+def test_a_joint_that_mimics_a_follower_follows_the_first_driver_for_any_order_of_joints_in_the_file() -> None:
     found = followers(*CHAIN)
     assert found["b"] == Follower("a", 0.5, 0.2)
     assert (found["c"].driver, found["c"].multiplier) == ("a", -1.0)

@@ -108,7 +108,7 @@ def _geom_centre(model: mujoco.MjModel, data: mujoco.MjData, g: int) -> np.ndarr
     return data.geom_xpos[g] + data.geom_xmat[g].reshape(3, 3) @ corners.mean(axis=0)
 
 
-def test_limits_come_from_the_file_and_velocity_limits_from_the_caller(arm: Path) -> None:
+def test_the_limits_of_joints_come_from_the_file_but_their_velocity_limits_come_from_the_caller(arm: Path) -> None:
     urdf, _, _ = read(arm)
 
     def written(joint: str, element: str) -> dict[str, str]:
@@ -123,7 +123,7 @@ def test_limits_come_from_the_file_and_velocity_limits_from_the_caller(arm: Path
     assert written("turn", "rotor") == {"inertia": "0.2", "gear": "1"}
 
 
-def test_a_capsule_stays_a_capsule_and_drawings_count_only_without_collision_shapes(arm: Path) -> None:
+def test_a_capsule_stays_a_capsule_and_a_drawing_is_a_collision_shape_only_if_a_body_has_no_other(arm: Path) -> None:
     urdf, _, geometry = read(arm)
     shapes = {item.name.rpartition("_")[0]: item.geometry for item in geometry.geometryObjects}
     assert isinstance(shapes["shoulder"], coal.Capsule)

@@ -96,7 +96,9 @@ def test_an_srdf_that_names_the_pair_prevents_the_warning(ur5: Path, caplog: pyt
     assert made(ur5, caplog, srdf=f'<robot name="ur5">{both}</robot>')[1] == []
 
 
-def test_a_pair_that_other_postures_bring_apart_needs_another_home(ur5: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_the_warning_about_a_pair_that_other_postures_bring_apart_proposes_another_home(
+    ur5: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     bent = {"elbow_joint": 2.9, "shoulder_lift_joint": -1.2}
     robot, (said,) = made(ur5, caplog, home=bent)
     assert robot.home[1:3].tolist() == [-1.2, 2.9]

@@ -81,7 +81,9 @@ def test_xacro_arguments_have_the_defaults_of_the_file_and_an_srdf_in_the_same_f
         ("hinge.xacro", 'lower="-1"', 'lower="${reach}m"', "<limit> has lower = '0.30000000000000004m'"),
     ],
 )
-def test_an_error_of_xacro_raises_an_error_of_one_line(package: Path, file: str, old: str, new: str, says: str) -> None:
+def test_a_model_that_xacro_cannot_expand_raises_an_error_of_one_line(
+    package: Path, file: str, old: str, new: str, says: str
+) -> None:
     broken = package / "urdf" / file
     broken.write_text(broken.read_text().replace(old, new, 1))
     with pytest.raises(Q2R2Error) as error:

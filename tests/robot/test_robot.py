@@ -26,7 +26,7 @@ def _urdf(links: int = 3, limit: str = 'lower="-1" upper="1" velocity="1" effort
     ) + "</robot>"  # fmt: skip
 
 
-def test_arrays_follow_the_order_of_the_joint_names(dual_iiwa7: Robot) -> None:
+def test_the_arrays_of_a_robot_have_the_order_of_its_joint_names(dual_iiwa7: Robot) -> None:
     robot = dual_iiwa7
     assert robot.joint_names == tuple(f"{side}_A{number}" for side in ("left", "right") for number in range(1, 8))
     assert robot.model.nq == robot.model.nv == 14
@@ -66,7 +66,9 @@ def test_distances_names_the_pairs_in_the_order_of_the_model_and_returns_negativ
     assert "table_0" in (worst.name_a, worst.name_b)
 
 
-def test_the_urdf_of_a_robot_loads_to_an_equal_robot(dual_iiwa7: Robot, dual_iiwa7_cell: ComposedCell) -> None:
+def test_a_robot_that_is_loaded_from_the_urdf_of_another_robot_is_equal_to_that_robot(
+    dual_iiwa7: Robot, dual_iiwa7_cell: ComposedCell
+) -> None:
     again = Robot.from_urdf(dual_iiwa7.urdf, TOOLS, srdf=dual_iiwa7_cell.srdf)
     assert again.name == "dual_iiwa7"
     assert again.joint_names == dual_iiwa7.joint_names
@@ -84,7 +86,7 @@ def test_robot_called_with_a_file_name_raises_an_error_that_names_the_right_cons
     assert copy(dual_iiwa7).joint_names == dual_iiwa7.joint_names
 
 
-def test_one_of_two_arms_may_be_left_out(dual_iiwa7_cell: ComposedCell) -> None:
+def test_a_robot_can_have_only_one_of_the_two_arms_in_its_urdf(dual_iiwa7_cell: ComposedCell) -> None:
     robot = Robot.from_urdf(dual_iiwa7_cell.urdf, {"left": "left_tool_frame"}, srdf=dual_iiwa7_cell.srdf)
     assert robot.joint_names == tuple(f"left_A{number}" for number in range(1, 8))
     watched = {frozenset(map(link_of, names)) for names in pair_names(robot.collision_model)}

@@ -167,7 +167,7 @@ def test_a_joint_that_moves_both_tools_may_be_named_by_only_one_arm() -> None:
 
 
 @pytest.mark.parametrize("name", ["baxter", "tiago"])
-def test_a_user_can_check_and_run_the_cell(name: str, folder: Path) -> None:
+def test_the_commands_check_and_run_accept_a_cell_whose_arms_are_parts_of_one_robot(name: str, folder: Path) -> None:
     file = str(folder / f"{name}.yaml")
     checked = CliRunner().invoke(app, ["check", file, "--json"])
     assert checked.exit_code == 0, checked.output

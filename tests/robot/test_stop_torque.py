@@ -37,7 +37,7 @@ def test_the_reported_torque_is_the_largest_one_over_all_signs_of_the_decelerati
     assert (stop.gravity.ratio, stop.gravity.posture) == (pytest.approx(at_rest.max()), stop.stop.posture)
 
 
-def test_share_over_is_zero_exactly_for_bearable_decelerations(robot: Robot) -> None:
+def test_the_figure_share_over_is_zero_exactly_for_bearable_decelerations(robot: Robot) -> None:
     (stop,) = stop_torques(robot, FAST, postures=1000)
     assert 0.05 < stop.stop.share_over < 0.15
     assert 0.0 < stop.bearable < 1.0

@@ -142,7 +142,7 @@ def moved(chain: Sequence[FingerJoint], ends: Array, at: dict[str, float], trave
 @pytest.mark.slow
 @given(st.lists(joints(), min_size=1, max_size=4), _VECTORS, _VECTORS, st.tuples(st.floats(0, 1), st.floats(0, 1)))
 @settings(max_examples=50, deadline=None)
-def test_any_chain_of_fingers_is_inside_its_body(
+def test_a_finger_at_the_end_of_any_chain_of_joints_is_inside_its_body(
     chain: list[FingerJoint], first: Array, second: Array, between: tuple[float, float]
 ) -> None:
     body = TurningBody("left", "finger_0", np.array([first, second]), 0.01, tuple(chain))
@@ -156,7 +156,7 @@ def test_any_chain_of_fingers_is_inside_its_body(
         assert max(np.linalg.norm(capsule[0]), np.linalg.norm(capsule[1])) <= body.extent + 1e-12
 
 
-def test_positions_between_few_samples_are_inside_the_body_too() -> None:
+def test_a_body_contains_the_positions_between_samples_even_if_there_are_few_samples() -> None:
     """Each driver turns by 6 rad, with as few samples as possible, because three drivers share them."""
     chain = [
         FingerJoint(False, np.array([0.0, 0.0, 1.0]), np.zeros(3), 0.0, -turn, turn, -turn, turn, driver)
@@ -188,7 +188,7 @@ def test_bodies_that_are_computed_together_equal_single_bodies_within_the_sampli
         assert together.radius[row] == pytest.approx(radius, abs=1e-4)
 
 
-def test_no_second_derivative_by_two_joints_exceeds_its_bound() -> None:
+def test_no_second_derivative_of_a_position_by_two_joints_exceeds_its_bound() -> None:
     """Differences are computed for chains of rotations and slides that one driver moves, anywhere on their travel."""
     random, h = np.random.default_rng(2), 1e-3
     nearest = np.zeros((3, 3))

@@ -75,7 +75,7 @@ def test_a_link_that_is_only_a_frame_needs_no_collision_shape(frame: str) -> Non
     assert Robot.from_urdf(arm(last=frame), {"left": "l5"}).unchecked_links == ()
 
 
-def test_all_links_without_a_shape_are_named_at_once() -> None:
+def test_one_error_names_all_links_without_a_collision_shape() -> None:
     with pytest.raises(RobotError, match=r"l3: weighs 1 kg.*; l5: weighs 2 kg"):
         Robot.from_urdf(arm(weighs(1.0), weighs(2.0)), {"left": "l5"})
 

@@ -62,7 +62,7 @@ def test_the_file_of_a_cell_replaces_the_acceleration_limits_of_the_joints_that_
 
 
 @pytest.mark.parametrize("name", ["A8", "left_A2", "flange", "finger_joint_1"])
-def test_a_joint_that_does_not_belong_to_the_arm_is_named_with_those_that_do(name: str) -> None:
+def test_the_error_about_a_joint_that_does_not_belong_to_the_arm_lists_the_joints_that_do(name: str) -> None:
     cell = one_arm(tool={"model": "hand_e"}, acceleration_limit={name: 4.0})
     with pytest.raises(ConfigError) as error:
         Robot.from_config(cell)
