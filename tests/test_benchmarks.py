@@ -45,7 +45,7 @@ def test_every_benchmark_has_the_option_json_and_is_described_in_the_readme(scri
 
 @pytest.mark.slow
 @pytest.mark.soak
-def test_answers_during_a_standstill_of_a_processor_are_separated_from_others() -> None:
+def test_answers_during_a_standstill_of_a_processor_are_separated_from_other_answers() -> None:
     bench = load_script("benchmarks/fri.py")
     answers, stills = [(0.0, 0.001), (0.010, 0.013), (0.020, 0.028)], [(0.012, 0.014), (0.030, 0.031)]
     assert bench.undisturbed(answers, stills) == pytest.approx([0.001, 0.008])

@@ -128,7 +128,7 @@ def test_joint_positions_of_a_wrong_type_or_shape_are_refused_by_every_function(
     assert np.isfinite(controller.step({}, 0.001, q).q).all(), "a posture that is not usable is not used"
 
 
-def test_lists_of_numbers_are_accepted_as_joints(robot: Robot) -> None:
+def test_a_list_of_numbers_is_accepted_as_joint_positions(robot: Robot) -> None:
     assert robot.tool_pose(robot.home.tolist(), "left") == robot.tool_pose(robot.home, "left")
 
 
@@ -187,7 +187,7 @@ def test_brake_with_an_invalid_time_changes_nothing(controller: CartesianControl
 
 
 @pytest.mark.parametrize("pose", [None, 5, np.eye(4), NO_NUMBER, pin.SE3(np.zeros((3, 3)), np.zeros(3))])
-def test_relative_motion_takes_only_finite_poses(pose: Any) -> None:
+def test_relative_motion_accepts_only_finite_poses(pose: Any) -> None:
     unanchored, motion, identity = RelativeMotion(), RelativeMotion(), pin.SE3.Identity()
     motion.anchor(identity, identity)
     allowed = "allowed: finite numbers" if pose is NO_NUMBER else POSE

@@ -63,7 +63,7 @@ print(sentence(reason))
     assert said.stdout == "the drive of A4 has 81 degrees\n", said.stderr
 
 
-def test_a_sentence_shows_its_numbers_and_its_cause() -> None:
+def test_the_sentence_of_a_reason_contains_its_numbers_and_its_cause() -> None:
     assert (
         sentence(Reason.of(TeleopReason.LINKED, cause=JUMPED, arm="left")) == "linked to left: the hand jumped 0.300 m"
     )

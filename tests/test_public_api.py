@@ -93,7 +93,9 @@ def test_the_code_on_a_page_imports_public_names_only(page: Path) -> None:
         ),
     ],
 )
-def test_an_inner_import_is_reported_with_file_line_and_what_is_allowed(code: str, told: list[str]) -> None:
+def test_an_import_of_an_inner_name_is_reported_with_its_file_its_line_and_what_is_allowed(
+    code: str, told: list[str]
+) -> None:
     assert list(inner_imports(code, "a.py")) == told
 
 
@@ -105,7 +107,7 @@ def test_the_page_of_the_api_documents_every_public_name_once(package: str) -> N
 
 
 @EACH_PACKAGE
-def test_every_public_name_exists_and_says_what_it_is(package: str) -> None:
+def test_every_public_name_exists_and_has_a_docstring(package: str) -> None:
     if (needed := NEEDED.get(package)) is not None and find_spec(needed) is None:
         pytest.skip(f"{needed} is not installed")
     for name in names_on_the_page(package):

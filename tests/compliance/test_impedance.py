@@ -82,7 +82,7 @@ class TestController:
 
     @pytest.mark.parametrize("field", ["q", "v"])
     @pytest.mark.parametrize("value", [np.nan, np.inf])
-    def test_an_unusable_state_holds_the_last_gravity_torque_and_is_reported(
+    def test_if_a_state_is_unusable_the_gravity_torque_of_the_last_state_is_held_and_the_fault_is_reported(
         self, robot: Robot, field: str, value: float
     ) -> None:
         controller, good, q = started(robot), at(robot.home), robot.home + 0.05
@@ -177,7 +177,9 @@ class TestAnImpedanceThatChanges:
             assert [values["damping_ratio"] for values in in_force] == pytest.approx(damping)
             assert [values["nullspace_stiffness"] for values in in_force] == pytest.approx([10.0, 10.0])
 
-    def test_after_a_change_torques_are_those_of_a_controller_made_with_the_new_settings(self, robot: Robot) -> None:
+    def test_after_a_change_torques_equal_those_of_a_controller_that_was_made_with_the_new_settings(
+        self, robot: Robot
+    ) -> None:
         soft = {"translational_stiffness": 300.0, "damping_ratio": 0.4, "nullspace_stiffness": 20.0}
         made, changed = started(robot, ImpedanceSettings(**soft)), ImpedanceController(robot)
         changed.change(soft)

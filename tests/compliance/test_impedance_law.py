@@ -75,7 +75,7 @@ class TestLimitRepulsion:
         assert np.ptp(torques) == 0
         return float(torques[0])
 
-    def test_the_limit_torque_is_a_spring_that_begins_before_the_limit_or_at_the_reference(self) -> None:
+    def test_the_limit_torque_acts_like_a_spring_that_begins_before_the_limit_or_at_the_reference(self) -> None:
         assert [self.torque(q) for q in (-0.9, 0.0, 0.9)] == [0.0, 0.0, 0.0]
         assert [self.torque(q) for q in (0.95, -0.95, 1.1)] == pytest.approx([-15.0, 15.0, -60.0])
         assert [self.torque(q, wanted=0.97) for q in (0.97, 0.98)] == pytest.approx([0.0, -3.0])
@@ -90,7 +90,7 @@ class TestLimitRepulsion:
         assert np.abs(np.diff(torques)).max() < 0.05
 
 
-def test_both_torque_bounds_hold_for_any_wanted_torque() -> None:
+def test_the_bounds_on_the_torque_and_on_its_change_hold_for_any_wanted_torque() -> None:
     random = np.random.default_rng(5)
     limit = np.array([176.0, 110.0, 40.0])
     bounded = np.zeros(3)

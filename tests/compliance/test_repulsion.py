@@ -223,7 +223,7 @@ ROD = """<robot name="rod"><link name="base"/><link name="rod"><inertial><mass v
 <parent link="base"/><child link="rod"/><limit lower="-1" upper="1" velocity="1" effort="1"/></joint></robot>"""
 
 
-def test_a_robot_without_pairs_has_no_wall() -> None:
+def test_for_a_robot_without_pairs_the_wall_has_no_torque() -> None:
     robot = Robot.from_urdf(ROD, {"left": "rod"}, unchecked_links=["rod"])
     report = MeasuredSeparation(robot, ControllerSettings()).update(np.zeros(1), np.ones(1))
     assert not report.tau.any()
@@ -327,7 +327,7 @@ def test_an_arm_that_is_pushed_towards_a_new_box_never_touches_the_box_until_it_
 
 
 @pytest.mark.parametrize("with_object", [False, True], ids=["empty hands", "an object in one hand's reach"])
-def test_an_obstacle_that_may_move_has_no_wall(with_object: bool) -> None:
+def test_the_wall_pushes_no_arm_away_from_an_obstacle_that_may_move(with_object: bool) -> None:
     robot = Robot.from_config(object_cell(BLOCK)) if with_object else ROBOT
     controller = CartesianController(robot, ControllerSettings(moving_obstacles=("hand", "box")))
     separation = MeasuredSeparation(robot, controller.settings)

@@ -59,7 +59,9 @@ def test_the_error_about_an_unknown_key_of_a_gripper_lists_the_keys_for_grippers
     assert f"allowed here: {allowed}" in message
 
 
-def test_the_motion_that_a_cabinet_sees_while_answers_catch_up_is_within_the_velocity_limits(tmp_path: Path) -> None:
+def test_the_velocity_scale_of_a_fri_cell_is_so_small_that_catching_up_keeps_the_velocity_limits(
+    tmp_path: Path,
+) -> None:
     def scale(given: float) -> float:
         text = changed("control.velocity_scale", given, lambda: shipped() | {"fri": {"left": {}, "right": {}}})
         return loaded(tmp_path, text).control.velocity_scale

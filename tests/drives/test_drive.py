@@ -154,7 +154,9 @@ def blinded(what: str, value: float, start: float, duration: float) -> tuple[Pip
 
 
 @pytest.mark.parametrize(("what", "value"), [("q", np.nan), ("v", np.inf)])
-def test_after_a_short_loss_of_measurements_the_run_goes_on_and_counts_the_lost_ticks(what: str, value: float) -> None:
+def test_after_a_short_loss_of_measurements_the_run_continues_and_its_summary_counts_the_lost_ticks(
+    what: str, value: float
+) -> None:
     loop, watch, _ = blinded(what, value, 0.9, 0.8 * BLIND)
     summary = loop.run(1.6, realtime=False)
     assert summary.torque is not None

@@ -55,7 +55,7 @@ def test_joints_are_hardly_ever_at_their_acceleration_limits_while_a_tool_follow
     assert max(off[300:]) < 0.01
 
 
-def test_targets_begin_at_the_tool_rest_at_the_newest_sample_and_end_with_a_release(
+def test_interpolation_starts_at_the_tool_and_ends_at_the_newest_sample_and_a_release_ends_the_target(
     controller: CartesianController,
 ) -> None:
     controller.reset(controller.robot.home)

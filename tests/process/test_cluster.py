@@ -75,7 +75,9 @@ def test_jobs_of_a_killed_worker_run_on_the_other_worker_and_each_result_comes_o
 
 
 @pytest.mark.slow
-def test_the_error_of_the_first_job_that_fails_is_raised_after_the_results_before_it(cluster: DaskCluster) -> None:
+def test_the_error_of_the_first_job_that_fails_is_raised_after_the_results_of_all_jobs_before_it(
+    cluster: DaskCluster,
+) -> None:
     results = Cluster(cluster.address).results(fail_from_two_on, JOBS)
     assert [next(results), next(results)] == [0, 1]
     with pytest.raises(ConfigError, match="job 2: allowed: 0, 1"):

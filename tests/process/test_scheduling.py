@@ -103,7 +103,7 @@ def test_the_scheduling_of_the_real_system_is_restored_and_other_threads_get_no_
 
 
 @pytest.mark.parametrize(("machine", "granted", "number"), [("x86_64", True, 314), ("aarch64", False, 274)])
-def test_a_reservation_is_requested_in_nanoseconds_and_a_refusal_is_reported(
+def test_a_reservation_of_processor_time_is_requested_in_nanoseconds_and_a_refusal_is_reported(
     monkeypatch: pytest.MonkeyPatch, machine: str, granted: bool, number: int
 ) -> None:
     asked: list[tuple[int, int, bytes, int]] = []
@@ -121,7 +121,9 @@ def test_a_reservation_is_requested_in_nanoseconds_and_a_refusal_is_reported(
     assert attributes == (48, 6, 1, 0, 0, 1_500_000, 2_000_000, 2_000_000)
 
 
-def test_a_machine_whose_system_call_is_unknown_gets_no_reservation(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_machine_whose_system_call_is_unknown_gets_no_reservation_of_processor_time(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(platform, "machine", lambda: "riscv64")
     assert not reserve(0.001, 0.002)
 

@@ -109,7 +109,7 @@ def test_a_run_without_ticks_gives_valid_json(statistics: RunStatistics) -> None
     json.dumps(summary.as_json(), allow_nan=False)
 
 
-def test_errors_are_root_mean_squares_over_the_engaged_ticks(statistics: RunStatistics) -> None:
+def test_the_errors_in_a_summary_are_root_mean_squares_over_the_engaged_ticks(statistics: RunStatistics) -> None:
     for metres, radians in ((3e-3, 0.01), (4e-3, 0.02)):
         add(statistics, error=pin.SE3(pin.exp3(np.array([0.0, radians, 0.0])), np.array([0.0, 0.0, metres])))
     add(statistics)
@@ -125,7 +125,7 @@ def test_changes_of_a_gripper_are_counted_but_not_its_first_opening(statistics: 
     assert statistics.summary(1.0).arms["right"].gripper_changes == 2
 
 
-def test_ratios_and_margin_are_the_worst_of_all_ticks_relative_to_the_limits_in_force() -> None:
+def test_the_summary_has_the_worst_ratios_and_margin_of_all_ticks_relative_to_the_limits_in_force() -> None:
     control = cell().control.model_copy(update={"velocity_scale": 0.5, "acceleration_limit": 4.0})
     statistics = RunStatistics(cell_robot(), control)
     add(statistics, v=-0.25 * statistics.robot.velocity_limit, a=np.full(14, -3.0))
@@ -138,14 +138,14 @@ def test_ratios_and_margin_are_the_worst_of_all_ticks_relative_to_the_limits_in_
     assert summary.min_position_margin_rad == pytest.approx(0.02)
 
 
-def test_an_acceleration_counts_against_the_limit_of_its_joint(statistics: RunStatistics) -> None:
+def test_an_acceleration_is_compared_with_the_limit_of_its_own_joint(statistics: RunStatistics) -> None:
     a = np.zeros(14)
     a[[0, 8]] = 3.0, -2.72  # The joints are A1 of the left arm and A2 of the right one, whose limit is lower.
     add(statistics, a=a)
     assert statistics.summary(1.0).max_acceleration_ratio == pytest.approx(2.72 / 5.44)
 
 
-def test_counts_and_the_closest_pair_come_from_the_reports(statistics: RunStatistics) -> None:
+def test_the_summary_takes_its_counts_and_the_closest_pair_from_the_reports_of_ticks(statistics: RunStatistics) -> None:
     add(statistics)
     add(statistics, report=replace(REPORT, closest_distance=0.03, closest_pair=("tool", "table"), fallback=True))
     add(statistics, report=replace(REPORT, certified=False, rejected=("left", "right")))
@@ -229,7 +229,7 @@ def test_a_histogram_ignores_numbers_that_are_not_finite_and_counts_numbers_beyo
 
 
 @pytest.mark.parametrize(("off", "followed"), [(0.0, True), (0.256, False)])
-def test_an_arm_whose_tool_is_far_from_its_reference_at_the_end_did_not_follow(
+def test_an_arm_whose_tool_is_far_from_its_reference_at_the_end_counts_as_not_following(
     statistics: RunStatistics, off: float, followed: bool
 ) -> None:
     led = {arm: statistics.robot.tool_pose(statistics.robot.home, arm) for arm in SIDES}

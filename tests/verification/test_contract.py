@@ -54,7 +54,7 @@ def moved(q: Array, v: Array, change: float, report: StepReport) -> Reference:
     return Reference(q + 0.5 * DT * (v + after), after, one(change / DT), report)
 
 
-def test_a_broken_promise_is_raised_with_its_name_its_value_and_what_is_allowed(
+def test_a_broken_promise_raises_an_error_with_its_name_its_value_and_what_is_allowed(
     robot: Robot, apart: StepReport
 ) -> None:
     contract = contract_of(robot)
@@ -92,7 +92,9 @@ def test_a_breach_of_each_promise_is_found(
     assert promise in broken
 
 
-def test_a_solver_failure_without_the_certified_stop_breaks_two_promises(robot: Robot, apart: StepReport) -> None:
+def test_if_a_solver_fails_and_the_certified_stop_is_not_executed_two_promises_are_broken(
+    robot: Robot, apart: StepReport
+) -> None:
     contract = contract_of(robot)
     broken = contract.observe(moved(robot.home, np.zeros(14), FASTEST, apart), DT, failed=True)
     assert list(broken) == ["not_stopped", "unsaid"]
@@ -133,7 +135,7 @@ def test_a_tick_of_zero_duration_must_not_move_anything(robot: Robot, apart: Ste
     assert list(contract_of(robot).observe(moves, 0.0)) == ["idle"]
 
 
-def test_a_joint_that_cannot_stop_before_its_limit_is_found(robot: Robot, apart: StepReport) -> None:
+def test_the_contract_finds_a_joint_that_cannot_stop_before_its_limit(robot: Robot, apart: StepReport) -> None:
     q = robot.home.copy()
     q[JOINT] = robot.position_upper[JOINT] - SETTINGS.position_margin - 0.7 * FASTEST * DT
     contract = contract_of(robot, q, sample_all=True)

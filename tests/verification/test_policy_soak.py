@@ -27,7 +27,7 @@ def test_the_soak_finds_that_the_last_action_of_a_stalled_policy_is_repeated_for
     assert not report.passed
 
 
-def test_the_command_prints_every_promise_and_the_number_of_actions() -> None:
+def test_the_command_soak_prints_every_promise_and_the_number_of_actions() -> None:
     result = q2r2("soak", "--policy", "--ticks", "300")
     assert result.exit_code == 0
     assert "speed after a stall of the policy" in result.stdout

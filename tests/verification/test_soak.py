@@ -240,7 +240,7 @@ def test_fingers_that_open_without_a_proof_are_found(monkeypatch: pytest.MonkeyP
     assert "distance - kept distance, at ticks" in {found.promise for found in report.broken}
 
 
-def test_equal_seeds_give_equal_runs() -> None:
+def test_two_soaks_with_equal_seeds_are_equal() -> None:
     first, second, other = (run_soak(CONFIG, 150, seed) for seed in (5, 5, 6))
     assert first.margins == second.margins
     assert first.margins != other.margins
@@ -275,7 +275,9 @@ def _report(**changes: Any) -> Callable[[Reference], Reference]:
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_a_broken_promise_is_found_at_its_tick(change: Callable[[Reference], Reference], promise: str) -> None:
+def test_a_broken_promise_is_found_in_the_tick_in_which_it_is_broken(
+    change: Callable[[Reference], Reference], promise: str
+) -> None:
     report = soak(change, first=12, ticks=100)
     assert not report.passed
     found = {violation.promise: violation for violation in report.broken}
