@@ -50,11 +50,11 @@ def hand(at: Array, speed: float = 0.25, **more: Any) -> MovingObstacle:
     return MovingObstacle(shape="sphere", size=(RADIUS,), position=tuple(at.tolist()), speed=speed, **more)
 
 
-BOX = (0.1, 0.3, 0.2)  # Lengths of the sides [m].
+BOX = (0.1, 0.3, 0.2)  # Side lengths of the box that represents a hand [m].
 
 
 class Coal:
-    """Measures the distances of all moving bodies from a ball or a box with Coal."""
+    """Uses the library Coal to measure the distances of all moving bodies from a ball or a box."""
 
     def __init__(self, controller: CartesianController, shape: coal.CollisionGeometry | None = None) -> None:
         self.model = controller.robot.model

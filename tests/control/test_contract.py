@@ -126,7 +126,7 @@ def test_arms_leave_a_stretched_posture_nearly_as_fast_as_the_acceleration_limit
             float(np.linalg.norm(controller.tool_pose(arm).translation - pose.translation))
             for arm, pose in driven.start.items()
         )
-    # At best, the joint with the longest path accelerates fully for half of it, and then decelerates fully.
+    # At best, the joint with the longest path accelerates fully for half of the path, and then decelerates fully.
     limit = robot.capped_acceleration(controller.settings.acceleration_limit)
     fastest = 2.0 * np.sqrt((np.abs(reference.q - q) / limit).max())
     assert 0.001 * driven.ticks < 1.2 * fastest

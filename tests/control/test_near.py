@@ -117,7 +117,7 @@ SLIDES: dict[str, tuple[Target, Target]] = {
 def test_joint_accelerations_hardly_jump_while_arms_slide_along_each_other(
     controller: CartesianController, slide: str
 ) -> None:
-    dt, started = 0.001, 2000  # Number of ticks after which the arms slide, and no longer react to the targets' jump.
+    dt, started = 0.001, 2000  # After ``started`` ticks the arms slide, and no longer react to the targets' jump.
     run = Driven(controller, dt=dt)
     targets = {
         arm: pin.SE3(pin.exp3(np.array(turn)) @ run.start[arm].rotation, np.array(place))
@@ -194,7 +194,7 @@ def test_a_tool_whose_target_is_inside_an_obstacle_comes_to_rest_in_front_of_the
     goal["left"].translation = np.array([0.65, 0.1, 0.5])
     reference = driven(CartesianController(robot), goal, 4.0)
     assert "post" in "|".join(reference.report.closest_pair)
-    # The shapes of the cell lie inside the monitored bodies. Coal measures the shapes.
+    # Coal measures the shapes of the cell. They lie inside the monitored bodies, so their distance is not smaller.
     assert min(pair.distance for pair in robot.distances(reference.q)) >= 0.02 - 1e-5
     assert reference.report.closest_distance < 0.03, "it goes as near as it may"
 

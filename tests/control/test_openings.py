@@ -81,9 +81,9 @@ def test_a_gripper_may_open_only_partly_beside_a_block_and_may_open_fully_above_
 def test_a_moving_gripper_must_not_open_if_its_stop_would_bring_open_fingers_too_close(
     controller: CartesianController,
 ) -> None:
-    """The closed gripper moves towards the block, and asks at every tick whether it may open.
+    """The closed gripper moves towards the block. At every tick, the test requests that it may have all openings.
 
-    If it may, Coal measures the distances of the open fingers along the stop.
+    If the request is accepted, Coal measures the distances of the open fingers along the stop.
     """
     robot = controller.robot
     kept = kept_distances(robot, SETTINGS).values

@@ -1,4 +1,4 @@
-"""The QP of a step can be read without side effects, and any program may solve it. The contract holds anyway."""
+"""The QP of a step can be read without side effects. A program may solve it, and any solution keeps the contract."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ KEPT = ControllerSettings(moving_obstacles=("hand",))
 
 
 def crossing(robot: Robot, tick: int = 0) -> dict[str, pin.SE3]:
-    """Return targets of which each is at the home position of the other tool. The left target swings up and down."""
+    """Return a target for each tool, at the home position of the other tool. The left target swings up and down."""
     left, right = (robot.tool_pose(robot.home, arm) for arm in ("left", "right"))
     swing = np.array([0.0, 0.0, 0.05 * math.sin(0.02 * tick)])
     return {

@@ -84,7 +84,7 @@ def test_numbers_that_are_not_finite_raise_no_exception_and_do_not_change_later_
 
 @pytest.fixture
 def data() -> KernelData:
-    """Return data with a cost whose minimum is 0.1 rad/s for every joint, within the box of 1 rad/s and the row."""
+    """Return data with a cost whose minimum is 0.1 rad/s for every joint. The box of 1 rad/s and the row allow it."""
     data = kernel_data("dual_iiwa7", np.zeros(NV))
     root = np.random.default_rng(5).normal(size=(NV, NV))
     data.tasks.H[:] = root @ root.T + np.eye(NV)

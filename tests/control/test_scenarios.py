@@ -170,7 +170,7 @@ def test_the_contract_holds_at_every_tick_of_every_hostile_motion(name: str, rob
     # Only a start in penetration has no certificate at first.
     assert (contract.uncertified > 0) == (case.start is in_penetration)
     assert failed == 0 or case.fault in STOPPING_FAULTS
-    # An absurd solution is followed as far as it is certified. After it, rows may be too late to prevent a fallback.
+    # An absurd solution is followed as far as it is certified. Later, rows may act too late to prevent a fallback.
     assert unfounded <= (0.02 if case.fault == "absurd" else 0.001) * contract.ticks
     if case.recovers:
         assert StepStatus.RECOVERING in statuses

@@ -25,7 +25,7 @@ def tracker() -> TargetTracker:
 
 
 def _taken(tracker: TargetTracker) -> TaskTargets:
-    return tracker._targets  # The public attribute ``pointer`` is for kernels only.
+    return tracker._targets  # There is no public access, because ``pointer`` is for kernels only.
 
 
 def _update(tracker: TargetTracker, targets: dict[str, Any], dt: float, q: Array, v: Array) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ DT = 0.002
 
 
 def crossing(controller: CartesianController) -> dict[str, pin.SE3 | None]:
-    """Return targets of which each is at the present position of the other tool."""
+    """Return a target for each tool, at the present position of the other tool."""
     left, right = (controller.tool_pose(arm) for arm in SIDES)
     return {"left": pin.SE3(left.rotation, right.translation), "right": pin.SE3(right.rotation, left.translation)}
 
@@ -43,7 +43,7 @@ def test_after_an_undone_step_no_pair_keeps_a_greater_distance_than_before_the_s
     controller.step({}, DT)
     assert controller.change({"min_distance": controller.settings.min_distance + 0.01}) is None
     before, late = controller.kept_distances, controller.step({}, DT)
-    while not (controller.kept_distances > before).any():  # Distances do not grow at every step.
+    while not (controller.kept_distances > before).any():  # Kept distances do not grow at every step.
         before, late = controller.kept_distances, controller.step({}, DT)
     controller.withdraw(late)
     np.testing.assert_array_equal(controller.kept_distances, before)

@@ -18,7 +18,7 @@ from tests.control.test_scenarios import CASES, Case, ticks_of
 from tests.qp.solvers import NAMES, ROBOT, controller_with, each_solver
 from tests.support.driven import Driven
 
-DT, MOVING, RESTING = 0.002, 0.16, 2.5  # [s]
+DT, MOVING, RESTING = 0.002, 0.16, 2.5  # Durations of a tick, of the motion, and of the wait for rest [s].
 SLOWLY_OUT = "start in penetration"  # In this motion arms move apart at 50 mm/s, and a tick has up to 80 rows.
 REST, RESTED = 1e-3, 0.02  # Arms rest if all joints are slower than this [rad/s] for this time [s].
 TRACKING = 1.05  # Largest tracking error with another solver, as a multiple of the error with DAQP.

@@ -15,7 +15,7 @@ from tests.control.test_scenarios import in_penetration
 from tests.qp.solvers import ROBOT, controller_with, each_solver
 from tests.support.driven import Driven
 
-DT, DRIVEN = 0.002, 0.04  # [s]
+DT, DRIVEN = 0.002, 0.04  # Durations of a tick and of a motion [s].
 TICKS = 6
 Corner = tuple[Array, Array, pin.Motion]  # q and v, and the motion of the targets away from the tools [m], [rad].
 OUT = pin.Motion(np.array([0.3, 0.0, 0.3]), np.zeros(3))

@@ -1,4 +1,4 @@
-"""The QP has one solution. Every solver finds the solution of brute force in small problems, and of DAQP in motions."""
+"""The QP has one solution. Every solver finds that of brute force in small problems, and that of DAQP in motions."""
 
 from __future__ import annotations
 

@@ -70,6 +70,7 @@ def test_the_distance_of_two_segments_equals_the_distance_of_their_closest_point
     random = np.random.default_rng(1)
     on_a, on_b = np.zeros(3), np.zeros(3)
     # Segments that are parallel except for rounding are measured in the middle of the overlap, not at its nearer end.
+    # The tolerance for them is therefore greater.
     tolerance = 1e-7 if kind == "nearly parallel" else 1e-9
     for _ in range(SAMPLES):
         segments = _segments(kind, random)

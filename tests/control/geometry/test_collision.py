@@ -24,7 +24,10 @@ def _coal_distances(robot: Robot, q: Array) -> Array:
 
 
 def _core_distance(cell: CellArrays) -> Array:
-    """Return the distance (p,) at which the cores meet [m]. The closed forms are not smooth below this distance."""
+    """Return for each pair (p,) the distance at which the cores of its bodies meet [m].
+
+    A core is a body without its radius. The closed forms are not smooth below this distance.
+    """
     return np.asarray(-cell.bodies.radius[cell.pairs.first] - cell.bodies.radius[cell.pairs.second])
 
 

@@ -18,7 +18,7 @@ from tests.control.cells import CellArrays, arrays_of, cell, placed, random_post
 
 ROBOT, MODEL = cell("dual_iiwa7").robot, cell("dual_iiwa7").collision
 NAMES = pair_names(ROBOT.collision_model)
-DEPTH = 0.015  # [m]
+DEPTH = 0.015  # Allowed depth of contacts between fingers and the table [m].
 TOUCHING = np.array(["finger" in a + b and "table" in a + b for a, b in NAMES])
 ROUNDED = with_rounded_boxes(MODEL, np.where(TOUCHING, DEPTH, -0.02))
 
@@ -58,12 +58,12 @@ def test_a_box_is_rounded_with_the_allowed_depth_of_its_pair_as_the_radius() -> 
     np.testing.assert_allclose(second - first, DEPTH)
 
 
-SMOOTHING = 1e-4  # [m^2]
-CORES_APART = 0.03  # [m]
+SMOOTHING = 1e-4  # Parameter of the smooth distance [m^2].
+CORES_APART = 0.03  # Least distance of the cores in the postures that are compared [m].
 
 
 def _looked_at(arrays: CellArrays, q: Array, p: int, smooth: bool = True) -> tuple[float, Array]:
-    """Return the distance of pair ``p`` [m], and the row (nv,) that is its gradient."""
+    """Return the smooth or the exact distance of pair ``p`` [m], and the row (nv,) that is its gradient."""
     data, row = placed(arrays, q), np.zeros(len(q))
     distance = measure_smooth(arrays.collision, data, p, SMOOTHING) if smooth else measure(arrays.collision, data, p)
     distance_row(arrays.collision, data, p, row)
@@ -76,7 +76,7 @@ def _radii(arrays: CellArrays, p: int) -> float:
 
 @pytest.fixture(scope="module")
 def seen() -> list[tuple[Array, int]]:
-    """Return postures and pairs whose cores are apart there. Some of the pairs contain a box."""
+    """Return postures, each with a pair whose cores are apart in this posture. Some of the pairs contain a box."""
     arrays, random = cell("dual_iiwa7"), np.random.default_rng(21)
     found = []
     for _ in range(300):

@@ -232,7 +232,7 @@ def test_rounding_errors_do_not_add_up_over_many_ticks() -> None:
 
 
 def _turning_at_its_end(name: str, random: np.random.Generator, count: int) -> Iterator[Motion]:
-    """Yield the fastest certified stops of all joints together from postures that are too close.
+    """Yield the fastest certified stops in which all joints stop together, from postures in which a pair is too close.
 
     A faster stop would bring a pair closer again at its end.
     """

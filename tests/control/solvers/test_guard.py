@@ -1,4 +1,4 @@
-"""No solver can change the controller's arrays, and no solver makes a step raise."""
+"""No solver can change the controller's arrays, and no solver makes a step raise an exception."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ class UnprintableError(Exception):
 
 
 class Panic(BaseException):
-    """An exception like that of a library in Rust."""
+    """An exception that is not derived from Exception, like those of libraries in Rust."""
 
 
 @pytest.mark.parametrize("error", [UnprintableError(), Panic("at the disco")], ids=["unprintable", "panic"])

@@ -1,4 +1,4 @@
-"""Tasks in NumPy: the elbow's swivel alone and in the controller, and a task of another package."""
+"""The task for the swivel angle of an elbow, alone and in the controller, and a task of another package."""
 
 from __future__ import annotations
 
