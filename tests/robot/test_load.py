@@ -1,4 +1,4 @@
-"""The load of an arm, identified from torques at rest."""
+"""The load of an arm is identified from torques at rest."""
 
 from __future__ import annotations
 

@@ -134,7 +134,7 @@ def test_a_capsule_stays_a_capsule_and_a_drawing_is_a_collision_shape_only_if_a_
     text = ARM.replace('<geom type="plane"', '<geom name="table" type="plane"').replace("</mujoco>", contact)
     arm.write_text(text.replace('type="mesh" mesh="wedge" contype', 'name="drawn" type="mesh" mesh="wedge" contype', 1))
     assert read(arm)[0].findall("link[@name='shoulder']/visual") == [], "a pair names it"
-    assert 2.0 * shapes["slide"].halfSide == pytest.approx([0.06, 0.1, 0.14])  # The box is that around the ellipsoid.
+    assert 2.0 * shapes["slide"].halfSide == pytest.approx([0.06, 0.1, 0.14])  # This is the box around the ellipsoid.
 
 
 def test_a_file_with_two_arms_gets_a_root_link_at_the_origin_of_the_world(arm: Path) -> None:

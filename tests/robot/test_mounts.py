@@ -1,4 +1,4 @@
-"""The displacement between two sets of points."""
+"""The displacement that moves one set of points onto another set is found."""
 
 from __future__ import annotations
 

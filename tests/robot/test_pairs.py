@@ -1,4 +1,4 @@
-"""The monitored pairs of the shipped cell and of a cell of two pandas."""
+"""Which pairs of the shipped cells are monitored, and which links are monitored against a floor."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_within_an_arm_exactly_the_pairs_of_links_that_can_meet_are_monitored(du
 
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_the_floor_is_monitored_against_exactly_the_links_that_can_come_near_it(dual_iiwa: Robot, side: str) -> None:
-    """Link 1 turns only about the vertical, and link 2 is too short."""
+    """Two links cannot come near it: link 1 turns only about the vertical, and link 2 is too short."""
     reach_it = {f"{side}_link_{index}" for index in range(3, 8)} | {f"{side}_hand_e_envelope", f"{side}_{FINGERS}"}
     with_floor = {link for pair in _links(dual_iiwa) if "floor" in pair for link in pair if link.startswith(side)}
     assert with_floor == reach_it
@@ -107,7 +107,9 @@ def _disabled(text: str) -> set[tuple[str, ...]]:
 @pytest.mark.parametrize("arm", ["iiwa7", "iiwa14"])
 @pytest.mark.parametrize("flange", [None, pytest.param(TOUCH, marks=pytest.mark.slow)])
 def test_every_shipped_srdf_lists_the_pairs_that_the_program_finds(arm: str, flange: str | None) -> None:
-    gripper = load_config(f"config/dual_{arm}.yaml").arms["left"].gripper.model_dump()  # The fingers are one body.
+    gripper = (
+        load_config(f"config/dual_{arm}.yaml").arms["left"].gripper.model_dump()
+    )  # The gripper makes both fingers one body.
     made = model_srdfs(one_arm(model=arm, flange={"model": flange}, tool=HAND, gripper=gripper), SAMPLES)
     on = f"{TOUCH}_on_{arm}" if flange else arm
     assert made.keys() == {f"{arm}.srdf", "hand_e.srdf", f"{on}.srdf", f"hand_e_on_{on}.srdf"}

@@ -73,7 +73,7 @@ def _tiago_pairs() -> str:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a user's folder with both cells."""
+    """Return a folder with the files of both cells."""
     folder = tmp_path_factory.mktemp("cells")
     for cell in (BAXTER, TIAGO):
         (folder / f"{cell['name']}.yaml").write_text(yaml.safe_dump(cell))

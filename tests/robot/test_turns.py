@@ -18,7 +18,7 @@ PERIOD = 0.01  # [s]
 
 @pytest.fixture
 def robot() -> Any:
-    """Return a robot of three joints. The middle one has limits, and the others are continuous."""
+    """Return a robot of three joints. The middle joint has limits, and the other joints are continuous."""
     return SimpleNamespace(endless=np.array([True, False, True]), velocity_limit=np.array([2.0, 2.0, 4.0]))
 
 

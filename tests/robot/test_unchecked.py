@@ -29,7 +29,7 @@ def weighs(mass: float) -> str:
 
 
 def chain(*contents: str) -> str:
-    """Return a chain of links l1, l2 and so on, with these contents, on a base l0.
+    """Return a chain of links l1, l2 and so on, with the given contents, on a base l0.
 
     The links are 0.3 m apart, and turn on each other. The last link is fixed to the link before it.
     """
