@@ -1,4 +1,4 @@
-"""The arena's helpers, on a model of two arms that MuJoCo has compiled."""
+"""The functions of benchmarks/arena_*.py are tested on a model of two arms that MuJoCo has compiled."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The benchmarks outside the package start, and the one that measures the loop finds all its stages."""
+"""The scripts in benchmarks/ start, and the script that measures the loop measures all stages of a tick."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ NEEDED = {
     "page": ("viser", "websockets"),
     "camera": ("cv2",),
     "qp": ("qpbenchmark",),
-}  # The keys are the beginnings of the scripts' names.
+}  # Each key is the beginning of a script's name.
 
 
 def run(script: str, *options: str) -> str:

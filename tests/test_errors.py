@@ -254,7 +254,7 @@ Call = Callable[[Program, Any], object]
 
 
 def each(what: str, names: Iterable[str], call: Callable[[Program, str, Any], object]) -> dict[str, Call]:
-    """Return one call for each keyword in ``names``, under the key ``what`` and the keyword."""
+    """Return one call for each keyword in ``names``. Its key consists of ``what`` and the keyword."""
 
     def of(name: str) -> Call:
         return lambda own, x: call(own, name, x)

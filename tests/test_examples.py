@@ -39,7 +39,7 @@ def run_command(command: list[str], *arguments: Any, **options: Any) -> Done:
 
 @pytest.fixture
 def as_main(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
-    """Run code as the module ``__main__`` of this process, whose imports are done, and return its output."""
+    """Return a function that runs code as the module ``__main__`` of this process, and returns what the code prints."""
     monkeypatch.chdir(ROOT)
     monkeypatch.setattr(sys, "path", list(sys.path))
     monkeypatch.setattr(subprocess, "run", run_command)

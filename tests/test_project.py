@@ -42,7 +42,7 @@ PROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text())["
 
 
 def modules(*extras: str) -> set[str]:
-    """Return the packages that the dependencies, or these extras, install."""
+    """Return the import names of the project's dependencies, or of the packages in the given extras."""
     optional = PROJECT["optional-dependencies"]
     entries = [entry for extra in extras for entry in optional[extra]] if extras else PROJECT["dependencies"]
     names = [re.split(r"[\[<>=]", entry)[0].removeprefix("ros-jazzy-") for entry in entries]
@@ -50,7 +50,7 @@ def modules(*extras: str) -> set[str]:
 
 
 def names_imported(node: ast.AST) -> Iterator[str]:
-    """Return names that are imported when a module runs, inside functions too, but not only for type checkers."""
+    """Return the names that a module imports, also inside functions. Imports for type checkers only are left out."""
     if isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING":
         return
     if isinstance(node, ast.Import):

@@ -113,7 +113,7 @@ def test_every_public_name_exists_and_has_a_docstring(package: str) -> None:
     for name in names_on_the_page(package):
         found = getattr(import_module(package), name)
         if inspect.isclass(found) or inspect.isfunction(found):
-            # A dataclass without a docstring gets its signature as one.
+            # A dataclass without a docstring gets its signature as its docstring.
             assert not (found.__doc__ or f"{name}(").startswith(f"{name}("), f"{package}.{name} has no docstring"
 
 

@@ -1,4 +1,4 @@
-"""In-process loops that stand still for a while, and plants that do not obey their commands."""
+"""A loop stands still for a while, or a plant does not obey its commands: the arms stay safe."""
 
 from __future__ import annotations
 

@@ -68,7 +68,7 @@ def test_the_figures_of_a_controller_that_stands_still_follow_from_its_targets(r
     assert figures.end_error_mm == pytest.approx(10.0)
     assert figures.arrival_s is None
     assert figures.max_acceleration == pytest.approx(2.0)
-    # In two of the last 500 ticks, one joint accelerates: first up to the speed of the jerk, then back to rest.
+    # In two of the last 500 ticks, one joint accelerates: first from rest to 0.002 rad/s, then back to rest.
     assert figures.rest_acceleration == pytest.approx(np.sqrt(2.0 * 2.0**2 / 500.0))
     assert (figures.done, figures.failures, figures.fallback_percent) == (1.0, 1, None)
     nearest = min(robot.distances(robot.home), key=lambda pair: pair.distance)
@@ -126,7 +126,7 @@ def test_the_bench_runs_our_controller_in_free_air_and_in_the_cell(monkeypatch: 
     assert report.notes[0] == f"missing: not installed; {INSTALL}"
     assert report.notes[1].startswith("broken: cannot be built for this cell: ModuleNotFoundError")
     assert ours.min_distance_mm is not None
-    assert ours.min_distance_mm >= 1.0  # The nearest pair is a finger and an obstacle.
+    assert ours.min_distance_mm >= 1.0  # The nearest pair is a finger and an obstacle, which keep 1 mm.
     assert row.free_air.rms_error_mm is not None
     assert ours.rms_error_mm is not None
     # The target is 10 mm lower than the table allows.

@@ -236,7 +236,7 @@ HOLD, HOLD_DAMPING = 2000.0, 60.0  # Stiffness [Nm/rad] and damping [Nm s/rad] t
 def _pushed(
     force: float, friction: float, dt: float, separation: MeasuredSeparation
 ) -> Iterator[tuple[WallReport, float, float, float]]:
-    """Push the left hand for 1.5 s at the right hand, which is 60 mm away, and then release it for 1.5 s.
+    """Push the left hand for 1.5 s towards the right hand, 60 mm away, and then release it for 1.5 s.
 
     Yield at each tick the report, the sum of the energies of motion, of the wall and of the springs that hold the right
     arm [J], the work of the push [J], and the distance of the closest pair, measured by Coal [m].

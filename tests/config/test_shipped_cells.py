@@ -1,4 +1,4 @@
-"""Every shipped cell loads. The first one shows all settings with comments."""
+"""Every shipped cell loads. The file dual_iiwa7.yaml shows all settings with comments."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Commands that are means of references keep the limit of jerk and the other limits, and end at the last reference."""
+"""Commands that are means of references keep the jerk limit and the other limits, and end at the last reference."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ A, H = 10.0, 0.001  # Acceleration limit [rad/s^2] and period [s].
 
 
 def limited(jerk: object, mode: str = "position", **control: Any) -> Config:
-    """Return the shipped cell with the limit of jerk ``jerk`` [rad/s^3] and a loop of 1000 Hz."""
+    """Return the shipped cell with the jerk limit ``jerk`` [rad/s^3] and a loop of 1000 Hz."""
     settings = cell().control.model_copy(update={"jerk_limit": jerk, **control})
     return cell().model_copy(update={"control": settings, "loop_rate_hz": 1000.0})
 

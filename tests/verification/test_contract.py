@@ -20,7 +20,7 @@ from tests.control.test_scenarios import in_penetration
 SETTINGS = ControllerSettings()
 DT = 0.001
 JOINT = 2
-FASTEST = 5.69 * DT  # Largest change of velocity of A3 of an iiwa 7 in a tick [rad/s]. Other joints may do more.
+FASTEST = 5.69 * DT  # Largest change of velocity of A3 of an iiwa 7 in a tick [rad/s]. Other joints may change faster.
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +32,7 @@ def apart(robot: Robot) -> StepReport:
 
 
 def contract_of(robot: Robot, q: Array | None = None, v: Array | None = None, **options: Any) -> Contract:
-    """Return the contract of a controller whose stop uses every joint's limit."""
+    """Return the contract of a controller whose certified stop uses every joint's acceleration limit."""
     limit = robot.capped_acceleration(SETTINGS.acceleration_limit)
     kept = kept_distances(robot, SETTINGS).values
     controller: Any = SimpleNamespace(

@@ -167,7 +167,7 @@ def test_hostile_input_with_a_solver_that_returns_garbage_never_breaks_the_contr
 
 
 class Impossible:
-    """A task that asks for joint speeds that no acceleration limit allows."""
+    """A constraint that demands joint speeds that no acceleration limit allows."""
 
     hard = True
 
@@ -301,7 +301,7 @@ def test_arms_that_come_too_close_are_found_at_ticks_between_ticks_and_during_st
 
 
 def test_a_stop_that_is_due_and_not_executed_is_found() -> None:
-    """The faults go to a solver that the controller does not use."""
+    """The soak makes a solver fail that the controller does not use, so the controller executes no stop."""
     elsewhere = FaultySolver(DaqpSolver(14), np.random.default_rng(0))
     controller_and_solver()[1].fault = None
     report = soak(lambda reference: reference, 0, 300, solver=elsewhere)
