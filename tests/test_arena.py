@@ -124,7 +124,7 @@ def test_scripted_hands_move_on_a_straight_line_and_wait_for_their_tools_before_
     assert hands.done
 
 
-def test_looking_down_returns_a_rotation_with_the_given_direction_of_x_that_can_be_tilted() -> None:
+def test_the_function_looking_down_returns_a_rotation_whose_x_axis_has_the_given_direction() -> None:
     rotation = looking_down(np.array([0.0, 2.0]))
     assert rotation[:, 0] == pytest.approx([0.0, 1.0, 0.0])
     assert rotation[:, 2] == pytest.approx([0.0, 0.0, -1.0])

@@ -272,7 +272,7 @@ def _pushed(
         pytest.param(10.0, 0.002, 1e5, 0.01, id="braked, slow loop, ten times the stiffness"),
     ],
 )
-def test_an_arm_that_40_newtons_push_towards_the_other_arm_never_touches_it_and_gains_no_energy(
+def test_an_arm_that_is_pushed_with_40_newtons_towards_the_other_arm_never_touches_it_and_gains_no_energy(
     friction: float, dt: float, stiffness: float, least: float
 ) -> None:
     pressed, released = 0, []

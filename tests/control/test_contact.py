@@ -104,7 +104,7 @@ def test_fingers_of_both_hands_can_touch_each_other_if_the_settings_allow_it() -
         ),
     ],
 )
-def test_unknown_names_and_too_great_depths_of_allowed_contacts_are_refused(
+def test_unknown_names_and_too_large_depths_of_allowed_contacts_are_refused(
     look: Callable[[Robot, ControllerSettings], object], allowed: dict[str, Any], says: str
 ) -> None:
     with pytest.raises(ConfigError, match=says):

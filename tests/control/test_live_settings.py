@@ -128,7 +128,7 @@ def test_every_setting_that_the_task_model_keeps_in_an_array_can_change_while_th
 
 
 @pytest.mark.slow
-def test_after_a_reset_to_a_posture_with_close_bodies_pairs_keep_as_much_distance_as_it_allows(
+def test_after_a_reset_every_pair_keeps_as_much_distance_as_a_posture_with_close_bodies_allows(
     controller: CartesianController,
 ) -> None:
     run = Driven(controller)
@@ -148,7 +148,7 @@ def test_after_a_reset_to_a_posture_with_close_bodies_pairs_keep_as_much_distanc
 
 
 @pytest.mark.slow
-def test_at_a_reset_to_a_close_posture_kept_distances_that_have_grown_fall_so_that_the_arms_can_rest(
+def test_a_reset_to_a_posture_with_close_bodies_reduces_kept_distances_so_that_the_arms_can_rest(
     controller: CartesianController,
 ) -> None:
     run = Driven(controller)

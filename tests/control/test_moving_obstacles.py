@@ -155,7 +155,7 @@ def test_a_new_obstacle_in_front_of_a_moving_arm_is_named_and_the_arm_brakes_alo
         before = now
 
 
-def test_a_new_box_of_speed_0_stops_an_arm_like_a_fixed_obstacle_until_the_box_is_removed(
+def test_a_new_box_that_never_moves_stops_an_arm_like_a_fixed_obstacle_until_the_box_is_removed(
     controller: CartesianController,
 ) -> None:
     start = controller.tool_pose("left")
@@ -198,7 +198,7 @@ def test_an_arm_with_a_hand_too_near_can_only_move_away_and_the_other_arm_can_mo
     assert np.linalg.norm(controller.tool_pose("left").translation - away["left"].translation) < 5e-3
 
 
-def test_slower_and_rise_of_an_obstacle_follow_from_its_speeds_and_its_acceleration() -> None:
+def test_the_values_slower_and_rise_of_an_obstacle_follow_from_its_speeds_and_its_acceleration() -> None:
     made = hand(np.zeros(3), 1.0, acceleration=2.0, speed_now=0.2)
     assert (made.slower, made.rise) == pytest.approx((0.8, 0.4))
     assert hand(np.zeros(3), 1.0, acceleration=2.0).slower == 0.0

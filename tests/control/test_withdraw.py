@@ -70,7 +70,7 @@ def test_arms_that_move_towards_each_other_keep_limits_and_distances_although_so
     assert -1e-9 <= nearest < 0.01
 
 
-def test_a_step_of_brake_follows_the_certified_stop_and_can_be_undone(robot: Robot) -> None:
+def test_a_braking_step_follows_the_certified_stop_and_can_be_undone(robot: Robot) -> None:
     controller, before = moving(robot)
     deceleration = controller.stop_deceleration
     braked = controller.brake(DT)

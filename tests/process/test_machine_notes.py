@@ -48,7 +48,7 @@ def test_a_note_names_a_card_with_a_short_ring_buffer_and_the_command_that_lengt
     assert card_notes("lo") == ["lo: a ring buffer of 256 messages; ethtool -G lo rx 4096"]
 
 
-def test_a_card_about_which_nothing_is_known_needs_no_note(prints: Callable[..., None]) -> None:
+def test_there_is_no_note_about_a_card_about_which_nothing_is_known(prints: Callable[..., None]) -> None:
     prints("rx-usecs: n/a\n", "RX:\t\tn/a\nRX:\t\tn/a\n")
     assert card_notes("no_such_card") == []
 

@@ -77,7 +77,7 @@ def test_the_body_of_a_finger_contains_the_finger_at_every_opening(shape: str) -
         assert 2 * body.geometry.halfLength == pytest.approx(0.05 if shape == "sphere" else 0.07)
 
 
-def test_the_body_of_a_turning_finger_covers_all_its_positions_and_a_finger_on_a_planar_joint_stays_as_it_is() -> None:
+def test_a_turning_finger_gets_a_body_for_all_its_positions_and_a_finger_on_a_planar_joint_keeps_its_shape() -> None:
     (ball,) = bodies(robot_with("sphere", kind="planar"), "finger")
     assert isinstance(ball.geometry, coal.Sphere)
     (body,) = bodies(robot_with("cylinder across", kind="revolute"), "finger")

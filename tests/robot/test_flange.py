@@ -65,7 +65,7 @@ def test_the_body_of_each_flange_is_monitored_against_everything_that_its_arm_ca
     assert not {pair for pair in new if pair & {"right_media_flange"} and pair & {"right_link_5", "right_link_2"}}
 
 
-def test_the_sphere_of_the_touch_flange_encloses_the_flange_and_the_capsule_of_link_7_would_not() -> None:
+def test_the_sphere_of_the_touch_flange_encloses_the_flange_but_the_capsule_of_link_7_would_not() -> None:
     """The outline of the published mesh is given as radius by height z. The end of a plain flange is at z = 0 [m]."""
     outline = {-0.045: 0.055, -0.026: 0.0582, 0.0: 0.0553, 0.026: 0.0329}
     urdf = load_description("media_flange_touch_pneumatic").urdf

@@ -106,7 +106,7 @@ def test_names_that_no_pair_has_raise_an_error_of_one_line(dual_iiwa: Robot, pai
     assert len(str(caught.value).splitlines()) == 1
 
 
-def test_largest_distance_names_the_setting_with_the_greatest_distance() -> None:
+def test_the_property_largest_distance_names_the_setting_with_the_greatest_distance() -> None:
     for settings, key in (
         ({}, "min_distance"),
         ({"distances": {"arm_self": 0.03}}, "distances.arm_self"),

@@ -30,7 +30,7 @@ def test_a_point_that_was_touched_at_a_wrong_position_has_the_largest_error() ->
     assert 0.002 < off.max() < 0.01
 
 
-def test_the_displacement_onto_a_mirror_image_contains_no_reflection_and_has_a_great_error() -> None:
+def test_the_displacement_onto_a_mirror_image_contains_no_reflection_and_has_a_large_error() -> None:
     move, off = fit_move(POINTS, POINTS * (1.0, -1.0, 1.0))
     assert np.linalg.det(move.rotation) == pytest.approx(1.0)
     assert off.max() > 0.05

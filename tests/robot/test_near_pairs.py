@@ -34,7 +34,7 @@ def made(
     return robot, [record.getMessage() for record in caplog.records]
 
 
-def test_two_links_of_an_arm_that_block_it_are_named_with_lines_that_let_it_move(
+def test_two_links_that_block_their_own_arm_are_named_with_lines_that_let_the_arm_move(
     ur5: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     robot, (said,) = made(ur5, caplog)

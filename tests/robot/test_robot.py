@@ -55,7 +55,7 @@ def test_at_home_the_tools_point_down_at_mirrored_positions_and_no_monitored_pai
     assert min(pair.distance for pair in dual_iiwa.distances(dual_iiwa.home)) > 0.04
 
 
-def test_distances_names_the_pairs_in_the_order_of_the_model_and_returns_negative_values_in_penetration(
+def test_the_method_distances_has_the_order_of_the_models_pairs_and_negative_values_in_penetration(
     dual_iiwa7: Robot,
 ) -> None:
     pairs = dual_iiwa7.distances(dual_iiwa7.home)
@@ -80,7 +80,7 @@ def test_a_robot_that_is_loaded_from_the_urdf_of_another_robot_is_equal_to_that_
     )
 
 
-def test_robot_called_with_a_file_name_raises_an_error_that_names_the_right_constructors(dual_iiwa7: Robot) -> None:
+def test_calling_robot_with_a_file_name_raises_an_error_that_names_the_right_constructors(dual_iiwa7: Robot) -> None:
     with pytest.raises(RobotError, match=re.escape("Robot('arm.urdf', ...): allowed: Robot.from_config(config), Rob")):
         Robot("arm.urdf")  # type: ignore[call-arg, arg-type]
     assert copy(dual_iiwa7).joint_names == dual_iiwa7.joint_names

@@ -58,7 +58,7 @@ def arm(third: str = BALL, last: str = BALL) -> str:
         pytest.param(arm(DRAWN), "l3: is drawn and has no collision shape", id="drawn, of a mass that is not said"),
     ],
 )
-def test_a_heavy_or_drawn_link_without_a_collision_shape_is_refused_unless_unchecked_links_names_it(
+def test_a_heavy_or_drawn_link_without_a_shape_is_refused_unless_unchecked_links_names_the_link(
     urdf: str, fault: str
 ) -> None:
     with pytest.raises(RobotError, match=re.escape(fault)) as error:

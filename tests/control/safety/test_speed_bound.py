@@ -84,7 +84,7 @@ def still_hand(q: Array, random: np.random.Generator) -> Array:
 @pytest.mark.parametrize(
     ("shape", "speed"), [(TOGETHER, 2.0), (OWN, 0.2)], ids=["the ways are curved", "joints rest one after the other"]
 )
-def test_the_bound_holds_for_a_hand_at_rest_on_a_moving_arm_that_moves_while_the_arm_stops(
+def test_the_bound_holds_for_a_hand_that_rests_on_a_moving_arm_and_moves_while_the_arm_stops(
     shape: int, speed: float
 ) -> None:
     random, robot = np.random.default_rng(62), cell("dual_iiwa7").robot
