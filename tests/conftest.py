@@ -1,4 +1,4 @@
-"""Tests get the same random numbers in any order and under any load, and share the robot of the shipped cell."""
+"""Tests get the same random numbers in any order and under any load, and use one robot of the shipped cell."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The arena's helpers, on a model of two arms that MuJoCo has compiled."""
+"""The functions of benchmarks/arena_*.py are tested on a model of two arms that MuJoCo has compiled."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def placed(model: mujoco.MjModel, **positions: float) -> mujoco.MjData:
     return data
 
 
-def test_a_robot_made_from_a_mujoco_model_has_its_tool_poses_and_encloses_all_that_a_finger_sweeps(
+def test_a_robot_made_from_a_mujoco_model_has_the_same_tool_poses_and_its_bodies_contain_all_shapes(
     model: mujoco.MjModel, arms: dict[str, ArmModel]
 ) -> None:
     closing = [placed(model, left_slide=way, right_slide=way).qpos.copy() for way in (0.1, 0.04, 0.0)]
@@ -79,7 +79,9 @@ def test_a_robot_made_from_a_mujoco_model_has_its_tool_poses_and_encloses_all_th
                 assert inside.all(), (side, geom, way)
 
 
-def test_the_judge_counts_the_contacts_of_mujoco(model: mujoco.MjModel, arms: dict[str, ArmModel]) -> None:
+def test_the_judge_counts_each_contact_once_and_measures_by_how_much_limits_are_exceeded(
+    model: mujoco.MjModel, arms: dict[str, ArmModel]
+) -> None:
     judge = Judge(model, arms)
     judge.look(placed(model))
     assert (judge.contacts, judge.breaks_position, judge.breaks_velocity) == (0, False, False)
@@ -98,7 +100,7 @@ def test_the_judge_counts_the_contacts_of_mujoco(model: mujoco.MjModel, arms: di
     assert judge.nearest < 0.0
 
 
-def test_hands_move_straight_and_wait_for_their_tools_before_they_go_on() -> None:
+def test_scripted_hands_move_on_a_straight_line_and_wait_for_their_tools_before_they_move_on() -> None:
     asked: list[str] = []
 
     def asks() -> Iterator[Ask]:
@@ -122,7 +124,7 @@ def test_hands_move_straight_and_wait_for_their_tools_before_they_go_on() -> Non
     assert hands.done
 
 
-def test_a_hand_that_looks_down_has_its_x_axis_in_the_given_direction_and_may_lean() -> None:
+def test_the_function_looking_down_returns_a_rotation_whose_x_axis_has_the_given_direction() -> None:
     rotation = looking_down(np.array([0.0, 2.0]))
     assert rotation[:, 0] == pytest.approx([0.0, 1.0, 0.0])
     assert rotation[:, 2] == pytest.approx([0.0, 0.0, -1.0])

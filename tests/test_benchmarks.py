@@ -1,4 +1,4 @@
-"""The benchmarks outside the package start, and the one that measures the loop finds all its stages."""
+"""The scripts in benchmarks/ start, and the script that measures the loop measures all stages of a tick."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ NEEDED = {
     "page": ("viser", "websockets"),
     "camera": ("cv2",),
     "qp": ("qpbenchmark",),
-}  # The keys are the beginnings of the scripts' names.
+}  # Each key is the beginning of a script's name.
 
 
 def run(script: str, *options: str) -> str:
@@ -34,7 +34,7 @@ def run(script: str, *options: str) -> str:
 
 
 @pytest.mark.parametrize("script", SCRIPTS)
-def test_every_benchmark_says_which_question_it_answers(script: str) -> None:
+def test_every_benchmark_has_the_option_json_and_is_described_in_the_readme(script: str) -> None:
     needed = NEEDED.get(script.split("_")[0], ())
     if absent := [name for name in needed if find_spec(name) is None]:
         pytest.skip(f"not installed: {', '.join(absent)}")
@@ -45,7 +45,7 @@ def test_every_benchmark_says_which_question_it_answers(script: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.soak
-def test_answers_during_a_standstill_of_a_processor_are_separated_from_others() -> None:
+def test_answers_during_a_standstill_of_a_processor_are_separated_from_other_answers() -> None:
     bench = load_script("benchmarks/fri.py")
     answers, stills = [(0.0, 0.001), (0.010, 0.013), (0.020, 0.028)], [(0.012, 0.014), (0.030, 0.031)]
     assert bench.undisturbed(answers, stills) == pytest.approx([0.001, 0.008])

@@ -1,4 +1,4 @@
-"""The lines of the README that lead from episodes to a dataset, with one episode."""
+"""The lines of the README that lead from episodes to a dataset are run with one episode instead of ten."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every public name answers a wrong argument with one line of the package's own errors."""
+"""For a wrong argument, every public name raises an error of this package with a message of one line."""
 
 from __future__ import annotations
 
@@ -97,20 +97,22 @@ def test_a_cell_is_loaded_only_from_a_path(path: Any) -> None:
         (lambda: RelativeMotion(scale=-1), "RelativeMotion: position_scale = -1: allowed: more than 0"),
     ],
 )
-def test_settings_made_in_python_name_key_value_and_what_is_allowed(make: Callable[[], object], said: str) -> None:
+def test_an_error_about_settings_made_in_python_names_key_value_and_what_is_allowed(
+    make: Callable[[], object], said: str
+) -> None:
     assert one_line(ConfigError, make).startswith(said)
 
 
 @pytest.mark.parametrize(
     "arms", [None, {}, "left_tool_frame", ["left_tool_frame"], {"left": None}, {5: "left_tool_frame"}]
 )
-def test_arms_of_a_urdf_are_a_mapping_of_names(robot: Robot, arms: Any) -> None:
+def test_arms_of_a_urdf_that_are_not_a_mapping_of_names_are_refused(robot: Robot, arms: Any) -> None:
     said = one_line(RobotError, lambda: Robot.from_urdf(robot.urdf, arms))
     assert said.endswith("expected a mapping such as {'left': 'left_tool_frame'}")
 
 
 @pytest.mark.parametrize("q", [None, "abc", 5, [0.0] * 3, [math.nan] * 14, [[0.0]] * 14, [object()]])
-def test_joints_of_a_wrong_kind_or_shape_are_refused_everywhere(
+def test_joint_positions_of_a_wrong_type_or_shape_are_refused_by_every_function(
     robot: Robot, controller: CartesianController, q: Any
 ) -> None:
     pair = (robot.distances(robot.home)[0].name_a, robot.distances(robot.home)[0].name_b)
@@ -126,12 +128,12 @@ def test_joints_of_a_wrong_kind_or_shape_are_refused_everywhere(
     assert np.isfinite(controller.step({}, 0.001, q).q).all(), "a posture that is not usable is not used"
 
 
-def test_lists_of_numbers_are_accepted_as_joints(robot: Robot) -> None:
+def test_a_list_of_numbers_is_accepted_as_joint_positions(robot: Robot) -> None:
     assert robot.tool_pose(robot.home.tolist(), "left") == robot.tool_pose(robot.home, "left")
 
 
 @pytest.mark.parametrize("arm", [None, "foo", 5, []])
-def test_an_arm_that_does_not_exist_is_named_with_those_that_do(
+def test_the_error_about_an_arm_that_does_not_exist_names_the_arms_that_exist(
     robot: Robot, controller: CartesianController, arm: Any
 ) -> None:
     for call in (
@@ -185,7 +187,7 @@ def test_brake_with_an_invalid_time_changes_nothing(controller: CartesianControl
 
 
 @pytest.mark.parametrize("pose", [None, 5, np.eye(4), NO_NUMBER, pin.SE3(np.zeros((3, 3)), np.zeros(3))])
-def test_relative_motion_takes_only_finite_poses(pose: Any) -> None:
+def test_relative_motion_accepts_only_finite_poses(pose: Any) -> None:
     unanchored, motion, identity = RelativeMotion(), RelativeMotion(), pin.SE3.Identity()
     motion.anchor(identity, identity)
     allowed = "allowed: finite numbers" if pose is NO_NUMBER else POSE
@@ -252,7 +254,7 @@ Call = Callable[[Program, Any], object]
 
 
 def each(what: str, names: Iterable[str], call: Callable[[Program, str, Any], object]) -> dict[str, Call]:
-    """Return one call for each keyword in ``names``, under the key ``what`` and the keyword."""
+    """Return one call for each keyword in ``names``. Its key consists of ``what`` and the keyword."""
 
     def of(name: str) -> Call:
         return lambda own, x: call(own, name, x)
@@ -329,7 +331,7 @@ def program(robot: Robot, controller: CartesianController) -> Program:
 
 
 @pytest.mark.parametrize("name", CALLS)
-def test_an_argument_of_a_wrong_kind_raises_an_error_of_this_package_with_one_line(program: Program, name: str) -> None:
+def test_an_argument_of_a_wrong_type_raises_an_error_of_this_package_with_one_line(program: Program, name: str) -> None:
     refused = []
     for value in KINDS:
         try:

@@ -38,7 +38,7 @@ def test_data_that_are_not_a_reason_are_refused(data: dict[str, object]) -> None
         Reason.from_json(data)
 
 
-def test_every_kind_has_a_sentence_and_every_fault_of_a_hand_is_a_kind() -> None:
+def test_every_kind_of_reason_has_a_sentence_and_every_fault_of_a_hand_is_a_kind_of_reason() -> None:
     assert all(kind.template for room in ROOMS for kind in room)
     assert {str(fault) for fault in HandFault} <= set(TeleopReason)
 
@@ -63,7 +63,7 @@ print(sentence(reason))
     assert said.stdout == "the drive of A4 has 81 degrees\n", said.stderr
 
 
-def test_a_sentence_shows_its_numbers_and_its_cause() -> None:
+def test_the_sentence_of_a_reason_contains_its_numbers_and_its_cause() -> None:
     assert (
         sentence(Reason.of(TeleopReason.LINKED, cause=JUMPED, arm="left")) == "linked to left: the hand jumped 0.300 m"
     )

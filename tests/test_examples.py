@@ -26,7 +26,10 @@ START_PROCESS: Callable[..., Done] = subprocess.run
 
 
 def run_command(command: list[str], *arguments: Any, **options: Any) -> Done:
-    """Replace ``subprocess.run`` for an example. The package's command runs in this process, others are started."""
+    """Replace ``subprocess.run`` for an example.
+
+    The package's command runs in this process. Any other command runs in a new process.
+    """
     if command[:3] != [sys.executable, "-m", "q2r2_control"]:
         return START_PROCESS(command, *arguments, **options)
     result = CliRunner().invoke(app, command[3:])
@@ -36,7 +39,7 @@ def run_command(command: list[str], *arguments: Any, **options: Any) -> Done:
 
 @pytest.fixture
 def as_main(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
-    """Run code as the module ``__main__`` of this process, whose imports are done, and return its output."""
+    """Return a function that runs code as the module ``__main__`` of this process, and returns what the code prints."""
     monkeypatch.chdir(ROOT)
     monkeypatch.setattr(sys, "path", list(sys.path))
     monkeypatch.setattr(subprocess, "run", run_command)
@@ -67,7 +70,7 @@ def test_the_code_of_the_readme_runs(as_main: Callable[..., str]) -> None:
 
 
 @pytest.mark.parametrize(("page", "ends"), [("api.md", "True 0"), ("solvers.md", "")])
-def test_the_code_of_a_page_of_docs_runs_from_its_first_to_its_last_line(
+def test_the_code_of_a_page_of_docs_runs_from_the_first_to_the_last_line(
     page: str, ends: str, as_main: Callable[..., str]
 ) -> None:
     parts = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / page).read_text(encoding="utf-8"), re.DOTALL)

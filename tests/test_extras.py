@@ -1,4 +1,4 @@
-"""The line that installs an extra."""
+"""The function install_line returns the command that installs an extra."""
 
 from __future__ import annotations
 
@@ -20,18 +20,20 @@ def activated(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("VIRTUAL_ENV", "/venv")
 
 
-def test_in_a_checkout_the_line_names_its_folder_so_that_it_works_from_any_folder() -> None:
+def test_in_a_checkout_the_command_contains_the_folder_so_that_it_works_from_any_other_folder() -> None:
     assert install_line("web") == f"pip install -e '{ROOT}[web]'"
     assert install_line("lerobot") == f"make -C {ROOT} lerobot, which makes {ROOT}/.venv-lerobot of some gigabytes"
 
 
-def test_elsewhere_the_line_names_the_package(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_outside_a_checkout_the_command_names_the_package(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(extras, "_CHECKOUT", tmp_path)
     assert install_line("web") == "pip install 'q2r2_control[web]'"
     assert install_line("lerobot") == "pip install 'q2r2_control[lerobot]'"
 
 
-def test_the_line_names_the_python_of_an_environment_that_is_not_activated(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_command_starts_with_the_python_of_an_environment_that_is_not_activated(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.delenv("VIRTUAL_ENV")
     monkeypatch.setattr(sys, "executable", "/venv/bin/python")
     assert install_line("web") == f"/venv/bin/python -m pip install -e '{ROOT}[web]'"

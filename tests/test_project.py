@@ -42,7 +42,7 @@ PROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text())["
 
 
 def modules(*extras: str) -> set[str]:
-    """Return the packages that the dependencies, or these extras, install."""
+    """Return the import names of the project's dependencies, or of the packages in the given extras."""
     optional = PROJECT["optional-dependencies"]
     entries = [entry for extra in extras for entry in optional[extra]] if extras else PROJECT["dependencies"]
     names = [re.split(r"[\[<>=]", entry)[0].removeprefix("ros-jazzy-") for entry in entries]
@@ -50,7 +50,7 @@ def modules(*extras: str) -> set[str]:
 
 
 def names_imported(node: ast.AST) -> Iterator[str]:
-    """Return names that are imported when a module runs, inside functions too, but not only for type checkers."""
+    """Return the names that a module imports, also inside functions. Imports for type checkers only are left out."""
     if isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING":
         return
     if isinstance(node, ast.Import):
@@ -70,7 +70,7 @@ def imported_by(file: Path) -> frozenset[str]:
 
 
 def imported(files: Iterable[Path]) -> set[str]:
-    """Return top-level packages, without the standard library and this package."""
+    """Return the top-level packages that ``files`` import, without the standard library and this package."""
     names = {name.partition(".")[0] for file in files for name in imported_by(file)}
     return names - set(sys.stdlib_module_names) - {PACKAGE}
 
@@ -98,7 +98,7 @@ def test_the_ros_manifest_has_the_name_and_version_of_the_python_package() -> No
 def test_no_modules_import_each_other_in_a_circle() -> None:
     files = [
         file for file in OTHERS | NODES if file.name != "__init__.py"
-    ]  # An import of a module is also one of its package.
+    ]  # Importing a module also imports its package, so packages are left out.
     known = {".".join(file.relative_to(ROOT).with_suffix("").parts): file for file in files}
     graph = {name: imported_by(file) & known.keys() for name, file in known.items()}
     TopologicalSorter(graph).prepare()  # A circle would raise CycleError.
@@ -139,7 +139,7 @@ def test_the_configuration_reference_agrees_with_the_settings() -> None:
     assert made.FILE.read_text(encoding="utf-8") == made.reference(), "python docs/make_reference.py"
 
 
-def test_no_two_public_classes_share_a_name() -> None:
+def test_no_two_public_classes_have_the_same_name() -> None:
     found = [name for path in NODES | OTHERS for name in re.findall(r"^class ([A-Z]\w*)", path.read_text(), re.M)]
     assert {name for name in found if found.count(name) > 1} == set()
 

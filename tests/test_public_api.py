@@ -19,7 +19,7 @@ from tests.support.modules import ROOT, blocks_of
 PACKAGE = "q2r2_control"
 ENTRIES = re.findall(r"^::: (\S+)$", (ROOT / "docs" / "api.md").read_text(encoding="utf-8"), re.MULTILINE)
 PACKAGES = sorted({entry.rpartition(".")[0] for entry in ENTRIES})
-NEEDED = {f"{PACKAGE}.gym": "gymnasium", f"{PACKAGE}.ros": "rclpy"}  # What some of a sub-package's names need.
+NEEDED = {f"{PACKAGE}.gym": "gymnasium", f"{PACKAGE}.ros": "rclpy"}  # The module that some names of a subpackage need.
 HEAVY = ("numba", "pinocchio", "mujoco", "scipy", "rclpy", "numpy", "matplotlib", "pydantic")
 CLIENTS = sorted(file for folder in ("plugins", "examples") for file in (ROOT / folder).rglob("*.py"))
 # Kernels are a part of the package itself, so their page imports inner modules.
@@ -93,25 +93,27 @@ def test_the_code_on_a_page_imports_public_names_only(page: Path) -> None:
         ),
     ],
 )
-def test_an_inner_import_is_reported_with_file_line_and_what_is_allowed(code: str, told: list[str]) -> None:
+def test_an_import_of_an_inner_name_is_reported_with_its_file_its_line_and_what_is_allowed(
+    code: str, told: list[str]
+) -> None:
     assert list(inner_imports(code, "a.py")) == told
 
 
 @EACH_PACKAGE
-def test_the_page_of_the_api_has_every_public_name_once(package: str) -> None:
+def test_the_page_of_the_api_documents_every_public_name_once(package: str) -> None:
     if package == f"{PACKAGE}.gym":
         pytest.importorskip("gymnasium")
     assert names_on_the_page(package) == sorted(import_module(package).__all__)
 
 
 @EACH_PACKAGE
-def test_every_public_name_exists_and_says_what_it_is(package: str) -> None:
+def test_every_public_name_exists_and_has_a_docstring(package: str) -> None:
     if (needed := NEEDED.get(package)) is not None and find_spec(needed) is None:
         pytest.skip(f"{needed} is not installed")
     for name in names_on_the_page(package):
         found = getattr(import_module(package), name)
         if inspect.isclass(found) or inspect.isfunction(found):
-            # A dataclass without a docstring gets its signature as one.
+            # A dataclass without a docstring gets its signature as its docstring.
             assert not (found.__doc__ or f"{name}(").startswith(f"{name}("), f"{package}.{name} has no docstring"
 
 

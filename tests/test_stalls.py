@@ -1,4 +1,4 @@
-"""In-process loops that stand still for a while, and plants that do not obey their commands."""
+"""A loop stands still for a while, or a plant does not obey its commands: the arms stay safe."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def swinging(plant: Plant | str, mode: str = "position", path: Callable[[float],
 
 
 def largest_step(plant: RecordingPlant, limit: Array) -> float:
-    """Return the largest step of any joint between two commands, as a share of its limit in one period."""
+    """Return the largest step of any joint between two commands, divided by what its limit allows in one period."""
     ways = np.abs(np.diff(np.array([command.q for command in plant.commands]), axis=0))
     return float((ways / (limit / RATE)).max())
 
@@ -66,7 +66,9 @@ class StallingClock:
 
 
 @pytest.mark.parametrize("stall", [0.05, 0.7])
-def test_after_a_stall_no_joint_moves_farther_than_in_a_period(stall: float, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_after_a_stall_no_joint_moves_farther_between_two_commands_than_its_limit_allows_in_a_period(
+    stall: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(loop_clock, "time", StallingClock(stall))
     plant = RecordingPlant()
     loop = swinging(plant)
@@ -108,7 +110,7 @@ def test_a_plant_that_catches_up_after_a_stall_is_not_reported_as_jumping(
 
 
 @pytest.mark.parametrize(("mode", "plant"), [("velocity", "kinematic"), ("torque", "mujoco")])
-def test_states_that_are_lost_while_the_arms_brake_are_not_used_any_more(mode: str, plant: str) -> None:
+def test_if_states_are_lost_while_the_arms_brake_the_old_states_are_no_longer_used(mode: str, plant: str) -> None:
     loop = swinging(plant, mode)
     watch = Watch(loop)
     measure = loop.plant.state
@@ -132,7 +134,7 @@ def test_states_that_are_lost_while_the_arms_brake_are_not_used_any_more(mode: s
     assert np.abs(rest.q - watch.ticks[-1].reference.q).max() < 0.05
 
 
-def test_a_plant_that_gives_no_more_states_gets_a_last_command_that_holds_the_arms() -> None:
+def test_a_plant_that_sends_no_more_states_gets_a_last_command_that_stops_the_arms() -> None:
     plant = RecordingPlant()
     loop = swinging(plant, "velocity")
 
@@ -179,7 +181,7 @@ def shifted(by: float) -> Callable[[RecordingPlant], Callable[[RobotState], Robo
     ],
     ids=["blocked", "teleporting", "frozen", "not a number"],
 )
-def test_a_plant_that_does_not_obey_ends_the_run_and_the_arms_brake_first(
+def test_if_a_plant_does_not_obey_the_arms_brake_and_the_run_ends_with_an_error(
     fault: Callable[[RecordingPlant], Callable[[RobotState], RobotState]], message: str
 ) -> None:
     plant = RecordingPlant()

@@ -59,16 +59,16 @@ class Standing:
         return self._q.copy(), np.zeros(len(self._q))
 
 
-def test_figures_of_a_controller_that_stands_still_are_those_of_the_targets(robot: Robot) -> None:
+def test_the_figures_of_a_controller_that_stands_still_follow_from_its_targets(robot: Robot) -> None:
     ends = round(SHORT.ends / DT)
     figures = run_motion(Standing(jerked=ends - 100, failing=ends - 50), robot, SHORT)
-    # The target goes 10 mm at a constant speed; the root mean square of that is 10 / sqrt(3).
+    # The target moves by 10 mm at a constant speed, so the root mean square of the error is 10 / sqrt(3).
     assert figures.rms_error_mm == pytest.approx(10.0 / np.sqrt(3.0), rel=0.01)
     assert figures.max_error_mm == pytest.approx(10.0, rel=0.01)
     assert figures.end_error_mm == pytest.approx(10.0)
     assert figures.arrival_s is None
     assert figures.max_acceleration == pytest.approx(2.0)
-    # In two of the last 500 ticks, one joint accelerates: first up to the speed of the jerk, then back to rest.
+    # In two of the last 500 ticks, one joint accelerates: first from rest to 0.002 rad/s, then back to rest.
     assert figures.rest_acceleration == pytest.approx(np.sqrt(2.0 * 2.0**2 / 500.0))
     assert (figures.done, figures.failures, figures.fallback_percent) == (1.0, 1, None)
     nearest = min(robot.distances(robot.home), key=lambda pair: pair.distance)
@@ -98,7 +98,7 @@ def test_a_tool_within_10_mm_of_the_goal_has_arrived(robot: Robot, goal: float, 
     assert run_motion(Standing(), robot, replace(away, has_goal=False)).arrival_s is None
 
 
-def test_a_tool_that_leaves_the_goal_has_arrived_when_it_is_back_for_good(robot: Robot) -> None:
+def test_a_tool_that_leaves_the_goal_has_arrived_only_when_it_has_finally_returned(robot: Robot) -> None:
     way = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
     there_and_back = replace(SHORT, path=lambda t, home: home + 0.2 * min(t, 0.2 - t) * way)
     figures = run_motion(OwnController(robot, CONFIG), robot, there_and_back)
@@ -107,7 +107,7 @@ def test_a_tool_that_leaves_the_goal_has_arrived_when_it_is_back_for_good(robot:
     assert 0.1 < figures.arrival_s < 0.4
 
 
-def test_the_report_says_how_far_a_too_slow_controller_got(robot: Robot) -> None:
+def test_the_report_contains_the_fraction_of_the_motion_that_a_too_slow_controller_completed(robot: Robot) -> None:
     figures = run_motion(Standing(), robot, SHORT, patience=0.0)
     assert figures.done < 0.01
     assert figures == MotionFigures("short", "standing", figures.done)
@@ -126,7 +126,7 @@ def test_the_bench_runs_our_controller_in_free_air_and_in_the_cell(monkeypatch: 
     assert report.notes[0] == f"missing: not installed; {INSTALL}"
     assert report.notes[1].startswith("broken: cannot be built for this cell: ModuleNotFoundError")
     assert ours.min_distance_mm is not None
-    assert ours.min_distance_mm >= 1.0  # The nearest pair is a finger and an obstacle.
+    assert ours.min_distance_mm >= 1.0  # The nearest pair is a finger and an obstacle, which keep 1 mm.
     assert row.free_air.rms_error_mm is not None
     assert ours.rms_error_mm is not None
     # The target is 10 mm lower than the table allows.
@@ -136,7 +136,7 @@ def test_the_bench_runs_our_controller_in_free_air_and_in_the_cell(monkeypatch: 
     assert (ours.motion, ours.controller) == ("slide", "q2r2_control")
 
 
-def test_the_target_of_a_peer_is_ahead_by_speed_over_gain() -> None:
+def test_the_target_that_a_peer_gets_is_ahead_by_its_speed_divided_by_the_gain() -> None:
     peer = Standing()
     leading = Leading(peer, gain=8.0)
     leading.reset(np.ones(14))

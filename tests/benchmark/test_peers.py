@@ -1,4 +1,4 @@
-"""Peers follow targets on the same cell; each is skipped where its package is not installed."""
+"""Peers, which are other controllers, follow targets on the same cell. A peer that is not installed is skipped."""
 
 from __future__ import annotations
 
@@ -35,7 +35,9 @@ def peer(request: pytest.FixtureRequest) -> BenchController:
 
 
 @pytest.mark.slow
-def test_a_peer_stays_at_its_targets_and_goes_to_others_within_the_limits(peer: BenchController) -> None:
+def test_a_peer_rests_at_home_if_its_targets_are_there_and_moves_to_other_targets_within_the_limits(
+    peer: BenchController,
+) -> None:
     peer.reset(ROBOT.home)
     for _ in range(20):
         q, v = peer.step(HOME, DT)
@@ -55,13 +57,14 @@ def test_a_peer_stays_at_its_targets_and_goes_to_others_within_the_limits(peer: 
         assert np.linalg.norm(pin.log3(error.rotation)) < 0.002
 
 
-def test_a_peer_with_an_acceleration_limit_starts_as_slowly_as_we_do(peer: BenchController) -> None:
+def test_a_peer_with_an_acceleration_limit_starts_as_slowly_as_our_controller(peer: BenchController) -> None:
     if peer.name in WITHOUT_ACCELERATION_LIMIT:
         pytest.skip("it has none")
     peer.reset(ROBOT.home)
     goals = {arm: pin.SE3(pose.rotation, pose.translation + 0.1) for arm, pose in HOME.items()}
     _, v = peer.step(goals, DT)
-    # The tolerance of roboplan's solver, 1e-6 rad in a tick, is a tenth of what the limit allows.
+    # The solver of roboplan may be off by 1e-6 rad in a tick, which is a tenth of what the limit allows. The test
+    # therefore permits a quarter more than the limit.
     limit = ROBOT.capped_acceleration(CONFIG.control.acceleration_limit)
     assert (np.abs(v) <= 1.25 * limit * DT).all()
 

@@ -30,7 +30,7 @@ def ways(motion: WorkMotion, start: dict[str, pin.SE3]) -> Array:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("motion", WORK_MOTIONS.values(), ids=WORK_MOTIONS)
-def test_targets_begin_at_home_move_smoothly_at_bounded_speed_and_end_still(
+def test_targets_begin_at_home_move_smoothly_at_bounded_speed_and_end_at_rest(
     motion: WorkMotion, start: dict[str, pin.SE3]
 ) -> None:
     way = ways(motion, start)
@@ -48,7 +48,7 @@ def test_targets_begin_at_home_move_smoothly_at_bounded_speed_and_end_still(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("gap", "speed"), [(0.40, 0.15), (0.20, 0.50), (0.16, 0.04)])
-def test_a_carry_keeps_its_gap_and_has_the_speed_of_its_name(
+def test_a_carrying_motion_keeps_the_distance_and_the_speed_that_its_name_states(
     gap: float, speed: float, start: dict[str, pin.SE3]
 ) -> None:
     motion = WORK_MOTIONS[f"carry-{gap:.2f}-{speed:.2f}"]

@@ -89,7 +89,7 @@ def test_after_a_push_the_target_returns_with_the_set_damping_ratio(axis: int, r
 
 
 @pytest.mark.slow
-def test_with_critical_damping_the_target_returns_without_overshoot_and_exactly() -> None:
+def test_with_critical_damping_the_target_returns_exactly_and_does_not_overshoot() -> None:
     admittance = Admittance(ROBOT)
     _displaced(admittance, _touch(_wrench(2, -20.0)), 2000)
     back = np.array(_displaced(admittance, UNTOUCHED, 4000))[:, 2]
@@ -110,7 +110,7 @@ def test_a_force_below_the_dead_band_never_moves_the_tool(axis: int) -> None:
 
 
 @pytest.mark.slow
-def test_beyond_the_dead_band_the_displacement_rises_without_a_step_to_that_of_the_whole_force() -> None:
+def test_beyond_the_dead_band_the_displacement_grows_gradually_to_the_value_for_the_whole_force() -> None:
     forces = np.linspace(1.5, 30.0, 115)
     ends = np.array([_displaced(Admittance(ROBOT), _touch(_wrench(0, force)), 100, 0.1)[-1][0] for force in forces])
     slopes = np.diff(ends) / np.diff(forces)
@@ -136,7 +136,7 @@ def test_any_wrench_at_any_tick_keeps_the_displacement_inside_its_limits() -> No
     np.testing.assert_allclose(farthest, [DEFAULT.max_displacement, DEFAULT.max_rotation], rtol=1e-6)
 
 
-def test_the_velocity_of_the_displacement_ends_when_the_displacement_reaches_its_limit() -> None:
+def test_the_velocity_of_the_displacement_becomes_zero_when_the_displacement_is_at_its_limit() -> None:
     admittance = Admittance(ROBOT, AdmittanceSettings(damping_ratio=0.1, filter_time=0.0))
     push, x = _touch(_wrench(0, 95.0)), 0.0
     while x < DEFAULT.max_displacement - 1e-9:
@@ -153,7 +153,7 @@ def test_an_arm_yields_only_to_a_push_at_its_own_tool() -> None:
     assert _away(targets["right"], GOALS["right"])[2] > 0.01
 
 
-def test_an_arm_that_holds_is_not_displaced_and_starts_again_from_its_new_target() -> None:
+def test_an_arm_without_a_target_is_not_displaced_and_later_starts_from_its_new_target() -> None:
     admittance, push = Admittance(ROBOT), _touch(_wrench(0, 20.0))
     assert _displaced(admittance, push, 1000)[-1][0] > 0.015
     for holding in ({"left": None, "right": GOALS["right"]}, {"right": GOALS["right"]}):
@@ -183,7 +183,7 @@ BAD = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", BAD)
-def test_a_measurement_that_is_not_finite_holds_the_last_wrench_and_is_reported(kind: str) -> None:
+def test_if_a_measurement_is_not_finite_the_last_wrench_is_kept_and_the_fault_is_reported(kind: str) -> None:
     admittance, (tau, q) = Admittance(ROBOT), BAD[kind]
     _displaced(admittance, _touch(_wrench(1, 20.0)), 3000)
     before = admittance.report().arms["left"]
@@ -203,7 +203,7 @@ def test_an_invalid_dt_changes_no_displacement_and_is_reported(dt: float) -> Non
     assert admittance.report().rejected
 
 
-def test_reset_forgets_wrench_and_displacement() -> None:
+def test_a_reset_sets_the_wrench_and_the_displacement_to_zero() -> None:
     admittance = Admittance(ROBOT)
     _displaced(admittance, _touch(_wrench(0, 20.0)), 500)
     admittance.reset()
@@ -212,7 +212,7 @@ def test_reset_forgets_wrench_and_displacement() -> None:
 
 
 @pytest.mark.parametrize("key", ["stiffness", "rotation_stiffness", "damping_ratio", "mass", "inertia"])
-def test_settings_that_would_drift_or_add_energy_are_refused(key: str) -> None:
+def test_settings_with_which_an_arm_would_drift_or_gain_energy_are_refused(key: str) -> None:
     with pytest.raises(ConfigError, match=key):
         AdmittanceSettings(**{key: 0.0})
 
@@ -245,7 +245,7 @@ def _loop(goals: dict[str, pin.SE3 | None], dt: float, ticks: int) -> Iterator[A
 
 @pytest.mark.slow
 @AXES
-def test_a_push_in_mujoco_moves_the_tool_by_the_give_of_the_admittance_and_of_the_servos(
+def test_a_push_in_mujoco_moves_the_tool_by_the_sum_of_what_admittance_and_servos_yield(
     axis: int,
 ) -> None:
     push = _wrench(axis, 20.0 if axis < 3 else 5.0)
@@ -265,7 +265,7 @@ def test_a_push_in_mujoco_moves_the_tool_by_the_give_of_the_admittance_and_of_th
 
 
 @pytest.mark.slow
-def test_a_tool_that_presses_on_a_body_of_10_kilonewtons_per_metre_comes_to_rest() -> None:
+def test_a_tool_that_presses_on_a_body_with_a_stiffness_of_10_kilonewtons_per_metre_comes_to_rest() -> None:
     body = 10000.0
     surface = ROBOT.tool_pose(ROBOT.home, "left").translation[2] - 0.02
     below = {arm: pin.SE3(goal.rotation, goal.translation - [0.0, 0.0, 0.06]) for arm, goal in GOALS.items() if goal}

@@ -47,7 +47,7 @@ def test_impedance_settings_that_would_not_hold_the_arm_are_refused(key: str, va
 
 class TestController:
     @pytest.mark.parametrize("scale", [1.0, 0.5])
-    def test_the_first_torque_is_gravity_at_the_measured_posture(self, robot: Robot, scale: float) -> None:
+    def test_the_first_torque_is_the_gravity_torque_at_the_measured_posture(self, robot: Robot, scale: float) -> None:
         controller = ImpedanceController(robot, ImpedanceSettings(torque_scale=scale))
         q = robot.home + 0.1
         controller.reset(at(q))
@@ -57,7 +57,7 @@ class TestController:
         assert not command.report.held
         assert command.report.clipped == ()
 
-    def test_extra_torque_is_added_and_bounded_with_all_other_torques(self, robot: Robot) -> None:
+    def test_an_extra_torque_is_added_and_the_sum_of_all_torques_is_bounded(self, robot: Robot) -> None:
         controller = started(robot)
         extra = np.zeros(14)
         extra[0], extra[5] = 0.5, 1e6
@@ -67,7 +67,9 @@ class TestController:
         assert command.report.saturated == command.report.rate_limited == ("left_A6",)
         assert controller.step(reference(robot.home), at(robot.home), DT, np.full(14, np.nan)).report.held
 
-    def test_the_report_names_arms_beyond_the_clip_and_joints_at_their_limits(self, robot: Robot) -> None:
+    def test_the_report_names_arms_whose_error_is_clipped_and_joints_that_their_limits_repel(
+        self, robot: Robot
+    ) -> None:
         controller, q = started(robot), robot.home.copy()
         q[:7] += 0.6
         report = controller.step(reference(robot.home), at(q), DT).report
@@ -80,7 +82,7 @@ class TestController:
 
     @pytest.mark.parametrize("field", ["q", "v"])
     @pytest.mark.parametrize("value", [np.nan, np.inf])
-    def test_an_unusable_state_holds_the_last_gravity_torque_and_is_reported(
+    def test_if_a_state_is_unusable_the_gravity_torque_of_the_last_state_is_held_and_the_fault_is_reported(
         self, robot: Robot, field: str, value: float
     ) -> None:
         controller, good, q = started(robot), at(robot.home), robot.home + 0.05
@@ -162,7 +164,7 @@ class TestAnImpedanceThatChanges:
             assert controller.in_force("right") == before
         assert controller.in_force("left") == asked
 
-    def test_another_change_begins_at_the_present_value_and_leaves_other_changes_alone(self, robot: Robot) -> None:
+    def test_another_change_starts_from_the_present_value_and_does_not_affect_other_changes(self, robot: Robot) -> None:
         controller = started(robot, ImpedanceSettings(ramp_time=0.1))
         controller.change({"damping_ratio": 0.5, "nullspace_stiffness": 10.0})
         for ticks, damping in ((50, None), (50, [1.25, 0.5]), (50, [1.75, 0.5])):
@@ -175,7 +177,9 @@ class TestAnImpedanceThatChanges:
             assert [values["damping_ratio"] for values in in_force] == pytest.approx(damping)
             assert [values["nullspace_stiffness"] for values in in_force] == pytest.approx([10.0, 10.0])
 
-    def test_after_a_change_torques_are_those_of_a_controller_made_with_the_new_settings(self, robot: Robot) -> None:
+    def test_after_a_change_torques_equal_those_of_a_controller_that_was_made_with_the_new_settings(
+        self, robot: Robot
+    ) -> None:
         soft = {"translational_stiffness": 300.0, "damping_ratio": 0.4, "nullspace_stiffness": 20.0}
         made, changed = started(robot, ImpedanceSettings(**soft)), ImpedanceController(robot)
         changed.change(soft)

@@ -50,7 +50,7 @@ def test_translation_and_rotation_of_an_error_are_each_clipped_in_length_and_kee
 
 class TestASingularPosture:
     @pytest.mark.slow
-    def test_the_tool_inertia_has_no_direction_heavier_than_1000_kg(self) -> None:
+    def test_the_inertia_of_the_tool_is_at_most_1000_kg_in_any_direction(self) -> None:
         J, M = left_arm(ROBOT, STRETCHED)
         assert np.linalg.matrix_rank(J) < 6
         root = np.sqrt(STIFFNESS / STIFFNESS[0])
@@ -75,7 +75,7 @@ class TestLimitRepulsion:
         assert np.ptp(torques) == 0
         return float(torques[0])
 
-    def test_the_limit_torque_is_a_spring_that_begins_before_the_limit_or_at_the_reference(self) -> None:
+    def test_the_limit_torque_acts_like_a_spring_that_begins_before_the_limit_or_at_the_reference(self) -> None:
         assert [self.torque(q) for q in (-0.9, 0.0, 0.9)] == [0.0, 0.0, 0.0]
         assert [self.torque(q) for q in (0.95, -0.95, 1.1)] == pytest.approx([-15.0, 15.0, -60.0])
         assert [self.torque(q, wanted=0.97) for q in (0.97, 0.98)] == pytest.approx([0.0, -3.0])
@@ -90,7 +90,7 @@ class TestLimitRepulsion:
         assert np.abs(np.diff(torques)).max() < 0.05
 
 
-def test_both_torque_bounds_hold_for_any_wanted_torque() -> None:
+def test_the_bounds_on_the_torque_and_on_its_change_hold_for_any_wanted_torque() -> None:
     random = np.random.default_rng(5)
     limit = np.array([176.0, 110.0, 40.0])
     bounded = np.zeros(3)
@@ -142,7 +142,7 @@ def arm_torque(
 
 
 @pytest.mark.parametrize("spread", [0.02, 0.5], ids=["near", "further than the clip"])
-def test_the_torque_of_the_controller_is_that_of_the_written_formulas(spread: float) -> None:
+def test_the_torque_of_the_controller_equals_that_of_the_formulas_in_the_papers(spread: float) -> None:
     random = np.random.default_rng(7)
     settings = ImpedanceSettings(damping_ratio=0.7, limit_distance=1e-3, torque_rate_limit=1e5)
     controller = ImpedanceController(ROBOT, settings)

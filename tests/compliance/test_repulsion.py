@@ -78,7 +78,7 @@ def test_the_torque_at_rest_is_the_negative_gradient_of_the_energy_of_the_wall(
         assert np.abs(report.tau).max() > 0.0
 
 
-def test_the_energy_is_that_of_springs_compressed_by_the_depths_that_coal_measures() -> None:
+def test_the_energy_equals_that_of_springs_compressed_by_the_depths_that_coal_measures() -> None:
     stiffness = WallSettings().stiffness
     for q, report in _postures()[:100]:
         depth = np.array([max(SHELL - pair.distance, 0.0) for pair in ROBOT.distances(q)])
@@ -98,7 +98,7 @@ def test_the_report_names_the_pairs_that_the_wall_pushes_apart_and_the_closest_p
         assert all(pair in pressing for pair, distance in distances.items() if distance < SHELL - 4e-4)
 
 
-def test_a_pair_that_may_touch_does_not_hide_a_pair_that_must_not_touch() -> None:
+def test_in_the_report_a_pair_that_may_touch_does_not_hide_a_pair_that_must_not_touch() -> None:
     q = ROBOT.home.copy()
     q[1] = 0.7  # The left fingers are 10 mm inside the table.
     contact = {"pair": ("*_finger_*", "table"), "depth": 0.015, "speed": 0.03}
@@ -163,7 +163,7 @@ def test_the_damping_never_adds_energy() -> None:
 
 
 @pytest.mark.slow
-def test_the_torque_of_the_wall_rises_gradually_while_a_pair_closes_in() -> None:
+def test_the_torque_of_the_wall_rises_gradually_while_a_pair_approaches() -> None:
     crossed = 0
     for q, report in _postures()[:12]:
         # The approach begins outside the wall, and moves against the torque at constant speed in very small steps.
@@ -223,7 +223,7 @@ ROD = """<robot name="rod"><link name="base"/><link name="rod"><inertial><mass v
 <parent link="base"/><child link="rod"/><limit lower="-1" upper="1" velocity="1" effort="1"/></joint></robot>"""
 
 
-def test_a_robot_without_pairs_has_no_wall() -> None:
+def test_for_a_robot_without_pairs_the_wall_has_no_torque() -> None:
     robot = Robot.from_urdf(ROD, {"left": "rod"}, unchecked_links=["rod"])
     report = MeasuredSeparation(robot, ControllerSettings()).update(np.zeros(1), np.ones(1))
     assert not report.tau.any()
@@ -236,7 +236,7 @@ HOLD, HOLD_DAMPING = 2000.0, 60.0  # Stiffness [Nm/rad] and damping [Nm s/rad] t
 def _pushed(
     force: float, friction: float, dt: float, separation: MeasuredSeparation
 ) -> Iterator[tuple[WallReport, float, float, float]]:
-    """Push the left hand for 1.5 s at the right hand, which is 60 mm away, and then release it for 1.5 s.
+    """Push the left hand for 1.5 s towards the right hand, 60 mm away, and then release it for 1.5 s.
 
     Yield at each tick the report, the sum of the energies of motion, of the wall and of the springs that hold the right
     arm [J], the work of the push [J], and the distance of the closest pair, measured by Coal [m].
@@ -272,7 +272,7 @@ def _pushed(
         pytest.param(10.0, 0.002, 1e5, 0.01, id="braked, slow loop, ten times the stiffness"),
     ],
 )
-def test_an_arm_pushed_at_the_other_arm_with_40_newtons_never_touches_it_nor_gains_energy(
+def test_an_arm_that_is_pushed_with_40_newtons_towards_the_other_arm_never_touches_it_and_gains_no_energy(
     friction: float, dt: float, stiffness: float, least: float
 ) -> None:
     pressed, released = 0, []
@@ -298,7 +298,7 @@ def test_a_wall_whose_distances_changed_pushes_like_a_wall_made_with_these_dista
     np.testing.assert_array_equal(told.update(q, REST).tau, made.update(q, REST).tau)
 
 
-def test_an_arm_pushed_at_a_new_box_never_touches_it_until_the_box_is_removed() -> None:
+def test_an_arm_that_is_pushed_towards_a_new_box_never_touches_the_box_until_it_is_removed() -> None:
     controller = CartesianController(ROBOT, ControllerSettings(moving_obstacles=("hand", "box")))
     separation, size = MeasuredSeparation(ROBOT, controller.settings), (0.2, 0.05, 0.3)
     at = ROBOT.tool_pose(ROBOT.home, "left").translation + np.array([0.0, 0.14, 0.0])
@@ -327,7 +327,7 @@ def test_an_arm_pushed_at_a_new_box_never_touches_it_until_the_box_is_removed() 
 
 
 @pytest.mark.parametrize("with_object", [False, True], ids=["empty hands", "an object in one hand's reach"])
-def test_an_obstacle_that_may_move_has_no_wall(with_object: bool) -> None:
+def test_the_wall_pushes_no_arm_away_from_an_obstacle_that_may_move(with_object: bool) -> None:
     robot = Robot.from_config(object_cell(BLOCK)) if with_object else ROBOT
     controller = CartesianController(robot, ControllerSettings(moving_obstacles=("hand", "box")))
     separation = MeasuredSeparation(robot, controller.settings)

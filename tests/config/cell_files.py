@@ -43,7 +43,7 @@ def fault(tmp_path: Path, text: str | bytes) -> str:
 
 
 def changed(path: str, value: object, cell: Callable[[], dict[str, Any]] = shipped) -> str:
-    """Return a cell as YAML with one value replaced or added; ``path`` is written with dots."""
+    """Return a cell as YAML with one value replaced or added. Dots separate the keys in ``path``."""
     data: Any = cell()
     *parents, key = path.split(".")
     place = data

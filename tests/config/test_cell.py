@@ -1,4 +1,4 @@
-"""The YAML of a cell: every fault gives one line that names the key and what is allowed."""
+"""Every fault in the YAML of a cell raises an error of one line that names the key and what is allowed."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ ARM = {"model": "iiwa7", "home": [0] * 7, "tip": "link_ee"}
         "external.arms.left.gripper.action",
     ],
 )
-def test_an_unknown_key_is_named_with_those_allowed_there(tmp_path: Path, path: str) -> None:
+def test_the_error_about_an_unknown_key_lists_the_keys_that_its_block_may_have(tmp_path: Path, path: str) -> None:
     cell = external if path.startswith("external") else shipped
     message = fault(tmp_path, changed(path, 1.5, cell))
     assert message.startswith(f"{path} = 1.5: unknown key; ")
@@ -51,13 +51,17 @@ def test_an_unknown_key_is_named_with_those_allowed_there(tmp_path: Path, path: 
         ({"units": 9}, "digital, input, output"),
     ],
 )
-def test_the_keys_of_a_gripper_are_those_of_its_kind(tmp_path: Path, gripper: dict[str, Any], allowed: str) -> None:
+def test_the_error_about_an_unknown_key_of_a_gripper_lists_the_keys_for_grippers_of_its_kind(
+    tmp_path: Path, gripper: dict[str, Any], allowed: str
+) -> None:
     message = fault(tmp_path, changed("fri.left.gripper", gripper))
     assert message.startswith("fri.left.gripper.units = 9: unknown key; ")
     assert f"allowed here: {allowed}" in message
 
 
-def test_the_motion_that_a_cabinet_sees_while_answers_catch_up_is_within_the_velocity_limits(tmp_path: Path) -> None:
+def test_the_velocity_scale_of_a_fri_cell_is_so_small_that_catching_up_keeps_the_velocity_limits(
+    tmp_path: Path,
+) -> None:
     def scale(given: float) -> float:
         text = changed("control.velocity_scale", given, lambda: shipped() | {"fri": {"left": {}, "right": {}}})
         return loaded(tmp_path, text).control.velocity_scale
@@ -66,7 +70,7 @@ def test_the_motion_that_a_cabinet_sees_while_answers_catch_up_is_within_the_vel
     assert scale(0.5) == 0.5
 
 
-def test_a_gripper_by_modbus_has_a_host_or_a_serial_device(tmp_path: Path) -> None:
+def test_the_address_of_a_modbus_gripper_is_a_host_or_a_serial_device(tmp_path: Path) -> None:
     for modbus, endpoint in (("[::1]:1502", ("::1", 1502)), ("gripper", ("gripper", 502)), ("/dev/ttyUSB0", None)):
         config = loaded(tmp_path, changed("fri.left.gripper", {"modbus": modbus}))
         gripper = config.fri["left"].gripper
@@ -74,7 +78,7 @@ def test_a_gripper_by_modbus_has_a_host_or_a_serial_device(tmp_path: Path) -> No
         assert gripper.endpoint == endpoint
 
 
-def test_a_misspelt_key_is_named_before_the_missing_one(tmp_path: Path) -> None:
+def test_a_misspelt_key_is_named_before_the_key_that_is_therefore_missing(tmp_path: Path) -> None:
     message = fault(tmp_path, CELL.read_text().replace("shape: box", "shapes: box"))
     assert message.startswith("obstacles.table.shapes = 'box': unknown key; did you mean shape? allowed here: colour, ")
 
@@ -139,9 +143,11 @@ def test_a_misspelt_key_is_named_before_the_missing_one(tmp_path: Path) -> None:
     ],
     ids=lambda value: value if isinstance(value, str) else f"{value!r:.24}",
 )
-def test_a_bad_value_is_named_with_what_is_allowed(tmp_path: Path, path: str, value: object, allowed: str) -> None:
+def test_the_error_about_a_wrong_value_names_its_key_and_says_what_is_allowed(
+    tmp_path: Path, path: str, value: object, allowed: str
+) -> None:
     message = fault(tmp_path, changed(path, value, external if path.startswith("external") else shipped))
-    # A fault of two keys together is reported at the mapping that contains both.
+    # A fault that concerns two keys is reported at the mapping that contains both keys.
     assert message.startswith((path, path.rpartition(".")[0] + ": "))
     assert allowed in message
 
@@ -199,7 +205,7 @@ def test_each_fault_in_a_file_is_named_with_its_line(tmp_path: Path) -> None:
         (15, "obstacles.table.pose"),
         (16, "colour"),
         (7, "arms.left.home.1"),
-        (14, "obstacles.table.shape"),  # The key is missing. The line is that of its block.
+        (14, "obstacles.table.shape"),  # The key is missing, so the line is that of its block.
         (14, "obstacles.table.size"),
     ]
     with pytest.raises(ConfigError) as of_no_file:
@@ -212,14 +218,14 @@ def test_the_message_contains_the_number_of_further_faults(tmp_path: Path) -> No
     assert fault(tmp_path, text).endswith("(and 2 more)")
 
 
-def test_numbers_may_be_written_in_every_usual_way(tmp_path: Path) -> None:
+def test_numbers_may_be_written_in_every_usual_notation(tmp_path: Path) -> None:
     values = {"1e-3": 1e-3, "1.0e-3": 1e-3, "2E-2": 2e-2, "5e-1": 0.5, "0": 0.0, ".25": 0.25}
     for text, value in values.items():
         minimal = "name: x\narms: {left: {model: iiwa7, home: [0]}}\n"
         assert loaded(tmp_path, f"{minimal}control: {{position_margin: {text}}}\n").control.position_margin == value
 
 
-def test_a_mapping_may_be_merged_into_another_and_changed_there(tmp_path: Path) -> None:
+def test_a_mapping_can_be_merged_into_another_mapping_which_replaces_some_of_its_values(tmp_path: Path) -> None:
     text = (
         "name: x\narms:\n  left: &arm\n    model: iiwa7\n    home: [0]\n"
         "  right:\n    <<: *arm\n    mount: {position: [0, -1, 0]}\n    home: [1]\n"
@@ -238,14 +244,14 @@ def test_a_mapping_may_be_merged_into_another_and_changed_there(tmp_path: Path) 
         ("arms.left.tool", {}, None),
     ],
 )
-def test_a_tool_frame_that_the_file_names_gets_the_name_of_its_side(
+def test_a_tool_frame_that_the_file_names_gets_the_prefix_of_its_side(
     tmp_path: Path, path: str, value: object, frame: str | None
 ) -> None:
     config = loaded(tmp_path, changed(path, value))
     assert config.named_tool_frame("left") == frame
 
 
-def test_networks_that_may_connect_are_read_as_networks(tmp_path: Path) -> None:
+def test_addresses_and_networks_that_may_connect_are_read_as_ip_networks(tmp_path: Path) -> None:
     headset = loaded(tmp_path, changed("headset.allow", ["192.168.1.0/24", "10.0.0.7", "fd00::/64"])).headset
     assert headset.networks == tuple(map(ip_network, ("192.168.1.0/24", "10.0.0.7/32", "fd00::/64")))
     assert loaded(tmp_path, changed("headset.allow", None)).headset.networks is None

@@ -1,4 +1,4 @@
-"""The block of another controller in a cell: its faults are reported like those of other blocks."""
+"""Faults in the block ``external``, which describes another controller, are reported like faults in other blocks."""
 
 from __future__ import annotations
 
@@ -41,11 +41,13 @@ UNCLEAR = {
 
 
 @pytest.mark.parametrize(("text", "says"), UNCLEAR.values(), ids=UNCLEAR)
-def test_a_cell_has_to_say_clearly_which_controller_drives_the_arms(tmp_path: Path, text: str, says: str) -> None:
+def test_a_cell_that_does_not_say_clearly_which_controller_moves_which_arm_is_refused(
+    tmp_path: Path, text: str, says: str
+) -> None:
     assert fault(tmp_path, text).startswith(says)
 
 
-def test_limits_of_targets_are_for_presets_that_take_targets(tmp_path: Path) -> None:
+def test_limits_of_targets_are_refused_for_a_preset_that_takes_joint_positions(tmp_path: Path) -> None:
     cell = external()
     cell["external"] |= {"preset": "jtc"}
     del cell["external"]["mode"]
@@ -62,7 +64,7 @@ def test_limits_of_targets_are_for_presets_that_take_targets(tmp_path: Path) -> 
 PAGE = (Path(__file__).resolve().parents[2] / "docs" / "kuka.md").read_text(encoding="utf-8")
 
 
-def test_the_blocks_of_the_page_about_kuka_are_valid_in_a_cell() -> None:
+def test_the_yaml_blocks_of_kuka_md_are_valid_in_a_cell() -> None:
     lbr, kuka_drivers = (read_yaml(dedent(block)) for block in re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL))
     cell = read_yaml(find_resource("config/dual_iiwa14.yaml").read_text(encoding="utf-8"))
     config = parse_config(yaml_of(cell | kuka_drivers), "cell.yaml")
@@ -76,8 +78,10 @@ def test_the_blocks_of_the_page_about_kuka_are_valid_in_a_cell() -> None:
 
 
 @pytest.mark.parametrize(("name", "frame", "base"), [("iiwa7", "link_ee", 1.266), ("iiwa14", "link_7", 1.261)])
-def test_the_page_puts_the_tool_frame_of_the_shipped_cell_on_tf(name: str, frame: str, base: float) -> None:
-    """The height ``base`` is that of the frame above the base of the stretched arm in the driver's own model [m]."""
+def test_the_command_in_kuka_md_publishes_the_tool_frame_of_the_shipped_cell_on_tf(
+    name: str, frame: str, base: float
+) -> None:
+    """``base`` is the height of ``frame`` above the base of the upright arm in the driver's own model [m]."""
     text = find_resource(f"config/dual_{name}.yaml").read_text(encoding="utf-8")
     robot = Robot.from_config(parse_config(text, "cell.yaml"))
     stretched = pin.neutral(robot.model)

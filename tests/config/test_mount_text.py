@@ -32,7 +32,7 @@ def arms(*mounts: str) -> str:
         ),
     ],
 )
-def test_the_mount_is_replaced_and_everything_else_stays(text: str) -> None:
+def test_the_mount_is_replaced_and_all_other_keys_and_comments_stay(text: str) -> None:
     changed = with_mount(text, "right", POSITION, RPY)
     expected = yaml.safe_load(text)
     expected["arms"]["right"]["mount"] = {"position": POSITION, "rpy": RPY}

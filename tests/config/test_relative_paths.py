@@ -1,4 +1,4 @@
-"""The folders in which the files that a cell names are searched."""
+"""Files that a cell names are searched in several folders, one after the other."""
 
 from __future__ import annotations
 
@@ -40,7 +40,9 @@ class TestRelativePathsAreLookedUp:
         return load_config(folder / "cell.yaml")
 
     @pytest.mark.parametrize("model", ["rod.urdf", "rod", "../cell/rod.urdf"])
-    def test_from_the_folder_of_the_file_first(self, folders: tuple[Path, Path], model: str) -> None:
+    def test_a_file_is_searched_first_in_the_folder_of_the_yaml_file(
+        self, folders: tuple[Path, Path], model: str
+    ) -> None:
         cell, _ = folders
         config = self.config(cell, model)
         assert config.srdf == str(cell / "pairs.srdf")
@@ -48,7 +50,9 @@ class TestRelativePathsAreLookedUp:
         assert Robot.from_config(config).joint_names == ("left_hinge",)
 
     @pytest.mark.parametrize("model", ["rod.urdf", "rod"])
-    def test_then_from_the_working_directory(self, folders: tuple[Path, Path], model: str) -> None:
+    def test_a_file_that_is_not_in_the_folder_of_the_yaml_file_is_searched_in_the_working_directory(
+        self, folders: tuple[Path, Path], model: str
+    ) -> None:
         cell, _ = folders
         for file in ("rod.urdf", "robots/rod.urdf", "pairs.srdf"):
             (cell / file).unlink()

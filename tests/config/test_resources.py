@@ -1,4 +1,4 @@
-"""The shipped files are found from every folder, and a missing file gives one line."""
+"""The shipped files are found from every folder, and a missing file raises an error of one line."""
 
 from __future__ import annotations
 
@@ -23,7 +23,9 @@ def test_shipped_files_are_found_from_any_folder(tmp_path: Path, monkeypatch: py
     assert find_resource("robots/iiwa7.urdf") == CHECKOUT / "robots" / "iiwa7.urdf"
 
 
-def test_a_file_in_the_working_folder_comes_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_in_the_working_directory_is_preferred_to_a_shipped_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "config").mkdir()
     mine = tmp_path / "config" / "dual_iiwa7.yaml"
     mine.write_text("name: mine\narms: {left: {model: iiwa7, home: [0]}}\n", encoding="utf-8")
@@ -44,7 +46,7 @@ def test_a_name_that_is_not_a_file_raises_an_error_of_one_line(path: str) -> Non
         assert "config/dual_iiwa14.yaml, config/dual_iiwa7.yaml" in str(caught.value)
 
 
-def test_a_folder_is_named_as_a_folder(tmp_path: Path) -> None:
+def test_the_error_about_a_folder_instead_of_a_file_says_that_the_path_is_a_folder(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=f"{tmp_path}: a folder; allowed: the path of a file"):
         find_resource(tmp_path)
 

@@ -1,4 +1,4 @@
-"""Every shipped cell loads. The first one shows all settings with comments."""
+"""Every shipped cell loads. The file dual_iiwa7.yaml shows all settings with comments."""
 
 from __future__ import annotations
 
@@ -32,7 +32,10 @@ def models_in(annotation: object) -> Iterator[type[BaseModel]]:
 
 
 def shown(model: type[BaseModel], data: dict[str, Any], place: str = "") -> Iterator[tuple[str, type[BaseModel], Any]]:
-    """Return every block of a file with its keys and its model. Of blocks by name, only the first is returned."""
+    """Yield the path, the model and the data of every block of a file.
+
+    If the user chooses the names of blocks, as for obstacles, only the first block is shown.
+    """
     yield place, model, data
     for key, field in model.model_fields.items():
         value, path = data.get(key), f"{place}.{key}".lstrip(".")
@@ -45,13 +48,13 @@ def shown(model: type[BaseModel], data: dict[str, Any], place: str = "") -> Iter
 
 
 class TestTheShippedCellShowsAllThereIsToTune:
-    # Keys whose value is not the default, which a comment in the file says.
+    # Keys whose value differs from the default. A comment in the file says so.
     CHOSEN = ("control.solve_time_limit", "control.distances", "mujoco.objects")
     # Blocks whose keys another block of the same kind shows, such as an arm's mount.
     SHOWN_ELSEWHERE = ("arms.left.tool.mount", "obstacles.table.rpy", "robot.mount.rpy", "external")
 
     @pytest.mark.parametrize("text", [external_text(), robot_text()], ids=["arms of their own", "one robot"])
-    def test_every_key_is_written_and_commented(self, text: str) -> None:
+    def test_every_setting_is_written_in_the_cells_file_and_has_a_comment(self, text: str) -> None:
         lines = text.splitlines()
         for place, model, data in shown(Config, read_yaml(text)):
             if place == "arms.left" and "robot:" in text:
@@ -68,7 +71,7 @@ class TestTheShippedCellShowsAllThereIsToTune:
     @pytest.mark.parametrize(
         "place", ["headset", "control", "impedance", "admittance", "supervision", "teleop", "mujoco", "judge"]
     )
-    def test_the_written_values_are_the_defaults(self, place: str) -> None:
+    def test_the_values_in_the_shipped_cells_file_are_the_defaults(self, place: str) -> None:
         written = getattr(load_config(CELL), place)
         default = type(written)()
         for key in type(written).model_fields:
@@ -77,13 +80,13 @@ class TestTheShippedCellShowsAllThereIsToTune:
         for key in ("loop_rate_hz", "controller"):
             assert getattr(load_config(CELL), key) == Config.model_fields[key].default
 
-    def test_the_example_of_a_pair_by_name_exists_in_the_cell(self) -> None:
+    def test_the_pair_in_the_example_for_control_pairs_exists_in_the_cell(self) -> None:
         (example,) = re.findall(r"names of the bodies, such as (\[.*?\}\])", CELL.read_text(encoding="utf-8"))
         config = Config.model_validate(read_yaml(changed("control.pairs", read_yaml(example))))
         kept = kept_distances(Robot.from_config(config), config.control)
         assert "pairs[0]" in kept.keys
 
-    def test_the_example_of_a_real_camera_is_valid_and_the_cell_has_three_simulated_ones(self) -> None:
+    def test_the_example_of_a_real_camera_is_valid_and_the_cell_has_three_simulated_cameras(self) -> None:
         (example,) = re.findall(r"# (\{front: \{topic.*\}\})\n", CELL.read_text(encoding="utf-8"))
         assert not Config.model_validate(read_yaml(changed("cameras", read_yaml(example)))).simulated_cameras
         assert list(load_config(CELL).simulated_cameras) == ["above", "left_wrist", "right_wrist"]

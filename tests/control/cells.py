@@ -95,7 +95,10 @@ def kernel_data(name: str, q: Array, v: Array | None = None) -> KernelData:
 
 
 def move_data(name: str, data: KernelData, q: Array, v: Array | None = None) -> None:
-    """Place bodies and joint frames of ``data`` at ``q`` (nv,) and velocity ``v``. Making new data would take 20 ms."""
+    """Place bodies and joint frames of ``data`` at ``q`` (nv,), with the velocity ``v`` (nv,).
+
+    Tests reuse data in this way because making new data takes 20 ms.
+    """
     model, safety = kernel_model(name).safety, data.safety
     safety.state.q[:] = q
     safety.state.v[:] = 0.0 if v is None else v

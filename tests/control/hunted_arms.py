@@ -1,4 +1,4 @@
-"""Arms that are chased by a moving hand. Their distances from the hand are measured by Coal, not by our kernels."""
+"""Arms that are chased by a moving obstacle called hand. Coal, and not our kernels, measures the distances."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 from q2r2_control.verification.fault_injection import FaultySolver, WorstSolver, untimed
 
-RADIUS = 0.1  # Radius of a hand [m].
+RADIUS = 0.1  # Radius of the sphere that represents a hand [m].
 
 
 @cache
@@ -50,11 +50,11 @@ def hand(at: Array, speed: float = 0.25, **more: Any) -> MovingObstacle:
     return MovingObstacle(shape="sphere", size=(RADIUS,), position=tuple(at.tolist()), speed=speed, **more)
 
 
-BOX = (0.1, 0.3, 0.2)  # Lengths of the sides [m].
+BOX = (0.1, 0.3, 0.2)  # Side lengths of the box that represents a hand [m].
 
 
 class Coal:
-    """Measures the distances of all moving bodies from a ball or a box with Coal."""
+    """Uses the library Coal to measure the distances of all moving bodies from a ball or a box."""
 
     def __init__(self, controller: CartesianController, shape: coal.CollisionGeometry | None = None) -> None:
         self.model = controller.robot.model
@@ -114,7 +114,7 @@ class Hunt:
         self.nearest_moving, self.touched, self.moved, self.retreats = np.inf, 0, 0, 0
 
     def run(self, seconds: float, speed: float, period: float, acceleration: float | None = None) -> None:
-        """Run the hunt. A report comes every ``period`` [s]."""
+        """Run the hunt. The controller gets a report on the obstacle every ``period`` [s]."""
         controller, robot = self.controller, self.controller.robot
         targets = {arm: robot.tool_pose(robot.home, arm) for arm in robot.arms}
         q, v, t, due, change = robot.home, np.zeros(robot.model.nv), 0.0, 0.0, 0.0

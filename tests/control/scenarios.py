@@ -62,12 +62,12 @@ def into_the_table(t: float, start: Mapping[str, pin.SE3]) -> Targets:
 
 
 def one_arm_frozen(t: float, start: Mapping[str, pin.SE3]) -> Targets:
-    """The left arm holds, and the target of the right arm is at the start position of the left tool."""
+    """The left arm has no target, and the target of the right arm is at the start position of the left tool."""
     return {"left": None, "right": pin.SE3(start["right"].rotation, start["left"].translation)}
 
 
 def not_a_number(t: float, start: Mapping[str, pin.SE3]) -> Targets:
-    """Valid targets that move, with invalid targets in between."""
+    """The targets move up and down. They are invalid in three of four time spans of 50 ms."""
     good = {side: _moved(pose, (0.0, 0.0, 0.1 * np.sin(6.0 * t))) for side, pose in start.items()}
     step = int(t / 0.05) % 4
     if step == 1:
@@ -80,7 +80,7 @@ def not_a_number(t: float, start: Mapping[str, pin.SE3]) -> Targets:
 
 
 def circle(t: float, start: Mapping[str, pin.SE3]) -> Targets:
-    """A calm, reachable circle."""
+    """The targets move on slow circles that the tools can follow."""
     phase = 2.0 * np.pi * 0.5 * t
     return {side: _moved(pose, (0.0, 0.1 * np.sin(phase), 0.1 * (1.0 - np.cos(phase)))) for side, pose in start.items()}
 

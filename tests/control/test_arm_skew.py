@@ -1,4 +1,4 @@
-"""Two arms that follow the reference with different delays: each may be anywhere on its recent path."""
+"""The two arms follow the reference with different delays, so each arm may be anywhere on its recent path."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Ways:
         self.between = np.array([bool(one and other and one != other) for one, other in pairs])
 
     def least_margin(self, reference: Reference) -> float:
-        """Return the least margin of pairs between both arms [m], with each arm anywhere on its own path."""
+        """Return the least margin of the pairs between the two arms [m]. Each arm is at any posture of its own path."""
         stop = self.controller.stop_deceleration
         lasts = np.abs(reference.v) / stop
         places = list(self.past[-round(WINDOW / DT) - 1 :: 7])
@@ -49,7 +49,7 @@ class Ways:
 
 
 def beside_each_other(controller: CartesianController, window: float) -> dict[str, pin.SE3]:
-    """Move both tools until they are 0.15 m apart, start again from rest there, and return their poses."""
+    """Move both tools until they are 0.15 m apart, reset the controller to rest there, and return the tool poses."""
     targets: dict[str, pin.SE3 | None] = {}
     for arm, y in zip(SIDES, (0.075, -0.075), strict=True):
         targets[arm] = pin.SE3(controller.tool_pose(arm).rotation, np.array([0.55, y, 0.45]))
@@ -86,7 +86,9 @@ def test_two_arms_that_swing_alike_keep_their_distance_wherever_each_arm_is_on_i
 
 @pytest.mark.slow
 @pytest.mark.parametrize("window", [0.0, WINDOW])
-def test_hostile_solvers_bring_arms_with_different_delays_too_close_only_without_allowed_skew(window: float) -> None:
+def test_with_a_hostile_solver_arms_with_different_delays_keep_their_distance_only_if_skew_is_allowed(
+    window: float,
+) -> None:
     controller, solver = controller_and_solver()
     solver.fault = None
     controller.move_obstacle("hand", None)
@@ -101,7 +103,7 @@ def test_hostile_solvers_bring_arms_with_different_delays_too_close_only_without
     assert (min(margins) >= -1e-9) == (window > 0.0)
 
 
-def test_an_undone_step_leaves_the_history_unchanged(robot: Robot) -> None:
+def test_an_undone_step_leaves_the_history_of_the_reference_unchanged(robot: Robot) -> None:
     controller = CartesianController(robot)
     start = beside_each_other(controller, WINDOW)
     for k in range(150):
@@ -115,7 +117,7 @@ def test_an_undone_step_leaves_the_history_unchanged(robot: Robot) -> None:
         np.testing.assert_array_equal(array, kept)
 
 
-def test_a_longer_window_takes_effect_as_time_passes_and_a_shorter_window_at_once(robot: Robot) -> None:
+def test_the_skew_grows_with_time_to_a_longer_allowed_value_and_falls_at_once_to_a_shorter_value(robot: Robot) -> None:
     controller = CartesianController(robot)
     controller.allow_skew(0.02)
     assert controller.skew == 0.0

@@ -1,6 +1,6 @@
-"""A program's own constraints are rows of the QP, or a condition that each step has to satisfy.
+"""A program's own constraints are rows of the QP. Every step except the certified stop satisfies the hard ones.
 
-The contract holds whatever they return.
+The contract holds whatever a constraint returns.
 """
 
 from __future__ import annotations
@@ -119,7 +119,7 @@ def test_a_hard_constraint_keeps_an_elbow_above_a_plane_that_it_would_otherwise_
     assert min(plane.elbow(at) for at in q) > plane.height - 1e-4
 
 
-def test_a_hard_row_that_no_step_satisfies_brakes_the_arms_and_the_report_names_it(robot: Robot) -> None:
+def test_a_hard_row_that_no_step_satisfies_brakes_the_arms_and_the_report_names_its_constraint(robot: Robot) -> None:
     fast = Answers(lambda nv: (np.eye(nv)[:1], np.full(1, 100.0)), hard=True)
     controller = CartesianController(robot, constraints=[fast])
     moving, _ = driven(controller, 100)
@@ -146,7 +146,7 @@ def test_a_given_solution_that_breaks_a_hard_row_is_not_executed(robot: Robot) -
 
 
 class NoLess:
-    """A constraint that the next velocities are at least as fast as ``along`` in the direction of ``along``."""
+    """A constraint that keeps the next velocities at least as fast as ``along`` in the direction of ``along``."""
 
     hard = True
     along: Array | None = None
@@ -157,7 +157,9 @@ class NoLess:
         return self.along[None, :], np.array([self.along @ self.along])
 
 
-def test_if_the_certified_part_of_a_solution_breaks_a_hard_row_exactly_the_stop_is_executed(robot: Robot) -> None:
+def test_if_the_certified_part_of_a_solution_breaks_a_hard_row_the_certified_stop_is_executed_exactly(
+    robot: Robot,
+) -> None:
     """The given solutions ignore all pairs, so that often only a part of a solution can be certified.
 
     This part is slower than the row allows. The arms then have to do exactly what they do without a solution.
@@ -215,7 +217,7 @@ def test_osqp_keeps_a_hard_row_in_a_closed_loop_too(robot: Robot) -> None:
 
 @pytest.mark.parametrize("hard", [False, True], ids=["soft", "hard"])
 @pytest.mark.parametrize("name", NONSENSE)
-def test_a_constraint_with_an_invalid_answer_raises_nothing_and_the_report_names_it(
+def test_an_invalid_answer_of_a_constraint_raises_no_exception_and_the_report_names_the_constraint(
     robot: Robot, name: str, hard: bool
 ) -> None:
     broken = Answers(NONSENSE[name], hard)
@@ -238,7 +240,7 @@ class BrokenTask:
         return np.zeros((len(q), len(q))), np.zeros(len(q))
 
 
-def test_a_task_that_raises_in_a_step_changes_nothing_and_the_report_names_it(robot: Robot) -> None:
+def test_a_task_that_raises_an_exception_in_a_step_changes_nothing_and_is_named_in_the_report(robot: Robot) -> None:
     task = BrokenTask()
     controllers = CartesianController(robot, tasks=[task]), CartesianController(robot)
     task.asked = True
@@ -266,7 +268,7 @@ class Heavy:
     ],
     ids=["negative", "not symmetric"],
 )
-def test_a_task_with_an_unusable_matrix_is_not_used_and_the_report_names_it(
+def test_a_task_with_an_unusable_matrix_is_not_used_and_is_named_in_the_report(
     robot: Robot, matrix: Callable[[int], Array], told: str
 ) -> None:
     task = Heavy(matrix)
@@ -284,7 +286,7 @@ class NoSolver:
         return np.zeros(len(problem.g))
 
 
-def test_a_solver_with_an_invalid_answer_is_named_in_the_report_and_a_class_is_refused(robot: Robot) -> None:
+def test_a_solver_with_an_invalid_answer_is_named_in_the_report_and_a_solver_class_is_refused(robot: Robot) -> None:
     controller = CartesianController(robot, solver=NoSolver())
     report = controller.step(crossing(robot), DT).report
     assert report.unsolved
@@ -294,7 +296,7 @@ def test_a_solver_with_an_invalid_answer_is_named_in_the_report_and_a_class_is_r
         CartesianController(robot, solver=NoSolver)  # type: ignore[arg-type]
 
 
-def test_targets_that_cannot_be_used_are_named_with_what_is_allowed(robot: Robot) -> None:
+def test_the_report_names_unusable_targets_and_says_which_targets_are_allowed(robot: Robot) -> None:
     controller = CartesianController(robot)
     pose = controller.tool_pose("left")
     beyond = pin.SE3(pose.rotation, np.array([np.nan, 0.0, 0.0]))
@@ -319,6 +321,8 @@ def test_targets_that_cannot_be_used_are_named_with_what_is_allowed(robot: Robot
         ({"constraints": [StillJoint(99)]}, r"constraints\[0\]: StillJoint.rows raised IndexError"),
     ],
 )
-def test_a_task_or_constraint_without_an_answer_at_home_is_refused(robot: Robot, parts: Any, told: str) -> None:
+def test_a_task_or_constraint_that_is_invalid_at_the_home_posture_is_refused(
+    robot: Robot, parts: Any, told: str
+) -> None:
     with pytest.raises(ConfigError, match=told):
         CartesianController(robot, **parts)

@@ -1,4 +1,4 @@
-"""Pairs that may touch: how deep and how fast the reference enters, and that other pairs keep their distances."""
+"""Pairs that may touch enter each other no deeper and no faster than allowed. Other pairs keep their distances."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ CONFIG = load_config("config/dual_iiwa7.yaml")
 ROBOT = Robot.from_config(CONFIG)
 PAIRS = pair_names(ROBOT.collision_model)
 TABLE = 0.2  # Height of the table's top [m].
-FRAME_TO_TIPS = 0.013  # [m]
-DEPTH, SPEED = 0.012, 0.04  # [m], [m/s]
+FRAME_TO_TIPS = 0.013  # Distance from the tool frame to the finger tips [m].
+DEPTH, SPEED = 0.012, 0.04  # Allowed depth [m] and closing speed [m/s] of a contact.
 DOWN = pin.rpy.rpyToMatrix(np.pi, 0.0, np.pi)  # The tools point down as at home.
 DT = 0.002
 
@@ -50,7 +50,7 @@ def towards_the_table(controller: CartesianController, speed: float, seconds: fl
 
 @pytest.mark.slow
 @pytest.mark.parametrize("speed", [0.2, 5.0])
-def test_a_finger_that_may_touch_enters_up_to_its_depth_and_no_faster_than_allowed(speed: float) -> None:
+def test_a_finger_that_may_touch_the_table_enters_it_no_deeper_and_no_faster_than_allowed(speed: float) -> None:
     allowed = settings({"pair": ["left_*finger*", "table"], "depth": DEPTH, "speed": SPEED})
     heights, speeds = towards_the_table(CartesianController(ROBOT, allowed), speed)
     assert heights.min() == pytest.approx(-DEPTH, abs=5e-4)
@@ -59,7 +59,7 @@ def test_a_finger_that_may_touch_enters_up_to_its_depth_and_no_faster_than_allow
     assert speeds[heights > 0.05].max() > 2.0 * SPEED, "nothing is slowed that is far from contact"
 
 
-def test_a_body_that_must_not_touch_keeps_its_distance_from_the_same_table() -> None:
+def test_a_body_that_must_not_touch_the_table_keeps_its_distance_while_another_body_touches_it() -> None:
     """The right fingers have targets at the same height, but are not allowed to touch the table."""
     controller = CartesianController(ROBOT, settings({"pair": ["left_*finger*", "table"], "depth": DEPTH}))
     goal = {arm: pin.SE3(DOWN, np.array([0.5, y, 0.1])) for arm, y in (("left", 0.25), ("right", -0.25))}
@@ -70,7 +70,7 @@ def test_a_body_that_must_not_touch_keeps_its_distance_from_the_same_table() -> 
 
 
 @pytest.mark.slow
-def test_fingers_of_both_hands_may_touch_each_other() -> None:
+def test_fingers_of_both_hands_can_touch_each_other_if_the_settings_allow_it() -> None:
     """The hands face each other, and their targets cross over. The fingers enter each other up to the depth."""
     depth = 0.005
     controller = CartesianController(ROBOT, settings({"pair": ["*finger*", "*finger*"], "depth": depth}))
@@ -104,7 +104,7 @@ def test_fingers_of_both_hands_may_touch_each_other() -> None:
         ),
     ],
 )
-def test_impossible_names_and_depths_are_refused(
+def test_unknown_names_and_too_large_depths_of_allowed_contacts_are_refused(
     look: Callable[[Robot, ControllerSettings], object], allowed: dict[str, Any], says: str
 ) -> None:
     with pytest.raises(ConfigError, match=says):

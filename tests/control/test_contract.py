@@ -49,13 +49,13 @@ def run(controller: CartesianController, scenario: Any, duration: float, dt: flo
         pytest.param("one arm frozen", 10.0, id="against an arm that holds"),
     ],
 )
-def test_a_constant_target_ends_in_rest_whether_it_is_reachable_or_not(
+def test_arms_with_constant_targets_come_to_rest_whether_the_targets_are_reachable_or_not(
     controller: CartesianController, name: str, duration: float
 ) -> None:
     assert run(controller, SCENARIOS[name], duration, 0.005).tail_acceleration() < 0.1
 
 
-def test_a_reachable_target_is_reached_and_held(controller: CartesianController) -> None:
+def test_a_tool_moves_to_a_reachable_target_and_stays_there(controller: CartesianController) -> None:
     driven = Driven(controller)
     by = pin.SE3(pin.exp3(np.array([0.2, -0.3, 0.4])), np.array([0.05, 0.05, 0.15]))
     goal = {
@@ -82,7 +82,7 @@ def test_an_invalid_dt_moves_nothing_and_is_reported(controller: CartesianContro
     assert np.abs(before.a).max() > 1.0
 
 
-def test_a_dt_above_a_tenth_of_a_second_moves_the_arms_as_a_tenth_of_a_second_does(
+def test_a_dt_above_a_tenth_of_a_second_moves_the_arms_exactly_like_a_dt_of_a_tenth_of_a_second(
     controller: CartesianController,
 ) -> None:
     results = []
@@ -126,7 +126,7 @@ def test_arms_leave_a_stretched_posture_nearly_as_fast_as_the_acceleration_limit
             float(np.linalg.norm(controller.tool_pose(arm).translation - pose.translation))
             for arm, pose in driven.start.items()
         )
-    # At best, the joint with the longest path accelerates fully for half of it, and then decelerates fully.
+    # At best, the joint with the longest path accelerates fully for half of the path, and then decelerates fully.
     limit = robot.capped_acceleration(controller.settings.acceleration_limit)
     fastest = 2.0 * np.sqrt((np.abs(reference.q - q) / limit).max())
     assert 0.001 * driven.ticks < 1.2 * fastest
@@ -208,7 +208,7 @@ def test_a_pair_too_close_by_a_rounding_error_keeps_its_certificate_and_opens_to
     assert -ROUNDING <= least_margin(robot, settings, 600, "towards_nearest", seed=2) < 0.0
 
 
-def test_a_start_with_an_unproven_stop_has_no_certificate_until_a_step_is_certified() -> None:
+def test_a_controller_that_starts_with_an_unproven_stop_has_no_certificate_until_it_certifies_a_step() -> None:
     controller, solver = controller_of("iiwa7")
     q, turn = controller.robot.home.copy(), np.zeros(controller.robot.model.nv)
     turn[[arm.joints[0] for arm in controller.robot.arms.values()]] = [-1.0, 1.0]  # The arms turn towards each other.

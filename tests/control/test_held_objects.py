@@ -1,4 +1,7 @@
-"""A held object is monitored: its pairs first keep their present distance, later more, and no arm moves for it."""
+"""A held object is monitored. Its pairs first keep their present distances, and greater ones as they open.
+
+No arm moves because an object is gripped.
+"""
 
 from __future__ import annotations
 
@@ -48,7 +51,7 @@ def object_distances(controller: CartesianController, q: Array) -> Array:
     return coal_distances(controller.robot, objects.geometry, q)[-len(objects.holders) :]
 
 
-def test_a_block_on_the_table_is_gripped_and_released_without_a_motion(
+def test_no_arm_moves_when_a_block_on_the_table_is_gripped_or_released(
     controller: CartesianController, at_grip: Array
 ) -> None:
     run = Driven(controller, at_grip)
@@ -58,7 +61,7 @@ def test_a_block_on_the_table_is_gripped_and_released_without_a_motion(
         assert np.abs(reference.q - at_grip).max() < 1e-9
 
 
-def test_a_gripped_block_is_lifted_at_once_and_put_down_to_a_quarter_of_a_millimetre(
+def test_a_gripped_block_can_be_lifted_at_once_and_can_be_put_down_to_0_25_mm_above_the_table(
     controller: CartesianController, at_grip: Array
 ) -> None:
     run = Driven(controller, at_grip)
@@ -94,7 +97,7 @@ def test_the_margin_of_a_report_refers_to_the_distances_kept_at_that_tick(
 
 
 @pytest.mark.slow
-def test_an_object_that_overlaps_the_table_when_gripped_never_overlaps_it_more(robot: Robot) -> None:
+def test_an_object_that_overlaps_the_table_when_it_is_gripped_never_overlaps_the_table_more(robot: Robot) -> None:
     large = cell({"box": (0.04, 0.04, 0.08), "at": (0.0, 0.0, 0.013)})
     controller = CartesianController(Robot.from_config(large), large.control.timed(realtime=False))
     run = Driven(controller)
@@ -108,10 +111,10 @@ def test_an_object_that_overlaps_the_table_when_gripped_never_overlaps_it_more(r
     assert counting(controller).min() == 0.0
 
 
-def test_an_object_gripped_in_motion_keeps_its_new_distances_during_the_known_stop(
+def test_an_object_that_is_gripped_in_motion_keeps_its_new_distances_during_the_certified_stop(
     controller: CartesianController,
 ) -> None:
-    """The tool moves down towards the table at 0.4 m/s. Coal measures the distances along the known stop."""
+    """The tool moves down towards the table at 0.4 m/s. Coal measures the distances along the certified stop."""
     controller.reset(controller.robot.home)
     z = height(controller)
     while height(controller) > GRIP + 0.003:
@@ -136,7 +139,7 @@ def test_an_object_gripped_in_motion_keeps_its_new_distances_during_the_known_st
 
 
 @pytest.mark.slow
-def test_a_hand_that_moves_a_held_bar_into_the_other_arm_stops_at_the_kept_distance() -> None:
+def test_an_arm_that_moves_a_held_bar_towards_the_other_arm_stops_at_the_kept_distance() -> None:
     long = cell({"box": (0.03, 0.25, 0.03)})
     controller = CartesianController(Robot.from_config(long), long.control.timed(realtime=False))
     others = np.array([any("right_" in name for name in pair) for pair in controller.robot.objects.pair_names()])
@@ -151,7 +154,7 @@ def test_a_hand_that_moves_a_held_bar_into_the_other_arm_stops_at_the_kept_dista
 
 
 @pytest.mark.slow
-def test_two_held_blocks_are_kept_apart_unless_they_overlap_when_the_second_is_gripped(
+def test_two_held_blocks_are_kept_apart_unless_they_overlap_when_the_second_block_is_gripped(
     controller: CartesianController,
 ) -> None:
     run = Driven(controller)
@@ -197,7 +200,7 @@ def test_after_a_release_no_report_names_a_pair_of_the_object_even_if_no_time_pa
     assert not counting(controller).size
 
 
-def test_an_undone_step_undoes_the_greater_distances_that_its_substeps_gave_the_block(
+def test_if_a_step_is_undone_the_kept_distances_of_a_held_block_are_those_before_the_step(
     controller: CartesianController, at_grip: Array
 ) -> None:
     controller.reset(at_grip)

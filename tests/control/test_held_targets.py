@@ -42,7 +42,7 @@ def test_a_stream_of_targets_is_followed_on_a_straight_line_at_the_speed_of_the_
     assert late.max() < 2.3 / rate
 
 
-def test_a_target_that_is_new_at_every_step_or_after_a_long_hold_is_passed_on_at_once() -> None:
+def test_a_target_is_passed_on_at_once_if_every_step_has_a_new_one_or_the_last_one_was_held_long() -> None:
     held = HeldTargets()
     for step in range(20):
         assert followed(held, new := pose(0.001 * step)) == new
@@ -51,7 +51,7 @@ def test_a_target_that_is_new_at_every_step_or_after_a_long_hold_is_passed_on_at
     assert followed(held, jump := pose(0.6)) == jump
 
 
-def test_a_target_that_is_held_is_reached_and_then_stays() -> None:
+def test_the_interpolated_target_arrives_at_a_held_target_and_then_stays_there() -> None:
     held = HeldTargets()
     for goal in (0.0, 0.1, 0.2):
         found = [followed(held, pose(goal)).translation[0] for _ in range(10)]
@@ -60,7 +60,7 @@ def test_a_target_that_is_held_is_reached_and_then_stays() -> None:
     assert [followed(held, pose(0.2)) for _ in range(5)][-1] == pose(0.2)
 
 
-def test_a_target_that_was_changed_in_place_is_a_new_one() -> None:
+def test_a_pose_object_that_was_changed_in_place_counts_as_a_new_target() -> None:
     held, mine = HeldTargets(), pose(0.0)
     for _ in range(10):
         followed(held, mine)
@@ -76,7 +76,7 @@ SCALED, MIRRORED = (pin.SE3(factor * np.eye(3), np.zeros(3)) for factor in (1.01
     [None, "no pose", pose(math.nan), pose(1e200), SCALED, MIRRORED],
     ids=["None", "a text", "not finite", "far away", "scaled", "mirrored"],
 )
-def test_an_invalid_target_is_passed_on_and_so_is_the_target_after_it(other: object) -> None:
+def test_an_invalid_target_and_the_target_after_it_are_passed_on_unchanged(other: object) -> None:
     held = HeldTargets()
     given: Any
     for given in (pose(0.0), pose(0.1), other):
@@ -101,7 +101,10 @@ def robot() -> Robot:
 
 
 def velocities(controller: CartesianController, steps: int, ask: bool = False) -> list[Array]:
-    """Return the joint velocities while a target moves along a sine at up to 0.2 m/s, with 90 samples a second."""
+    """Return the joint velocities while a target moves along a sine at up to 0.2 m/s, with 90 samples a second.
+
+    With ``ask``, the problem of each step is read before the step.
+    """
     controller.reset(controller.robot.home)
     start, found = controller.tool_pose("left"), []
     for step in range(steps):

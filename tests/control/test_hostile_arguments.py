@@ -44,20 +44,26 @@ def going_on(contract: Contract, controller: CartesianController) -> None:
         contract.check(controller.step({"left": pin.SE3(pose.rotation, pose.translation + 0.1)}, 0.002), 0.002)
 
 
-def test_no_dt_makes_a_tick_raise(contract: Contract, controller: CartesianController, hostile: Any) -> None:
+def test_no_dt_makes_a_tick_raise_an_exception(
+    contract: Contract, controller: CartesianController, hostile: Any
+) -> None:
     contract.check(controller.step({}, hostile), 0.0)
 
 
-def test_no_target_makes_a_tick_raise(contract: Contract, controller: CartesianController, hostile: Any) -> None:
+def test_no_target_makes_a_tick_raise_an_exception(
+    contract: Contract, controller: CartesianController, hostile: Any
+) -> None:
     for arm in SIDES:
         contract.check(controller.step({arm: hostile}, 0.002), 0.002)
 
 
-def test_no_posture_makes_a_tick_raise(contract: Contract, controller: CartesianController, hostile: Any) -> None:
+def test_no_posture_makes_a_tick_raise_an_exception(
+    contract: Contract, controller: CartesianController, hostile: Any
+) -> None:
     contract.check(controller.step({}, 0.002, hostile), 0.002)
 
 
-def test_no_given_solution_makes_a_tick_raise(
+def test_no_given_solution_makes_a_tick_raise_an_exception(
     contract: Contract, controller: CartesianController, hostile: Any
 ) -> None:
     contract.check(controller.advance(hostile, {}, 0.002), 0.002)
@@ -97,7 +103,7 @@ def test_targets_that_are_not_a_mapping_are_refused_and_nothing_moves(
     ids=["reset q", "reset v", "hold_at", "withdraw", "change distance", "change gain", "tool_pose", "opening arm",
          "opening from", "opening to", "holding arm", "obstacle name", "obstacle"],
 )  # fmt: skip
-def test_other_calls_raise_only_our_errors_and_the_next_tick_keeps_the_contract(
+def test_calls_other_than_a_tick_raise_only_our_errors_and_the_next_tick_keeps_the_contract(
     robot: Robot, controller: CartesianController, hostile: Any, call: Any
 ) -> None:
     controller.reset(robot.home)

@@ -35,7 +35,7 @@ def _double(values: Array) -> None:
         values[i] *= 2.0
 
 
-def test_bound_machine_code_belongs_to_the_kernel_and_has_run_once() -> None:
+def test_the_function_bound_runs_a_kernel_once_and_returns_its_machine_code() -> None:
     values = np.ones(3)
     double = bound(_double, values)
     np.testing.assert_array_equal(values, [2.0, 2.0, 2.0])
@@ -48,7 +48,7 @@ def test_bound_machine_code_belongs_to_the_kernel_and_has_run_once() -> None:
 PAGE = Path(__file__).parents[2] / "docs" / "kernels.md"
 
 
-def test_the_example_of_the_kernels_page_compiles_and_sees_changes_in_the_model(tmp_path: Path) -> None:
+def test_the_example_in_kernels_md_compiles_and_sees_changes_in_the_model(tmp_path: Path) -> None:
     (template,) = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
     source = tmp_path / "spring.py"
     source.write_text(template)

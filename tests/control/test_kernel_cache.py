@@ -47,9 +47,9 @@ def name_of(source: Path) -> str:
 
 
 @pytest.mark.parametrize("source", kernel_cache.compiled_sources(), ids=name_of)
-def test_the_name_of_the_cache_covers_everything_that_a_kernel_uses(source: Path) -> None:
+def test_the_name_of_the_cache_folder_depends_on_every_module_that_a_kernel_uses(source: Path) -> None:
     covered = {name_of(path) for path in kernel_cache.compiled_sources()}
-    # No constant of these modules is compiled into a kernel. Kernels use only their arguments.
+    # Kernels get the values of these modules as arguments, so no constant of them is compiled into a kernel.
     harmless = {
         f"q2r2_control.{name}"
         for name in (
@@ -77,7 +77,7 @@ def test_if_the_cache_cannot_be_written_another_folder_is_used(sources: Path, mo
     folder.rmdir()
 
 
-def test_the_two_newest_versions_are_kept_and_only_older_ones_are_deleted(sources: Path) -> None:
+def test_the_two_newest_folders_of_the_cache_are_kept_and_only_older_folders_are_deleted(sources: Path) -> None:
     root = kernel_cache._cache_folder().parent
     (root / "notes").mkdir()
     for age, name in enumerate(("a" * 16, "b" * 16, "c" * 16), start=1):
@@ -119,7 +119,7 @@ def doubled_by(file: Path) -> list[tuple[int, int]]:
     return told
 
 
-def test_a_second_checkout_compiles_nothing(own_cache: Path) -> None:
+def test_kernels_of_a_second_checkout_are_not_compiled_again(own_cache: Path) -> None:
     doubled_by(own_cache / "doubling.py")
     assert doubled_by(own_cache / "elsewhere" / "doubling.py") == []
 

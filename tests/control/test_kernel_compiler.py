@@ -31,12 +31,15 @@ def chain() -> tuple[Any, Any, Any]:
 
 
 def compiled(kinds: dict[Any, Any]) -> Any:
-    """Return the only compiled version of a kernel in ``kinds``, which are its wholes or its parts."""
+    """Return the only compiled version in ``kinds``.
+
+    ``kinds`` are a kernel's ``overloads``, which Python calls, or its ``parts``, which other kernels call.
+    """
     (found,) = kinds.values()
     return found
 
 
-def test_a_kernel_that_only_kernels_call_has_no_machine_code_of_its_own(chain: tuple[Any, Any, Any]) -> None:
+def test_a_kernel_that_only_other_kernels_call_has_no_machine_code_of_its_own(chain: tuple[Any, Any, Any]) -> None:
     third, sixth, difference = chain
     assert difference(6.0) == 1.0
     for part in (third, sixth):
@@ -59,7 +62,7 @@ def test_a_kernel_that_python_has_called_can_become_part_of_another_kernel(chain
     assert (third(6.0), difference(6.0)) == (2.0, 1.0)
 
 
-def test_a_kernel_with_a_builtin_that_python_has_called_can_become_part_of_two_kernels() -> None:
+def test_a_kernel_that_uses_max_and_that_python_has_called_can_become_part_of_two_kernels() -> None:
     @kernel
     def at_least_one(x: float) -> float:
         return max(x, 1.0) + max(int(x), 3)
@@ -75,7 +78,7 @@ def test_a_kernel_with_a_builtin_that_python_has_called_can_become_part_of_two_k
     assert (at_least_one(5.0), halved(5.0), doubled(5.0)) == (10.0, 5.0, 30.0)
 
 
-def test_a_part_that_cannot_be_compiled_raises_and_the_next_kernel_is_compiled_as_a_whole(
+def test_a_part_that_cannot_be_compiled_raises_an_exception_and_the_next_kernel_is_compiled_as_a_whole(
     chain: tuple[Any, Any, Any],
 ) -> None:
     @kernel

@@ -14,7 +14,7 @@ from q2r2_control.control.jit import bound, kernel
 from q2r2_control.control.kernel_pointers import KernelPointer, pointee, pointer_to
 
 
-def test_a_copy_has_its_own_memory() -> None:
+def test_a_copy_of_a_pointer_has_its_own_memory() -> None:
     held = pointer_to((np.ones(3),))
     for other in (copy.deepcopy(held), pickle.loads(pickle.dumps(held))):
         _double_held(other)
@@ -23,7 +23,7 @@ def test_a_copy_has_its_own_memory() -> None:
 
 
 def test_named_tuples_with_the_same_name_and_different_fields_have_different_types() -> None:
-    # The test compares only types. If it compiled code for these types, the code would be cached with the package's.
+    # The test compares only types. If it compiled code for these types, the package's cache would keep this code.
     one = namedtuple("Bodies", "first second")  # type: ignore[name-match]
     other = namedtuple("Bodies", "second first")  # type: ignore[name-match]
     values = np.ones(1), np.zeros(1)
@@ -41,7 +41,7 @@ def test_every_pointer_has_the_type_that_numba_gives_its_value() -> None:
         assert pointer_to((part, (array, part))).numba_type.pointee == numba.typeof((part, (array, part)))
 
 
-def test_an_argument_without_an_address_raises_an_error_and_does_not_crash() -> None:
+def test_an_argument_without_an_address_raises_an_error_and_does_not_crash_the_process() -> None:
     double = bound(_double_held, pointer_to((np.ones(3),)))
     with pytest.raises(AttributeError, match="address"):
         double(None)

@@ -16,7 +16,7 @@ from tests.control.test_scenarios import robot_of
 from tests.support.driven import Driven
 
 DT = 0.002
-NEAR, FAR = 0.005, 0.035  # [m]
+NEAR, FAR = 0.005, 0.035  # A small and a great value of min_distance [m].
 UP = np.array([0.0, 0.0, 0.05])  # [m]
 
 
@@ -31,7 +31,7 @@ def margins(run: Driven) -> np.ndarray:
 
 
 @pytest.mark.slow
-def test_a_greater_distance_pushes_no_pair_apart_and_is_kept_when_the_pair_has_opened(
+def test_a_greater_min_distance_pushes_no_pair_apart_and_is_kept_once_the_pair_has_opened(
     controller: CartesianController,
 ) -> None:
     run = Driven(controller)
@@ -53,7 +53,7 @@ def test_a_greater_distance_pushes_no_pair_apart_and_is_kept_when_the_pair_has_o
     assert run.contract.uncertified == 0
 
 
-def test_a_distance_grows_no_faster_than_allowed_and_falls_at_once(controller: CartesianController) -> None:
+def test_a_kept_distance_grows_no_faster_than_allowed_and_falls_at_once(controller: CartesianController) -> None:
     run = Driven(controller)
     run.drive(0.1)
     assert controller.change({"min_distance": FAR}) is None
@@ -80,7 +80,7 @@ def test_random_changes_of_settings_during_motion_never_break_the_contract(contr
     assert run.contract.uncertified == 0
 
 
-def test_a_smaller_separation_gain_slows_approaching_arms_without_a_jerk(
+def test_a_smaller_separation_gain_slows_approaching_arms_and_no_velocity_jumps(
     controller: CartesianController,
 ) -> None:
     closing, changes = {}, {}
@@ -100,8 +100,11 @@ def test_a_smaller_separation_gain_slows_approaching_arms_without_a_jerk(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in LIVE if name != "min_distance"])
-def test_a_changed_controller_moves_as_one_that_was_made_with_the_new_value(name: str) -> None:
-    """Both motions are equal to the bit. The right arm gives way, near the left arm and out of its reach."""
+def test_a_controller_with_a_changed_setting_moves_exactly_like_one_that_was_made_with_this_value(name: str) -> None:
+    """Both motions are equal to the bit.
+
+    The arms first block each other, so the right arm gives way. Then both targets are out of reach.
+    """
     usual = ControllerSettings(priority="left")
     value = 0.4 * getattr(usual, name)
     made = [CartesianController(robot_of("iiwa7"), usual.model_copy(update=update)) for update in ({name: value}, {})]
@@ -112,7 +115,7 @@ def test_a_changed_controller_moves_as_one_that_was_made_with_the_new_value(name
     assert np.abs(ways[0] - ways[1]).max() > 1e-4
 
 
-def test_a_setting_is_live_if_the_model_of_a_task_keeps_it_in_an_array() -> None:
+def test_every_setting_that_the_task_model_keeps_in_an_array_can_change_while_the_controller_runs() -> None:
     usual = ControllerSettings(priority="left")
 
     def arrays(settings: ControllerSettings) -> bytes:
@@ -125,7 +128,7 @@ def test_a_setting_is_live_if_the_model_of_a_task_keeps_it_in_an_array() -> None
 
 
 @pytest.mark.slow
-def test_after_a_reset_near_a_body_pairs_keep_as_much_distance_as_the_posture_allows(
+def test_after_a_reset_every_pair_keeps_as_much_distance_as_a_posture_with_close_bodies_allows(
     controller: CartesianController,
 ) -> None:
     run = Driven(controller)
@@ -145,7 +148,9 @@ def test_after_a_reset_near_a_body_pairs_keep_as_much_distance_as_the_posture_al
 
 
 @pytest.mark.slow
-def test_a_kept_distance_that_has_grown_falls_to_its_first_value_at_a_reset(controller: CartesianController) -> None:
+def test_a_reset_to_a_posture_with_close_bodies_reduces_kept_distances_so_that_the_arms_can_rest(
+    controller: CartesianController,
+) -> None:
     run = Driven(controller)
     run.drive(4.0, SCENARIOS["crossing"])
     near = run.q
@@ -178,10 +183,12 @@ def test_arms_within_their_buffer_rest_after_a_reset_and_the_buffer_grows_as_the
     assert left.contract.uncertified == 0
 
 
-def test_an_approaching_pair_keeps_no_more_distance_than_its_stop_keeps(controller: CartesianController) -> None:
+def test_the_kept_distance_of_an_approaching_pair_never_exceeds_its_distance_during_the_certified_stop(
+    controller: CartesianController,
+) -> None:
     run, robot = Driven(controller), controller.robot
     lost = np.zeros(0)
-    # The loop ends when a stop would take more than 4 mm from the distance of a pair, and end clearly below FAR.
+    # The loop ends when a stop would bring some pair closer by more than 4 mm, to a distance clearly below FAR.
     while run.ticks < 800 and not (lost > 0.004).any():
         run.drive(0.01, SCENARIOS["crossing"])
         stop = controller.stop_deceleration
@@ -189,7 +196,7 @@ def test_an_approaching_pair_keeps_no_more_distance_than_its_stop_keeps(controll
         lost = np.where(ends < FAR - 0.004, robot.distance_values(run.q) - ends, 0.0)
     assert (lost > 0.004).any()
     assert controller.change({"min_distance": FAR}) is None
-    controller.reset(run.q, run.v)  # After the reset, pairs keep at once as much as they can.
+    controller.reset(run.q, run.v)  # After the reset, pairs keep at once as much distance as they can.
     stop = controller.stop_deceleration
     for share in np.linspace(0.0, 1.0, 41):
         time = np.minimum(share * (np.abs(run.v) / stop).max(), np.abs(run.v) / stop)
@@ -217,7 +224,7 @@ def test_a_change_that_is_not_allowed_is_refused_with_the_reason_and_changes_not
     assert controller.settings is before
 
 
-def test_a_distance_that_home_does_not_keep_is_refused_with_the_name_of_the_pair(
+def test_a_min_distance_that_the_home_posture_does_not_keep_is_refused_with_the_name_of_the_pair(
     controller: CartesianController,
 ) -> None:
     nearest = min(controller.robot.distances(controller.robot.home), key=lambda pair: pair.distance)

@@ -44,7 +44,7 @@ def controller() -> Iterator[CartesianController]:
         pytest.param(1.0, 0.033, 3.0, False, id="with a bound on its acceleration"),
     ],
 )
-def test_no_moving_body_comes_near_a_hand_that_chases_it(
+def test_no_moving_body_comes_too_close_to_a_hand_that_chases_it(
     controller: CartesianController, speed: float, period: float, acceleration: float | None, box: bool
 ) -> None:
     hunt = Hunt(controller, controller_and_solver()[1], seed=1, box=box)
@@ -55,7 +55,9 @@ def test_no_moving_body_comes_near_a_hand_that_chases_it(
 
 
 @pytest.mark.slow
-def test_a_hand_that_is_faster_than_reported_reaches_a_moving_arm(controller: CartesianController) -> None:
+def test_a_hand_that_is_faster_than_reported_can_come_too_close_to_a_moving_arm(
+    controller: CartesianController,
+) -> None:
     hunt = Hunt(controller, controller_and_solver()[1], seed=1, lie=5.0)
     hunt.run(6.0, 0.25, 0.1)
     assert hunt.broken, "or the test above could not fail"
@@ -84,7 +86,7 @@ def worst_error(controller: CartesianController, obstacle: MovingObstacle | None
     return worst
 
 
-def test_arms_beside_a_slow_hand_follow_as_in_free_air(controller: CartesianController) -> None:
+def test_arms_beside_a_slow_hand_follow_nearly_as_accurately_as_without_a_hand(controller: CartesianController) -> None:
     free = worst_error(controller, None)
     controller.reset(controller.robot.home)
     side = controller.tool_pose("left").translation + np.array([0.0, 0.3 + RADIUS + 0.06, 0.0])
@@ -93,7 +95,7 @@ def test_arms_beside_a_slow_hand_follow_as_in_free_air(controller: CartesianCont
     assert beside < 1.5 * free + 1e-3
 
 
-def test_if_reports_of_an_obstacle_end_the_arms_come_to_rest_and_the_step_names_the_pair(
+def test_if_no_more_reports_on_an_obstacle_come_the_arms_come_to_rest_and_the_report_names_the_pair(
     controller: CartesianController,
 ) -> None:
     start = {arm: controller.tool_pose(arm) for arm in controller.robot.arms}
@@ -108,8 +110,10 @@ def test_if_reports_of_an_obstacle_end_the_arms_come_to_rest_and_the_step_names_
     assert max(np.abs(controller.step(circle(0.002 * tick, start), 0.002).v).max() for tick in range(500)) > 0.05
 
 
-def test_no_arm_moves_any_more_where_a_hand_may_be_that_is_not_reported_again(controller: CartesianController) -> None:
-    """The target leads away from the reported place, where an arm may go as long as reports come."""
+def test_an_arm_moves_only_where_a_hand_that_is_no_longer_reported_cannot_have_arrived(
+    controller: CartesianController,
+) -> None:
+    """The target leads away from the obstacle. As long as reports come, the arm may move there."""
     start, speed = controller.tool_pose("left"), 0.3
     reported, goal = start.translation + np.array([0.0, 0.4, 0.0]), start.translation - np.array([0.0, 0.3, 0.0])
     coal_distances, back, moved = Coal(controller), np.array([0.0, 1.0, 0.0]), 0.0
@@ -124,7 +128,7 @@ def test_no_arm_moves_any_more_where_a_hand_may_be_that_is_not_reported_again(co
     assert 0.5 < moved < 1.3
 
 
-def test_an_obstacle_in_front_of_a_moving_arm_is_named_and_the_arm_brakes_along_its_stop(
+def test_a_new_obstacle_in_front_of_a_moving_arm_is_named_and_the_arm_brakes_along_its_certified_stop(
     controller: CartesianController,
 ) -> None:
     start = {arm: controller.tool_pose(arm) for arm in controller.robot.arms}
@@ -151,7 +155,7 @@ def test_an_obstacle_in_front_of_a_moving_arm_is_named_and_the_arm_brakes_along_
         before = now
 
 
-def test_a_new_box_is_an_obstacle_like_any_other_until_it_is_removed(
+def test_a_new_box_that_never_moves_stops_an_arm_like_a_fixed_obstacle_until_the_box_is_removed(
     controller: CartesianController,
 ) -> None:
     start = controller.tool_pose("left")
@@ -171,7 +175,7 @@ def test_a_new_box_is_an_obstacle_like_any_other_until_it_is_removed(
     assert np.linalg.norm(controller.tool_pose("left").translation - goal) < 2e-3
 
 
-def test_an_arm_that_a_hand_is_too_near_to_can_leave_and_meanwhile_the_other_arm_moves(
+def test_an_arm_with_a_hand_too_near_can_only_move_away_and_the_other_arm_can_move_freely(
     controller: CartesianController,
 ) -> None:
     start = {arm: controller.tool_pose(arm) for arm in controller.robot.arms}
@@ -194,14 +198,14 @@ def test_an_arm_that_a_hand_is_too_near_to_can_leave_and_meanwhile_the_other_arm
     assert np.linalg.norm(controller.tool_pose("left").translation - away["left"].translation) < 5e-3
 
 
-def test_the_reach_of_an_obstacle_is_that_of_a_point_that_gains_speed() -> None:
+def test_the_values_slower_and_rise_of_an_obstacle_follow_from_its_speeds_and_its_acceleration() -> None:
     made = hand(np.zeros(3), 1.0, acceleration=2.0, speed_now=0.2)
     assert (made.slower, made.rise) == pytest.approx((0.8, 0.4))
     assert hand(np.zeros(3), 1.0, acceleration=2.0).slower == 0.0
     assert hand(np.zeros(3), 1.0, speed_now=0.2).slower == 0.0
 
 
-def test_without_moving_obstacles_the_arrays_of_kernels_have_no_entries_for_them() -> None:
+def test_without_moving_obstacles_the_arrays_of_kernels_have_no_entries_for_such_obstacles() -> None:
     robot = robot_of_cell()
     without, one = (
         kernel_model_of(robot, ControllerSettings(moving_obstacles=names)).safety for names in ((), ("hand",))
@@ -222,12 +226,14 @@ def test_without_moving_obstacles_the_arrays_of_kernels_have_no_entries_for_them
         pytest.param({"shape": "sphere", "size": (0.1,), "speed": 0.1, "speed_now": 0.2}, "speed_now", id="too fast"),
     ],
 )
-def test_an_invalid_obstacle_is_refused_in_one_line(values: dict[str, Any], says: str) -> None:
+def test_an_invalid_obstacle_raises_an_error_that_names_the_wrong_key(values: dict[str, Any], says: str) -> None:
     with pytest.raises(ConfigError, match=says):
         MovingObstacle(**values)
 
 
-def test_a_name_that_the_settings_do_not_have_is_refused(controller: CartesianController) -> None:
+def test_a_moving_obstacle_with_an_unknown_name_or_the_name_of_a_fixed_obstacle_is_refused(
+    controller: CartesianController,
+) -> None:
     with pytest.raises(ConfigError, match="'foot': allowed: hand"):
         controller.move_obstacle("foot", hand(np.zeros(3)))
     with pytest.raises(ConfigError, match="table"):

@@ -1,4 +1,4 @@
-"""How close arms come to table, floor, obstacles, each other and themselves. The contract holds at every tick."""
+"""Arms come close to the table, the floor, obstacles, each other and themselves, and always keep the contract."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tests.support.driven import Driven
 CONFIG = load_config("config/dual_iiwa7.yaml")
 SETTINGS = CONFIG.control.model_copy(update={"solve_time_limit": None})  # No result depends on the clock.
 TABLE = 0.2  # Height of the table's top [m].
-FRAME_TO_TIPS = 0.013  # [m]
+FRAME_TO_TIPS = 0.013  # Distance from the tool frame to the finger tips [m].
 DOWN = pin.rpy.rpyToMatrix(np.pi, 0.0, np.pi)  # The tools point down as at home.
 SIDES = (("left", 1.0), ("right", -1.0))
 
@@ -63,8 +63,10 @@ def test_tools_driven_down_onto_the_table_end_with_their_tips_between_1_and_2_mm
 
 
 @pytest.mark.slow
-def test_hands_driven_at_each_other_end_at_the_distance_that_fingers_keep(controller: CartesianController) -> None:
-    """The tools point at each other, and with their targets the tips would overlap by 50 mm."""
+def test_grippers_driven_towards_each_other_stop_at_the_kept_distance_of_their_fingers(
+    controller: CartesianController,
+) -> None:
+    """The tools point at each other. At their targets, the finger tips would overlap by 50 mm."""
     goal = {
         arm: pin.SE3(
             pin.rpy.rpyToMatrix(side * np.pi / 2, 0.0, 0.0), np.array([0.55, side * (FRAME_TO_TIPS - 0.025), 0.5])
@@ -88,7 +90,7 @@ def test_the_nearest_pair_and_the_tightest_pair_are_reported_separately(controll
     assert report.margin < SETTINGS.distance_buffer + 1e-4
 
 
-def test_pairs_with_the_distance_0_come_to_rest_without_touching() -> None:
+def test_bodies_whose_kept_distance_is_0_come_to_rest_without_touching() -> None:
     data = CONFIG.model_dump(mode="json")
     data["control"] |= {"pairs": [{"pair": ["*_finger_*", "table"], "distance": 0.0}], "solve_time_limit": None}
     config = CONFIG.model_validate(data)
@@ -115,7 +117,7 @@ SLIDES: dict[str, tuple[Target, Target]] = {
 def test_joint_accelerations_hardly_jump_while_arms_slide_along_each_other(
     controller: CartesianController, slide: str
 ) -> None:
-    dt, started = 0.001, 2000  # Number of ticks after which the arms slide, and no longer react to the targets' jump.
+    dt, started = 0.001, 2000  # After ``started`` ticks the arms slide, and no longer react to the targets' jump.
     run = Driven(controller, dt=dt)
     targets = {
         arm: pin.SE3(pin.exp3(np.array(turn)) @ run.start[arm].rotation, np.array(place))
@@ -131,7 +133,7 @@ def with_floor(floor: float | None) -> CartesianController:
     return CartesianController(Robot.from_config(CONFIG.model_copy(update={"floor": floor})), SETTINGS)
 
 
-def test_arms_with_targets_below_the_floor_beside_the_table_come_to_rest_above_it() -> None:
+def test_arms_with_targets_below_the_floor_beside_the_table_come_to_rest_above_the_floor() -> None:
     floor = -0.15
     controller = with_floor(floor)
     reference = driven(controller, down_to(-0.3, y=1.0, x=0.1), 4.0)
@@ -141,7 +143,7 @@ def test_arms_with_targets_below_the_floor_beside_the_table_come_to_rest_above_i
 
 
 def hands_in_the_table(depth: float) -> Array:
-    """Return a posture in which both tools are ``depth`` [m] below the table's top, together with their hands."""
+    """Return a posture in which both grippers are inside the table, with the tools ``depth`` [m] below its top."""
     ghost = Robot.from_config(CONFIG)
     ghost.collision_model.removeAllCollisionPairs()
     controller = CartesianController(ghost, SETTINGS)
@@ -154,7 +156,7 @@ def hands_in_the_table(depth: float) -> Array:
 
 
 def test_hands_and_wrists_that_start_deep_in_the_table_come_out_of_it() -> None:
-    """Alone, a hand would leave the table through its underside, near the floor, and a wrist through its top."""
+    """Alone, a hand would leave the table through its underside near the floor, and a wrist through its top."""
     controller = with_floor(0.0)
     home = {arm: controller.tool_pose(arm) for arm in controller.robot.arms}
     controller.reset(hands_in_the_table(0.18))
@@ -165,8 +167,8 @@ def test_hands_and_wrists_that_start_deep_in_the_table_come_out_of_it() -> None:
     assert np.diff([report.closest_distance for report in reports]).min() >= -1e-9, "it never comes closer"
 
 
-def test_if_nothing_can_be_certified_the_report_names_the_pairs_that_hold_the_arms() -> None:
-    """Without a floor, a hand would leave through the underside and a wrist through the top, so neither can move."""
+def test_if_no_step_can_be_certified_the_report_names_the_pairs_that_are_too_close() -> None:
+    """Without a floor, a hand would leave the table downwards and a wrist upwards, so neither can move."""
     controller = with_floor(None)
     home = {arm: controller.tool_pose(arm) for arm in controller.robot.arms}
     controller.reset(hands_in_the_table(0.12))
@@ -183,7 +185,7 @@ SHAPES = {"box": [0.1, 0.1, 0.5], "cylinder": [0.06, 0.5]}
 
 @pytest.mark.slow
 @pytest.mark.parametrize("shape", SHAPES)
-def test_a_tool_pushed_into_an_obstacle_stops_before_it_and_rests(shape: str) -> None:
+def test_a_tool_whose_target_is_inside_an_obstacle_comes_to_rest_in_front_of_the_obstacle(shape: str) -> None:
     post = {"shape": shape, "size": SHAPES[shape], "position": [0.65, 0.1, 0.55], "rpy": [0.3, 0.2, 0.0]}
     data = CONFIG.model_dump(mode="json")
     data["obstacles"]["post"] = post
@@ -192,7 +194,7 @@ def test_a_tool_pushed_into_an_obstacle_stops_before_it_and_rests(shape: str) ->
     goal["left"].translation = np.array([0.65, 0.1, 0.5])
     reference = driven(CartesianController(robot), goal, 4.0)
     assert "post" in "|".join(reference.report.closest_pair)
-    # The shapes of the cell lie inside the monitored bodies. Coal measures the shapes.
+    # Coal measures the shapes of the cell. They lie inside the monitored bodies, so their distance is not smaller.
     assert min(pair.distance for pair in robot.distances(reference.q)) >= 0.02 - 1e-5
     assert reference.report.closest_distance < 0.03, "it goes as near as it may"
 
@@ -209,10 +211,10 @@ def test_a_target_that_bends_the_hand_towards_the_forearm_is_followed_up_to_the_
 
 
 @pytest.mark.slow
-def test_a_circle_is_followed_well_although_the_hand_is_near_its_own_forearm(
+def test_a_circle_is_followed_well_although_the_hand_is_near_the_forearm_of_its_own_arm(
     controller: CartesianController,
 ) -> None:
-    """The circle is half a metre in the air. The target moves at 0.3 m/s, and 6 mm of distance are free at its top."""
+    """The circle is half a metre in the air. The target moves at 0.3 m/s. At the top, 6 mm are free."""
     run, errors, nearest = Driven(controller, dt=0.001), [], np.inf
     for tick in range(4000):
         nearest = min(nearest, run.drive(0.001, circle).report.closest_distance)

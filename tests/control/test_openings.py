@@ -1,6 +1,6 @@
 """Fingers that slide or turn are monitored at all openings that they may have.
 
-A change of these openings is accepted only if it is proven to be safe. Coal measures whether it is.
+A change of these openings is accepted only if it is proven to be safe. Coal checks this proof independently.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def height(controller: CartesianController) -> float:
     return float(controller.tool_pose("left").translation[2])
 
 
-def test_a_closed_gripper_reaches_a_pose_beside_a_block_that_a_gripper_that_may_open_does_not(
+def test_a_closed_gripper_moves_to_a_pose_beside_a_block_where_a_gripper_that_may_open_cannot_go(
     controller: CartesianController,
 ) -> None:
     run = Driven(controller)
@@ -58,7 +58,7 @@ def test_a_closed_gripper_reaches_a_pose_beside_a_block_that_a_gripper_that_may_
     assert height(controller) == pytest.approx(BESIDE.translation[2], abs=5e-4)
 
 
-def test_beside_the_block_the_gripper_opens_as_far_as_the_block_allows_and_above_it_fully(
+def test_a_gripper_may_open_only_partly_beside_a_block_and_may_open_fully_above_the_block(
     controller: CartesianController,
 ) -> None:
     run = Driven(controller)
@@ -81,9 +81,9 @@ def test_beside_the_block_the_gripper_opens_as_far_as_the_block_allows_and_above
 def test_a_moving_gripper_must_not_open_if_its_stop_would_bring_open_fingers_too_close(
     controller: CartesianController,
 ) -> None:
-    """The closed gripper moves towards the block, and asks at every tick whether it may open.
+    """The closed gripper moves towards the block. At every tick, the test requests that it may have all openings.
 
-    If it may, Coal measures the distances of the open fingers along the stop.
+    If the request is accepted, Coal measures the distances of the open fingers along the stop.
     """
     robot = controller.robot
     kept = kept_distances(robot, SETTINGS).values
@@ -111,7 +111,7 @@ def test_a_moving_gripper_must_not_open_if_its_stop_would_bring_open_fingers_too
     assert (False, True) not in answers
 
 
-def test_a_reset_forgets_openings(controller: CartesianController) -> None:
+def test_after_a_reset_each_gripper_may_have_any_opening_again(controller: CartesianController) -> None:
     controller.reset(controller.robot.home)
     controller.set_opening("left", 0.2, 0.3)
     assert controller.openings == {"left": (0.2, 0.3), "right": ALL_OF_THE_WAY}
@@ -133,7 +133,7 @@ def test_a_reset_forgets_openings(controller: CartesianController) -> None:
         ("left", (None, 1.0), "finite numbers"),
     ],
 )
-def test_an_invalid_opening_is_refused_by_name(
+def test_an_invalid_opening_or_an_unknown_arm_is_refused_with_the_reason(
     controller: CartesianController, arm: str, interval: tuple[float, float], complaint: str
 ) -> None:
     with pytest.raises(RobotError, match=complaint):
@@ -141,7 +141,7 @@ def test_an_invalid_opening_is_refused_by_name(
 
 
 @pytest.mark.parametrize("below", [0.0, 5e-10])
-def test_fingers_exactly_at_their_distance_can_move_away_again(robot: Robot, below: float) -> None:
+def test_fingers_exactly_at_their_kept_distance_can_move_away_again(robot: Robot, below: float) -> None:
     run = Driven(CartesianController(robot, SETTINGS))
     run.set_opening("left", 0.0, 0.0)
     report = run.drive(2.0, {"left": BESIDE}).report
@@ -158,7 +158,7 @@ COAL = 2e-6  # Largest difference between our distances and those of Coal [m].
 
 
 class Cell(Driven):
-    """A run that checks the contract, and measures with the real positions of the fingers."""
+    """A run that checks the contract, and measures distances with the real positions of the fingers."""
 
     def __init__(self, config: Config) -> None:
         # No result depends on the clock.
@@ -167,11 +167,11 @@ class Cell(Driven):
         super().__init__(CartesianController(robot, settings), dt=DT)
 
     def spare(self, openings: dict[str, float]) -> float:
-        """Return the least margin of a pair, measured with the real shapes of the fingers at ``openings`` [m]."""
+        """Return the least margin of a pair [m], measured with the real shapes of the fingers at ``openings``."""
         return float((self.real.distances(self.q, openings) - self.kept).min())
 
     def spare_of_bodies(self) -> float:
-        """Return the least margin of a pair, measured with the fingers' bodies for the accepted openings [m]."""
+        """Return the least margin of a pair [m], measured with the fingers' bodies for the accepted openings."""
         model = collision_model_at(self.robot.collision_model, self.robot.finger_bodies, self.controller.openings)
         return float((coal_distances(self.robot, model, self.q) - self.kept).min())
 
@@ -181,7 +181,7 @@ def cell(tmp_path: Path) -> Cell:
     return Cell(turning_cell(tmp_path))
 
 
-def test_an_open_gripper_does_not_close_into_the_table_and_closes_higher_above_it(cell: Cell) -> None:
+def test_an_open_gripper_must_not_close_near_the_table_and_may_close_higher_above_it(cell: Cell) -> None:
     assert cell.set_opening("left", 1.0, 1.0) is None
     cell.drive(1.8, {"left": above_table(0.006)})
     # The tips of the closed fingers would be 8 mm inside the table.
@@ -198,8 +198,8 @@ def test_an_open_gripper_does_not_close_into_the_table_and_closes_higher_above_i
     cell.drive(0.02, {"left": above_table(0.06)})
 
 
-def test_a_narrower_interval_whose_capsule_reaches_the_table_is_refused_and_the_wider_one_stays(cell: Cell) -> None:
-    """The gripper points at the table with a side on which a narrower interval has capsules that reach farther."""
+def test_a_narrower_interval_of_openings_is_refused_if_its_capsule_would_be_too_close_to_the_table(cell: Cell) -> None:
+    """Capsules for the narrower interval extend farther towards the table, because the gripper is tilted."""
     wide, narrow, direction = (0.0, 0.7), (0.175, 0.7), np.array([-0.1135, 0.3231, 0.9395])
     fingers = [body for body in cell.robot.finger_bodies if isinstance(body, TurningBody) and body.arm == "left"]
     reach = {}
@@ -220,7 +220,8 @@ def test_a_narrower_interval_whose_capsule_reaches_the_table_is_refused_and_the_
     assert pair is not None
     assert "table_0" in pair
     assert cell.controller.openings["left"] == wide
-    assert cell.set_opening("left", 0.3, 0.4) is None  # A much smaller opening lies within the wider body.
+    # The capsules for openings from 0.3 to 0.4 lie within those for the wider interval.
+    assert cell.set_opening("left", 0.3, 0.4) is None
     assert cell.spare_of_bodies() >= -COAL
     assert cell.set_opening("left", *wide) is None
     cell.drive(0.4, {"left": high})
@@ -243,7 +244,7 @@ def test_with_hostile_targets_and_openings_no_finger_is_too_close_at_its_real_po
             interval = ((low, high), (low, 1.0), (0.0, high), ALL_OF_THE_WAY)[random.integers(4)]
             stop = cell.controller.stop_deceleration
             refused += cell.set_opening(str(random.choice(["left", "right"])), *interval) is not None
-            # The arms may be braking along the stop already.
+            # The arms may already be braking along this stop, so it must not change.
             np.testing.assert_array_equal(cell.controller.stop_deceleration, stop)
         cell.drive(DT, goals)
         if tick % 8 == 0:

@@ -1,4 +1,4 @@
-"""The QP of a step can be read without side effects, and any program may solve it. The contract holds anyway."""
+"""The QP of a step can be read without side effects. A program may solve it, and any solution keeps the contract."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ KEPT = ControllerSettings(moving_obstacles=("hand",))
 
 
 def crossing(robot: Robot, tick: int = 0) -> dict[str, pin.SE3]:
-    """Return targets of which each is at the home position of the other tool. The left target swings up and down."""
+    """Return a target for each tool, at the home position of the other tool. The left target swings up and down."""
     left, right = (robot.tool_pose(robot.home, arm) for arm in ("left", "right"))
     swing = np.array([0.0, 0.0, 0.05 * math.sin(0.02 * tick)])
     return {
@@ -33,7 +33,7 @@ def crossing(robot: Robot, tick: int = 0) -> dict[str, pin.SE3]:
 
 
 def same(one: Reference, other: Reference) -> bool:
-    """Return whether two references are equal to the bit, with everything that their reports say about the motion."""
+    """Return whether two references and their reports are equal to the bit. Only the solve times may differ."""
     arrays = all(np.array_equal(getattr(one, name), getattr(other, name)) for name in "qva")
     return arrays and replace(one.report, solve_time=0.0) == replace(other.report, solve_time=0.0)
 
@@ -71,7 +71,7 @@ def test_reading_the_problem_does_not_change_a_run_in_any_bit(robot: Robot) -> N
         assert same(read.step(targets, dt), unread.step(targets, dt)), tick
 
 
-def test_the_problem_is_the_one_that_the_step_solves(robot: Robot) -> None:
+def test_the_problem_that_a_program_reads_is_the_problem_that_the_step_solves(robot: Robot) -> None:
     by_hand, controller = CartesianController(robot), CartesianController(robot)
     with_rows = 0
     for tick in range(300):
@@ -103,7 +103,9 @@ NO_SOLUTION: tuple[Any, ...] = (
 
 @pytest.mark.slow
 @pytest.mark.parametrize("x", NO_SOLUTION, ids=lambda x: repr(x)[:12])
-def test_an_invalid_solution_brakes_along_the_certified_stop_like_an_unsolved_step(robot: Robot, x: Any) -> None:
+def test_after_an_invalid_solution_the_arms_brake_along_the_certified_stop_as_without_a_solution(
+    robot: Robot, x: Any
+) -> None:
     controller = CartesianController(robot)
     before = [controller.step(crossing(robot), DT) for _ in range(100)][-1]
     report = controller.advance(x, crossing(robot), DT).report
@@ -114,7 +116,7 @@ def test_an_invalid_solution_brakes_along_the_certified_stop_like_an_unsolved_st
     assert not reference.v.any()
 
 
-def test_given_velocities_far_beyond_the_box_never_break_the_contract(robot: Robot) -> None:
+def test_given_velocities_far_beyond_the_velocity_box_never_break_the_contract(robot: Robot) -> None:
     controller, random = CartesianController(robot), np.random.default_rng(3)
     contract = Contract(controller, robot.home)
     for tick in range(400):

@@ -1,4 +1,4 @@
-"""DAQP finds the minimum of the soft problem, and is called only if the cost's own minimum breaks a bound."""
+"""DAQP finds the minimum of the soft problem, and is called only if the minimum of the cost alone breaks a bound."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def _solved(solver: DaqpSolver, problem: QpProblem) -> Array:
     return solution.v
 
 
-def test_the_minimum_is_found_for_any_number_of_rows_in_successive_ticks_also_with_conflicting_rows() -> None:
+def test_the_minimum_is_found_for_any_number_of_rows_in_successive_ticks_even_if_rows_conflict() -> None:
     random, solver = np.random.default_rng(30), DaqpSolver(NV)
     for rows, conflicting in ((0, False), (5, False), (4, True), (0, False), (17, False), (3, False), (60, False)):
         for _ in range(5):
@@ -64,7 +64,7 @@ def test_the_minimum_is_found_for_any_number_of_rows_in_successive_ticks_also_wi
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1e3], ids="cost times {:g}".format)
-def test_a_single_row_gives_way_by_the_same_share_for_any_weight_of_the_cost(scale: float) -> None:
+def test_a_single_row_is_violated_by_the_same_fraction_for_any_weight_of_the_cost(scale: float) -> None:
     row = np.zeros((1, NV))
     row[0, :2] = 0.6, 0.8
     wide = np.full(NV, 10.0)
@@ -73,7 +73,7 @@ def test_a_single_row_gives_way_by_the_same_share_for_any_weight_of_the_cost(sca
 
 
 @pytest.mark.parametrize("what", ["g", "H", "rows"])
-def test_numbers_that_are_not_finite_raise_nothing_and_do_not_change_later_solutions(what: str) -> None:
+def test_numbers_that_are_not_finite_raise_no_exception_and_do_not_change_later_solutions(what: str) -> None:
     problem, solver = _problem(np.random.default_rng(32), 3), DaqpSolver(NV)
     before = _solved(solver, problem)
     broken = getattr(problem, what).copy()
@@ -84,7 +84,7 @@ def test_numbers_that_are_not_finite_raise_nothing_and_do_not_change_later_solut
 
 @pytest.fixture
 def data() -> KernelData:
-    """Return data with a cost whose minimum is 0.1 rad/s for every joint, within the box of 1 rad/s and the row."""
+    """Return data with a cost whose minimum is 0.1 rad/s for every joint. The box of 1 rad/s and the row allow it."""
     data = kernel_data("dual_iiwa7", np.zeros(NV))
     root = np.random.default_rng(5).normal(size=(NV, NV))
     data.tasks.H[:] = root @ root.T + np.eye(NV)
@@ -156,7 +156,7 @@ def circling(home: pin.SE3, t: float, side: float) -> pin.SE3:
 
 
 @pytest.mark.slow
-def test_the_direct_minimum_is_the_solution_whenever_there_is_one() -> None:
+def test_whenever_a_direct_minimum_exists_it_equals_the_solution_of_the_full_problem() -> None:
     robot, solver = cell("dual_iiwa7").robot, BothWays()
     controller = CartesianController(robot, ControllerSettings(), solver=solver)
     home = {arm: controller.tool_pose(arm) for arm in robot.arms}

@@ -25,7 +25,7 @@ from tests.control.cells import pandas
 from tests.control.scenarios import SCENARIOS, Scenario, circle, crossing
 
 DURATION = 2.0  # [s]
-# A faulty solver fails in the last part of every period. These are the period [s] and the share of this part.
+# A faulty solver fails in the last part of every period [s]. FAULT_SHARE is this part's fraction of the period.
 FAULT_PERIOD, FAULT_SHARE = 0.2, 0.2
 AGAINST_US = "against us"  # All attacks in turn, each for one period.
 Start = Callable[[Robot], tuple[Array, Array]]
@@ -148,7 +148,7 @@ def ticks_of(dt: float, jitter: bool) -> Iterator[float]:
 @pytest.mark.parametrize(
     ("robot", "dt"), [("iiwa7", 0.001), ("iiwa7", 0.01), pytest.param("panda", 0.01, marks=pytest.mark.slow)]
 )
-def test_the_contract_holds_at_every_tick(name: str, robot: str, dt: float) -> None:
+def test_the_contract_holds_at_every_tick_of_every_hostile_motion(name: str, robot: str, dt: float) -> None:
     case = CASES[name]
     controller, solver = controller_of(robot)
     q, v = case.start(controller.robot)
@@ -170,7 +170,7 @@ def test_the_contract_holds_at_every_tick(name: str, robot: str, dt: float) -> N
     # Only a start in penetration has no certificate at first.
     assert (contract.uncertified > 0) == (case.start is in_penetration)
     assert failed == 0 or case.fault in STOPPING_FAULTS
-    # An absurd solution is followed as far as it is certified. After it, rows may be too late to prevent a fallback.
+    # An absurd solution is followed as far as it is certified. Later, rows may act too late to prevent a fallback.
     assert unfounded <= (0.02 if case.fault == "absurd" else 0.001) * contract.ticks
     if case.recovers:
         assert StepStatus.RECOVERING in statuses

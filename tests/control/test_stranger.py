@@ -25,14 +25,14 @@ ANY = next(name for name in ("clarabel", "quadprog", "daqp") if name in qpsolver
 
 
 class Slowly:
-    """A task: a cost on every joint's speed."""
+    """A task that adds a cost on every joint's speed."""
 
     def cost(self, q: Numbers, v: Numbers) -> tuple[Numbers, Numbers]:
         return 0.01 * np.eye(len(q)), np.zeros(len(q))
 
 
 class NotBackwards:
-    """A constraint: the left tool does not move backwards along the world's x."""
+    """A constraint that the left tool does not move backwards along the world's x axis."""
 
     hard = True
 

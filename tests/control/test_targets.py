@@ -25,7 +25,7 @@ def tracker() -> TargetTracker:
 
 
 def _taken(tracker: TargetTracker) -> TaskTargets:
-    return tracker._targets  # The public attribute ``pointer`` is for kernels only.
+    return tracker._targets  # There is no public access, because ``pointer`` is for kernels only.
 
 
 def _update(tracker: TargetTracker, targets: dict[str, Any], dt: float, q: Array, v: Array) -> tuple[str, ...]:
@@ -79,7 +79,7 @@ def test_a_target_of_an_unknown_arm_is_named(tracker: TargetTracker) -> None:
 
 
 @pytest.mark.parametrize("far", [150.0, 1e307], ids="{:g} m".format)
-def test_a_target_beyond_any_cell_keeps_its_direction_but_not_its_distance(tracker: TargetTracker, far: float) -> None:
+def test_a_target_far_beyond_any_cell_is_moved_nearer_in_the_same_direction(tracker: TargetTracker, far: float) -> None:
     assert _update(tracker, {"left": _pose(None, far * np.array([1.0, -0.5, 0.25]))}, 0.001, STILL, STILL) == ()
     np.testing.assert_allclose(_taken(tracker).translation[0], [100.0, -50.0, 25.0])
 
@@ -99,7 +99,9 @@ def _moved(start: pin.SE3, twist: Array, t: float) -> pin.SE3:
 
 
 @pytest.mark.parametrize("dt", [0.0005, 0.005, 0.1], ids="dt {} s".format)
-def test_the_feed_forward_of_a_moving_target_becomes_its_twist(tracker: TargetTracker, dt: float) -> None:
+def test_the_feed_forward_velocity_of_a_moving_target_becomes_equal_to_its_twist(
+    tracker: TargetTracker, dt: float
+) -> None:
     twist = np.array([0.2, -0.1, 0.05, 0.5, -0.3, 0.8])
     start = _pose(pin.exp3(np.array([1.0, -0.5, 0.2])))
     for tick in range(1 + int(np.ceil(0.5 / dt))):
@@ -115,13 +117,13 @@ TELEPORTS = {
 
 
 @pytest.mark.parametrize("elsewhere", TELEPORTS.values(), ids=TELEPORTS.keys())
-def test_a_target_that_jumps_has_no_velocity(tracker: TargetTracker, elsewhere: pin.SE3) -> None:
+def test_a_target_that_jumps_gets_no_feed_forward_velocity(tracker: TargetTracker, elsewhere: pin.SE3) -> None:
     for pose in (_pose(), elsewhere, elsewhere):
         _update(tracker, {"left": pose}, 0.001, STILL, STILL)
         np.testing.assert_array_equal(_taken(tracker).feed_forward[0], 0.0)
 
 
-def test_the_first_target_after_a_hold_or_a_reset_has_no_velocity(tracker: TargetTracker) -> None:
+def test_the_first_target_after_a_hold_or_a_reset_gets_no_feed_forward_velocity(tracker: TargetTracker) -> None:
     nearby = _pose(None, np.array([0.5005, 0.0, 0.4]))
     for forget in (lambda: _update(tracker, {}, 0.001, STILL, STILL), lambda: tracker.reset(STILL)):
         _update(tracker, {"left": _pose()}, 0.001, STILL, STILL)
@@ -131,7 +133,7 @@ def test_the_first_target_after_a_hold_or_a_reset_has_no_velocity(tracker: Targe
 
 
 @pytest.mark.parametrize("dt", [0.0, -0.001], ids=["no time", "time backwards"])
-def test_a_target_has_no_velocity_if_no_time_passes(tracker: TargetTracker, dt: float) -> None:
+def test_a_target_gets_no_feed_forward_velocity_if_no_time_passes(tracker: TargetTracker, dt: float) -> None:
     for x in (0.5, 0.6):
         assert _update(tracker, {"left": _pose(None, np.array([x, 0.0, 0.4]))}, dt, STILL, STILL) == ()
         assert np.isfinite(_taken(tracker).feed_forward).all()
@@ -139,7 +141,9 @@ def test_a_target_has_no_velocity_if_no_time_passes(tracker: TargetTracker, dt: 
 
 
 @pytest.mark.parametrize("absent", [{}, {"left": None}], ids=["missing", "None"])
-def test_a_released_arm_brakes_and_holds_where_it_comes_to_rest(tracker: TargetTracker, absent: dict[str, Any]) -> None:
+def test_an_arm_without_a_target_brakes_and_holds_the_posture_where_it_comes_to_rest(
+    tracker: TargetTracker, absent: dict[str, Any]
+) -> None:
     _update(tracker, {"left": _pose(), "right": _pose()}, 0.001, STILL, STILL)
     left = np.arange(14) < 7
     q = STILL.copy()
@@ -153,7 +157,7 @@ def test_a_released_arm_brakes_and_holds_where_it_comes_to_rest(tracker: TargetT
         np.testing.assert_allclose(_taken(tracker).hold[left], q[left], err_msg="pushed aside it goes back")
 
 
-def test_after_a_reset_every_arm_holds_where_it_is(tracker: TargetTracker) -> None:
+def test_after_a_reset_every_arm_holds_its_posture(tracker: TargetTracker) -> None:
     _update(tracker, {"left": _pose(), "right": _pose()}, 0.001, STILL, STILL)
     tracker.reset(np.linspace(-1, 1, 14))
     assert _taken(tracker).follows.tolist() == [0, 0]

@@ -17,7 +17,7 @@ def least_ahead(controller: CartesianController) -> float:
     return float((distances(controller.step({}, 0.0).q) - kept).min())
 
 
-def test_a_prediction_finds_the_margin_of_the_report_beside_a_moving_hand() -> None:
+def test_beside_a_moving_hand_a_prediction_finds_the_same_margin_as_the_report() -> None:
     controller = controller_at_home()
     side = controller.tool_pose("left").translation + np.array([0.0, RADIUS + 0.12, 0.0])
     controller.move_obstacle("hand", hand(side))

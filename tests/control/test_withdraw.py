@@ -14,7 +14,7 @@ DT = 0.002
 
 
 def crossing(controller: CartesianController) -> dict[str, pin.SE3 | None]:
-    """Return targets of which each is at the present position of the other tool."""
+    """Return a target for each tool, at the present position of the other tool."""
     left, right = (controller.tool_pose(arm) for arm in SIDES)
     return {"left": pin.SE3(left.rotation, right.translation), "right": pin.SE3(right.rotation, left.translation)}
 
@@ -26,7 +26,7 @@ def moving(robot: Robot) -> tuple[CartesianController, Reference]:
     return controller, [controller.step(targets, DT) for _ in range(100)][-1]
 
 
-def test_an_undone_step_leaves_state_and_stop_unchanged(robot: Robot) -> None:
+def test_an_undone_step_leaves_the_reference_and_its_certified_stop_unchanged(robot: Robot) -> None:
     controller, before = moving(robot)
     stop = controller.stop_deceleration
     late = controller.step(crossing(controller), DT)
@@ -38,19 +38,19 @@ def test_an_undone_step_leaves_state_and_stop_unchanged(robot: Robot) -> None:
     np.testing.assert_allclose(controller.tool_pose("left"), robot.tool_pose(before.q, "left"), atol=1e-9)
 
 
-def test_after_an_undone_step_no_pair_keeps_more_than_before_it(robot: Robot) -> None:
+def test_after_an_undone_step_no_pair_keeps_a_greater_distance_than_before_the_step(robot: Robot) -> None:
     controller = CartesianController(robot)
     controller.step({}, DT)
     assert controller.change({"min_distance": controller.settings.min_distance + 0.01}) is None
     before, late = controller.kept_distances, controller.step({}, DT)
-    while not (controller.kept_distances > before).any():  # Distances do not grow at every step.
+    while not (controller.kept_distances > before).any():  # Kept distances do not grow at every step.
         before, late = controller.kept_distances, controller.step({}, DT)
     controller.withdraw(late)
     np.testing.assert_array_equal(controller.kept_distances, before)
 
 
 @pytest.mark.slow
-def test_arms_that_move_towards_each_other_keep_limits_and_distances_with_late_steps(robot: Robot) -> None:
+def test_arms_that_move_towards_each_other_keep_limits_and_distances_although_some_steps_are_late(robot: Robot) -> None:
     controller, random = CartesianController(robot), np.random.default_rng(0)
     cap = robot.capped_acceleration(controller.settings.acceleration_limit)
     targets, before = crossing(controller), Reference(robot.home, np.zeros_like(robot.home), robot.home, None)  # type: ignore[arg-type]
@@ -70,7 +70,7 @@ def test_arms_that_move_towards_each_other_keep_limits_and_distances_with_late_s
     assert -1e-9 <= nearest < 0.01
 
 
-def test_a_braking_step_follows_the_certified_stop_and_can_be_undone_too(robot: Robot) -> None:
+def test_a_braking_step_follows_the_certified_stop_and_can_be_undone(robot: Robot) -> None:
     controller, before = moving(robot)
     deceleration = controller.stop_deceleration
     braked = controller.brake(DT)

@@ -1,4 +1,4 @@
-"""Two arms work close together: the contract holds at every tick, and motion that keeps its distance is not slowed."""
+"""Two arms work close together, and keep the contract. A motion in which no pair comes too close is not slowed."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ pytestmark = pytest.mark.slow
 
 CONFIG = load_config("config/dual_iiwa7.yaml")
 SETTINGS = CONFIG.control.model_copy(update={"solve_time_limit": None})  # No result depends on the clock.
-# Time after the motion in which the arms come to rest [s]. Arms that block each other slide for a while before.
+# Time after the motion in which the arms come to rest [s]. Arms that block each other first slide along each other.
 STILL = 3.0
 
 
@@ -26,7 +26,7 @@ def robot_of(free: bool) -> Robot:
 
 @cache
 def figures_of(name: str, free: bool = False) -> MotionFigures:
-    """Return our figures in a work motion. With ``free``, no pair is monitored."""
+    """Return the figures of our controller in a work motion. With ``free``, no pair is monitored."""
     robot = robot_of(free)
     return run_motion(OwnController(robot, CONFIG), robot, WORK_MOTIONS[name])
 
@@ -43,7 +43,9 @@ CHECKED = [name for name in WORK_MOTIONS if not name.startswith("carry")] + ["ca
 
 
 @pytest.mark.parametrize("motion", [WORK_MOTIONS[name] for name in CHECKED], ids=CHECKED)
-def test_work_keeps_the_contract_at_every_tick_without_fallback_and_ends_in_rest(motion: WorkMotion) -> None:
+def test_work_motions_keep_the_contract_at_every_tick_with_hardly_any_fallback_and_end_at_rest(
+    motion: WorkMotion,
+) -> None:
     run = Driven(CartesianController(robot_of(free=False), SETTINGS))
     run.drive(motion.ends + STILL, lambda t, start: motion.targets(min(t, motion.ends), start))
     contract = run.contract
@@ -52,7 +54,7 @@ def test_work_keeps_the_contract_at_every_tick_without_fallback_and_ends_in_rest
     assert contract.tail_acceleration() < 0.1
 
 
-def test_arms_that_carry_something_close_together_follow_as_in_free_air() -> None:
+def test_arms_that_carry_something_close_together_follow_nearly_as_accurately_as_in_free_air() -> None:
     name = "carry-0.20-0.50"
     assert rms(name) <= 1.5 * rms(name, free=True)
     assert figures_of(name).fallback_percent == 0.0

@@ -89,14 +89,16 @@ def test_without_a_trusted_state_the_command_is_the_gravity_torque(robot: Robot)
     np.testing.assert_allclose(last.tau, gravity, atol=1e-9)
 
 
-def test_without_a_trusted_state_a_plant_with_servos_follows_the_reference(robot: Robot) -> None:
+def test_without_a_trusted_state_a_plant_with_servos_is_commanded_to_the_positions_of_the_reference(
+    robot: Robot,
+) -> None:
     drive, reference, state = pulled(robot, has_servos=True)
     command = drive.command(reference, state, {}, DT, trusted=False)
     assert command.mode is CommandMode.POSITION
     np.testing.assert_array_equal(command.q, reference.q)
 
 
-def test_the_wall_presses_if_a_measured_pair_is_too_close(robot: Robot) -> None:
+def test_the_wall_pushes_a_measured_pair_apart_if_the_pair_is_too_close(robot: Robot) -> None:
     drive, reference, state = pulled(robot, has_servos=False)
     # Random postures are tried until a measured pair is closer than its kept distance, and no pair touches.
     q = state.q.copy()

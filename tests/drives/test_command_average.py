@@ -1,4 +1,4 @@
-"""Commands that are means of references keep the limit of jerk and the other limits, and end at the last reference."""
+"""Commands that are means of references keep the jerk limit and the other limits, and end at the last reference."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ A, H = 10.0, 0.001  # Acceleration limit [rad/s^2] and period [s].
 
 
 def limited(jerk: object, mode: str = "position", **control: Any) -> Config:
-    """Return the shipped cell with the limit of jerk ``jerk`` [rad/s^3] and a loop of 1000 Hz."""
+    """Return the shipped cell with the jerk limit ``jerk`` [rad/s^3] and a loop of 1000 Hz."""
     settings = cell().control.model_copy(update={"jerk_limit": jerk, **control})
     return cell().model_copy(update={"control": settings, "loop_rate_hz": 1000.0})
 
@@ -42,7 +42,7 @@ def hasty_reference(ticks: int, dt: Array, seed: int = 1) -> list[tuple[Array, A
 
 
 @pytest.mark.parametrize("jerk", [700.0, 5000.0, 6000.0, 19_000.0])
-def test_with_regular_ticks_commands_reach_the_limit_of_jerk_and_never_exceed_it(jerk: float) -> None:
+def test_with_regular_ticks_commands_use_the_jerk_limit_fully_and_never_exceed_it(jerk: float) -> None:
     average = CommandAverage(2.0 * A / jerk, H)
     average.reset(np.zeros(2))
     commands = [average.update(q, v, H)[0] for q, v in hasty_reference(3000, np.full(3000, H))]
@@ -54,7 +54,7 @@ def test_with_regular_ticks_commands_reach_the_limit_of_jerk_and_never_exceed_it
     assert float(np.abs(acceleration).max()) <= A * (1.0 + 1e-6)
 
 
-def test_the_commanded_velocity_is_the_mean_of_the_velocities() -> None:
+def test_the_commanded_velocity_is_the_mean_of_the_last_velocities_of_the_reference() -> None:
     average = CommandAverage(0.004, H)
     average.reset(np.zeros(2))
     path = hasty_reference(50, np.full(50, H))
@@ -62,7 +62,7 @@ def test_the_commanded_velocity_is_the_mean_of_the_velocities() -> None:
     assert commanded[-1] == pytest.approx(np.mean([v for _, v in path[-4:]], axis=0), abs=1e-12)
 
 
-def test_a_reference_that_rests_is_commanded_exactly_after_one_window() -> None:
+def test_a_reference_that_rests_is_commanded_exactly_after_one_averaging_window() -> None:
     average, rest = CommandAverage(0.003, H), np.array([0.1, math.pi / 7])
     average.reset(np.zeros(2))
     for expected in (False, False, True, True):
@@ -72,7 +72,7 @@ def test_a_reference_that_rests_is_commanded_exactly_after_one_window() -> None:
     assert not v.any()
 
 
-def test_a_tick_without_time_changes_no_command() -> None:
+def test_a_tick_of_zero_duration_changes_no_command() -> None:
     average = CommandAverage(0.004, H)
     average.reset(np.zeros(2))
     for q, v in hasty_reference(20, np.full(20, H)):
@@ -82,7 +82,7 @@ def test_a_tick_without_time_changes_no_command() -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_with_irregular_ticks_commands_stay_within_the_allowed_distance_of_the_references_path(seed: int) -> None:
+def test_with_irregular_ticks_commands_stay_within_the_allowed_distance_from_the_references_path(seed: int) -> None:
     window = 0.004
     dt = np.random.default_rng(seed).uniform(0.3 * H, 1.5 * H, 2000)
     average = CommandAverage(window, H)
@@ -100,7 +100,7 @@ def test_with_irregular_ticks_commands_stay_within_the_allowed_distance_of_the_r
         assert np.abs(command - there).max() <= 0.25 * A * window**2
 
 
-def test_after_a_late_tick_the_reference_itself_is_commanded_and_the_average_begins_again() -> None:
+def test_after_a_late_tick_the_reference_itself_is_commanded_and_averaging_starts_again() -> None:
     average = CommandAverage(0.004, H)
     average.reset(np.zeros(2))
     for q, v in hasty_reference(20, np.full(20, H)):
@@ -138,7 +138,7 @@ def hasty(t: float) -> Array:
 
 
 @pytest.mark.parametrize("mode", [CommandMode.POSITION, CommandMode.VELOCITY])
-def test_a_whole_run_keeps_the_limit_of_jerk_in_every_tick(mode: CommandMode) -> None:
+def test_a_whole_run_keeps_the_jerk_limit_in_every_tick(mode: CommandMode) -> None:
     jerk = 3000.0
     loop = Pipeline.from_config(limited(jerk), input=HandsInput(left=hasty, right=hasty), plant="kinematic", mode=mode)
     commands: list[Command] = []
@@ -150,13 +150,13 @@ def test_a_whole_run_keeps_the_limit_of_jerk_in_every_tick(mode: CommandMode) ->
     assert np.abs(np.diff(q, n=3, axis=0) / H**3).max() > 0.5 * jerk
 
 
-def test_in_torque_mode_pairs_keep_no_additional_distance_for_the_limit_of_jerk() -> None:
+def test_in_torque_mode_pairs_keep_no_additional_distance_because_of_a_jerk_limit() -> None:
     loop = Pipeline.from_config(limited(5000.0), input=HandsInput(), plant="mujoco", mode="torque")
     plain = Pipeline.from_config(limited(None), input=HandsInput(), plant="mujoco", mode="torque")
     assert (loop.controller.kept_distances == plain.controller.kept_distances).all()
 
 
-def test_a_limit_of_jerk_is_refused_for_a_plant_that_executes_stops_itself_but_does_not_average() -> None:
+def test_a_jerk_limit_is_refused_for_a_plant_that_executes_stops_itself_but_does_not_average_commands() -> None:
     config = load_config("config/dual_iiwa7_fri.yaml")
     config = config.model_copy(update={"control": config.control.model_copy(update={"jerk_limit": 5000.0})})
     with pytest.raises(ConfigError, match=r"control.jerk_limit: allowed: null, since FriPlant does not keep it"):

@@ -61,7 +61,7 @@ def way(watch: Watch, arm: str) -> Array:
     )
 
 
-def test_in_torque_mode_an_arm_pushed_at_the_other_arm_never_touches_it_and_comes_back() -> None:
+def test_in_torque_mode_an_arm_that_is_pushed_towards_the_other_arm_never_touches_it_and_returns() -> None:
     # The spring is so soft that the push overcomes it. The wall bears the rest of the push.
     config = configured(impedance={"translational_stiffness": 300.0, "rotational_stiffness": 100.0})
     loop, watch = pushed(config, "torque", np.array([0.0, -100.0, 0.0, 0.0, 0.0, 0.0]), ENGAGED, 1.5)
@@ -86,7 +86,7 @@ def test_in_torque_mode_an_arm_pushed_at_the_other_arm_never_touches_it_and_come
     assert json.loads(json.dumps(summary.as_json(), allow_nan=False))["torque"]["pressed_pairs"]
 
 
-def test_in_position_mode_with_the_admittance_a_push_moves_the_tool_and_it_returns() -> None:
+def test_in_position_mode_with_an_admittance_a_push_moves_the_tool_and_the_tool_returns() -> None:
     config = configured(admittance={"enabled": True})
     loop, watch = pushed(config, "position", np.array([0.0, 30.0, 0.0, 0.0, 0.0, 0.0]), ENGAGED, 1.2)
     summary = loop.run(3.0, realtime=False)
@@ -122,7 +122,7 @@ def test_an_admittance_on_a_plant_that_measures_no_external_torque_is_refused() 
 
 
 class BlindPlant(MujocoPlant):
-    """A simulated cell whose sensors fail. ``broken`` is the wrong position of one joint."""
+    """A simulated cell whose sensors fail. ``broken`` is one joint's wrong value in the array ``what``, or None."""
 
     broken: float | None = None
     what = "q"
@@ -154,7 +154,9 @@ def blinded(what: str, value: float, start: float, duration: float) -> tuple[Pip
 
 
 @pytest.mark.parametrize(("what", "value"), [("q", np.nan), ("v", np.inf)])
-def test_after_a_short_loss_of_measurements_the_run_goes_on_and_counts_the_lost_ticks(what: str, value: float) -> None:
+def test_after_a_short_loss_of_measurements_the_run_continues_and_its_summary_counts_the_lost_ticks(
+    what: str, value: float
+) -> None:
     loop, watch, _ = blinded(what, value, 0.9, 0.8 * BLIND)
     summary = loop.run(1.6, realtime=False)
     assert summary.torque is not None

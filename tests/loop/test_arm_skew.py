@@ -1,4 +1,4 @@
-"""Two arms behind drivers that do not report their lag: one arm stands still, or its driver falls silent."""
+"""Two arms whose drivers do not report their lag stay apart if one arm stands still or its driver falls silent."""
 
 from __future__ import annotations
 
@@ -75,7 +75,9 @@ class TwoDrivers:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("are_watched", [True, False])
-def test_an_arm_that_stands_still_is_not_hit_by_the_other_arm_if_their_lags_are_watched(are_watched: bool) -> None:
+def test_an_arm_keeps_its_distance_from_an_arm_that_stands_still_only_if_their_lags_are_watched(
+    are_watched: bool,
+) -> None:
     arms = TwoDrivers(are_watched)
     arms.run_until(HAPPENS)
     assert min(arms.margins) >= 0.0

@@ -44,7 +44,7 @@ class Arms:
         return self.loop.step(self.state, {"left": target}, self.now, DT, {"left": 1.0}, {})
 
 
-def test_arms_of_another_program_are_commanded_after_they_rested_and_not_after_a_stop() -> None:
+def test_arms_of_another_program_get_commands_after_they_have_rested_and_none_after_a_stop() -> None:
     arms = Arms(owns_plant=False)
     assert arms.tick().command is None
     while arms.loop.supervisor.phase is not Phase.ACTIVE:
@@ -91,7 +91,7 @@ def test_joint_states_that_are_not_finite_are_not_trusted() -> None:
     assert not step.trusted
 
 
-def test_arms_that_lost_their_session_brake_from_their_states_until_a_state_jumps() -> None:
+def test_arms_that_lost_their_session_brake_from_measured_states_until_a_state_jumps() -> None:
     arms = Arms(owns_plant=True)
     arms.loop.activate(arms.state, arms.now)
     arms.loop.observe(arms.state, arms.now, DT, lost=Reason.of(FriReason.FRI_DROPPED, arm="left"))
@@ -112,7 +112,7 @@ def test_arms_that_lost_their_session_brake_from_their_states_until_a_state_jump
         pytest.param((0.0, 0.6), 0.9, 0.9, id="less closed to that one"),
     ],
 )
-def test_while_the_arms_do_not_move_a_held_gripper_may_only_go_back(
+def test_a_gripper_that_was_held_may_only_move_back_while_the_arms_are_at_rest(
     before: tuple[float, float] | None, wanted: float, granted: float
 ) -> None:
     assert without_proof(wanted, before) == granted
@@ -133,7 +133,7 @@ class ReportedHand(Arms):
 
 
 @pytest.mark.slow
-def test_the_age_of_a_hands_report_grows_with_the_clock_when_the_loop_stalls() -> None:
+def test_the_age_of_a_hands_report_grows_with_the_clock_even_if_the_loop_stalls() -> None:
     arms = ReportedHand(owns_plant=True)
     arms.loop.activate(arms.state, arms.now)
     first = arms.now + DT

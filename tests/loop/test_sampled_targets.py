@@ -1,4 +1,4 @@
-"""Targets that come less often than the steps of a controller."""
+"""Targets that come less often than the steps of a controller are interpolated."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ def wave(start: pin.SE3, t: float) -> pin.SE3:
 
 
 def share_at_limit(velocities: list[Array]) -> float:
-    """Return the share of steps, after the beginning, in which some joint is at its acceleration limit."""
+    """Return the fraction of steps, after the first 300, in which some joint is at its acceleration limit."""
     accelerations = np.abs(np.diff(np.array(velocities[300:]), axis=0)).max(axis=1) / DT
     return float((accelerations > 0.99 * LIMIT).mean())
 
 
 @pytest.mark.parametrize("rate", [10.0, 30.0, 90.0])
 @pytest.mark.parametrize("jitter", [0.0, 0.2], ids=["even", "uneven by a fifth of a period"])
-def test_joints_are_hardly_ever_at_their_limits_while_a_tool_follows_sampled_targets(
+def test_joints_are_hardly_ever_at_their_acceleration_limits_while_a_tool_follows_sampled_targets(
     controller: CartesianController, rate: float, jitter: float
 ) -> None:
     controller.reset(controller.robot.home)
@@ -55,7 +55,7 @@ def test_joints_are_hardly_ever_at_their_limits_while_a_tool_follows_sampled_tar
     assert max(off[300:]) < 0.01
 
 
-def test_targets_begin_at_the_tool_rest_at_the_newest_sample_and_end_with_a_release(
+def test_interpolation_starts_at_the_tool_and_ends_at_the_newest_sample_and_a_release_ends_the_target(
     controller: CartesianController,
 ) -> None:
     controller.reset(controller.robot.home)
@@ -72,7 +72,9 @@ def test_targets_begin_at_the_tool_rest_at_the_newest_sample_and_end_with_a_rele
     assert targets.at(6.0) == {}
 
 
-def test_a_sample_that_is_not_a_pose_is_not_used_and_other_faults_are_named(controller: CartesianController) -> None:
+def test_a_sample_that_is_not_a_valid_pose_is_not_used_and_other_invalid_arguments_raise_errors(
+    controller: CartesianController,
+) -> None:
     targets, start = SampledTargets(controller, 50.0), controller.tool_pose("left")
     assert not targets.set("left", pin.SE3(np.eye(3), np.array([math.nan, 0.0, 0.0])), 0.0)
     assert not targets.set("left", pin.SE3(2.0 * np.eye(3), np.zeros(3)), 0.0)

@@ -1,4 +1,4 @@
-"""Jobs on the workers of a real scheduler: their results are those of one process, whatever happens to a worker."""
+"""Jobs on the workers of a real scheduler have the same results as in one process, whatever happens to a worker."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def fail_from_two_on(number: int) -> int:
 
 
 def name_in_folder(file: Path) -> str:
-    """Return the file's text. A relative path begins at the sender's working directory."""
+    """Return the file's name and text. A relative path begins at the sender's working directory."""
     return f"{file}: {file.read_text()}"
 
 
@@ -56,7 +56,7 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[DaskCluster]:
 
 
 def fault_of(place: Cluster, **options: object) -> str:
-    """Return the line that refuses the jobs before any of them has begun."""
+    """Return the message of the error with which all jobs are refused before any job begins."""
     with pytest.raises(ConfigError) as fault:
         list(place.results(square, JOBS, **options))  # type: ignore[arg-type]
     assert "\n" not in str(fault.value)
@@ -75,7 +75,9 @@ def test_jobs_of_a_killed_worker_run_on_the_other_worker_and_each_result_comes_o
 
 
 @pytest.mark.slow
-def test_the_error_of_the_first_job_that_fails_is_raised_after_the_results_before_it(cluster: DaskCluster) -> None:
+def test_the_error_of_the_first_job_that_fails_is_raised_after_the_results_of_all_jobs_before_it(
+    cluster: DaskCluster,
+) -> None:
     results = Cluster(cluster.address).results(fail_from_two_on, JOBS)
     assert [next(results), next(results)] == [0, 1]
     with pytest.raises(ConfigError, match="job 2: allowed: 0, 1"):
@@ -95,7 +97,7 @@ def test_a_file_that_a_worker_cannot_see_is_named_before_any_job_begins(cluster:
 
 
 @pytest.mark.slow
-def test_a_relative_path_means_the_same_file_as_here(
+def test_a_relative_path_means_the_same_file_for_a_worker_as_for_the_sender(
     cluster: DaskCluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "note").write_text("found")
@@ -103,11 +105,11 @@ def test_a_relative_path_means_the_same_file_as_here(
     place = Cluster(cluster.address)
     results = place.results(name_in_folder, [Path("note")], lambda file: file, tmp_path)
     assert list(results) == ["note: found"]
-    assert [file.name for file in tmp_path.iterdir()] == ["note"]  # No probe is left.
+    assert [file.name for file in tmp_path.iterdir()] == ["note"]  # No file that probes the folder is left.
 
 
 @pytest.mark.slow
-def test_a_worker_with_another_version_of_this_package_or_of_python_is_refused_in_one_line(
+def test_a_worker_with_another_version_of_this_package_or_of_python_raises_an_error_of_one_line(
     cluster: DaskCluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as changed:
@@ -127,7 +129,7 @@ def test_a_worker_with_another_version_of_this_package_or_of_python_is_refused_i
 
 
 @pytest.mark.slow
-def test_a_scheduler_that_cannot_do_the_work_is_refused_in_one_line(
+def test_a_scheduler_that_cannot_do_the_work_raises_an_error_of_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("distributed", reason="the extra cluster is not installed")
@@ -152,7 +154,7 @@ class _Answers(logging.Handler):
 
 
 @pytest.mark.slow
-def test_jobs_wait_for_another_worker_if_none_is_left_and_end_with_the_scheduler(tmp_path: Path) -> None:
+def test_jobs_wait_for_another_worker_if_none_is_left_and_fail_if_the_scheduler_ends(tmp_path: Path) -> None:
     pytest.importorskip("distributed", reason="the extra cluster is not installed")
     with dask_cluster(tmp_path, workers=1) as cluster:
         answers, logger = _Answers(cluster), logging.getLogger(cluster_module.__name__)
@@ -168,7 +170,7 @@ def test_jobs_wait_for_another_worker_if_none_is_left_and_end_with_the_scheduler
             list(Cluster(cluster.address).results(partial(kill, cluster.scheduler), JOBS))
 
 
-def test_without_dask_one_line_says_what_installs_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_if_dask_is_not_installed_the_error_says_what_installs_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(ConfigError, match=r"--cluster needs dask.distributed: .*pip install .*\[cluster\]'"):
         chosen_place(1, "tcp://127.0.0.1:8786")

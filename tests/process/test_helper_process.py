@@ -1,4 +1,4 @@
-"""A process beside the loop, or a child of this process, never keeps the run from ending."""
+"""A process beside the loop never keeps the run from ending, and neither do the children of that process."""
 
 from __future__ import annotations
 

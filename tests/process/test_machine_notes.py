@@ -15,7 +15,7 @@ RING = "Pre-set maximums:\nRX:\t\t4096\nTX:\t\t4096\nCurrent hardware settings:\
 
 @pytest.fixture
 def prints(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """Replace the computer's ``ethtool`` by one that prints ``gathers`` and ``rings``."""
+    """Replace the computer's ``ethtool`` by a script that prints the given texts ``gathers`` and ``rings``."""
 
     def put(gathers: str = QUIET, rings: str = RING.format(4096)) -> None:
         (tmp_path / "-c").write_text(gathers)
@@ -33,23 +33,27 @@ def test_a_card_that_forwards_every_message_at_once_needs_no_note(prints: Callab
 
 
 @pytest.mark.parametrize("gathers", ["Adaptive RX: off  TX: off\nrx-usecs: 50\n", "Adaptive RX: on  TX: off\n"])
-def test_a_card_that_gathers_messages_is_named_with_the_command(prints: Callable[..., None], gathers: str) -> None:
+def test_a_note_names_a_card_that_gathers_messages_and_the_command_that_stops_this(
+    prints: Callable[..., None], gathers: str
+) -> None:
     prints(gathers)
     (note,) = card_notes("lo")
     assert note.endswith("ethtool -C lo adaptive-rx off rx-usecs 0")
 
 
-def test_a_card_with_a_short_ring_buffer_is_named_with_the_command(prints: Callable[..., None]) -> None:
+def test_a_note_names_a_card_with_a_short_ring_buffer_and_the_command_that_lengthens_the_buffer(
+    prints: Callable[..., None],
+) -> None:
     prints(rings=RING.format(256))
     assert card_notes("lo") == ["lo: a ring buffer of 256 messages; ethtool -G lo rx 4096"]
 
 
-def test_a_card_without_information_gives_no_note(prints: Callable[..., None]) -> None:
+def test_there_is_no_note_about_a_card_about_which_nothing_is_known(prints: Callable[..., None]) -> None:
     prints("rx-usecs: n/a\n", "RX:\t\tn/a\nRX:\t\tn/a\n")
     assert card_notes("no_such_card") == []
 
 
-def test_addresses_of_this_computer_need_no_card() -> None:
+def test_addresses_of_this_computer_need_no_note() -> None:
     assert network_notes(["127.0.0.1", "::1"]) == []
 
 
@@ -62,7 +66,7 @@ def test_addresses_of_this_computer_need_no_card() -> None:
         ("6.8.0-48-generic", None, False),
     ],
 )
-def test_a_kernel_that_throttles_real_time_threads_for_other_programs_is_named(
+def test_a_note_names_a_kernel_that_throttles_real_time_threads_for_other_programs(
     tmp_path: Path, release: str, shares: str | None, is_noted: bool
 ) -> None:
     for cpu in ("cpu0", "cpu1") if shares is not None else ():

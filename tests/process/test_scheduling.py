@@ -62,7 +62,7 @@ def test_if_everything_is_permitted_no_line_is_printed_and_everything_is_undone(
     assert system.calls[-1] == ("sched", 0, os.SCHED_OTHER, 0)
 
 
-def test_a_refusal_of_the_system_is_described_in_one_line_with_the_cure(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_line_describes_what_the_system_refuses_and_says_how_to_permit_it(monkeypatch: pytest.MonkeyPatch) -> None:
     FakeSystem(monkeypatch, grants_memory=False, grants_scheduler=False)
     with real_time() as refused:
         assert refused is not None
@@ -89,7 +89,7 @@ def test_future_memory_is_locked_only_if_no_limit_could_refuse_it_during_the_run
         assert system.calls[0] == ("mlockall", flags)
 
 
-def test_the_real_system_is_restored_and_other_threads_get_no_priority() -> None:
+def test_the_scheduling_of_the_real_system_is_restored_and_other_threads_get_no_priority() -> None:
     before = os.sched_getscheduler(0)
     policies = []
     with real_time() as refused:
@@ -103,7 +103,7 @@ def test_the_real_system_is_restored_and_other_threads_get_no_priority() -> None
 
 
 @pytest.mark.parametrize(("machine", "granted", "number"), [("x86_64", True, 314), ("aarch64", False, 274)])
-def test_a_reservation_is_requested_in_nanoseconds_and_a_refusal_is_reported(
+def test_a_reservation_of_processor_time_is_requested_in_nanoseconds_and_a_refusal_is_reported(
     monkeypatch: pytest.MonkeyPatch, machine: str, granted: bool, number: int
 ) -> None:
     asked: list[tuple[int, int, bytes, int]] = []
@@ -121,7 +121,9 @@ def test_a_reservation_is_requested_in_nanoseconds_and_a_refusal_is_reported(
     assert attributes == (48, 6, 1, 0, 0, 1_500_000, 2_000_000, 2_000_000)
 
 
-def test_a_machine_whose_system_call_is_unknown_gets_no_reservation(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_machine_whose_system_call_is_unknown_gets_no_reservation_of_processor_time(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(platform, "machine", lambda: "riscv64")
     assert not reserve(0.001, 0.002)
 
@@ -167,7 +169,7 @@ def test_a_signal_that_interrupts_the_handler_of_another_signal_does_not_wait_fo
 
 @pytest.fixture
 def _nothing_frozen() -> Iterator[None]:
-    """Undo the freezing of imported objects by the tests."""
+    """Unfreeze the objects that tests/conftest.py has frozen, and freeze them again after the test."""
     gc.unfreeze()
     yield
     gc.freeze()

@@ -4,9 +4,10 @@ With the best slacks, s_i = max(0, lower_i - a_i v), the cost is
 
     f(v) = 1/2 v' H v + g' v + 1/2 sum_i max(0, lower_i - a_i v)^2 / rho_i.
 
-At the solution each joint is at its lower bound, at its upper bound or between them, and each row is satisfied or gives
-way. For each of these combinations f is a quadratic function, whose minimum is found by one linear system. Of all these
-minima that satisfy the box and the hard rows, the one with the least cost is the solution, since f is strictly convex.
+At the solution each joint is at its lower bound, at its upper bound or between them. Each row is satisfied or
+violated. For each of these combinations f is a quadratic function, whose minimum is found by one linear system. Of all
+these minima that satisfy the box and the hard rows, the one with the least cost is the solution, since f is strictly
+convex.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ def _least_point(problem: QpProblem, sides: npt.NDArray[np.int64], active: npt.N
     """Return the minimum (nv,) [rad/s] of f for one combination; None if it does not exist.
 
     ``sides`` (nv,) is -1 for a joint at its lower bound, 1 at its upper bound, and 0 between them. Rows with ``active``
-    (m,) give way if they are soft, and are met exactly if they are hard.
+    (m,) are violated if they are soft, and are met exactly if they are hard.
     """
     soft = np.arange(len(active)) < len(active) - problem.hard
     giving, met = problem.rows[active & soft], problem.rows[active & ~soft]

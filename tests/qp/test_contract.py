@@ -18,7 +18,7 @@ from tests.control.test_scenarios import CASES, Case, ticks_of
 from tests.qp.solvers import NAMES, ROBOT, controller_with, each_solver
 from tests.support.driven import Driven
 
-DT, MOVING, RESTING = 0.002, 0.16, 2.5  # [s]
+DT, MOVING, RESTING = 0.002, 0.16, 2.5  # Durations of a tick, of the motion, and of the wait for rest [s].
 SLOWLY_OUT = "start in penetration"  # In this motion arms move apart at 50 mm/s, and a tick has up to 80 rows.
 REST, RESTED = 1e-3, 0.02  # Arms rest if all joints are slower than this [rad/s] for this time [s].
 TRACKING = 1.05  # Largest tracking error with another solver, as a multiple of the error with DAQP.
@@ -80,7 +80,9 @@ def _every(solver: str, name: str) -> pytest.ParameterSet:
 
 
 @pytest.mark.parametrize(("solver", "name"), [_every(solver, name) for solver in NAMES for name in MOTIONS])
-def test_arms_keep_the_contract_come_to_rest_and_follow_as_well_as_with_daqp(solver: str, name: str) -> None:
+def test_with_every_solver_arms_keep_the_contract_come_to_rest_and_follow_as_well_as_with_daqp(
+    solver: str, name: str
+) -> None:
     run = motion(solver, name)
     assert run.rested is not False
     assert run.unsolved <= 0.01 * len(run.references)
@@ -157,7 +159,7 @@ def test_joints_that_are_driven_towards_their_limits_reach_each_limit_and_break_
     np.testing.assert_allclose(references[-1].q[last], limits.upper[last], atol=2e-3)
 
 
-def test_a_reachable_motion_is_followed_within_millimetres() -> None:
+def test_a_target_that_moves_on_a_reachable_circle_is_followed_within_5_mm() -> None:
     assert MOTIONS["circle"].scenario is circle
     assert 1e-3 < motion("daqp", "circle").error < 5e-3
 

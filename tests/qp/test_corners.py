@@ -15,7 +15,7 @@ from tests.control.test_scenarios import in_penetration
 from tests.qp.solvers import ROBOT, controller_with, each_solver
 from tests.support.driven import Driven
 
-DT, DRIVEN = 0.002, 0.04  # [s]
+DT, DRIVEN = 0.002, 0.04  # Durations of a tick and of a motion [s].
 TICKS = 6
 Corner = tuple[Array, Array, pin.Motion]  # q and v, and the motion of the targets away from the tools [m], [rad].
 OUT = pin.Motion(np.array([0.3, 0.0, 0.3]), np.zeros(3))
@@ -83,7 +83,7 @@ def moved(controller: CartesianController, way: pin.Motion) -> dict[str, pin.SE3
 
 
 @pytest.mark.parametrize("name", CORNERS)
-def test_the_box_is_never_empty_and_all_numbers_are_finite(name: str) -> None:
+def test_in_an_extreme_state_the_velocity_box_is_not_empty_and_all_numbers_of_the_qp_are_finite(name: str) -> None:
     q, v, way = CORNERS[name](ROBOT)
     controller = controller_with("daqp")
     controller.reset(q, v)
@@ -127,8 +127,8 @@ def test_a_joint_at_its_limit_that_still_moves_towards_it_brakes_as_hard_as_poss
             reference = driven.drive(DT, driven.start)
             unsolved += reference.report.unsolved
         assert sign * reference.v[joint] == pytest.approx(abs(v[joint]) - TICKS * braking[joint] * DT, abs=1e-6)
-    # In some ticks an elbow is folded into its own arm, and 48 rows contradict each other. OSQP finds no solution then.
-    # The arm brakes, as it does with a solution.
+    # In some ticks an elbow is folded into its own arm, and 48 rows contradict each other. OSQP then finds no solution,
+    # but the arm brakes just as it does with a solution.
     assert unsolved <= (0.15 if solver == "osqp" else 0.0) * TICKS * len(joints)
 
 

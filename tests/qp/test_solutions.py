@@ -1,4 +1,4 @@
-"""The QP has one solution. Every solver finds the solution of brute force in small problems, and of DAQP in motions."""
+"""The QP has one solution. Every solver finds that of brute force in small problems, and that of DAQP in motions."""
 
 from __future__ import annotations
 
@@ -185,7 +185,7 @@ def test_a_solver_finds_a_solution_if_the_box_hardly_allows_three_similar_rows(n
     assert unsolved <= (2 if name == "osqp" else 0)
 
 
-def test_daqp_through_qpsolvers_equals_daqp_called_directly() -> None:
+def test_daqp_called_through_qpsolvers_finds_the_same_solutions_as_daqp_called_directly() -> None:
     through, directly = QpSolversSolver("daqp"), solver_of("daqp", ROBOT.model.nv)
     for motion in MOTIONS:
         for problem in problems_of(motion):

@@ -1,4 +1,4 @@
-"""The joints and the tip of an arm if the configuration names neither."""
+"""If the configuration names neither the joints nor the tip of an arm, they are found in the arm's model."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_the_chain_of_an_arm_with_a_side_branch_is_found(more: Sequence[str], ti
     assert default_tip(tree(*ARM, *more), (), "key") == tip
 
 
-def test_a_joint_that_the_gripper_drives_or_that_others_mimic_ends_the_arm() -> None:
+def test_the_arm_ends_before_a_joint_that_the_gripper_drives_or_that_other_joints_mimic() -> None:
     model = tree(*ARM, "flange hook revolute drive")
     assert default_tip(model, (), "key") == "hook"
     assert default_tip(model, ("drive",), "key") == "flange"
@@ -85,7 +85,7 @@ def test_an_ambiguous_chain_is_refused_with_the_possible_tips(more: Sequence[str
     assert str(error.value) == f"key: {says}"
 
 
-def test_a_tool_ends_at_its_frame_and_not_at_its_fingers() -> None:
+def test_the_end_of_a_tool_is_its_tool_frame_and_not_one_of_its_fingers() -> None:
     tool = LinkTree(load_description("hand_e").urdf, "hand_e")
     assert end_of(tool, tool.root, "key") == "tool_frame"
 
@@ -99,7 +99,9 @@ def test_a_tool_ends_at_its_frame_and_not_at_its_fingers() -> None:
         (["to_one", "to_one"], "key.joints = to_one, to_one: expected from base to tip, once each: to_one"),
     ],
 )
-def test_named_joints_that_are_not_the_chain_are_refused(names: list[str], says: str) -> None:
+def test_named_joints_that_are_outside_the_chain_repeated_or_in_another_order_are_refused(
+    names: list[str], says: str
+) -> None:
     with pytest.raises(ConfigError) as error:
         named_joints(tree(*ARM), "flange", names, "key")
     assert str(error.value) == says

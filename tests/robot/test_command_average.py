@@ -1,6 +1,6 @@
-"""The window of averaged commands fits the limit of jerk.
+"""The time over which commands are averaged follows from the jerk limit.
 
-Pairs keep more distance, by as much as the mean can be off the path.
+The averaged command can be off the path of the reference, so every pair keeps a distance that is greater by as much.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ def robot() -> Robot:
     return Robot.from_config(load_config("config/dual_iiwa7.yaml"))
 
 
-def test_the_window_is_the_time_that_the_acceleration_needs_from_one_limit_to_the_other(robot: Robot) -> None:
+def test_the_averaging_window_is_the_time_that_the_acceleration_needs_from_one_limit_to_the_other(robot: Robot) -> None:
     assert average_window(robot, ControllerSettings()) == 0.0
     assert average_window(robot, ControllerSettings(jerk_limit=5000.0)) == pytest.approx(0.004)
     slower = ControllerSettings(jerk_limit=5000.0, acceleration_limit=5.0)
     assert average_window(robot, slower) == pytest.approx(0.002)
 
 
-def test_the_joint_with_the_least_limit_decides_the_window(robot: Robot) -> None:
+def test_the_joint_with_the_lowest_jerk_limit_decides_the_window(robot: Robot) -> None:
     jerk = (5000.0,) * 10 + (2500.0,) + (5000.0,) * 3
     assert average_window(robot, ControllerSettings(jerk_limit=jerk)) == pytest.approx(0.008)
 
@@ -47,7 +47,7 @@ def test_a_jerk_limit_that_does_not_fit_the_robot_is_refused_by_name(robot: Robo
         kept_distances(robot, ControllerSettings(jerk_limit=jerk))
 
 
-def test_no_pair_comes_closer_by_more_than_the_allowance_when_every_joint_is_off(robot: Robot) -> None:
+def test_no_pair_comes_closer_by_more_than_the_allowance_if_every_joint_is_off_its_path(robot: Robot) -> None:
     settings = ControllerSettings(jerk_limit=1000.0)
     off = 0.25 * average_window(robot, settings) ** 2 * robot.capped_acceleration(10.0)
     allowance = average_allowance(robot, settings, robot.collision_model)

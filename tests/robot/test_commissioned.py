@@ -44,7 +44,7 @@ def cell(old: str = "", new: str = "", text: str = REAL) -> Config:
         ("tool_tool: 0.01", "tool_tool: 0.02"),
     ],
 )
-def test_addresses_mounts_tools_and_limits_are_in_the_fingerprint(old: str, new: str) -> None:
+def test_a_change_of_an_address_mount_tool_or_limit_changes_the_fingerprint_of_a_cell(old: str, new: str) -> None:
     assert fingerprint(cell(old, new)) != fingerprint(cell())
 
 
@@ -57,7 +57,9 @@ def test_addresses_mounts_tools_and_limits_are_in_the_fingerprint(old: str, new:
         ("mass: 0.1", "mass: 0.2"),
     ],
 )
-def test_obstacles_gains_home_and_the_simulation_are_not_in_the_fingerprint(old: str, new: str) -> None:
+def test_a_change_of_obstacles_gains_home_or_simulation_does_not_change_the_fingerprint_of_a_cell(
+    old: str, new: str
+) -> None:
     assert fingerprint(cell(old, new)) == fingerprint(cell())
 
 
@@ -102,13 +104,13 @@ def test_a_real_cell_that_was_not_commissioned_is_refused_with_the_command_that_
     assert load_commissioned(file, "mujoco") == load_config(file)  # Nothing real moves.
 
 
-def test_a_commissioned_cell_goes_at_a_tenth_of_its_speed_unless_full_speed_is_asked_for(tmp_path: Path) -> None:
+def test_a_commissioned_cell_moves_at_a_tenth_of_its_speed_unless_full_speed_is_requested(tmp_path: Path) -> None:
     file = write_real_cell(tmp_path, signed_off=True)
     assert load_commissioned(file) == slowed(load_config(file))
     assert load_commissioned(file, full_speed=True) == load_config(file)
 
 
-def test_a_cell_of_simulated_cabinets_is_loaded_as_it_is() -> None:
+def test_a_cell_with_simulated_cabinets_is_loaded_with_its_full_speed() -> None:
     assert load_commissioned("config/dual_iiwa7_fri.yaml") == load_config("config/dual_iiwa7_fri.yaml")
 
 

@@ -20,7 +20,9 @@ HAND, TOUCH = {"model": "hand_e", "frame": "tool_frame"}, "media_flange_touch_pn
 FINGERS = {"joints": ["finger_joint_1", "finger_joint_2"], "open_position": 0.025}
 
 
-def test_the_cell_names_its_parts_by_side(dual_iiwa7_cell: ComposedCell) -> None:
+def test_a_composed_cell_prefixes_names_of_frames_and_joints_with_the_side_of_their_arm(
+    dual_iiwa7_cell: ComposedCell,
+) -> None:
     cell = dual_iiwa7_cell
     assert cell.tool_frames == {"left": "left_tool_frame", "right": "right_tool_frame"}
     for side in ("left", "right"):
@@ -29,7 +31,9 @@ def test_the_cell_names_its_parts_by_side(dual_iiwa7_cell: ComposedCell) -> None
     assert cell.obstacles == ("table",)
 
 
-def test_every_name_is_unique_for_its_kind_even_if_shapes_share_one(tmp_path: Path) -> None:
+def test_every_link_joint_shape_and_material_has_a_unique_name_even_if_the_model_repeats_names_of_shapes(
+    tmp_path: Path,
+) -> None:
     text = find_resource("robots/iiwa7.urdf").read_text()
     file = tmp_path / "arm.urdf"
     file.write_text(re.sub(r'<(visual|collision) name="[^"]*"', r'<\1 name="shape"', text))
@@ -53,7 +57,7 @@ def test_mounts_and_obstacles_stand_where_the_config_puts_them() -> None:
     np.testing.assert_allclose(data.oMf[model.getFrameId("post", pin.FrameType.BODY)].translation, [4, 5, 6])
 
 
-def test_undriven_joints_are_fixed_but_a_finger_that_mimics_a_driven_one_moves_with_it() -> None:
+def test_undriven_joints_are_fixed_but_a_finger_that_mimics_a_driven_finger_moves_with_it() -> None:
     panda = {"model": "example-robot-data:panda", "home": [0, 0, 0, -1, 0, 1, 0]}
     cell = compose(one_arm(**panda))
     assert cell.tool_frames == {"left": "left_panda_hand_tcp"}
@@ -64,7 +68,7 @@ def test_undriven_joints_are_fixed_but_a_finger_that_mimics_a_driven_one_moves_w
     assert moved.home["left_panda_finger_joint2"] == 0.04
 
 
-def test_pairs_of_tool_and_arm_are_excluded_only_where_the_tool_sits_flat_on_the_flange() -> None:
+def test_pairs_of_tool_and_arm_are_excluded_only_if_the_tool_is_mounted_directly_on_the_flange() -> None:
     flat = compose(one_arm(tool=HAND)).srdf
     moved = compose(one_arm(tool=HAND | {"mount": {"position": [0, 0, 0.2]}})).srdf
     elsewhere = compose(one_arm(tool=HAND | {"link": "link_3"}, home=[0.0] * 3)).srdf
@@ -95,7 +99,9 @@ def test_pairs_of_tool_and_arm_are_excluded_only_where_the_tool_sits_flat_on_the
         ),
     ],
 )  # fmt: skip
-def test_a_bad_arm_ends_in_one_line_that_names_key_value_and_what_is_allowed(arm: dict[str, Any], line: str) -> None:
+def test_an_invalid_arm_raises_an_error_of_one_line_with_the_key_and_what_is_allowed(
+    arm: dict[str, Any], line: str
+) -> None:
     with pytest.raises(ConfigError) as error:
         compose(one_arm(**arm))
     assert line in str(error.value)

@@ -53,7 +53,7 @@ ENDS = '<parent link="base"/><child link="tip"/>'
         ("<robot name", '<!DOCTYPE r [<!ENTITY a "aa">]><robot x="&c;" name', "not XML"),
     ],
 )
-def test_an_untrustworthy_description_is_refused_in_one_line(old: str, new: str, complaint: str) -> None:
+def test_an_invalid_description_raises_an_error_of_one_line(old: str, new: str, complaint: str) -> None:
     with pytest.raises(RobotError) as error:
         parse_urdf(GOOD.replace(old, new), "arm.urdf")
     assert str(error.value).startswith("arm.urdf: ")
@@ -61,7 +61,7 @@ def test_an_untrustworthy_description_is_refused_in_one_line(old: str, new: str,
     assert "\n" not in str(error.value)
 
 
-def test_two_links_that_carry_each_other_beside_the_tree_are_refused() -> None:
+def test_two_links_that_carry_each_other_outside_the_tree_of_links_are_refused() -> None:
     loop = "".join(f'<link name="{a}"/>' for a in "ab") + "".join(
         f'<joint name="{a}{b}" type="fixed"><parent link="{a}"/><child link="{b}"/></joint>' for a, b in ("ab", "ba")
     )
@@ -69,7 +69,7 @@ def test_two_links_that_carry_each_other_beside_the_tree_are_refused() -> None:
         parse_urdf(GOOD.replace("</robot>", loop + "</robot>"), "arm.urdf")
 
 
-def test_a_joint_without_limits_gets_two_turns_in_each_direction() -> None:
+def test_a_joint_without_limits_gets_limits_of_two_turns_in_each_direction() -> None:
     endless = GOOD.replace("revolute", "continuous").replace('lower="-1" upper="1" ', "")
     joint = parse_urdf(endless, "arm.urdf").find("joint")
     assert joint is not None
@@ -89,7 +89,7 @@ def test_a_joint_without_limits_gets_two_turns_in_each_direction() -> None:
         ("package://lbr/urdf/iiwa7.urdf", "AMENT_PREFIX_PATH"),
     ],
 )
-def test_a_missing_model_is_named_with_the_existing_ones(model: str, complaint: str) -> None:
+def test_the_error_about_an_unusable_name_of_a_model_says_which_names_are_allowed(model: str, complaint: str) -> None:
     with pytest.raises(ConfigError, match=complaint):
         load_description(model)
 

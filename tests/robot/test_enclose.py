@@ -49,7 +49,7 @@ def _clouds() -> dict[str, Array]:
 
 
 @pytest.mark.parametrize("cloud", _clouds().values(), ids=_clouds())
-def test_every_vertex_is_inside_its_capsule(cloud: Array) -> None:
+def test_every_vertex_of_a_mesh_is_inside_the_capsule_around_the_mesh(cloud: Array) -> None:
     points = cloud @ pin.rpy.rpyToMatrix(0.3, -1.1, 2.0).T
     radius, start, end = enclosing_capsule(points)
     assert np.isfinite([radius, *start, *end]).all()
@@ -93,7 +93,9 @@ def _one(shape: coal.CollisionGeometry, parent_joint: int) -> pin.GeometryModel:
     ],
     ids=["post", "round table top", "tin", "box"],
 )  # fmt: skip
-def test_a_primitive_lies_inside_its_replacement(shape: coal.CollisionGeometry, parent_joint: int) -> None:
+def test_a_primitive_shape_lies_inside_the_capsule_or_box_that_replaces_it(
+    shape: coal.CollisionGeometry, parent_joint: int
+) -> None:
     geometry = _one(shape, parent_joint)
     before = geometry.geometryObjects[0].copy()
     enclose_shapes(geometry)
@@ -188,7 +190,7 @@ def test_the_capsules_of_a_link_together_contain_its_mesh(link: str, count: int)
     assert beyond.max() <= 0.0
 
 
-def test_three_capsules_around_a_forearm_are_clearly_smaller_than_one() -> None:
+def test_three_capsules_around_a_forearm_have_a_clearly_smaller_volume_than_one_capsule() -> None:
     volumes = []
     for counts in ({}, {"forearm_link": 3}):
         geometry = _geometry("example-robot-data:ur5")
@@ -231,7 +233,7 @@ def test_impossible_numbers_of_capsules_are_refused(capsules: dict[str, int], sa
         Robot.from_config(parse_config(text, "cell.yaml"))
 
 
-def test_a_round_mesh_needs_memory_only_for_its_points() -> None:
+def test_the_capsule_of_a_round_mesh_is_found_without_an_array_of_all_pairs_of_points() -> None:
     points = np.random.default_rng(0).normal(size=(3000, 3))
     points /= np.linalg.norm(points, axis=1, keepdims=True)  # All points are corners.
     tracemalloc.start()

@@ -37,7 +37,7 @@ def robot_with(shape: str, kind: str = "prismatic", second: str = "") -> Robot:
         <origin xyz="0 0.03 0" rpy="0 0 1"/><axis xyz="0 1 0"/><limit lower="-0.01" upper="0.04" {LIMITS}/></joint>
         {second}</robot>""",
         {"left": "tool"},
-        unchecked_links=["tool"],  # No pair is monitored.
+        unchecked_links=["tool"],  # This permits an arm without a monitored pair.
     )
 
 
@@ -61,7 +61,7 @@ def finger_at(position: float) -> pin.SE3:
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_the_body_contains_the_finger_at_every_opening(shape: str) -> None:
+def test_the_body_of_a_finger_contains_the_finger_at_every_opening(shape: str) -> None:
     (body,) = bodies(robot_with(shape), "finger")
     points = {
         "sphere": 0.01 * np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, -1]]),
@@ -77,7 +77,7 @@ def test_the_body_contains_the_finger_at_every_opening(shape: str) -> None:
         assert 2 * body.geometry.halfLength == pytest.approx(0.05 if shape == "sphere" else 0.07)
 
 
-def test_the_body_of_a_turning_finger_covers_its_sweep_and_that_on_a_planar_joint_is_not_changed() -> None:
+def test_a_turning_finger_gets_a_body_for_all_its_positions_and_a_finger_on_a_planar_joint_keeps_its_shape() -> None:
     (ball,) = bodies(robot_with("sphere", kind="planar"), "finger")
     assert isinstance(ball.geometry, coal.Sphere)
     (body,) = bodies(robot_with("cylinder across", kind="revolute"), "finger")
@@ -88,7 +88,7 @@ def test_the_body_of_a_turning_finger_covers_its_sweep_and_that_on_a_planar_join
 
 
 @pytest.mark.parametrize(("away", "count"), [(0.0, 1), (0.001, 2)], ids=["on its line", "beside it"])
-def test_a_second_finger_on_the_same_line_shares_the_body_of_the_first(away: float, count: int) -> None:
+def test_two_fingers_have_a_common_body_only_if_they_slide_on_the_same_line(away: float, count: int) -> None:
     second = f"""<link name="other"><collision>{SHAPES["sphere"]}</collision></link>
         <joint name="slide_2" type="prismatic"><parent link="tool"/><child link="other"/><origin xyz="{away} 0.03 0"
         rpy="0 0 1"/><axis xyz="0 -1 0"/><limit lower="0.02" upper="0.06" {LIMITS}/></joint>"""
@@ -101,7 +101,7 @@ def test_a_second_finger_on_the_same_line_shares_the_body_of_the_first(away: flo
             assert beyond(finger_at(position).translation, found[0]) == pytest.approx(-0.01, abs=1e-9)
 
 
-def test_the_slide_of_a_lift_that_carries_the_arm_is_not_a_finger() -> None:
+def test_the_column_of_a_lift_that_carries_the_arm_is_not_treated_as_a_finger() -> None:
     lift = f"""<robot name="r"><link name="base"/><link name="tool"/>
         <link name="column"><collision><geometry><sphere radius="0.05"/></geometry></collision></link>
         <joint name="lift" type="prismatic"><parent link="base"/><child link="column"/><axis xyz="0 0 1"/>

@@ -1,4 +1,4 @@
-"""A finger's body at a known opening contains the finger tightly, and is never larger for fewer openings."""
+"""A finger's body for known openings contains the finger tightly, and is never larger for a narrower interval."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ LIMITS = 'velocity="1" effort="10"'
 
 
 def hand(mimic: str = "", axis: str = "0 -1 0", stroke: tuple[float, float] = (0.03, 0.0)) -> str:
-    """Return a hand whose fingers are spheres on two lines. The second one may mimic the first."""
+    """Return a hand whose fingers are spheres on two lines. The second finger may mimic the first."""
     ball = '<collision><geometry><sphere radius="0.008"/></geometry></collision>'
     limit = f'<limit lower="{min(stroke) - 0.002}" upper="{max(stroke) + 0.002}" {LIMITS}/>'
     return f"""<robot name="hand"><link name="palm"/><link name="one">{ball}</link><link name="two">{ball}</link>
@@ -54,7 +54,7 @@ def outside(point: Array, ends: tuple[Array, Array]) -> float:
 
 
 def finger_at(robot: Robot, joint: str, position: float, points: Array) -> Array:
-    """Return points of a finger's link in the frame of the arm's last joint; its joint is at ``position``."""
+    """Return points of a finger's link in the frame of the arm's last joint. The finger's joint is at ``position``."""
     full = pin.buildModelFromXML(robot.urdf)
     q = pin.neutral(full)
     q[full.joints[full.getJointId(joint)].idx_q] = position
@@ -94,7 +94,7 @@ def test_fingers_on_two_lines_have_separate_bodies(positions: tuple[float, float
             assert np.linalg.norm(ends[1] - ends[0]) == pytest.approx(0.03 * np.ptp(interval) + beyond, abs=1e-9)
 
 
-def test_a_finger_that_mimics_another_finger_is_where_the_mimic_puts_it(tmp_path: object) -> None:
+def test_the_body_of_a_finger_that_mimics_another_finger_is_where_the_mimic_puts_the_finger(tmp_path: object) -> None:
     mimic = '<mimic joint="slide" multiplier="-0.5" offset="0.001"/>'
     robot = cell(hand(mimic, axis="0 1 0"), ("slide",), str(tmp_path), (0.03, 0.0))
     ends = ends_at(robot, "left_two_0", (0.2, 0.6))
@@ -104,7 +104,7 @@ def test_a_finger_that_mimics_another_finger_is_where_the_mimic_puts_it(tmp_path
     assert np.linalg.norm(ends[1] - ends[0]) == pytest.approx(0.5 * 0.03 * 0.4, abs=1e-9)
 
 
-def test_the_body_of_more_openings_contains_that_of_fewer() -> None:
+def test_the_body_for_a_wider_interval_of_openings_contains_the_body_for_an_interval_within_it() -> None:
     robot, random = Robot.from_config(HAND_E), np.random.default_rng(0)
     for body in robot.finger_bodies:
         assert isinstance(body, FingerBody)
@@ -115,7 +115,7 @@ def test_the_body_of_more_openings_contains_that_of_fewer() -> None:
         assert body.part(ALL_OF_THE_WAY) == (0.0, 1.0)
 
 
-def test_without_known_closed_and_open_positions_bodies_cover_all_positions_of_fingers() -> None:
+def test_if_closed_and_open_positions_are_unknown_bodies_cover_all_positions_of_fingers() -> None:
     made = Robot.from_config(HAND_E)
     plain = Robot.from_urdf(made.urdf, {arm.name: arm.tool_frame for arm in made.arms.values()})
     assert plain.finger_bodies == ()

@@ -42,7 +42,7 @@ def watched(robot: Robot) -> set[frozenset[str]]:
     ids=["a model", "sizes", "sizes without mass"],
 )
 @pytest.mark.parametrize("tool", [HAND, {}], ids=["with a hand", "bare"])
-def test_the_tool_is_moved_outwards_by_the_thickness_and_the_arm_carries_the_mass(
+def test_a_flange_moves_the_tool_outwards_by_its_thickness_and_adds_its_mass_to_the_arm(
     flange: dict[str, Any], thickness: float, mass: float, tool: dict[str, Any]
 ) -> None:
     plain, moved = (Robot.from_config(one_arm(tool=tool, flange=given)) for given in ({}, flange))
@@ -65,8 +65,8 @@ def test_the_body_of_each_flange_is_monitored_against_everything_that_its_arm_ca
     assert not {pair for pair in new if pair & {"right_media_flange"} and pair & {"right_link_5", "right_link_2"}}
 
 
-def test_the_sphere_of_the_touch_flange_encloses_its_outline_which_link_7_does_not() -> None:
-    """The outline is that of the published mesh, from the end of the plain flanges: radius at height z [m]."""
+def test_the_sphere_of_the_touch_flange_encloses_the_flange_but_the_capsule_of_link_7_would_not() -> None:
+    """The outline of the published mesh is given as radius by height z. The end of a plain flange is at z = 0 [m]."""
     outline = {-0.045: 0.055, -0.026: 0.0582, 0.0: 0.0553, 0.026: 0.0329}
     urdf = load_description("media_flange_touch_pneumatic").urdf
     sphere, centre = urdf.find("link/collision/geometry/sphere"), urdf.find("link/collision/origin")
@@ -78,7 +78,7 @@ def test_the_sphere_of_the_touch_flange_encloses_its_outline_which_link_7_does_n
     assert link_7 == pytest.approx(0.019, abs=5e-4)
 
 
-def test_known_pairs_of_tool_and_arm_are_not_used_with_an_unknown_flange_between_them() -> None:
+def test_the_known_pairs_of_a_tool_on_an_arm_are_not_used_if_an_unknown_flange_is_between_them() -> None:
     far = '"left_link_4" link2="left_hand_e_envelope"'
     assert far in compose(one_arm(tool=HAND)).srdf
     assert far in compose(one_arm(tool=HAND, flange=TOUCH)).srdf
@@ -87,7 +87,7 @@ def test_known_pairs_of_tool_and_arm_are_not_used_with_an_unknown_flange_between
     assert "media_flange" not in compose(elsewhere).srdf
 
 
-def test_a_users_flange_is_a_urdf_whose_last_link_or_frame_carries_the_tool(tmp_path: Path) -> None:
+def test_a_users_flange_can_be_a_urdf_whose_named_link_carries_the_tool(tmp_path: Path) -> None:
     """The flange is a coupler with a sensor beside it.
 
     It has two ends, and the cell names the one that carries the tool.

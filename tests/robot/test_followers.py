@@ -1,4 +1,4 @@
-"""Joints that mimic others: their positions, their limits on the driver, and equality in all models of a robot."""
+"""Joints that mimic a driver have the right positions in all models of a robot, and limit how far the driver moves."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def followers(*joints: str, driven: tuple[str, ...] = ()) -> dict[str, Follower]
 CHAIN = (joint("c", "b -2 0.1"), joint("b", "a 0.5 0.2"), joint("a"))
 
 
-def test_a_follower_of_a_follower_follows_the_first_driver_in_any_order_of_the_file() -> None:
+def test_a_joint_that_mimics_a_follower_follows_the_first_driver_for_any_order_of_joints_in_the_file() -> None:
     found = followers(*CHAIN)
     assert found["b"] == Follower("a", 0.5, 0.2)
     assert (found["c"].driver, found["c"].multiplier) == ("a", -1.0)
@@ -113,7 +113,7 @@ ROTOR = '<joint name="b" type="continuous"><parent link="base"/><child link="b_l
 
 
 @pytest.mark.parametrize("multiplier", [100.0, -2.0])
-def test_a_continuous_follower_leaves_its_driver_the_whole_range(multiplier: float) -> None:
+def test_a_continuous_follower_does_not_limit_the_range_of_its_driver(multiplier: float) -> None:
     follower = ROTOR.format(f'<mimic joint="a" multiplier="{multiplier}"/>')
     text = ET.tostring(parse_urdf(model(joint("a", limit="-2.9 2.9"), follower), "arm.urdf"))
     for root in (ET.fromstring(text), parse_urdf(text, "written again")):
@@ -171,7 +171,7 @@ def test_a_simulated_fingertip_starts_where_its_chain_of_mimics_puts_it(cell: Co
     assert found == pytest.approx({"finger": 0.5, "middle": -0.5, "tip": -0.15}, abs=1e-6)
 
 
-def test_a_bar_that_follows_an_arm_s_joint_is_refused_unless_it_is_named(
+def test_a_bar_that_follows_a_joint_of_an_arm_is_refused_unless_unchecked_links_names_the_bar(
     tmp_path_factory: pytest.TempPathFactory,
 ) -> None:
     urdf = model(*ARM, joint("bar", "j2 -1 0", "-2 2", parent="j2_link"))

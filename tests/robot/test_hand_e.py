@@ -12,7 +12,7 @@ import pytest
 from q2r2_control.robot.description import load_description
 from q2r2_control.types import Array
 
-FLANGE_TO_TIPS = 0.1565
+FLANGE_TO_TIPS = 0.1565  # Distance from the flange to the finger tips [m].
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +40,7 @@ def _outside(point: Array, capsule: pin.GeometryObject, placement: pin.SE3) -> f
 
 @pytest.mark.slow
 @pytest.mark.parametrize("opening", [0.0, 0.005, 0.0125, 0.02, 0.025])
-def test_envelopes_contain_body_and_fingers_at_every_opening(
+def test_the_envelopes_of_the_hand_e_contain_its_body_and_its_fingers_at_every_opening(
     hand: tuple[pin.Model, pin.GeometryModel], opening: float
 ) -> None:
     model, geometry = hand
@@ -57,7 +57,9 @@ def test_envelopes_contain_body_and_fingers_at_every_opening(
             assert outside <= 0, (item.name, placement.act(point))
 
 
-def test_the_tool_frame_lies_between_the_pads_just_behind_the_tips(hand: tuple[pin.Model, pin.GeometryModel]) -> None:
+def test_the_tool_frame_lies_between_the_finger_pads_13_mm_behind_the_tips(
+    hand: tuple[pin.Model, pin.GeometryModel],
+) -> None:
     model, _ = hand
     np.testing.assert_allclose([model.lowerPositionLimit, model.upperPositionLimit], [[0.0] * 2, [0.025] * 2])
     place = model.frames[model.getFrameId("tool_frame")].placement

@@ -1,4 +1,4 @@
-"""Home postures that no file names."""
+"""If no file names a home posture, a search finds one."""
 
 from __future__ import annotations
 

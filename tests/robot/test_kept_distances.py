@@ -1,4 +1,4 @@
-"""The distance that each pair keeps: by the class of its bodies, by their names, or else min_distance."""
+"""Each pair keeps the distance for its names, otherwise that for the class of its bodies, otherwise min_distance."""
 
 from __future__ import annotations
 
@@ -99,14 +99,14 @@ def test_a_named_pair_keeps_its_own_distance_instead_of_that_of_its_class(dual_i
         (["left_LINK_5", "table"], "no monitored body is called 'left_LINK_5'"),
     ],
 )
-def test_names_that_no_pair_has_are_refused_in_one_line(dual_iiwa: Robot, pair: list[str], says: str) -> None:
+def test_names_that_no_pair_has_raise_an_error_of_one_line(dual_iiwa: Robot, pair: list[str], says: str) -> None:
     settings = ControllerSettings.model_validate({"pairs": [{"pair": pair, "distance": 0.01}]})
     with pytest.raises(ConfigError, match=rf"^control\.pairs\[0\]\.pair = .*: {says}") as caught:
         kept_distances(dual_iiwa, settings)
     assert len(str(caught.value).splitlines()) == 1
 
 
-def test_the_largest_distance_is_found_in_any_setting() -> None:
+def test_the_property_largest_distance_names_the_setting_with_the_greatest_distance() -> None:
     for settings, key in (
         ({}, "min_distance"),
         ({"distances": {"arm_self": 0.03}}, "distances.arm_self"),

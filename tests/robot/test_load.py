@@ -1,4 +1,4 @@
-"""The load of an arm, identified from torques at rest."""
+"""The load of an arm is identified from torques at rest."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def measured(robot: Robot, count: int, spread: float) -> tuple[Array, Array]:
     return postures, np.array(missing)
 
 
-def test_the_additional_load_of_an_arm_is_found_in_the_flanges_frame(robot: Robot) -> None:
+def test_an_additional_load_of_an_arm_is_identified_in_the_frame_of_the_flange(robot: Robot) -> None:
     right, left = (identify_load(robot, arm, *measured(robot, 8, 0.4), MODEL) for arm in ("right", "left"))
     masses = np.array([right.expected_kg, ADDED])
     centre = masses @ np.array([right.expected_centre_mm, 1e3 * AT]) / masses.sum()

@@ -11,7 +11,7 @@ from q2r2_control.robot.pinocchio_models import lock_joints, resting_position
 
 
 @pytest.mark.parametrize("model", ["iiwa7", "example-robot-data:tiago_dual", "example-robot-data:talos"])
-def test_a_locked_joint_is_where_pinocchio_has_it_at_that_position(model: str) -> None:
+def test_with_locked_joints_every_link_is_where_pinocchio_puts_it_at_the_same_positions(model: str) -> None:
     urdf = load_description(model).urdf
     whole = pin.buildModelFromXML(ET.tostring(urdf, encoding="unicode"))
     random = np.random.default_rng(0)
@@ -35,6 +35,8 @@ def test_a_locked_joint_is_where_pinocchio_has_it_at_that_position(model: str) -
 
 
 @pytest.mark.parametrize(("lower", "upper", "rest"), [(-1, 1, 0.0), (0.5, 1, 0.5), (-2, -1, -1.0)])
-def test_a_joint_rests_as_near_zero_as_its_limits_allow(lower: float, upper: float, rest: float) -> None:
+def test_the_resting_position_of_a_joint_is_as_near_to_zero_as_its_limits_allow(
+    lower: float, upper: float, rest: float
+) -> None:
     joint = ET.fromstring(f'<joint name="j" type="revolute"><limit lower="{lower}" upper="{upper}"/></joint>')
     assert resting_position(joint) == rest

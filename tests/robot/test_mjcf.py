@@ -108,7 +108,7 @@ def _geom_centre(model: mujoco.MjModel, data: mujoco.MjData, g: int) -> np.ndarr
     return data.geom_xpos[g] + data.geom_xmat[g].reshape(3, 3) @ corners.mean(axis=0)
 
 
-def test_limits_come_from_the_file_and_velocity_limits_from_the_caller(arm: Path) -> None:
+def test_the_limits_of_joints_come_from_the_file_but_their_velocity_limits_come_from_the_caller(arm: Path) -> None:
     urdf, _, _ = read(arm)
 
     def written(joint: str, element: str) -> dict[str, str]:
@@ -123,7 +123,7 @@ def test_limits_come_from_the_file_and_velocity_limits_from_the_caller(arm: Path
     assert written("turn", "rotor") == {"inertia": "0.2", "gear": "1"}
 
 
-def test_a_capsule_stays_a_capsule_and_drawings_count_only_without_collision_shapes(arm: Path) -> None:
+def test_a_capsule_stays_a_capsule_and_a_drawing_is_a_collision_shape_only_if_a_body_has_no_other(arm: Path) -> None:
     urdf, _, geometry = read(arm)
     shapes = {item.name.rpartition("_")[0]: item.geometry for item in geometry.geometryObjects}
     assert isinstance(shapes["shoulder"], coal.Capsule)
@@ -134,10 +134,10 @@ def test_a_capsule_stays_a_capsule_and_drawings_count_only_without_collision_sha
     text = ARM.replace('<geom type="plane"', '<geom name="table" type="plane"').replace("</mujoco>", contact)
     arm.write_text(text.replace('type="mesh" mesh="wedge" contype', 'name="drawn" type="mesh" mesh="wedge" contype', 1))
     assert read(arm)[0].findall("link[@name='shoulder']/visual") == [], "a pair names it"
-    assert 2.0 * shapes["slide"].halfSide == pytest.approx([0.06, 0.1, 0.14])  # The box is that around the ellipsoid.
+    assert 2.0 * shapes["slide"].halfSide == pytest.approx([0.06, 0.1, 0.14])  # This is the box around the ellipsoid.
 
 
-def test_arms_at_an_angle_to_the_world_and_two_arms_in_one_file_get_a_root(arm: Path) -> None:
+def test_a_file_with_two_arms_gets_a_root_link_at_the_origin_of_the_world(arm: Path) -> None:
     text = re.sub(r'<body name="base"', '<body name="other" pos="0 1 0"><joint/><geom size="0.1"/></body>\\g<0>', ARM)
     arm.write_text(text)
     urdf, model, _ = read(arm)

@@ -1,4 +1,4 @@
-"""The displacement between two sets of points."""
+"""The displacement that moves one set of points onto another set is found."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def test_the_true_displacement_is_found(count: int) -> None:
     assert_allclose(off, 0.0, atol=1e-12)
 
 
-def test_a_point_that_was_touched_elsewhere_has_the_largest_error() -> None:
+def test_a_point_that_was_touched_at_a_wrong_position_has_the_largest_error() -> None:
     touched = np.array([TRUE.actInv(point) for point in POINTS])
     touched[2] += (0.0, 0.01, 0.0)
     _, off = fit_move(POINTS, touched)
@@ -30,7 +30,7 @@ def test_a_point_that_was_touched_elsewhere_has_the_largest_error() -> None:
     assert 0.002 < off.max() < 0.01
 
 
-def test_a_mirror_image_is_not_a_displacement() -> None:
+def test_the_displacement_onto_a_mirror_image_contains_no_reflection_and_has_a_large_error() -> None:
     move, off = fit_move(POINTS, POINTS * (1.0, -1.0, 1.0))
     assert np.linalg.det(move.rotation) == pytest.approx(1.0)
     assert off.max() > 0.05

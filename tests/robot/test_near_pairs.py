@@ -1,4 +1,4 @@
-"""Pairs that are too near at home are named with a cure, when a robot is made and when a cell is checked."""
+"""Pairs that are too near at home are named with a change that helps, both for a new robot and for a checked cell."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def made(
     return robot, [record.getMessage() for record in caplog.records]
 
 
-def test_own_links_that_block_an_arm_are_named_with_lines_that_release_it(
+def test_two_links_that_block_their_own_arm_are_named_with_lines_that_let_the_arm_move(
     ur5: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     robot, (said,) = made(ur5, caplog)
@@ -53,7 +53,9 @@ def test_own_links_that_block_an_arm_are_named_with_lines_that_release_it(
     assert errors[1] < 1e-3 < errors[0]
 
 
-def test_the_warning_is_python_code_that_removes_the_warning(ur5: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_the_warning_contains_python_code_that_prevents_the_warning(
+    ur5: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     robot, (said,) = made(ur5, caplog)
     srdf, settings = said.partition("to change: ")[2].split(", or ")
     assert preflight_faults(robot, ControllerSettings(), None) != ()
@@ -70,7 +72,7 @@ def test_the_warning_is_python_code_that_removes_the_warning(ur5: Path, caplog: 
         ("tiago_dual", {"left": "hand_left_grasping_frame", "right": "hand_right_grasping_frame"}),
     ],
 )
-def test_both_cures_are_named_and_needed_if_pairs_are_too_near_at_home_and_other_links_hardly_part(
+def test_if_pairs_are_too_near_at_home_and_other_links_hardly_part_two_needed_changes_are_named(
     model: str, tools: dict[str, str], caplog: pytest.LogCaptureFixture
 ) -> None:
     file = load_description(f"example-robot-data:{model}").file
@@ -94,7 +96,9 @@ def test_an_srdf_that_names_the_pair_prevents_the_warning(ur5: Path, caplog: pyt
     assert made(ur5, caplog, srdf=f'<robot name="ur5">{both}</robot>')[1] == []
 
 
-def test_a_pair_that_other_postures_bring_apart_needs_another_home(ur5: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_the_warning_about_a_pair_that_other_postures_bring_apart_proposes_another_home(
+    ur5: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     bent = {"elbow_joint": 2.9, "shoulder_lift_joint": -1.2}
     robot, (said,) = made(ur5, caplog, home=bent)
     assert robot.home[1:3].tolist() == [-1.2, 2.9]
@@ -103,7 +107,9 @@ def test_a_pair_that_other_postures_bring_apart_needs_another_home(ur5: Path, ca
     assert "base_link and forearm_link overlap, and are not watched, though they can part" in said
 
 
-def test_a_refused_start_names_the_lines_for_the_cell(ur5: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_the_refusal_of_a_start_contains_the_lines_that_the_cell_needs(
+    ur5: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     robot, _ = made(ur5, caplog)
     (fault,) = preflight_faults(robot, ControllerSettings(), None)
     assert fault == (

@@ -1,4 +1,4 @@
-"""Models that end in .xacro, expanded by the real xacro."""
+"""Models whose file names end in .xacro are expanded by the real xacro."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def package(tmp_path: Path) -> Path:
     return package
 
 
-def test_a_cell_names_arguments_and_packages_and_gets_the_expanded_arm(package: Path, tmp_path: Path) -> None:
+def test_a_cell_that_names_xacro_arguments_and_packages_gets_the_expanded_arm(package: Path, tmp_path: Path) -> None:
     (tmp_path / "cell.yaml").write_text(
         "name: cell\npackages: {my_arm: checkout/description_of_my_arm}\narms:\n  left:\n"
         f"    model: {MODEL}\n    xacro_args: {{robot_name: med7, with_tip: true}}\n    home: [0, 0]\n"
@@ -63,7 +63,7 @@ def test_a_cell_names_arguments_and_packages_and_gets_the_expanded_arm(package: 
     assert 'xyz="0 0 0.30000000000000004"' in cell.urdf
 
 
-def test_arguments_have_the_defaults_of_the_file_and_an_srdf_beside_it_belongs_to_it(package: Path) -> None:
+def test_xacro_arguments_have_the_defaults_of_the_file_and_an_srdf_in_the_same_folder_is_loaded(package: Path) -> None:
     description = load_description(MODEL, None, {"my_arm": str(package)})
     assert description.name == "arm"
     assert description.urdf.find("link[@name='tip']") is None
@@ -81,7 +81,9 @@ def test_arguments_have_the_defaults_of_the_file_and_an_srdf_beside_it_belongs_t
         ("hinge.xacro", 'lower="-1"', 'lower="${reach}m"', "<limit> has lower = '0.30000000000000004m'"),
     ],
 )
-def test_an_error_of_xacro_raises_an_error_of_one_line(package: Path, file: str, old: str, new: str, says: str) -> None:
+def test_a_model_that_xacro_cannot_expand_raises_an_error_of_one_line(
+    package: Path, file: str, old: str, new: str, says: str
+) -> None:
     broken = package / "urdf" / file
     broken.write_text(broken.read_text().replace(old, new, 1))
     with pytest.raises(Q2R2Error) as error:
@@ -91,12 +93,14 @@ def test_an_error_of_xacro_raises_an_error_of_one_line(package: Path, file: str,
     assert "\n" not in str(error.value)
 
 
-def test_arguments_of_a_model_without_xacro_are_refused() -> None:
+def test_xacro_arguments_for_a_model_that_is_not_a_xacro_file_are_refused() -> None:
     with pytest.raises(ConfigError, match=r"iiwa7: xacro_args are for models that end in \.xacro"):
         load_description("iiwa7", {"robot_name": "lbr"})
 
 
-def test_without_xacro_one_line_says_what_to_install(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_if_xacro_is_not_installed_the_error_says_what_to_install(
+    package: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(sys.modules, "xacro", None)
     with pytest.raises(ConfigError, match=re.escape(f"{install_line('xacro')}, or expand it to .urdf")):
         load_description(MODEL, None, {"my_arm": str(package)})

@@ -1,4 +1,4 @@
-"""The monitored pairs of the shipped cell and of a cell of two pandas."""
+"""Which pairs of the shipped cells are monitored, and which links are monitored against a floor."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def _links(robot: Robot) -> set[frozenset[str]]:
     return {frozenset(map(link_of, names)) for names in pair_names(robot.collision_model)}
 
 
-def test_every_moving_link_except_a_bare_hand_is_monitored_against_the_other_arm_and_the_table(
+def test_every_moving_link_and_envelope_of_a_hand_is_monitored_against_the_other_arm_and_the_table(
     dual_iiwa: Robot,
 ) -> None:
     watched = _links(dual_iiwa)
@@ -40,7 +40,7 @@ def test_every_moving_link_except_a_bare_hand_is_monitored_against_the_other_arm
 
 
 @pytest.mark.parametrize("side", ["left", "right"])
-def test_exactly_the_own_links_that_can_meet_are_monitored(dual_iiwa: Robot, side: str) -> None:
+def test_within_an_arm_exactly_the_pairs_of_links_that_can_meet_are_monitored(dual_iiwa: Robot, side: str) -> None:
     hand = "hand_e_envelope"
     near = [
         ("link_0", "link_2"), ("link_0", "link_3"), ("link_0", "link_4"), ("link_0", "link_5"), ("link_0", "link_6"),
@@ -55,8 +55,8 @@ def test_exactly_the_own_links_that_can_meet_are_monitored(dual_iiwa: Robot, sid
 
 
 @pytest.mark.parametrize("side", ["left", "right"])
-def test_the_floor_is_watched_against_the_links_that_can_come_near_it(dual_iiwa: Robot, side: str) -> None:
-    """Link 1 turns only about the vertical, and link 2 is too short."""
+def test_the_floor_is_monitored_against_exactly_the_links_that_can_come_near_it(dual_iiwa: Robot, side: str) -> None:
+    """Two links cannot come near it: link 1 turns only about the vertical, and link 2 is too short."""
     reach_it = {f"{side}_link_{index}" for index in range(3, 8)} | {f"{side}_hand_e_envelope", f"{side}_{FINGERS}"}
     with_floor = {link for pair in _links(dual_iiwa) if "floor" in pair for link in pair if link.startswith(side)}
     assert with_floor == reach_it
@@ -67,7 +67,9 @@ def test_the_floor_is_watched_against_the_links_that_can_come_near_it(dual_iiwa:
     [((0.0, 0.0, 0.7), 0.0), ((0.0, 0.5, 0.0), -0.3), ((0.0, 0.5, 0.0), 0.1), ((3.1416, 0.0, 0.0), -0.3)],
     ids=["upright", "tilted", "tilted, a floor that is high", "hung"],
 )
-def test_links_without_a_monitored_pair_with_the_floor_stay_away_from_it(rpy: tuple[float, ...], height: float) -> None:
+def test_links_without_a_monitored_pair_with_the_floor_never_move_near_the_floor(
+    rpy: tuple[float, ...], height: float
+) -> None:
     mount = {"position": (0.0, 0.0, 0.0), "rpy": rpy}
     robot = Robot.from_config(one_arm(mount=mount).model_copy(update={"floor": height}))
     geometry = robot.collision_model.copy()
@@ -87,7 +89,7 @@ def test_links_without_a_monitored_pair_with_the_floor_stay_away_from_it(rpy: tu
     assert ((lowest > CLEARANCE) | (highest - lowest < 1e-5)).all()
 
 
-def test_a_link_named_floor_that_is_not_a_level_surface_is_an_ordinary_link() -> None:
+def test_a_link_named_floor_that_is_not_a_level_surface_is_treated_like_any_other_link() -> None:
     urdf = compose(one_arm().model_copy(update={"floor": None})).urdf.replace("left_link_5", "floor")
     robot = Robot.from_urdf(urdf, arms={"left": "left_link_ee"})
     assert frozenset(("left_link_1", "floor")) in _links(robot)
@@ -105,7 +107,9 @@ def _disabled(text: str) -> set[tuple[str, ...]]:
 @pytest.mark.parametrize("arm", ["iiwa7", "iiwa14"])
 @pytest.mark.parametrize("flange", [None, pytest.param(TOUCH, marks=pytest.mark.slow)])
 def test_every_shipped_srdf_lists_the_pairs_that_the_program_finds(arm: str, flange: str | None) -> None:
-    gripper = load_config(f"config/dual_{arm}.yaml").arms["left"].gripper.model_dump()  # The fingers are one body.
+    gripper = (
+        load_config(f"config/dual_{arm}.yaml").arms["left"].gripper.model_dump()
+    )  # The gripper makes both fingers one body.
     made = model_srdfs(one_arm(model=arm, flange={"model": flange}, tool=HAND, gripper=gripper), SAMPLES)
     on = f"{TOUCH}_on_{arm}" if flange else arm
     assert made.keys() == {f"{arm}.srdf", "hand_e.srdf", f"{on}.srdf", f"hand_e_on_{on}.srdf"}

@@ -57,7 +57,7 @@ def test_a_clearance_that_is_not_above_the_kept_distance_is_refused(tmp_path: Pa
         ("<robot>", "cannot be read"),
     ],
 )
-def test_a_cells_srdf_that_does_not_fit_it_is_refused(tmp_path: Path, text: str, fault: str) -> None:
+def test_an_srdf_that_does_not_fit_its_cell_is_refused(tmp_path: Path, text: str, fault: str) -> None:
     file = tmp_path / "cell.srdf"
     file.write_text(text)
     with pytest.raises(ConfigError, match=fault):

@@ -26,7 +26,7 @@ def _urdf(links: int = 3, limit: str = 'lower="-1" upper="1" velocity="1" effort
     ) + "</robot>"  # fmt: skip
 
 
-def test_arrays_follow_the_order_of_the_joint_names(dual_iiwa7: Robot) -> None:
+def test_the_arrays_of_a_robot_have_the_order_of_its_joint_names(dual_iiwa7: Robot) -> None:
     robot = dual_iiwa7
     assert robot.joint_names == tuple(f"{side}_A{number}" for side in ("left", "right") for number in range(1, 8))
     assert robot.model.nq == robot.model.nv == 14
@@ -38,7 +38,7 @@ def test_arrays_follow_the_order_of_the_joint_names(dual_iiwa7: Robot) -> None:
     assert (robot.home < robot.position_upper).all()
 
 
-def test_fingers_are_locked_open(dual_iiwa7: Robot) -> None:
+def test_the_joints_of_fingers_are_locked_at_their_open_positions(dual_iiwa7: Robot) -> None:
     assert not [name for name in dual_iiwa7.joint_names if "finger" in name]
     finger = dual_iiwa7.model.frames[dual_iiwa7.model.getFrameId("left_hand_e_finger_1", pin.FrameType.BODY)]
     tool = dual_iiwa7.model.frames[dual_iiwa7.arms["left"].frame_id]
@@ -46,7 +46,7 @@ def test_fingers_are_locked_open(dual_iiwa7: Robot) -> None:
 
 
 @pytest.mark.parametrize(("side", "sign"), [("left", 1), ("right", -1)])
-def test_at_home_the_tools_point_down_mirrored_and_far_from_other_bodies(
+def test_at_home_the_tools_point_down_at_mirrored_positions_and_no_monitored_pair_is_close(
     dual_iiwa: Robot, side: str, sign: int
 ) -> None:
     pose = dual_iiwa.tool_pose(dual_iiwa.home, side)
@@ -55,7 +55,9 @@ def test_at_home_the_tools_point_down_mirrored_and_far_from_other_bodies(
     assert min(pair.distance for pair in dual_iiwa.distances(dual_iiwa.home)) > 0.04
 
 
-def test_distances_name_the_pairs_in_their_order_and_turn_negative_in_penetration(dual_iiwa7: Robot) -> None:
+def test_the_method_distances_has_the_order_of_the_models_pairs_and_negative_values_in_penetration(
+    dual_iiwa7: Robot,
+) -> None:
     pairs = dual_iiwa7.distances(dual_iiwa7.home)
     assert tuple((pair.name_a, pair.name_b) for pair in pairs) == pair_names(dual_iiwa7.collision_model)
     into_the_table = np.where(np.arange(14) % 7 == 1, 2.0, 0.0)
@@ -64,7 +66,9 @@ def test_distances_name_the_pairs_in_their_order_and_turn_negative_in_penetratio
     assert "table_0" in (worst.name_a, worst.name_b)
 
 
-def test_the_urdf_of_a_robot_loads_to_an_equal_robot(dual_iiwa7: Robot, dual_iiwa7_cell: ComposedCell) -> None:
+def test_a_robot_that_is_loaded_from_the_urdf_of_another_robot_is_equal_to_that_robot(
+    dual_iiwa7: Robot, dual_iiwa7_cell: ComposedCell
+) -> None:
     again = Robot.from_urdf(dual_iiwa7.urdf, TOOLS, srdf=dual_iiwa7_cell.srdf)
     assert again.name == "dual_iiwa7"
     assert again.joint_names == dual_iiwa7.joint_names
@@ -76,13 +80,13 @@ def test_the_urdf_of_a_robot_loads_to_an_equal_robot(dual_iiwa7: Robot, dual_iiw
     )
 
 
-def test_a_file_instead_of_a_urdf_tree_is_refused_with_the_right_constructors(dual_iiwa7: Robot) -> None:
+def test_calling_robot_with_a_file_name_raises_an_error_that_names_the_right_constructors(dual_iiwa7: Robot) -> None:
     with pytest.raises(RobotError, match=re.escape("Robot('arm.urdf', ...): allowed: Robot.from_config(config), Rob")):
         Robot("arm.urdf")  # type: ignore[call-arg, arg-type]
     assert copy(dual_iiwa7).joint_names == dual_iiwa7.joint_names
 
 
-def test_one_of_two_arms_may_be_left_out(dual_iiwa7_cell: ComposedCell) -> None:
+def test_a_robot_can_have_only_one_of_the_two_arms_in_its_urdf(dual_iiwa7_cell: ComposedCell) -> None:
     robot = Robot.from_urdf(dual_iiwa7_cell.urdf, {"left": "left_tool_frame"}, srdf=dual_iiwa7_cell.srdf)
     assert robot.joint_names == tuple(f"left_A{number}" for number in range(1, 8))
     watched = {frozenset(map(link_of, names)) for names in pair_names(robot.collision_model)}
@@ -97,7 +101,7 @@ def test_without_an_srdf_neighbours_and_pairs_that_touch_at_home_are_not_monitor
     assert fat.ignored_pairs == (("l1_0", "l3_0"), ("l2_0", "l4_0"))
 
 
-def test_without_an_srdf_an_arm_inside_the_other_one_or_an_obstacle_at_home_is_still_monitored() -> None:
+def test_without_an_srdf_arms_are_monitored_even_if_they_overlap_each_other_or_an_obstacle_at_home() -> None:
     arms = _urdf(3).replace("</robot>", "").replace('"l', '"a_l').replace('"j', '"a_j') + _urdf(3).replace(
         '<robot name="chain">', ""
     ).replace("</robot>", "")
@@ -111,7 +115,7 @@ def test_without_an_srdf_an_arm_inside_the_other_one_or_an_obstacle_at_home_is_s
     assert {frozenset(("l3_0", "a_l3_0")), frozenset(("l3_0", "post_0")), frozenset(("l1_0", "post_0"))} <= watched
 
 
-def test_with_an_srdf_only_pairs_that_overlap_everywhere_are_not_monitored() -> None:
+def test_with_an_srdf_only_pairs_that_overlap_in_every_posture_are_not_monitored() -> None:
     """Links 1 and 3 are at most 0.6 m apart, and less at home, where the chain is bent."""
     bent = _urdf(3).replace('xyz="0 0 0.3"', 'xyz="0 0 0.3" rpy="0 1 0"')
     touching_at_home, touching_always = bent.replace("0.1", "0.28"), bent.replace("0.1", "0.301")
@@ -138,7 +142,7 @@ def test_with_an_srdf_only_pairs_that_overlap_everywhere_are_not_monitored() -> 
         pytest.param("arm.urdf", "neither XML nor a file", id="a file that is not there"),
     ],
 )  # fmt: skip
-def test_a_robot_that_cannot_be_controlled_is_refused_in_one_line(urdf: str, complaint: str) -> None:
+def test_a_robot_that_cannot_be_controlled_raises_an_error_of_one_line(urdf: str, complaint: str) -> None:
     with pytest.raises(RobotError) as error:
         Robot.from_urdf(urdf, {"left": "l3"})
     assert complaint in str(error.value)
@@ -158,7 +162,7 @@ def test_arms_that_the_urdf_does_not_have_are_refused(arms: dict[str, str], comp
         Robot.from_urdf(_urdf(), arms)
 
 
-def test_a_robot_whose_only_link_without_shapes_is_named_monitors_no_pair() -> None:
+def test_a_robot_without_shapes_monitors_no_pair_if_unchecked_links_names_its_link() -> None:
     robot = Robot.from_urdf(BARE, {"left": "rod"}, unchecked_links=["rod"])
     assert robot.distances(robot.home) == []
     assert robot.ignored_pairs == ()

@@ -62,7 +62,7 @@ TIAGO: dict[str, Any] = {
 def _tiago_pairs() -> str:
     """Return an SRDF with pairs that the maker does not list.
 
-    The forearm's capsule reaches into the palm's capsule, and the torso's capsule into the shoulder's.
+    The capsules of forearm and palm overlap, and so do those of torso and shoulder.
     """
     hand = ("safety_box", "palm_link", "index_link", "mrl_link", "thumb_link")
     pairs = [(f"arm_{side}_5_link", f"hand_{side}_{part}") for side in ("left", "right") for part in hand]
@@ -73,7 +73,7 @@ def _tiago_pairs() -> str:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a user's folder with both cells."""
+    """Return a folder with the files of both cells."""
     folder = tmp_path_factory.mktemp("cells")
     for cell in (BAXTER, TIAGO):
         (folder / f"{cell['name']}.yaml").write_text(yaml.safe_dump(cell))
@@ -91,7 +91,7 @@ def tiago(folder: Path) -> Robot:
     return Robot.from_config(load_config(folder / "tiago.yaml"))
 
 
-def test_the_arms_are_monitored_against_each_other_and_the_torso_that_carries_them(baxter: Robot) -> None:
+def test_the_arms_are_monitored_against_each_other_and_against_the_torso_that_carries_them(baxter: Robot) -> None:
     watched = {frozenset(map(link_of, names)) for names in pair_names(baxter.collision_model)}
     for pair in (
         ("left_gripper_base_link", "right_gripper_base_link"),
@@ -117,7 +117,9 @@ def test_a_robot_without_an_srdf_monitors_every_pair_that_some_posture_brings_ap
 
 
 @pytest.mark.parametrize("name", ["baxter", "tiago"])
-def test_dynamics_are_those_of_the_whole_model_with_locked_joints(name: str, request: pytest.FixtureRequest) -> None:
+def test_the_dynamics_of_a_robot_equal_those_of_the_whole_model_with_locked_joints(
+    name: str, request: pytest.FixtureRequest
+) -> None:
     robot: Robot = request.getfixturevalue(name)
     cell = BAXTER if name == "baxter" else TIAGO
     urdf = ET.tostring(load_description(cell["robot"]["model"]).urdf, encoding="unicode")
@@ -165,7 +167,7 @@ def test_a_joint_that_moves_both_tools_may_be_named_by_only_one_arm() -> None:
 
 
 @pytest.mark.parametrize("name", ["baxter", "tiago"])
-def test_a_user_can_check_and_run_the_cell(name: str, folder: Path) -> None:
+def test_the_commands_check_and_run_accept_a_cell_whose_arms_are_parts_of_one_robot(name: str, folder: Path) -> None:
     file = str(folder / f"{name}.yaml")
     checked = CliRunner().invoke(app, ["check", file, "--json"])
     assert checked.exit_code == 0, checked.output
@@ -179,7 +181,7 @@ def test_a_user_can_check_and_run_the_cell(name: str, folder: Path) -> None:
     assert all(arm["position_error_mm_rms"] < 20.0 for arm in summary["arms"].values())
 
 
-def test_each_arm_can_carry_a_tool_with_its_own_names() -> None:
+def test_both_arms_can_carry_the_same_tool_whose_names_get_the_prefix_of_their_side() -> None:
     cell = copy.deepcopy(BAXTER)
     fingers = {"joints": ["finger_joint_1", "finger_joint_2"], "open_position": 0.025}
     for arm in cell["arms"].values():
@@ -220,7 +222,9 @@ def _changed(path: str, value: object) -> Config:
         ("obstacles", {"torso": {"shape": "sphere", "size": [0.1]}}, "obstacles.torso: the cell has a link of this"),
     ],
 )
-def test_a_bad_part_raises_an_error_of_one_line_that_says_what_is_allowed(path: str, value: object, says: str) -> None:
+def test_an_invalid_value_in_a_cell_raises_an_error_of_one_line_that_says_what_is_allowed(
+    path: str, value: object, says: str
+) -> None:
     with pytest.raises(ConfigError) as error:
         Robot.from_config(_changed(path, value))
     assert says in str(error.value)

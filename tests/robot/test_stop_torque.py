@@ -1,4 +1,4 @@
-"""The torque of a commanded stop, against inverse dynamics with every combination of signs."""
+"""The torque of a commanded stop agrees with inverse dynamics for every combination of signs."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def robot() -> Robot:
     return Robot.from_config(one_arm(tool={"model": "hand_e"}))
 
 
-def test_the_torque_is_the_largest_over_all_signs_of_the_decelerations(robot: Robot) -> None:
+def test_the_reported_torque_is_the_largest_one_over_all_signs_of_the_decelerations(robot: Robot) -> None:
     (stop,) = stop_torques(robot, UNEQUAL, postures=1, seed=1)
     data, q, rest = robot.model.createData(), np.array(stop.stop.posture), np.zeros(7)
     signs = np.array(list(product((-1.0, 1.0), repeat=7)))
@@ -37,7 +37,7 @@ def test_the_torque_is_the_largest_over_all_signs_of_the_decelerations(robot: Ro
     assert (stop.gravity.ratio, stop.gravity.posture) == (pytest.approx(at_rest.max()), stop.stop.posture)
 
 
-def test_share_over_is_zero_exactly_for_bearable_decelerations(robot: Robot) -> None:
+def test_the_figure_share_over_is_zero_exactly_for_bearable_decelerations(robot: Robot) -> None:
     (stop,) = stop_torques(robot, FAST, postures=1000)
     assert 0.05 < stop.stop.share_over < 0.15
     assert 0.0 < stop.bearable < 1.0
@@ -45,7 +45,7 @@ def test_share_over_is_zero_exactly_for_bearable_decelerations(robot: Robot) -> 
     assert stop_torques(robot, 1.001 * stop.bearable * FAST, postures=1000)[0].stop.share_over == 0.001
 
 
-def test_too_much_gravity_for_a_joint_is_distinguished_from_a_stop(robot: Robot) -> None:
+def test_the_torque_that_gravity_needs_is_reported_separately_from_the_torque_of_a_stop(robot: Robot) -> None:
     weak = Robot.from_config(one_arm(tool={"model": "hand_e"}))
     weak.torque_limit[3] = 5.0
     (stop,) = stop_torques(weak, FAST, postures=1000)

@@ -93,7 +93,7 @@ def test_the_controller_and_coal_use_the_same_bodies(hand: Hand) -> None:
             assert kernels.size[number] == pytest.approx(item.geometry.halfLength + item.geometry.radius, abs=1e-12)
 
 
-def test_no_interval_reaches_farther_from_a_joint_than_the_bounds_of_the_kernels(hand: Hand) -> None:
+def test_no_capsule_for_any_interval_of_openings_extends_beyond_the_bounds_of_the_kernels(hand: Hand) -> None:
     robot, _, bodies = hand
     model, random = collision_model_of(robot), np.random.default_rng(1)
     names = [item.name for item in robot.collision_model.geometryObjects]
@@ -108,7 +108,7 @@ def test_no_interval_reaches_farther_from_a_joint_than_the_bounds_of_the_kernels
             assert max(np.linalg.norm(start), np.linalg.norm(end)) <= min(reach) + 1e-12
 
 
-# Strategies for any chain of turning and sliding joints with one or two drivers.
+# Hypothesis strategies for any chain of turning and sliding joints with one or two drivers.
 _NUMBERS = st.floats(-0.1, 0.1)
 _VECTORS = st.tuples(_NUMBERS, _NUMBERS, _NUMBERS)
 _AXES = st.sampled_from([(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.6, 0.8), (-0.48, 0.6, 0.64)])
@@ -119,7 +119,7 @@ def joints(draw: st.DrawFn) -> FingerJoint:
     slides = draw(st.booleans())
     size = 0.05 if slides else 1.6
     closed, opened, home = (size * draw(st.floats(-1.0, 1.0)) for _ in range(3))
-    # The travel beyond the stroke is the same share of the stroke for all joints of one driver.
+    # The travel beyond the stroke is the same fraction of the stroke for all joints of one driver.
     beyond = 0.1 * (opened - closed)
     axis, point = np.array(draw(_AXES)), np.array(draw(_VECTORS))
     driver = draw(st.sampled_from("ab"))
@@ -129,7 +129,7 @@ def joints(draw: st.DrawFn) -> FingerJoint:
 def moved(chain: Sequence[FingerJoint], ends: Array, at: dict[str, float], travel: bool = False) -> Array:
     """Return the ends (2, 3) of a shape [m].
 
-    ``at`` has the opening of each driver, from 0 to 1, or with ``travel`` the share of the driver's whole travel.
+    ``at`` has the opening of each driver, from 0 to 1, or with ``travel`` the fraction of the driver's whole travel.
     """
     for joint in reversed(chain):
         first, last = (joint.before, joint.beyond) if travel else (joint.closed, joint.open)
@@ -144,7 +144,7 @@ def moved(chain: Sequence[FingerJoint], ends: Array, at: dict[str, float], trave
 @pytest.mark.slow
 @given(st.lists(joints(), min_size=1, max_size=4), _VECTORS, _VECTORS, st.tuples(st.floats(0, 1), st.floats(0, 1)))
 @settings(max_examples=50, deadline=None)
-def test_any_chain_of_fingers_is_inside_its_body(
+def test_a_finger_at_the_end_of_any_chain_of_joints_is_inside_its_body(
     chain: list[FingerJoint], first: Array, second: Array, between: tuple[float, float]
 ) -> None:
     body = TurningBody("left", "finger_0", np.array([first, second]), 0.01, tuple(chain))
@@ -158,7 +158,7 @@ def test_any_chain_of_fingers_is_inside_its_body(
         assert max(np.linalg.norm(capsule[0]), np.linalg.norm(capsule[1])) <= body.extent + 1e-12
 
 
-def test_positions_between_few_samples_are_inside_the_body_too() -> None:
+def test_a_body_contains_the_positions_between_samples_even_if_there_are_few_samples() -> None:
     """Each driver turns by 6 rad, with as few samples as possible, because three drivers share them."""
     chain = [
         FingerJoint(False, np.array([0.0, 0.0, 1.0]), np.zeros(3), 0.0, -turn, turn, -turn, turn, driver)
@@ -171,7 +171,7 @@ def test_positions_between_few_samples_are_inside_the_body_too() -> None:
         assert outside(moved(chain, body.ends, at), capsule, body.radius) <= 0.0
 
 
-def test_a_capsule_is_inside_another_one_if_both_of_its_ends_are() -> None:
+def test_a_capsule_is_inside_another_one_if_the_balls_at_both_of_its_ends_are() -> None:
     outer = Capsules(np.zeros((1, 3)), np.array([[0.0, 0.0, 0.1]]), np.array([0.02]))
     inside = Capsules(np.array([[0.005, 0.0, 0.0]]), np.array([[0.0, 0.004, 0.1]]), np.array([0.014]))
     assert not sticks_out(inside, outer).any()
@@ -180,7 +180,7 @@ def test_a_capsule_is_inside_another_one_if_both_of_its_ends_are() -> None:
     assert sticks_out(inside._replace(radius=np.array([0.016])), outer).all()
 
 
-def test_several_bodies_at_once_equal_each_one_alone_within_the_sampling_error(hand: Hand) -> None:
+def test_bodies_that_are_computed_together_equal_single_bodies_within_the_sampling_error(hand: Hand) -> None:
     _, _, bodies = hand
     together = TurningSweeps(list(bodies.values())).capsules((0.1, 0.4))
     for row, body in enumerate(bodies.values()):
@@ -190,7 +190,7 @@ def test_several_bodies_at_once_equal_each_one_alone_within_the_sampling_error(h
         assert together.radius[row] == pytest.approx(radius, abs=1e-4)
 
 
-def test_no_second_derivative_by_two_joints_exceeds_its_bound() -> None:
+def test_no_second_derivative_of_a_position_by_two_joints_exceeds_its_bound() -> None:
     """Differences are computed for chains of rotations and slides that one driver moves, anywhere on their travel."""
     random, h = np.random.default_rng(2), 1e-3
     nearest = np.zeros((3, 3))

@@ -1,4 +1,4 @@
-"""Continuous joints whose angle is reported within one turn: their positions go on. Other joints do not change."""
+"""If the angle of a continuous joint is reported within one turn, turns are counted. Other reports do not change."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ PERIOD = 0.01  # [s]
 
 @pytest.fixture
 def robot() -> Any:
-    """Return a robot of three joints. The middle one has limits, and the others are continuous."""
+    """Return a robot of three joints. The middle joint has limits, and the other joints are continuous."""
     return SimpleNamespace(endless=np.array([True, False, True]), velocity_limit=np.array([2.0, 2.0, 4.0]))
 
 
@@ -26,7 +26,7 @@ def wrapped(angle: Array) -> Array:
     return np.remainder(angle + np.pi, 2.0 * np.pi) - np.pi
 
 
-def test_positions_go_on_when_reports_wrap_around_at_half_a_turn(robot: Any) -> None:
+def test_counted_positions_continue_when_reported_angles_wrap_around_at_half_a_turn(robot: Any) -> None:
     counter, t = TurnCounter(robot), np.arange(0.0, 12.0, PERIOD)
     real = np.stack([1.9 * t - 1.0, np.sin(t), -1.7 * t], axis=1)
     reported = real.copy()
@@ -48,7 +48,7 @@ def test_the_position_of_a_joint_with_limits_is_never_changed(robot: Any) -> Non
     assert counter.counted(np.array([0.0, -3.1, 0.0]), PERIOD)[1] == -3.1
 
 
-def test_after_a_gap_in_which_a_joint_may_have_made_half_a_turn_the_report_is_used_as_it_is(robot: Any) -> None:
+def test_after_a_pause_in_which_a_joint_may_have_made_half_a_turn_its_report_is_used_unchanged(robot: Any) -> None:
     counter = TurnCounter(robot)
     counter.counted(np.array([3.1, 0.0, 3.1]), 0.0)
     found = counter.counted(np.array([-3.1, 0.0, -3.1]), 0.8)
@@ -56,7 +56,7 @@ def test_after_a_gap_in_which_a_joint_may_have_made_half_a_turn_the_report_is_us
     assert found[0] == pytest.approx(2.0 * np.pi - 3.1), "at 2 rad/s it takes longer"
 
 
-def test_a_gap_of_one_joint_does_not_affect_the_others(robot: Any) -> None:
+def test_a_pause_in_the_reports_of_one_joint_does_not_affect_other_joints(robot: Any) -> None:
     counter = TurnCounter(robot)
     counter.counted(np.array([3.1, 0.0, 3.1]), np.zeros(3))
     for now in np.arange(PERIOD, 2.0, PERIOD):
@@ -67,7 +67,7 @@ def test_a_gap_of_one_joint_does_not_affect_the_others(robot: Any) -> None:
 
 
 @pytest.mark.parametrize(("reported", "held"), [(-3.1, -3.08), (-3.1, 3.12), (3.12, -3.1)])
-def test_a_held_posture_is_as_near_to_the_measured_one_as_its_angle_allows(
+def test_the_held_angle_is_given_in_the_turn_that_is_nearest_to_the_measured_angle(
     robot: Any, reported: float, held: float
 ) -> None:
     counter, zero = TurnCounter(robot), np.zeros(3)
@@ -81,13 +81,13 @@ def test_a_held_posture_is_as_near_to_the_measured_one_as_its_angle_allows(
     assert state.held[0] == held, "the plant's own array is not written to"
 
 
-def test_a_report_that_is_not_finite_is_passed_on_and_forgets_nothing(robot: Any) -> None:
+def test_a_report_that_is_not_finite_is_passed_on_and_does_not_change_the_count_of_turns(robot: Any) -> None:
     counter = TurnCounter(robot)
     counter.counted(np.array([3.1, 0.0, 0.0]), 0.0)
     assert np.isnan(counter.counted(np.array([np.nan, 0.0, 0.0]), PERIOD)[0])
     assert counter.counted(np.array([-3.1, 0.0, 0.0]), 2 * PERIOD)[0] == pytest.approx(2.0 * np.pi - 3.1)
 
 
-def test_a_robot_knows_its_endless_joints() -> None:
+def test_a_robot_says_which_of_its_joints_are_continuous() -> None:
     jaco = Robot.from_config(load_config("config/dual_kinova.yaml"))
     assert jaco.endless[:6].tolist() == [True, False, False, True, False, True]

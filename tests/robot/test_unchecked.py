@@ -1,4 +1,4 @@
-"""Links of an arm that keep no distance: they are refused by name, unless ``unchecked_links`` names them."""
+"""Links of an arm that would keep no distance are refused by name, unless ``unchecked_links`` names them."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def weighs(mass: float) -> str:
 
 
 def chain(*contents: str) -> str:
-    """Return a chain of links l1, l2 and so on, with these contents, on a base l0.
+    """Return a chain of links l1, l2 and so on, with the given contents, on a base l0.
 
     The links are 0.3 m apart, and turn on each other. The last link is fixed to the link before it.
     """
@@ -58,7 +58,9 @@ def arm(third: str = BALL, last: str = BALL) -> str:
         pytest.param(arm(DRAWN), "l3: is drawn and has no collision shape", id="drawn, of a mass that is not said"),
     ],
 )
-def test_a_body_without_a_shape_is_refused_unless_it_is_named(urdf: str, fault: str) -> None:
+def test_a_heavy_or_drawn_link_without_a_shape_is_refused_unless_unchecked_links_names_the_link(
+    urdf: str, fault: str
+) -> None:
     with pytest.raises(RobotError, match=re.escape(fault)) as error:
         Robot.from_urdf(urdf, {"left": "l5"})
     link = fault[:2]
@@ -69,11 +71,11 @@ def test_a_body_without_a_shape_is_refused_unless_it_is_named(urdf: str, fault: 
 @pytest.mark.parametrize(
     "frame", ["", weighs(0.01), weighs(0.0001) + DRAWN], ids=["neither", "10 g", "drawn, and said to be light"]
 )
-def test_a_frame_needs_no_shape(frame: str) -> None:
+def test_a_link_that_is_only_a_frame_needs_no_collision_shape(frame: str) -> None:
     assert Robot.from_urdf(arm(last=frame), {"left": "l5"}).unchecked_links == ()
 
 
-def test_all_links_without_a_shape_are_named_at_once() -> None:
+def test_one_error_names_all_links_without_a_collision_shape() -> None:
     with pytest.raises(RobotError, match=r"l3: weighs 1 kg.*; l5: weighs 2 kg"):
         Robot.from_urdf(arm(weighs(1.0), weighs(2.0)), {"left": "l5"})
 
@@ -83,14 +85,14 @@ def test_a_link_that_no_arm_moves_needs_no_shape() -> None:
     assert Robot.from_urdf(base, {"left": "l5"}).unchecked_links == ()
 
 
-def test_an_arm_without_monitored_pairs_is_refused_unless_its_tool_is_named() -> None:
+def test_an_arm_without_monitored_pairs_is_refused_unless_unchecked_links_names_its_tool() -> None:
     neighbours = chain(BALL, BALL, "")
     with pytest.raises(RobotError, match=r"left arm: no pair of its shapes is monitored.* or unchecked_links=\['l3'\]"):
         Robot.from_urdf(neighbours, {"left": "l3"})
     assert Robot.from_urdf(neighbours, {"left": "l3"}, unchecked_links=("l3",)).collision_model.ngeoms == 2
 
 
-def test_the_shapes_of_another_arm_do_not_make_an_arm_checked() -> None:
+def test_an_arm_without_shapes_is_refused_even_if_another_arm_has_shapes() -> None:
     other = (
         arm().replace('<robot name="chain">', "").replace("</robot>", "").replace('"l', '"a_l').replace('"j', '"a_j')
     )
@@ -110,7 +112,7 @@ def test_the_shapes_of_another_arm_do_not_make_an_arm_checked() -> None:
         ("l3", "unchecked_links = 'l3': allowed: names of links"),
     ],
 )
-def test_names_of_missing_links_are_refused(given: object, complaint: str) -> None:
+def test_names_of_missing_links_in_unchecked_links_are_refused(given: object, complaint: str) -> None:
     with pytest.raises(RobotError, match=re.escape(complaint)):
         Robot.from_urdf(arm(), {"left": "l5"}, unchecked_links=given)  # type: ignore[arg-type]
 
@@ -122,7 +124,7 @@ def z1(**keys: object) -> Config:
     return Config.model_validate(made.model_dump() | keys)
 
 
-def test_a_cell_names_links_or_encloses_their_drawings() -> None:
+def test_a_cell_can_name_links_without_shapes_or_enclose_their_drawings() -> None:
     assert [fault.partition(":")[0] for fault in unchecked_faults(Robot.from_config(z1()))] == [
         "left_link01",
         "left_link05",
@@ -140,7 +142,7 @@ def test_a_cell_names_links_or_encloses_their_drawings() -> None:
     assert "left_link01" not in watched
 
 
-def test_programs_that_move_arms_refuse_unchecked_links_with_the_lines_of_check() -> None:
+def test_programs_that_move_arms_refuse_links_without_shapes_with_the_faults_that_check_names() -> None:
     lines = "; ".join(unchecked_faults(Robot.from_config(z1())))
     with pytest.raises(RobotError, match=re.escape(f"{z1().name}: {lines}")):
         Pipeline.from_config(z1(), input="scripted", plant="kinematic")

@@ -1,4 +1,4 @@
-"""Forms of a URDF that programs read in different ways are unified, refused, or reported."""
+"""Forms of a URDF that programs interpret differently are unified, refused, or reported."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def arm(**parts: str) -> ET.Element:
     return parse_urdf(ARM.format(**(USUAL | parts)), "arm.urdf")
 
 
-def test_an_origin_by_quaternion_equals_that_by_roll_pitch_and_yaw() -> None:
+def test_an_origin_given_by_a_quaternion_equals_the_same_origin_given_by_roll_pitch_and_yaw() -> None:
     turned = pin.Quaternion(pin.rpy.rpyToMatrix(0.3, -0.7, 2.0)).coeffs()
     joint = arm(origin=f'quat_xyzw="{" ".join(map(str, turned))}"').find("joint")
     assert joint is not None
@@ -56,7 +56,9 @@ INERTIA = "<inertia ixx='1' iyy='1' izz='1' ixy='0' ixz='0' iyz='0'/>"
 
 
 @pytest.mark.parametrize(("has", "lacks"), [("<mass value='1'/>", "inertia"), (INERTIA, "mass")])
-def test_mass_without_inertia_or_inertia_without_mass_is_refused_with_the_link(has: str, lacks: str) -> None:
+def test_an_inertial_with_only_a_mass_or_only_an_inertia_is_refused_with_the_name_of_its_link(
+    has: str, lacks: str
+) -> None:
     with pytest.raises(RobotError, match=f"the <inertial> of link hand has no <{lacks}>; allowed: both"):
         arm(link=f"<inertial>{has}</inertial>")
 
@@ -117,11 +119,13 @@ def test_a_drawing_in_millimetres_that_becomes_a_shape_is_scaled_to_metres(tmp_p
     [(b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n", "git lfs pull"), (b"\0" * 84, "hand.stl")],
     ids=["pointer of Git LFS", "no triangles"],
 )
-def test_a_mesh_that_cannot_be_read_is_named(tmp_path: Path, content: bytes, said: str) -> None:
+def test_the_error_about_a_mesh_that_cannot_be_read_names_the_file_or_what_to_do(
+    tmp_path: Path, content: bytes, said: str
+) -> None:
     with pytest.raises(RobotError, match=said):
         read_models(with_mesh(tmp_path, "hand.stl", content), "arm.urdf")
 
 
-def test_a_mesh_of_one_triangle_is_a_body(tmp_path: Path) -> None:
+def test_a_mesh_of_one_triangle_is_accepted_as_a_shape(tmp_path: Path) -> None:
     _, geometry = read_models(with_mesh(tmp_path, "hand.stl", TRIANGLE), "arm.urdf")
     assert isinstance(geometry.geometryObjects[0].geometry, coal.BVHModelBase)

@@ -30,7 +30,7 @@ def rod(limit: str) -> str:
         pytest.param('drake:acceleration="7.25"', 7.25, id="as Drake writes it"),
     ],
 )
-def test_the_limit_of_a_joint_is_the_least_one_in_its_model(limit: str, expected: float) -> None:
+def test_the_acceleration_limit_of_a_joint_is_the_least_one_in_its_model(limit: str, expected: float) -> None:
     robot = Robot.from_urdf(rod(limit), {"left": "rod"}, unchecked_links=["rod"])
     assert robot.acceleration_limit.tolist() == [expected]
     assert robot.capped_acceleration(5.0).tolist() == [min(expected, 5.0)]
@@ -49,20 +49,20 @@ def test_the_limit_of_a_joint_is_the_least_one_in_its_model(limit: str, expected
         ('drake:acceleration="inf"', "acceleration = 'inf'; allowed: 1 finite number(s)"),
     ],
 )
-def test_an_invalid_limit_is_refused_in_one_line(limit: str, complaint: str) -> None:
+def test_an_invalid_acceleration_limit_raises_an_error_of_one_line(limit: str, complaint: str) -> None:
     with pytest.raises(RobotError) as error:
         Robot.from_urdf(rod(limit), {"left": "rod"}, unchecked_links=["rod"])
     assert complaint in str(error.value)
     assert "\n" not in str(error.value)
 
 
-def test_the_cell_s_file_replaces_the_limits_of_the_joints_that_it_names() -> None:
+def test_the_file_of_a_cell_replaces_the_acceleration_limits_of_the_joints_that_it_names() -> None:
     robot = Robot.from_config(one_arm(acceleration_limit={"A2": 4.0, "A4": 12.0}))
     assert robot.acceleration_limit.tolist() == [8.65, 4.0, 5.69, 12.0, 11.78, 13.76, 13.17]
 
 
 @pytest.mark.parametrize("name", ["A8", "left_A2", "flange", "finger_joint_1"])
-def test_a_joint_that_does_not_belong_to_the_arm_is_named_with_those_that_do(name: str) -> None:
+def test_the_error_about_a_joint_that_does_not_belong_to_the_arm_lists_the_joints_that_do(name: str) -> None:
     cell = one_arm(tool={"model": "hand_e"}, acceleration_limit={name: 4.0})
     with pytest.raises(ConfigError) as error:
         Robot.from_config(cell)

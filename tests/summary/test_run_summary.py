@@ -1,4 +1,4 @@
-"""The figures of a run: their meaning, that they are numbers, and that they are right."""
+"""The figures of a run are right, can be written as JSON, and have keys that do not change."""
 
 from __future__ import annotations
 
@@ -68,7 +68,9 @@ def test_the_largest_slip_of_an_engagement_is_reported(statistics: RunStatistics
     assert figures["left"].slip_deg_max == pytest.approx(60.0)
 
 
-def test_the_time_for_which_a_gripper_was_held_is_reported_with_the_last_pair(statistics: RunStatistics) -> None:
+def test_the_time_for_which_a_gripper_was_held_is_reported_with_the_last_pair_that_held_it(
+    statistics: RunStatistics,
+) -> None:
     for held in ({"left": ("left_finger", "table")}, {"left": ("left_finger", "right_link_5")}, {}):
         add(statistics, held_grippers=held, dt=0.25)
     figures = statistics.summary(1.0).arms
@@ -76,7 +78,7 @@ def test_the_time_for_which_a_gripper_was_held_is_reported_with_the_last_pair(st
     assert (figures["right"].gripper_held_s, figures["right"].gripper_held_by) == (0.0, None)
 
 
-def test_the_json_of_a_run_has_every_key_that_others_read() -> None:
+def test_the_json_of_a_run_has_every_key_that_other_programs_read() -> None:
     loop = Pipeline.from_config(cell(), input=ScriptedInput("circle"), plant="kinematic")
     data = json.loads(json.dumps(loop.run(1.0, realtime=False).as_json(), allow_nan=False))
     assert " ".join(data) == KEYS
@@ -107,7 +109,7 @@ def test_a_run_without_ticks_gives_valid_json(statistics: RunStatistics) -> None
     json.dumps(summary.as_json(), allow_nan=False)
 
 
-def test_errors_are_root_mean_squares_over_the_engaged_ticks(statistics: RunStatistics) -> None:
+def test_the_errors_in_a_summary_are_root_mean_squares_over_the_engaged_ticks(statistics: RunStatistics) -> None:
     for metres, radians in ((3e-3, 0.01), (4e-3, 0.02)):
         add(statistics, error=pin.SE3(pin.exp3(np.array([0.0, radians, 0.0])), np.array([0.0, 0.0, metres])))
     add(statistics)
@@ -123,7 +125,7 @@ def test_changes_of_a_gripper_are_counted_but_not_its_first_opening(statistics: 
     assert statistics.summary(1.0).arms["right"].gripper_changes == 2
 
 
-def test_ratios_and_margin_are_the_worst_of_all_ticks_relative_to_the_limits_in_force() -> None:
+def test_the_summary_has_the_worst_ratios_and_margin_of_all_ticks_relative_to_the_limits_in_force() -> None:
     control = cell().control.model_copy(update={"velocity_scale": 0.5, "acceleration_limit": 4.0})
     statistics = RunStatistics(cell_robot(), control)
     add(statistics, v=-0.25 * statistics.robot.velocity_limit, a=np.full(14, -3.0))
@@ -136,14 +138,14 @@ def test_ratios_and_margin_are_the_worst_of_all_ticks_relative_to_the_limits_in_
     assert summary.min_position_margin_rad == pytest.approx(0.02)
 
 
-def test_an_acceleration_counts_against_the_limit_of_its_joint(statistics: RunStatistics) -> None:
+def test_an_acceleration_is_compared_with_the_limit_of_its_own_joint(statistics: RunStatistics) -> None:
     a = np.zeros(14)
     a[[0, 8]] = 3.0, -2.72  # The joints are A1 of the left arm and A2 of the right one, whose limit is lower.
     add(statistics, a=a)
     assert statistics.summary(1.0).max_acceleration_ratio == pytest.approx(2.72 / 5.44)
 
 
-def test_counts_and_the_closest_pair_come_from_the_reports(statistics: RunStatistics) -> None:
+def test_the_summary_takes_its_counts_and_the_closest_pair_from_the_reports_of_ticks(statistics: RunStatistics) -> None:
     add(statistics)
     add(statistics, report=replace(REPORT, closest_distance=0.03, closest_pair=("tool", "table"), fallback=True))
     add(statistics, report=replace(REPORT, certified=False, rejected=("left", "right")))
@@ -160,7 +162,7 @@ def test_the_summary_says_whether_the_run_ended_at_rest(statistics: RunStatistic
     assert statistics.summary(1.0).at_rest is at_rest
 
 
-def test_a_broken_button_cannot_fill_the_memory(statistics: RunStatistics) -> None:
+def test_only_the_newest_events_are_kept_so_a_broken_button_cannot_fill_the_memory(statistics: RunStatistics) -> None:
     statistics.events.extend(
         Event(float(i), "left", "a", "b", Reason(CommonReason.OTHER)) for i in range(EVENTS_KEPT + 10)
     )
@@ -179,7 +181,9 @@ def summary() -> TorqueSummary:
     return TorqueSummary({"left": 0.0, "right": 0.0})
 
 
-def test_extremes_are_kept_and_each_tick_counts_once_for_any_number_of_joints(summary: TorqueSummary) -> None:
+def test_the_torque_summary_keeps_extremes_and_counts_each_tick_once_for_any_number_of_joints(
+    summary: TorqueSummary,
+) -> None:
     pressed = replace(FREE, pressing=(HANDS, ELBOWS), force=30.0, closest_pair=HANDS, closest_distance=0.015)
     summary.add(0.002, replace(QUIET, saturated=("left_A1", "left_A2"), clipped=("right",)), pressed)
     summary.add(0.002, replace(QUIET, rate_limited=("left_A1",), clipped=("right",)), replace(pressed, force=20.0))
@@ -214,7 +218,7 @@ def test_percentiles_equal_those_of_numpy_to_a_thousandth_of_the_unit(size: int)
     assert found.max == pytest.approx(1e6 * values.max(), rel=1e-12)
 
 
-def test_any_number_can_be_added_and_a_number_beyond_the_range_counts_as_the_largest() -> None:
+def test_a_histogram_ignores_numbers_that_are_not_finite_and_counts_numbers_beyond_its_range_as_the_largest() -> None:
     histogram = Histogram(1e-3)
     for value in (float("nan"), float("inf"), float("-inf")):
         histogram.add(value)
@@ -225,7 +229,7 @@ def test_any_number_can_be_added_and_a_number_beyond_the_range_counts_as_the_lar
 
 
 @pytest.mark.parametrize(("off", "followed"), [(0.0, True), (0.256, False)])
-def test_an_arm_whose_tool_is_far_from_its_reference_at_the_end_did_not_follow(
+def test_an_arm_whose_tool_is_far_from_its_reference_at_the_end_counts_as_not_following(
     statistics: RunStatistics, off: float, followed: bool
 ) -> None:
     led = {arm: statistics.robot.tool_pose(statistics.robot.home, arm) for arm in SIDES}

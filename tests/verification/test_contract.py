@@ -20,7 +20,7 @@ from tests.control.test_scenarios import in_penetration
 SETTINGS = ControllerSettings()
 DT = 0.001
 JOINT = 2
-FASTEST = 5.69 * DT  # Largest change of velocity of A3 of an iiwa 7 in a tick [rad/s]. Other joints may do more.
+FASTEST = 5.69 * DT  # Largest change of velocity of A3 of an iiwa 7 in a tick [rad/s]. Other joints may change faster.
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +32,7 @@ def apart(robot: Robot) -> StepReport:
 
 
 def contract_of(robot: Robot, q: Array | None = None, v: Array | None = None, **options: Any) -> Contract:
-    """Return the contract of a controller whose stop uses every joint's limit."""
+    """Return the contract of a controller whose certified stop uses every joint's acceleration limit."""
     limit = robot.capped_acceleration(SETTINGS.acceleration_limit)
     kept = kept_distances(robot, SETTINGS).values
     controller: Any = SimpleNamespace(
@@ -54,7 +54,7 @@ def moved(q: Array, v: Array, change: float, report: StepReport) -> Reference:
     return Reference(q + 0.5 * DT * (v + after), after, one(change / DT), report)
 
 
-def test_a_broken_promise_is_raised_with_its_name_its_value_and_what_is_allowed(
+def test_a_broken_promise_raises_an_error_with_its_name_its_value_and_what_is_allowed(
     robot: Robot, apart: StepReport
 ) -> None:
     contract = contract_of(robot)
@@ -81,7 +81,7 @@ def test_a_broken_promise_is_raised_with_its_name_its_value_and_what_is_allowed(
         ("refused", {}, {"rejected": ("left", "right")}),
     ],
 )
-def test_each_promise_is_checked(
+def test_a_breach_of_each_promise_is_found(
     robot: Robot, apart: StepReport, promise: str, changes: dict[str, Any], report: dict[str, Any]
 ) -> None:
     still = Reference(robot.home, np.zeros(14), np.zeros(14), replace(apart, rejected=("left",)))
@@ -92,7 +92,9 @@ def test_each_promise_is_checked(
     assert promise in broken
 
 
-def test_a_solver_failure_without_the_certified_stop_breaks_two_promises(robot: Robot, apart: StepReport) -> None:
+def test_if_a_solver_fails_and_the_certified_stop_is_not_executed_two_promises_are_broken(
+    robot: Robot, apart: StepReport
+) -> None:
     contract = contract_of(robot)
     broken = contract.observe(moved(robot.home, np.zeros(14), FASTEST, apart), DT, failed=True)
     assert list(broken) == ["not_stopped", "unsaid"]
@@ -111,14 +113,14 @@ def test_a_joint_that_started_too_fast_must_not_become_faster_or_exceed_its_limi
     assert list(contract.observe(moved(slower.q, slower.v, FASTEST, apart), DT)) == ["velocity"]
 
 
-def test_a_joint_that_started_outside_its_limits_must_not_go_further_out(robot: Robot, apart: StepReport) -> None:
+def test_a_joint_that_started_outside_its_limits_must_not_move_farther_out(robot: Robot, apart: StepReport) -> None:
     q = robot.home.copy()
     q[JOINT] = robot.position_upper[JOINT] + 0.05
     assert list(contract_of(robot, q).observe(moved(q, np.zeros(14), 1e-6, apart), DT)) == ["outward"]
     assert not contract_of(robot, q).observe(moved(q, np.zeros(14), -1e-6, apart), DT)
 
 
-def test_a_joint_that_has_returned_into_its_limits_stays_there(robot: Robot, apart: StepReport) -> None:
+def test_a_joint_that_has_returned_into_its_limits_must_stay_there(robot: Robot, apart: StepReport) -> None:
     limit = robot.position_upper[JOINT] - SETTINGS.position_margin
     q = robot.home.copy()
     q[JOINT] = limit + 1e-5
@@ -128,19 +130,19 @@ def test_a_joint_that_has_returned_into_its_limits_stays_there(robot: Robot, apa
     assert "position" in contract.observe(moved(inside.q + one(2e-5), np.zeros(14), 0.0, apart), DT)
 
 
-def test_a_tick_without_duration_moves_nothing(robot: Robot, apart: StepReport) -> None:
+def test_a_tick_of_zero_duration_must_not_move_anything(robot: Robot, apart: StepReport) -> None:
     moves = Reference(robot.home + one(1e-12), one(0.0), one(0.0), apart)
     assert list(contract_of(robot).observe(moves, 0.0)) == ["idle"]
 
 
-def test_a_joint_that_cannot_stop_before_its_limit_is_found(robot: Robot, apart: StepReport) -> None:
+def test_the_contract_finds_a_joint_that_cannot_stop_before_its_limit(robot: Robot, apart: StepReport) -> None:
     q = robot.home.copy()
     q[JOINT] = robot.position_upper[JOINT] - SETTINGS.position_margin - 0.7 * FASTEST * DT
     contract = contract_of(robot, q, sample_all=True)
     assert "stop_position" in contract.observe(moved(q, np.zeros(14), FASTEST, apart), DT)
 
 
-def test_recovering_pairs_never_come_closer_again_and_keep_their_distance_once_apart(
+def test_pairs_that_recover_must_not_come_closer_again_and_must_keep_their_distance_once_apart(
     robot: Robot, apart: StepReport
 ) -> None:
     q, v = in_penetration(robot)
@@ -159,7 +161,7 @@ def test_recovering_pairs_never_come_closer_again_and_keep_their_distance_once_a
     assert observed(0.021) == ["uncertified"]
 
 
-def test_pairs_that_were_apart_stay_apart_while_others_recover(robot: Robot, apart: StepReport) -> None:
+def test_pairs_that_were_apart_must_stay_apart_while_other_pairs_recover(robot: Robot, apart: StepReport) -> None:
     q, v = in_penetration(robot)
     contract = contract_of(robot, q, sample_all=True)
     into_the_table = robot.home.copy()
@@ -176,7 +178,7 @@ def test_a_wrong_distance_is_found_by_coal(robot: Robot, apart: StepReport, repo
     assert list(contract.observe(moved(robot.home, np.zeros(14), 0.0, report), DT)) == ["coal"]
 
 
-def test_a_margin_keeps_the_worst_value_and_counts_nan_as_broken() -> None:
+def test_a_margin_keeps_the_worst_value_and_counts_nan_as_a_violation() -> None:
     margin = Margin("distance", "m", ">=", 0.0)
     assert all(margin.note(value, tick) for tick, value in enumerate((0.3, 0.1, 0.2), 1))
     assert (margin.worst, margin.tick, margin.violations) == (0.1, 2, 0)

@@ -1,4 +1,4 @@
-"""A hostile policy breaks no promise. The soak finds a check of actions that is missing."""
+"""A hostile policy breaks no promise. If a check of actions is missing, the soak finds a broken promise."""
 
 from __future__ import annotations
 
@@ -18,14 +18,16 @@ def test_no_hostile_action_breaks_a_promise_and_the_arms_rest_after_each_stall()
     assert min(report.counts[name] for name in ("chunks", "policy_ticks", "begins", "stops", "stalls")) > 0
 
 
-def test_a_policy_whose_last_action_is_repeated_for_ever_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_soak_finds_that_the_last_action_of_a_stalled_policy_is_repeated_for_too_long(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr("q2r2_control.teleop.policy_motion.SILENT", 10.0)
     report = PolicySoak(cell(), seed=0, streams=("walk", "stall")).run(5500)
     assert [found.promise for found in report.broken] == ["speed after a stall of the policy"]
     assert not report.passed
 
 
-def test_the_command_prints_every_promise_and_the_number_of_actions() -> None:
+def test_the_command_soak_prints_every_promise_and_the_number_of_actions() -> None:
     result = q2r2("soak", "--policy", "--ticks", "300")
     assert result.exit_code == 0
     assert "speed after a stall of the policy" in result.stdout

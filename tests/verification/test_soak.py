@@ -167,7 +167,7 @@ def test_hostile_input_with_a_solver_that_returns_garbage_never_breaks_the_contr
 
 
 class Impossible:
-    """A task that asks for joint speeds that no acceleration limit allows."""
+    """A constraint that demands joint speeds that no acceleration limit allows."""
 
     hard = True
 
@@ -176,7 +176,7 @@ class Impossible:
 
 
 class Flipping:
-    """A constraint that reverses its rows at each tick: three joints have to turn one way, and then the other way."""
+    """A constraint that reverses its rows at each tick: three joints have to turn forwards, and then backwards."""
 
     hard = True
 
@@ -240,7 +240,7 @@ def test_fingers_that_open_without_a_proof_are_found(monkeypatch: pytest.MonkeyP
     assert "distance - kept distance, at ticks" in {found.promise for found in report.broken}
 
 
-def test_equal_seeds_give_equal_runs() -> None:
+def test_two_soaks_with_equal_seeds_are_equal() -> None:
     first, second, other = (run_soak(CONFIG, 150, seed) for seed in (5, 5, 6))
     assert first.margins == second.margins
     assert first.margins != other.margins
@@ -275,7 +275,9 @@ def _report(**changes: Any) -> Callable[[Reference], Reference]:
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_a_broken_promise_is_found_at_its_tick(change: Callable[[Reference], Reference], promise: str) -> None:
+def test_a_broken_promise_is_found_in_the_tick_in_which_it_is_broken(
+    change: Callable[[Reference], Reference], promise: str
+) -> None:
     report = soak(change, first=12, ticks=100)
     assert not report.passed
     found = {violation.promise: violation for violation in report.broken}
@@ -291,7 +293,7 @@ def test_a_wrong_reported_distance_is_found_by_coal() -> None:
     assert [found.promise for found in report.broken] == ["reported distance off Coal's"]
 
 
-def test_arms_that_come_too_close_are_found_at_ticks_between_them_and_in_stops() -> None:
+def test_arms_that_come_too_close_are_found_at_ticks_between_ticks_and_during_stops() -> None:
     """The controller keeps 20 mm, but the contract is checked with 150 mm."""
     report = soak(lambda reference: reference, 0, 1000, settings=SETTINGS.model_copy(update={"min_distance": 0.15}))
     promises = {found.promise for found in report.broken}
@@ -299,7 +301,7 @@ def test_arms_that_come_too_close_are_found_at_ticks_between_them_and_in_stops()
 
 
 def test_a_stop_that_is_due_and_not_executed_is_found() -> None:
-    """The faults go to a solver that the controller does not use."""
+    """The soak makes a solver fail that the controller does not use, so the controller executes no stop."""
     elsewhere = FaultySolver(DaqpSolver(14), np.random.default_rng(0))
     controller_and_solver()[1].fault = None
     report = soak(lambda reference: reference, 0, 300, solver=elsewhere)
@@ -309,7 +311,7 @@ def test_a_stop_that_is_due_and_not_executed_is_found() -> None:
     }
 
 
-def test_leaving_penetration_the_separation_never_decreases() -> None:
+def test_while_bodies_leave_a_penetration_their_distance_never_decreases() -> None:
     """A soak found this case. The wrist is 16 mm inside the table, and its distance grows to 0.5 mm.
 
     The stop then reduced the distance by 0.3 mm.
@@ -337,7 +339,7 @@ def test_leaving_penetration_the_separation_never_decreases() -> None:
     [((100.0, 103.0, 106.0, 109.0), 9.0), ((142.0, 145.0, 147.5, 147.1), -1.2), ((100.0, None, 100.0, 100.0), None)],
     ids=["a leak", "a heap that settles", "unknown"],
 )
-def test_growing_memory_counts_and_a_heap_that_settles_does_not(
+def test_a_steady_growth_of_memory_is_reported_and_a_heap_that_settles_is_not(
     memory: tuple[float | None, ...], growth: float | None
 ) -> None:
     found = steady_growth(memory)

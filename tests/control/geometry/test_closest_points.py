@@ -51,7 +51,7 @@ def _to_segment(point: Array, start: Array, end: Array) -> float:
 
 
 def _least_distance(segments: Segments) -> float:
-    """Return the least distance of two segments, computed in another way than by the kernel.
+    """Return the least distance of two segments. The method differs from that of the kernel.
 
     The squared distance is a convex quadratic function of (s, t). On the unit square, it is least at its unconstrained
     minimum if this minimum lies inside, otherwise on a side.
@@ -66,10 +66,11 @@ def _least_distance(segments: Segments) -> float:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_distance_of_two_segments_is_that_of_their_closest_points(kind: str) -> None:
+def test_the_distance_of_two_segments_equals_the_distance_of_their_closest_points(kind: str) -> None:
     random = np.random.default_rng(1)
     on_a, on_b = np.zeros(3), np.zeros(3)
     # Segments that are parallel except for rounding are measured in the middle of the overlap, not at its nearer end.
+    # The tolerance for them is therefore greater.
     tolerance = 1e-7 if kind == "nearly parallel" else 1e-9
     for _ in range(SAMPLES):
         segments = _segments(kind, random)
@@ -101,7 +102,10 @@ def _outside(points: Array, half: Array) -> Array:
 
 
 def _nearest_along(a0: Array, a1: Array, half: Array) -> float:
-    """Return the distance of a segment from a box. It is convex along the segment, so bisection finds its minimum."""
+    """Return the distance of a segment from a box.
+
+    The distance of a point from the box is convex along the segment, so bisection finds its minimum.
+    """
     low, high = 0.0, 1.0
     for _ in range(100):
         middle = 0.5 * (low + high)
@@ -165,7 +169,7 @@ def test_the_distance_of_a_segment_and_a_box_is_right_in_special_positions(
         _assert_witnesses(answer, np.array(start), np.array(end), half)
 
 
-def test_no_direction_takes_a_segment_out_of_a_box_by_a_shorter_translation() -> None:
+def test_the_depth_of_a_segment_in_a_box_is_the_length_of_the_shortest_translation_out_of_the_box() -> None:
     directions = np.random.default_rng(8).normal(size=(400, 3))
     directions = np.vstack([directions / np.linalg.norm(directions, axis=1, keepdims=True), np.eye(3), -np.eye(3)])
     entered = across = 0
@@ -179,7 +183,7 @@ def test_no_direction_takes_a_segment_out_of_a_box_by_a_shorter_translation() ->
         np.testing.assert_allclose(answer.on_box - answer.on_a, answer.distance * answer.normal, atol=1e-9)
         assert np.abs(np.abs(answer.on_box) - half).min() < 1e-9, "the way out ends on the box"
         across += np.abs(answer.normal).max() < 1.0 - 1e-9
-        # A segment that moves by t n is outside when its nearest end has passed the farthest corner of the box.
+        # A segment that moves along a direction is outside when its rear end has passed the farthest corner of the box.
         ways = np.abs(directions) @ half - np.minimum(directions @ a0, directions @ a1)
         assert -answer.distance <= ways.min() + 1e-9
         out = answer.distance * answer.normal

@@ -24,7 +24,10 @@ def _coal_distances(robot: Robot, q: Array) -> Array:
 
 
 def _core_distance(cell: CellArrays) -> Array:
-    """Return the distance (p,) at which the cores meet [m]. The closed forms are not smooth below this distance."""
+    """Return for each pair (p,) the distance at which the cores of its bodies meet [m].
+
+    A core is a body without its radius. The closed forms are not smooth below this distance.
+    """
     return np.asarray(-cell.bodies.radius[cell.pairs.first] - cell.bodies.radius[cell.pairs.second])
 
 
@@ -44,7 +47,7 @@ def test_distances_of_all_pairs_equal_coals_distances_outside_and_in_penetration
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_cheap_bound_is_never_greater_than_the_distance(name: str) -> None:
+def test_the_cheap_lower_bound_is_never_greater_than_the_distance(name: str) -> None:
     arrays, random = cell(name), np.random.default_rng(9)
     for _ in range(20):
         q = random_posture(arrays.robot, random)
@@ -91,14 +94,14 @@ def test_rows_are_the_gradients_of_the_distances(seed: int, name: str) -> None:
 
 
 def _way_bound(arrays: CellArrays, way: Array) -> Array:
-    """Return S (p,) of stop_certificate.py [m] for joints that travel ``way`` (nv,) [rad or m]."""
+    """Return the bound S of stop_certificate.py per pair (p,) [m], if the joints travel ``way`` (nv,) [rad or m]."""
     padded = np.concatenate([[0.0], way])
     return np.asarray((arrays.pairs.reach * padded[arrays.pairs.joint]).sum(axis=1))
 
 
 @given(seed=st.integers(0, 2**32 - 1), name=st.sampled_from(NAMES), size=st.floats(1e-4, 3.0))
 @settings(derandomize=True, max_examples=150, deadline=None)
-def test_no_distance_changes_by_more_than_the_travel_of_joints_times_their_reach(
+def test_no_distance_changes_by_more_than_the_bound_computed_from_the_travel_of_its_joints(
     seed: int, name: str, size: float
 ) -> None:
     arrays, random = cell(name), np.random.default_rng(seed)
@@ -123,7 +126,7 @@ SLIDING = """<robot name="slide"><link name="base"><collision><origin xyz="0.9 0
 <limit lower="-0.3" upper="0.3" velocity="1" effort="1"/></joint></robot>"""
 
 
-def test_rows_and_reaches_are_right_for_prismatic_joints_too() -> None:
+def test_gradients_and_bounds_on_changes_of_distances_are_right_for_prismatic_joints_too() -> None:
     arrays, random = (
         arrays_of(Robot.from_urdf(SLIDING, {"left": "tip"}, unchecked_links=["carriage", "turned"])),
         np.random.default_rng(13),

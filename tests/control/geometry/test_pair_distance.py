@@ -18,7 +18,7 @@ from tests.control.cells import CellArrays, arrays_of, cell, placed, random_post
 
 ROBOT, MODEL = cell("dual_iiwa7").robot, cell("dual_iiwa7").collision
 NAMES = pair_names(ROBOT.collision_model)
-DEPTH = 0.015  # [m]
+DEPTH = 0.015  # Allowed depth of contacts between fingers and the table [m].
 TOUCHING = np.array(["finger" in a + b and "table" in a + b for a, b in NAMES])
 ROUNDED = with_rounded_boxes(MODEL, np.where(TOUCHING, DEPTH, -0.02))
 
@@ -33,7 +33,9 @@ def measured(model: CollisionModel, q: Array) -> tuple[Array, Array]:
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_only_pairs_with_a_depth_get_rounded_boxes_and_no_rounded_box_is_larger(seed: int) -> None:
+def test_only_pairs_with_an_allowed_depth_get_rounded_boxes_and_no_rounded_box_is_larger_than_its_box(
+    seed: int,
+) -> None:
     q = random_posture(ROBOT, np.random.default_rng(seed))
     (distance, _), (rounded, bound) = measured(MODEL, q), measured(ROUNDED, q)
     np.testing.assert_array_equal(rounded[~TOUCHING], distance[~TOUCHING])
@@ -51,17 +53,17 @@ def test_rounded_boxes_do_not_change_distances_above_the_face_of_a_box() -> None
     np.testing.assert_allclose(rounded[TOUCHING], distance[TOUCHING], atol=1e-12)
 
 
-def test_a_rounded_box_has_the_depth_of_its_pair_as_its_radius() -> None:
+def test_a_box_is_rounded_with_the_allowed_depth_of_its_pair_as_the_radius() -> None:
     first, second = ((model.bodies.radius[model.pairs.second])[TOUCHING] for model in (MODEL, ROUNDED))
     np.testing.assert_allclose(second - first, DEPTH)
 
 
-SMOOTHING = 1e-4  # [m^2]
-CORES_APART = 0.03  # [m]
+SMOOTHING = 1e-4  # Parameter of the smooth distance [m^2].
+CORES_APART = 0.03  # Least distance of the cores in the postures that are compared [m].
 
 
 def _looked_at(arrays: CellArrays, q: Array, p: int, smooth: bool = True) -> tuple[float, Array]:
-    """Return the distance of pair ``p`` [m], and the row (nv,) that is its gradient."""
+    """Return the smooth or the exact distance of pair ``p`` [m], and the row (nv,) that is its gradient."""
     data, row = placed(arrays, q), np.zeros(len(q))
     distance = measure_smooth(arrays.collision, data, p, SMOOTHING) if smooth else measure(arrays.collision, data, p)
     distance_row(arrays.collision, data, p, row)
@@ -74,7 +76,7 @@ def _radii(arrays: CellArrays, p: int) -> float:
 
 @pytest.fixture(scope="module")
 def seen() -> list[tuple[Array, int]]:
-    """Return postures and pairs whose cores are apart there. Some of the pairs contain a box."""
+    """Return postures, each with a pair whose cores are apart in this posture. Some of the pairs contain a box."""
     arrays, random = cell("dual_iiwa7"), np.random.default_rng(21)
     found = []
     for _ in range(300):

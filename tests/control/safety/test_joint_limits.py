@@ -30,7 +30,7 @@ def _box(q: Array, v: Array, bounds: JointLimits, h: float) -> tuple[VelocityBox
 
 
 def _stoppable(room: Array, v: Array, bounds: JointLimits) -> npt.NDArray[np.bool_]:
-    """Return property P of joint_limits.py towards one side, with rounding."""
+    """Return by joint whether property P of joint_limits.py holds towards one limit, except for rounding errors."""
     return np.where(
         v <= 0.0, room >= -EXACT, v**2 / (2 * bounds.acceleration) + bounds.longest_step * v <= room + EXACT
     )
@@ -67,7 +67,9 @@ CHOICES: dict[str, Choice] = {
 
 @pytest.mark.parametrize("longest", [0.0005, 0.02], ids="longest step {} s".format)
 @pytest.mark.parametrize("choose", CHOICES.values(), ids=CHOICES.keys())
-def test_any_velocity_from_the_box_keeps_every_limit_also_between_steps(choose: Choice, longest: float) -> None:
+def test_any_velocity_from_the_velocity_box_keeps_every_limit_at_steps_and_between_them(
+    choose: Choice, longest: float
+) -> None:
     random = np.random.default_rng(6)
     bounds = _bounds(random, longest)
     q, v = _start_on_the_edge_of_p(random, bounds)
@@ -90,7 +92,7 @@ def test_any_velocity_from_the_box_keeps_every_limit_also_between_steps(choose: 
 
 
 def _turning_point(v: Array, chosen: Array) -> Array:
-    """Return the share of the step at which a reversing joint is at rest, or 1 if no joint reverses."""
+    """Return for each joint the fraction of the step after which it reverses, or 1 if it does not reverse."""
     turns = v * chosen < 0.0
     return np.where(turns, v / np.where(turns, v - chosen, 1.0), 1.0)
 
@@ -103,7 +105,7 @@ def _turning_point(v: Array, chosen: Array) -> Array:
     part=st.floats(1e-3, 1.0),
 )
 @settings(derandomize=True, max_examples=500, deadline=None)
-def test_the_bound_is_the_largest_velocity_from_which_a_joint_can_still_stop(
+def test_the_velocity_bound_is_the_largest_velocity_from_which_a_joint_can_still_stop_at_its_limit(
     room: float, share: float, a: float, longest: float, part: float
 ) -> None:
     h = part * longest
@@ -115,7 +117,7 @@ def test_the_bound_is_the_largest_velocity_from_which_a_joint_can_still_stop(
 
 
 def _recover(q: Array, v: Array, bounds: JointLimits, choose: Choice, seconds: float) -> tuple[Array, Array]:
-    """Return positions and velocities (t, n) of joints that start outside P. The acceleration is checked on the way."""
+    """Return positions and velocities (t, n) of joints that start outside P. Check the acceleration at every step."""
     random, h = np.random.default_rng(7), bounds.longest_step
     positions, velocities = [q], [v]
     for _ in range(int(seconds / h)):

@@ -1,4 +1,4 @@
-"""The bounds on the past motion of the reference hold at the kept postures and between them."""
+"""The bounds on the past motion of the reference hold at the postures in its history and between them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ DENSE = np.linspace(0.0, H, 21)
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_no_joint_was_farther_away_in_the_window_than_the_bounds_say(name: str) -> None:
+def test_no_joint_was_farther_from_its_present_position_during_the_window_than_the_bounds_say(name: str) -> None:
     random, robot = np.random.default_rng(3), cell(name).robot
     model, limit = kernel_model(name).safety, robot.velocity_limit
     data = kernel_data(name, robot.home).safety
@@ -29,7 +29,7 @@ def test_no_joint_was_farther_away_in_the_window_than_the_bounds_say(name: str) 
             times.append(step * H + DENSE)
             positions.append(q + np.outer(DENSE, v) + np.outer(0.5 * DENSE**2, (v_next - v) / H))
             q, v = positions[-1][-1], v_next
-            # Joints that swing to and fro are at the same position at each tick, and elsewhere between the ticks.
+            # Some joints swing to and fro, so they are at the same position at each tick and elsewhere between ticks.
             v_next = -v if random.uniform() < 0.5 else 0.05 * random.uniform(-limit, limit)
         look_back(model.collision, history, q, v)
         age = times[-1][-1] - np.concatenate(times)

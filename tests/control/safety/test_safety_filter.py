@@ -31,7 +31,7 @@ def moved(data: SafetyData, wish: Array, usable: bool = True) -> int:
     return int(outcome)
 
 
-def test_a_solution_within_the_box_and_far_from_collisions_is_executed_unchanged() -> None:
+def test_a_solution_within_the_velocity_box_and_far_from_collisions_is_executed_unchanged() -> None:
     data, wish = started(), V + np.linspace(0.008, -0.008, 14)
     assert moved(data, wish) == FOLLOWED
     np.testing.assert_array_equal(data.state.v, wish)
@@ -40,7 +40,7 @@ def test_a_solution_within_the_box_and_far_from_collisions_is_executed_unchanged
     assert data.active.used[0] == 0
 
 
-def test_a_solution_beyond_the_box_is_clamped_joint_by_joint_and_the_joint_is_named() -> None:
+def test_a_solution_beyond_the_velocity_box_is_clamped_for_each_joint_and_the_joint_is_named() -> None:
     data, wish = started(), V.copy()
     wish[3] = 1e12
     assert moved(data, wish) == FOLLOWED

@@ -38,7 +38,7 @@ def _stays_beyond(model: CollisionModel, data: CollisionData, step: QuadraticPie
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_proven_distance_holds_during_the_whole_step_and_is_often_close_to_the_least_one(name: str) -> None:
+def test_a_proven_distance_holds_during_the_whole_step_and_is_often_close_to_the_least_distance(name: str) -> None:
     random, robot = np.random.default_rng(21), cell(name).robot
     proven = 0
     for _ in range(40):
@@ -55,7 +55,7 @@ def test_a_proven_distance_holds_during_the_whole_step_and_is_often_close_to_the
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_pair_exactly_at_its_distance_is_proven_to_move_apart(name: str) -> None:
+def test_a_pair_that_opens_from_exactly_its_threshold_is_proven_to_stay_beyond_the_threshold(name: str) -> None:
     """A bound from the distance alone would fail, because it needs a free distance of half of the joints' travel."""
     random, robot = np.random.default_rng(22), cell(name).robot
     parted = 0

@@ -18,7 +18,7 @@ H = 0.001
 
 
 class Seen:
-    """The measured distances and the written rows in one state. The known stop is that of all joints together."""
+    """The measured distances and the written rows in one state. In the known stop, all joints stop together."""
 
     def __init__(self, name: str, q: Array, v: Array) -> None:
         model, data = kernel_model(name).safety, kernel_data(name, q, v).safety
@@ -70,7 +70,9 @@ def test_a_pair_that_approaches_fast_is_examined_early_enough(seed: int, name: s
 
 @given(seed=SEEDS, name=st.sampled_from(NAMES))
 @settings(derandomize=True, max_examples=40, deadline=None)
-def test_arms_at_rest_get_rows_for_the_pairs_that_one_step_can_make_matter(seed: int, name: str) -> None:
+def test_for_arms_at_rest_a_pair_counts_as_near_exactly_if_one_step_can_make_its_rows_necessary(
+    seed: int, name: str
+) -> None:
     q, v = _state(name, seed, 0.0)
     seen, exact, model = Seen(name, q, v), distances(cell(name), q[None])[0], kernel_model(name).safety
     approach, surge = model.approach, float(np.max(model.limits.acceleration)) * model.limits.longest_step
@@ -105,8 +107,8 @@ def _least_free(name: str, q: Array, v: Array, duration: float, p: int) -> float
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_velocities_that_keep_the_rows_use_up_free_distance_no_faster_than_the_gain_allows(name: str) -> None:
-    """Velocities that break the rows use up free distance faster: the rows are neither too lax nor too strict."""
+def test_velocities_that_satisfy_the_rows_use_up_free_distance_no_faster_than_the_gain_allows(name: str) -> None:
+    """Velocities that break the rows use up free distance faster, so the rows are neither too lax nor too strict."""
     random, kept, broken = np.random.default_rng(5), 0, 0
     for seed in range(150):
         q, v = _state(name, seed, 0.4)

@@ -60,7 +60,9 @@ def test_velocities_of_bodies_are_the_rates_of_change_of_their_positions() -> No
 
 @pytest.mark.parametrize("shape", range(SHAPES), ids=["together", "arm by arm", "own"])
 @pytest.mark.parametrize("name", NAMES)
-def test_no_pair_comes_closer_in_a_step_and_any_stop_than_its_speed_bound_says(name: str, shape: int) -> None:
+def test_no_pair_comes_closer_in_a_step_and_in_any_kind_of_stop_than_its_speed_bound_says(
+    name: str, shape: int
+) -> None:
     random, robot = np.random.default_rng(61), cell(name).robot
     apart = share_no_joint(name)
     for _ in range(40):
@@ -82,7 +84,9 @@ def still_hand(q: Array, random: np.random.Generator) -> Array:
 @pytest.mark.parametrize(
     ("shape", "speed"), [(TOGETHER, 2.0), (OWN, 0.2)], ids=["the ways are curved", "joints rest one after the other"]
 )
-def test_a_hand_at_rest_on_a_moving_arm_may_come_closer_while_the_arm_stops(shape: int, speed: float) -> None:
+def test_the_bound_holds_for_a_hand_that_rests_on_a_moving_arm_and_moves_while_the_arm_stops(
+    shape: int, speed: float
+) -> None:
     random, robot = np.random.default_rng(62), cell("dual_iiwa7").robot
     apart, moved = share_no_joint("dual_iiwa7"), 0
     for _ in range(40):
@@ -96,7 +100,7 @@ def test_a_hand_at_rest_on_a_moving_arm_may_come_closer_while_the_arm_stops(shap
 
 
 @pytest.mark.parametrize("speed", [0.01, 0.1], ids=["a stop as short as the step", "a long stop"])
-def test_the_bound_holds_and_is_tight_if_joints_stop_together(speed: float) -> None:
+def test_the_speed_bound_holds_and_is_tight_if_all_joints_stop_together(speed: float) -> None:
     random, robot = np.random.default_rng(64), cell("dual_iiwa7").robot
     apart, used = share_no_joint("dual_iiwa7"), []
     for _ in range(40):
@@ -155,7 +159,7 @@ def _fastest_approaches(velocities: BodyVelocities, first: IntArray, second: Int
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_no_pair_approaches_faster_than_its_bound_and_some_come_near_it(name: str) -> None:
+def test_no_pair_approaches_faster_than_its_bound_and_some_pairs_approach_nearly_that_fast(name: str) -> None:
     random, robot = np.random.default_rng(51), cell(name).robot
     nearest = 0.0
     for _ in range(30):

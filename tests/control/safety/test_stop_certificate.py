@@ -22,7 +22,7 @@ MIN_DISTANCE = 0.02
 
 @given(v=st.floats(-3, 3), v_next=st.floats(-3, 3), h=st.floats(1e-5, 0.02))
 @settings(derandomize=True, max_examples=200, deadline=None)
-def test_the_travel_of_a_step_adds_motion_there_and_back(v: float, v_next: float, h: float) -> None:
+def test_the_travel_of_a_step_is_the_sum_of_its_motions_in_both_directions(v: float, v_next: float, h: float) -> None:
     t = np.linspace(0.0, h, 2001)
     q = v * t + 0.5 * (v_next - v) / h * t**2
     way = float(np.abs(np.diff(q)).sum())
@@ -122,7 +122,9 @@ def _aimed_at_the_threshold(name: str, random: np.random.Generator, count: int, 
 
 @pytest.mark.parametrize("shape", range(SHAPES), ids=["together", "arm by arm", "own"])
 @pytest.mark.parametrize("name", ["dual_iiwa7", "dual_panda"])
-def test_motions_just_too_fast_are_refused_and_clearly_slower_ones_are_mostly_certified(name: str, shape: int) -> None:
+def test_motions_that_are_slightly_too_fast_are_refused_and_clearly_slower_motions_are_mostly_certified(
+    name: str, shape: int
+) -> None:
     accepted = total = 0
     for number, motion in enumerate(_aimed_at_the_threshold(name, np.random.default_rng(16), 6, shape)):
         if number % 2 == 0:
@@ -154,7 +156,7 @@ def _swings(random: np.random.Generator, count: int, dip: float) -> Iterator[Mot
             return
 
 
-def test_a_pair_that_comes_too_close_within_a_step_is_refused_even_if_it_is_apart_at_both_ends() -> None:
+def test_a_step_within_which_a_pair_comes_too_close_is_refused_even_if_the_pair_is_apart_at_both_ends() -> None:
     swings = list(_swings(np.random.default_rng(21), 8, dip=5e-4))
     assert len(swings) == 8
     for motion in swings:
@@ -230,7 +232,7 @@ def test_rounding_errors_do_not_add_up_over_many_ticks() -> None:
 
 
 def _turning_at_its_end(name: str, random: np.random.Generator, count: int) -> Iterator[Motion]:
-    """Yield the fastest certified stops of all joints together from postures that are too close.
+    """Yield the fastest certified stops in which all joints stop together, from postures in which a pair is too close.
 
     A faster stop would bring a pair closer again at its end.
     """
@@ -338,7 +340,7 @@ def test_in_a_stop_arm_by_arm_each_arm_takes_the_time_of_its_slowest_joint(seed:
 @pytest.mark.parametrize("shape", range(SHAPES), ids=["together", "arm by arm", "own"])
 @given(seed=SEEDS)
 @settings(derandomize=True, max_examples=200, deadline=None)
-def test_every_shape_of_stop_keeps_position_limits_at_every_moment(shape: int, seed: int) -> None:
+def test_every_kind_of_stop_keeps_position_limits_at_every_moment(shape: int, seed: int) -> None:
     """Each joint starts at, or below, the speed that property P allows at its distance from the limit.
 
     A slow joint that stops together with a fast joint moves for a long time, and must not drift beyond its limit.

@@ -11,7 +11,7 @@ GROUPS = {OWN: np.arange(14), ARM_BY_ARM: MODEL.arm, TOGETHER: np.zeros(14)}
 
 
 @pytest.mark.parametrize("shape", GROUPS)
-def test_joints_that_stop_together_rest_at_the_same_time_except_joints_near_a_limit(shape: int) -> None:
+def test_joints_that_stop_together_come_to_rest_at_the_same_time_except_joints_near_a_limit(shape: int) -> None:
     limits, groups, deceleration = MODEL.limits, GROUPS[shape], np.zeros(14)
     for _ in range(50):
         q, v = random_posture(cell("dual_iiwa7").robot, RANDOM), RANDOM.uniform(-1.0, 1.0, 14)

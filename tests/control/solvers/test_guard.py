@@ -1,4 +1,4 @@
-"""No solver can change the controller's arrays, and no solver makes a step raise."""
+"""No solver can change the controller's arrays, and no solver makes a step raise an exception."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ NO_SOLUTIONS: dict[str, Any] = {
 
 
 @pytest.mark.parametrize("answer", NO_SOLUTIONS.values(), ids=NO_SOLUTIONS)
-def test_an_answer_that_is_not_a_solution_is_a_failed_solve_and_the_arms_stop(answer: Any) -> None:
+def test_an_answer_that_is_not_a_solution_counts_as_a_failed_solve_and_the_arms_stop(answer: Any) -> None:
     controller = CartesianController(ROBOT, ControllerSettings(), solver=Answering(answer))
     reference = controller.step({arm: controller.tool_pose(arm) for arm in ROBOT.arms}, DT)
     assert reference.report.unsolved == 1
@@ -119,11 +119,11 @@ class UnprintableError(Exception):
 
 
 class Panic(BaseException):
-    """An exception like that of a library in Rust."""
+    """An exception that is not derived from Exception, like those of libraries in Rust."""
 
 
 @pytest.mark.parametrize("error", [UnprintableError(), Panic("at the disco")], ids=["unprintable", "panic"])
-def test_no_exception_of_a_solver_leaves_a_step(error: BaseException) -> None:
+def test_a_step_raises_no_exception_if_its_solver_raises_one(error: BaseException) -> None:
     controller = CartesianController(ROBOT, ControllerSettings(), solver=Raising(error))
     report = controller.step({arm: controller.tool_pose(arm) for arm in ROBOT.arms}, DT).report
     assert report.unsolved == 1

@@ -1,4 +1,4 @@
-"""OSQP, which is set up once, finds DAQP's solutions of successive problems, with few rows and with many."""
+"""OSQP is set up once. For successive problems with few or many rows, it finds the same solutions as DAQP."""
 
 from __future__ import annotations
 

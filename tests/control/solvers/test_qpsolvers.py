@@ -1,4 +1,4 @@
-"""With every installed solver, the arms move as with DAQP. No solver prints anything or lets a step raise."""
+"""With every installed solver, the arms move as with DAQP. No solver prints anything or makes a step fail."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def test_arms_move_with_each_solver_as_they_move_with_daqp(name: str, capfd: pyt
 
 
 @pytest.mark.parametrize("name", INSTALLED)
-def test_a_problem_without_a_solution_is_a_failed_solve_and_the_next_problem_is_solved(
+def test_a_problem_without_a_solution_counts_as_a_failed_solve_and_the_next_problem_is_solved(
     name: str, capfd: pytest.CaptureFixture[str]
 ) -> None:
     solver, random = make_solver(name, NV), np.random.default_rng(2)
@@ -96,7 +96,7 @@ def test_a_row_that_no_velocity_can_break_causes_no_message(name: str, capfd: py
         assert solver.solve(problem).v is not None
 
 
-def test_the_output_of_making_a_solver_goes_to_stderr(
+def test_what_a_solver_prints_while_it_is_made_goes_to_stderr(
     capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class Loud:
@@ -110,7 +110,7 @@ def test_the_output_of_making_a_solver_goes_to_stderr(
 
 
 @pytest.mark.skipif("highs" not in INSTALLED, reason="HiGHS is not installed")
-def test_reaching_the_iteration_limit_is_a_failed_solve() -> None:
+def test_a_solve_that_reaches_the_iteration_limit_counts_as_failed() -> None:
     problem = _problem(np.random.default_rng(5), 40)
     assert make_solver("highs", NV, options={"qp_iteration_limit": 1}).solve(problem).v is None
     assert make_solver("highs", NV).solve(problem).v is not None

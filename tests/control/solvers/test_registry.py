@@ -1,4 +1,4 @@
-"""Solvers are found by their names, in settings and in Python, and a missing solver gives one line."""
+"""Solvers are found by their names, in settings and in Python. A missing solver raises an error of one line."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ def test_an_unknown_solver_raises_an_error_of_one_line_with_the_installed_solver
     assert line.endswith("pip install 'qpsolvers[open-source-solvers]'")
 
 
-def test_a_known_solver_that_is_not_installed_is_named_with_its_pip_line() -> None:
+def test_a_known_solver_that_is_not_installed_is_named_with_the_command_that_installs_it() -> None:
     missing = next(name for name in ("gurobi", "mosek", "cvxopt") if name not in qpsolvers.available_solvers)
     with pytest.raises(ConfigError, match=rf"pip install 'qpsolvers\[{missing}\]'$"):
         CartesianController(ROBOT, solver=missing)
 
 
 @pytest.mark.parametrize("name", ["daqp", "osqp"])
-def test_an_option_that_a_solver_does_not_have_is_refused_at_the_start(name: str) -> None:
+def test_an_option_that_a_solver_does_not_have_is_refused_when_the_controller_is_made(name: str) -> None:
     with pytest.raises(ConfigError, match=rf"control\.solver_options = \{{'colour': 1\}}: {name} refuses: "):
         CartesianController(ROBOT, ControllerSettings(solver=name, solver_options={"colour": 1}))
 

@@ -1,4 +1,4 @@
-"""Tasks in NumPy: the elbow's swivel alone and in the controller, and a task of another package."""
+"""The task for the swivel angle of an elbow, alone and in the controller, and a task of another package."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def run(angles: dict[str, float | None], start: Array) -> tuple[ElbowSwivel, Arr
     return ElbowSwivel(robot, angles), run.q, way
 
 
-def test_elbows_turn_to_their_angles_and_the_tools_stay() -> None:
+def test_elbows_turn_to_their_angles_and_the_tools_stay_where_they_are() -> None:
     task, q, way = run({"left": 0.4, "right": -0.3}, cell("dual_iiwa7").robot.home)
     assert task.angle("left", q) == pytest.approx(0.4, abs=0.02)
     assert task.angle("right", q) == pytest.approx(-0.3, abs=0.02)
@@ -90,7 +90,7 @@ def test_a_stretched_arm_with_an_elbow_angle_keeps_the_contract_and_comes_to_res
         ({"angles": {"left": 0.1}, "joints": 5}, "joints = 5: allowed: three, at shoulder, elbow and wrist"),
     ],
 )
-def test_meaningless_settings_are_refused_by_name(settings: dict[str, object], told: str) -> None:
+def test_meaningless_settings_of_the_task_swivel_are_refused_by_name(settings: dict[str, object], told: str) -> None:
     with pytest.raises(ConfigError, match=told):
         CartesianController(cell("dual_iiwa7").robot, ControllerSettings(tasks={"swivel": settings}))
 

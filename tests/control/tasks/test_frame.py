@@ -28,7 +28,7 @@ MOTION = Motion(np.array([6.0, 5.0]), np.array([2.0, 5.0]), np.array([1.0, 2.5])
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_tool_poses_and_jacobians_equal_pinocchios(name: str) -> None:
+def test_tool_poses_and_jacobians_equal_those_of_pinocchio(name: str) -> None:
     arrays, random = cell(name), np.random.default_rng(20)
     model, data, tools = arrays.robot.model, arrays.robot.model.createData(), tools_of(arrays.robot)
     rotation, translation, J = np.zeros((3, 3)), np.zeros(3), np.ones((6, model.nv))
@@ -56,7 +56,7 @@ ANGLES = [0.0, 1e-15, 1e-12, 1e-9, 1e-6, 1e-3, 0.5, 1.5, 2.0, 2.1, 3.0, np.pi - 
 
 
 @pytest.mark.parametrize("angle", ANGLES, ids="{:.7g} rad".format)
-def test_a_rotation_vector_is_pinocchios_logarithm(angle: float) -> None:
+def test_a_rotation_vector_equals_the_logarithm_that_pinocchio_computes(angle: float) -> None:
     random = np.random.default_rng(21)
     axes = [*np.eye(3), *-np.eye(3), *random.normal(size=(50, 3))]
     for axis in axes:
@@ -78,7 +78,7 @@ def test_the_rotation_vector_of_half_a_turn_has_one_of_the_two_directions_of_its
 
 @given(gain=st.floats(0.1, 50.0), deceleration=st.floats(0.1, 50.0), share=st.floats(0.0, 5.0))
 @settings(derandomize=True, max_examples=300, deadline=None)
-def test_the_approach_speed_is_continuous_and_so_is_its_slope(gain: float, deceleration: float, share: float) -> None:
+def test_the_approach_speed_and_its_slope_are_continuous(gain: float, deceleration: float, share: float) -> None:
     bend = deceleration / gain**2
     step = 1e-6 * bend
     for error in (bend, share * bend + 2 * step):
@@ -122,7 +122,8 @@ def test_the_cost_of_a_tool_is_the_weighted_square_of_its_twist_error() -> None:
     np.testing.assert_allclose(g, -0.1 * J.T @ W @ twist, atol=1e-12)
 
 
-# Position weights, rotation weights, whether x, y and z of a target are reached, and whether the tool's own z axis is.
+# Position weights, rotation weights, whether the tool reaches the target's x, y and z, and whether it reaches the
+# direction of the target's z axis.
 PARTS = {
     "position only": ((1, 1, 1), (0, 0, 0), (True, True, True), False),
     "rotation only": ((0, 0, 0), (1, 1, 1), (False, False, False), True),
@@ -132,7 +133,7 @@ PARTS = {
 
 
 @pytest.mark.parametrize("name", PARTS)
-def test_a_tool_reaches_the_weighted_parts_of_a_pose_and_the_posture_decides_the_rest(name: str) -> None:
+def test_a_tool_moves_to_the_weighted_parts_of_a_target_and_the_posture_decides_the_other_parts(name: str) -> None:
     along, about, reached, upright = PARTS[name]
     settings = ControllerSettings(position_weights=along, rotation_weights=about)
     controller = CartesianController(cell("dual_iiwa7").robot, settings)
@@ -154,7 +155,7 @@ def test_a_tool_reaches_the_weighted_parts_of_a_pose_and_the_posture_decides_the
         assert (turn < 1e-3) == (about == (1, 1, 1))
 
 
-def test_a_tool_without_any_weight_leaves_all_joints_to_the_posture() -> None:
+def test_if_all_weights_of_the_tools_are_zero_the_joints_move_to_the_given_posture() -> None:
     robot = cell("dual_iiwa7").robot
     controller = CartesianController(robot, ControllerSettings(position_weights=(0, 0, 0), rotation_weights=(0, 0, 0)))
     driven = Driven(controller)

@@ -33,7 +33,7 @@ def driven(tasks: dict[str, Any], moved: dict[str, pin.SE3] | None = None, **set
     return run
 
 
-def test_a_joint_moves_to_its_position_and_the_tools_stay() -> None:
+def test_a_joint_moves_to_its_position_and_the_tools_stay_where_they_are() -> None:
     robot = cell("dual_iiwa7").robot
     run = driven({"joints": {"positions": {"left_A3": robot.home[2] + 0.3}}})
     assert run.q[2] == pytest.approx(robot.home[2] + 0.3, abs=0.02)
@@ -41,7 +41,7 @@ def test_a_joint_moves_to_its_position_and_the_tools_stay() -> None:
         np.testing.assert_allclose(run.controller.tool_pose(arm).translation, start.translation, atol=1e-3)
 
 
-def test_a_tool_looks_at_a_point_and_stays_where_it_is() -> None:
+def test_the_task_look_at_turns_a_tool_towards_a_point_and_does_not_displace_the_tool() -> None:
     point = np.array([0.6, 0.4, 0.1])
     run = driven({"look_at": {"point": point.tolist(), "arms": ["left"]}}, rotation_weights=(0, 0, 0))
     tool = run.controller.tool_pose("left")
@@ -50,7 +50,7 @@ def test_a_tool_looks_at_a_point_and_stays_where_it_is() -> None:
     np.testing.assert_allclose(tool.translation, run.start["left"].translation, atol=1e-3)
 
 
-def test_a_tool_stays_near_its_cone_although_its_target_is_tilted_farther() -> None:
+def test_the_task_upright_keeps_a_tool_near_its_cone_although_the_target_is_tilted_farther() -> None:
     tilted = pin.SE3(pin.exp3(np.array([0.6, 0.0, 0.0])), np.zeros(3))
     run = driven({"upright": {"angle": 0.2, "axis": DOWN, "arms": ["left"]}}, {"left": tilted, "right": tilted})
     lean = {arm: math.acos(run.controller.tool_pose(arm).rotation[:, 2] @ DOWN) for arm in run.start}
@@ -58,7 +58,7 @@ def test_a_tool_stays_near_its_cone_although_its_target_is_tilted_farther() -> N
     assert lean["right"] == pytest.approx(0.6, abs=1e-3)
 
 
-def test_a_tool_within_its_cone_has_no_cost() -> None:
+def test_the_task_upright_has_no_cost_for_a_tool_within_its_cone() -> None:
     robot = cell("dual_iiwa7").robot
     H, g = Upright(robot, 0.2, axis=DOWN).cost(robot.home, robot.home)
     assert not H.any()
@@ -75,7 +75,7 @@ def test_two_tools_keep_their_relative_pose_although_only_one_target_moves() -> 
     assert np.linalg.norm(pin.log3(start.rotation.T @ now.rotation)) < 5e-3
 
 
-def test_look_at_reduces_its_error_at_the_gain_also_while_the_tool_moves() -> None:
+def test_the_task_look_at_reduces_its_error_at_the_rate_of_its_gain_even_while_the_tool_moves() -> None:
     robot, random = cell("dual_iiwa7").robot, np.random.default_rng(5)
     point = np.array([0.5, 0.1, 0.4])
 
@@ -115,6 +115,6 @@ def test_look_at_reduces_its_error_at_the_gain_also_while_the_tool_moves() -> No
         ({"relative": {"wieght": 1.0}}, "relative.wieght = 1.0: no such setting; its settings: position, rpy, gain"),
     ],
 )
-def test_a_wrong_setting_is_refused_with_what_is_allowed(tasks: dict[str, Any], told: str) -> None:
+def test_the_refusal_of_a_wrong_setting_says_what_is_allowed(tasks: dict[str, Any], told: str) -> None:
     with pytest.raises(ConfigError, match=told):
         CartesianController(cell("dual_iiwa7").robot, ControllerSettings(tasks=tasks))

@@ -1,4 +1,4 @@
-"""The nullspace projection, and a posture that is given at every tick: the elbow reaches it, and the contract holds."""
+"""The projection to the nullspace moves no tool. An elbow moves to the given posture, and the contract holds."""
 
 from __future__ import annotations
 
@@ -52,7 +52,9 @@ def test_the_elbow_moves_to_the_given_posture_or_home_while_the_tool_stays(
 
 
 @pytest.mark.parametrize("bad", [np.full(14, np.nan), np.full(14, np.inf), np.zeros(3)], ids=["nan", "inf", "short"])
-def test_an_unusable_posture_is_not_used(controller: CartesianController, robot: Robot, bad: Array) -> None:
+def test_an_unusable_posture_is_ignored_and_the_last_usable_posture_is_kept(
+    controller: CartesianController, robot: Robot, bad: Array
+) -> None:
     controller.reset(robot.home)
     goal = {"left": controller.tool_pose("left")}
     posture = swung(robot, "left", 0.2)

@@ -1,4 +1,7 @@
-"""Two arms that block each other: which arm gives way, and that both stay safe, come to rest and get free again."""
+"""If two arms block each other, their priority decides which arm gives way. Both stay safe and come to rest.
+
+They move on as soon as the path is free.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +42,7 @@ def test_two_arms_with_a_priority_come_to_rest(name: str, duration: float) -> No
 
 
 @pytest.mark.parametrize("priority", ["left", "right"])
-def test_the_arm_with_priority_reaches_a_target_of_both_arms_nearly_as_fast_as_alone(priority: str) -> None:
+def test_the_arm_with_priority_moves_to_a_target_that_both_arms_have_nearly_as_fast_as_alone(priority: str) -> None:
     times = {}
     for case in ("alone", "against the other"):
         run = Driven(controller_of(priority), dt=0.005)
@@ -76,7 +79,7 @@ def test_arms_that_blocked_each_other_reach_their_targets_when_the_path_is_free(
 
 
 @pytest.mark.parametrize("priority", ["equal", "right"])
-def test_an_arm_without_a_target_holds_and_does_not_give_way(priority: str) -> None:
+def test_an_arm_without_a_target_holds_its_posture_and_does_not_give_way(priority: str) -> None:
     run = Driven(controller_of(priority), dt=0.005)
     run.drive(4.0, SCENARIOS["one arm frozen"])
     assert run.contract.tail_acceleration() < 0.1
