@@ -71,7 +71,7 @@ def test_every_task_succeeds_and_arms_touch_only_what_they_grasp(played: Played)
         assert max(grasp["put_back_mm"], grasp["fall_mm"]) < 1.0
 
 
-def test_the_arms_follow_the_hands_within_a_millimetre_or_so_and_need_no_fallback(played: Played) -> None:
+def test_the_arms_follow_the_hands_within_1_5_millimetres_and_need_no_fallback(played: Played) -> None:
     assert played.summary.fallback_ticks == played.summary.uncertified_ticks == played.summary.rejected_targets == 0
     assert played.summary.at_rest
     for arm in played.summary.arms.values():
@@ -88,7 +88,7 @@ def test_the_arms_follow_the_hands_within_a_millimetre_or_so_and_need_no_fallbac
 
 
 @pytest.mark.parametrize("name", ["wipe", "peg"])
-def test_arms_that_yield_press_with_the_wanted_force_and_find_the_hole(name: str) -> None:
+def test_arms_in_torque_mode_wipe_with_the_wanted_force_and_find_the_hole_for_the_peg(name: str) -> None:
     result = Played(name, CommandMode.TORQUE).results[name]
     assert result.reason == ""
     if name == "wipe":
@@ -98,12 +98,12 @@ def test_arms_that_yield_press_with_the_wanted_force_and_find_the_hole(name: str
 
 
 @pytest.mark.parametrize("mode", list(SHOWN))
-def test_arms_whose_hands_ask_for_one_place_stop_before_they_touch(mode: CommandMode) -> None:
+def test_arms_whose_hands_move_to_the_same_point_stop_before_the_arms_touch(mode: CommandMode) -> None:
     played = Played("clash", mode)
     assert played.results["clash"].reason == ""
     led = [[tick.targets[arm].pose for arm in ("left", "right")] for tick in played.ticks]
     ways = [left.translation[1] - right.translation[1] for left, right in led if left is not None and right is not None]
-    assert min(ways) < 1e-3  # Both tools were asked to be at one place.
+    assert min(ways) < 1e-3  # The targets of both tools were at the same point.
     assert played.summary.at_rest
     assert played.summary.uncertified_ticks == 0
 
@@ -129,7 +129,7 @@ def test_arms_that_touch_other_bodies_spoil_the_task_and_are_named(q: list[float
     assert set(touches.forbidden.values()) == {0.5}
 
 
-def test_tasks_are_put_in_an_order_in_which_they_can_be_done_one_after_the_other() -> None:
+def test_tasks_are_sorted_into_the_order_in_which_they_can_be_done() -> None:
     assert [task.name for task in tasks_named(["stack", "meet", "stack"])] == ["meet", "stack"]
     assert tasks_named(["all"]) == tuple(TASKS.values())
     with pytest.raises(

@@ -25,7 +25,7 @@ def wiped(strokes: Sequence[tuple[float, float]], touched: int = LEFT | TABLE) -
     return judge
 
 
-def test_300_mm_with_5_to_15_newtons_count_as_wiped() -> None:
+def test_strokes_of_300_mm_with_5_to_15_newtons_count_as_wiped() -> None:
     assert wiped([(0.16, 14.5), (0.16, 6.0)]).faults() == []
     assert wiped([(0.32, 10.0), (0.03, 3.0)]).faults() == []
 
@@ -40,7 +40,7 @@ def test_300_mm_with_5_to_15_newtons_count_as_wiped() -> None:
         pytest.param([(0.4, 0.0)], LEFT, 1, id="in the air"),
     ],
 )
-def test_other_lengths_and_forces_do_not_count_as_wiped(
+def test_shorter_strokes_and_other_forces_do_not_count_as_wiped(
     strokes: Sequence[tuple[float, float]], touched: int, faults: int
 ) -> None:
     assert len(wiped(strokes, touched).faults()) == faults
@@ -54,7 +54,7 @@ def stands(off: float = 0.0, above: float = 0.0, tilt: float = 0.0, touched: int
     return judge
 
 
-def test_a_peg_that_stands_at_the_bottom_of_the_hole_for_a_second_succeeds() -> None:
+def test_the_task_succeeds_if_the_peg_stands_at_the_bottom_of_the_hole_for_a_second() -> None:
     assert stands(off=0.0006, above=0.001, tilt=math.radians(1.5)).faults() == []
 
 
@@ -68,6 +68,6 @@ def test_a_peg_that_stands_at_the_bottom_of_the_hole_for_a_second_succeeds() -> 
         pytest.param(stands(touched=Toucher.PART | LEFT), id="still held"),
     ],
 )
-def test_a_peg_that_does_not_stand_in_the_hole_fails(judge: PegJudge) -> None:
+def test_the_task_fails_if_the_peg_does_not_stand_freely_in_the_hole(judge: PegJudge) -> None:
     assert len(judge.faults()) == 1
     assert judge.measured()["stood_s"] == 0.0

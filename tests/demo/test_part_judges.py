@@ -37,14 +37,14 @@ LIES, GRIPPED = (1.0, 0.0, 0.2, TABLE), (0.5, 0.0, 0.2, TABLE | LEFT)
 HELD, BACK = (1.5, 0.0, 0.3, LEFT), (1.0, 0.0, 0.2, TABLE)
 
 
-def test_a_part_that_is_held_up_for_a_second_and_put_back_succeeds() -> None:
+def test_lifting_succeeds_if_the_part_is_held_up_for_a_second_and_put_back() -> None:
     judge = play(LiftJudge("part"), [LIES, GRIPPED, HELD, GRIPPED, BACK])
     assert judge.faults() == []
     measured = {"lifted_mm": 100.0, "held_s": 1.5, "put_back_mm": 0.0, "fall_mm": 0.0}
     assert judge.measured() == pytest.approx(measured)
 
 
-def test_a_part_that_was_put_back_for_a_second_may_be_moved_again() -> None:
+def test_a_part_that_has_lain_for_a_second_after_it_was_put_back_may_be_moved_again() -> None:
     lain = [LIES, GRIPPED, HELD, GRIPPED, BACK, BACK]
     elsewhere = (1.0, 0.3, 0.2, TABLE)
     assert play(LiftJudge("part"), [*lain, HELD, elsewhere]).faults() == []
@@ -63,7 +63,9 @@ def test_a_part_that_was_put_back_for_a_second_may_be_moved_again() -> None:
         ([LIES, GRIPPED, HELD], "put_back_mm", 100.0),
     ],
 )
-def test_a_part_that_is_not_lifted_and_put_back_fails(phases: list[Phase], name: str, figure: float) -> None:
+def test_lifting_fails_if_the_part_is_not_held_up_long_enough_and_put_back(
+    phases: list[Phase], name: str, figure: float
+) -> None:
     judge = play(LiftJudge("part"), phases)
     assert len(judge.faults()) == 1
     assert judge.measured()[name] == pytest.approx(figure)
@@ -89,13 +91,15 @@ def test_a_part_in_both_hands_must_not_tilt_by_5_degrees() -> None:
         pytest.param(0.12, 0.0, LEFT, id="by one alone"),
     ],
 )
-def test_a_part_is_carried_by_both_hands_100_mm_away_and_put_back(away: float, held: float, touched: int) -> None:
+def test_carrying_succeeds_only_if_both_hands_carry_the_part_100_mm_away_and_put_it_back(
+    away: float, held: float, touched: int
+) -> None:
     judge = play(CarryJudge("part"), [LIES, (0.5, 0.0, 0.2, TABLE | FINGERS), (1.5, away, 0.3, touched), GRIPPED, BACK])
     assert judge.measured()["held_s"] == pytest.approx(held)
     assert (judge.faults() == []) == (held >= HELD_TIME)
 
 
-def test_a_part_that_both_hands_held_and_the_taker_carries_away_succeeds() -> None:
+def test_a_handover_succeeds_if_both_hands_held_the_part_and_the_taker_carries_it_away() -> None:
     judge = play(HandoverJudge("part", LEFT, RIGHT), [LIES, GIVER, BOTH, TAKER, AWAY])
     assert judge.faults() == []
     assert judge.measured()["carried_mm"] == pytest.approx(120.0)
@@ -112,13 +116,13 @@ def test_a_part_that_both_hands_held_and_the_taker_carries_away_succeeds() -> No
         pytest.param([LIES, GIVER, BOTH, (1.2, -0.12, 0.2, RIGHT | TABLE)], id="pushed over the table"),
     ],
 )
-def test_a_part_that_is_not_handed_over_fails(phases: list[Phase]) -> None:
+def test_a_handover_fails_if_one_of_its_steps_is_missing(phases: list[Phase]) -> None:
     judge = play(HandoverJudge("part", LEFT, RIGHT), phases)
     assert len(judge.faults()) == 1
     assert judge.measured()["held_by_taker_s"] < 1.0
 
 
-def test_a_part_that_falls_between_the_hands_fails() -> None:
+def test_a_handover_fails_if_the_part_falls_between_the_hands() -> None:
     phases = [LIES, GIVER, BOTH, (0.1, 0.0, 0.39, Toucher.NOTHING), TAKER, AWAY]
     judge = play(HandoverJudge("part", LEFT, RIGHT), phases)
     assert len(judge.faults()) == 1
@@ -133,7 +137,7 @@ def stack(offset: float = 0.0, height: float = 0.06, tilt: float = 0.0, touched:
     return judge
 
 
-def test_a_part_that_rests_on_another_one_for_a_second_succeeds() -> None:
+def test_stacking_succeeds_if_the_part_rests_on_the_other_part_for_a_second() -> None:
     assert stack(offset=0.002, height=0.0598).faults() == []
     assert stack().measured()["stood_s"] == pytest.approx(1.2)
 
@@ -148,6 +152,6 @@ def test_a_part_that_rests_on_another_one_for_a_second_succeeds() -> None:
         pytest.param(stack(touched=Toucher.PART | LEFT), id="still held"),
     ],
 )
-def test_a_part_that_does_not_stand_on_another_one_fails(judge: Judge) -> None:
+def test_stacking_fails_if_the_part_does_not_stand_freely_on_the_other_part(judge: Judge) -> None:
     assert len(judge.faults()) == 1
     assert judge.measured()["stood_s"] == 0.0

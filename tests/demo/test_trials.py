@@ -1,4 +1,4 @@
-"""Tasks of the demo are tried with scripted hands that tremble, in a different way for each seed."""
+"""Tasks of the demo are tried with scripted hands that tremble, differently for each seed."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_every_seed_is_tried_and_failed_seeds_have_reasons() -> None:
 
 
 @pytest.mark.slow
-def test_arms_that_yield_do_a_task_with_shaky_hands_that_are_lost_for_a_second() -> None:
+def test_arms_in_torque_mode_do_a_task_although_the_hands_tremble_and_are_lost_for_a_second() -> None:
     assert try_task(coarse(CommandMode.TORQUE), CommandMode.TORQUE, True, ("grasp", 0)) == ""
 
 

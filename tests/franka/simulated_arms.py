@@ -18,7 +18,7 @@ _ASKED = "asked for by a test"
 
 
 def why_not() -> str | None:
-    """Return why no arm can be simulated here; None if they can."""
+    """Return why no arm can be simulated here, or None if arms can be simulated."""
     if find_spec("pylibfranka") is None:
         return "pylibfranka is not installed: make test-franka installs it"
     if not SIMULATOR.exists():
@@ -79,5 +79,5 @@ class SimulatedArm:
 
     @property
     def reflexes(self) -> list[str]:
-        """The lines about reflexes for which nobody asked."""
+        """The lines of output about reflexes that no test has requested."""
         return [line for line in self.lines if _ABORTED in line and _ASKED not in line]

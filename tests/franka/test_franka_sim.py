@@ -1,4 +1,4 @@
-"""Two simulated FR3 behind the real client library. franka-sim judges the commands, and others wrote it."""
+"""Two simulated FR3 behind the real client library. franka-sim judges the commands. It is not part of this project."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ PATIENCE = 60.0  # [s]
 
 
 @pytest.mark.parametrize("mode", [CommandMode.POSITION, CommandMode.TORQUE])
-def test_sessions_that_end_in_every_way_have_no_reflex_and_no_violation(mode: CommandMode) -> None:
+def test_no_session_has_a_reflex_or_violates_a_limit_however_it_ends(mode: CommandMode) -> None:
     found = run_slowly("--sessions", str(len(ENDS)), "--mode", mode, slowness=SLOWNESS)
     assert found["failure"] == ""
     assert found["ends"] == dict.fromkeys(ENDS, 1)
@@ -43,7 +43,7 @@ def wait_until(holds: Callable[[], bool]) -> None:
         time.sleep(0.05)
 
 
-def test_hand_grasps_what_is_between_its_fingers_and_opens_again(tmp_path: Path) -> None:
+def test_a_hand_grasps_the_object_between_its_fingers_and_opens_again(tmp_path: Path) -> None:
     from q2r2_franka.hand import Hand
     from q2r2_franka.settings import HandSettings
 

@@ -65,7 +65,7 @@ class Arm:
         return end, way
 
 
-def test_arm_comes_to_rest_on_its_certified_stop_if_no_command_comes() -> None:
+def test_an_arm_comes_to_rest_on_its_certified_stop_if_no_command_comes() -> None:
     arm = Arm()
     _, way = arm.accelerate(SPEED)
     for _ in range(200):
@@ -76,7 +76,7 @@ def test_arm_comes_to_rest_on_its_certified_stop_if_no_command_comes() -> None:
     assert arm.session.is_still(arm.now)
 
 
-def test_command_that_begins_before_the_time_of_the_last_answer_is_refused() -> None:
+def test_a_command_that_begins_before_the_time_of_the_last_answer_is_refused() -> None:
     arm = Arm()
     end, way = arm.accelerate(SPEED)
     for _ in range(20):
@@ -84,17 +84,17 @@ def test_command_that_begins_before_the_time_of_the_last_answer_is_refused() -> 
     assert not arm.command(end + TICK, SPEED, way + SPEED * TICK, end)
 
 
-def test_arm_that_is_ahead_waits_for_the_other_one() -> None:
+def test_an_arm_that_is_ahead_waits_for_the_other_arm() -> None:
     arm = Arm()
     arm.accelerate(SPEED)
     before = arm.session.state.answered
     for _ in range(500):
         arm.ask(ahead=0.05)
-    # In 0.5 s, the rate falls by 0.1 at 0.4 per second, and stays there.
+    # The rate of the arm's time falls by 0.1, at 0.4 per second, and stays at 0.9 until the end of the 0.5 s.
     assert arm.session.state.answered - before == pytest.approx(0.5 - 0.1 * (0.5 - 0.125), abs=0.001)
 
 
-def test_arm_is_ahead_of_another_one_by_the_difference_of_their_times() -> None:
+def test_an_arm_is_ahead_of_another_arm_by_the_difference_of_their_times() -> None:
     first, other = Arm(), Arm()
     first.accelerate(SPEED)
     other.accelerate(SPEED)
@@ -107,14 +107,14 @@ def test_arm_is_ahead_of_another_one_by_the_difference_of_their_times() -> None:
     assert other.session.state.behind == pytest.approx(0.03, abs=1.5 * PERIOD)
 
 
-def test_reference_that_does_not_begin_at_the_arm_is_not_followed() -> None:
+def test_a_reference_that_does_not_begin_at_the_arm_is_not_followed() -> None:
     arm = Arm()
     arm.command(arm.now + 2 * TICK, 0.0, 0.01, arm.now + TICK)
     arm.ask()
     assert not arm.session.state.following
 
 
-def test_torque_that_nobody_updates_is_replaced_by_damping() -> None:
+def test_a_torque_that_is_not_updated_is_replaced_by_damping() -> None:
     arm = Arm(CommandMode.TORQUE)
     push, damping = (5.0,) * JOINTS, (10.0,) * JOINTS
     arm.command(arm.now + 2 * TICK, 0.0, 0.0, arm.now + TICK, tau=push, damping=damping)
@@ -127,7 +127,7 @@ def test_torque_that_nobody_updates_is_replaced_by_damping() -> None:
     np.testing.assert_allclose(sent, -3.0)
 
 
-def test_arm_whose_robot_ended_the_motion_counts_as_ended_once() -> None:
+def test_a_motion_that_the_robot_ended_counts_as_ended_only_once() -> None:
     arm = Arm()
     arm.accelerate(SPEED)
     arm.session.end("reflex")

@@ -1,4 +1,4 @@
-"""Commands keep the published limits, whatever the path does and whichever of them are lost."""
+"""Commands keep the published limits for every path, and whichever commands are lost."""
 
 from __future__ import annotations
 
@@ -34,15 +34,15 @@ def checked(entries: list[Entry]) -> Checked:
     return check_commands([begin, *entries])["left"]
 
 
-def test_positions_keep_the_limits_of_jerk_where_the_acceleration_jumps_by_twice_its_limit() -> None:
+def test_positions_keep_the_jerk_limit_even_if_the_acceleration_jumps_by_twice_its_limit() -> None:
     sent = PositionStream(MIDDLE)
     path = list(restless_path(limits.ACCELERATION, np.random.default_rng(1)))
     assert checked([Entry(0, False, False, 1, 0.0, sent.next([q])) for q in path]).violated == []
-    assert checked([Entry(0, False, False, 1, 0.0, q) for q in path]).violated == ["jerk"]  # The check can fail.
+    assert checked([Entry(0, False, False, 1, 0.0, q) for q in path]).violated == ["jerk"]  # The check finds it.
 
 
 @pytest.mark.parametrize("lost", [1, 2, 5, 15])
-def test_robot_that_got_no_commands_comes_back_to_the_path_within_the_limits(lost: int) -> None:
+def test_a_robot_that_got_no_commands_comes_back_to_the_path_within_the_limits(lost: int) -> None:
     random = np.random.default_rng(lost)
     sent, entries, passed = PositionStream(MIDDLE), list[Entry](), list[Array]()
     for i, q in enumerate(restless_path(2.0, random)):
@@ -55,7 +55,7 @@ def test_robot_that_got_no_commands_comes_back_to_the_path_within_the_limits(los
     assert result.lost == lost * 15
 
 
-def test_command_equals_the_mean_of_positions_again_some_time_after_lost_commands() -> None:
+def test_a_command_equals_the_mean_of_positions_again_some_time_after_lost_commands() -> None:
     path = list(restless_path(2.0, np.random.default_rng(2), 400))
     all_heard, some_lost = PositionStream(MIDDLE), PositionStream(MIDDLE)
     expected = [all_heard.next([q]) for q in path]
@@ -75,7 +75,7 @@ def test_torques_change_no_faster_than_the_robot_allows() -> None:
     assert checked([Entry(0, False, True, 1, 0.0, tau) for tau in wanted]).violated == ["torque", "torque rate"]
 
 
-def test_velocity_near_a_position_limit_is_checked_against_the_smaller_limit_there() -> None:
+def test_a_velocity_near_a_position_limit_is_checked_against_the_smaller_velocity_limit_there() -> None:
     speed = 1.0  # [rad/s]
     path = [MIDDLE + (limits.UPPER - MIDDLE - 0.05) * [1, 0, 0, 0, 0, 0, 0]]
     path += [path[0] + speed * PERIOD * i * np.eye(JOINTS)[0] for i in range(1, 20)]
@@ -96,5 +96,5 @@ def test_recorded_commands_are_read_as_they_were_written(tmp_path: Path) -> None
         np.testing.assert_array_equal(read.values, written.values)
 
 
-def test_number_of_averaged_positions_is_enough_for_the_limit_of_jerk() -> None:
+def test_the_number_of_averaged_positions_is_large_enough_for_the_jerk_limit() -> None:
     assert 2.0 * limits.ACCELERATION / (stream.MEANS * PERIOD) <= limits.JERK

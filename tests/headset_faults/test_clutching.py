@@ -27,7 +27,7 @@ again_and_again = pytest.mark.parametrize("times", [10, pytest.param(100, marks=
 def aligned(op: Operator, shift: float, samples: int) -> Iterator[float]:
     """Align by the left hand's chord. The frame moves ``samples`` samples after the buttons are pressed.
 
-    It moves by the share ``shift`` of ``ANEW``.
+    The frame moves by the share ``shift`` of ``ANEW``.
     """
     op.lower.add("left")
     op.upper.add("left")
@@ -108,13 +108,13 @@ def test_an_arm_under_an_unknown_load_sinks_no_farther_when_it_is_paused_and_eng
     ("mode", "mujoco", "load", "off"),
     [
         (CommandMode.TORQUE, {}, 42.0, 1e-3),
-        # With soft joints, the sag of the tool depends on the posture. Where this arm rests at the end, it is 2.6 mm
-        # more.
+        # With soft joints, the sag of the tool depends on the posture. In the posture of rest at the end, the sag is
+        # 2.6 mm larger.
         (CommandMode.POSITION, {"position_stiffness": 1500.0}, 75.0, 3.5e-3),
     ],
     ids=["on the spring of torque mode", "of soft joints"],
 )
-def test_a_sagging_arm_that_is_engaged_many_times_during_motion_keeps_its_sag_without_lag(
+def test_a_sagging_arm_that_is_engaged_many_times_during_motion_keeps_its_sag_and_does_not_lag(
     mode: CommandMode, mujoco: dict[str, object], load: float, off: float, times: int
 ) -> None:
     """The hand moves to and fro at up to 0.6 m/s.
@@ -157,7 +157,7 @@ def test_a_sagging_arm_that_is_engaged_many_times_during_motion_keeps_its_sag_wi
     assert math.dist(last.tools["left"].translation, target.translation) < off
 
 
-def test_an_arm_that_was_pushed_away_stays_there_when_it_is_engaged() -> None:
+def test_an_arm_that_was_pushed_away_does_not_move_when_it_is_engaged() -> None:
     def script(op: Operator) -> Iterator[float]:
         yield 0.1
         op.plant.push("left", np.array([0.0, 140.0, 0.0, 0.0, 0.0, 0.0]), 2.0)

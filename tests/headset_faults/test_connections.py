@@ -109,7 +109,7 @@ def test_samples_that_come_in_bursts_within_the_timeout_are_followed_without_a_j
     assert run.states == {"engaged"}
 
 
-def test_samples_held_up_for_200_ms_stop_both_arms_and_move_no_arm_when_they_come() -> None:
+def test_a_network_delay_of_200_ms_stops_both_arms_and_the_late_samples_move_no_arm() -> None:
     run = InStepRun(late_by(0.2))
     assert "pose_silent" in run.reasons("lost")
     assert [len(run.watch.engagements(arm)) for arm in SIDES] == [1, 1]

@@ -58,7 +58,7 @@ def run() -> InStepRun:
 
 
 @pytest.mark.parametrize("arm", SIDES)
-def test_the_buttons_engage_and_pause_and_engage_again_and_the_tool_rests_while_the_hand_turns(
+def test_presses_engage_and_pause_the_arm_and_the_tool_rests_while_the_hand_turns_in_the_pause(
     run: InStepRun, arm: str
 ) -> None:
     assert changes(run.summary.events, arm)[:4] == [

@@ -17,7 +17,7 @@ from tests.support.processes import cell, cell_robot, pipeline_of, speed
 def pipeline(
     source: Input | None = None, plant: str = "kinematic", mode: str = "position", **changes: object
 ) -> Pipeline:
-    """Return a pipeline at 500 Hz, the lowest rate with one substep per tick. Ticks take most of a test's time."""
+    """Return a pipeline at 500 Hz, the lowest rate with one substep per tick. Fewer ticks make the tests faster."""
     source = source or ScriptedInput("circle", frequency_hz=0.5)
     return pipeline_of({"loop_rate_hz": 500.0, **changes}, source, plant, mode)
 
@@ -43,7 +43,7 @@ class RecordingPlant(KinematicPlant):
 
 
 def when_moving(action: Callable[[], object]) -> Callable[[Tick], None]:
-    """Return a listener that acts once, in the middle of a motion."""
+    """Return a listener that calls ``action`` once, in the middle of a motion."""
     acted: list[Tick] = []
 
     def listener(tick: Tick) -> None:

@@ -49,7 +49,7 @@ def watched(hands: HandsInput, duration: float, plant: str = "kinematic", **bind
 
 
 def played(*pushed: tuple[float, str]) -> list[Tick]:
-    """Run the hands with stop on the trigger and the way home on the grip."""
+    """Run the hands. A push of the trigger stops the arms, and a push of the grip moves them home."""
     return watched(PlayingHands(*pushed), 6.0, trigger="stop", grip="home").ticks
 
 
@@ -63,7 +63,7 @@ def cell_robot() -> Robot:
 
 
 @pytest.mark.slow
-def test_a_press_on_the_way_home_ends_it_where_the_arms_come_to_rest() -> None:
+def test_a_press_during_homing_brakes_the_arms_to_rest_before_they_are_home() -> None:
     ticks = played((1.5, "press_middle"), (1.9, "button_lower"))
     assert {event.kind for tick in ticks if tick.t > 1.6 for event in tick.events} == {"homing_interrupted"}
     assert {tick.states["right"] for tick in ticks if 1.52 < tick.t < 1.9} == {"homing"}
@@ -74,7 +74,7 @@ def test_a_press_on_the_way_home_ends_it_where_the_arms_come_to_rest() -> None:
 
 
 @pytest.mark.slow
-def test_after_a_stop_both_arms_rest_until_it_is_undone_and_a_press_engages_them() -> None:
+def test_after_a_stop_presses_engage_no_arm_and_undoing_the_stop_moves_no_arm() -> None:
     ticks = played((1.5, "press_index"), (2.0, "button_lower"), (2.3, "press_middle"), (3.0, "press_index"))
     stopped = [tick for tick in ticks if set(tick.states.values()) == {"stopped"}]
     assert (stopped[0].t, stopped[-1].t) == (pytest.approx(1.5, abs=0.02), pytest.approx(3.0, abs=0.02))
@@ -96,7 +96,10 @@ def test_a_program_may_send_the_arms_home_too() -> None:
 
 
 def wandering(t: float) -> Array:
-    """Return a gentle motion along and about all axes, which reaches no joint limit and no pair."""
+    """Return the hand's displacement at ``t`` [s] (6,) [m, rad]: a gentle motion along and about all axes.
+
+    The arm comes near no joint limit and no other body.
+    """
     since = max(t - ENGAGED - 0.3, 0.0)
     soft = min(since, 1.0) ** 2 * (3.0 - 2.0 * min(since, 1.0))
     x, y, z, about_x, about_y, about_z = np.sin(np.pi * since * np.array([1.0, 0.7, 0.5, 0.8, 1.0, 0.6]))
@@ -105,7 +108,7 @@ def wandering(t: float) -> Array:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("plant", ["kinematic", "mujoco"])
-def test_two_tools_that_carry_keep_their_relation_while_one_hand_moves_and_turns_both(plant: str) -> None:
+def test_carried_tools_keep_their_relative_pose_while_one_hand_moves_and_turns_both_tools(plant: str) -> None:
     hands = PlayingHands((0.35, "press_middle"), left=wandering)
     ticks = watched(hands, 5.0, plant, grip="carry").ticks
     carried = [tick for tick in ticks if tick.states["right"] == "carried"]
@@ -124,7 +127,7 @@ def test_two_tools_that_carry_keep_their_relation_while_one_hand_moves_and_turns
 
 
 @pytest.mark.slow
-def test_changes_of_a_program_apply_from_the_next_tick_on_without_a_jump() -> None:
+def test_settings_that_a_program_changes_apply_from_the_next_tick_on_without_a_jump() -> None:
     loop = pipeline(PlayingHands())
     watch = Watch(loop)
     half = loop.config.teleop.model_copy(update={"position_scale": 0.5})

@@ -1,4 +1,4 @@
-"""Measurements of arms that move slowly, and the bounds of these measurements."""
+"""Commissioning moves arms slowly, measures the motion, and compares the results with bounds."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def robot(config: Config) -> Robot:
 
 
 @pytest.mark.slow
-def test_a_joint_moves_by_a_degree_and_back_alone(config: Config) -> None:
+def test_one_joint_moves_by_a_degree_and_back_while_all_others_rest(config: Config) -> None:
     with slow_run(config) as run:
         start = run.reference
         motion = measure_joint(run, 8)
@@ -54,14 +54,14 @@ def test_a_joint_that_does_not_move_is_named(config: Config) -> None:
     ],
     ids=["too short", "far behind", "not alone", "the other way"],
 )
-def test_a_joint_has_to_follow_and_to_move_alone(motion: JointMotion) -> None:
+def test_it_is_an_error_if_a_joint_does_not_follow_or_if_other_joints_move_with_it(motion: JointMotion) -> None:
     JointMotion("A1", 1.0, 0.9, 0.5, 0.1).check()
     with pytest.raises(PlantError, match="A1: commanded 1"):
         motion.check()
 
 
 @pytest.mark.slow
-def test_an_arm_whose_hand_lets_go_stops_within_its_certified_stop_and_the_latency(config: Config) -> None:
+def test_an_arm_whose_hand_lets_go_stops_within_its_certified_stop_plus_the_latency(config: Config) -> None:
     with slow_run(config) as run:
         report = measure_stop(run, "left")
     assert report.tool_speed_mm_s == pytest.approx(30.0, abs=1.0)
@@ -102,7 +102,7 @@ def test_a_stop_that_is_too_late_or_too_long_is_reported(robot: Robot) -> None:
         late.check()
 
 
-def test_an_arm_that_did_not_follow_gives_no_measurement(robot: Robot) -> None:
+def test_an_arm_that_did_not_follow_the_hand_causes_an_error_instead_of_a_measurement(robot: Robot) -> None:
     with pytest.raises(PlantError, match="the left arm did not follow the hand"):
         let_go_report(robot, "left", moments(robot, 0.0, engaged=False))
     still = replace(let_go_report(robot, "left", moments(robot, 0.1)), tool_speed_mm_s=1.0)

@@ -109,7 +109,7 @@ def stalls(ticks: list[Tick], arm: str) -> list[float]:
 
 
 @pytest.mark.slow
-def test_at_the_edge_of_reach_and_with_bursts_no_arm_stands_still_while_its_target_moves() -> None:
+def test_no_arm_at_the_edge_of_reach_stands_still_while_its_target_moves_even_if_samples_come_in_bursts() -> None:
     hands = Sweeping()
     loop = pipeline(hands)
     loop.listeners.append(hands.look)

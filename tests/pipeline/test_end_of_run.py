@@ -24,7 +24,7 @@ from tests.support.processes import Watch, assert_torque_bounds, cell, speed
 @pytest.mark.slow
 class TestStop:
     @pytest.mark.parametrize("how", ["the duration", "SIGINT", "SIGTERM"])
-    def test_a_request_during_motion_brakes_first(self, how: str) -> None:
+    def test_a_run_that_is_ended_during_motion_first_brakes_the_arms(self, how: str) -> None:
         loop = pipeline()
         handlers = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
         watch = Watch(loop)
@@ -53,8 +53,8 @@ class TestStop:
             loop.plant.advance(0.1)
             np.testing.assert_allclose(loop.plant.state().q, rest.q, atol=1e-3)
 
-    def test_the_end_waits_for_slow_braking(self) -> None:
-        # Braking takes longer than the additional second that is allowed.
+    def test_a_run_ends_only_when_slow_braking_has_ended(self) -> None:
+        # Braking takes longer than a second. A run waits for the braking time and for one second more.
         loop = pipeline(control=cell().control.model_copy(update={"acceleration_limit": 0.05}))
         watch = Watch(loop)
         summary = loop.run(4.0, realtime=False)
@@ -63,7 +63,7 @@ class TestStop:
         assert speed(watch.ticks[-1]) < 1e-3
         assert summary.at_rest
 
-    def test_a_request_before_the_run_ends_it_at_once_and_does_not_end_the_next_run(self) -> None:
+    def test_a_stop_request_before_a_run_ends_this_run_at_once_and_does_not_end_the_next_run(self) -> None:
         loop = pipeline()
         loop.stop()
         assert loop.run(10.0, realtime=False).ticks == 1
@@ -80,14 +80,14 @@ def assert_braked(loop: Pipeline, watch: Watch, summary: RunSummary) -> None:
     assert summary.at_rest
     limit = loop.robot.capped_acceleration(loop.config.control.acceleration_limit)
     braking = float((np.abs(watch.ticks[-len(stopping) - 1].reference.v) / limit).max())
-    # Slower motion is the last correction of a held posture.
+    # A joint below 1e-3 rad/s counts as resting, because it only corrects the held posture.
     rest = next(tick for tick in stopping if speed(tick) < 1e-3)
     assert rest.t - stopping[0].t <= 1.5 * braking + 0.05 + 3.0 * max(tick.dt for tick in stopping)
 
 
 @pytest.mark.slow
 class TestFailure:
-    def test_a_failing_listener_brakes_first_and_is_not_called_again(self) -> None:
+    def test_if_a_listener_fails_the_arms_brake_first_and_the_listener_is_not_called_again(self) -> None:
         loop, calls = pipeline(), []
 
         def fail() -> None:
@@ -102,7 +102,9 @@ class TestFailure:
         assert speed(watch.ticks[-1]) <= 1e-6 < max(map(speed, watch.ticks))
 
     @pytest.mark.parametrize("call", ["poll", "connected"])
-    def test_a_failing_input_brakes_first(self, call: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_if_an_input_fails_the_arms_brake_before_the_run_ends(
+        self, call: str, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
         loop = pipeline()
         watch = Watch(loop)
 
@@ -116,7 +118,7 @@ class TestFailure:
         assert speed(watch.ticks[-1]) <= 1e-6 < max(map(speed, watch.ticks))
 
     @pytest.mark.parametrize("who", ["apply", "listener", "reset", "nobody"])
-    def test_the_end_leaves_no_thread_no_port_and_no_plant_open(
+    def test_after_a_run_its_thread_has_ended_and_its_port_and_its_plant_are_closed(
         self, who: str, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         plant, server = RecordingPlant(), HeadsetServer(port=0)

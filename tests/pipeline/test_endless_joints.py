@@ -25,7 +25,7 @@ class WrappedPlant(KinematicPlant):
 
 
 @pytest.mark.slow
-def test_arms_follow_hands_across_the_angle_where_reports_wrap_around() -> None:
+def test_arms_follow_hands_across_the_angle_at_which_the_reported_angles_wrap_around() -> None:
     config = load_config("config/dual_kinova.yaml").model_copy(update={"loop_rate_hz": 500.0})
     robot = Robot.from_config(config)
     plant = WrappedPlant(robot, config)

@@ -1,4 +1,4 @@
-"""Grippers in the whole loop: they close and open, are monitored at their real width, and hold objects."""
+"""Grippers in the whole loop: they close and open, are monitored at their real opening, and hold objects."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.support.processes import Watch, cell
 
 
 @pytest.mark.slow
-def test_at_every_tick_fingers_are_monitored_at_the_width_of_their_grippers() -> None:
+def test_fingers_are_monitored_at_the_opening_of_their_gripper_at_every_tick() -> None:
     loop = pipeline(ScriptedInput("meet"), "mujoco")
     watch, widest = Watch(loop), list[float]()
 
@@ -35,7 +35,7 @@ def test_at_every_tick_fingers_are_monitored_at_the_width_of_their_grippers() ->
 
     loop.listeners.append(listener)
     summary = loop.run(5.6, realtime=False)
-    # The gripper has closed on a block.
+    # At the end, the left gripper has closed on a block. Therefore it is monitored at a smaller opening.
     assert widest[0] == 1.0
     assert widest[-1] < 0.9
     assert widest[-1] == pytest.approx(watch.ticks[-1].grippers["left"] + 0.04, abs=0.02)
@@ -45,7 +45,7 @@ def test_at_every_tick_fingers_are_monitored_at_the_width_of_their_grippers() ->
 
 
 class SeldomAskedGrippers(KinematicPlant):
-    """A plant whose grippers get commands and are measured as seldom as Modbus grippers may be."""
+    """A plant whose grippers are commanded and read as seldom as Modbus grippers may be."""
 
     _measured: dict[str, float] | None = None
     _asked = 0.0
@@ -63,9 +63,9 @@ class SeldomAskedGrippers(KinematicPlant):
         return self._measured or self.openings
 
 
-def test_fingers_are_monitored_at_their_width_also_if_the_gripper_is_seldom_read() -> None:
+def test_fingers_are_monitored_at_their_opening_even_if_the_gripper_is_read_seldom() -> None:
     config, hands = cell(), LeftUpperPresses("circle")
-    hands.again = 1.25  # At this time the gripper is half closed.
+    hands.again = 1.25  # The second press comes while the gripper is half closed.
     slow = {
         side: arm.model_copy(update={"gripper": arm.gripper.model_copy(update={"speed": 0.05})})
         for side, arm in config.arms.items()
@@ -87,8 +87,8 @@ def test_fingers_are_monitored_at_their_width_also_if_the_gripper_is_seldom_read
 
 
 @pytest.mark.slow
-def test_what_is_gripped_is_part_of_the_tool_until_it_is_put_down() -> None:
-    """The object is the flat block of the demo. The contract, with objects, is checked at every tick."""
+def test_a_gripped_object_counts_as_a_part_of_the_tool_until_it_is_put_down() -> None:
+    """The object is the flat block of the demo. The contract, which covers held objects, is checked at every tick."""
     flat = {"box": (0.06, 0.04, 0.015), "at": (0.0, 0.0, 0.0085), "mass": 0.1}
     config = object_cell(None, flat).model_copy(update={"loop_rate_hz": 500.0})
     loop = Pipeline.from_config(config, input=ScriptedInput("grasp"), plant="mujoco")
@@ -102,11 +102,11 @@ def test_what_is_gripped_is_part_of_the_tool_until_it_is_put_down() -> None:
     assert summary.fallback_ticks == summary.uncertified_ticks == 0
     jumps = [np.abs(second.reference.v - first.reference.v).max() for first, second in pairwise(watch.ticks)]
     gripped = next(i for i, tick in enumerate(watch.ticks) if tick.holding["right"])
-    # Largest change of velocity [rad/s]. The position of the resting hand is averaged meanwhile.
+    # No velocity jumps at the grasp [rad/s]. The averaged pose of the resting hand may still move the arm a little.
     assert max(jumps[gripped - 1 : gripped + 20]) < 5e-4
 
 
-def test_a_new_run_compensates_no_weight_of_an_object_that_was_held_at_the_end_of_the_last_run() -> None:
+def test_a_new_run_does_not_compensate_the_weight_of_an_object_that_was_held_in_the_last_run() -> None:
     config = object_cell({"mass": 2.0})
     loop = Pipeline.from_config(config, input=ScriptedInput("circle"), plant="mujoco", mode="torque")
     drive: Any = loop.drive
@@ -133,7 +133,9 @@ class LeftUpperPresses(ScriptedInput):
 
 
 @pytest.mark.slow
-def test_a_gripper_that_the_limiter_keeps_from_closing_holds_no_object(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_gripper_that_the_limiter_keeps_from_closing_counts_as_holding_no_object(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(GripperLimiter, "limit", lambda *_: {"left": 0.5, "right": 1.0})
     loop = Pipeline.from_config(object_cell({}), input=LeftUpperPresses("circle"), plant="mujoco")
     watch = Watch(loop)

@@ -39,7 +39,9 @@ def loop() -> Pipeline:
 
 
 @pytest.mark.parametrize("call", CALLS.values(), ids=list(CALLS))
-def test_a_run_goes_on_after_a_call_with_any_value(loop: Pipeline, call: Callable[[Pipeline, Any], Any]) -> None:
+def test_a_run_keeps_the_contract_after_a_program_calls_it_with_any_value(
+    loop: Pipeline, call: Callable[[Pipeline, Any], Any]
+) -> None:
     reference = loop.tick().reference
     contract = Contract(loop.controller, reference.q, reference.v)
     for value in HOSTILE.values():

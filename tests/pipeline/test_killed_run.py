@@ -1,4 +1,4 @@
-"""A run is killed in the middle of a motion, with real processes and sockets."""
+"""A process that moves the arms is killed during a motion, with real processes and sockets."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_arms_of_a_killed_run_come_to_rest_within_their_certified_stop(config: C
     with waiting_cabinets(Robot.from_config(config), config) as cabinets:
         reports = measure_kill(config, lambda: np.concatenate([cabinets[arm].arm.q for arm in SIDES]), led=0.3)
     for report in reports:
-        assert set(cabinets[report.arm].trips) <= {Trip.LATE}  # The session ended with the client.
+        assert set(cabinets[report.arm].trips) <= {Trip.LATE}  # A cabinet without its client ends the session.
         assert 0.0 < report.stopped_mm < report.allowed_mm
 
 
@@ -68,7 +68,7 @@ class LeadingThread:
 
 
 @pytest.mark.slow
-def test_arms_that_hardly_move_upwards_are_not_killed_and_the_message_says_where_to_begin(
+def test_a_run_whose_arms_hardly_rise_is_not_killed_and_the_error_asks_for_free_space_above_them(
     config: Config, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     slow = config.model_copy(update={"control": config.control.model_copy(update={"max_linear_speed": 0.005})})
@@ -86,7 +86,7 @@ def test_arms_that_hardly_move_upwards_are_not_killed_and_the_message_says_where
 
 
 @pytest.mark.slow
-def test_a_run_that_cannot_begin_gives_the_reason(config: Config) -> None:
+def test_a_run_that_cannot_begin_raises_an_error_with_the_reason(config: Config) -> None:
     port = config.fri["left"].port
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("127.0.0.1", port))

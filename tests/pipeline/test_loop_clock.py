@@ -15,7 +15,7 @@ PERIOD = 0.01
 class LateSleeper:
     """A replacement for the module ``time``.
 
-    Each sleep takes longer than asked for, by the next value of ``delays``.
+    Each sleep lasts longer than its argument by the next value of ``delays`` [s].
     """
 
     def __init__(self, delays: list[float]) -> None:
@@ -42,7 +42,7 @@ def _ticks(monkeypatch: pytest.MonkeyPatch, delays: list[float], count: int) -> 
     return times, steps
 
 
-def test_late_wake_ups_do_not_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_lateness_of_one_tick_does_not_delay_later_ticks(monkeypatch: pytest.MonkeyPatch) -> None:
     delays = np.random.default_rng(1).uniform(0.0, 0.8 * PERIOD, 200).tolist()
     lateness = _ticks(monkeypatch, delays, 200)[0] - PERIOD * np.arange(1, 201)
     assert ((lateness >= -1e-9) & (lateness <= 0.8 * PERIOD + 1e-9)).all()
@@ -85,21 +85,21 @@ def paced_run(monkeypatch: pytest.MonkeyPatch, ticks: int, busy_s: float) -> tup
     return loop, computer.monotonic() - began
 
 
-def test_paced_time_passes_as_fast_as_the_clock_on_a_fast_computer(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_paced_time_passes_as_fast_as_real_time_on_a_fast_computer(monkeypatch: pytest.MonkeyPatch) -> None:
     loop, took = paced_run(monkeypatch, 1000, busy_s=0.3 * PERIOD)
     assert took == pytest.approx(1000 * PERIOD, abs=2 * PERIOD)
     assert loop.real_time_factor() == pytest.approx(1.0, rel=0.01)
     assert (loop.overruns, loop.falls_behind()) == (0, False)
 
 
-def test_paced_time_goes_on_in_slow_motion_on_a_slow_computer(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_paced_time_passes_more_slowly_than_real_time_on_a_slow_computer(monkeypatch: pytest.MonkeyPatch) -> None:
     loop, took = paced_run(monkeypatch, 1000, busy_s=2.5 * PERIOD)
     assert took == pytest.approx(2500 * PERIOD)
     assert loop.real_time_factor() == pytest.approx(0.4, rel=0.01)
     assert (loop.overruns, loop.falls_behind()) == (0, False)
 
 
-def test_a_long_stall_of_the_computer_is_not_caught_up_with(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_paced_time_does_not_catch_up_after_a_long_stall_of_the_computer(monkeypatch: pytest.MonkeyPatch) -> None:
     computer = LateSleeper([])
     monkeypatch.setattr(loop_clock, "time", computer)
     loop = LoopClock(PERIOD, realtime=False, pace=WallPace())
@@ -111,7 +111,7 @@ def test_a_long_stall_of_the_computer_is_not_caught_up_with(monkeypatch: pytest.
     assert computer.monotonic() - began >= 100 * PERIOD - 0.1 - 2 * PERIOD
 
 
-def test_a_loop_that_is_late_in_more_than_a_tenth_of_a_seconds_ticks_falls_behind(
+def test_a_loop_falls_behind_if_it_is_late_in_more_than_a_tenth_of_the_ticks_of_a_second(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     often, seldom = ([2.5 * PERIOD if tick % every == 0 else 0.0 for tick in range(400)] for every in (5, 40))
@@ -131,7 +131,7 @@ def test_lateness_and_overruns_are_counted(monkeypatch: pytest.MonkeyPatch) -> N
     for _ in range(6):
         loop.wait()
     late = loop.lateness.percentiles(1e-3)
-    # The third tick is 25 ms late. The fourth follows at once on a new grid, where it is not late.
+    # The third tick is 25 ms late. The due times start anew there, so the fourth tick is not late.
     assert loop.overruns == 1
     assert (late.p50, late.max) == (pytest.approx(0.0, abs=2e-3), pytest.approx(25.0))
     assert late.p99 == pytest.approx(25.0)
@@ -141,7 +141,7 @@ def state(stamp: float) -> RobotState:
     return RobotState(np.zeros(2), np.zeros(2), np.zeros(2), None, stamp)
 
 
-def test_states_of_a_plant_with_another_clock_that_jumps_back_count_as_new() -> None:
+def test_a_state_counts_as_new_even_if_the_plants_own_clock_has_jumped_back() -> None:
     clock = PlantClock(state(1000.0))
     for stamp, now, expected in ((1000.25, 5.25, 0.25), (1000.5, 5.5, 0.25), (1000.0, 5.75, -0.5)):
         clock.give(0.25)

@@ -1,4 +1,4 @@
-"""Loops adapt to the computer: its clock may pace simulated time, and a loop in real time gets a rate that it keeps."""
+"""Loops adapt to the computer. Its clock may pace simulated time. A loop in real time gets a rate that it can keep."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from q2r2_control.summary.tick import Tick
 from q2r2_control.verification.contract import Contract
 from tests.pipeline.loops import pipeline
 
-_MEASURED = {"compute_time", "solve_time"}  # The time that the computer took is not a result.
+_MEASURED = {"compute_time", "solve_time"}  # These times depend on the computer, so they are not compared.
 
 
 def flat(value: object) -> object:
@@ -98,7 +98,7 @@ def test_ticks_that_measure_the_computer_move_no_arm_and_reach_no_listener() -> 
     assert len(loop.listeners) == 1
 
 
-def test_a_rate_in_the_cell_is_used_unchanged_and_simulated_time_measures_no_computer(
+def test_no_ticks_are_measured_if_the_cell_has_a_rate_or_if_the_time_is_simulated(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     def fail(self: Pipeline) -> Iterator[float]:
@@ -110,7 +110,7 @@ def test_a_rate_in_the_cell_is_used_unchanged_and_simulated_time_measures_no_com
     assert summary.ticks == pytest.approx(101, abs=2), "1000 Hz"
 
 
-def test_a_loop_that_falls_behind_says_so_once_and_names_the_cure(
+def test_a_loop_that_falls_behind_prints_one_line_that_names_the_cures(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(pipeline_module.LoopClock, "falls_behind", lambda self: True)
@@ -120,7 +120,7 @@ def test_a_loop_that_falls_behind_says_so_once_and_names_the_cure(
         assert cure in line
 
 
-def test_a_measured_rate_that_turns_out_too_high_is_explained(
+def test_if_a_loop_falls_behind_a_measured_rate_the_line_says_that_the_rate_was_chosen_at_the_start(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(Pipeline, "_resting_ticks", lambda self: iter([1e-5] * 1000))

@@ -29,7 +29,7 @@ from tests.recording.runs import ROOT, pipeline
 from tests.support.pictures import needs_opengl
 
 COUNT = 200  # Number of pictures in the video.
-LONGEST = 60.0  # A run ends after this time even if what it waits for never happens. Usually it is much shorter [s].
+LONGEST = 60.0  # Longest duration of a run whose end condition is never met [s]. Most runs are much shorter.
 ENOUGH = 12  # Number of different pictures that a policy has to see.
 SIMULATED = {"position": (1.9, 0.0, 1.0), "look_at": (0.4, 0.0, 0.3), "width": 64, "height": 48, "rate": 30}
 
@@ -55,7 +55,7 @@ class Seeing:
 
 
 class Run:
-    """A run whose camera is a video file, until ``during`` returns True."""
+    """A run whose camera is a video file. It ends when ``during`` returns True."""
 
     def __init__(
         self,
@@ -65,7 +65,7 @@ class Run:
         realtime: bool = True,
     ) -> None:
         self.loop = pipeline(source=PolicyInput(policy), cameras={"front": camera})
-        self.shots: list[tuple[float, int]] = []  # Time of each capture by the computer's clock [s], and its number.
+        self.shots: list[tuple[float, int]] = []  # Time of each capture on the computer's clock [s], and the number.
         self.ticks: list[Tick] = []
 
         def stop(tick: Tick) -> None:
@@ -85,18 +85,18 @@ class Run:
         self.shots.append((shot.time, number_of_jpeg(shot.jpeg)))
 
 
-def test_a_policy_sees_the_picture_whose_number_belongs_to_its_time(tmp_path: Path) -> None:
+def test_each_picture_that_a_policy_sees_has_the_time_of_its_own_capture(tmp_path: Path) -> None:
     policy = Seeing()
     run = Run(front(write_video(tmp_path / "front.avi", range(COUNT))), policy, lambda _: len(policy.seen) >= ENOUGH)
     captured = {round(time, 6): number for time, number in run.shots}
-    first, *others = policy.seen  # The first one may be older than the notes of this test.
+    first, *others = policy.seen  # The first picture may be older than ``run.shots``.
     assert [captured[round(time, 6)] for time, _ in others] == [number for _, number in others]
     start = first[0] - first[1] / FPS
     passed = [round((time - start) * FPS) % COUNT for time, _ in policy.seen]
     assert passed == [number for _, number in policy.seen], "the file's own times"
 
 
-def test_in_simulated_time_a_picture_has_a_time_of_the_loops_clock(tmp_path: Path) -> None:
+def test_in_simulated_time_the_time_of_a_picture_is_a_time_of_the_loops_clock(tmp_path: Path) -> None:
     policy = Seeing()
     camera = front(write_video(tmp_path / "front.avi", range(COUNT)))
 
@@ -136,7 +136,7 @@ class Careless(Seeing):
         return observation.state.q
 
 
-def test_a_policy_that_reads_a_camera_that_has_stopped_stops_the_arms_with_one_line(
+def test_if_a_policy_reads_a_camera_that_has_stopped_the_arms_stop_and_one_line_is_printed(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     policy, video = Reading(), write_video(tmp_path / "short.avi", range(5))
@@ -155,7 +155,7 @@ def test_a_policy_that_reads_a_camera_that_has_stopped_stops_the_arms_with_one_l
     assert not any("Traceback" in line for line in caplog.messages)
 
 
-def test_a_policy_that_does_not_read_a_camera_goes_on_when_it_stops(tmp_path: Path) -> None:
+def test_a_policy_that_does_not_read_a_camera_goes_on_when_the_camera_stops(tmp_path: Path) -> None:
     policy, video = Careless(), write_video(tmp_path / "short.avi", range(5))
 
     def goes_on(tick: Tick) -> bool:
@@ -174,7 +174,9 @@ def test_a_policy_that_does_not_read_a_camera_goes_on_when_it_stops(tmp_path: Pa
         ("hand", SIMULATED, "camera 'hand': no such camera; allowed: front"),
     ],
 )
-def test_a_camera_without_pictures_says_why_there_are_none(name: str, camera: dict[str, Any], says: str) -> None:
+def test_an_access_to_a_camera_without_pictures_raises_an_error_with_the_reason(
+    name: str, camera: dict[str, Any], says: str
+) -> None:
     loop = pipeline(cameras={"front": CameraConfig.model_validate(camera)})
     pictures = NewestPictures(loop.config, loop.plant, None).at(1.0)
     assert pictures.get(name) is None
@@ -187,7 +189,7 @@ def simulated(policy: Callable[[Observation], Array]) -> Pipeline:
     return pipeline(plant="mujoco", source=PolicyInput(policy, rate=100.0), cameras=cameras)
 
 
-def test_simulated_cameras_give_a_picture_in_each_of_their_periods() -> None:
+def test_a_simulated_camera_gives_one_picture_in_each_of_its_periods() -> None:
     times: list[float] = []
 
     def hold(observation: Observation) -> Array:

@@ -35,13 +35,13 @@ class FeltHands(HandsInput):
         self.felt.append((self.now, feedback))
 
     def by(self, hand: str, pulse: Pulse) -> list[float]:
-        """Return the amplitudes of a hand's vibrations that have this frequency."""
+        """Return the amplitudes of a hand's vibrations that have the frequency of ``pulse``."""
         of = [one for _, one in self.felt if one.hand == hand and one.amplitude > 0.0]
         return [one.amplitude for one in of if one.frequency == pulse.frequency]
 
 
 def straight(way: Array, duration: float = 1.5) -> Path:
-    """Return a motion from rest to rest along ``way`` [m], after both arms were engaged."""
+    """Return a motion along ``way`` [m] from rest to rest, which begins after both arms were engaged."""
 
     def path(t: float) -> Array:
         share = np.clip((t - BEGIN - 0.1) / duration, 0.0, 1.0)
@@ -85,7 +85,7 @@ def test_a_hand_out_of_reach_feels_its_target_slip_and_a_hand_that_turns_too_far
 
 
 @pytest.mark.slow
-def test_a_push_at_the_tool_is_felt_only_by_its_hand() -> None:
+def test_a_push_at_a_tool_is_felt_only_by_the_hand_that_drives_this_tool() -> None:
     hands = FeltHands()
     loop = pipeline(hands, "mujoco")
     plant = loop.plant
@@ -99,7 +99,7 @@ def test_a_push_at_the_tool_is_felt_only_by_its_hand() -> None:
 
 
 @pytest.mark.slow
-def test_a_gripper_that_closes_on_a_block_is_felt_once_and_an_empty_one_is_not_felt() -> None:
+def test_a_hand_feels_once_that_its_gripper_closes_on_a_block_and_does_not_feel_an_empty_gripper() -> None:
     class FeltScript(ScriptedInput):
         grasps: ClassVar[dict[str, int]] = {}
 

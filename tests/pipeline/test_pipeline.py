@@ -54,7 +54,7 @@ def test_a_loop_calls_a_programs_own_tasks_constraints_and_solver_at_every_tick_
     )
     speeds: list[Array] = []
     loop.listeners.append(lambda tick: speeds.append(np.abs(tick.reference.v)))
-    for _ in range(2):  # A run in simulated time may have its own controller.
+    for _ in range(2):  # Each run in simulated time may have its own controller.
         own.asked = dict.fromkeys(own.asked, 0)
         loop.run(1.8, realtime=False)
         assert min(own.asked.values()) >= 900
@@ -63,7 +63,7 @@ def test_a_loop_calls_a_programs_own_tasks_constraints_and_solver_at_every_tick_
     assert fastest[3] > 0.01
 
 
-def test_a_loop_uses_its_own_solver_instead_of_the_cells() -> None:
+def test_a_solver_that_a_program_names_replaces_the_solver_of_the_cell() -> None:
     loop = Pipeline.from_config(cell(), input=ScriptedInput("circle"), plant="kinematic", solver="osqp")
     assert loop.controller.settings.solver == loop.config.control.solver == "osqp"
     with pytest.raises(ConfigError, match=r"control\.solver = 'nosuch'"):
@@ -140,7 +140,7 @@ def without_times(summary: RunSummary) -> str:
 
 
 @pytest.mark.slow
-def test_a_run_starts_paused_even_when_the_one_before_ended_engaged() -> None:
+def test_no_arm_is_engaged_at_the_start_of_a_run_even_if_the_last_run_ended_with_engaged_arms() -> None:
     loop = pipeline()
     assert loop.run(2.0, realtime=False).arms["left"].engaged_s > 1.0
     for realtime in (False, True):
@@ -179,7 +179,7 @@ def test_a_run_takes_as_many_ticks_as_its_duration_has_periods(rate: float) -> N
     assert summary.duration_s == pytest.approx(summary.ticks / rate)
 
 
-def test_in_real_time_a_run_lasts_as_long_as_asked() -> None:
+def test_a_run_in_real_time_lasts_as_long_as_its_requested_duration() -> None:
     loop = pipeline(loop_rate_hz=100.0)
     watch = Watch(loop)
     summary = loop.run(0.5)
@@ -246,7 +246,7 @@ def test_five_thousand_ticks_of_hostile_samples_break_no_limit_and_raise_nothing
 
 
 @pytest.mark.slow
-def test_a_torque_that_is_not_renewed_in_time_does_not_throw_a_simulated_arm() -> None:
+def test_a_simulated_arm_stays_at_its_reference_even_if_its_torques_are_renewed_late() -> None:
     config = cell().model_copy(update={"loop_rate_hz": 500.0})
     robot = Robot.from_config(config)
     hands = ScriptedInput("circle", frequency_hz=0.5)
@@ -258,7 +258,7 @@ def test_a_torque_that_is_not_renewed_in_time_does_not_throw_a_simulated_arm() -
 
 
 @pytest.mark.slow
-def test_single_ticks_equal_those_of_a_run() -> None:
+def test_ticks_that_a_program_takes_one_by_one_equal_the_ticks_of_a_run() -> None:
     watch, loop = Watch(whole := pipeline()), pipeline()
     whole.run(1.8, realtime=False)
     ran = [tick.reference.q for tick in watch.ticks][:900]
@@ -272,7 +272,7 @@ def test_single_ticks_equal_those_of_a_run() -> None:
     np.testing.assert_array_equal(stepped, ran)
 
 
-def test_single_ticks_are_refused_with_real_arms_because_nothing_would_brake_these() -> None:
+def test_single_ticks_are_refused_with_real_arms_because_nothing_would_brake_the_arms() -> None:
     loop = Pipeline.from_config(load_config("config/dual_iiwa7_fri.yaml"))
     with pytest.raises(ConfigError, match="ticks one by one: allowed with a plant that is simulated only"):
         loop.begin()

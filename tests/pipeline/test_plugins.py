@@ -34,7 +34,7 @@ def merged(data: Any, changes: Any) -> Any:
 
 @pytest.fixture
 def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The shipped cell with the YAML of the page. The page's package is installed, together with a broken entry."""
+    """Return the shipped cell with the YAML of docs/extending.md. Its package and a broken plugin are installed."""
     groups: dict[str, dict[str, str]] = {}
     for block in blocks_of(PAGE, "toml"):
         groups |= tomllib.loads(block)["project"]["entry-points"]
@@ -115,7 +115,7 @@ def test_the_input_in_docs_extending_engages_in_a_real_time_run_too(file: Path) 
     ],
     ids=["input", "cannot be imported", "plant", "binding", "binding by name"],
 )
-def test_for_a_part_that_is_not_installed_or_not_on_the_device_check_prints_one_line_and_the_pipeline_raises_it(
+def test_the_command_check_prints_one_line_about_a_missing_plugin_or_control_and_the_pipeline_raises_it(
     file: Path, change: dict[str, Any], told: str
 ) -> None:
     checked = q2r2("check", str(changed(file, change)))
@@ -125,6 +125,6 @@ def test_for_a_part_that_is_not_installed_or_not_on_the_device_check_prints_one_
         Pipeline.from_config(load_config(str(file)))
 
 
-def test_a_device_without_controls_engages_nothing() -> None:
+def test_a_device_without_any_control_is_refused() -> None:
     with pytest.raises(ConfigError, match="no control at all"):
         cell().teleop.bindings.check_device(DeviceControls((), ()))

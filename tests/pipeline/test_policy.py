@@ -23,11 +23,13 @@ from tests.support.processes import Watch, changes
 
 pytestmark = pytest.mark.slow
 
-CYCLE, PRESS, GIVES_BACK = 0.6, 0.1, 0.3  # Times of an operator who takes over again and again [s].
+# Length of a cycle, length of a press, and time in the cycle at which the operator gives the arms back [s].
+# The operator takes over at the start of each cycle.
+CYCLE, PRESS, GIVES_BACK = 0.6, 0.1, 0.3
 
 
 class Circle:
-    """Both tools move in circles of 60 mm, from where they are first seen."""
+    """A policy that moves both tools in circles of 60 mm, which begin at the first tool poses that it sees."""
 
     space, rate = ActionSpace.TOOL, 50.0
 
@@ -59,7 +61,7 @@ def with_operator() -> Pipeline:
     return pipeline(source=PolicyInput(Circle(), operator=Operator()))
 
 
-def test_takeovers_make_no_target_jump_and_every_tick_says_who_acted() -> None:
+def test_no_target_jumps_at_a_takeover_and_every_tick_says_who_acted() -> None:
     loop, count = with_operator(), 8
     watch = Watch(loop)
     summary = loop.run((count + 1) * CYCLE, realtime=False)
@@ -102,7 +104,7 @@ def test_a_recording_says_at_every_frame_who_acted_and_is_replayed_to_the_bit(tm
 
 
 class Jumping(Circle):
-    """After 0.3 s, the left tool jumps by 1 m in each chunk."""
+    """A policy whose actions after 0.3 s put the left tool 1 m away."""
 
     def __call__(self, observation: Observation) -> Array:
         actions = super().__call__(observation)
@@ -130,7 +132,7 @@ class Leaving(HandsInput):
 
 
 @pytest.mark.parametrize("stopped", [False, True], ids=["engaged", "after a stop that waits for a press"])
-def test_a_program_that_gives_the_arms_to_the_policy_waits_for_no_press(stopped: bool) -> None:
+def test_after_a_program_has_given_the_arms_to_the_policy_the_arms_move_without_a_press(stopped: bool) -> None:
     policy = PolicyInput(Circle(), operator=Leaving())
     loop = pipeline(source=policy)
     watch = Watch(loop)

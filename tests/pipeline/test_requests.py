@@ -30,7 +30,7 @@ def test_a_pause_holds_both_arms_until_a_new_press() -> None:
 
 
 @pytest.mark.slow
-def test_a_press_by_a_program_engages_arms_with_present_hands_and_pauses_no_arm() -> None:
+def test_a_press_of_a_program_engages_arms_whose_hands_send_data_and_pauses_no_arm() -> None:
     loop = pipeline()
     loop.listeners.append(when_moving(loop.pause))
     pressed: list[Tick] = []
@@ -48,7 +48,7 @@ def test_a_press_by_a_program_engages_arms_with_present_hands_and_pauses_no_arm(
         assert moved[-1][1] == "engaged"
 
 
-def test_a_press_by_a_program_does_not_hold_a_dead_mans_switch() -> None:
+def test_a_press_of_a_program_does_not_engage_arms_that_have_a_dead_mans_switch() -> None:
     bindings = BindingSettings(lower=Action.NONE, grip=Action.DEAD_MAN)
     loop = pipeline(teleop=TeleopSettings(bindings=bindings))
     loop.listeners.append(lambda tick: loop.engage())
@@ -76,7 +76,7 @@ def test_stiffnesses_change_gradually_and_only_in_torque_mode() -> None:
         pipeline().change_control({"translational_stiffness": 500.0})
 
 
-def test_the_age_of_a_hands_report_grows_between_two_runs_of_one_pipeline() -> None:
+def test_the_report_of_a_moving_obstacle_grows_older_between_two_runs_of_one_pipeline() -> None:
     loop = pipeline(control=cell().control.model_copy(update={"moving_obstacles": ("hand",)}))
     hand = MovingObstacle(shape="sphere", size=(0.1,), position=(9.0, 9.0, 9.0), speed=0.1)
     reported: list[float] = []
@@ -94,12 +94,12 @@ def test_the_age_of_a_hands_report_grows_between_two_runs_of_one_pipeline() -> N
 
 
 def run_with_a_hand() -> tuple[Pipeline, MovingObstacle]:
-    """Return a pipeline that knows a moving obstacle by name, and a report of it far from the arms."""
+    """Return a pipeline that knows a moving obstacle by its name, and a report of this obstacle far from the arms."""
     loop = pipeline(control=cell().control.model_copy(update={"moving_obstacles": ("hand",)}))
     return loop, MovingObstacle(shape="sphere", size=(0.1,), position=(9.0, 9.0, 9.0), speed=0.1, age=0.5)
 
 
-def test_a_report_of_a_hand_ages_before_the_run_begins() -> None:
+def test_the_report_of_a_moving_obstacle_grows_older_before_the_run_begins() -> None:
     loop, hand = run_with_a_hand()
     loop.move_obstacle("hand", hand)
     time.sleep(0.2)
@@ -107,7 +107,7 @@ def test_a_report_of_a_hand_ages_before_the_run_begins() -> None:
     assert loop.controller.obstacle_reports["hand"].age >= 0.7
 
 
-def test_a_reported_hand_is_known_and_ages_after_a_run_in_simulated_time() -> None:
+def test_the_report_of_a_moving_obstacle_stays_and_grows_older_after_a_run_in_simulated_time() -> None:
     loop, hand = run_with_a_hand()
     loop.move_obstacle("hand", hand)
     loop.run(0.02, realtime=False)
@@ -117,7 +117,7 @@ def test_a_reported_hand_is_known_and_ages_after_a_run_in_simulated_time() -> No
     assert loop.controller.obstacle_reports["hand"].age >= 0.7
 
 
-def test_a_late_first_tick_makes_a_reported_hand_older() -> None:
+def test_the_report_of_a_moving_obstacle_grows_older_by_the_delay_of_a_late_first_tick() -> None:
     made, hand = run_with_a_hand()
     loop = FreezingLoop(made.config, made.robot, made.input, made.plant)
     loop.begin()
@@ -128,7 +128,7 @@ def test_a_late_first_tick_makes_a_reported_hand_older() -> None:
 
 
 @pytest.mark.slow
-def test_a_reported_hand_in_front_of_an_arm_is_named_once_and_brakes_the_arm() -> None:
+def test_a_moving_obstacle_in_front_of_an_arm_brakes_the_arm_and_is_named_in_an_event() -> None:
     loop = pipeline(control=cell().control.model_copy(update={"moving_obstacles": ("hand",)}))
     ticks: list[Tick] = []
 
@@ -154,7 +154,7 @@ def test_a_reported_hand_in_front_of_an_arm_is_named_once_and_brakes_the_arm() -
 
 
 @pytest.mark.slow
-def test_in_torque_mode_the_wall_contains_a_new_box_until_it_is_removed() -> None:
+def test_in_torque_mode_the_wall_repels_an_arm_from_a_new_box_until_the_box_is_removed() -> None:
     loop = pipeline(
         plant="mujoco", mode="torque", control=cell().control.model_copy(update={"moving_obstacles": ("box",)})
     )

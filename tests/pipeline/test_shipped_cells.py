@@ -25,14 +25,14 @@ FILES = [
 
 @pytest.mark.slow
 @pytest.mark.parametrize("file", FILES)
-def test_the_tools_of_a_cell_follow_the_hands_around_a_circle_and_keep_the_contract_where_they_cannot(
+def test_a_shipped_cell_follows_hands_in_a_circle_and_keeps_the_contract_for_targets_out_of_reach(
     file: Path,
 ) -> None:
-    # This is the lowest rate with one substep per tick, because ticks take most of a test's time.
+    # This is the lowest rate with one substep per tick. Fewer ticks make the test faster.
     config = load_config(file).model_copy(update={"loop_rate_hz": 500.0})
     pipeline = Pipeline.from_config(config, input=ScriptedInput.from_config(config, "circle"), plant="mujoco")
     assert preflight_faults(pipeline.robot, pipeline.controller.settings, pipeline.controller) == ()
-    watch = Watch(pipeline)  # It watches the contract.
+    watch = Watch(pipeline)  # It checks the contract at every tick.
     summary = pipeline.run(2.8, realtime=False)
     heights = [[tool.translation[2] for tool in tick.tools.values()] for tick in watch.ticks]
     assert (np.ptp(heights, axis=0) > 0.02).all()

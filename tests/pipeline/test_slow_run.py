@@ -18,7 +18,7 @@ def config() -> Config:
 
 
 @pytest.mark.slow
-def test_no_joint_is_faster_than_a_twentieth_of_its_limit_and_all_rest_at_the_end(config: Config) -> None:
+def test_no_joint_is_faster_than_a_twentieth_of_its_limit_and_all_joints_rest_at_the_end(config: Config) -> None:
     cabinets: list[PendantCabinets] = []
     with slow_run(config, prepare=cabinets.append) as run:
         goal = run.reference + 0.2 * np.tile([0, 0, 0, 1, 1, 1, -1], 2)
@@ -36,7 +36,7 @@ def test_no_joint_is_faster_than_a_twentieth_of_its_limit_and_all_rest_at_the_en
     assert run.is_over
 
 
-def test_the_arms_do_not_take_a_straight_way_that_is_not_free(config: Config) -> None:
+def test_the_arms_do_not_move_if_the_straight_path_to_the_goal_is_not_free(config: Config) -> None:
     with slow_run(config) as run:
         start = run.reference
         into_the_table = start.copy()

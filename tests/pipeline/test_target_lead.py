@@ -1,4 +1,4 @@
-"""Targets that are moved ahead of time, because the plant is late."""
+"""Targets are moved ahead along their motion by the delay of the plant."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def followed(lead: TargetLead, position: float, angle: float = 0.0) -> pin.SE3:
     return led["left"]
 
 
-def test_a_steady_motion_is_ahead_by_the_delay() -> None:
+def test_the_target_of_a_steady_motion_is_moved_ahead_by_the_delay() -> None:
     lead = TargetLead()
     for k in range(100):
         led = followed(lead, 0.3 * k * DT, 1.5 * k * DT)
@@ -50,13 +50,13 @@ def test_a_motion_that_stops_suddenly_overshoots_only_for_a_moment() -> None:
     assert over[15] < 0.1 * over[0]
 
 
-def test_a_jump_of_the_target_does_not_count_as_its_motion() -> None:
+def test_a_target_that_jumps_is_not_moved_ahead() -> None:
     lead = TargetLead()
     followed(lead, 0.0)
     assert followed(lead, 0.1).translation[0] == 0.1
 
 
-def test_an_arm_that_begins_again_has_no_lead_from_before() -> None:
+def test_the_first_target_after_a_pause_is_not_moved_ahead_by_the_motion_before_the_pause() -> None:
     lead = TargetLead()
     for k in range(50):
         followed(lead, 0.3 * k * DT)

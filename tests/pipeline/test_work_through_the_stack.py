@@ -13,7 +13,7 @@ from work_through_stack import Stack
 
 pytestmark = pytest.mark.slow
 
-RATE = 500.0  # This is the lowest rate with one substep per tick, because ticks take most of a test's time [Hz].
+RATE = 500.0  # The lowest rate with one substep per tick [Hz]. Fewer ticks make the tests faster.
 CARRY = replace(carry(0.20, 0.30, shortest=1.0), rest=0.6)
 PASS = replace(WORK_MOTIONS["pass"], rest=0.6)
 SLIDE = replace(WORK_MOTIONS["slide"], rest=1.5)
@@ -37,18 +37,18 @@ def assert_safe(done: Any) -> None:
 def test_arms_that_carry_something_follow_the_hands_closely(mode: str) -> None:
     done = work(CARRY, mode)
     assert_safe(done)
-    # Only the filter's delay remains, which causes 13.5 mm at 0.3 m/s.
+    # Only the error from the filter's delay remains: 13.5 mm at 0.3 m/s.
     assert done.path_error_mm < 7.0
     assert done.rms_error_mm < 20.0
 
 
-def test_arms_get_past_each_other_where_the_hands_lead_them() -> None:
+def test_arms_pass_each_other_if_the_hands_show_them_a_path() -> None:
     done = work(PASS, "torque")
     assert_safe(done)
     assert done.end_error_mm < 3.0
 
 
-def test_a_hand_that_presses_down_slides_the_tool_over_the_table_and_rests_there() -> None:
+def test_a_hand_that_presses_down_slides_the_tool_along_the_table_until_the_tool_rests() -> None:
     done = work(SLIDE, "torque", seed=None)
     assert_safe(done)
     assert 10.0 < done.end_error_mm < 11.0, "10 mm lower than it may"

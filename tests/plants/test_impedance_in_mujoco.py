@@ -23,7 +23,7 @@ POSTURES = {
     "high": [0.4, 0.3, -0.3, -1.0, 0.5, -0.6, 0.2],
     "elbow out": [0.6, 0.5, -1.2, -1.5, 0.9, 1.2, -0.3],
 }
-# Masses of links 0..7 of an iiwa 7 in Drake's description [kg]. The URDF has those of the other public description.
+# Masses of links 0..7 of an iiwa 7 in Drake's description [kg]. The URDF has those of another public description.
 OTHER_MASSES = (3.863, 2.7025, 2.7258, 3.175, 2.73, 1.69, 1.8, 0.4)
 SETTINGS = ImpedanceSettings()
 FORCE = 20.0  # [N]
@@ -94,10 +94,11 @@ def modes(robot: Robot, settings: ImpedanceSettings) -> tuple[Array, Array]:
 
 
 def fitted_ratio(z: Array) -> float:
-    """Return the damping ratio of z'' + 2 xi w z' + w^2 z = 0 that fits a release from rest best, for any xi.
+    """Return the damping ratio xi of z'' + 2 xi w z' + w^2 z = 0 that best fits ``z`` after a release from rest.
 
-    Integrated twice, z - z_0 = -2 xi w S(z - z_0) - w^2 SS z, which is linear in 2 xi w and w^2 and takes no derivative
-    of a measurement. This assumes nothing about xi. A logarithmic decrement, in contrast, needs an oscillation.
+    Integrated twice, the equation is z - z_0 = -2 xi w S(z - z_0) - w^2 SS z, where S is the integral over time. It is
+    linear in 2 xi w and w^2, and contains no derivative of a measurement. The fit works for every xi. A logarithmic
+    decrement, in contrast, needs an oscillation.
     """
     first = cumulative_trapezoid(z - z[0], dx=DT, initial=0)
     second = cumulative_trapezoid(cumulative_trapezoid(z, dx=DT, initial=0), dx=DT, initial=0)
@@ -107,7 +108,7 @@ def fitted_ratio(z: Array) -> float:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("ratio", [0.7, 1.0])
-def test_every_mode_that_is_released_returns_with_its_damping_ratio(
+def test_each_mode_of_the_tool_on_its_spring_returns_with_the_damping_ratio_of_the_settings(
     bare: MujocoPlant, robot: Robot, ratio: float
 ) -> None:
     settings = SETTINGS.model_copy(update={"damping_ratio": ratio})
@@ -190,7 +191,7 @@ def test_a_stretched_arm_stays_stable(bare: MujocoPlant, robot: Robot, wrench: A
     assert np.linalg.norm(loop.displacement()[:3]) < 1e-3
 
 
-def test_an_arm_after_a_blow_keeps_every_bound_and_comes_back(bare: MujocoPlant, robot: Robot) -> None:
+def test_after_a_blow_an_arm_keeps_the_bounds_of_its_torques_and_comes_back(bare: MujocoPlant, robot: Robot) -> None:
     settings = SETTINGS.model_copy(update={"torque_rate_limit": 1000.0})
     loop = TorqueLoop(bare, robot, settings, robot.home, SLOW)
     bare.push("left", np.array([0.0, 300.0, 300.0, 0, 0, 0]), 0.15)
@@ -204,9 +205,9 @@ def test_an_arm_after_a_blow_keeps_every_bound_and_comes_back(bare: MujocoPlant,
     assert np.linalg.norm(loop.displacement()[:3]) < 2e-3
 
 
-def test_a_known_held_mass_causes_no_sag_and_no_torque_jump(bare_config: Config) -> None:
+def test_a_held_mass_that_the_controller_knows_causes_no_sag_and_no_jump_of_torques(bare_config: Config) -> None:
     """A mass of 2 kg at the tool's point causes a sag of 9.8 mm at 2000 N/m, as long as the controller does not know
-    it.
+    the mass.
     """
     data = bare_config.model_dump()
     data["arms"]["left"]["gripper"]["object"] = {"mass": 2.0}

@@ -40,7 +40,9 @@ def test_the_plant_is_exactly_at_the_command_at_the_end_of_the_tick(plant: Kinem
 
 
 @pytest.mark.parametrize("dt", [0.001, 0.0037, 0.02])
-def test_a_gripper_closes_at_its_speed_for_any_tick(plant: KinematicPlant, robot: Robot, dt: float) -> None:
+def test_a_gripper_closes_at_its_speed_for_every_length_of_a_tick(
+    plant: KinematicPlant, robot: Robot, dt: float
+) -> None:
     plant.apply(hold(robot.home, left=0.0))
     while plant.state().stamp < 0.1:
         plant.advance(dt)
@@ -53,7 +55,7 @@ def test_a_gripper_closes_at_its_speed_for_any_tick(plant: KinematicPlant, robot
     assert plant.gripper_openings() == {"left": 0.0, "right": 1.0}
 
 
-def test_reset_forgets_command_time_and_grippers(plant: KinematicPlant, robot: Robot) -> None:
+def test_a_reset_clears_the_command_the_time_and_the_openings_of_grippers(plant: KinematicPlant, robot: Robot) -> None:
     plant.apply(hold(robot.home + 0.1, left=0.0))
     plant.advance(0.1)
     plant.apply(hold(robot.home + 0.2))
@@ -65,6 +67,6 @@ def test_reset_forgets_command_time_and_grippers(plant: KinematicPlant, robot: R
     assert plant.gripper_openings() == {"left": 1.0, "right": 1.0}
 
 
-def test_torque_mode_is_refused_with_what_is_allowed(plant: KinematicPlant, robot: Robot) -> None:
+def test_torque_mode_is_refused_and_the_error_says_what_is_allowed(plant: KinematicPlant, robot: Robot) -> None:
     with pytest.raises(PlantError, match=r"torque.*follows position, velocity commands only"):
         plant.apply(replace(hold(robot.home), mode=CommandMode.TORQUE))

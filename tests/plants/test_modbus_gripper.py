@@ -118,7 +118,7 @@ def test_a_gripper_that_loses_power_during_activation_is_activated_again(
         pytest.param(0x09, [], id="nobody has spoken to it for a second"),
     ],
 )
-def test_a_fault_that_only_a_reset_ends_is_reset(
+def test_a_gripper_is_reset_at_the_first_command_if_only_a_reset_ends_its_fault(
     connect: Connect, simulated: SimulatedGripper, fault: int, begins: list[tuple[int, ...]]
 ) -> None:
     simulated.activate()
@@ -145,7 +145,7 @@ def test_fingers_that_an_object_stops_are_measured_at_that_opening(
     assert gripper.in_words().endswith("unit 9: active, position 204 of 255, holds something")
 
 
-def test_the_ends_of_the_counts_are_closed_and_open_and_values_beyond_are_clipped(
+def test_the_setting_counts_gives_the_open_and_closed_positions_and_measured_openings_are_clipped(
     connect: Connect, simulated: SimulatedGripper
 ) -> None:
     simulated.activate()
@@ -157,7 +157,7 @@ def test_the_ends_of_the_counts_are_closed_and_open_and_values_beyond_are_clippe
         assert simulated.position == position
 
 
-def test_a_lost_connection_is_reported_once_and_returns_with_the_newest_opening(
+def test_a_lost_connection_is_reported_once_and_the_newest_opening_is_sent_after_its_return(
     connect: Connect, simulated: SimulatedGripper, caplog: pytest.LogCaptureFixture
 ) -> None:
     gripper = connect()
@@ -220,7 +220,7 @@ def test_a_fault_during_a_run_is_reported_once_in_words(
 
 @contextmanager
 def serial_line(port: int) -> Iterator[str]:
-    """Return a serial device whose other end is a TCP port."""
+    """Return the path of a serial device whose other end is connected to a TCP port."""
     end, device = os.openpty()
     done = threading.Event()
 

@@ -75,7 +75,9 @@ class TestPositionMode:
                 saturated |= np.abs(state.tau) >= robot.torque_limit * (1 - 1e-12)
         assert saturated.all()
 
-    def test_a_velocity_ends_with_its_tick_if_no_newer_command_comes(self, plant: MujocoPlant, robot: Robot) -> None:
+    def test_an_arm_rests_at_the_last_commanded_position_if_no_newer_command_comes(
+        self, plant: MujocoPlant, robot: Robot
+    ) -> None:
         commands = list(tool_motion(robot, "left", np.array([0.0, 0.0, 0.2]), 0.8, DT, robot.home))[:400]
         for command in commands:
             plant.apply(command)
@@ -87,7 +89,7 @@ class TestPositionMode:
 
 
 class TestTorqueMode:
-    def test_position_mode_at_the_measured_posture_stops_the_arm(self, plant: MujocoPlant, robot: Robot) -> None:
+    def test_a_position_command_at_the_measured_posture_stops_the_arm(self, plant: MujocoPlant, robot: Robot) -> None:
         plant.apply(_torque_command(np.zeros(14)))
         plant.advance(0.05)
         measured = plant.state().q
@@ -97,7 +99,9 @@ class TestTorqueMode:
 
 
 class TestPush:
-    def test_external_torque_equals_the_joint_torques_of_the_push(self, plant: MujocoPlant, robot: Robot) -> None:
+    def test_the_measured_external_torques_are_the_joint_torques_of_the_push(
+        self, plant: MujocoPlant, robot: Robot
+    ) -> None:
         wrench = np.array([10.0, -20.0, 30.0, 1.0, 2.0, -3.0])
         plant.push("left", wrench, 0.5)
         plant.advance(0.4)
@@ -109,7 +113,7 @@ class TestPush:
         plant.advance(0.4)
         np.testing.assert_allclose(_external(plant.state()), 0, atol=1e-9)
 
-    def test_a_push_lasts_for_its_duration_exact_to_a_step(self, plant: MujocoPlant) -> None:
+    def test_a_push_lasts_for_its_duration_to_within_one_step(self, plant: MujocoPlant) -> None:
         plant.push("left", np.array([50.0, 0, 0, 0, 0, 0]), 0.003)
         felt = []
         for _ in range(5):
@@ -153,7 +157,7 @@ class TestGripper:
             plant.advance(DT)
             for joint in ("left_finger_joint_1", "left_finger_joint_2"):
                 assert abs(plant.data.joint(joint).qfrc_actuator[0]) <= 60.0 + 1e-9
-        # A block of 40 mm leaves a part of the stroke of 50 mm.
+        # A block of 40 mm stops the fingers, which open by 50 mm.
         assert plant.gripper_openings()["left"] == pytest.approx(0.8, abs=0.03)
         resting = _block_height(plant)
         grip = float(robot.tool_pose(plant.state().q, "left").translation[2]) - resting
@@ -172,13 +176,17 @@ class TestGripper:
 class TestTime:
     @pytest.mark.slow
     @pytest.mark.parametrize("dt", [0.0001, 0.00037, 0.001, 0.0013, 1 / 60, 1 / 72])
-    def test_the_stamp_differs_from_the_sum_of_ticks_by_less_than_a_step(self, plant: MujocoPlant, dt: float) -> None:
+    def test_the_stamp_of_a_state_differs_from_the_elapsed_time_by_less_than_a_step(
+        self, plant: MujocoPlant, dt: float
+    ) -> None:
         for tick in range(1, 301):
             plant.advance(dt)
             assert -1e-8 < tick * dt - plant.state().stamp < DT
 
     @pytest.mark.parametrize("dt", [float("nan"), float("inf"), -DT, 3600.0])
-    def test_an_impossible_dt_moves_nothing(self, plant: MujocoPlant, robot: Robot, dt: float) -> None:
+    def test_an_impossible_dt_raises_an_error_and_moves_nothing(
+        self, plant: MujocoPlant, robot: Robot, dt: float
+    ) -> None:
         before = plant.state()
         plant.apply(hold(robot.home + 0.1))
         plant.advance(0.0)
@@ -235,7 +243,7 @@ def test_a_block_at_rest_moves_when_an_arm_pushes_it(grasping_plant: MujocoPlant
     assert float(plant.data.body("block").xpos[1]) > before + 0.02
 
 
-def test_a_diverged_simulation_is_an_error_until_reset(plant: MujocoPlant, robot: Robot) -> None:
+def test_a_diverged_simulation_raises_an_error_and_works_again_after_a_reset(plant: MujocoPlant, robot: Robot) -> None:
     plant.data.qvel[3] = np.nan
     with pytest.raises(PlantError, match="diverged"):
         plant.advance(DT)

@@ -25,7 +25,7 @@ def axes(**camera: object) -> tuple[Array, Array]:
     return found.xpos.copy(), found.xmat.reshape(3, 3).copy()
 
 
-def test_a_camera_that_looks_at_a_point_has_it_in_the_middle_and_stands_upright() -> None:
+def test_a_camera_that_looks_at_a_point_shows_the_point_in_the_middle_of_an_upright_picture() -> None:
     position, turned = axes(position=(2, 1, 1.5), look_at=(0.5, 0, 0))
     right, up, back = turned.T
     np.testing.assert_allclose(position, (2, 1, 1.5))
@@ -35,13 +35,13 @@ def test_a_camera_that_looks_at_a_point_has_it_in_the_middle_and_stands_upright(
     assert up[2] > 0.5
 
 
-def test_a_camera_without_rotation_looks_along_x_with_z_up_and_one_that_looks_down_has_x_up_in_its_picture() -> None:
+def test_a_camera_without_rotation_looks_along_x_with_z_up_and_a_camera_that_looks_down_has_x_up() -> None:
     along_x, down = axes(position=(0, 0, 1), rpy=(0, 0, 0))[1].T, axes(position=(0.5, 0, 2), look_at=(0.5, 0, 0))[1].T
     np.testing.assert_allclose(along_x, ((0, -1, 0), (0, 0, 1), (-1, 0, 0)), atol=1e-12)
     np.testing.assert_allclose(down, ((0, -1, 0), (1, 0, 0), (0, 0, 1)), atol=1e-12)
 
 
-def test_a_camera_on_a_missing_link_is_refused_with_the_existing_links() -> None:
+def test_the_error_for_a_camera_on_a_missing_link_names_the_existing_links() -> None:
     with pytest.raises(PlantError, match=r"cameras\.one\.link = 'hand': no such link; allowed: left_link_0, "):
         axes(link="hand", position=(0, 0, 1), rpy=(0, 0, 0))
 

@@ -36,7 +36,7 @@ def test_joint_space_inertia_and_gravity_equal_the_controllers_model(plant: Mujo
     np.testing.assert_allclose(plant.data.qfrc_bias[index], gravity, atol=1e-5)
 
 
-def test_joints_feel_the_share_of_rotor_inertia_that_the_cell_says(config: Config, robot: Robot) -> None:
+def test_each_joint_has_the_share_of_its_rotor_inertia_that_the_cell_sets(config: Config, robot: Robot) -> None:
     share = config.mujoco.model_copy(update={"rotor_share": 0.25})
     lighter = MujocoPlant(robot, config.model_copy(update={"mujoco": share}))
     for name, armature in zip(robot.joint_names, robot.model.armature, strict=True):
@@ -54,7 +54,7 @@ def test_joint_and_torque_limits_are_those_of_the_robot(plant: MujocoPlant, robo
         )
 
 
-def test_drawings_and_envelopes_touch_nothing_but_fingers_do(plant: MujocoPlant) -> None:
+def test_visual_shapes_and_envelopes_have_no_contacts_but_fingers_have_contacts(plant: MujocoPlant) -> None:
     names = {plant.model.geom(index).name for index in range(plant.model.ngeom)}
     assert {"left_link_3_ring", "left_hand_e_finger_1_tip_1_envelope", "right_hand_e_finger_2_contact"} <= names
     for name in names:
@@ -82,7 +82,7 @@ def test_only_the_blocks_on_the_table_are_in_contact_at_home(plant: MujocoPlant,
         pytest.param([0, -1.2, 0, 2.0, 0, -1.5, 0] + [0] * 7, {"left"}, id="an arm and itself"),
     ],
 )
-def test_bodies_that_can_really_meet_collide(plant: MujocoPlant, q: list[float], prefixes: set[str]) -> None:
+def test_bodies_that_can_touch_each_other_have_contacts(plant: MujocoPlant, q: list[float], prefixes: set[str]) -> None:
     plant.reset(np.array(q, dtype=float))
     assert prefixes in [{name.split("_")[0] for name in pair} for pair in _pairs_in_contact(plant)]
 
@@ -105,7 +105,7 @@ def test_a_block_falls_onto_the_floor(
     assert obstacles or plant.model.geom("floor").type[0] == mujoco.mjtGeom.mjGEOM_PLANE
 
 
-def test_a_finger_meets_the_floor(config: Config) -> None:
+def test_a_finger_can_touch_the_floor(config: Config) -> None:
     plant = _with_a_falling_block(config, 0.2)
     reaching_down = np.array([0.0, 1.6, 0.0, -0.9, 0.0, 0.6, 0.0])
     plant.reset(np.concatenate([reaching_down, reaching_down]))
@@ -122,7 +122,7 @@ def _with_a_falling_block(config: Config, floor: float | None) -> MujocoPlant:
     return MujocoPlant(Robot.from_config(cell), cell)
 
 
-def test_neighbours_never_touch_in_the_whole_joint_range(plant: MujocoPlant, robot: Robot) -> None:
+def test_neighbouring_links_have_no_contact_in_the_whole_joint_range(plant: MujocoPlant, robot: Robot) -> None:
     rng = np.random.default_rng(7)
     for _ in range(200):
         plant.reset(rng.uniform(robot.position_lower, robot.position_upper))
@@ -133,7 +133,7 @@ def test_neighbours_never_touch_in_the_whole_joint_range(plant: MujocoPlant, rob
                 assert abs(first - second) > 1, pair
 
 
-def test_an_object_named_like_a_part_of_the_robot_is_refused(robot: Robot, config: Config) -> None:
+def test_an_object_with_the_name_of_another_body_is_refused(robot: Robot, config: Config) -> None:
     thing = ObjectConfig(size=(0.04, 0.04, 0.04), position=(0.5, 0.0, 0.3))
     clashing = config.model_copy(update={"mujoco": MujocoConfig(objects={"table": thing})})
     with pytest.raises(PlantError, match=r"dual_iiwa7: MuJoCo cannot make a model of it: .*table"):
@@ -157,7 +157,7 @@ DAE = """<?xml version="1.0"?>
 </COLLADA>
 """
 
-# MuJoCo refuses the inertia as it is.
+# MuJoCo alone would refuse this inertia, because izz is 0.
 URDF = """<robot name="rod"><link name="base"/><link name="rod">
 <inertial><mass value="1"/><inertia ixx="1e-4" iyy="1e-4" izz="0" ixy="0" ixz="0" iyz="0"/></inertial>
 <collision><geometry><mesh filename="wedge.dae" scale="2 2 2"/></geometry></collision></link>
@@ -176,7 +176,7 @@ def _cell(folder: Path) -> Config:
     return load_config(folder / "cell.yaml")
 
 
-def test_the_mesh_in_mujoco_is_the_one_that_the_controller_encloses(tmp_path: Path) -> None:
+def test_the_capsule_of_the_controller_encloses_the_mesh_in_mujoco(tmp_path: Path) -> None:
     config = _cell(tmp_path)
     robot = Robot.from_config(config)
     model = build_model(robot, config)
@@ -194,7 +194,7 @@ def test_the_mesh_in_mujoco_is_the_one_that_the_controller_encloses(tmp_path: Pa
     assert (across <= capsule.geometry.radius + 1e-6).all()
 
 
-def test_an_unreadable_mesh_is_named_in_one_line(tmp_path: Path) -> None:
+def test_an_unreadable_mesh_is_named_in_an_error_of_one_line(tmp_path: Path) -> None:
     config = _cell(tmp_path)
     robot = Robot.from_config(config)
     (tmp_path / "wedge.dae").write_text("no mesh")

@@ -11,12 +11,14 @@ from q2r2_control.plants.scene import let_fingers_slide, set_obstacles
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
-LOAD = 20.0  # [N]
+LOAD = 20.0  # Force that presses the pad on the table [N].
 # Mass of the pad [kg]. MuJoCo scales stiffness with the lightest moving part, such as a finger in its gripper.
 MASS = 0.1
 
 
-def test_every_pad_is_paired_with_the_table_at_the_cells_friction(robot: Robot, config: Config) -> None:
+def test_every_finger_pad_has_a_contact_pair_with_the_table_and_the_friction_of_the_cell(
+    robot: Robot, config: Config
+) -> None:
     slippery = config.mujoco.model_copy(update={"obstacle_friction": 0.3})
     model = MujocoPlant(robot, config.model_copy(update={"mujoco": slippery})).model
     table = model.geom("table_collision").id
@@ -31,12 +33,14 @@ def test_every_pad_is_paired_with_the_table_at_the_cells_friction(robot: Robot, 
     assert named == {frozenset((shape, table)) for shape in (*pads, sponge)}
     np.testing.assert_array_equal(model.pair_friction[:, :2], 0.3)
     assert model.geom_friction[table, 0] == 0.3
-    # The table bears a finger like any other body.
+    # The table is as stiff for a finger as for any other body.
     of_pads = model.pair_solref[(model.pair_geom1 != sponge) & (model.pair_geom2 != sponge)]
     np.testing.assert_array_equal(of_pads, np.tile(model.geom_solref[table], (len(pads), 1)))
 
 
-def test_a_soft_object_yields_by_its_stiffness_where_it_stands(robot: Robot, config: Config) -> None:
+def test_a_soft_object_under_a_force_is_compressed_by_the_force_over_its_stiffness(
+    robot: Robot, config: Config
+) -> None:
     plant = MujocoPlant(robot, config)
     sponge, heights = plant.model.body("sponge").id, []
     for force in (0.0, 5.0, 10.0):
@@ -49,9 +53,9 @@ def test_a_soft_object_yields_by_its_stiffness_where_it_stands(robot: Robot, con
 
 
 def depths(config: Config, speed: float, named: bool) -> Array:
-    """Return the depth in the table at each millisecond [m] of a pad that slides under the load :data:`LOAD`.
+    """Return how deep a pad is in the table at each millisecond [m]. It slides at ``speed`` [m/s] under :data:`LOAD`.
 
-    With ``named``, the model has contact pairs of pads and obstacles.
+    If ``named`` is True, the model has contact pairs of pads and obstacles.
     """
     spec = mujoco.MjSpec()
     spec.option.cone, spec.option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, 100.0
@@ -76,7 +80,7 @@ def depths(config: Config, speed: float, named: bool) -> Array:
     return np.array(seen)
 
 
-def test_a_finger_stays_in_contact_and_about_as_deep_when_it_slides(config: Config) -> None:
+def test_a_finger_that_slides_stays_in_contact_at_about_the_depth_of_a_resting_finger(config: Config) -> None:
     """If friction acted as fast as the contact force, the finger would rise by its whole depth, and hop."""
     still = depths(config, 0.0, named=True)
     np.testing.assert_allclose(still, depths(config, 0.0, named=False), rtol=0.01)

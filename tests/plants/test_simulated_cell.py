@@ -27,7 +27,7 @@ def push(cell: SimulatedCell, now: float) -> None:
 
 
 @pytest.mark.parametrize("late", [0.02, 0.05, 0.09])
-def test_a_torque_that_is_not_renewed_acts_for_some_milliseconds(cell: SimulatedCell, late: float) -> None:
+def test_a_torque_that_is_not_renewed_acts_for_about_12_milliseconds(cell: SimulatedCell, late: float) -> None:
     cell.advance(0.0)
     push(cell, 0.0)
     for now in np.arange(0.004, late, 0.004):
@@ -47,7 +47,7 @@ def test_an_old_torque_does_not_act_for_the_whole_time_of_a_late_call(cell: Simu
     assert cell.plant.data.time <= 0.012 + 1e-9
 
 
-def test_servos_hold_the_arms_if_no_torques_come_for_a_while(cell: SimulatedCell) -> None:
+def test_servos_hold_the_arms_if_no_torques_come_for_a_tenth_of_a_second(cell: SimulatedCell) -> None:
     cell.advance(0.0)
     push(cell, 0.0)
     for now in np.arange(0.004, 1.0, 0.004):
@@ -106,7 +106,7 @@ def test_without_commands_the_cell_coasts_briefly_and_brakes() -> None:
     assert not follower.v.any()
 
 
-def test_a_command_may_name_some_joints_and_the_others_stay() -> None:
+def test_a_command_may_name_only_some_joints_and_the_other_joints_stay() -> None:
     follower = JointFollower(np.array([0.1, 0.2]), ACCELERATION, LIMIT)
     for tick in range(100):
         follower.command(np.array([1]), np.array([0.25]), np.zeros(1), tick * DT)

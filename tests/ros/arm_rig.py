@@ -34,13 +34,14 @@ def patient(parameters: Mapping[str, Any]) -> list[str]:
     return [f"{name}:={value}" for name, value in (PATIENT | dict(parameters)).items()]
 
 
-HOLDING = ("paused", "lost")  # States of an arm that was engaged.
+HOLDING = ("paused", "lost")  # States in which an arm holds after it was engaged.
 
 
 class ArmRig:
     """The hand and the robot of one arm.
 
-    If ``follows`` is True, the tool is always at the newest target. If ``sends_tool`` is True, its pose is on /tf.
+    If ``follows`` is True, the tool is always at the newest target. If ``sends_tool`` is True, the tool's pose is on
+    /tf.
     """
 
     def __init__(
@@ -52,16 +53,16 @@ class ArmRig:
         robot: str = "q2r2",
         answers: bool | None = None,
     ) -> None:
-        """With ``answers``, the rig reports like the built-in controller.
+        """If ``answers`` is True, the rig reports its state like the built-in controller.
 
-        By default, it does so if it takes the targets that are meant for that controller.
+        The default of ``answers`` is True if ``topic`` is None, because the rig then takes that controller's targets.
         """
         self.arm, self.node = arm, node
         self.hand, self.tool = HAND, TOOL
         self.lower = self.upper = False
         self.grip = self.trigger = 0.0
         self.sends_hand = self.sends_tool = self.follows = True
-        self.sent = 0  # Messages of the hand since a button was pressed or released.
+        self.sent = 0  # Number of messages of the hand since the last press or release of a button.
         self.targets: list[PoseStamped] = []
         self.state: dict[str, Any] = {}
         self.ready_states = 0  # Number of ready states in a row.
@@ -118,7 +119,7 @@ class ArmRig:
             time.sleep(PERIOD / 2)
 
     def let_the_hand_rest(self) -> None:
-        """Send a hand at rest until the controller's filter, which is slowest at rest, has reached the hand's pose."""
+        """Send the pose of a resting hand until the controller's filter, which is slowest at rest, has reached it."""
         self.sent = 0
         self.wait(lambda: self.sent > 2.0 / PERIOD, "the hand rests")
 
@@ -177,7 +178,7 @@ class ArmRigs:
         self.press_until(lambda rig: rig.state.get("engaged"), "the arm is engaged")
 
     def wait_until_ready(self, states: int) -> None:
-        """Wait until all rigs have been ready in that many states in a row, from now on."""
+        """Wait until each rig has been ready in ``states`` new states in a row."""
         for rig in self.rigs:
             rig.ready_states = 0
         self.wait(lambda rig: rig.ready_states >= states, "nothing keeps the arm from being engaged")
@@ -196,7 +197,7 @@ class ArmRigs:
             thread.join()
 
     def interrupt_hand_data(self) -> None:
-        """Send no hand data until all arms are paused, and then send them from another place."""
+        """Send no hand data until all arms are paused. Then send them again, with the hands at other positions."""
         for rig in self.rigs:
             rig.sends_hand = False
         self.wait_for_pause()
@@ -211,7 +212,7 @@ class ArmRigs:
         self.wait(condition, what)
 
     def press(self, button: str = "lower") -> None:
-        """Press one button of each hand, which is no chord. Hold it, and then release it, for several messages."""
+        """Hold one button of each hand for several messages, and then release it for several. This is no chord."""
         for held in (True, False):
             for rig in self.rigs:
                 setattr(rig, button, held)

@@ -99,7 +99,7 @@ class Cell:
         wait_until(lambda: all(self.find_tool(arm) is not None for arm in self.robot.arms), "tools are on /tf")
 
     def engage(self, *arms: str) -> Stream:
-        """Begin streams of targets at the tools, and wait until they are followed."""
+        """Begin a stream of targets at the tool of each arm, and wait until the arms follow."""
         stream = Stream(self, {arm: self.tool(arm) for arm in arms})
         follows = lambda: all(self.state(f"{arm}_state") == "following" for arm in arms)  # noqa: E731
         wait_until(follows, f"{arms} follow", lambda: self.states)
@@ -117,7 +117,7 @@ class Cell:
         assert self.call("/cartesian_controller/reset").success
 
     def wait_until_there(self, arm: str, goal: pin.SE3, within: float) -> None:
-        """Wait until a tool is within this distance of a pose [m]."""
+        """Wait until the tool of ``arm`` is less than ``within`` [m] away from ``goal``."""
 
         def there() -> bool:
             tool = self.find_tool(arm)
@@ -131,7 +131,7 @@ class Cell:
 
 
 class Stream:
-    """A thread that sends the targets of some arms steadily until its end; ``poses`` may be replaced."""
+    """A thread that steadily sends the targets of some arms until :meth:`end`. Tests may change ``poses``."""
 
     def __init__(self, cell: Cell, poses: dict[str, pin.SE3]) -> None:
         self.poses = dict(poses)
@@ -141,7 +141,7 @@ class Stream:
         self._thread.start()
 
     def move(self, arm: str, by: tuple[float, float, float], speed: float = 0.25) -> None:
-        """Move an arm's target on a straight line [m], [m/s], and return when it has arrived."""
+        """Move an arm's target straight by ``by`` [m] at ``speed`` [m/s]. Return when the target has arrived."""
         start, way = self.poses[arm], np.array(by)
         steps = max(int(np.linalg.norm(way) / speed * RATE), 1)
         for step in range(1, steps + 1):
@@ -185,7 +185,8 @@ def shifted(pose: pin.SE3, *by: float) -> pin.SE3:
     return pin.SE3(pose.rotation, pose.translation + np.array(by))
 
 
-SLOW = 0.05  # This is 3 % of a joint's limit: the arm still settles, but no longer follows [rad/s].
+# Speed of 3 % of a joint's limit [rad/s]. A slower arm still settles, but no longer follows.
+SLOW = 0.05
 REST = 0.01  # A joint that is slower than this rests [rad/s].
 REST_TIME = 0.3  # Time for which joints have to be slower than that [s].
 # The window is longer than the time in which a starved robot catches up, and shorter than a jump takes [s].
@@ -193,7 +194,7 @@ SPEED_WINDOW = 0.2
 
 
 class Joints(NamedTuple):
-    t: float  # Time of its receipt, on this machine's steady clock [s].
+    t: float  # Time of receipt of the message, on this machine's steady clock [s].
     q: Array
     v: Array
     stamp: float  # Stamp of the message [s].
@@ -231,7 +232,7 @@ class JointRecorder:
         return np.asarray(speeds.max(axis=0), dtype=float)
 
     def fastest(self, since: float) -> float:
-        """Return the largest speed of any joint since a time [s], as a mean over a window [rad/s]."""
+        """Return the largest mean speed of a joint in a window of ``SPEED_WINDOW`` after ``since`` [rad/s]."""
         states, first, fastest = self.since(since), 0, 0.0
         for state in states:
             while state.stamp - states[first].stamp > SPEED_WINDOW:
@@ -257,13 +258,14 @@ class JointRecorder:
         return self.q
 
     def stop_after(self, fault: float) -> tuple[float, float]:
-        """Wait for rest after a fault [s].
+        """Wait until all joints rest after a fault at the time ``fault`` [s].
 
-        Return the largest joint speed [rad/s], and the time until all joints are slow [s].
+        Return the largest joint speed just before the fault [rad/s], and the time from the fault until all joints are
+        slower than ``SLOW`` [s].
         """
 
         def last(speed: float) -> float:
-            """Return the last time when a joint was faster than this."""
+            """Return the last time at which a joint was faster than ``speed`` [rad/s]."""
             return max((state.t for state in self.since(fault) if np.abs(state.v).max() > speed), default=fault)
 
         wait_until(lambda: self.states[-1].t - last(REST) > REST_TIME, "all joints rest")

@@ -19,7 +19,7 @@ ROBOT, CONTROLLER, ARMS = "mujoco_robot", "cartesian_controller", "arm_controlle
 class Cockpit:
     def __init__(self, node: Any, robot: Robot, processes: Processes, parameters: Mapping[str, Any]) -> None:
         self._starts: dict[str, Callable[[], RosProcess]] = {
-            ROBOT: lambda: start_robot(processes, "max_jump:=1.0"),  # A jump has to be visible.
+            ROBOT: lambda: start_robot(processes, "max_jump:=1.0"),  # The robot follows a jump, so that tests see it.
             CONTROLLER: lambda: start_controller(processes, *PATIENT),
             ARMS: lambda: processes.start_node(ARMS, *patient(parameters)),
         }

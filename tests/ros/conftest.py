@@ -1,6 +1,6 @@
 """ROS 2 in tests: a private domain for each worker, processes and nodes in it, and the message packages they need.
 
-Modules that need ROS call :func:`need_ros` on top, or use one of these fixtures, which skip.
+Modules that need ROS call :func:`need_ros` at their top, or use a fixture of this file. Both skip tests without ROS.
 """
 
 from __future__ import annotations
@@ -49,11 +49,12 @@ def domain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
 @pytest.fixture(scope="session", autouse=True)
 def precedence() -> Iterator[None]:
     """Give this process and its children priority over all others, if that is permitted."""
-    # No process of a test has priority over another one, as on a machine without other load.
+    # All processes of the tests have the same priority, as on a machine without other load.
     with suppress(OSError):
         os.setpriority(os.PRIO_PROCESS, 0, _NICE)
-    # On Linux, nice levels count only within a session, and the session of a terminal goes on after the tests.
-    # The file is empty where control groups share the processor: then there is nothing to change and to restore.
+    # On Linux, a nice level counts only within its session. Therefore the level of the session is changed too, and is
+    # restored at the end, because the session of a terminal goes on after the tests. If control groups share the
+    # processor, the file is empty and nothing is changed.
     of_session, words = Path("/proc/self/autogroup"), list[str]()
     with suppress(OSError):
         words = of_session.read_text().split()
@@ -135,7 +136,7 @@ def spun_node(domain: int, name: str = "test") -> Iterator[Any]:
     ended = Event()
 
     def spin() -> None:
-        # A test may destroy an entity that the executor is about to wait for. The other entities continue.
+        # If a test destroys an entity that the executor is about to wait for, the executor spins on with the others.
         while not ended.is_set():
             with suppress(InvalidHandle):
                 executor.spin()

@@ -21,7 +21,7 @@ SAG = 2e-3  # The measured joints hang this far below their commands [rad].
 BRAKES = 10.0  # Deceleration of a cabinet whose client is gone [rad/s^2].
 TOPICS = {"for Jazzy": ("lbr_joint_position_command", "lbr_state"), "of 2024": ("joint_position", "state")}
 _ROUNDING = 1e-6  # Relative tolerance of the limits.
-_ORDER = [2, 0, 1, 3, 4, 6, 5]  # Order of the joints in its joint states.
+_ORDER = [2, 0, 1, 3, 4, 6, 5]  # Order of the joints in the driver's joint states.
 
 
 class FakeLbr:
@@ -33,7 +33,7 @@ class FakeLbr:
     def __init__(self, robot: Robot, arm: str, tau: float = TAU) -> None:
         """The time constant of the filter of positions is ``tau`` [s]."""
         joints = robot.arms[arm].joints
-        self._share = 1.0 if tau == 0.0 else 1.0 - math.exp(-PERIOD / tau)  # Share of the distance per period.
+        self._share = 1.0 if tau == 0.0 else 1.0 - math.exp(-PERIOD / tau)  # Share of the error that a period removes.
         # Positions and velocities as commanded to the cabinet [rad], [rad/s].
         self.q, self.v = robot.home[joints].copy(), np.zeros(len(joints))
         self.session, self.quality, self.safety = Session.MONITORING_READY, Quality.EXCELLENT, Safety.NORMAL
@@ -41,7 +41,7 @@ class FakeLbr:
         self.silent = False  # If True, the driver's process has ended.
         self.begun, self.trips = 0, list[str]()
         self.target: Array | None = None  # The newest command of this session.
-        self.ipo = self.q  # The cabinet's own motion stays where the session began. Commands are added to it.
+        self.ipo = self.q  # The cabinet's own position stays where the session began [rad]. Commands are added to it.
         self._fastest = robot.velocity_limit[joints] * (1.0 + _ROUNDING)
         away = NARROWER + self._fastest * PERIOD  # The driver's guard safe_stop has this narrower limit.
         self._lower, self._upper = robot.position_lower[joints] + away, robot.position_upper[joints] - away

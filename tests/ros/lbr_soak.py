@@ -28,7 +28,7 @@ _STUCK = 20.0  # A session in which nothing moves for this time will never move 
 
 @dataclass
 class LbrSoak:
-    """A soak that begins both sessions, lets the arms move for a while, and ends them in some way."""
+    """A soak that begins both sessions, lets the arms move for a while, and ends one or both for a random cause."""
 
     virtual: VirtualLbrs
     sessions: int
@@ -62,7 +62,7 @@ class LbrSoak:
         self.faults.append(f"{self.virtual.now:.3f} s, session {self.ended}, {self._how}: {what}")
 
     def _on_command(self, arm: str, q: Array) -> None:
-        """Check a command when it is sent: each period is within the limits of the reference and without a jump."""
+        """Check a command when it is sent. Its step must keep the limits of the reference, and it must not jump."""
         node, joints, session = self.virtual.node, self.virtual.robot.arms[arm].joints, self.virtual.drivers[arm].begun
         tick, v = node._advances, np.full(len(q), math.nan)
         if arm in self._commands:

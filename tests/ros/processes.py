@@ -1,8 +1,8 @@
-"""Processes that a test starts, each ended by its own id, with its output in a failure's report; and waiting for nodes.
+"""Processes that a test starts and ends by their ids. The report of a failed test contains their output.
 
-To import a node takes one to two seconds of processor time, and a test of a whole set starts five nodes. Therefore they
-are forked from a server that has imported all modules once, before ROS is initialised. A forked process then runs the
-same code as ``python -m`` does.
+To import a node takes one to two seconds of processor time, and a test of a whole set starts five nodes. Nodes are
+therefore forked from a server that has imported all modules once, before ROS is initialised. A forked process then runs
+the same code as ``python -m`` does.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class RosProcess:
         """Return the first whole line of output that contains ``text``. Fails if the process ends or time runs out."""
         deadline = time.monotonic() + timeout
         while True:
-            ended = not self.running  # This is asked before reading, so that all of the output is read.
+            ended = not self.running  # This comes before reading, so that no last output is missed.
             for line in self.output.splitlines(keepends=True):
                 if text in line and line.endswith("\n"):
                     return line.rstrip("\n")

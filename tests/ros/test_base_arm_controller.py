@@ -34,7 +34,7 @@ from tests.ros.arm_rig import TOOL, ArmRig, assert_same, offset, patient, steps,
 from tests.ros.programs.stalling_arm import STALL
 
 
-def test_an_arm_engages_where_it_is_follows_pauses_and_resumes_without_a_jump(
+def test_an_arm_engages_at_its_tool_follows_the_hand_and_resumes_after_a_pause_without_a_jump(
     rig: ArmRig, processes: Processes
 ) -> None:
     process = rig.start(processes)
@@ -71,8 +71,10 @@ def _quaternion(target: Any) -> list[float]:
     return [orientation.x, orientation.y, orientation.z, orientation.w]
 
 
-def test_an_arm_that_hangs_below_its_target_resumes_with_that_target(rig: ArmRig, processes: Processes) -> None:
-    """Another controller moves the arm and reports no command. The last target counts as the pose that it holds."""
+def test_an_arm_that_hangs_below_its_target_resumes_with_this_target_after_a_pause(
+    rig: ArmRig, processes: Processes
+) -> None:
+    """Another controller moves the arm and reports no command. Its last target counts as the pose that it holds."""
     rig.start(processes)
     rig.engage()
     rig.wait(lambda: rig.targets, "targets come")
@@ -88,7 +90,9 @@ def test_an_arm_that_hangs_below_its_target_resumes_with_that_target(rig: ArmRig
     assert_same(rig.wait_for_rest(), offset(TOOL, (0.0, 0.05, 0.0)), 1e-3)
 
 
-def test_a_silent_hand_pauses_the_arm_and_its_return_moves_nothing(rig: ArmRig, processes: Processes) -> None:
+def test_a_silent_hand_pauses_its_arm_and_the_return_of_hand_data_moves_no_arm(
+    rig: ArmRig, processes: Processes
+) -> None:
     rig.start(processes, {"teleop.gate.timeout": 0.5})
     rig.engage()
     rig.move((0.1, 0.0, 0.0), 0.2)
@@ -110,7 +114,9 @@ def test_a_silent_hand_pauses_the_arm_and_its_return_moves_nothing(rig: ArmRig, 
     assert_same(rig.newest(), held, 1e-6)
 
 
-def test_a_node_that_stood_still_in_a_tick_sends_no_target_of_the_past(rig: ArmRig, processes: Processes) -> None:
+def test_a_node_that_stood_still_during_a_tick_sends_no_target_from_before_the_standstill(
+    rig: ArmRig, processes: Processes
+) -> None:
     """The node sends neither the target that it had computed, nor the rest of its last motion."""
     process = processes.start_module("tests.ros.programs.stalling_arm", *as_arguments(*patient({})))
     rig.wait_until_connected()
@@ -152,7 +158,9 @@ def test_an_arm_needs_the_pose_of_its_tool_and_a_gripper_needs_its_server(rig: A
     assert rig.state["gripper"] == "open"
 
 
-def test_services_and_a_second_publisher_of_targets_pause_the_arm(rig: ArmRig, node: Any, processes: Processes) -> None:
+def test_the_services_pause_and_reset_and_a_second_publisher_of_targets_pause_the_arm(
+    rig: ArmRig, node: Any, processes: Processes
+) -> None:
     rig.start(processes)
     for service in ("pause", "reset"):
         rig.engage()
@@ -188,7 +196,9 @@ def test_a_second_publisher_of_the_same_hand_pauses_the_arm_and_is_named(
     rig.engage()
 
 
-def test_a_hand_feels_the_controllers_reports_about_its_arm(rig: ArmRig, node: Any, processes: Processes) -> None:
+def test_a_hand_feels_the_small_spare_distance_of_its_arm_that_the_controller_reports(
+    rig: ArmRig, node: Any, processes: Processes
+) -> None:
     publisher = node.create_publisher(String, "/cartesian_controller/condition/left", 10)
     rig.start(processes)
     rig.wait(publisher.get_subscription_count, "the node listens")
@@ -199,7 +209,9 @@ def test_a_hand_feels_the_controllers_reports_about_its_arm(rig: ArmRig, node: A
 
 
 @pytest.mark.parametrize("kind", ["GripperCommand", "ParallelGripperCommand"])
-def test_a_gripper_is_closed_when_its_result_says_so(kind: str, rig: ArmRig, processes: Processes, domain: int) -> None:
+def test_a_gripper_counts_as_closed_when_the_result_of_its_goal_says_stalled(
+    kind: str, rig: ArmRig, processes: Processes, domain: int
+) -> None:
     action = getattr(control_msgs.action, kind)
     goals: Queue[Any] = Queue()
     stalls = True
@@ -239,7 +251,7 @@ BAD_PARAMETERS = {
 
 
 @pytest.mark.parametrize("given", BAD_PARAMETERS)
-def test_a_bad_parameter_is_refused_with_one_line(given: str, context: Any) -> None:
+def test_a_bad_parameter_raises_an_error_of_one_line(given: str, context: Any) -> None:
     with pytest.raises(ConfigError) as error:
         LeftArmController(context=context, cli_args=as_arguments(given))
     assert BAD_PARAMETERS[given] in str(error.value)

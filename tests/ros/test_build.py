@@ -33,14 +33,16 @@ def build_interfaces(
 
 
 @pytest.mark.slow
-def test_the_shipped_packages_define_what_the_app_and_grippers_use() -> None:
+def test_the_shipped_message_packages_define_the_types_that_the_app_and_grippers_use() -> None:
     assert [package.name for package in interface_packages()] == NAMES
     assert "from quest2ros.msg import OVR2ROSInputs" in Interfaces(INTERFACES / "quest2ros").proof
     assert "from control_msgs.action import ParallelGripperCommand" in Interfaces(INTERFACES / "control_msgs").proof
 
 
 @pytest.mark.slow
-def test_a_sourced_install_stays_and_a_package_built_beside_it_is_used_after_it_is_sourced_too(tmp_path: Path) -> None:
+def test_packages_of_a_sourced_install_are_kept_and_a_package_built_beside_it_is_used_when_sourced(
+    tmp_path: Path,
+) -> None:
     if missing := missing_tools(Path(sys.prefix)):
         pytest.skip(f"nothing can be built here: missing {'; '.join(missing)}")
     venv.create(bare_environment := tmp_path / "bare", symlinks=True, with_pip=False)
@@ -74,7 +76,7 @@ def test_a_sourced_install_stays_and_a_package_built_beside_it_is_used_after_it_
 
 
 @pytest.mark.slow
-def test_without_a_compiler_one_line_says_so(tmp_path: Path) -> None:
+def test_without_a_compiler_the_command_prints_one_line_that_says_so(tmp_path: Path) -> None:
     """The PATH contains only make. CMake comes with the environment."""
     if (make := shutil.which("make")) is None:
         pytest.skip("needs make")
@@ -87,12 +89,12 @@ def test_without_a_compiler_one_line_says_so(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_folder_that_is_not_on_pythons_path_is_refused(tmp_path: Path) -> None:
+def test_a_folder_that_is_no_virtual_environment_is_refused(tmp_path: Path) -> None:
     assert f"a virtual environment that can be written to, since {tmp_path} is none" in missing_tools(tmp_path)
 
 
 @pytest.mark.slow
-def test_a_build_that_fails_names_its_log(tmp_path: Path) -> None:
+def test_the_error_of_a_failed_build_names_the_log(tmp_path: Path) -> None:
     pytest.importorskip("catkin_pkg")
     source = tmp_path / "broken"
     source.mkdir()
@@ -103,8 +105,8 @@ def test_a_build_that_fails_names_its_log(tmp_path: Path) -> None:
     assert "broken" in log.read_text()
 
 
-# The list is that of docs.ros.org/en/jazzy/p/control_msgs in its order. A type hash depends only on names and types of
-# fields.
+# The fields and their order are those of docs.ros.org/en/jazzy/p/control_msgs. A type hash depends only on the names
+# and types of fields.
 GRIPPER_STATE = "float64 position\nfloat64 effort\nbool stalled\nbool reached_goal"
 PUBLISHED_FIELDS = {
     "tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms",
@@ -154,7 +156,7 @@ def printed(folder: Path, *command: str, **environment: str) -> str:
     return run.stdout
 
 
-def test_colcon_installs_a_command_that_runs_with_its_own_settings_robots_and_interfaces(tmp_path: Path) -> None:
+def test_colcon_installs_a_command_that_runs_with_the_installed_settings_robots_and_interfaces(tmp_path: Path) -> None:
     pytest.importorskip("colcon_ros", reason="needs colcon: pip install 'q2r2_control[dev]'")
     copy = tmp_path / "src" / "q2r2_control"
     for name in FOLDERS:

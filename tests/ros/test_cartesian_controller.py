@@ -50,7 +50,7 @@ def cell(started: Cell) -> Iterator[Cell]:
     started.end_streams()
 
 
-def test_an_arm_follows_its_target_and_the_other_one_holds(cell: Cell, robot: Robot) -> None:
+def test_an_arm_follows_its_target_while_the_other_arm_holds(cell: Cell, robot: Robot) -> None:
     assert "[INFO]" in cell.processes[1].wait_for("active: the reference"), "nothing is wrong with that"
     assert "[WARN]" in cell.processes[1].wait_for("the stop service was called")
     stream = cell.engage("left")
@@ -64,7 +64,9 @@ def test_an_arm_follows_its_target_and_the_other_one_holds(cell: Cell, robot: Ro
     assert all(np.abs((q - start_q)[right]).max() < STILL for q in cell.postures)
 
 
-def test_pause_stop_and_home_work(cell: Cell, robot: Robot) -> None:
+def test_the_services_pause_and_stop_bring_the_arms_to_rest_and_the_service_home_moves_them_home(
+    cell: Cell, robot: Robot
+) -> None:
     stream = cell.engage("left")
     stream.move("left", (0.0, 0.0, 0.06))
     assert cell.call("/cartesian_controller/pause", SetBool.Request(data=True)).success
@@ -83,7 +85,7 @@ def test_pause_stop_and_home_work(cell: Cell, robot: Robot) -> None:
     wait_until(lambda: cell.state("mode", "mujoco_robot") == "holding", "nothing is commanded")
 
 
-def test_a_controller_that_stood_still_in_motion_publishes_no_jump(cell: Cell, robot: Robot) -> None:
+def test_a_controller_that_stood_still_during_a_motion_publishes_no_jump(cell: Cell, robot: Robot) -> None:
     commands: list[tuple[int, Any]] = []  # Numbers and positions of the commands.
 
     def take(message: JointTrajectory, info: Any) -> None:
@@ -96,7 +98,7 @@ def test_a_controller_that_stood_still_in_motion_publishes_no_jump(cell: Cell, r
         stream.poses["left"] = shifted(stream.poses["left"], 0.0, 0.0, way)
         wait_until(lambda: cell.joints.speeds(0.05).max() > 0.5, "the arm is fast")
         os.kill(cell.processes[1].pid, signal.SIGSTOP)
-        time.sleep(0.05)  # The time is too short for a new start.
+        time.sleep(0.05)  # After so short a standstill, the controller does not start anew.
         os.kill(cell.processes[1].pid, signal.SIGCONT)
         time.sleep(0.7)
     for (before, start), (number, end) in pairwise(commands):
@@ -125,7 +127,7 @@ def test_a_second_publisher_of_targets_during_motion_stops_the_arm_and_is_named(
         assert np.abs(cell.q - rest).max() < STILL
         other.destroy_timer(timer)
     tools = [cell.robot.tool_pose(q, "left").translation for q in cell.postures]
-    # Only its own motion of 1 cm is allowed.
+    # The arm may only follow the motion of 1 cm of its first stream.
     assert max(np.linalg.norm(tool - begin.translation) for tool in tools) < 0.03
     stream.poses["left"] = shifted(begin, 0.0, 0.0, 0.2)
     time.sleep(1.5)  # After this time, one publisher is assumed again.
@@ -133,7 +135,7 @@ def test_a_second_publisher_of_targets_during_motion_stops_the_arm_and_is_named(
     wait_until(lambda: cell.state("left_state") == "following", "the stream that is left begins anew")
 
 
-def test_the_controller_follows_with_other_topics_in_another_frame_and_in_simulated_time(
+def test_the_controller_follows_targets_on_another_topic_in_another_frame_and_in_simulated_time(
     cell: Cell, robot: Robot, processes: Processes
 ) -> None:
     cell.call("/cartesian_controller/stop")

@@ -57,7 +57,7 @@ def here(cell: Cell) -> JointTrajectory:
 
 def test_a_second_publisher_of_commands_stops_both_arms_and_is_named(driven: Driven) -> None:
     driven.engage("left", "right")
-    long = 3.0 * NODE_RATE  # This is a number of commands. After it, earlier publishers are discovered.
+    long = 3.0 * NODE_RATE  # After this number of commands, all earlier publishers are discovered.
     wait_until(lambda: driven.state("sent")[TOPIC] > long, "it has driven for some seconds")
     second = driven.node.create_publisher(JointTrajectory, TOPIC, 1)
     found = driven.wait_for_fault(RosReason.OTHER_COMMANDER)

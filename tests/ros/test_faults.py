@@ -30,7 +30,7 @@ ANCHORED = 0.005  # A tool whose hand rests moves less than this [m].
 FAST = 1.7
 AWHILE = 0.5  # Time in which any motion would be seen [s].
 WAY = (0.3, 0.0, 0.12)  # Motion of the hands [m].
-FROZEN = 2.0  # The time is longer than any timeout [s].
+FROZEN = 2.0  # Duration of a freeze, which is longer than any timeout [s].
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +87,7 @@ def test_a_killed_node_stops_both_arms_and_its_restart_moves_no_arm(moving: Cock
     assert_only_a_press_moves(moving, joints)
 
 
-def test_a_frozen_node_stops_both_arms_and_moves_none_when_it_continues(moving: Cockpit) -> None:
+def test_a_frozen_node_stops_both_arms_and_moves_no_arm_when_it_continues(moving: Cockpit) -> None:
     fault = moving.signal(ARMS, signal.SIGSTOP)
     joints = stopped(moving, "arms frozen", fault)
     time.sleep(max(fault + FROZEN - time.monotonic(), 0.0))
@@ -96,7 +96,7 @@ def test_a_frozen_node_stops_both_arms_and_moves_none_when_it_continues(moving: 
     assert_only_a_press_moves(moving, joints)
 
 
-def test_a_wrong_parameter_of_one_arm_ends_both_with_one_line(processes: Processes) -> None:
+def test_a_wrong_parameter_of_one_arm_ends_the_process_of_both_arms_with_one_line(processes: Processes) -> None:
     process = processes.start_node("arm_controllers", "right_q2r2_arm_controller:rate:=-1.0")
     assert process.wait() == 2
     line = process.output.splitlines()[-1]

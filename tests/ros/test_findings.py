@@ -61,7 +61,7 @@ def found(seen: SetView) -> list[Finding]:
     return examine_set(seen, EXPECTED)
 
 
-def test_there_are_no_findings_in_a_good_set_or_without_a_set() -> None:
+def test_the_doctor_finds_nothing_if_a_set_has_no_faults_or_if_no_set_runs() -> None:
     assert found(view()) == []
     assert found(SetView((), (), ("/stranger",), arm_views((), CELL))) == []
 
@@ -110,13 +110,13 @@ def test_every_fault_that_stops_the_arms_is_found_with_its_cure(seen: SetView, w
     assert [one for one in found(seen) if one.stops_arms and what in one.what and cure in one.cure], found(seen)
 
 
-def test_controllers_of_single_arms_may_share_a_topic_of_commands() -> None:
+def test_two_controllers_that_move_one_arm_each_may_share_a_command_topic() -> None:
     left = node("/controller", phase="active", left_state="holding", sent={"/commands": 1})
     right = node("/other", phase="active", right_state="holding", sent={"/commands": 1})
     assert found(view(left, right, topic("/commands", ("/controller", "/other"), ("/robot",)))) == []
 
 
-def test_a_second_receiver_of_commands_is_a_warning() -> None:
+def test_a_second_receiver_of_commands_causes_a_warning() -> None:
     (finding,) = found(view(topic("/commands", ("/controller",), ("/robot", "/echo"))))
     assert "2 takers: /robot, /echo" in finding.what
     assert not finding.stops_arms
@@ -147,7 +147,7 @@ def test_every_package_that_the_nodes_import_is_checked() -> None:
     ],
 )
 def test_the_report_says_which_computers_nodes_can_find(variables: dict[str, str], reaches: str) -> None:
-    facts, findings = examine_environment(variables | {"ROS_DOMAIN_ID": "-1"})  # With this domain, no node is tried.
+    facts, findings = examine_environment(variables | {"ROS_DOMAIN_ID": "-1"})  # In this domain, no node can start.
     assert facts["reaches"].startswith(reaches)
     assert any("ROS_DOMAIN_ID is '-1'" in finding.what and finding.stops_arms for finding in findings)
 

@@ -54,7 +54,9 @@ CHAINS = {
 
 
 @pytest.mark.parametrize(("frame", "within", "pose", "received"), CHAINS.values(), ids=CHAINS)
-def test_a_frame_is_found(frame: str, within: str, pose: pin.SE3, received: float, tree: FrameTree) -> None:
+def test_the_pose_of_a_frame_in_another_frame_is_found_through_a_chain_of_transforms(
+    frame: str, within: str, pose: pin.SE3, received: float, tree: FrameTree
+) -> None:
     placement = tree.find(frame, within)
     assert placement is not None
     np.testing.assert_allclose(placement.pose.homogeneous, pose.homogeneous, atol=1e-12)
@@ -78,7 +80,7 @@ def test_an_invalid_transform_is_ignored(bad: float, tree: FrameTree) -> None:
     np.testing.assert_allclose(placement.pose.homogeneous, B.homogeneous, atol=1e-12)
 
 
-def test_a_message_with_a_name_that_is_not_text_is_dropped_and_the_next_one_is_read(node: Any) -> None:
+def test_a_message_with_a_name_that_is_not_text_is_dropped_and_the_next_message_is_read(node: Any) -> None:
     dropped: list[str] = []
     node.drop = lambda topic, text: dropped.append(topic)  # Nodes of the package have this method.
     listener = FrameListener(node)

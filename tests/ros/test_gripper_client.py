@@ -87,7 +87,7 @@ def bench(domain: int) -> Iterator[Bench]:
         yield bench
 
 
-def test_a_gripper_moves_on_as_more_is_permitted_and_reports_its_opening_only_at_the_end(bench: Bench) -> None:
+def test_a_gripper_opens_in_steps_as_is_permitted_and_counts_as_open_only_at_the_end(bench: Bench) -> None:
     bench.command(close=True)
     bench.pass_time(0.3)
     assert bench.openings() == []  # Nothing is permitted yet.
@@ -115,12 +115,12 @@ def test_a_request_without_an_answer_is_dropped_and_reported(bench: Bench) -> No
     assert bench.openings() == []
 
 
-def test_a_press_without_a_server_ends_the_request_before_it(bench: Bench) -> None:
+def test_a_press_while_no_server_is_there_ends_the_previous_request(bench: Bench) -> None:
     bench.command(close=False)
     bench.grant(1.0, 0.4)
     bench.wait(lambda: bench.asked and bench.asked[-1] == [1.0, 0.4], "it opens a part of the way")
-    # This runs in the executor's thread. rclpy fails if an action server ends while its executor is about to wait for
-    # it.
+    # The server is destroyed in the executor's thread, because rclpy fails if an action server ends while its executor
+    # is about to wait for it.
     bench.far.executor.create_task(bench.server.destroy)
     wait_until(lambda: not bench.client._has_server(), "the server is gone")
     bench.command(close=True)
@@ -141,7 +141,7 @@ def test_a_gripper_follows_a_trigger_at_most_ten_times_a_second(bench: Bench, mo
     assert asked == pytest.approx([0.96, 0.56, 0.0])
 
 
-def test_a_refused_goal_on_the_way_ends_the_request(bench: Bench) -> None:
+def test_a_goal_that_the_gripper_refuses_ends_the_request(bench: Bench) -> None:
     bench.command(close=True)
     bench.grant(0.0, 0.0)
     bench.wait(lambda: bench.client.closed, "it is closed")
@@ -156,7 +156,7 @@ def test_a_refused_goal_on_the_way_ends_the_request(bench: Bench) -> None:
     assert bench.client.state == "closed"
 
 
-def test_a_gripper_with_a_command_topic_waits_too_and_two_presses_before_an_answer_both_count(domain: int) -> None:
+def test_a_gripper_with_a_command_topic_waits_for_a_grant_and_counts_both_of_two_presses_before_it(domain: int) -> None:
     with closing(Bench(domain, GripperType.FLOAT64_MULTI_ARRAY, "/fingers")) as bench:
         bench.client.toggle(time.monotonic())
         bench.client.toggle(time.monotonic())
@@ -167,7 +167,7 @@ def test_a_gripper_with_a_command_topic_waits_too_and_two_presses_before_an_answ
         assert bench.client.state == "open"
 
 
-def test_a_press_is_reported_if_no_node_reads_the_grippers_topic(domain: int) -> None:
+def test_a_press_is_reported_as_failed_if_no_node_reads_the_grippers_topic(domain: int) -> None:
     with spun_node(domain, "alone") as node:
         settings = GripperSettings(action_type=GripperType.FLOAT64_MULTI_ARRAY, closed_position=_CLOSED)
         client = GripperClient(node, "/nobody", settings)

@@ -39,7 +39,7 @@ class Gripper:
 
     def __init__(self, cell: Cell) -> None:
         self.began = 0.0
-        self._cell, self.opening = cell, 1.0  # Opening from 0 for closed to 1 for open, as in joint states.
+        self._cell, self.opening = cell, 1.0  # Measured opening, from 0 (closed) to 1 (open).
         cell.node.create_subscription(JointState, "/joint_states", self._on_joint_state, STREAM_QOS)
         self.grants = OpeningGrants(cell.node, "/cartesian_controller", "left", "/q2r2/left/target_frame")
         self.client = GripperClient(cell.node, "/q2r2/left_gripper/gripper_cmd", GripperSettings(), self.grants)
@@ -91,10 +91,10 @@ def _go(stream: Stream, goal: pin.SE3) -> None:
     stream.poses["left"] = goal
 
 
-def test_a_gripper_that_is_commanded_to_close_and_stands_still_holds_its_object(cell: Cell) -> None:
+def test_a_gripper_that_is_commanded_to_close_but_stands_still_counts_as_holding_an_object(cell: Cell) -> None:
     wanted = cell.node.create_publisher(Float64MultiArray, "/q2r2/right/target_frame/wanted_opening", LATCHED_QOS)
     assert cell.state("right_holds_object") is False
-    wanted.publish(Float64MultiArray(data=[0.3, math.nan]))  # There is no goal, so that the gripper stays open.
+    wanted.publish(Float64MultiArray(data=[0.3, math.nan]))  # The gripper gets no goal, so it stays open.
     wait_until(lambda: cell.state("right_holds_object") is True, "the object counts")
     cell.stop_and_reset()
     wait_until(lambda: cell.state("phase") == "active", "the arms are active")
@@ -103,7 +103,7 @@ def test_a_gripper_that_is_commanded_to_close_and_stands_still_holds_its_object(
     wait_until(lambda: cell.state("right_holds_object") is False, "the object does not count any more")
 
 
-def test_an_invalid_opening_is_dropped_with_a_warning_and_the_last_one_stays(cell: Cell) -> None:
+def test_an_invalid_opening_is_dropped_with_a_warning_and_the_last_valid_opening_stays(cell: Cell) -> None:
     bad, topic = [0.5, 3.0], "/q2r2/left/target_frame/wanted_opening"
     gripper = Gripper(cell)
     gripper.grants.ask(1.0)

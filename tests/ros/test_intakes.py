@@ -82,7 +82,7 @@ def test_a_late_target_is_passed_on_as_none_and_reported(context: Any, robot: Ro
     node.destroy_node()
 
 
-def test_the_stamp_shows_that_a_target_was_made_before_its_sender_stood_still(
+def test_a_target_whose_stamp_lies_before_a_standstill_of_its_sender_is_not_used(
     context: Any, robot: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     node = BaseNode("intake", context=context)
@@ -90,10 +90,10 @@ def test_the_stamp_shows_that_a_target_was_made_before_its_sender_stood_still(
     taken: list[bool] = []
     intake.subscribe(lambda arm, pose, *_: taken.append(pose is not None), lambda arm: None)
     targets = Arrivals(node, "/q2r2/left/target_frame")
-    stream = [(100.00, 99.0), (100.04, 99.01)]  # The second one was a little late.
+    stream = [(100.00, 99.0), (100.04, 99.01)]  # The second target is a little late.
     # One target is old, one is in time, and one is repeated.
     stream += [(102.05, 99.02), (102.06, 101.06), (105.0, 101.06)]
-    stream += [(105.0 + 0.4 * tick, 102.0 + 0.1 * tick) for tick in range(1, 4)]  # The clock is slow.
+    stream += [(105.0 + 0.4 * tick, 102.0 + 0.1 * tick) for tick in range(1, 4)]  # The sender's clock is slow.
     for received, made in stream:
         monkeypatch.setattr(BaseNode, "now", received)
         targets.arrive(stamped_pose(pin.SE3.Identity(), "world", made), USUAL)
@@ -132,7 +132,7 @@ def test_a_late_command_does_not_move_the_simulated_robot_and_is_reported(defaul
     node.destroy_node()
 
 
-def test_joint_states_of_single_arms_are_merged_and_need_all_joints(context: Any, robot: Robot) -> None:
+def test_joint_states_of_single_arms_are_merged_once_all_joints_are_known(context: Any, robot: Robot) -> None:
     given = as_arguments(*(f"{arm}.joint_states_topic:=/{arm}/joint_states" for arm in robot.arms))
     node = BaseNode("intake", context=context, cli_args=given)
     intake = JointIntake(node, robot)
@@ -191,7 +191,9 @@ def test_turns_of_endless_joints_are_counted_separately_for_each_arms_topic(
     node.destroy_node()
 
 
-def test_publishers_on_one_topic_are_merged_by_joint_and_a_missing_joint_is_named(context: Any, robot: Robot) -> None:
+def test_states_of_several_publishers_on_one_topic_are_merged_by_joint_and_a_missing_joint_is_named(
+    context: Any, robot: Robot
+) -> None:
     node = BaseNode("intake", context=context)
     intake = JointIntake(node, robot)
     taken: list[Any] = []
@@ -209,13 +211,13 @@ def test_publishers_on_one_topic_are_merged_by_joint_and_a_missing_joint_is_name
     q += 0.1
     send(5, 14)
     np.testing.assert_allclose(taken[-1].q, [*(q[:5] - 0.1), *q[5:]])
-    assert taken[-1].stamp == taken[-2].stamp  # The first publisher, which may have ended, has sent the oldest part.
+    assert taken[-1].stamp == taken[-2].stamp  # The oldest part is that of the first publisher.
     send(0, 5)
     assert taken[-1].stamp > taken[-2].stamp
     node.destroy_node()
 
 
-def test_joints_with_other_names_are_accepted_on_an_arms_own_topic_until_the_right_names_come(
+def test_joints_with_other_names_are_accepted_on_an_arms_own_topic_until_the_cells_names_come(
     context: Any, robot: Robot
 ) -> None:
     given = as_arguments("left.joint_states_topic:=/left/joint_states", "right.joint_states_topic:=joint_states")
@@ -234,7 +236,7 @@ def test_joints_with_other_names_are_accepted_on_an_arms_own_topic_until_the_rig
     np.testing.assert_allclose(intake.state.q[left], 0.1)
     assert intake.theirs["left_A3"] == "lbr_A3"
     for topic, prefix in (("/left/joint_states", "other"), ("/left/joint_states", "right"), ("/joint_states", "lbr")):
-        send(topic, prefix, 0.3)  # These are other robots.
+        send(topic, prefix, 0.3)  # These names belong to other robots.
         np.testing.assert_allclose(intake.state.q, np.where(np.isin(np.arange(14), left), 0.1, 0.2))
     send("/left/joint_states", "left", 0.4)
     np.testing.assert_allclose(intake.state.q[left], 0.4)
@@ -244,7 +246,7 @@ def test_joints_with_other_names_are_accepted_on_an_arms_own_topic_until_the_rig
     node.destroy_node()
 
 
-def test_an_admittance_has_no_good_state_without_external_torques(context: Any, robot: Robot) -> None:
+def test_with_admittance_joint_states_are_used_only_if_external_torques_have_come(context: Any, robot: Robot) -> None:
     node = BaseNode("intake", context=context)
     with pytest.raises(ConfigError, match=r"admittance.enabled = true: set the parameter external_torque_topic"):
         JointIntake(node, robot, needs_external_torque=True)
@@ -268,7 +270,7 @@ def test_an_admittance_has_no_good_state_without_external_torques(context: Any, 
     node.destroy_node()
 
 
-def test_an_arm_pauses_when_its_controller_does_not_follow_but_not_on_its_way_home(context: Any) -> None:
+def test_an_arm_pauses_when_its_controller_does_not_follow_except_during_homing(context: Any) -> None:
     node = BaseNode("arm", context=context)
     watch = FollowWatch(node, "/controller", "left", 0.3)
     node.create_publisher(String, "/controller/state", 1)
@@ -323,7 +325,7 @@ def test_the_reason_why_a_controller_does_not_follow_is_read_from_its_state(
     node.destroy_node()
 
 
-def test_an_arm_is_not_ready_before_each_controller_has_reported_its_joint_states(context: Any) -> None:
+def test_an_arm_is_not_ready_before_a_new_controller_has_reported_that_it_gets_joint_states(context: Any) -> None:
     arm = LeftArmController(context=context)
     states = Arrivals(arm, "/cartesian_controller/state")
 
@@ -344,8 +346,8 @@ def test_an_arm_is_not_ready_before_each_controller_has_reported_its_joint_state
     arm.destroy_node()
 
 
-def test_a_subclass_without_a_preset_is_not_ready_for_another_projects_controller(context: Any) -> None:
-    """It would get the built-in controller's targets, whose steps are as large as that controller's limits allow."""
+def test_a_subclass_without_a_preset_is_not_ready_unless_the_built_in_controller_runs(context: Any) -> None:
+    """Another project's controller would get targets with steps as large as the built-in controller's limits allow."""
     prefix = "/bh_robot/left_arm_clik_controller"
     arm = BaseArmController("left", "bh_robot", ctrl_prefix=prefix, context=context)
     theirs = BaseNode("left_arm_clik_controller", namespace="/bh_robot", context=context)
@@ -370,7 +372,7 @@ def test_a_subclass_without_a_preset_is_not_ready_for_another_projects_controlle
         node.destroy_node()
 
 
-def test_an_unreadable_message_is_dropped_with_one_warning_a_topic(
+def test_an_unreadable_message_is_dropped_with_one_warning_for_each_topic(
     context: Any, capfd: pytest.CaptureFixture[str]
 ) -> None:
     arm, name, text = LeftArmController(context=context), "/cartesian_controller", String(data="[]")
@@ -397,14 +399,14 @@ def joint_state(**changes: Any) -> JointState:
     return JointState(**(fields | changes))
 
 
-def test_joints_are_matched_by_name_and_others_may_be_not_finite_and_torques_missing() -> None:
+def test_a_joint_state_is_read_by_name_even_if_other_joints_are_not_finite_or_torques_are_missing() -> None:
     state = robot_state(joint_state(), NAMES, 7.0)
     assert isinstance(state, RobotState)
     assert (state.q.tolist(), state.v.tolist(), state.tau.tolist()) == ([1.0, 2.0, 3.0], [0.1, 0.2, 0.3], [0.0] * 3)
     assert state.stamp == 7.0
 
 
-def test_unmeasured_numbers_are_zero_like_missing_ones() -> None:
+def test_velocities_and_torques_that_are_not_measured_are_read_as_zero() -> None:
     unmeasured = [math.nan] * 4
     state = robot_state(joint_state(velocity=unmeasured, effort=[1.0, math.nan, math.nan, 2.0]), NAMES, 7.0)
     assert isinstance(state, RobotState)
@@ -424,7 +426,7 @@ def test_unmeasured_numbers_are_zero_like_missing_ones() -> None:
         ({"position": []}, "0 position values for 4 joints"),
     ],
 )
-def test_an_invalid_state_is_refused_by_name(changes: dict[str, Any], fault: str) -> None:
+def test_the_reason_for_an_invalid_joint_state_says_what_is_wrong(changes: dict[str, Any], fault: str) -> None:
     assert robot_state(joint_state(**changes), NAMES, 0.0) == fault
 
 
@@ -438,5 +440,7 @@ def test_a_pose_is_read_with_its_quaternion_normalized() -> None:
     ("position", "orientation"),
     [({"x": math.nan}, TURN), ({"y": math.inf}, TURN), ({}, {"w": 0.0}), ({}, {"w": 1.1}), ({}, {"w": math.nan})],
 )
-def test_numbers_that_are_not_a_pose_give_no_pose(position: dict[str, float], orientation: dict[str, float]) -> None:
+def test_a_pose_message_with_invalid_numbers_is_read_as_none(
+    position: dict[str, float], orientation: dict[str, float]
+) -> None:
     assert pose_of(Pose(position=Point(**position), orientation=Quaternion(**orientation))) is None

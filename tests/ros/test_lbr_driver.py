@@ -35,15 +35,13 @@ from tests.ros.test_intakes import Arrivals
 from tests.ros.virtual_lbrs import Operator, lbr_cell, virtual_lbrs
 
 PAGE = Path(__file__).parents[2] / "docs/kuka.md"
-# The rows of that page's table of filters.
+# The rows of the table of filters in docs/kuka.md.
 FILTERS = re.findall(r"^\| (0[.\d]*) \| ([.\d]+) \| ([.\d]+) \|$", PAGE.read_text(), re.MULTILINE)
 
 
 @pytest.mark.parametrize("sessions", [15, pytest.param(500, marks=pytest.mark.soak)])
 @pytest.mark.parametrize("release", TOPICS)
-def test_sessions_that_end_in_every_possible_way_trip_no_guard_and_never_jump(
-    release: str, sessions: int, domain: int
-) -> None:
+def test_no_guard_trips_and_no_command_jumps_however_the_sessions_end(release: str, sessions: int, domain: int) -> None:
     with virtual_lbrs(release, domain, sessions) as virtual:
         soak = LbrSoak(virtual, sessions).run()
     assert soak.faults == []
@@ -69,7 +67,7 @@ def test_a_session_that_begins_while_the_arms_still_brake_gets_no_command_of_the
 
 
 @pytest.mark.parametrize(("tau", "delay", "speed"), [tuple(map(float, row)) for row in FILTERS])
-def test_the_drivers_filter_delays_a_steady_motion_and_is_faster_after_two_commands_as_docs_kuka_says(
+def test_the_delay_of_the_drivers_filter_and_its_speed_after_a_double_step_are_those_in_docs_kuka(
     tau: float, delay: float, speed: float, robot: Robot
 ) -> None:
     driver, ramp = FakeLbr(robot, "left", tau), 0.2  # ``ramp`` is the speed of the commanded joints [rad/s].
@@ -86,7 +84,7 @@ def test_the_drivers_filter_delays_a_steady_motion_and_is_faster_after_two_comma
     assert driver.v / ramp == pytest.approx(speed, abs=0.005)
 
 
-def test_external_torques_are_passed_on_after_both_drivers_have_sent_them_and_only_if_finite(
+def test_external_torques_are_used_only_if_they_are_finite_and_both_drivers_have_sent_them(
     context: Any, robot: Robot
 ) -> None:
     node, told = BaseNode("controller", context=context), list[Array]()
@@ -123,7 +121,7 @@ def test_an_arm_is_ready_only_after_its_driver_reports_commanding_active(domain:
 
 
 @pytest.mark.parametrize("topics", [("/left/joints", "/right/command/joints"), ("/lbr/command/a", "/lbr/command/b")])
-def test_commands_use_the_topic_on_which_each_driver_reports_its_session(
+def test_command_topics_without_a_namespace_for_each_driver_are_refused(
     topics: tuple[str, str], context: Any, robot: Robot
 ) -> None:
     node = BaseNode("controller", context=context)
@@ -168,14 +166,14 @@ def test_the_release_that_a_drivers_topics_belong_to_is_reported_once(
         (("right_joint_1", "right_joint_2"), []),
     ],
 )
-def test_names_are_recognised_by_their_last_part_if_it_identifies_one_joint_of_this_arm(
+def test_a_joint_name_is_recognised_by_its_last_part_if_this_part_identifies_one_joint_of_the_arm(
     given: tuple[str, ...], theirs: list[str]
 ) -> None:
     ours = ("left_A1", "left_A2")
     assert called_otherwise(ours, given, ("right",)) == dict(zip(ours, theirs, strict=False))
 
 
-def test_a_cell_of_this_driver_keeps_its_limits_unless_the_yaml_differs(tmp_path: Path) -> None:
+def test_a_cell_behind_this_driver_has_the_drivers_limits_unless_its_yaml_says_limits_model(tmp_path: Path) -> None:
     text = find_resource("config/dual_iiwa7_fri.yaml").read_text()
     assert load_config(CONFIG).control.position_margin == 0.01
     assert parse_config(text, "cell.yaml").control.position_margin == 0.105
@@ -188,7 +186,7 @@ def test_a_cell_of_this_driver_keeps_its_limits_unless_the_yaml_differs(tmp_path
     assert parse_config(changed, "cell.yaml").control.velocity_scale == 1.0
 
 
-def test_the_margin_contains_the_drivers_soft_limits_and_the_step_of_its_safe_stop(
+def test_the_position_margin_covers_the_drivers_soft_limits_and_the_step_of_its_safe_stop(
     robot: Robot, tmp_path: Path
 ) -> None:
     margin, longest_period = load_config(lbr_cell(tmp_path)).control.position_margin, 0.01

@@ -62,7 +62,7 @@ def found(cell: Config, *drivers: DriverView, nodes: tuple[NodeView, ...] = ()) 
     return examine_drivers(SetView(nodes, (), (), (), drivers), cell)
 
 
-def test_there_are_no_findings_about_drivers_as_lbr_fri_ros2_stack_starts_them(cell: Config) -> None:
+def test_the_doctor_finds_no_fault_in_drivers_that_lbr_fri_ros2_stack_starts(cell: Config) -> None:
     assert found(cell, driver(), driver("right", description=urdf(169 / 170))) == []
     assert found(cell) == []
 
@@ -120,13 +120,13 @@ def test_every_fault_that_keeps_a_driver_from_following_is_found_with_its_cure(
     assert cure in finding.cure
 
 
-def test_limits_that_cannot_be_compared_are_a_warning(cell: Config) -> None:
+def test_limits_that_cannot_be_compared_cause_a_warning(cell: Config) -> None:
     (finding,) = found(cell, driver(description=""))
     assert not finding.stops_arms
     assert "its limits are not compared" in finding.what
 
 
-def test_a_running_controller_judges_the_session_itself(cell: Config) -> None:
+def test_the_doctor_does_not_judge_a_drivers_session_if_a_controller_runs(cell: Config) -> None:
     controller = NodeView("/controller", "error", "waits", 0.1, {"phase": "inactive"})
     assert found(cell, driver(state=WAITS), nodes=(controller,)) == []
 
@@ -136,7 +136,7 @@ def test_missing_message_packages_are_found_with_the_command_that_builds_them(
 ) -> None:
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "lbr_fri_idl" else find(name))
-    _, findings = examine_environment({"ROS_DOMAIN_ID": "-1"})  # With this domain, no node is tried.
+    _, findings = examine_environment({"ROS_DOMAIN_ID": "-1"})  # In this domain, no node can start.
     (finding,) = (one for one in findings if "lbr_fri_idl" in one.what)
     assert (finding.stops_arms, finding.cure) == (True, "q2r2 ros build-interfaces")
 

@@ -59,7 +59,7 @@ class Managed(Cell):
         self.commander.publish(JointTrajectory(joint_names=list(self.robot.joint_names), points=[point]))
 
     def move_by_another(self, q: Any) -> None:
-        """Send joint commands of another node to ``q`` [rad], evenly, within a second."""
+        """Move the joints evenly to ``q`` [rad] within a second, by commands of another node."""
         start, began = self.q.copy(), time.monotonic()
         while (share := time.monotonic() - began) < 1.5:
             self.command(start + min(share, 1.0) * (q - start))
@@ -74,7 +74,9 @@ def cell(module_node: Any, module_processes: Processes, robot: Robot) -> Managed
     return cell
 
 
-def test_the_controller_starts_active_and_rests_before_it_answers_a_deactivation(cell: Managed, robot: Robot) -> None:
+def test_the_controller_starts_active_and_brings_the_arms_to_rest_before_it_answers_a_deactivation(
+    cell: Managed, robot: Robot
+) -> None:
     assert cell.lifecycle() == "active"
     stream = cell.engage("left")
     stream.move("left", (0.0, 0.0, 0.15))
@@ -97,7 +99,9 @@ def test_the_controller_starts_active_and_rests_before_it_answers_a_deactivation
     wait_until(lambda: cell.state("left_state") == "deactivated", "its state says so")
 
 
-def test_the_controller_takes_over_where_another_silent_node_has_left_the_arms(cell: Managed, robot: Robot) -> None:
+def test_the_controller_activates_where_another_node_left_the_arms_once_this_node_is_silent(
+    cell: Managed, robot: Robot
+) -> None:
     if cell.lifecycle() == "active":
         assert cell.ask(Transition.TRANSITION_DEACTIVATE)
     goal = cell.q.copy()
@@ -124,7 +128,7 @@ def test_the_controller_takes_over_where_another_silent_node_has_left_the_arms(c
 
 
 @pytest.mark.parametrize("output", ["velocity", "torque"])
-def test_arms_that_follow_velocities_or_torques_are_left_at_rest_and_taken_over(
+def test_arms_with_velocity_or_torque_commands_rest_when_the_controller_is_deactivated_or_activated(
     domain: int, module_processes: Processes, processes: Processes, robot: Robot, output: str, tmp_path: Path
 ) -> None:
     module_processes.end_all()  # The nodes of this process have the same names.

@@ -41,7 +41,9 @@ def set_in(node: Any, **values: Any) -> Any:
     return node.set_parameters_atomically(parameters)
 
 
-def test_scale_and_guard_that_are_set_during_motion_apply_without_a_jump(node: Any, processes: Processes) -> None:
+def test_scale_and_guard_settings_that_change_during_motion_apply_without_a_jump(
+    node: Any, processes: Processes
+) -> None:
     rig = ArmRig(node)
     rig.start(processes)
     client = AsyncParameterClient(node, "left_q2r2_arm_controller")
@@ -64,7 +66,7 @@ def test_scale_and_guard_that_are_set_during_motion_apply_without_a_jump(node: A
     began, before = time.monotonic(), rig.newest()
     rig.move((0.12, 0.0, 0.0))
     way = np.linalg.norm(rig.newest().translation - before.translation)
-    assert way < 0.05 * (time.monotonic() - began)  # The hand asks for 0.06 m.
+    assert way < 0.05 * (time.monotonic() - began)  # The hand moves the target by 0.06 m.
     assert_same(rig.wait_for_rest(), offset(before, (0.06, 0.0, 0.0)), 1e-3)
 
 
@@ -103,7 +105,7 @@ def test_distances_and_gains_of_the_controller_are_set_together_or_not_at_all(co
     node.destroy_node()
 
 
-def test_a_permitted_impedance_applies_to_both_arms(context: Any, robot: Robot) -> None:
+def test_permitted_impedance_settings_apply_to_both_arms_and_others_are_refused(context: Any, robot: Robot) -> None:
     impedance = ImpedanceController(robot, ImpedanceSettings(ramp_time=0.1))
     zero = np.zeros(robot.model.nv)
     at_home = RobotState(robot.home, zero, zero, None, 0.0)
@@ -121,7 +123,7 @@ def test_a_permitted_impedance_applies_to_both_arms(context: Any, robot: Robot) 
         assert not refused.successful
         assert name in refused.reason
     node.destroy_node()
-    # The change applies only after the arms are commanded.
+    # The change has not yet taken effect, because the arms were not commanded since.
     assert [impedance.in_force(arm) for arm in robot.arms] == [before] * 2
     impedance.reset(at_home)
     assert [impedance.in_force(arm) for arm in robot.arms] == [asked] * 2
@@ -167,7 +169,7 @@ def test_a_subclass_may_mirror_its_arm_and_give_its_filter_in_samples(context: A
     made.destroy_node()
 
 
-def test_an_arm_whose_tool_is_on_a_topic_pauses_when_that_topic_ends(
+def test_an_arm_whose_tool_pose_comes_on_a_topic_pauses_when_the_topic_is_silent(
     rig: ArmRig, node: Any, processes: Processes
 ) -> None:
     rig.sends_tool = False
@@ -187,7 +189,7 @@ def test_an_arm_whose_tool_is_on_a_topic_pauses_when_that_topic_ends(
 
 # The first preset takes poses. The second preset takes joint commands of the built-in controller.
 @pytest.mark.parametrize("preset", ["fzi", "jtc"])
-def test_an_arm_waits_while_the_safe_target_is_far_from_its_tool(
+def test_an_arm_is_not_engaged_while_the_safe_target_is_far_from_its_tool(
     rig: ArmRig, node: Any, processes: Processes, preset: str
 ) -> None:
     safe = offset(TOOL, (0.0, 0.0, 0.15))  # A wrong tool_frame would cause this distance.
@@ -200,7 +202,7 @@ def test_an_arm_waits_while_the_safe_target_is_far_from_its_tool(
     rig.wait(lambda: rig.state["last_event_kind"] == RosReason.SAFE_TARGET_AWAY, "the press is refused")
     says = "safe_target/left is 0.150 m and 0.00 rad from left_tool_frame: the arm moves, or left_tool_frame is not the"
     assert says in rig.state["last_event"]
-    # The line does not come again at each tick.
+    # The line is printed once, and not at every tick.
     assert process.output.count(f"controller]: /cartesian_controller/{says}") == 1
     assert not rig.targets
     safe = TOOL

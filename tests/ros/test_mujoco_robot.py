@@ -62,7 +62,9 @@ def trajectory(robot: Robot, q: np.ndarray, names: tuple[str, ...] | None = None
     )
 
 
-def test_links_are_where_robot_state_publisher_puts_them_each_in_its_parent_s_frame(cell: Cell, robot: Robot) -> None:
+def test_each_link_has_the_pose_in_its_parents_frame_that_robot_state_publisher_would_publish(
+    cell: Cell, robot: Robot
+) -> None:
     joints = [joint for joint in ElementTree.fromstring(robot.urdf) if joint.tag == "joint"]
     links: list[Any] = [(joint.find("child"), joint.find("parent")) for joint in joints]
     parents = {child.attrib["link"]: parent.attrib["link"] for child, parent in links}
@@ -104,7 +106,7 @@ def test_the_robot_follows_positions_in_any_order_of_names_and_stays_there(cell:
     assert np.abs(cell.joints.wait_for_rest() - postures[-1]).max() < 0.01
 
 
-def test_each_arm_may_have_its_own_sender_on_one_topic(cell: Cell, robot: Robot) -> None:
+def test_two_senders_on_one_topic_may_command_one_arm_each(cell: Cell, robot: Robot) -> None:
     joints = {arm: robot.arms[arm].joints for arm in robot.arms}
     senders = {arm: cell.node.create_publisher(JointTrajectory, "joint_trajectory", COMMAND_QOS) for arm in joints}
     for sender in senders.values():
@@ -162,7 +164,7 @@ def result_of(client: ActionClient, position: float) -> Any:
     return ended.result().result
 
 
-def test_external_torques_belong_to_the_tick_of_their_joint_states(cell: Cell) -> None:
+def test_external_torques_have_the_stamp_of_the_joint_states_of_the_same_tick(cell: Cell) -> None:
     stamps: dict[str, list[int]] = {"/joint_states": [], "/mujoco_robot/external_torque": []}
 
     for topic, its in stamps.items():

@@ -55,7 +55,7 @@ def names_of(node: Any) -> set[str]:
 
 @pytest.mark.parametrize("name", NODES)
 @pytest.mark.usefixtures("in_namespace")
-def test_no_name_of_a_node_in_a_namespace_is_absolute(name: str) -> None:
+def test_a_node_in_a_namespace_has_all_its_topics_and_services_in_this_namespace(name: str) -> None:
     node = NODES[name]()
     try:
         state = f"{NAMESPACE}/{node.get_name()}/state"

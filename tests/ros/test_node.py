@@ -94,7 +94,7 @@ def test_a_controller_refuses_an_arm_with_a_link_that_is_not_monitored(domain: i
     assert "has no collision shape, so that nothing keeps it off anything; allowed: <collision>" in run.stderr
 
 
-def test_ctrl_c_before_the_interpreter_has_started_waits_for_the_executable_of_a_set() -> None:
+def test_a_ctrl_c_that_comes_while_python_starts_ends_the_executable_without_output() -> None:
     process = subprocess.Popen(
         [sys.executable, "-m", "q2r2_control.ros.launch.executables", "mujoco_robot"],
         cwd=ROOT,
@@ -140,7 +140,7 @@ print(executables._executable("hangs")(), 0.0 < left() <= 2.0)
 
 
 @pytest.mark.parametrize(("hangs", "said", "code"), [("hangs", "", -signal.SIGALRM), ("ends", "0 True\n", 0)])
-def test_a_node_ends_in_time_whatever_its_middleware_does_and_without_priority_meanwhile(
+def test_a_node_that_ends_drops_its_priority_and_ends_in_time_even_if_its_middleware_hangs(
     hangs: str, said: str, code: int
 ) -> None:
     command = [sys.executable, "-c", HANGS, hangs]
@@ -168,14 +168,14 @@ rclpy.spin(node)
         {"ROS_STATIC_PEERS": "192.168.1.7", "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"},
     ],
 )
-def test_settings_of_the_user_are_kept(environment: dict[str, str]) -> None:
+def test_middleware_settings_of_the_user_are_kept(environment: dict[str, str]) -> None:
     before = dict(environment)
     set_up_middleware(environment)
     assert environment == before
 
 
 @pytest.mark.parametrize("ours", [{}, {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}], ids=["subnet", "localhost"])
-def test_our_own_profile_is_set_and_kept(ours: dict[str, str]) -> None:
+def test_without_settings_of_the_user_the_shipped_profile_is_set_and_kept(ours: dict[str, str]) -> None:
     set_up_middleware(ours)
     assert Path(ours["FASTRTPS_DEFAULT_PROFILES_FILE"]).is_file()
     # Both settings allow only UDP: one by a variable, the other by its profile, which the range has to keep.
@@ -262,7 +262,9 @@ def test_all_messages_that_have_arrived_are_taken_in_order_before_the_tick(
     assert 0 < times[-1]["source_timestamp"] <= times[-1]["received_timestamp"]
 
 
-def test_latched_messages_are_heard_and_a_cancelled_tick_is_silent(ticking: Ticking, executor: TickExecutor) -> None:
+def test_the_executor_delivers_latched_messages_and_runs_no_cancelled_tick(
+    ticking: Ticking, executor: TickExecutor
+) -> None:
     timer = ticking.create_tick(PERIOD, lambda: ticking.log.append("tick"))
     ticking.listen(LATCHED_QOS).publish(String(data="said before"))
     spin_until(executor, lambda: {"tick", "said before"} <= set(ticking.log))
@@ -292,7 +294,7 @@ def test_a_subscription_that_a_message_destroys_gets_no_further_message(
     assert ticking.log == ["one"]
 
 
-def test_services_are_answered_and_coroutines_run(ticking: Ticking, executor: TickExecutor) -> None:
+def test_the_executor_answers_services_and_runs_coroutines(ticking: Ticking, executor: TickExecutor) -> None:
     def serve(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         response.success = True
         return response
@@ -313,7 +315,7 @@ def test_services_are_answered_and_coroutines_run(ticking: Ticking, executor: Ti
 
 
 @pytest.mark.parametrize("make", [BaseNode.create_tick, BaseNode.create_timer], ids=["a tick's", "a slow timer's"])
-def test_an_error_of_a_callback_is_raised(make: Any, ticking: Ticking, executor: TickExecutor) -> None:
+def test_the_executor_raises_the_error_of_a_callback(make: Any, ticking: Ticking, executor: TickExecutor) -> None:
     def fail() -> None:
         raise ValueError("of the callback")
 
@@ -322,7 +324,7 @@ def test_an_error_of_a_callback_is_raised(make: Any, ticking: Ticking, executor:
         spin_until(executor, lambda: False)
 
 
-def test_another_executor_runs_ticks_and_messages_too(ticking: Ticking, context: Any) -> None:
+def test_an_executor_of_rclpy_runs_ticks_and_callbacks_of_messages_too(ticking: Ticking, context: Any) -> None:
     plain, publisher = SingleThreadedExecutor(context=context), ticking.listen()
     plain.add_node(ticking)
     ticking.create_tick(PERIOD, lambda: ticking.log.append("tick"))

@@ -73,7 +73,9 @@ def test_a_marker_is_an_obstacle_until_it_is_deleted(take: Taken, controller: Ca
     assert take.said == []
 
 
-def test_a_marker_of_long_ago_is_no_younger_than_its_stamp(take: Taken, controller: CartesianController) -> None:
+def test_an_obstacle_from_an_old_marker_is_as_old_as_the_markers_stamp(
+    take: Taken, controller: CartesianController
+) -> None:
     take(marker(header=Header(frame_id="world", stamp=time_message(take.node.now - 60.0))))
     assert controller.moving_obstacles["hand"].age >= 60.0
 

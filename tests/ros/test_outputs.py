@@ -1,4 +1,4 @@
-"""Messages of outputs, the time when they give up their receiver, and the controller's reports that hands feel."""
+"""Outputs send messages and notice receivers that are silent or new. Hands feel the controller's reports."""
 
 from __future__ import annotations
 
@@ -55,7 +55,10 @@ class Stream:
         self.published = self.left_out = 0
 
     def run(self, seconds: float, fault: Callable[[], Reason | None] | None = None) -> Reason | None:
-        """Publish for this time, or until there is a ``fault``, by default the listener's silence. Return the fault."""
+        """Publish for ``seconds``, or until ``fault`` returns a reason; by default, that the listener is silent.
+
+        Return this reason, or None.
+        """
         end, find = time.monotonic() + seconds, fault or self._publisher.silence
         while time.monotonic() < end:
             if (found := find()) is not None:
@@ -93,17 +96,17 @@ class Commands:
         self.taken += 1
 
 
-def test_a_receiver_of_positions_is_kept_while_the_arms_are_off_their_reference(node: Any) -> None:
+def test_a_known_receiver_of_positions_still_gets_commands_while_the_arms_are_off_their_reference(node: Any) -> None:
     commands = Commands(node, positions=True)
     assert commands.send(0.2, off_reference=False) is None
     before = commands.taken
     assert commands.send(3.0 * TIMEOUT, off_reference=True) is None
-    # There are some 300 commands. The others were left out, or late on a busy machine.
+    # About 300 commands are due. Some of them may be left out, or late on a busy machine.
     assert commands.taken - before > 100
 
 
 @pytest.mark.parametrize(("positions", "off_reference"), [(True, True), (True, False), (False, True)])
-def test_a_new_receiver_is_noticed_while_arms_are_off_their_reference(
+def test_a_new_receiver_of_positions_is_a_fault_only_while_arms_are_off_their_reference(
     positions: bool, off_reference: bool, node: Any
 ) -> None:
     commands = Commands(node, positions)
@@ -113,7 +116,9 @@ def test_a_new_receiver_is_noticed_while_arms_are_off_their_reference(
     assert (fault is not None and fault.kind is RosReason.NEW_RECEIVER) == (positions and off_reference)
 
 
-def test_arms_with_separate_topics_get_their_own_joints_there(node: Any, robot: Robot, context: Any) -> None:
+def test_arms_with_separate_command_topics_get_only_their_own_joints_on_their_topic(
+    node: Any, robot: Robot, context: Any
+) -> None:
     # The right arm's topic comes from the pattern for all arms, and the left one's from its own setting.
     given = ("output_topic:=/{arm}/commands", "left.output_topic:=/left/commands")
     sender = BaseNode("sender", context=context, cli_args=as_arguments(*given))
@@ -133,7 +138,7 @@ def test_arms_with_separate_topics_get_their_own_joints_there(node: Any, robot: 
     sender.destroy_node()
 
 
-def test_torques_for_an_lbr_are_without_gravity(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_torques_for_an_lbr_do_not_contain_gravity(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patch:
         patch.setitem(sys.modules, "lbr_fri_idl.msg", None)
         with pytest.raises(ConfigError, match="lbr_fri_idl cannot be imported"):
@@ -153,7 +158,9 @@ def test_torques_for_an_lbr_are_without_gravity(robot: Robot, monkeypatch: pytes
 PUSH = np.array([0.0, 0.0, 20.0])  # Force on the left tool [N].
 
 
-def test_nearness_limits_and_contact_of_each_arm_are_reported_correctly(node: Any, robot: Robot) -> None:
+def test_the_spare_distance_the_joint_limits_and_the_contact_force_of_each_arm_are_reported(
+    node: Any, robot: Robot
+) -> None:
     controller = CartesianController(robot)
     controller.reset(robot.home)
     told: dict[str, ArmCondition] = {}
@@ -242,7 +249,9 @@ def test_only_a_frozen_listener_is_reported(rate: float, acknowledged: bool, nod
     wait_until(lambda: publisher.silence() is None, "it is there again")
 
 
-def test_a_listener_that_ended_before_is_not_reported(node: Any, listener: RosProcess, processes: Processes) -> None:
+def test_a_listener_that_ended_before_the_stream_began_is_not_reported(
+    node: Any, listener: RosProcess, processes: Processes
+) -> None:
     publisher = WatchedPublisher(node, PoseStamped, "/watched", TIMEOUT)
     wait_until(lambda: publisher.listeners == 1, "the listener is found")
     os.kill(listener.pid, signal.SIGKILL)
@@ -252,7 +261,7 @@ def test_a_listener_that_ended_before_is_not_reported(node: Any, listener: RosPr
     assert publisher.listeners == 1  # The graph still lists it.
 
 
-def test_an_endpoint_keeps_the_name_of_its_node_when_the_graph_has_lost_it() -> None:
+def test_an_endpoint_keeps_the_name_of_its_node_after_the_graph_has_lost_this_name() -> None:
     known, lost, other = (
         TopicEndpointInfo(node_namespace=space, node_name=name, endpoint_gid=[number] * 16)
         for space, name, number in (("/", "talker", 1), ("_NODE_NAMESPACE_UNKNOWN_", _LOST, 1), ("/", _LOST, 2))

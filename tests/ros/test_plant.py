@@ -89,7 +89,7 @@ def test_a_policy_moves_the_arms_and_a_gripper_of_a_robot_behind_ros(cell: Cell,
         assert summary().arms["left"].policy_s > 0.0
 
 
-def test_arms_rest_when_the_robot_ends_and_go_on_without_a_jump_from_the_posture_of_its_successor(
+def test_arms_rest_when_the_robot_ends_and_go_on_without_a_jump_from_the_posture_of_a_new_robot(
     cell: Cell, config: Config, processes: Processes
 ) -> None:
     goal = cell.q.copy()
@@ -99,7 +99,7 @@ def test_arms_rest_when_the_robot_ends_and_go_on_without_a_jump_from_the_posture
         cell.processes[0].end()
         wait_until(lambda: ticks[-1].states["left"] != "policy", "the policy has not the arms any more")
         lost = len(ticks)
-        start_robot(processes)  # The robot is at home again.
+        start_robot(processes)  # The new robot is at home.
         cell.forget()
         assert np.abs(cell.q - goal).max() > 0.9 * MOVED, "no command from before has moved it"
         wait_until(lambda: np.abs(cell.q - goal).max() < 5e-3, "the arms are there again")
@@ -133,7 +133,7 @@ def test_a_new_receiver_gets_no_commands_while_the_arms_are_elsewhere(
 
 
 @pytest.mark.parametrize("begins", ["a publisher that appears", "one that was silent"])
-def test_arms_that_another_node_commands_are_released_and_the_node_is_named(
+def test_arms_that_another_node_commands_are_released_and_this_node_is_named(
     begins: str, cell: Cell, config: Config, caplog: pytest.LogCaptureFixture
 ) -> None:
     goal, other = cell.q.copy(), None
@@ -150,7 +150,7 @@ def test_arms_that_another_node_commands_are_released_and_the_node_is_named(
         wait_until(lambda: "/test commands the arms on /joint_trajectory" in caplog.text, "the other is named")
 
 
-def test_arms_that_others_command_and_missing_arms_raise_an_error_of_one_line(
+def test_a_plant_whose_arms_are_missing_or_commanded_by_others_raises_an_error_of_one_line(
     node: Any, robot: Robot, config: Config, processes: Processes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(plant_module, "_WAIT", 0.5)
@@ -162,7 +162,7 @@ def test_arms_that_others_command_and_missing_arms_raise_an_error_of_one_line(
     wait_until(lambda: cell.joints.states, "joint states come")
     other = node.create_publisher(JointTrajectory, "joint_trajectory", COMMAND_QOS)
     timer = node.create_timer(0.02, lambda: other.publish(JointTrajectory()))
-    monkeypatch.setattr(plant_module, "_QUIET", 4.0)  # Discovery takes its time on a busy machine.
+    monkeypatch.setattr(plant_module, "_QUIET", 4.0)  # Discovery takes long on a busy machine.
     try:
         with pytest.raises(PlantError, match="/test commands the arms on /joint_trajectory"):
             plant.reset()

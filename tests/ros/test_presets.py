@@ -1,4 +1,4 @@
-"""Another project's controller moves the arms. Its targets keep its rules in both modes.
+"""Another project's controller moves the arms. In both modes, it gets targets that keep the rules of its preset.
 
 This package's own controller stands in for it, with another name and topics. The left arm's node, in mode raw, sends it
 the hand's target. The right arm's node, in mode filtered, sends it the built-in controller's safe target.
@@ -46,7 +46,7 @@ from tests.ros.processes import wait_until
 PRESET = "kuka_lbr_impedance"
 STILL = 4e-3  # Largest motion of a tool at rest [m].
 NEAR = 6e-3  # A tool within this distance has arrived [m].
-SETTLED = 4e-3  # Distance from a resting tool or target [m].
+SETTLED = 4e-3  # Largest distance between a target and a tool at the start of a stream [m].
 LONGEST_GAP = 0.3  # Longest gap in a stream, on a machine with other load [s].
 NAMES = {
     **dict.fromkeys(("builtin", "kuka_lbr_clik", "kuka_lbr_impedance", "fzi"), "target_frame"),
@@ -112,7 +112,7 @@ def distance(one: pin.SE3, other: pin.SE3) -> float:
 
 @pytest.fixture
 def theirs(domain: int, robot: Robot, processes: Processes, tmp_path: Path) -> Iterator[Theirs]:
-    """Return the cell with both controllers. The built-in one has only the right arm, and moves no arm itself."""
+    """Return the cell with both controllers. The built-in controller has only the right arm and moves no arm itself."""
     cell = yaml.safe_load(find_resource(CONFIG).read_text())
     del cell["arms"]["left"]
     (right_arm := tmp_path / "right_arm.yaml").write_text(yaml.safe_dump(cell))
@@ -167,7 +167,7 @@ def test_a_controller_gets_targets_that_keep_its_rules_in_both_modes(
         move((0.0, 0.0, 0.06))
         os.kill(theirs.process.pid, signal.SIGKILL)
         theirs.process.wait()
-        rigs.move((0.1, 0.0, 0.0), 0.3)  # The restarted controller must not be asked to catch up with that motion.
+        rigs.move((0.1, 0.0, 0.0), 0.3)  # The restarted controller must not get targets that catch up with it.
         rigs.wait_for_pause()
         joints.wait_for_rest()
         with joints.tools_rest(STILL, "its controller is restarted"):
@@ -205,9 +205,9 @@ def test_moveit_servo_is_switched_to_poses_after_each_of_its_starts(node: Any, m
     assert not agreed(0)  # There is no service yet.
     node.create_service(SetBool, service, answer)
     wait_until(lambda: agreed(0), "it agrees")
-    assert asked == [True, True]  # It refused the first time.
+    assert asked == [True, True]  # The service refused the first request.
     assert agreed(0)
-    assert not agreed(1)  # It was restarted.
+    assert not agreed(1)  # MoveIt Servo has started again.
     wait_until(lambda: agreed(1), "it agrees again")
     assert asked == [True, True, True]
 
@@ -220,7 +220,7 @@ def test_a_preset_that_no_test_runs_differs_from_the_tested_preset_only_in_names
 
 
 def test_the_presets_have_the_topics_of_their_controllers() -> None:
-    # lbr_fri_ros2_stack names it relative to its controller's node, so that the name resolves in the robot's namespace.
+    # In lbr_fri_ros2_stack, the topic's name is relative to its controller's node, so it is in the robot's namespace.
     lbr = PRESETS["lbr_position"].topic_of
     assert lbr("/left/lbr_joint_position_command_controller") == "/left/command/lbr_joint_position_command"
     assert lbr("/lbr_joint_position_command_controller") == "/command/lbr_joint_position_command"

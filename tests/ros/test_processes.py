@@ -33,7 +33,7 @@ from tests.support.processes import alive, children
 need_ros()
 pytestmark = pytest.mark.alone
 
-# Two programs run instead of nodes, through the same function as in the command.
+# This script runs two programs instead of nodes, by the function that the command uses.
 PROGRAM = """
 import signal, sys, time
 signal.signal(signal.SIGINT, lambda *_: sys.exit(0))
@@ -119,7 +119,7 @@ def names(nodes: Sequence[NodeProcess]) -> list[str]:
     return [node.name for node in nodes]
 
 
-def test_a_set_has_the_controller_that_its_preset_needs_with_its_topics_and_frames(tmp_path: Path) -> None:
+def test_a_set_has_the_controller_that_its_preset_needs_with_the_topics_and_frames_of_the_cell(tmp_path: Path) -> None:
     file = external_cell(tmp_path, "fzi", "raw")
     assert names(nodes_of(file, "headset")) == ["arm_controllers", "tcp_endpoint"]
     assert names(nodes_of(file, "none", "mujoco")) == ["mujoco_robot", "arm_controllers"]
@@ -141,7 +141,9 @@ def test_a_set_has_the_controller_that_its_preset_needs_with_its_topics_and_fram
         assert parameters[f"{arm}.target_frame_id"] == "bh_robot_base"
 
 
-def test_the_command_adds_a_recorder_first_and_a_page_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ros_up_starts_the_recorder_before_the_other_nodes_and_the_page_after_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pytest.importorskip("viser", reason="the extra web brings it")
     monkeypatch.chdir(tmp_path)  # The folder of recordings is made here.
     started: list[NodeProcess] = []
@@ -185,7 +187,7 @@ def test_arguments_for_ros_reach_every_node(monkeypatch: pytest.MonkeyPatch) -> 
     )
 
 
-def test_arms_have_separate_processes_on_request_and_a_cell_with_one_arm_has_its_nodes(tmp_path: Path) -> None:
+def test_each_arm_has_its_own_process_on_request_or_if_the_cell_has_only_one_arm(tmp_path: Path) -> None:
     assert names(nodes_of(CONFIG, "none"))[2:] == ["arm_controllers"]
     assert names(nodes_of(CONFIG, "none", separate=True))[2:] == ["left_arm_controller", "right_arm_controller"]
     cell = external() | {"controller": "builtin"}
@@ -195,7 +197,7 @@ def test_arms_have_separate_processes_on_request_and_a_cell_with_one_arm_has_its
 
 
 @pytest.mark.parametrize(("stance", "hand"), [("side_by_side", "right"), ("mirror", "left")])
-def test_in_a_cell_with_one_arm_a_scripted_input_has_only_the_hand_that_moves_it(
+def test_in_a_cell_with_one_arm_a_scripted_input_has_only_the_hand_that_moves_this_arm(
     tmp_path: Path, stance: str, hand: str
 ) -> None:
     cell = yaml.safe_load((ROOT / "config" / "iiwa7.yaml").read_text())
@@ -233,7 +235,7 @@ def launch(monkeypatch: pytest.MonkeyPatch) -> Any:
     ("preset", "source", "folder", "separate"),
     [("builtin", "headset", "recordings", "true"), ("jtc", "none", "", "false")],
 )
-def test_the_launch_file_starts_the_same_as_the_command(
+def test_the_launch_file_starts_the_same_nodes_as_the_command(
     launch: Any, tmp_path: Path, preset: str, source: str, folder: str, separate: str
 ) -> None:
     config = CONFIG if preset == "builtin" else external_cell(tmp_path, preset, "filtered")

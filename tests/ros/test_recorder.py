@@ -62,14 +62,14 @@ class RunningRecorder:
         wait_until(lambda: self.state()[key] == value, f"{key} is {value}")
 
     def poses(self) -> list[bytes]:
-        """Return poses of the hand in the file while it is written."""
+        """Return the hand's poses that the file contains so far."""
         with suppress(RecordingError):  # A write may be going on.
             recording = open_recording(self.folder)
             return [message.payload for messages in recording.messages((HAND,)) for message in messages]
         return []
 
     def discarded(self) -> list[bool]:
-        """Return whether each episode in the file was discarded, while it is written."""
+        """Return, for each episode that the file contains so far, whether it was discarded."""
         with suppress(RecordingError):  # A write may be going on.
             return [span.discarded for span in read_spans(open_recording(self.folder))]
         return []
@@ -103,7 +103,7 @@ def record_poses(recorder: RunningRecorder, node: Any, count: int) -> bytes:
     return last
 
 
-def test_messages_are_in_the_file_to_the_byte_and_are_read_without_ros(
+def test_the_file_contains_messages_byte_for_byte_and_can_be_read_without_ros(
     recorder: RunningRecorder, node: Any, tmp_path: Path
 ) -> None:
     from rosbags.highlevel import AnyReader
@@ -144,7 +144,7 @@ def late_recorder(rig: ArmRig, node: Any, processes: Processes, folder: Path) ->
     return recorder
 
 
-def test_hand_and_services_know_each_others_episodes(node: Any, processes: Processes, tmp_path: Path) -> None:
+def test_presses_and_services_begin_and_end_the_same_episodes(node: Any, processes: Processes, tmp_path: Path) -> None:
     rig = ArmRig(node)
     rig.start(processes, {"teleop.bindings.grip": "record_toggle"})
     recorder = late_recorder(rig, node, processes, tmp_path)
@@ -155,7 +155,7 @@ def test_hand_and_services_know_each_others_episodes(node: Any, processes: Proce
     felt(rig, EPISODE_ENDS)
     refused = call(node, "/recorder/stop")
     assert not refused.success
-    felt(rig, EPISODE_REJECTED)  # This is the verdict. It is stronger than a discard that comes meanwhile.
+    felt(rig, EPISODE_REJECTED)  # This vibration hides a weaker one, such as that of a discard.
     squeeze(rig)
     recorder.wait("episode_open", True)
     assert call(node, "/recorder/discard").success
@@ -212,7 +212,7 @@ def test_a_killed_recorder_leaves_a_file_that_its_writer_closes(recorder: Runnin
 
         # The count is that of all topics, and the newest messages may still be on the way to the pipe.
         wait_until(lambda: sent() >= 2 * HANDED_OVER, "the node hands over what is not written", patience=600.0)
-        recorder.state()  # By then, they are in the pipe.
+        recorder.state()  # When this state has come, those messages are in the pipe.
         os.kill(recorder.process.pid, signal.SIGKILL)
     finally:
         os.kill(writer, signal.SIGCONT)
@@ -291,10 +291,10 @@ def test_a_whole_set_is_recorded_and_judged_and_ends_at_ctrl_c(node: Any, proces
     )
     assert call(node, "/recorder/start").success
     states = States(node, "recorder")
-    enough = states.wait_for()["messages"] + 10_000  # There are some 10 topics a tick.
+    enough = states.wait_for()["messages"] + 10_000  # Each tick has about 10 messages.
     wait_until(lambda: states.wait_for()["messages"] > enough, "the arms are moved", patience=600.0)
     assert call(node, "/recorder/stop").success
-    # The judging process gets no time while nodes with real-time priority use both processors.
+    # Nodes with real-time priority may use all processors. They are stopped, so that the judging process gets time.
     others = [pid for pid in children(process.pid) if "recorder" not in Path(f"/proc/{pid}/cmdline").read_text()]
     for pid in others:
         os.kill(pid, signal.SIGSTOP)

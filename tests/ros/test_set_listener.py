@@ -34,7 +34,7 @@ CELL = load_config(CONFIG)
 NO_TOOL_POSE = RosReason.NO_TOOL_POSE.template.format(cause="")
 
 
-def test_rates_are_those_of_the_senders_and_only_states_are_listened_to(node: Any, domain: int) -> None:
+def test_a_set_listener_tells_the_rates_of_the_senders_and_subscribes_only_to_states(node: Any, domain: int) -> None:
     state = node.create_publisher(String, "/test/state", 10)
     other = node.create_publisher(String, "/stranger/state", 10)
     sender = node.create_publisher(PoseStamped, "/target", 10)
@@ -82,7 +82,9 @@ print("left:", sum(isinstance(one, Executor) for one in gc.get_objects()))
     node.destroy_timer(timer)
 
 
-def test_the_command_watches_nodes_and_subscribes_to_no_command_and_no_hand(node: Any, processes: Processes) -> None:
+def test_the_command_watch_shows_nodes_and_subscribes_to_no_commands_and_no_hand_data(
+    node: Any, processes: Processes
+) -> None:
     processes.start_node("left_arm_controller")
     processes.start_node("SimulationInput")
     States(node, "left_q2r2_arm_controller").wait_for(kind="no_tool_pose")
@@ -184,7 +186,7 @@ WHY: dict[str, tuple[tuple[NodeView, ...], str]] = {
 
 
 @pytest.mark.parametrize(("nodes", "why"), WHY.values(), ids=WHY)
-def test_a_line_gives_the_reason_for_the_state_of_an_arm(nodes: tuple[NodeView, ...], why: str) -> None:
+def test_the_view_of_an_arm_gives_the_reason_for_its_state(nodes: tuple[NodeView, ...], why: str) -> None:
     left, right = arm_views(nodes, CELL)
     assert why in left.why
     assert (left.name, right.name, right.node) == ("left", "right", "")

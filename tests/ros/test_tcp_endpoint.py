@@ -36,7 +36,7 @@ def start_endpoint(processes: Processes, *parameters: str) -> tuple[RosProcess, 
 
 
 class KeepaliveHeadset(FakeHeadset):
-    """Sends a keepalive from time to time like the app, so that a slow machine does not end the connection."""
+    """A headset that sends keepalives like the app, so that the connection does not end on a slow machine."""
 
     def __init__(self, address: tuple[str, int], dialect: str = "ros2") -> None:
         super().__init__(address, dialect)
@@ -72,7 +72,7 @@ class Hand:
         for suffix, queue in self.queues.items():
             for attempt in attempts(1):
                 probe = {
-                    # The pose must not be frozen.
+                    # Each attempt sends another pose, because frozen poses are left out.
                     "pose": headset.pose(self.name, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, float(attempt))),
                     "twist": headset.twist(self.name, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
                     "inputs": headset.inputs(self.name),
@@ -156,7 +156,7 @@ def test_only_networks_that_the_cell_or_a_parameter_allows_are_served(processes:
     assert "parameter allow: 'the lab' is neither an address nor a network" in refused.output
 
 
-def test_vibrations_reach_a_headset_that_subscribed_byte_by_byte(node: Any, processes: Processes) -> None:
+def test_a_headset_that_has_subscribed_gets_vibrations_byte_for_byte(node: Any, processes: Processes) -> None:
     _, address = start_endpoint(processes)
     haptic = node.create_publisher(OVR2ROSHapticFeedback, "q2r_right_hand_haptic_feedback", 10)
     with KeepaliveHeadset(address) as headset:
@@ -170,7 +170,9 @@ def test_vibrations_reach_a_headset_that_subscribed_byte_by_byte(node: Any, proc
         assert frame == ("q2r_right_hand_haptic_feedback", CDR + struct.pack("<2f", 0.25, 1.0))
 
 
-def test_topics_are_silent_without_a_headset_and_another_one_may_follow(node: Any, processes: Processes) -> None:
+def test_topics_are_silent_without_a_headset_and_a_second_headset_may_connect_later(
+    node: Any, processes: Processes
+) -> None:
     process, address = start_endpoint(processes)
     states = States(node, "tcp_endpoint")
     assert states.wait_for(peer=None)["level"] == "warn"
@@ -195,7 +197,7 @@ def test_topics_are_silent_without_a_headset_and_another_one_may_follow(node: An
     assert process.interrupt() == 0
 
 
-def test_frozen_poses_are_left_out_with_one_line(node: Any, processes: Processes) -> None:
+def test_frozen_poses_are_not_published_and_one_line_reports_them(node: Any, processes: Processes) -> None:
     process, address = start_endpoint(processes)
     hand, deadline = Hand(node, "left"), time.monotonic() + PATIENCE
     with KeepaliveHeadset(address) as headset:
@@ -249,5 +251,5 @@ def test_the_view_shows_values_rate_and_age_and_reports_a_timeout(node: Any, pro
     assert check.interrupt() == 0
 
 
-def test_after_its_duration_the_exit_code_says_that_nothing_has_arrived(processes: Processes) -> None:
+def test_the_check_ends_after_its_duration_with_exit_code_1_if_nothing_has_arrived(processes: Processes) -> None:
     assert processes.start_node(NAME, "duration:=2.5").wait(LONG) == 1

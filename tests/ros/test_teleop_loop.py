@@ -54,7 +54,7 @@ class WayHome:
         (None, "lost: homing_fault: homing_ended"),
     ],
 )
-def test_a_way_home_ends_with_the_outcome_of_the_controller_or_else_with_a_fault(
+def test_homing_ends_with_the_outcome_that_the_controller_reports_or_else_with_a_fault(
     outcome: Reason | None, event: str
 ) -> None:
     way = WayHome()
@@ -71,7 +71,9 @@ def test_a_way_home_ends_with_the_outcome_of_the_controller_or_else_with_a_fault
         ((True, "done"), "lost: not_homing: homing_not_begun"),
     ],
 )
-def test_a_way_home_that_the_controller_does_not_begin_ends(answer: tuple[bool, str] | None, event: str) -> None:
+def test_homing_that_the_controller_does_not_begin_ends_with_a_fault(
+    answer: tuple[bool, str] | None, event: str
+) -> None:
     way = WayHome()
     future = way.services["home"].call_async.return_value
     future.done.return_value = answer is not None
@@ -83,7 +85,7 @@ def test_a_way_home_that_the_controller_does_not_begin_ends(answer: tuple[bool, 
     assert (way.update(1.0, goes=False) or way.update(3.0, goes=False)) == [event] * 2
 
 
-def test_a_pause_on_the_way_home_makes_the_controller_hold() -> None:
+def test_a_pause_during_homing_makes_the_controller_hold() -> None:
     way = WayHome()
     way.update(0.0, goes=True)
     way.teleop.pause(0.5, Reason(TeleopReason.PAUSE_SERVICE))
@@ -101,7 +103,7 @@ def both(context: Any) -> Iterator[tuple[LeftArmController, RightArmController]]
 
 
 @pytest.mark.parametrize(("left", "right", "in_step"), [(1, 1, True), (1, 2, False), (None, None, False)])
-def test_the_relation_of_tools_is_corrected_only_if_both_references_have_the_same_stamp(
+def test_the_relative_pose_of_tools_is_corrected_only_if_both_references_have_the_same_stamp(
     left: int | None, right: int | None, in_step: bool, both: tuple[Any, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     loop, stamps = both[0].loop, {"left": left, "right": right}
@@ -136,8 +138,8 @@ def test_a_parameter_of_the_teleoperation_that_is_set_in_one_node_is_set_in_both
     assert (left.hand, right.hand) == ("right", "left")
 
 
-def test_a_lost_report_does_not_hold_back_the_next_ones(both: tuple[Any, Any]) -> None:
-    # A reliable subscription delivers in order. After a process was frozen, reports waited 3 s for a lost one.
+def test_a_lost_report_does_not_delay_the_next_reports(both: tuple[Any, Any]) -> None:
+    # A reliable subscription delivers in order. After a process was frozen, reports would wait 3 s for a lost report.
     reports = [one for node in both for one in node.subscriptions if one.topic_name.endswith("/state")]
     assert {one.topic_name for one in reports} == {"/cartesian_controller/state", "/recorder/state"}
     assert {one.qos_profile.reliability for one in reports} == {ReliabilityPolicy.BEST_EFFORT}

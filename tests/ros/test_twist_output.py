@@ -28,7 +28,7 @@ TOOL = pin.SE3(np.eye(3), np.array([0.5, 0.0, 0.4]))
 
 
 class Driven:
-    """The output of a node that nobody spins, at times that the test gives."""
+    """The output of a node that is not spun. The test sets the time of each step."""
 
     def __init__(self, node: Any, context: Any) -> None:
         self.arm = LeftArmController(preset="twist", ctrl_prefix="/robot/left_ctrl", context=context)
@@ -41,7 +41,7 @@ class Driven:
     def step(self, target: pin.SE3 | None, base: pin.SE3 | None = BASE, state: ArmState = ArmState.ENGAGED) -> None:
         self.now += PERIOD
         self.output.step(target, self.at, base, self.now, time.monotonic(), state=state)
-        time.sleep(0.5 * PERIOD)  # Acknowledgements come by the clock of the middleware.
+        time.sleep(0.5 * PERIOD)  # Acknowledgements take real time.
 
     def move(self, velocity: Array, turn: Array) -> None:
         """Let the target move on for one tick, and the tool with it."""
@@ -99,7 +99,7 @@ def moving(driven: Driven) -> None:
     wait_until(taken, "the velocity is that of the target", driven.newest)
 
 
-def test_the_velocity_is_that_of_the_target_in_the_axes_of_the_base(driven: Driven) -> None:
+def test_the_receiver_gets_the_velocity_of_the_target_in_the_axes_of_the_base(driven: Driven) -> None:
     moving(driven)
 
 
@@ -119,7 +119,7 @@ def test_after_a_jump_of_the_target_the_velocity_stays_within_the_limits_of_the_
 
 
 @pytest.mark.parametrize("state", [ArmState.PAUSED, ArmState.LOST])
-def test_an_arm_that_is_paused_or_lost_brakes_and_then_gets_zero_for_as_long_as_it_holds(
+def test_an_arm_that_is_paused_or_lost_brakes_and_then_gets_velocity_zero_as_long_as_it_holds(
     state: ArmState, driven: Driven
 ) -> None:
     moving(driven)
@@ -137,13 +137,13 @@ def test_an_arm_that_is_paused_or_lost_brakes_and_then_gets_zero_for_as_long_as_
     assert driven.output.sent == sent + 5
 
 
-def test_zero_is_sent_at_once_where_the_base_is_not_known_any_more(driven: Driven) -> None:
+def test_velocity_zero_is_sent_at_once_when_the_pose_of_the_base_is_not_known_any_more(driven: Driven) -> None:
     moving(driven)
     driven.step(None, base=None, state=ArmState.LOST)
     wait_until(driven.stands, "zero comes", driven.newest)
 
 
-def test_zero_is_sent_at_once_when_the_stream_is_dropped(driven: Driven) -> None:
+def test_velocity_zero_is_sent_at_once_when_the_stream_is_dropped(driven: Driven) -> None:
     moving(driven)
     driven.output.forget(driven.now)
     wait_until(driven.stands, "zero comes", driven.newest)

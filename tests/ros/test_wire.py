@@ -54,7 +54,7 @@ def test_joint_states_are_written_and_read_as_by_rclpy(names: list[str], t: floa
     assert deserialize_message(data, JointState) == joint_state_message(names, none, none, tau, t)
 
 
-def test_joint_states_of_many_senders_are_distinguished_whatever_fields_are_empty() -> None:
+def test_joint_states_of_several_senders_are_read_correctly_whichever_fields_are_empty() -> None:
     read = joint_state_reader()
     for _ in range(3):
         for names in NAMES:
@@ -81,7 +81,7 @@ def test_bytes_that_are_not_a_message_are_refused() -> None:
     for read, message in messages.items():
         whole = serialize_message(message)
         read(whole)
-        text = 16 if isinstance(message, TFMessage) else 12  # The length of the first text is here.
+        text = 16 if isinstance(message, TFMessage) else 12  # Offset of the length of the first text.
         endless = whole[:text] + b"\xff\xff\xff\x7f" + whole[text + 4 :]
         for data in (whole[:24], endless, b"\x00\x00" + whole[2:], b""):
             with pytest.raises(SerdeError):
@@ -125,7 +125,7 @@ def test_poses_are_written_and_read_as_by_rclpy(frame: str, t: float) -> None:
     np.testing.assert_allclose(read.numbers, read_pose(expected).numbers, atol=1e-15)
 
 
-def test_transforms_of_many_senders_are_distinguished() -> None:
+def test_transforms_of_several_senders_are_read_correctly() -> None:
     read = transforms_reader()
     for _ in range(3):
         for links in (["a"], ["b"], ["a", "bc"], ["ab", "c"], []):
@@ -137,7 +137,7 @@ def test_transforms_of_many_senders_are_distinguished() -> None:
                 assert pin.XYZQUATToSE3(np.array(one.numbers)).isApprox(pose, 1e-12)
 
 
-def test_links_are_where_mujoco_has_them_in_their_parents(robot: Robot) -> None:
+def test_each_link_has_the_pose_in_its_parents_frame_that_it_has_in_mujoco(robot: Robot) -> None:
     plant = MujocoPlant(robot, load_config(CONFIG))
     plant.reset(robot.home + 0.2)
     model, data = plant.model, plant.data

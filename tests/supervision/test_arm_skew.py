@@ -18,7 +18,11 @@ PERIOD = 0.005  # Period of the arms' messages [s].
 def timings(
     left: float = 0.0, right: float = 0.0, silent: tuple[float, float] = (0.0, 0.0), noise: float = 0.0
 ) -> dict[str, ArmTiming]:
-    """Return the timings of two arms. All arguments are in periods; ``left`` and ``right`` are the arms' lags."""
+    """Return the timings of two arms. All arguments are in periods.
+
+    ``left`` and ``right`` are the lags that the arms report. ``silent`` are the times since these reports,
+    and ``noise`` is the noise of the lags.
+    """
     behind = {"left": left, "right": right}
     return {
         arm: ArmTiming(PERIOD * lag, PERIOD * quiet, PERIOD, PERIOD * noise)
@@ -50,7 +54,7 @@ def test_arms_brake_while_their_lags_differ_by_more_than_is_allowed(found: dict[
     assert watch.holds == holds
 
 
-def test_the_window_is_the_allowed_skew_and_two_more_message_periods() -> None:
+def test_the_skew_window_is_the_allowed_skew_plus_two_message_periods_plus_the_given_time() -> None:
     found = timings()
     assert skew_window(found, 0.004) == pytest.approx(allowed_skew(found) + 2.0 * PERIOD + 0.004)
     found["left"] = ArmTiming(0.0, 0.0, 2.0 * PERIOD)
@@ -104,7 +108,9 @@ def test_both_arms_brake_while_one_is_behind_and_go_on_when_it_has_caught_up(
     assert controller.tool_pose("left").translation[2] == pytest.approx(left.translation[2] + 0.05, abs=1e-3)
 
 
-def test_arms_whose_lags_stay_different_begin_again_from_rest(robot: Robot, controller: CartesianController) -> None:
+def test_arms_whose_lags_stay_different_are_stopped_and_hold_when_the_lags_are_equal_again(
+    robot: Robot, controller: CartesianController
+) -> None:
     world = World(robot, controller)
     left, right = world.engage_both()
     for _ in range(60):

@@ -1,4 +1,4 @@
-"""Arms that another controller moves. Their elbows are free, and the measured arms must not come too close."""
+"""Another controller moves the arms. Elbows may leave the reference, but no arm may come too close to other bodies."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from tests.support.reasons import kinds
 
 DT = 0.005  # [s]
 SPEED = 0.3  # Speed of the elbow's swing, as the norm of the joint velocities [rad/s].
-POST, RADIUS = 2.6, 0.04  # Angle of the swing at which a post is in the way [rad], and radius of the post [m].
+POST, RADIUS = 2.6, 0.04  # Angle of the swing at which the elbow meets a post [rad], and radius of the post [m].
 LAG, PACE = 0.6, 0.3  # Lag of a soft controller [s], and speed of a tool [m/s] or joint [rad/s] that it moves.
 MIN_DISTANCE, TOLERANCE = 0.02, 0.01  # [m]
 
@@ -51,7 +51,7 @@ def swing(robot: Robot, angle: float) -> list[Array]:
 
 @pytest.fixture(scope="module")
 def config(robot: Robot, tmp_path_factory: pytest.TempPathFactory) -> Config:
-    """Return the cell with a post. The left elbow meets it during the swing, but the reference's elbow does not."""
+    """Return the cell with a post that the measured left elbow meets in its swing. The reference's elbow does not."""
     data = robot.model.createData()
     pin.forwardKinematics(robot.model, data, swing(robot, POST)[-1])
     elbow = data.oMi[robot.model.getJointId("left_A4")].translation
@@ -96,7 +96,7 @@ def world(config: Config) -> World:
 def test_elbows_may_swing_while_the_tools_rest_but_not_too_close_to_other_bodies(world: World) -> None:
     postures, far = swing(world.robot, 1.5), round(0.7 / (SPEED * DT))
     home = world.controller.tool_pose("left").translation
-    # The time is longer than a deviation may last.
+    # The elbow stays away from the reference for longer than a deviation may last. This alone is no fault.
     world.show(postures[:far] + postures[far : far + 1] * round(1.0 / DT))
     assert np.abs(postures[far] - world.robot.home).max() > 0.5
     assert world.supervisor.phase is Phase.ACTIVE
@@ -129,9 +129,11 @@ def test_the_pair_that_is_farthest_below_its_own_required_distance_is_named(robo
 
 
 @pytest.mark.parametrize(("joint", "by"), [(0, 0.1), (6, 0.4)], ids=["by a distance", "by an angle alone"])
-def test_an_arm_whose_tool_stays_away_from_the_reference_starts_over(world: World, joint: int, by: float) -> None:
+def test_an_arm_whose_tool_stays_away_from_its_reference_gets_a_new_reference_at_the_measured_tool(
+    world: World, joint: int, by: float
+) -> None:
     moved = world.robot.home.copy()
-    # The tool is too far away for a stream to begin there, but the joint is not too far from its reference.
+    # The tool is too far from its reference for the start of a stream, but no joint is too far from its reference.
     moved[joint] += by
     steps = [world.robot.home + share * (moved - world.robot.home) for share in np.linspace(0.0, 1.0, 40)]
     world.show(steps + [moved] * round(0.4 / DT))
@@ -146,7 +148,7 @@ def test_an_arm_whose_tool_stays_away_from_the_reference_starts_over(world: Worl
     assert np.linalg.norm(world.controller.tool_pose("left").translation - tool) < 1e-3
 
 
-def test_a_soft_controller_that_lags_is_followed_and_an_arm_that_runs_away_starts_over(world: World) -> None:
+def test_an_arm_may_lag_behind_its_reference_but_an_arm_that_moves_away_from_it_is_stopped(world: World) -> None:
     q, goal, lags = world.robot.home.copy(), world.controller.tool_pose("left"), []
 
     def lead() -> Reference:
@@ -162,7 +164,7 @@ def test_a_soft_controller_that_lags_is_followed_and_an_arm_that_runs_away_start
         q += DT / LAG * (reference.q - q)
     assert world.supervisor.arm_state("left") == "following"
     assert world.supervisor.events == []
-    assert min(lags[-round(0.6 / DT) :]) > 0.2  # The time is longer than a deviation may last.
+    assert min(lags[-round(0.6 / DT) :]) > 0.2  # The lag lasts longer than a deviation may last.
     ran = 0.0
     while not world.supervisor.events:
         q[0] += PACE * DT
@@ -173,7 +175,7 @@ def test_a_soft_controller_that_lags_is_followed_and_an_arm_that_runs_away_start
     assert world.supervisor.phase is Phase.BRAKING
 
 
-def test_an_arm_whose_targets_end_in_motion_comes_to_rest_without_going_back(world: World) -> None:
+def test_an_arm_whose_targets_end_during_motion_comes_to_rest_without_moving_back(world: World) -> None:
     tool, heights = world.controller.tool_pose("left"), []
     q = world.robot.home.copy()
     for tick in range(round(1.5 / DT)):
@@ -190,7 +192,7 @@ def test_an_arm_whose_targets_end_in_motion_comes_to_rest_without_going_back(wor
     assert heights[-1] > max(heights) - 1e-4
 
 
-def test_on_the_way_home_the_tools_move_until_they_arrive_and_targets_are_refused(config: Config) -> None:
+def test_during_homing_the_tools_move_home_and_targets_are_refused_until_the_tools_arrive(config: Config) -> None:
     world = World(config)
     q = world.robot.home.copy()
     q[[1, 8]] += 0.2

@@ -67,7 +67,9 @@ def gripper(controller: CartesianController) -> Cell:
     return Cell(controller)
 
 
-def test_the_interval_shrinks_around_a_closed_gripper_and_does_not_change_at_rest(gripper: Cell) -> None:
+def test_the_monitored_interval_shrinks_around_a_closed_gripper_and_stays_while_the_gripper_rests(
+    gripper: Cell,
+) -> None:
     gripper.run(0.0, 0.5)
     assert gripper.granted["left"] == gripper.motion.openings["left"] == 0.0
     assert gripper.controller.openings["left"][0] == 0.0
@@ -77,7 +79,7 @@ def test_the_interval_shrinks_around_a_closed_gripper_and_does_not_change_at_res
     assert gripper.asked == asked < 12
 
 
-def test_a_gripper_opens_as_far_as_is_proven_asks_every_5_ms_and_opens_fully_in_free_space(gripper: Cell) -> None:
+def test_a_gripper_opens_as_far_as_is_proven_safe_and_tries_every_5_ms_to_open_farther(gripper: Cell) -> None:
     gripper.run(0.0, 1.6, BESIDE)
     assert not gripper.limiter.held
     gripper.run(1.0, 0.4, BESIDE)
@@ -96,7 +98,7 @@ def test_a_gripper_opens_as_far_as_is_proven_asks_every_5_ms_and_opens_fully_in_
     assert not gripper.limiter.held
 
 
-def test_without_a_measurement_commands_pass_and_fingers_count_at_all_openings(gripper: Cell) -> None:
+def test_without_a_measurement_a_gripper_gets_its_commands_and_its_fingers_count_at_all_openings(gripper: Cell) -> None:
     for wanted in (1.0, 0.0, 0.5):
         gripper.tick(wanted, {})
         assert gripper.granted == {"left": wanted, "right": 1.0}
@@ -104,7 +106,9 @@ def test_without_a_measurement_commands_pass_and_fingers_count_at_all_openings(g
 
 
 @pytest.mark.parametrize("measured", [{}, {"left": math.nan}, {"left": 7.0}], ids=["none", "no number", "absurd"])
-def test_without_a_trusted_measurement_a_gripper_keeps_its_command(gripper: Cell, measured: dict[str, float]) -> None:
+def test_without_a_trusted_measurement_a_gripper_keeps_its_last_command(
+    gripper: Cell, measured: dict[str, float]
+) -> None:
     gripper.run(0.0, 0.5)
     openings = gripper.controller.openings
     for _ in range(100):
@@ -123,7 +127,7 @@ def test_a_finger_slightly_beyond_its_calibrated_end_can_still_be_moved(
     assert gripper.granted["left"] == wanted
 
 
-def test_a_gripper_that_is_forced_into_another_body_is_named_and_may_close(gripper: Cell) -> None:
+def test_the_body_beside_a_gripper_that_was_forced_open_is_named_and_the_gripper_may_close(gripper: Cell) -> None:
     gripper.run(0.0, 1.6, BESIDE)
     openings = gripper.controller.openings["left"]
     for _ in range(20):
@@ -136,7 +140,9 @@ def test_a_gripper_that_is_forced_into_another_body_is_named_and_may_close(gripp
         assert gripper.granted["left"] == wanted
 
 
-def test_a_gripper_that_was_commanded_before_counts_with_that_opening_at_once(controller: CartesianController) -> None:
+def test_a_limiter_that_resumes_monitors_a_gripper_at_once_at_its_commanded_and_measured_openings(
+    controller: CartesianController,
+) -> None:
     controller.reset(controller.robot.home)
     limiter = GripperLimiter(controller)
     limiter.resume({"left": 0.0, "right": 0.3}, {"left": 0.2, "right": math.nan}, 1.0)
@@ -147,7 +153,9 @@ def test_a_gripper_that_was_commanded_before_counts_with_that_opening_at_once(co
     assert controller.openings["left"][1] < 0.3
 
 
-def test_an_opening_counts_for_the_longest_delay_of_the_gripper(controller: CartesianController) -> None:
+def test_an_earlier_opening_is_monitored_until_the_longest_delay_of_the_gripper_has_passed(
+    controller: CartesianController,
+) -> None:
     least = {}
     for remembered in (0.05, 0.3):
         controller.reset(controller.robot.home)
@@ -160,7 +168,7 @@ def test_an_opening_counts_for_the_longest_delay_of_the_gripper(controller: Cart
     assert 0.3 <= least[0.3] < 0.7
 
 
-def test_turning_fingers_wait_above_the_table_before_they_close_and_go_on_by_themselves(tmp_path: Path) -> None:
+def test_turning_fingers_close_only_as_far_as_the_table_allows_and_go_on_when_the_arm_rises(tmp_path: Path) -> None:
     config = turning_cell(tmp_path)
     robot = Robot.from_config(config)
     real = RealHands(robot)
@@ -189,12 +197,12 @@ def test_turning_fingers_wait_above_the_table_before_they_close_and_go_on_by_the
     run(0.0, above_table(0.06), 1.5)
     assert motion.openings["left"] == 0.0
     assert not limiter.held
-    # The arm moves down with closed fingers, which reach farther. Therefore the arm waits.
+    # Closed fingers reach farther down than open ones. Therefore the arm stops above its target.
     run(0.0, above_table(0.006), 1.0)
     assert controller.tool_pose("left").translation[2] > above_table(0.006).translation[2] + 0.005
 
 
-def test_a_gripper_whose_smaller_interval_is_refused_does_not_count_as_held_up(gripper: Cell) -> None:
+def test_a_gripper_whose_monitored_interval_may_not_shrink_does_not_count_as_held_up(gripper: Cell) -> None:
     controller = gripper.controller
     gripper.run(0.0, 0.05)
     with patch.object(controller, "set_opening", return_value=("finger", "table")):
@@ -236,7 +244,7 @@ def hand(holder: CartesianController) -> Hand:
     return Hand(holder)
 
 
-def test_a_gripper_that_closed_on_a_block_holds_it_from_standstill_until_the_block_slips_out(hand: Hand) -> None:
+def test_a_gripper_holds_a_block_from_the_standstill_of_its_fingers_until_the_block_slips_out(hand: Hand) -> None:
     assert not hand.run(0.0, 0.2, least=0.8)
     assert hand.run(0.0, 0.2, least=0.8)
     assert hand.run(0.0, 1.0, least=0.8)
@@ -245,7 +253,7 @@ def test_a_gripper_that_closed_on_a_block_holds_it_from_standstill_until_the_blo
 
 
 @pytest.mark.parametrize("least", [0.0, 0.06], ids=["nothing", "1.5 mm"])
-def test_a_gripper_that_closes_fully_or_nearly_holds_no_object(hand: Hand, least: float) -> None:
+def test_a_gripper_that_closes_fully_or_nearly_fully_holds_no_object(hand: Hand, least: float) -> None:
     assert not hand.run(0.0, 1.5, least=least)
 
 
@@ -261,19 +269,19 @@ def test_an_object_is_held_although_the_measured_opening_is_noisy(hand: Hand) ->
     assert held
 
 
-def test_a_slowly_closing_gripper_holds_no_object_on_the_way(hand: Hand) -> None:
+def test_a_gripper_holds_no_object_while_it_closes_slowly(hand: Hand) -> None:
     for step in range(100):
         assert not hand.run(0.0, TICK, least=1.0 - 0.01 * step)
 
 
-def test_without_measurements_the_last_known_state_stays(hand: Hand) -> None:
+def test_without_measurements_a_gripper_counts_as_holding_an_object_if_it_last_held_one(hand: Hand) -> None:
     assert not hand.run(0.0, 0.5, measured=math.nan)
     hand.run(0.0, 0.5, least=0.8)
     assert hand.run(0.0, 0.5, measured=math.nan)
     assert hand.run(1.0, 0.5, measured=math.nan)
 
 
-def test_a_gripper_without_measured_opening_holds_its_object_while_it_is_commanded_closed() -> None:
+def test_a_gripper_without_measured_opening_counts_as_holding_while_its_command_is_less_than_half_open() -> None:
     """The cell names no joints for the left gripper."""
     data = BLOCK_CELL.model_dump()
     data["arms"]["left"]["gripper"]["joints"] = ()
@@ -286,7 +294,7 @@ def test_a_gripper_without_measured_opening_holds_its_object_while_it_is_command
     assert held == [False, True, True, False]
 
 
-def test_a_gripper_holds_an_object_only_after_it_stood_still_for_the_stall_time() -> None:
+def test_a_gripper_holds_an_object_only_after_its_fingers_have_stood_still_for_the_stall_time() -> None:
     for stall in (0.2, 0.5):
         grip = Grip(0.025, stall)
         held = [at for at in np.arange(0.0, 1.0, 0.01) if grip.look(0.0, 1.0, float(at))]

@@ -1,4 +1,4 @@
-"""The way home from any posture: all joints move, the contract holds, and the way home can be interrupted."""
+"""Homing moves all joints home from any posture and keeps the contract. It can be interrupted."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from tests.supervision.conftest import CONFIG, STRICT, unhurried
 from tests.support.reasons import kinds
 
 DT = 0.004  # [s]
-LONGEST = 60.0  # Longest time that the way home may take [s].
+LONGEST = 60.0  # Longest time that homing may take [s].
 
 
 class World:
@@ -97,7 +97,7 @@ def test_from_nearly_all_random_postures_all_joints_reach_home_and_keep_the_cont
     assert ends.count("homing_arrived") >= reached, ends
 
 
-def test_a_motion_is_braked_before_the_way_home_begins(robot: Robot, controller: CartesianController) -> None:
+def test_a_motion_is_braked_before_homing_begins(robot: Robot, controller: CartesianController) -> None:
     world = World(robot, controller, robot.home)
     tool = controller.tool_pose("left")
     for step in range(100):
@@ -115,7 +115,7 @@ def test_a_motion_is_braked_before_the_way_home_begins(robot: Robot, controller:
 @pytest.mark.parametrize(
     ("how", "arguments"), [("pause", (True,)), ("stop", (Reason(RosReason.STOP_SERVICE),)), ("reset", ())]
 )
-def test_the_way_home_can_be_interrupted_and_the_arms_come_to_rest_where_they_are(
+def test_homing_can_be_interrupted_and_the_arms_then_come_to_rest_at_once(
     robot: Robot, controller: CartesianController, how: str, arguments: tuple[object, ...]
 ) -> None:
     (q,) = postures(robot, controller, 1, seed=6)
@@ -134,9 +134,7 @@ def test_the_way_home_can_be_interrupted_and_the_arms_come_to_rest_where_they_ar
     assert np.abs(world.state.q - at).max() < 0.04
 
 
-def test_a_way_home_that_its_caller_ends_is_recorded_as_interrupted(
-    robot: Robot, controller: CartesianController
-) -> None:
+def test_homing_that_its_caller_ends_is_recorded_as_interrupted(robot: Robot, controller: CartesianController) -> None:
     world = World(robot, controller, robot.home + 0.05)
     homing = world.supervisor.homing
     assert world.supervisor.go_home() is None
@@ -146,8 +144,8 @@ def test_a_way_home_that_its_caller_ends_is_recorded_as_interrupted(
     assert kinds(homing.outcome) == "homing_interrupted"
 
 
-def test_while_no_way_is_known_the_arms_rest_and_a_tick_examines_at_most_two_samples(robot: Robot) -> None:
-    distances = Mock(side_effect=chain([np.ones(3)], repeat(np.zeros(3))))  # Only the start is free.
+def test_while_no_path_home_is_known_the_arms_rest_and_a_tick_examines_at_most_two_postures(robot: Robot) -> None:
+    distances = Mock(side_effect=chain([np.ones(3)], repeat(np.zeros(3))))  # Only the start is free of collisions.
     bounds = {"position_lower": robot.position_lower, "position_upper": robot.position_upper}
     searched: Any = SimpleNamespace(arms=robot.arms, **bounds)
     homing, q, ticks = JointHoming(searched, lambda: (distances, np.full(3, 0.02)), robot.home), robot.home + 0.5, 0
@@ -156,13 +154,13 @@ def test_while_no_way_is_known_the_arms_rest_and_a_tick_examines_at_most_two_sam
         at = homing.step(q, np.zeros_like(q), DT).joints
         assert at is not None
         assert np.array_equal(at, q)
-        assert distances.call_count - before <= 3  # One more call measures the distances at the start.
+        assert distances.call_count - before <= 3  # One call measures the distances at the start; two examine postures.
         ticks += 1
     assert homing.outcome is CommonReason.HOMING_NO_WAY
     assert ticks > 100
 
 
-def test_if_only_the_straight_way_is_allowed_no_other_way_is_taken(robot: Robot) -> None:
+def test_homing_ends_if_only_the_straight_path_is_allowed_and_this_path_is_not_free(robot: Robot) -> None:
     free = Mock(side_effect=chain([np.ones(3)], repeat(np.zeros(3))))
     bounds = {"position_lower": robot.position_lower, "position_upper": robot.position_upper}
     searched: Any = SimpleNamespace(arms=robot.arms, **bounds)
@@ -172,7 +170,7 @@ def test_if_only_the_straight_way_is_allowed_no_other_way_is_taken(robot: Robot)
     assert homing.outcome is CommonReason.HOMING_NO_WAY
 
 
-def test_the_way_home_waits_for_an_arm_that_is_held_up_and_then_reports_it(robot: Robot) -> None:
+def test_homing_waits_for_an_arm_that_is_held_up_and_then_ends_with_this_reason(robot: Robot) -> None:
     settings = load_config(CONFIG).control
     homing = JointHoming(robot, lambda: (robot.distance_values, kept_distances(robot, settings).values), robot.home)
     q = robot.home.copy()
@@ -185,7 +183,7 @@ def test_the_way_home_waits_for_an_arm_that_is_held_up_and_then_reports_it(robot
         if homing.outcome is not None:
             break
     assert homing.outcome is CommonReason.HOMING_HELD_UP
-    assert 0.05 < farthest < 0.13  # Otherwise, the arm would start fast when it is free again.
+    assert 0.05 < farthest < 0.13  # A farther target would let the arm start fast when it is free again.
 
 
 @pytest.mark.parametrize(
@@ -195,7 +193,7 @@ def test_the_way_home_waits_for_an_arm_that_is_held_up_and_then_reports_it(robot
         pytest.param(pin.SE3(pin.exp3(np.array([0.0, 0.0, 0.6])), np.zeros(3)), id="0.6 rad away, at 0.3 rad/s"),
     ],
 )
-def test_tools_that_are_held_up_end_their_way_home_five_seconds_after_they_were_due(
+def test_homing_of_tools_that_are_held_up_ends_five_seconds_after_the_tools_were_due_at_home(
     robot: Robot, away: pin.SE3
 ) -> None:
     home = robot.tool_pose(robot.home, "left")
@@ -248,7 +246,10 @@ class Beside(World):
 
 @pytest.fixture
 def in_the_way(robot: Robot) -> tuple[CartesianController, Array, Array]:
-    """Return a controller, a posture with the left arm turned outwards, and a place on its straight way home."""
+    """Return a controller, a posture with the left arm turned outwards, and a point on this arm's straight path home.
+
+    The point is where the left tool is halfway home (3,), in the world frame [m].
+    """
     settings = unhurried(load_config(CONFIG)).model_copy(update={"moving_obstacles": ("thing",)})
     turned = robot.home.copy()
     turned[robot.arms["left"].joints[0]] += 1.0
@@ -263,18 +264,18 @@ def in_the_way(robot: Robot) -> tuple[CartesianController, Array, Array]:
         pytest.param({"shape": "sphere", "size": (0.1,), "speed": 0.25}, id="a hand that may move"),
     ],
 )
-def test_a_way_home_avoids_a_moving_obstacle_where_it_was_reported(
+def test_a_path_home_avoids_a_moving_obstacle_at_the_position_that_was_reported(
     in_the_way: tuple[CartesianController, Array, Array], thing: dict[str, Any]
 ) -> None:
     controller, turned, middle = in_the_way
     world = Beside(controller, turned, MovingObstacle(position=tuple(middle.tolist()), **thing))
     with pytest.raises(AssertionError):
-        world.check(0.5 * (turned + controller.robot.home))  # The straight way is not free.
+        world.check(0.5 * (turned + controller.robot.home))  # The straight path is not free.
     assert world.go_home() == "homing_arrived"
     assert np.abs(world.state.q - controller.robot.home).max() < 0.004
 
 
-def test_a_moving_obstacle_that_enters_the_way_home_holds_the_arms_up_until_the_way_ends(
+def test_a_moving_obstacle_that_enters_the_path_home_holds_the_arms_up_until_homing_ends(
     in_the_way: tuple[CartesianController, Array, Array],
 ) -> None:
     controller, turned, middle = in_the_way

@@ -1,4 +1,4 @@
-"""Measured joint states that are late, old, not finite, or that jump; and the rules for arms of another controller."""
+"""Joint states are a fault if they are late, old or not finite, or if they jump. Other controllers may lag farther."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def state(q: float, stamp: float, v: float = 0.0, external: float | None = None)
 
 
 class Joints:
-    """A watch that has accepted states at rest until ``now`` [s]."""
+    """A watch that has accepted resting arms. The newest state came at the time ``now`` [s]."""
 
     def __init__(self, settings: SupervisionSettings = SETTINGS) -> None:
         self.watch = JointWatch(NAMES, LIMIT, watch_settings(settings, yields=False), lambda: " from /arm")
@@ -57,7 +57,7 @@ def test_no_fault_is_found_while_states_come_and_the_arms_rest(joints: Joints) -
     assert joints.watch.believed
 
 
-def test_the_end_of_states_is_a_fault_after_the_timeout(joints: Joints) -> None:
+def test_missing_joint_states_are_a_fault_after_the_timeout(joints: Joints) -> None:
     joints.now += SETTINGS.state_timeout - 1e-6
     assert joints.fault() is None
     joints.now += 2e-6
@@ -86,7 +86,9 @@ def test_the_first_fault_stays_until_states_are_accepted_again(joints: Joints) -
 
 
 @pytest.mark.parametrize("what", ["position", "velocity", "external torque"])
-def test_a_number_that_is_not_finite_is_ignored_for_a_while_and_then_reported(joints: Joints, what: str) -> None:
+def test_states_with_a_number_that_is_not_finite_are_ignored_for_50_ms_and_then_reported(
+    joints: Joints, what: str
+) -> None:
     bad = {
         "position": lambda stamp: state(np.nan, stamp),
         "velocity": lambda stamp: state(0.0, stamp, v=np.inf),
@@ -122,7 +124,7 @@ def test_a_joint_that_moves_farther_than_its_speed_allows_is_a_fault(gap: float)
         assert joints.fault() is expected
 
 
-def test_the_joint_that_jumped_is_named_even_if_a_faster_joint_moved_farther(joints: Joints) -> None:
+def test_the_joint_that_jumped_is_named_even_if_a_joint_with_a_higher_limit_moved_farther(joints: Joints) -> None:
     joints.now += PERIOD
     zero = np.zeros(2)
     joints.watch.observe(RobotState(np.array([0.1, 0.105]), zero, zero, None, joints.now), joints.now)
@@ -130,13 +132,13 @@ def test_the_joint_that_jumped_is_named_even_if_a_faster_joint_moved_farther(joi
     assert sentence(joints.watch.fault) == "shoulder jumped by 0.100 rad"
 
 
-def test_simulated_time_since_the_last_state_counts_if_it_is_longer_than_the_loops_time(joints: Joints) -> None:
+def test_a_joint_may_move_farther_if_more_simulated_time_than_loop_time_has_passed(joints: Joints) -> None:
     joints.now += PERIOD
     joints.watch.observe(state(0.4, joints.now), joints.now, passed=0.2)
     assert joints.fault() is None
 
 
-def test_arms_that_creep_are_not_settled_and_resting_arms_are_after_the_settle_time() -> None:
+def test_creeping_arms_are_not_settled_and_resting_arms_are_settled_after_the_settle_time() -> None:
     watch, now = JointWatch(NAMES, LIMIT, watch_settings(SETTINGS, yields=False)), 0.0
     while now < 3.0 * SETTINGS.settle_time:
         now += PERIOD
@@ -150,7 +152,7 @@ def test_arms_that_creep_are_not_settled_and_resting_arms_are_after_the_settle_t
     assert not watch.settled(now + SETTINGS.state_timeout + 1e-6), "the newest state is too old"
 
 
-def test_arms_whose_session_is_lost_may_brake_from_states_that_still_come(joints: Joints) -> None:
+def test_arms_whose_session_is_lost_may_brake_from_joint_states_that_still_arrive(joints: Joints) -> None:
     joints.watch.lose(Reason.of(CommonReason.LOOP_STALLED, duration=1.0))
     assert joints.fault() is CommonReason.LOOP_STALLED
     assert joints.watch.believed
@@ -185,7 +187,7 @@ def test_compliant_arms_may_deviate_farther_from_their_reference() -> None:
     assert watch_settings(SETTINGS, yields=False).deviation == SETTINGS.max_deviation
 
 
-def test_only_the_other_controller_is_compliant_and_its_arms_may_lag_farther() -> None:
+def test_settings_for_external_arms_turn_admittance_off_and_allow_a_larger_deviation() -> None:
     config = load_config(CONFIG)
     config = config.model_copy(update={"admittance": config.admittance.model_copy(update={"enabled": True})})
     external = settings_for_external_arms(config)

@@ -34,7 +34,7 @@ def test_the_lags_of_moving_arms_are_found_exactly(robot: Robot, lags: tuple[flo
     assert found(robot, wanted, 0.8) == pytest.approx(wanted, abs=0.011)
 
 
-def test_resting_and_reversing_arms_get_the_least_possible_difference_of_lags(robot: Robot) -> None:
+def test_resting_or_reversing_arms_with_the_same_lag_get_nearly_the_same_lag(robot: Robot) -> None:
     same = dict.fromkeys(SIDES, 0.04)
     for now in (-0.1, 0.5 * np.pi, np.pi):
         lags = found(robot, same, float(now))
@@ -42,12 +42,12 @@ def test_resting_and_reversing_arms_get_the_least_possible_difference_of_lags(ro
 
 
 def test_the_largest_lag_that_is_found_is_0_4_s(robot: Robot) -> None:
-    """An arm that is farther away was moved by something else."""
+    """If an arm is farther behind than that, something else has moved it."""
     assert found(robot, dict.fromkeys(SIDES, 0.6), 1.2) == pytest.approx(dict.fromkeys(SIDES, 0.4), abs=0.011)
 
 
 def test_a_resting_arm_gets_the_same_lag_as_the_moving_arm(robot: Robot) -> None:
-    """Any lag explains the posture of the resting arm."""
+    """Every lag would explain the posture of the resting arm, so the lag of the other arm is taken."""
     watch, left = MeasuredLags(robot), robot.arms["left"].joints
 
     def at(t: float) -> Array:

@@ -23,7 +23,7 @@ def test_a_home_that_a_joint_cannot_hold_against_gravity_is_a_fault(
     assert fault.startswith(f"home: left_A2 needs {gravity[1]:.1f} Nm against gravity alone; allowed: its torque limit")
 
 
-def test_every_pair_closer_than_min_distance_is_named_once_with_the_nearest_first(robot: Robot) -> None:
+def test_each_pair_closer_than_min_distance_is_named_once_and_the_closest_pair_comes_first(robot: Robot) -> None:
     nearest = sorted(pair.distance for pair in robot.distances(robot.home))
     between = ControllerSettings(min_distance=float(np.mean(nearest[1:3])))
     faults = preflight_faults(robot, between, CartesianController(robot, between))
@@ -46,7 +46,7 @@ def test_a_home_without_a_certified_stop_is_a_fault(robot: Robot, controller: Ca
 
 
 @pytest.mark.parametrize(("room", "left"), [(0.3, None), (0.2005, "0.0005"), (0.1, "0")])
-def test_a_joint_without_range_between_its_margins_is_a_fault(
+def test_it_is_a_fault_if_position_margin_leaves_almost_none_of_a_joints_range(
     robot: Robot, monkeypatch: pytest.MonkeyPatch, room: float, left: str | None
 ) -> None:
     lower, upper = robot.position_lower.copy(), robot.position_upper.copy()
@@ -75,7 +75,7 @@ def test_a_home_nearer_to_a_joint_limit_than_the_margin_is_a_fault(
         assert fault == f"home: left_A3 = {robot.home[2]:g}; allowed: {allowed}"
 
 
-def test_limits_in_degrees_are_a_fault_and_a_joint_of_many_turns_is_not_a_fault(
+def test_limits_in_degrees_are_a_fault_and_a_range_of_many_turns_is_no_fault(
     robot: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     lower, upper, fastest = robot.position_lower.copy(), robot.position_upper.copy(), robot.velocity_limit.copy()

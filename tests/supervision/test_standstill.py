@@ -1,4 +1,4 @@
-"""A controller that stands still while joint states go on, compared with arms that lag, reverse, or are not heard."""
+"""A controller that stands still while joint states go on is found. Arms that lag or reverse are not reported."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from tests.supervision.conftest import STRICT
 
 DT = 0.004
 WITHIN = 0.1  # Longest time until the standstill is found [s].
-FROZEN_AT = 0.6  # [s]
+FROZEN_AT = 0.6  # Time at which the driver stops [s].
 
 
 def swinging(speed: float, hertz: float) -> Callable[[float], Array]:
@@ -85,7 +85,7 @@ def test_a_driver_that_stops_during_motion_is_found_within_a_tenth_of_a_second(
     assert FROZEN_AT < found < FROZEN_AT + WITHIN + DT
 
 
-def test_a_driver_that_never_began_is_found_before_its_arm_is_far_behind() -> None:
+def test_a_driver_that_never_began_is_found_before_the_command_is_0_1_rad_away() -> None:
     asked = ramp(1.2, 8.0)
     found = next(findings(JOINTS, asked, frozen_at=0.0))
     assert float(np.abs(asked(found)).max()) < 0.1
@@ -117,7 +117,7 @@ def test_an_arm_that_lags_is_not_reported_as_standing_when_it_starts_or_reverses
     assert list(findings(limits, swinging(speed, hertz), seconds=6.0, delay=delay, lag=lag)) == []
 
 
-def test_a_late_controller_may_begin_late_again_after_a_rest() -> None:
+def test_a_controller_with_a_delay_may_begin_late_again_after_a_rest() -> None:
     motion = swinging(0.6, 1.0)
 
     def asked(t: float) -> Array:
@@ -126,8 +126,8 @@ def test_a_late_controller_may_begin_late_again_after_a_rest() -> None:
     assert list(findings(LAGGING_JOINTS, asked, seconds=3.0, delay=0.3, lag=0.03)) == []
 
 
-def test_nothing_is_judged_where_the_loop_or_the_states_have_a_gap() -> None:
-    """A loop that stood still sent no commands. Without states nothing is known about the arm."""
+def test_no_standstill_is_reported_while_ticks_or_joint_states_are_missing() -> None:
+    """A loop that stood still has sent no commands. While no states come, the motion of the arm is unknown."""
 
     def gap(t: float) -> bool:
         return not FROZEN_AT < t < FROZEN_AT + 0.08
@@ -139,7 +139,7 @@ def test_nothing_is_judged_where_the_loop_or_the_states_have_a_gap() -> None:
     assert 1.0 < found <= 1.0 + WITHIN
 
 
-def test_nothing_is_judged_before_a_whole_window_was_seen() -> None:
+def test_no_standstill_is_reported_before_a_whole_window_has_passed() -> None:
     """The command moves away at once, while the measured arm stays."""
     watch, still = StandstillWatch(JOINTS), np.zeros(3)
     for step in range(40):
@@ -149,7 +149,7 @@ def test_nothing_is_judged_before_a_whole_window_was_seen() -> None:
     assert found is not None
 
 
-def test_fifty_states_a_second_are_enough() -> None:
+def test_a_standstill_is_found_from_only_fifty_states_a_second() -> None:
     asked = ramp(1.2, 8.0)
     assert list(findings(JOINTS, asked, state_period=0.02)) == []
     assert next(findings(JOINTS, asked, state_period=0.02, lag=0.008, frozen_at=FROZEN_AT)) <= FROZEN_AT + 0.12
@@ -179,7 +179,9 @@ class Cell:
             self.q = self.q + self.v * DT
 
 
-def test_both_arms_are_stopped_if_the_driver_of_one_stands_still(robot: Robot, controller: CartesianController) -> None:
+def test_both_arms_are_stopped_if_the_driver_of_one_arm_stands_still(
+    robot: Robot, controller: CartesianController
+) -> None:
     cell = Cell(robot, controller)
     up = np.array([0.0, 0.0, 0.25])
     cell.run(0.2, up)

@@ -1,4 +1,4 @@
-"""The rules by which the controller moves arms, with the real controller but without ROS and without a clock."""
+"""The supervisor's rules for the motion of arms, tested with the real controller but without ROS and a real clock."""
 
 from __future__ import annotations
 
@@ -61,7 +61,10 @@ class World:
     def run(
         self, seconds: float, target: pin.SE3 | None = None, sees: bool = True, right: pin.SE3 | None = None
     ) -> None:
-        """Let time pass with constant targets of the left and the ``right`` arm. ``sees``: whether states come."""
+        """Let time pass with constant targets: ``target`` for the left arm, ``right`` for the right arm.
+
+        Joint states come only if ``sees`` is True.
+        """
         zero = np.zeros_like(self.q)
         for _ in range(round(seconds / DT)):
             self.now += DT
@@ -86,7 +89,7 @@ def raised(pose: pin.SE3, by: float) -> pin.SE3:
     return pin.SE3(pose.rotation, pose.translation + np.array([0.0, 0.0, by]))
 
 
-def test_nothing_is_commanded_before_joint_states_are_valid_and_at_rest(world: World, robot: Robot) -> None:
+def test_nothing_is_commanded_before_joint_states_are_valid_and_the_arms_rest(world: World, robot: Robot) -> None:
     world.run(0.5, sees=False)
     assert world.commanded == [None] * len(world.commanded)
     for step in range(50):  # A person pushes the arm.
@@ -99,7 +102,7 @@ def test_nothing_is_commanded_before_joint_states_are_valid_and_at_rest(world: W
     assert np.allclose(first, world.q, atol=1e-9)
 
 
-def test_why_arms_cannot_be_activated_is_logged_once_for_each_reason(world: World) -> None:
+def test_each_reason_why_arms_cannot_be_activated_is_logged_once(world: World) -> None:
     gone, stalled = Reason(CommonReason.OTHER), Reason.of(CommonReason.LOOP_STALLED, duration=1.0)
     for why in (gone, gone, stalled, stalled):
         world.supervisor.update_state(why, world.now)
@@ -116,8 +119,8 @@ def test_arms_that_were_stopped_before_their_activation_are_activated_only_after
     assert world.states == ["holding"] * 2
 
 
-def test_the_first_reference_is_where_the_drives_hold_the_arms(world: World) -> None:
-    """The measured arms sag. A reference that began there would let them sag again and again."""
+def test_the_first_reference_is_the_posture_that_the_drives_hold(world: World) -> None:
+    """The measured arms sag below it. If references began at the measured posture, the arms would sag at each start."""
     held, zero = world.q + 0.02, np.zeros_like(world.q)
     references: list[Array] = []
     while not references:
@@ -140,13 +143,13 @@ def test_an_arm_that_was_pushed_away_from_its_reference_is_engaged_where_it_is(w
     assert world.states == ["following", "holding"]
 
 
-def test_if_targets_of_one_linked_arm_end_both_hold_until_a_new_stream_of_each_begins(world: World) -> None:
+def test_if_the_targets_of_one_linked_arm_end_both_arms_hold_until_each_gets_a_new_stream(world: World) -> None:
     _, right = world.engage_both()
     world.run(0.3, right=raised(right, 0.01))
     assert not world.supervisor.follows("right")
     assert [reason.root.kind for reason in world.supervisor.targets.ended.values()] == ["targets_ceased"] * 2
     rest = world.tool("right")
-    world.run(1.0, right=raised(right, 0.02))  # The other stream goes on.
+    world.run(1.0, right=raised(right, 0.02))  # The right arm's stream goes on.
     assert np.allclose(world.tool("right").translation, rest.translation, atol=1e-6)
     world.run(0.2)
     world.run(0.1, world.tool("left"), right=world.tool("right"))
@@ -204,7 +207,7 @@ def test_arms_that_were_stopped_stay_stopped_after_the_loop_stood_still(world: W
     assert kinds(world.supervisor.fault) == "other"
 
 
-def test_lost_joint_states_brake_the_arms_and_their_return_moves_nothing(world: World) -> None:
+def test_the_loss_of_joint_states_brakes_the_arms_and_the_return_of_the_states_moves_no_arm(world: World) -> None:
     tool, before = world.engage(by=0.1), world.q
     world.run(0.6, raised(tool, 0.1), sees=False)
     assert world.states == ["inactive"] * 2
@@ -219,7 +222,7 @@ def test_lost_joint_states_brake_the_arms_and_their_return_moves_nothing(world: 
     assert kinds(world.supervisor.events[1]) == "joint_states: states_silent"
 
 
-def test_a_joint_that_cannot_hold_against_gravity_is_stopped_and_the_reason_tells_the_torque(
+def test_an_arm_with_a_joint_that_cannot_bear_gravity_is_stopped_and_the_reason_tells_the_torque(
     world: World, robot: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(robot, "torque_limit", np.full_like(robot.torque_limit, 1e-3))
@@ -248,7 +251,7 @@ def test_arms_that_do_not_follow_their_reference_are_stopped_until_a_reset(world
     assert np.allclose(world.q, rest, atol=1e-9)
 
 
-def test_homing_ends_at_home_and_takes_no_targets(world: World) -> None:
+def test_homing_ends_at_home_and_targets_do_not_change_its_path(world: World) -> None:
     tool = world.engage(by=0.1, seconds=1.0)
     assert world.supervisor.go_home() is None
     world.run(4.0, raised(tool, 0.1))
@@ -257,7 +260,7 @@ def test_homing_ends_at_home_and_takes_no_targets(world: World) -> None:
     assert world.supervisor.arm_state("left") == "holding"
 
 
-def test_a_stream_may_go_anywhere_but_after_a_silence_it_has_to_begin_at_the_tool() -> None:
+def test_a_stream_may_move_anywhere_but_has_to_begin_at_the_tool_again_after_a_silence() -> None:
     stream = TargetStream(StreamSettings())
     assert stream.offer(TOOL, [TOOL], 0.0) is None
     assert stream.offer(raised(TOOL, 0.2), [], 0.1) is None
@@ -275,7 +278,7 @@ def test_targets_are_not_followed_any_more_when_a_reason_forbids_it(world: World
     assert not world.supervisor.follows("left")
 
 
-def test_targets_that_begin_elsewhere_are_followed_after_they_jump_to_the_tool_or_after_a_silence() -> None:
+def test_a_stream_that_began_away_from_the_tool_is_followed_after_a_jump_to_the_tool_or_a_silence() -> None:
     passing, jumping, silent = (TargetStream(StreamSettings()) for _ in range(3))
     for step in range(100):
         assert passing.offer(raised(TOOL, 0.5 - 0.01 * step), [TOOL], 0.01 * step) is not None
@@ -284,7 +287,7 @@ def test_targets_that_begin_elsewhere_are_followed_after_they_jump_to_the_tool_o
         assert stream.offer(raised(TOOL, 0.2), [TOOL], 0.0) is not None
     assert jumping.offer(TOOL, [TOOL], 0.01) is None
     assert silent.offer(raised(TOOL, 0.04), [TOOL], 0.01) is not None
-    assert silent.offer(TOOL, [TOOL], 0.02) is not None  # The target reached the tool at a hand's speed.
+    assert silent.offer(TOOL, [TOOL], 0.02) is not None  # This motion to the tool is too slow for a jump.
     assert silent.offer(TOOL, [TOOL], 0.2) is None
 
 
@@ -297,7 +300,7 @@ def test_after_drop_a_target_stream_is_refused_until_reset_even_if_its_target_eq
     assert stream.offer(TOOL, [TOOL], 0.02) is None
 
 
-def test_arms_whose_receiver_is_gone_are_noticed_and_a_new_receiver_gets_no_jump(world: World) -> None:
+def test_the_loss_of_the_receiver_of_commands_is_noticed_and_a_new_receiver_gets_no_jump(world: World) -> None:
     tool = world.engage()
     world.blocked = True  # The program that moved the arms is gone.
     world.run(0.3, raised(tool, 0.06))
@@ -328,7 +331,7 @@ def test_braking_arms_go_on_braking_when_their_receiver_is_gone(world: World) ->
     assert kinds(world.supervisor.fault) == "other"
 
 
-def test_arms_that_lag_behind_the_commands_do_not_deviate_from_their_reference(world: World) -> None:
+def test_arms_that_only_lag_behind_their_commands_do_not_count_as_off_their_reference(world: World) -> None:
     tool = world.engage()
     world.lag = 0.06
     deviation = 0.0

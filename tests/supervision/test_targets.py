@@ -1,4 +1,4 @@
-"""Messages of frozen senders and of two publishers are found. Even motion stays even in a loop of another period."""
+"""Late messages and second publishers are noticed. Even motion stays even if sender and loop have different periods."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Stream:
 
 
 @pytest.mark.parametrize("offset", [0.0, 3600.0, -3600.0])
-def test_only_the_message_that_a_frozen_sender_completes_is_late(offset: float) -> None:
+def test_after_a_sender_was_frozen_only_its_first_message_counts_as_late(offset: float) -> None:
     stream = Stream(offset)
     assert not any(stream.take() for _ in range(100))
     assert stream.take(extra=1.0, after=1.0) == pytest.approx(1.0, abs=2e-3)
@@ -59,7 +59,7 @@ def test_after_a_change_of_a_clock_messages_are_used_again_within_little_more_th
     assert not any(late[105:])
 
 
-def test_if_the_middleware_knows_no_delay_no_message_becomes_late() -> None:
+def test_if_the_middleware_tells_no_delay_no_message_counts_as_late() -> None:
     watch = DelayWatch(ALLOWED)
     assert [watch.take(delay, now) for now, delay in enumerate((-math.inf, USUAL, math.nan, USUAL))] == [0.0] * 4
 
@@ -76,7 +76,7 @@ def test_two_publishers_that_alternate_are_found_at_the_third_and_fifth_message(
     assert all(count >= 2 for count in found[4:])
 
 
-def test_one_publisher_may_lose_numbers_and_a_new_publisher_is_one_break_that_is_forgotten() -> None:
+def test_numbers_may_be_skipped_and_numbers_of_a_new_publisher_count_as_one_break_for_a_time() -> None:
     assert not any(breaks([7, 8, 9, 20, 21, 60, 61]))
     found = breaks([*range(500, 520), *range(1, 150)])
     assert found[19:21] == [0, 1]
@@ -85,7 +85,7 @@ def test_one_publisher_may_lose_numbers_and_a_new_publisher_is_one_break_that_is
 
 
 @pytest.mark.parametrize(("number", "found"), [(190, 0), (220, 1)], ids=["its own number", "another's number"])
-def test_a_publisher_may_have_sent_for_a_tenth_of_a_second_before_its_next_message_arrives(
+def test_numbers_may_skip_only_as_many_messages_as_one_publisher_sends_in_a_tenth_of_a_second(
     number: int, found: int
 ) -> None:
     """The publisher sends at most 2000 messages in a second. All but the newest were lost while the network stalled."""
@@ -94,14 +94,14 @@ def test_a_publisher_may_have_sent_for_a_tenth_of_a_second_before_its_next_messa
     assert watch.take(number, 0.001, STREAM_TIMEOUT) == found
 
 
-def test_a_break_counts_for_one_second_and_a_repeated_message_is_one_break() -> None:
+def test_a_repeated_number_is_a_break_and_each_break_counts_for_one_second() -> None:
     watch = SequenceWatch()
     found = [watch.take(number, now, STREAM_TIMEOUT) for number, now in ((5, 0.0), (5, 0.1), (6, 0.2), (6, 0.3))]
     assert found == [0, 1, 1, 2]
     assert [watch.take(7 + k, 0.35 + 0.1 * k, STREAM_TIMEOUT) for k in range(12)] == [2] * 8 + [1, 1, 0, 0]
 
 
-def test_numbers_of_a_restarted_publisher_begin_again_after_a_silence() -> None:
+def test_numbers_that_begin_again_after_a_silence_are_no_break() -> None:
     watch = SequenceWatch()
     for number in range(100):
         watch.take(number, PERIOD * number, STREAM_TIMEOUT)
@@ -160,7 +160,7 @@ def test_extrapolated_targets_stay_on_the_path_of_the_targets() -> None:
         assert abs(turned) < 2e-3
 
 
-def test_a_jump_is_not_continued_as_a_motion() -> None:
+def test_a_jump_of_the_target_is_not_extrapolated_as_a_motion() -> None:
     line, low = TargetExtrapolator(), pin.SE3.Identity()
     high = pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.002]))
     for k in range(20):
@@ -171,7 +171,7 @@ def test_a_jump_is_not_continued_as_a_motion() -> None:
         assert found.translation[2] in (0.0, 0.002)
 
 
-def test_a_motion_continues_only_as_long_as_its_targets_may_be_late() -> None:
+def test_a_motion_is_extrapolated_by_at_most_two_and_a_half_periods_of_the_sender() -> None:
     line, velocity = TargetExtrapolator(), np.array([0.3, 0.0, 0.0])
     for k in range(10):
         line.put(pin.SE3(np.eye(3), velocity * k * SENDER), k * SENDER)
@@ -181,7 +181,7 @@ def test_a_motion_continues_only_as_long_as_its_targets_may_be_late() -> None:
 
 
 @pytest.mark.parametrize("stamps", [[0.0] * 10, [5e-6 * k for k in range(10)], [0.1 * k for k in range(10)]])
-def test_with_useless_stamps_targets_are_used_as_they_come(stamps: list[float]) -> None:
+def test_targets_with_useless_stamps_are_used_without_extrapolation(stamps: list[float]) -> None:
     line = TargetExtrapolator()
     for k, stamp in enumerate(stamps):
         target = circling(k * SENDER)
@@ -189,7 +189,7 @@ def test_with_useless_stamps_targets_are_used_as_they_come(stamps: list[float]) 
         assert line.at(stamp + 0.004) is target
 
 
-def test_a_target_that_is_due_before_the_last_one_is_used_as_it_is() -> None:
+def test_a_target_that_is_due_before_the_previous_target_is_used_without_extrapolation() -> None:
     line = TargetExtrapolator()
     for k in range(10):
         line.put(circling(k * SENDER), k * SENDER)
@@ -199,7 +199,7 @@ def test_a_target_that_is_due_before_the_last_one_is_used_as_it_is() -> None:
     assert line.at(5 * SENDER) is older
 
 
-def test_a_new_stream_does_not_depend_on_the_one_before() -> None:
+def test_a_new_stream_does_not_depend_on_the_previous_stream() -> None:
     line = TargetExtrapolator()
     for k in range(5):
         line.put(circling(k * SENDER), k * SENDER)

@@ -1,4 +1,4 @@
-"""Late ticks move nothing beyond its limits, and targets become motion that keeps its limits at every step."""
+"""A late tick moves no joint beyond its limits. A pose that follows targets keeps its limits at every step."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LIMIT = np.array([1.7, 3.1])
 
 
 @given(gap=st.floats(1e-6, 10.0), shares=st.tuples(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0)))
-def test_no_joint_can_move_farther_in_a_tick_than_in_one_period_at_its_limit(
+def test_a_late_tick_moves_no_joint_farther_than_one_period_at_the_velocity_limit(
     gap: float, shares: tuple[float, float]
 ) -> None:
     v = LIMIT * np.array(shares)
@@ -32,14 +32,14 @@ def test_no_joint_can_move_farther_in_a_tick_than_in_one_period_at_its_limit(
         assert (farthest <= LIMIT * PERIOD * (1.0 + 1e-9)).all()
 
 
-def test_a_punctual_tick_passes_unchanged_and_a_clock_that_stands_or_goes_back_moves_nothing() -> None:
+def test_a_punctual_tick_keeps_its_length_and_a_tick_without_advance_of_the_clock_has_length_0() -> None:
     pacer = TickPacer(PERIOD, LIMIT, ACCELERATION)
     assert [pacer.step(gap, LIMIT) for gap in (PERIOD, 0.3 * PERIOD, 0.0, -1.0)] == [PERIOD, 0.3 * PERIOD, 0.0, 0.0]
     assert pacer.missed_ticks == 0
     assert pacer.stretched == 0.0
 
 
-def test_slow_motion_catches_up_and_fast_motion_is_stretched_and_counted() -> None:
+def test_after_a_late_tick_slow_motion_catches_up_and_fast_motion_continues_later() -> None:
     slow, fast = (TickPacer(PERIOD, LIMIT, ACCELERATION) for _ in range(2))
     assert slow.step(3.0 * PERIOD, 0.1 * LIMIT) == 3.0 * PERIOD
     assert slow.stretched == 0.0
@@ -49,14 +49,14 @@ def test_slow_motion_catches_up_and_fast_motion_is_stretched_and_counted() -> No
     assert fast.missed_ticks == 24
 
 
-def test_a_plant_that_coasts_takes_the_reference_along_for_up_to_a_tenth_of_a_second() -> None:
+def test_if_the_plant_coasts_the_reference_moves_on_for_up_to_a_tenth_of_a_second() -> None:
     pacer = TickPacer(PERIOD, LIMIT, ACCELERATION, coasts=True)
     assert [pacer.step(gap, LIMIT) for gap in (0.09, 0.3)] == [0.09, 0.1]
     assert pacer.stretched == pytest.approx(0.2)
 
 
 @pytest.mark.parametrize("slow", [1.0, 1.001], ids=["at its period", "that ticks slightly slower"])
-def test_the_ticks_of_a_busy_machine_are_even_and_on_time(slow: float) -> None:
+def test_the_tick_clock_gives_even_and_punctual_times_to_jittering_ticks(slow: float) -> None:
     clock, random = TickClock(PERIOD), np.random.default_rng(1)
     ran = slow * PERIOD * np.arange(2000) + random.uniform(0.0, 6e-4, 2000)
     counted = np.array([clock.at(t) for t in ran])
@@ -72,7 +72,7 @@ def ten_ticks() -> TickClock:
 
 
 @pytest.mark.parametrize("late", [0.4, 1.7, 20.3])
-def test_a_late_tick_counts_for_all_due_ticks_and_ticks_that_follow_quickly_count_for_nothing(late: float) -> None:
+def test_a_late_tick_advances_time_by_all_due_periods_and_an_immediate_next_tick_by_none(late: float) -> None:
     clock = ten_ticks()
     due = 10 + round(late)
     assert clock.at((10 + late) * PERIOD) == pytest.approx(due * PERIOD, abs=0.02 * PERIOD)
@@ -82,14 +82,14 @@ def test_a_late_tick_counts_for_all_due_ticks_and_ticks_that_follow_quickly_coun
 
 
 @pytest.mark.parametrize("gap", [0.2, -0.02])
-def test_time_begins_again_after_a_long_gap_and_after_the_clock_was_set_back(gap: float) -> None:
+def test_the_tick_clock_starts_anew_after_a_long_gap_and_after_the_clock_was_set_back(gap: float) -> None:
     clock = ten_ticks()
     now = 9 * PERIOD + gap
     assert clock.at(now) == now
     assert clock.at(now + PERIOD) == pytest.approx(now + PERIOD)
 
 
-def test_time_stands_still_while_a_clock_is_back_by_less_than_a_period() -> None:
+def test_the_tick_clock_stands_still_while_the_clock_is_back_by_less_than_a_period() -> None:
     clock = ten_ticks()
     last = clock.at(10 * PERIOD)
     assert clock.at(9.5 * PERIOD) == last
@@ -155,7 +155,7 @@ def circle(t: float, radius: float, period: float) -> pin.SE3:
     return pose(radius * (math.cos(phase) - 1), radius * math.sin(phase), 0.0, (0.0, 0.0, 0.5 * math.sin(phase)))
 
 
-def test_the_remaining_braking_motion_is_dropped_after_a_gap_in_which_everything_came_to_rest() -> None:
+def test_a_braking_motion_is_dropped_after_a_gap_that_was_long_enough_for_it_to_end() -> None:
     watched = moving()
     held = watched.pose
     assert watched.step(None, 1.01 * LONGEST_DT).isApprox(held, 1e-12)
@@ -163,7 +163,7 @@ def test_the_remaining_braking_motion_is_dropped_after_a_gap_in_which_everything
     assert watched.step(None).isApprox(held, 1e-12)
 
 
-def test_the_first_pose_is_exactly_that_of_the_reset_and_stays_while_the_clock_does_not_advance() -> None:
+def test_the_first_pose_is_the_pose_of_the_reset_and_stays_while_the_clock_does_not_advance() -> None:
     start = pose(0.3, -0.2, 0.7, (0.1, 2.0, -0.4))
     watched = Watched(start)
     first = watched.step(start)
@@ -233,7 +233,7 @@ def test_no_sequence_of_targets_breaks_a_limit(
     assert watched.guard.at_rest
 
 
-def test_lower_limits_during_motion_brake_the_pose_at_the_acceleration_and_hold_from_then_on() -> None:
+def test_if_limits_are_lowered_during_motion_the_pose_brakes_to_them_at_the_allowed_acceleration() -> None:
     watched, velocities = Watched(), []
     for tick in range(1, 121):
         if tick == 41:

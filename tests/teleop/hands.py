@@ -54,7 +54,7 @@ class Operator:
     obstacles: dict[str, Reason] = field(default_factory=dict)
     lower: set[str] = field(default_factory=set)  # Hands that hold the lower button.
     upper: set[str] = field(default_factory=set)  # Hands that hold the upper button.
-    # By control, how far it is pushed, from 0 to 1. The names of the controls are those of the bindings.
+    # How far each control is pushed, from 0 to 1. The keys are the names that controls have in the bindings.
     held: dict[str, float] = field(default_factory=dict)
     only: str | None = None  # The hand that pushes the controls in ``held``; None if both hands do.
     silent: set[str] = field(default_factory=set)  # Hands that send nothing.
@@ -98,7 +98,7 @@ class Operator:
     ) -> list[dict[str, ArmTarget]]:
         """Tick for ``duration`` [s], and return the targets of each tick.
 
-        ``move`` returns the poses of the hands at the time since the call [s]; without it the hands rest.
+        ``move`` gets the time since the call [s] and returns the poses of the hands. Without ``move``, the hands rest.
         """
         start, history = self.now, []
         while self.now < start + duration - TICK / 2:

@@ -1,4 +1,4 @@
-"""Actions that concern both arms, which are stopping and moving home; and a gripper that follows a trigger."""
+"""A press can stop both arms or move them home. A gripper can follow a trigger."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class TestAStop:
         assert all(target.pose is None for target in driver.targets.values())
         assert not any(map(is_fault, driver.events))
 
-    def test_after_a_stop_no_arm_moves_until_the_stop_is_ended_and_a_press_engages(self) -> None:
+    def test_after_a_stop_no_arm_moves_until_the_stop_is_ended_and_a_press_engages_the_arm(self) -> None:
         driver = engaged()
         driver.push("grip")
         driver.push("stick_down")
@@ -49,7 +49,7 @@ class TestAStop:
         driver.press(*SIDES)
         assert driver.states == ENGAGED
 
-    def test_of_simultaneous_presses_a_stop_is_carried_out_first(self) -> None:
+    def test_a_stop_is_carried_out_before_all_other_presses_of_the_same_time(self) -> None:
         driver = engaged()
         driver.lower, driver.upper = {"left"}, {"left"}
         driver.held, driver.only = {"grip": 1.0, "stick_down": 1.0}, "right"
@@ -66,7 +66,7 @@ class TestAStop:
         driver.teleop.reset(driver.now, "left", Reason(TeleopReason.RESET_SERVICE))
         assert driver.states == PAUSED
 
-    def test_a_stop_whose_button_is_still_held_is_carried_out_although_a_fault_comes_before(self) -> None:
+    def test_a_stop_whose_button_is_held_is_carried_out_even_if_a_fault_comes_during_the_hold(self) -> None:
         driver = engaged(upper_hold="stop")
         driver.upper = {"left"}
         driver.run(0.3)
@@ -92,7 +92,7 @@ class TestTheWayHome:
         driver.press(*SIDES)
         assert driver.states == ENGAGED
 
-    def test_homing_is_refused_only_for_an_obstacle_of_the_arm_whose_hand_asks(self) -> None:
+    def test_homing_is_refused_only_if_a_reason_forbids_it_for_the_arm_whose_hand_requests_it(self) -> None:
         for blocked, states in (("left", PAUSED), ("right", HOMING)):
             driver = engaged()
             driver.press(*SIDES)
@@ -112,7 +112,7 @@ class TestTheWayHome:
         assert driver.states == PAUSED
         assert [driver.targets[arm].gripper for arm in SIDES] == [1.0, 1.0]
 
-    def test_homing_ends_with_a_fault_if_the_hand_that_asked_is_lost_but_not_if_the_other_hand_is(self) -> None:
+    def test_homing_ends_with_a_fault_only_if_the_hand_that_requested_it_is_lost(self) -> None:
         driver = engaged()
         driver.push("stick_down")
         driver.silent = {"right"}
@@ -123,7 +123,7 @@ class TestTheWayHome:
         assert driver.states == LOST
         assert {kinds(event.reason) for event in driver.events[-2:]} == {"homing_fault: pose_silent"}
 
-    def test_homing_that_a_program_asked_for_needs_no_hand(self) -> None:
+    def test_homing_that_a_program_requested_needs_no_hand(self) -> None:
         driver = hands.operator(bindings=BINDINGS)
         driver.silent = set(SIDES)
         driver.run(0.3)
@@ -137,7 +137,7 @@ class TestTheWayHome:
         driver.press("left")
         assert driver.states == PAUSED
 
-    def test_homing_is_refused_while_the_hand_that_asks_has_no_pose(self) -> None:
+    def test_homing_is_refused_if_the_hand_that_requests_it_has_no_pose(self) -> None:
         driver = hands.operator(bindings=BINDINGS)
         driver.alter = lambda received: spoilt(received, pose_stamp=-math.inf)
         driver.run(0.3)
@@ -173,7 +173,7 @@ class TestAGripperThatFollowsATrigger:
             seen.add(driver.targets["left"].gripper)
         assert len(seen) == 1
 
-    def test_after_a_reconnection_a_gripper_keeps_its_opening_until_the_trigger_has_reached_it(self) -> None:
+    def test_after_a_reconnection_a_gripper_moves_only_when_the_trigger_has_reached_the_grippers_opening(self) -> None:
         driver = self.driver()
         driver.held = {"trigger": 0.725}
         driver.run(0.4)

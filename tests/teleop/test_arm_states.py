@@ -25,7 +25,7 @@ def test_the_transitions_in_the_docs_equal_the_transitions_in_the_code() -> None
     assert {documented(*row) for row in rows if row[-1] in list(Who)} == set(TRANSITIONS)
 
 
-def test_no_state_has_two_transitions_for_one_cause() -> None:
+def test_no_cause_has_two_transitions_from_the_same_state() -> None:
     ways = [(source, line.cause) for line in TRANSITIONS for source in line.sources]
     assert len(ways) == len(set(ways))
     assert {line.cause for line in TRANSITIONS} == set(Cause)
@@ -38,7 +38,7 @@ def test_only_an_operator_or_a_policy_can_start_the_motion_of_an_arm() -> None:
 
 
 @pytest.mark.parametrize("state", ArmState)
-def test_a_stop_works_in_every_state_and_ends_only_by_the_control_that_stops(state: ArmState) -> None:
+def test_a_stop_works_in_every_state_and_ends_only_when_its_control_is_pressed_again(state: ArmState) -> None:
     assert next_state(state, Cause.STOP) is ArmState.STOPPED
     ends = [cause for cause in Cause if next_state(ArmState.STOPPED, cause) is not ArmState.STOPPED]
     assert ends == [Cause.GO_ON]

@@ -44,7 +44,7 @@ WAY, TURN = np.array([0.1, -0.05, 0.08]), np.array([0.1, 0.3, -0.2])
     [("precision", 0.25, 0.25), ("rotation_lock", 1.0, 0.0), ("translation_lock", 0.0, 1.0)],
 )
 @pytest.mark.parametrize("control", ["trigger", "stick_left"])
-def test_a_held_control_scales_the_motion_while_it_is_held_and_nothing_jumps(
+def test_a_held_control_scales_the_motion_and_its_press_and_release_make_no_target_jump(
     control: str, action: str, position: float, rotation: float
 ) -> None:
     driver = engaged(**{control: action})
@@ -71,7 +71,7 @@ def test_controls_that_are_pressed_and_released_during_motion_make_no_target_jum
     assert driver.states == ENGAGED
 
 
-def test_an_arm_that_is_engaged_while_precision_is_held_moves_with_precision_at_once() -> None:
+def test_an_arm_that_is_engaged_while_the_control_for_precision_is_held_moves_precisely_at_once() -> None:
     driver = hands.operator(bindings={"grip": "precision"})
     driver.run(0.1)
     driver.held = {"grip": 1.0}
@@ -90,7 +90,7 @@ class TestADeadMan:
         assert driver.states == IDLE
         return driver
 
-    def test_a_dead_man_engages_while_it_is_held_and_pauses_at_once_when_released(self) -> None:
+    def test_an_arm_is_engaged_while_its_dead_mans_switch_is_held_and_pauses_at_once_on_release(self) -> None:
         driver = self.driver()
         driver.held = {"grip": 1.0}
         driver.run(0.05)
@@ -103,7 +103,7 @@ class TestADeadMan:
         assert {event.kind for event in driver.events} == {"dead_man_held", "dead_man_released"}
         assert not any(map(is_fault, driver.events))
 
-    def test_after_a_fault_a_held_dead_man_switch_engages_only_after_release_and_a_new_press(self) -> None:
+    def test_after_a_fault_a_held_dead_mans_switch_engages_its_arm_only_after_a_release_and_a_new_press(self) -> None:
         driver = self.driver()
         driver.held = {"grip": 1.0}
         driver.run(0.05)
@@ -120,7 +120,7 @@ class TestADeadMan:
         assert driver.states == ENGAGED
 
     @pytest.mark.parametrize("lost", [False, True])
-    def test_a_dead_man_that_is_held_while_the_connection_starts_does_nothing(self, lost: bool) -> None:
+    def test_a_dead_mans_switch_that_is_held_while_the_connection_starts_does_nothing(self, lost: bool) -> None:
         driver = hands.operator(bindings=self.BINDINGS)
         driver.held = {"grip": 1.0}
         driver.run(0.2)
@@ -136,7 +136,9 @@ class TestADeadMan:
             assert driver.states == LOST
 
     @pytest.mark.parametrize("let_go", [False, True])
-    def test_after_an_alignment_the_arms_follow_again_only_if_the_dead_man_is_still_held(self, let_go: bool) -> None:
+    def test_after_an_alignment_the_arms_follow_again_only_if_the_dead_mans_switch_is_still_held(
+        self, let_go: bool
+    ) -> None:
         driver = self.driver()
         driver.held = {"grip": 1.0}
         driver.run(0.05)
@@ -149,7 +151,7 @@ class TestADeadMan:
         driver.run(0.2)
         assert driver.states == (PAUSED if let_go else ENGAGED)
 
-    def test_a_reading_that_is_not_finite_releases_a_dead_man(self) -> None:
+    def test_a_reading_that_is_not_finite_releases_a_dead_mans_switch(self) -> None:
         driver = self.driver()
         driver.held = {"grip": 1.0}
         driver.run(0.05)
@@ -158,7 +160,7 @@ class TestADeadMan:
         assert driver.states == PAUSED
 
 
-def test_a_pedal_of_the_device_can_be_a_dead_man_and_a_knob_can_stop_the_arms_by_a_hold() -> None:
+def test_a_pedal_can_be_a_dead_mans_switch_and_a_held_knob_can_stop_the_arms() -> None:
     driver = hands.operator(bindings={"lower": "none", "device": {"pedal": "dead_man", "knob_hold": "stop"}})
     driver.run(0.1)
     for more, expected in (({"pedal": 1.0}, ENGAGED), ({}, PAUSED), ({"knob": 0.9}, PAUSED), ({"knob": 0.9}, STOPPED)):
@@ -167,7 +169,7 @@ def test_a_pedal_of_the_device_can_be_a_dead_man_and_a_knob_can_stop_the_arms_by
         assert driver.states == expected
 
 
-def test_a_control_that_trembles_about_its_threshold_is_pressed_and_released_once() -> None:
+def test_a_control_that_trembles_about_its_threshold_counts_as_pressed_once_and_released_once() -> None:
     controls = HeldControls(BindingSettings(grip=Action.PRECISION))
     seen = []
     for value in (0.0, 0.55, 0.61, 0.45, 0.59, 0.41, 0.39, 0.55, 0.5, 0.59, 0.7):
@@ -177,7 +179,7 @@ def test_a_control_that_trembles_about_its_threshold_is_pressed_and_released_onc
 
 
 @pytest.mark.parametrize("control", HELD)
-def test_pushing_one_control_raises_its_own_travel_to_1_and_no_other_travel(control: str) -> None:
+def test_a_fully_pushed_control_has_travel_1_and_all_other_controls_have_no_travel(control: str) -> None:
     inputs = HandInputs(**PUSHED[control])
     assert travel(control, inputs) == 1.0
     assert all(travel(other, inputs) <= 0.0 for other in HELD if other != control)

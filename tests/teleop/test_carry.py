@@ -1,4 +1,4 @@
-"""One hand moves two tools as one rigid body: their relative pose, beginning and end, and that no target jumps."""
+"""One hand carries: it moves both tools as one rigid body. The tools keep their relative pose, and no target jumps."""
 
 from __future__ import annotations
 
@@ -70,13 +70,13 @@ class TestBothTools:
         assert_smooth(history)
 
     @pytest.mark.parametrize("hand", SIDES)
-    def test_carried_tools_follow_the_hand_that_asked_to_carry(self, hand: str) -> None:
+    def test_carried_tools_follow_the_hand_that_pressed_the_control_for_carrying(self, hand: str) -> None:
         driver = engaged(bindings=BINDINGS)
         driver.push("grip", hand)
         assert driver.states == {hand: "engaged", ("right" if hand == "left" else "left"): "carried"}
         assert [arm for arm, target in driver.targets.items() if target.hand is not None] == [hand]
 
-    def test_carrying_may_begin_with_one_arm_engaged_and_moves_no_arm_at_its_beginning(self) -> None:
+    def test_carrying_may_begin_with_one_engaged_arm_and_its_start_moves_no_arm(self) -> None:
         driver = carrying("left")
         assert driver.place("right").isApprox(driver.tools["right"], 1e-6)
 
@@ -110,7 +110,7 @@ class TestBothTools:
         raised = driver.place("right").translation[2] - right.translation[2]
         assert least < raised < greatest
 
-    def test_both_tools_stay_in_their_boxes(self) -> None:
+    def test_each_carried_tool_stays_in_its_workspace_box(self) -> None:
         box = {"x": [0.4, 0.6], "y": [-0.7, 0.7], "z": [0.35, 0.6]}
         driver = carrying(workspace={"right": box})
         history = driver.run(2.0, turning(driver))
@@ -133,7 +133,7 @@ class TestItEnds:
             pytest.param(lambda driver: driver.press("right"), id="by a pause of the other hand"),
         ],
     )
-    def test_carrying_ends_for_both_arms_which_hold_until_they_are_engaged_again(
+    def test_when_carrying_ends_both_arms_hold_until_they_are_engaged_again(
         self, end: Callable[[Operator], Any]
     ) -> None:
         driver = carrying()
@@ -167,7 +167,7 @@ class TestItEnds:
         driver.assert_holds()
 
     @pytest.mark.parametrize("linked", [True, False])
-    def test_carrying_ends_with_a_fault_of_the_hand_that_moves_both_tools(self, linked: bool) -> None:
+    def test_a_fault_of_the_hand_that_moves_both_tools_ends_carrying(self, linked: bool) -> None:
         driver = carrying(linked=linked)
         driver.silent = {"left"}
         driver.run(0.3)
@@ -181,7 +181,7 @@ class TestItEnds:
         assert driver.states == CARRYING
         assert all(targets["right"].pose is not None for targets in history)
 
-    def test_carrying_ends_with_a_stop_and_with_a_lost_connection(self) -> None:
+    def test_a_stop_and_a_lost_connection_end_carrying(self) -> None:
         driver = carrying()
         driver.push("stick_left", "right")
         assert driver.states == {"left": "stopped", "right": "stopped"}
@@ -199,7 +199,7 @@ class TestItDoesNotBegin:
         assert driver.states == {"left": "idle", "right": "engaged"}
         assert driver.refusals() == {"not_carried: engage_first"}
 
-    def test_carrying_is_refused_if_a_tool_is_held_up(self) -> None:
+    def test_carrying_is_refused_if_a_tool_cannot_follow_its_target(self) -> None:
         driver = engaged(bindings=BINDINGS)
         driver.commanded = {arm: driver.place(arm) for arm in SIDES}
         driver.run(1.0, turning(driver))
@@ -207,7 +207,7 @@ class TestItDoesNotBegin:
         assert driver.states == ENGAGED
         assert driver.refusals() == {"not_carried: tool_held_up"}
 
-    def test_the_way_home_is_refused_while_the_arms_carry(self) -> None:
+    def test_homing_is_refused_while_the_arms_carry(self) -> None:
         driver = carrying()
         driver.push("stick_down")
         assert driver.states == CARRYING

@@ -24,7 +24,7 @@ def settings(driver: Operator, **changes: object) -> TeleopSettings:
 
 
 @pytest.mark.parametrize("changes", CHANGES.values(), ids=CHANGES)
-def test_a_moving_arm_goes_on_without_a_jump(changes: dict[str, object]) -> None:
+def test_an_arm_whose_settings_change_during_motion_goes_on_without_a_jump(changes: dict[str, object]) -> None:
     driver = engaged()
     move = waving(driver)
     history = driver.run(0.4, move)
@@ -51,7 +51,7 @@ def test_a_change_of_stance_axes_or_controls_is_refused_until_both_arms_hold(cha
     assert driver.states == ENGAGED
 
 
-def test_a_changed_stance_gives_each_hand_the_other_arm() -> None:
+def test_each_hand_drives_the_other_arm_after_a_change_of_stance() -> None:
     driver = engaged()
     driver.press(*SIDES)
     assert driver.teleop.change(settings(driver, stance="mirror"), driver.now) is None
@@ -61,7 +61,7 @@ def test_a_changed_stance_gives_each_hand_the_other_arm() -> None:
     assert driver.states == {"left": "paused", "right": "engaged"}
 
 
-def test_a_press_that_began_before_the_change_of_hands_engages_nothing() -> None:
+def test_a_press_that_began_before_a_change_of_stance_engages_no_arm() -> None:
     driver = engaged()
     driver.press(*SIDES)
     driver.lower = {"left"}

@@ -1,4 +1,4 @@
-"""A warning comes for swapped controllers, and none for hands that cross during ordinary work."""
+"""Swapped controllers cause a warning. Hands that cross during ordinary work cause no warning."""
 
 from __future__ import annotations
 
@@ -51,12 +51,12 @@ def swapped(by: float = 0.4, heading: float = 0.0, turns: float = 0.0) -> Places
 
 
 @pytest.mark.parametrize("heading", [0.0, 1.5, math.pi, -2.0])
-def test_swapped_controllers_are_noticed_wherever_the_operator_faces(heading: float) -> None:
+def test_swapped_controllers_are_noticed_for_every_direction_that_the_operator_faces(heading: float) -> None:
     assert after(swapped(heading=heading))
     assert not after(swapped(by=-0.4, heading=heading))
 
 
-def test_hands_are_compared_in_the_axes_of_the_input() -> None:
+def test_crossed_hands_are_detected_in_other_axes_of_the_input_too() -> None:
     made = {hand: pose(*place) for hand, place in (("left", (0.2, 1.0, 0.3)), ("right", (-0.2, 1.0, 0.3)))}
     assert after(lambda t: made, axes=UNITY), "right is +x in the frame of Unity"
     assert not after(lambda t: {"left": made["right"], "right": made["left"]}, axes=UNITY)
@@ -76,12 +76,12 @@ def test_hands_that_cross_in_ordinary_work_do_not_count_as_crossed(places: Place
     assert not after(places)
 
 
-def test_hands_count_as_crossed_only_after_both_were_tracked_for_the_whole_time() -> None:
+def test_hands_count_as_crossed_only_if_both_were_tracked_for_the_whole_time() -> None:
     assert not after(swapped(), spoil=3.0)
     assert after(swapped(), spoil=1.0)
 
 
-def test_one_hand_alone_or_with_old_poses_never_counts_as_crossed() -> None:
+def test_hands_never_count_as_crossed_if_one_hand_is_missing_or_if_their_poses_are_old() -> None:
     hands = CrossedHands(WORLD)
     for t in np.arange(0.0, 5.0, 0.0125):
         hands.add(sample("left", swapped()(t)["left"], float(t)))
@@ -111,7 +111,7 @@ def test_engaging_with_swapped_controllers_records_one_warning_and_the_arms_stil
     assert driver.states == ENGAGED
 
 
-def test_engaging_with_each_controller_in_the_right_hand_records_no_warning() -> None:
+def test_engaging_records_no_warning_if_the_controllers_are_not_swapped() -> None:
     driver = Operator()
     driver.run(3.5)
     driver.press(*SIDES)

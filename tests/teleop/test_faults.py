@@ -1,4 +1,4 @@
-"""Faults and invalid input: the arms stop, and engage again only by a new press."""
+"""Faults and invalid input stop the arms. Only a new press engages the arms again."""
 
 from __future__ import annotations
 
@@ -41,7 +41,9 @@ FAULTS: dict[str, Callable[[HandSample], HandSample]] = {
 
 @pytest.mark.parametrize("linked", [True, False], ids=["linked", "each for itself"])
 @pytest.mark.parametrize("reason", list(FAULTS))
-def test_a_fault_of_the_left_hand_stops_its_arm_and_a_linked_arm_until_a_press(reason: str, linked: bool) -> None:
+def test_a_fault_of_the_left_hand_stops_the_left_arm_and_a_linked_right_arm_until_a_press(
+    reason: str, linked: bool
+) -> None:
     driver = engaged(linked=linked)
     driver.alter = lambda s: FAULTS[reason](s) if s.hand == "left" else s
     history = driver.run(0.3, waving(driver))
@@ -58,7 +60,7 @@ def test_a_fault_of_the_left_hand_stops_its_arm_and_a_linked_arm_until_a_press(r
 
 
 @pytest.mark.parametrize("linked", [True, False], ids=["linked", "each for itself"])
-def test_if_the_caller_stops_one_arm_a_linked_arm_stops_too_but_only_once(linked: bool) -> None:
+def test_a_program_that_stops_an_arm_stops_a_linked_arm_too_unless_the_first_arm_already_holds(linked: bool) -> None:
     driver = engaged(linked=linked)
     driver.teleop.pause(driver.now, Reason(TeleopReason.TOOL_UNKNOWN), "left")
     assert driver.states == (LOST if linked else {"left": "lost", "right": "engaged"})
@@ -75,7 +77,7 @@ def test_a_reset_arm_holds_until_a_press_after_a_new_sample_of_its_hand() -> Non
     assert driver.states == {"left": "lost", "right": "engaged"}
     driver.teleop.take_events()
     driver.teleop.reset(driver.now, "left", Reason(TeleopReason.RESET_SERVICE))
-    # The event is reported although the arm already holds.
+    # The arm already holds, but the second reset is reported as well.
     assert [event.kind for event in driver.teleop.take_events()] == ["reset_service"]
     driver.silent = {"left"}
     driver.run(0.1)
@@ -96,7 +98,7 @@ def test_silence_of_the_hands_stops_the_arms_within_the_timeout_and_one_tick() -
     assert 148 <= following <= 151
 
 
-def test_a_reading_of_the_buttons_that_arrives_after_a_newer_one_presses_nothing() -> None:
+def test_a_reading_of_the_buttons_that_arrives_after_a_newer_reading_causes_no_press() -> None:
     driver = engaged()
     driver.tick(driver.samples())
     late = replace(sample("left", driver.hands["left"], driver.now, lower=True), inputs_stamp=driver.now - 0.005)
@@ -158,7 +160,7 @@ def test_after_a_stall_of_the_loop_the_arms_stop_instead_of_catching_up() -> Non
 
 
 @pytest.mark.parametrize("back", [0.001, 0.1], ids=["a millisecond", "a tenth of a second"])
-def test_if_the_clock_goes_back_a_little_the_target_stays(back: float) -> None:
+def test_the_target_stays_if_the_clock_goes_back_by_up_to_a_tenth_of_a_second(back: float) -> None:
     driver = engaged()
     driver.run(0.2, waving(driver))
     before = driver.targets
@@ -199,7 +201,7 @@ hostile = st.builds(
 
 @settings(derandomize=True, max_examples=60, deadline=None)
 @given(st.lists(st.tuples(st.lists(hostile, max_size=3), values), max_size=20), st.booleans())
-def test_no_input_raises_and_every_target_is_finite(
+def test_no_input_raises_an_error_and_every_target_is_finite(
     ticks: list[tuple[list[HandSample], float]], start_engaged: bool
 ) -> None:
     driver = engaged() if start_engaged else operator()

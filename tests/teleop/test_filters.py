@@ -19,7 +19,7 @@ STILL = pose(0.1, 0.2, 0.3, (0.4, 0.5, 0.6))
 
 
 def follow(path: Path, duration: float = 3.0, dt: float = 0.002, period: float = 1 / 75) -> tuple[float, list[pin.SE3]]:
-    """Return the filter's delay [s], and its output at every tick for samples along ``path``."""
+    """Filter the samples of a hand that moves along ``path``. Return the filter's delay [s] and all its outputs."""
     pose_filter = PoseFilter(FilterSettings())
     pose_filter.reset(floats_of(path(0.0)), 0.0)
     due, outputs = period, []
@@ -46,7 +46,7 @@ def test_the_output_lags_a_steady_motion_by_exactly_the_stated_delay_at_any_spee
 
 
 @pytest.mark.parametrize("frequency", [8.0, 12.0], ids="{} Hz".format)
-def test_the_tremor_of_a_resting_hand_is_reduced_to_less_than_two_fifths_of_its_size(frequency: float) -> None:
+def test_the_filter_reduces_the_tremor_of_a_resting_hand_to_less_than_two_fifths(frequency: float) -> None:
     def path(t: float) -> pin.SE3:
         wave = math.sin(2 * math.pi * frequency * t)
         return pose(0.001 * wave, 0.0, 0.0, (0.0, math.radians(0.3) * wave, 0.0))
@@ -69,7 +69,7 @@ def test_the_overshoot_after_a_sudden_stop_of_the_hand_is_bounded() -> None:
 def largest_step(arrivals: list[tuple[float, list[tuple[float, float]]]]) -> float:
     """Return the largest step of the output between two ticks of 1 ms [m].
 
-    ``arrivals`` are times [s], each with the samples (stamp [s], x [m]) that arrive then.
+    Each element of ``arrivals`` is a time of receipt [s] with the samples (stamp [s], x [m]) that arrive at this time.
     """
     pose_filter = PoseFilter(FilterSettings())
     pose_filter.reset(floats_of(pose()), 0.0)
@@ -105,7 +105,7 @@ def test_the_output_is_continuous_after_gaps_and_bursts_of_the_stream(
 def speeds(arrivals: list[tuple[float, float]], velocity: float, since: float) -> np.ndarray:
     """Return the speed of the output at each tick after ``since`` [s], for a hand with constant ``velocity`` [m/s].
 
-    ``arrivals`` are the times of measurement and of receipt of each sample [s].
+    ``arrivals`` contains the time of measurement and the time of receipt of each sample [s].
     """
     pose_filter = PoseFilter(FilterSettings())
     pose_filter.reset(floats_of(pose()), 0.0)
@@ -119,7 +119,7 @@ def speeds(arrivals: list[tuple[float, float]], velocity: float, since: float) -
     return np.diff(outputs)[round(since / 0.001) :] / 0.001
 
 
-def test_jitter_of_receipt_hardly_changes_the_output_speed() -> None:
+def test_jitter_in_the_times_of_receipt_hardly_changes_the_speed_of_the_output() -> None:
     late = np.random.default_rng(5).exponential(0.0015, 300).clip(max=0.01)
     arrivals = [(n / 75, n / 75 + late[n]) for n in range(300)]
     assert np.std(speeds(arrivals, 0.5, 1.0)) < 0.04 * 0.5
@@ -130,8 +130,8 @@ def test_after_a_gap_the_output_catches_up_with_the_hand_at_a_bounded_speed() ->
     assert speeds(arrivals, 0.5, 1.0).max() < 3.5 * 0.5
 
 
-def test_without_beta_the_filter_is_of_first_order_with_the_time_constant_of_the_least_cutoff() -> None:
-    # With beta = 0, a tick corrects the share dt / (tau + dt) of the error. The input is ahead by (tau - delay) v.
+def test_with_beta_0_the_filter_is_of_first_order_and_min_cutoff_gives_its_time_constant() -> None:
+    # With beta = 0, a tick corrects dt / (tau + dt) of the error. The filter shifts its input ahead by (tau - delay) v.
     dt, tau, derivative_tau = 0.002, 1.0 / (2.0 * math.pi * 1.5), 1.0 / (2.0 * math.pi * 4.0)
     one_euro = OneEuro(min_cutoff=1.5, beta=0.0, derivative_cutoff=4.0, delay=0.03)
     share = dt / (tau + dt)
@@ -141,7 +141,7 @@ def test_without_beta_the_filter_is_of_first_order_with_the_time_constant_of_the
     assert one_euro.correction((0.01, 0.0, 0.0), (0.001, 0.0, 0.0), dt) == pytest.approx((expected, 0.0, 0.0))
 
 
-def test_the_filtered_quaternion_keeps_the_length_1_for_a_long_time() -> None:
+def test_the_filtered_quaternion_keeps_its_length_of_1_for_20_seconds() -> None:
     pose_filter = PoseFilter(FilterSettings())
     pose_filter.reset(floats_of(STILL), 0.0)
     for tick in range(20_000):

@@ -42,7 +42,9 @@ def gate() -> PoseGate:
     ],
     ids=str,
 )
-def test_a_pose_that_is_not_finite_or_not_a_rotation_is_refused_and_leaves_no_pose(changes: dict[str, object]) -> None:
+def test_after_a_pose_without_finite_numbers_or_a_valid_rotation_the_gate_has_no_pose(
+    changes: dict[str, object],
+) -> None:
     passed = gate()
     usable, fault = passed.receive(replace(GOOD, pose_stamp=1.01, **changes), 1.01)  # type: ignore[arg-type]
     assert (usable, kinds(fault), passed.pose) == (False, "pose_unusable", None)
@@ -67,13 +69,13 @@ def test_a_quaternion_of_either_sign_and_any_length_is_the_same_rotation(factor:
     ],
     ids=["a fast move passes", "a jump is a fault", "a fast turn passes", "a jump of the rotation is a fault"],
 )
-def test_a_jump_between_two_samples_is_a_fault_and_a_fast_motion_is_not(moved: object, fault: str | None) -> None:
+def test_a_jump_between_two_samples_is_a_fault_and_a_fast_motion_is_no_fault(moved: object, fault: str | None) -> None:
     usable, found = gate().receive(sample("left", moved, 1.013), 1.013)
     assert usable
     assert kinds(found) == (fault or "")
 
 
-def test_the_watchdog_measures_receipt_time_and_an_old_pose_does_not_reset_it() -> None:
+def test_the_watchdog_counts_from_the_receipt_of_a_pose_and_an_old_pose_does_not_reset_it() -> None:
     passed = gate()
     assert not passed.stale(1.15)
     passed.receive(GOOD, 1.14)
@@ -87,18 +89,18 @@ def test_a_stamp_in_the_future_does_not_delay_the_watchdog() -> None:
     assert passed.receive(replace(GOOD, pose_stamp=1.02), 1.02) == (True, None)
 
 
-def test_a_pose_that_arrives_after_a_newer_one_is_ignored() -> None:
+def test_a_pose_that_arrives_after_a_newer_pose_is_ignored() -> None:
     passed = gate()
     assert passed.receive(sample("left", pose(9.0), 0.99), 1.01) == (False, None)
     assert passed.pose is not None
     assert passed.pose[0][0] == 0.1
 
 
-def test_a_gap_between_two_poses_is_a_fault_even_if_the_watchdog_has_not_run_in_between() -> None:
+def test_a_gap_between_two_poses_is_a_fault_even_if_the_watchdog_did_not_run_during_the_gap() -> None:
     assert kinds(gate().receive(replace(GOOD, pose_stamp=1.2), 1.2)[1]) == "pose_gap"
 
 
-def test_samples_without_a_pose_yet_are_no_fault_but_a_pose_stamp_of_nan_is_a_fault() -> None:
+def test_samples_before_the_first_pose_are_no_fault_but_a_pose_stamp_of_nan_is_a_fault() -> None:
     fresh = PoseGate(GateSettings())
     assert fresh.receive(replace(GOOD, pose_stamp=-math.inf, quaternion=np.zeros(4)), 1.0) == (False, None)
     assert fresh.receive(replace(GOOD, pose_stamp=math.nan), 1.0)[1] is not None
@@ -107,7 +109,7 @@ def test_samples_without_a_pose_yet_are_no_fault_but_a_pose_stamp_of_nan_is_a_fa
 
 
 def faults_of_a_motion(speed: float, receipts: list[float], turning: bool = False) -> list[str]:
-    """Return the fault of each sample of a hand at constant ``speed`` [m/s or rad/s]; "" if it has none.
+    """Return the fault of each sample of a hand with constant ``speed`` [m/s or rad/s]; "" if the sample has no fault.
 
     The hand is measured at 75 Hz, and the samples are received at the times ``receipts`` [s].
     """
@@ -133,7 +135,7 @@ def test_a_hand_that_moves_faster_than_any_operator_is_a_fault(speed: float, tur
 
 
 @pytest.mark.parametrize("stall", [0.04, 0.08, 0.13])
-def test_samples_that_a_network_held_up_and_delivers_at_once_are_no_fault_of_speed(stall: float) -> None:
+def test_samples_that_a_network_delays_and_delivers_together_cause_no_speed_fault(stall: float) -> None:
     """The hand moves at 2 m/s. For ``stall`` [s] nothing arrives; then all samples of this time come, 0.1 ms apart.
 
     Successive samples are 27 mm apart.
@@ -143,7 +145,7 @@ def test_samples_that_a_network_held_up_and_delivers_at_once_are_no_fault_of_spe
     assert faults_of_a_motion(2.0, sorted(receipts)) == [""] * len(EVEN)
 
 
-def test_a_jump_is_one_fault_and_no_speed_is_measured_across_it() -> None:
+def test_a_jump_is_one_fault_and_does_not_count_as_speed_afterwards() -> None:
     passed = PoseGate(GateSettings(max_speed=1.0))
     for stamp in EVEN[:10]:
         passed.receive(sample("left", pose(), stamp), stamp)
@@ -153,7 +155,7 @@ def test_a_jump_is_one_fault_and_no_speed_is_measured_across_it() -> None:
 
 
 @pytest.mark.parametrize("fault", sorted(HandFault))
-def test_a_fault_that_the_input_found_is_passed_on_and_leaves_no_pose(fault: HandFault) -> None:
+def test_after_a_sample_with_a_fault_of_the_input_the_gate_reports_this_fault_and_has_no_pose(fault: HandFault) -> None:
     passed = gate()
     assert passed.problem is None
     assert passed.receive(replace(GOOD, pose_stamp=1.01, fault=fault), 1.01) == (False, Reason(TeleopReason(fault)))

@@ -68,11 +68,11 @@ def test_each_gesture_is_reported_once_at_the_expected_time(
     assert play(script, bindings) == expected
 
 
-def test_a_button_held_from_the_first_reading_does_not_count_until_released() -> None:
+def test_a_button_that_is_held_at_the_first_reading_counts_only_after_its_release() -> None:
     assert play("l" * 20 + "." + "l" * 10, start_released=False)[0] == (LOWER_DOWN, 0.21)
 
 
-def test_controls_that_are_held_from_the_first_reading_on_are_reported_once_after_a_second() -> None:
+def test_a_control_that_is_held_since_the_first_reading_is_reported_once_after_a_second() -> None:
     found = recognizer()
     for step in range(30):
         now = 0.1 * step
@@ -109,7 +109,7 @@ def test_cancelling_drops_all_presses_except_a_stop_whose_button_is_held() -> No
     assert gestures.due(3.0) == gestures.receive(HandInputs(button_lower=True), 3.1) == []
 
 
-def test_readings_that_arrive_late_and_together_are_judged_by_their_own_stamps() -> None:
+def test_readings_that_arrive_late_and_together_are_timed_by_their_own_stamps() -> None:
     gestures = recognizer(lower_hold="home")
     found = []
     for stamp, inputs in ((0.0, HandInputs()), (0.1, HandInputs(button_lower=True)), (0.8, HandInputs())):
@@ -118,9 +118,9 @@ def test_readings_that_arrive_late_and_together_are_judged_by_their_own_stamps()
 
 
 @pytest.mark.parametrize("control", HELD)
-def test_taps_of_triggers_and_sticks_are_reported_at_once_because_they_are_part_of_no_chord(control: str) -> None:
+def test_taps_of_triggers_and_sticks_are_reported_at_once_because_no_chord_contains_them(control: str) -> None:
     gestures = recognizer(**{control: "home"})
-    # A control that is held at the first reading does not count.
+    # The control is already held at the first reading, so it does not count as pressed.
     assert gestures.receive(HandInputs(**PUSHED[control]), 0.0) + gestures.due(1.0) == []
     gestures.receive(HandInputs(), 1.1)
     assert gestures.receive(HandInputs(**PUSHED[control]), 1.2) == [Press(control, Gesture.DOWN)]
@@ -128,7 +128,7 @@ def test_taps_of_triggers_and_sticks_are_reported_at_once_because_they_are_part_
     assert gestures.receive(HandInputs(), 1.3) + gestures.due(2.0) == []
 
 
-def test_an_unbound_control_and_a_lasting_action_make_no_gesture() -> None:
+def test_a_control_without_an_action_or_with_a_lasting_action_makes_no_gesture() -> None:
     gestures = recognizer(grip="precision")
     gestures.receive(HandInputs(), 0.0)
     pressed = HandInputs(press_index=1.0, press_middle=1.0, thumb_stick_vertical=1.0)

@@ -1,4 +1,4 @@
-"""Arms that sag: their tools are measured lower than commanded. Engaging moves neither the tool nor the command."""
+"""Some arms sag: their tools are measured lower than commanded. If they are engaged, no tool and no command moves."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def target(driver: Operator) -> Array:
     return driver.place().translation
 
 
-def test_the_target_begins_at_the_measured_tool_and_the_command_at_its_last_position() -> None:
+def test_the_target_begins_at_the_measured_tool_and_the_command_begins_at_its_last_position() -> None:
     driver = hanging(operator())
     assert driver.commanded is not None
     driver.engage()
@@ -45,7 +45,7 @@ def test_if_the_tool_is_far_from_its_command_the_command_begins_at_the_measured_
     np.testing.assert_allclose(command(driver), driver.tools["left"].translation, atol=1e-9)
 
 
-def test_each_engagement_uses_the_present_sag_and_changed_settings_do_not_alter_it() -> None:
+def test_each_engagement_uses_the_present_sag_and_changed_settings_do_not_alter_the_sag_in_use() -> None:
     driver = hanging(engaged())
     assert driver.targets["left"].offset is None
     changed = driver.settings.model_copy(update={"position_scale": 0.5})
@@ -57,7 +57,7 @@ def test_each_engagement_uses_the_present_sag_and_changed_settings_do_not_alter_
     np.testing.assert_allclose(command(driver) - target(driver), -SAG, atol=1e-12)
 
 
-def test_the_leash_is_measured_from_the_sagging_tool() -> None:
+def test_the_leash_is_measured_from_the_measured_tool_of_a_sagging_arm() -> None:
     for way in (0.2, -0.2):
         driver = hanging(operator(leash={"distance": 0.03}))
         driver.engage()

@@ -62,13 +62,13 @@ def test_an_event_causes_one_vibration_that_ends(happens: Event, pulse: Pulse) -
     assert haptics.at(9.0, "left") is None
 
 
-def test_a_pause_is_felt_when_it_begins_and_not_again_when_it_is_confirmed() -> None:
+def test_a_vibration_comes_when_a_pause_begins_and_none_comes_when_the_pause_is_confirmed() -> None:
     haptics = HapticPulses()
     haptics.start_pulse(event("pausing", "paused", TeleopReason.PRESSED))
     assert haptics.at(1.0, "left") is None
 
 
-def test_slip_is_felt_at_each_further_step_and_again_after_a_new_engagement() -> None:
+def test_slip_is_felt_whenever_it_has_grown_by_a_step_and_again_after_a_new_engagement() -> None:
     haptics = HapticPulses()
     felt = []
     for tick in range(100):
@@ -80,7 +80,7 @@ def test_slip_is_felt_at_each_further_step_and_again_after_a_new_engagement() ->
     assert haptics.at(20.0, "left") == feedback(pulses.SLIP)
 
 
-def test_a_slip_is_felt_again_only_after_it_has_shrunk_by_two_steps() -> None:
+def test_slip_that_grows_again_is_felt_only_if_it_had_shrunk_by_two_steps() -> None:
     haptics = HapticPulses()
     felt = []
     for number, steps in enumerate((3.1, 1.5, 3.1, 1.0, 3.1, 1.0, 0.0, 1.0)):
@@ -109,10 +109,10 @@ def condition(spare: float = 1.0, limits: tuple[str, ...] = (), force: float | N
     return ArmCondition(spare, frozenset(limits), force)
 
 
-def test_an_approach_is_felt_at_every_5_mm_and_more_strongly_when_nearer_and_a_retreat_is_not_felt() -> None:
+def test_an_approach_is_felt_every_5_mm_with_growing_strength_and_a_retreat_is_not_felt() -> None:
     haptics = HapticPulses()
     felt_at: list[float] = []
-    for tick in range(200):  # The margin falls from 60 mm to 0, where it trembles, and rises again.
+    for tick in range(200):  # The margin trembles while it falls from 60 mm to 0, and then it rises again.
         haptics.notice(condition(abs(0.06 - 0.0006 * tick) + (0.004 * (tick % 2) if tick < 100 else 0.0)))
         felt_at += [sent.amplitude for sent in felt(haptics, tick, tick + 1.0) if sent.amplitude > 0.0]
         if tick == 100:
@@ -122,7 +122,7 @@ def test_an_approach_is_felt_at_every_5_mm_and_more_strongly_when_nearer_and_a_r
     assert pulses.NEAR.amplitude < felt_at[0] < felt_at[-1] == pytest.approx(0.6)
 
 
-def test_a_contact_is_felt_at_every_5_newtons_and_stronger_at_larger_forces() -> None:
+def test_a_contact_is_felt_every_5_newtons_and_more_strongly_at_larger_forces() -> None:
     haptics = HapticPulses()
     felt_at = []
     for tick in range(80):
@@ -145,7 +145,7 @@ def test_reaching_a_joint_limit_and_grasping_are_each_felt_once() -> None:
     assert [one for one in sent if one.amplitude][2:] == [feedback(pulses.GRASP)] * 2
 
 
-def test_two_vibrations_are_felt_as_two_and_a_fault_does_not_wait() -> None:
+def test_a_second_vibration_waits_until_the_first_has_ended_but_a_fault_does_not_wait() -> None:
     haptics = HapticPulses()
     haptics.start_pulse(event("paused", "engaged", TeleopReason.PRESSED))
     first = felt(haptics, 1.0, 1.0 + pulses.ENGAGED.duration + 0.002)
@@ -158,7 +158,7 @@ def test_two_vibrations_are_felt_as_two_and_a_fault_does_not_wait() -> None:
 
 
 @pytest.mark.parametrize(("strength", "expected"), [(0.5, [0.5 * pulses.FAULT.amplitude, 0.0]), (0.0, [])])
-def test_the_strength_of_all_vibrations_is_a_setting_and_0_sends_nothing(
+def test_a_setting_scales_the_strength_of_all_vibrations_and_no_vibration_is_sent_if_it_is_0(
     strength: float, expected: list[float]
 ) -> None:
     haptics = HapticPulses(HapticSettings(strength=strength))
@@ -166,7 +166,7 @@ def test_the_strength_of_all_vibrations_is_a_setting_and_0_sends_nothing(
     assert [sent.amplitude for sent in felt(haptics, 1.0, 2.0)] == expected
 
 
-def test_of_two_simultaneous_vibrations_the_later_one_in_the_vocabulary_is_felt() -> None:
+def test_if_two_vibrations_are_due_the_one_that_is_later_in_the_vocabulary_is_felt() -> None:
     amplitudes = [pulse.amplitude for pulse in VOCABULARY]
     assert amplitudes == sorted(amplitudes)
     haptics = HapticPulses()

@@ -1,6 +1,6 @@
 """The leash between a tool and its target.
 
-It is tested alone with a tool that does not move, and in the closed loop with a stretched or blocked arm.
+The leash is tested alone with a tool that does not move, and in the closed loop with a stretched or blocked arm.
 """
 
 from __future__ import annotations
@@ -83,7 +83,9 @@ def test_a_target_within_the_leash_equals_the_relative_motion_bit_for_bit(motion
 
 
 @pytest.mark.parametrize("motion", MOTIONS.values(), ids=MOTIONS.keys())
-def test_a_taut_leash_keeps_the_target_at_its_length_from_the_tool_and_counts_the_slip(motion: RelativeMotion) -> None:
+def test_a_taut_leash_keeps_the_target_at_the_leashs_length_and_the_slip_is_the_missing_distance(
+    motion: RelativeMotion,
+) -> None:
     tied = Tied(motion, distance=0.1, angle=0.5)
     way, turn = 0.6, 0.9
     for target in tied.go(along(way / 600, 0, 0, 0, 0, turn / 600), 600):
@@ -101,7 +103,7 @@ def test_a_taut_leash_keeps_the_target_at_its_length_from_the_tool_and_counts_th
 
 @pytest.mark.parametrize("sign", [1.0, -1.0], ids=["a quaternion", "the other one of the same rotation"])
 @pytest.mark.parametrize("turning", [False, True], ids=["position", "rotation"])
-def test_a_target_is_held_at_the_end_of_the_leash_and_not_before(turning: bool, sign: float) -> None:
+def test_a_target_is_held_only_when_it_is_at_the_end_of_the_leash(turning: bool, sign: float) -> None:
     leash, length = Leash(LeashSettings(distance=0.1, angle=0.5)), 0.5 if turning else 0.1
     position, (a, b, c, w) = floats_of(TOOL)
     tool = position, (sign * a, sign * b, sign * c, sign * w)
@@ -123,7 +125,7 @@ def test_without_a_leash_the_target_may_be_at_any_distance_from_the_tool(setting
     assert tied.angle == pytest.approx(2.0 if "angle" in settings else 0.5)
 
 
-def test_a_target_on_a_taut_leash_moves_with_its_tool_without_a_step() -> None:
+def test_a_target_on_a_taut_leash_moves_smoothly_with_its_tool() -> None:
     tied = Tied(RelativeMotion(), distance=0.1, angle=0.5)
     tied.go(along(0.001), 300)
     before = tied.target
@@ -146,8 +148,8 @@ def test_when_the_hand_comes_back_the_target_starts_at_the_tool_and_follows_the_
     tied.go(out, 900)
     farthest, held = tied.hand, tied.target
     tied.go(-0.1 * out, 200)
-    # The target is as if the hand had been anchored at the tool when it was farthest, except for the first part of the
-    # way back, which may be tremor.
+    # The target is as if the hand's farthest pose and the tool pose were the new anchors. Only the first part of the
+    # hand's return has no effect, because it may be tremor.
     motion.anchor(farthest, TOOL)
     expected = motion.target(tied.hand)
     missing = expected.actInv(tied.target)
@@ -170,11 +172,11 @@ def test_the_noise_of_a_resting_hand_never_puts_the_target_at_the_tool() -> None
         assert tied.distance > 0.098
 
 
-def test_the_target_is_not_put_at_a_tool_that_still_follows() -> None:
+def test_the_target_is_not_put_at_the_tool_while_the_tool_still_follows() -> None:
     tied = Tied(RelativeMotion(), distance=0.1, angle=0.5)
     tied.go(along(0.001), 300)
     for _ in range(150):
-        tied.tool = moved(tied.tool, along(0.0004))  # The speed is 0.4 m/s.
+        tied.tool = moved(tied.tool, along(0.0004))  # The tool moves at 0.4 m/s.
         target = tied.go(along(-0.0001), 1)[0]
         assert target.translation[0] - tied.tool.translation[0] > 0.02  # The target was never put at the tool.
 
@@ -213,13 +215,15 @@ OUT = {
     "blocked by the table": np.array([0.0, 0.0, -0.65]),
     "blocked by the other arm": np.array([0.0, -1.2, 0.0]),
 }
-HELD, BACK = 6.0, 0.002  # Time at which the hand begins to come back [s], and by how much it comes back [m].
+HELD, BACK = 6.0, 0.002  # Time at which the hand begins to come back [s], and the distance that it comes back [m].
 RATE = 500.0  # Rate of the loop [Hz].
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("out", OUT.values(), ids=OUT)
-def test_an_arm_that_is_held_up_rests_and_then_follows_the_hand_back_at_once_without_a_lurch(out: Array) -> None:
+def test_an_arm_that_cannot_move_farther_rests_and_then_follows_the_hand_back_at_once_without_a_lurch(
+    out: Array,
+) -> None:
     """The left hand moves away smoothly within 2.5 s, trembles there, and comes back by ``BACK`` at ``HELD``."""
     farthest = float(np.linalg.norm(out))
 
@@ -237,13 +241,13 @@ def test_an_arm_that_is_held_up_rests_and_then_follows_the_hand_back_at_once_wit
     way = places @ out / farthest
     speed = np.linalg.norm(np.diff(places, axis=0, prepend=places[:1]), axis=1) * RATE
     start, held, soon, later = np.searchsorted(t, np.array([0.4, HELD, HELD + 0.25, HELD + 0.45]) - 1e-9)
-    assert way[held] - way[start] < farthest - 0.45  # The arm was held up for half a metre.
+    assert way[held] - way[start] < farthest - 0.45  # The tool stopped at least 0.45 m short of the hand.
     resting = (t > HELD - 0.5) & (t < HELD)
     acceleration = np.array([np.linalg.norm(tick.reference.a) for tick in ticks])[resting]
     assert np.sqrt(np.mean(acceleration**2)) < 0.2  # For an arm in free motion this is 0.39.
     assert speed[resting].max() < 0.01
-    # An almost straight arm needs a while for the second millimetre. An arm that was pushed aside also comes back to
-    # its path.
+    # The hand comes back by 2 mm. An almost straight arm has moved by only a part of this at ``soon``. An arm that was
+    # pushed aside also comes back to its path, so it may move by more than 2 mm.
     assert -2.0 * BACK < way[soon] - way[held] < -0.5 * BACK
     assert way[later] - way[held] > -2.0 * BACK
     assert speed[t >= HELD].max() < 0.05  # The hand comes back at 0.04 m/s.

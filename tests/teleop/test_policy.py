@@ -26,7 +26,7 @@ PERIOD = 0.05  # Period of actions [s].
 
 
 def chunk(times: npt.ArrayLike, ways: Array, arms: tuple[str, ...] = SIDES, **more: object) -> ActionChunk:
-    """Return actions at ``times`` whose tool poses are ``ways`` (n,) [m] along x away from :data:`TOOLS`."""
+    """Return a chunk with actions at ``times``. Its tool poses are ``ways`` (n,) [m] along x from :data:`TOOLS`."""
     tools = {arm: np.array([floats_of_moved(TOOLS[arm], way) for way in ways]) for arm in arms}
     return ActionChunk(np.array(times), PERIOD, tools=tools, **more)  # type: ignore[arg-type]
 
@@ -83,7 +83,7 @@ def test_the_first_target_is_the_tool_pose_and_each_action_is_reached_at_its_tim
     assert np.abs(np.diff(ways)).max() < 0.1 * TICK
 
 
-def test_a_newer_chunk_is_followed_from_its_first_time_on_and_the_difference_fades_without_a_jump() -> None:
+def test_a_newer_chunk_takes_over_at_the_time_of_its_first_action_without_a_jump() -> None:
     run = Run()
     start = run.now + TICK
     old = chunk(start + PERIOD * np.arange(20), np.zeros(20))
@@ -101,7 +101,7 @@ def test_a_newer_chunk_replaces_a_chunk_that_has_not_begun_yet() -> None:
     assert np.abs(run.ways(0.6, later, newer)).max() < 1e-12
 
 
-def test_a_late_chunk_is_followed_from_now_on_and_a_chunk_that_is_past_is_ignored() -> None:
+def test_a_late_chunk_is_followed_from_its_present_action_and_a_chunk_that_has_ended_is_ignored() -> None:
     run = Run()
     past = chunk(run.now - 2.0 + PERIOD * np.arange(10), np.full(10, 0.05))
     run.ways(0.1, past)
@@ -111,7 +111,7 @@ def test_a_late_chunk_is_followed_from_now_on_and_a_chunk_that_is_past_is_ignore
     assert ways[-1] == pytest.approx(0.08, abs=1e-3)
 
 
-def test_motions_continue_from_the_target_and_a_single_late_motion_is_made_in_full() -> None:
+def test_relative_motions_start_at_the_last_target_and_a_single_late_motion_is_executed_fully() -> None:
     run = Run()
     motion = np.tile([0.01, 0.0, 0.0, 0.0, 0.0, 0.2], (1, 1))
     for index in range(5):
@@ -173,7 +173,7 @@ def test_linked_arms_begin_to_follow_a_policy_together_or_not_at_all(before: flo
     assert run.states() == {"policy"}
 
 
-def test_linked_arms_that_a_fault_has_stopped_do_not_follow_actions_for_only_one_arm() -> None:
+def test_linked_arms_do_not_follow_a_chunk_for_only_one_arm_after_a_fault() -> None:
     run = Run()
     run.ways(0.1, for_both(run, STAYS))
     run.ways(0.1, for_both(run, JUMPS))
@@ -204,7 +204,7 @@ def test_actions_with_times_of_another_clock_are_refused() -> None:
     assert run.reasons() == ["policy_refused: policy_unusable"]
 
 
-def test_grippers_change_at_the_time_of_the_action() -> None:
+def test_a_gripper_moves_at_the_time_of_its_action() -> None:
     run = Run()
     openings = {"left": np.array([1.0, 0.25])}
     run.ways(PERIOD - 2 * TICK, chunk([run.now, run.now + PERIOD], np.zeros(2), grippers=openings))
@@ -214,7 +214,7 @@ def test_grippers_change_at_the_time_of_the_action() -> None:
     assert run.targets["right"].gripper == 1.0
 
 
-def test_between_actions_the_target_follows_a_parabola_through_them_in_all_directions() -> None:
+def test_the_target_follows_a_parabola_through_the_actions_along_all_axes() -> None:
     run = Run()
     run.now = 0.0
     way, times = np.array([0.1, -0.2, 0.3]), np.array([TICK + PERIOD * index for index in range(8)])
@@ -226,7 +226,7 @@ def test_between_actions_the_target_follows_a_parabola_through_them_in_all_direc
     run.tick(ActionChunk(times, PERIOD, tools={"left": actions}))
     while run.now < times[-2]:
         run.tick()
-        # Nothing is known of the time before the first action. Its velocity is the mean velocity up to the next action.
+        # The velocity at the first action is unknown. The mean velocity up to the second action replaces it.
         allowed = 2e-4 if run.now < times[1] else 1e-9
         np.testing.assert_allclose(run.tools["left"].translation, place(run.now), atol=allowed)
 
@@ -270,7 +270,7 @@ def test_targets_stay_in_the_workspace() -> None:
     assert run.ways(0.9, chunk(run.now + PERIOD * np.arange(20), 0.004 * np.arange(20.0))).max() == pytest.approx(0.02)
 
 
-def test_after_the_data_of_a_hand_have_ended_the_policy_may_not_move_its_arm_without_a_press() -> None:
+def test_after_a_hands_data_have_ended_a_policy_may_move_the_hands_arm_only_after_a_press() -> None:
     run = Run()
 
     def hands(lower: bool) -> tuple[HandSample, ...]:

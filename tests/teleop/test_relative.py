@@ -44,7 +44,7 @@ def anchored(hand: pin.SE3, tool: pin.SE3, **settings: object) -> RelativeMotion
     scale=st.floats(0.1, 5.0),
     axes=st.sampled_from([("+x", "+y", "+z"), ("+z", "-x", "+y")]),
 )
-def test_for_any_target_pose_there_is_a_hand_pose_that_leads_to_it(
+def test_every_target_pose_can_be_reached_by_some_hand_pose(
     hand: pin.SE3, tool: pin.SE3, wanted: pin.SE3, stance: str, frame: str, scale: float, axes: tuple[str, ...]
 ) -> None:
     settings: dict[str, object] = {"stance": stance, "rotation_frame": frame, "scale": scale, "axes": axes}
@@ -57,7 +57,7 @@ def test_for_any_target_pose_there_is_a_hand_pose_that_leads_to_it(
 
 @quick
 @given(hand=poses, tool=poses, moved=poses)
-def test_the_tool_repeats_the_motion_of_the_hand_in_the_world_frame_in_its_own_axes_or_reflected(
+def test_the_tool_repeats_the_hands_motion_in_the_world_frame_in_the_tool_frame_or_reflected(
     hand: pin.SE3, tool: pin.SE3, moved: pin.SE3
 ) -> None:
     way, turn = moved.translation - hand.translation, moved.rotation @ hand.rotation.T
@@ -129,7 +129,7 @@ def test_one_physical_motion_moves_the_tool_alike_in_every_axis_convention_of_th
     ],
     ids=lambda value: str(value) if isinstance(value, dict) else "",
 )
-def test_a_setting_that_is_not_allowed_is_named_with_the_allowed_values(
+def test_the_error_for_a_forbidden_setting_names_the_setting_and_the_allowed_values(
     arguments: dict[str, object], message: str
 ) -> None:
     with pytest.raises(ConfigError, match=message) as caught:

@@ -23,7 +23,10 @@ AXIS = np.array([0.6, 0.0, 0.8])  # Axis about which the hand turns.
 
 
 class Filtered:
-    """The filtered pose of a hand that moves along x and turns: ``plain`` without the mean, ``drawn`` with it."""
+    """The filtered poses of a hand that moves along x and turns.
+
+    ``plain`` contains the poses of the filter alone, and ``drawn`` those with the mean of the samples at rest.
+    """
 
     def __init__(self, noise: float = NOISE) -> None:
         self._random, self._noise = np.random.default_rng(4), noise / NOISE

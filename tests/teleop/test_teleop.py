@@ -1,4 +1,4 @@
-"""The whole teleop layer: engaging, pausing, grippers, chords. Targets are checked at every tick."""
+"""The whole teleop layer engages arms, pauses arms, moves grippers and obeys chords. No target may jump at any tick."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from q2r2_control.types import SIDES
 from tests.teleop.hands import ENGAGED, assert_smooth, engaged, first_target, operator, pose, sample, spoilt, waving
 
 
-def test_all_arms_start_idle_and_the_first_press_of_a_lower_button_engages_only_that_arm() -> None:
+def test_all_arms_start_idle_and_a_press_of_a_hands_lower_button_engages_only_the_arm_of_this_hand() -> None:
     driver = operator()
     driver.assert_holds()
     driver.engage("left")
@@ -64,7 +64,7 @@ def test_the_right_arm_moves_as_the_stance_says(stance: str, right_goes: tuple[f
     assert driver.teleop.hand_of("right") == ("right" if stance == "side_by_side" else "left")
 
 
-def test_pausing_stops_at_the_first_reading_of_the_button() -> None:
+def test_an_arm_stops_at_the_first_reading_of_the_button_that_pauses_it() -> None:
     driver = engaged()
     driver.run(0.3, waving(driver))
     driver.lower = {"left"}
@@ -77,7 +77,7 @@ def test_pausing_stops_at_the_first_reading_of_the_button() -> None:
     assert driver.states == {"left": "paused", "right": "engaged"}
 
 
-def test_engaging_again_starts_at_the_measured_position_with_the_orientation_of_the_last_target() -> None:
+def test_the_first_target_after_a_pause_has_the_measured_position_and_the_last_targets_orientation() -> None:
     driver = engaged()
     history = driver.run(0.5, waving(driver))
     driver.lower = set(SIDES)
@@ -95,7 +95,7 @@ def test_engaging_again_starts_at_the_measured_position_with_the_orientation_of_
         np.testing.assert_allclose(first.rotation, carried[arm], atol=1e-9)
 
 
-def test_a_thousand_pauses_between_which_the_hand_turns_do_not_move_the_tool() -> None:
+def test_a_thousand_pauses_in_which_the_hand_moves_do_not_move_the_target_off_the_tool() -> None:
     teleop, tool, now = Teleop(TeleopSettings(), ("left",)), pose(0.5, 0.1, 0.4, (3.0, 0.2, 0.1)), 0.0
     random, hand, firsts = np.random.default_rng(0), pose(), []
     for press in range(2001):
@@ -112,7 +112,7 @@ def test_a_thousand_pauses_between_which_the_hand_turns_do_not_move_the_tool() -
     np.testing.assert_allclose(firsts, np.broadcast_to(tool.homogeneous, (1001, 4, 4)), atol=1e-9)
 
 
-def test_each_press_of_the_upper_button_toggles_its_own_gripper() -> None:
+def test_each_press_of_a_hands_upper_button_toggles_the_gripper_of_its_arm() -> None:
     driver = engaged()
     openings = []
     for _ in range(4):
@@ -123,7 +123,9 @@ def test_each_press_of_the_upper_button_toggles_its_own_gripper() -> None:
 
 
 @pytest.mark.parametrize(("first", "delay"), [("lower", 0.0), ("lower", 0.06), ("upper", 0.03)])
-def test_a_chord_moves_no_gripper_stops_both_arms_and_sets_new_anchors_when_released(first: str, delay: float) -> None:
+def test_a_chord_stops_both_arms_and_its_release_sets_new_anchors_while_no_gripper_moves(
+    first: str, delay: float
+) -> None:
     driver = engaged()
     driver.run(0.2, waving(driver))
     (driver.lower if first == "lower" else driver.upper).add("left")
@@ -167,7 +169,7 @@ DT = 0.002
 def tracking_error(script: ScriptedInput, duration: float) -> tuple[float, float]:
     """Return the RMS distance [mm] and the RMS angle [deg] between the left target and its ideal pose.
 
-    The ideal pose is where the hand was, earlier by the delay of the filter. All ticks with an engaged arm count.
+    The ideal pose repeats the hand's motion later by the delay of the filter. All ticks with an engaged arm count.
     """
     teleop = Teleop(TeleopSettings(), SIDES)
     tools = {"left": pose(0.5, 0.4, 0.5, (3.0, 0.1, 0.2)), "right": pose(0.5, -0.4, 0.5)}
@@ -188,7 +190,7 @@ def tracking_error(script: ScriptedInput, duration: float) -> tuple[float, float
 
 
 @pytest.mark.parametrize("trajectory", ["circle", "rotate"])
-def test_a_hand_is_followed_closely(trajectory: str) -> None:
+def test_the_target_follows_the_hand_within_a_millimetre_and_a_third_of_a_degree(trajectory: str) -> None:
     distance, angle = tracking_error(ScriptedInput(trajectory, frequency_hz=0.5), 6.0)
     assert distance < 1.0
     assert angle < 0.33

@@ -1,4 +1,4 @@
-"""Targets never leave their workspace box, and come back from its sides at once. Each axis can have a scale."""
+"""Targets never leave their workspace box. They come back from a side of the box as soon as the hand comes back."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ def test_a_target_never_leaves_its_box_and_comes_back_with_the_hand_at_once() ->
     driver = engaged(workspace={"left": BOX})
     out = shift(driver, (0.3, 0.0, 0.0), 1.0)
     assert max(position[0] for position in out) <= 0.65
-    assert out[-1][0] > 0.64  # The target is at the side of the box, except for overshoot when the hand stops.
+    assert out[-1][0] > 0.64  # The target is at the side of the box, or a little inside, if the stopping hand overshot.
     assert driver.targets["left"].slip > 0.1
     assert driver.targets["right"].slip == 0.0
     back = shift(driver, (-0.1, 0.05, -0.05), 0.5)
     np.testing.assert_allclose(back[-1] - out[-1], (-0.1, 0.05, -0.05), atol=1e-3)
 
 
-def test_a_tool_that_is_outside_of_its_box_does_not_jump_and_may_only_move_inwards() -> None:
+def test_the_target_of_a_tool_outside_its_box_does_not_jump_and_may_only_move_inwards() -> None:
     driver = operator(workspace={"left": BOX | {"x": [0.6, 0.8]}})
     driver.engage()
     np.testing.assert_allclose(driver.place().translation, driver.tools["left"].translation, atol=1e-6)
@@ -64,7 +64,7 @@ def test_a_target_at_a_side_of_the_box_does_not_drift_while_the_hand_trembles(at
         assert abs(position[0] - at) < 1.5e-3
 
 
-def test_axes_have_their_own_scales_and_a_scale_of_0_locks_an_axis() -> None:
+def test_each_axis_has_its_own_scale_and_a_scale_of_0_locks_the_axis() -> None:
     driver = engaged(position_scale=0.5, axis_scales=(1.0, 2.0, 0.0))
     before = driver.tools["left"].translation
     after = shift(driver, (0.1, -0.05, 0.08), 1.0)[-1]

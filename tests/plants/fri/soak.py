@@ -31,7 +31,7 @@ _ALLOWANCE, _STILL = 0.05, 1e-3
 
 
 class Rest(NamedTuple):
-    """The promise for measured arms: times after the reference rests [s], and speeds of the fastest joint [rad/s]."""
+    """Bounds on the speed of the fastest measured joint [rad/s], at times after the reference has come to rest [s]."""
 
     slow_after: float
     slow: float

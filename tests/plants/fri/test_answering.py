@@ -48,7 +48,7 @@ class BrokenOnTheWay(ArmSession):
 
 
 class Between:
-    """The process, with this test as its cabinet and its loop."""
+    """The process that answers cabinets. This test plays its cabinet and its loop."""
 
     def __init__(self, session: ArmSession) -> None:
         self.cabinet = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -91,7 +91,7 @@ def test_the_process_answers_as_soon_as_its_creation_returns(between: Between) -
     assert between.ask().reflected == 1, "messages that came before it had begun would be dropped"
 
 
-def test_a_process_that_cannot_begin_gives_the_reason() -> None:
+def test_the_error_of_a_process_that_cannot_begin_contains_the_reason() -> None:
     with open_socket("127.0.0.1", 0) as ours, pytest.raises(PlantError, match="answered no more: it came broken"):
         CabinetAnswers([Line(BrokenOnTheWay("left", "cabinet"), "127.0.0.1", ours.fileno())])
 
@@ -118,7 +118,7 @@ def test_messages_from_other_addresses_are_not_answered(between: Between) -> Non
             other.recv(2000)
 
 
-def test_the_process_ends_with_the_loop(between: Between) -> None:
+def test_the_process_ends_when_the_loop_ends(between: Between) -> None:
     between.process.close()
     with pytest.raises(ProcessLookupError):
         os.kill(between.process.pid, 0)
@@ -127,7 +127,7 @@ def test_the_process_ends_with_the_loop(between: Between) -> None:
 @pytest.mark.slow
 def test_the_process_outlives_the_loop_until_the_arms_rest() -> None:
     with between_of(LongMotion(ANSWERS)) as between:
-        between.process._commands.close()  # The end of the loop's process closes it too.
+        between.process._commands.close()  # This pipe is closed too when the loop's process ends.
         while between.sent < ANSWERS:
             assert between.ask().reflected == between.sent
         between.process.close()
@@ -150,6 +150,6 @@ def test_a_loop_whose_process_was_killed_gets_a_fault(between: Between) -> None:
         between.process.send({})
 
 
-def test_a_process_that_fails_gives_the_reason(between: Between) -> None:
+def test_the_error_of_a_process_that_fails_contains_the_reason(between: Between) -> None:
     with pytest.raises(PlantError, match="the cabinets are answered no more: 'middle'"):
         between.process.send({"middle": ArmCommand(0.0, 0.0, 0.001, STILL, STILL, ONES)})

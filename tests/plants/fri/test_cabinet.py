@@ -43,7 +43,7 @@ class Client:
 
 
 def run(cabinet: Cabinet, periods: int, answer: Answer, version: int = 2) -> Monitoring:
-    """Return the message after ``periods`` periods, in each of which the client answered."""
+    """Let the client answer for ``periods`` periods. Return the next message."""
     for period in range(periods):
         message = cabinet.send(period * cabinet.settings.period)
         if (command := answer(message)) is not None:
@@ -60,7 +60,7 @@ def commanding(settings: CabinetSettings = SETTINGS) -> tuple[Cabinet, Client]:
     return cabinet, client
 
 
-def test_a_client_that_answers_in_time_goes_from_waiting_to_monitoring_and_with_the_overlay_to_commanding() -> None:
+def test_a_session_with_punctual_answers_reaches_monitoring_and_after_the_start_of_the_overlay_commanding() -> None:
     cabinet, client = Cabinet(SETTINGS, StillArm(HOME)), Client()
     seen: list[Session] = []
     for period in range(200):
@@ -125,7 +125,7 @@ def test_the_arm_moves_as_the_client_commands(version: int, multiplier: int) -> 
     assert message.q[0] > HOME[0] + 0.01
 
 
-def test_only_a_message_that_asks_for_an_answer_waits_for_one() -> None:
+def test_the_cabinet_waits_for_an_answer_only_after_messages_that_request_one() -> None:
     cabinet, client = Cabinet(replace(SETTINGS, multiplier=2), StillArm(HOME)), Client()
     waits = []
     for _ in range(4):
@@ -169,7 +169,7 @@ def test_invalid_answers_and_other_versions_end_the_session_and_a_late_answer_do
     endless, nowhere = (math.inf,) * 7, (math.nan, *HOME[1:])
     for datagram, trip in (
         (b"hello", Trip.MALFORMED),
-        # The message has another identifier.
+        # The identifier is that of a message, and not of an answer.
         (write_monitoring(Cabinet(SETTINGS, StillArm(HOME)).send(0.0)), Trip.MALFORMED),
         (write_command(FriCommand(1, 1, q=nowhere), 2), Trip.MALFORMED),
         (write_command(FriCommand(1, 1, q=HOME, tau=endless), 2), Trip.MALFORMED),
@@ -186,7 +186,7 @@ def test_invalid_answers_and_other_versions_end_the_session_and_a_late_answer_do
 def test_missed_answers_are_counted_only_if_the_client_answers_again() -> None:
     cabinet, client = commanding()
     run(cabinet, 100, lambda message: client.answer(message) if message.counter % 20 else None)
-    assert cabinet.missed == 6  # The last message of commanding() is one of them.
+    assert cabinet.missed == 6  # One of the six is the last message in ``commanding``.
     run(cabinet, 20, lambda message: None)
     assert (cabinet.missed, cabinet.trips) == (6, [Trip.LATE])
 

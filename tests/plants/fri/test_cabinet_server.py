@@ -26,7 +26,7 @@ PERFECT = Network()
 
 
 @pytest.mark.parametrize("overlay", [None, (0.0,) * 7], ids=["position", "torque"])
-def test_an_arm_moves_as_its_cabinet_commands_and_the_other_one_stays(
+def test_an_arm_moves_as_its_cabinet_commands_while_the_other_arm_stays(
     config: Config, robot: Robot, overlay: tuple[float, ...] | None
 ) -> None:
     cell = SimulatedArms(robot, config)
@@ -90,7 +90,7 @@ class Answered:
         return self._session.state
 
     def answer(self, now: float) -> bool:
-        """Answer the next message. Return False if none had come."""
+        """Answer the next message. Return False if no message had come."""
         try:
             datagram, source = self._client.recvfrom(LONGEST)
         except BlockingIOError:

@@ -79,7 +79,7 @@ def test_an_activation_is_reported_without_a_warning(config: Config, caplog: pyt
 
 
 @pytest.mark.slow
-def test_missing_messages_are_reported_once_a_run_for_each_cabinet(
+def test_lost_messages_are_reported_once_per_run_for_each_cabinet(
     config: Config, caplog: pytest.LogCaptureFixture
 ) -> None:
     pipeline = make_loop(config)
@@ -93,7 +93,7 @@ def test_missing_messages_are_reported_once_a_run_for_each_cabinet(
 
 
 @pytest.mark.slow
-def test_a_cabinet_without_the_grippers_output_is_named_once_and_gets_no_write(
+def test_a_cabinet_without_the_grippers_output_is_named_once_and_no_output_is_written(
     config: Config, caplog: pytest.LogCaptureFixture
 ) -> None:
     pipeline = make_loop(config, grippers=dict.fromkeys(SIDES, GripperIoConfig(output="Gripper.Opening")))
@@ -126,7 +126,7 @@ def test_a_network_with_drift_jitter_and_loss_ends_no_session(config: Config, ne
 
 
 @pytest.mark.slow
-def test_a_late_loop_brakes_on_the_stop_that_the_cabinets_get(config: Config) -> None:
+def test_if_the_loop_freezes_for_20_ms_the_arms_brake_as_certified_and_then_go_on(config: Config) -> None:
     pipeline = make_loop(config)
     plant = started(pipeline)
 
@@ -144,7 +144,7 @@ def test_a_late_loop_brakes_on_the_stop_that_the_cabinets_get(config: Config) ->
 def test_a_loop_with_only_late_ticks_follows_nearly_as_well_as_a_punctual_loop(
     config: Config, latest: float, thinks: bool, bound: float
 ) -> None:
-    """Ticks are up to ``latest`` [s] late. With ``thinks``, their commands are late as well."""
+    """Ticks are up to ``latest`` [s] late. If ``thinks`` is True, their commands are late as well."""
 
     def run(most: float) -> float:
         pipeline = make_loop(config, (0.002, 0.002), jitter=0.0004)
@@ -163,10 +163,10 @@ def test_a_loop_with_only_late_ticks_follows_nearly_as_well_as_a_punctual_loop(
     assert run(latest) < bound * run(0.0)
 
 
-def test_before_a_session_is_known_to_follow_each_tick_moves_the_reference_by_its_period(config: Config) -> None:
+def test_until_a_session_is_known_to_follow_each_tick_advances_the_reference_by_one_period(config: Config) -> None:
     plant = started(make_loop(config))
     plant.reset()
-    for tick in range(100):  # The loop's commands came too late in the session before.
+    for tick in range(100):  # In the previous session, the loop's commands came too late.
         plant.cell.sent(taken=False)
         assert plant.due(0.002 * tick) == pytest.approx((0.0, 0.002))
 
@@ -220,7 +220,7 @@ def test_arms_rest_on_their_certified_stop_while_a_solver_blocks_and_go_on_after
     plant = started(pipeline)
     sent: dict[str, list[tuple[float, Joints]]] = {arm: [] for arm in SIDES}
     plant.on_message = lambda arm, t: sent[arm].append((t, plant.cabinets[arm].commanded))
-    newest: list[Tick] = []  # The ticks before the one that blocks.
+    newest: list[Tick] = []  # The tick before the one in which the solver blocks.
     decelerations: list[np.ndarray] = []
 
     def block(tick: Tick) -> None:
@@ -267,7 +267,7 @@ def test_a_loop_that_is_always_too_late_is_reported(config: Config) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", [CommandMode.POSITION, CommandMode.TORQUE])
-def test_arms_follow_as_well_as_without_cabinets(config: Config, mode: CommandMode) -> None:
+def test_arms_behind_cabinets_follow_as_well_as_arms_without_cabinets(config: Config, mode: CommandMode) -> None:
     robot = Robot.from_config(config)
     pipeline = make_loop(config, mode=mode, jitter=0.0005, arms=SimulatedArms(robot, config))
     plant = started(pipeline)
@@ -292,7 +292,7 @@ class ShiftedArm(SimulatedArm):
 
 
 @pytest.mark.slow
-def test_arms_with_an_untrusted_state_are_braked_at_every_tick(config: Config, robot: Robot) -> None:
+def test_arms_whose_measured_state_is_not_trusted_are_braked_at_every_tick(config: Config, robot: Robot) -> None:
     arms = SimulatedArms(robot, config)
     arms.arms["left"] = left = ShiftedArm(arms, "left")
     pipeline = make_loop(config, mode=CommandMode.TORQUE, jitter=0.0004, arms=arms)
@@ -313,13 +313,13 @@ def test_arms_with_an_untrusted_state_are_braked_at_every_tick(config: Config, r
     assert len(brakings) > 4
     for speeds in brakings[:-1]:
         assert max(speeds) < speeds[0] + 0.2, "a jump of what is measured is hardly a push"
-        # These speeds are measured after the periods of both cabinets, and after the filter of the jump.
+        # By then, the periods of both cabinets and the effect of the jump in the filter of the velocity are over.
         later = np.array(speeds[20:])
         assert (np.diff(later) < 0.01 * later[:-1] + 1.0 / config.nominal_rate_hz).all(), "no arm gets faster"
         assert later[-1] < 0.02, "and both rest before they are believed again"
 
 
-def test_the_reference_brakes_like_the_path(robot: Robot) -> None:
+def test_the_controllers_reference_brakes_like_the_path_from_which_cabinets_are_answered(robot: Robot) -> None:
     controller = CartesianController(robot)
     target = controller.tool_pose("left")
     target.translation = target.translation + np.array([0.1, 0.1, 0.1])
@@ -337,7 +337,9 @@ def test_the_reference_brakes_like_the_path(robot: Robot) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", [CommandMode.POSITION, CommandMode.TORQUE])
-def test_sessions_end_in_every_way_without_a_jump_and_begin_again(config: Config, mode: CommandMode) -> None:
+def test_arms_do_not_jump_however_sessions_end_and_every_session_begins_again(
+    config: Config, mode: CommandMode
+) -> None:
     soak = Soak(make_loop(config, mode=mode, jitter=0.0004, drift=200e-6), sessions=4, seed=1).run()
     assert soak.ended == 4
     assert soak.moved > 0.3

@@ -46,7 +46,9 @@ def test_the_sessions_of_both_cabinets_reach_commanding_while_the_arms_are_held(
     np.testing.assert_allclose(state.held, robot.home)
 
 
-def test_a_gripper_by_modbus_gets_its_openings_and_is_measured(robot: Robot, fri_config: Config) -> None:
+def test_a_modbus_gripper_gets_the_commanded_openings_and_its_opening_is_measured(
+    robot: Robot, fri_config: Config
+) -> None:
     with SimulatedGripper() as simulated:
         gripper = ModbusGripperConfig(modbus=f"127.0.0.1:{simulated.port}")
         left = fri_config.fri["left"].model_copy(update={"gripper": gripper})
@@ -88,7 +90,7 @@ def test_a_port_that_another_program_uses_is_named(robot: Robot, fri_config: Con
             FriPlant.from_config(robot, fri_config).reset()
 
 
-def test_the_sessions_keep_the_cells_limit_of_torque_rate(robot: Robot, fri_config: Config) -> None:
+def test_each_session_gets_the_torque_rate_limit_of_the_cell(robot: Robot, fri_config: Config) -> None:
     impedance = fri_config.impedance.model_copy(update={"torque_rate_limit": 7000.0})
     lines = FriPlant.from_config(robot, fri_config.model_copy(update={"impedance": impedance}))._lines()
     for line in lines:

@@ -19,13 +19,13 @@ from tests.plants.fri.asking_cabinet import ACTIVE, IPO, MONITORING, WAITING, Ca
 FAR = (0.3, 0.5, 0.0, -1.2, 0.0, 1.0, 0.0)  # A client has moved the arm to this posture.
 
 
-def test_an_idle_cabinet_gets_no_answer_and_a_monitoring_one_gets_no_position() -> None:
+def test_an_idle_cabinet_gets_no_answer_and_a_monitoring_cabinet_gets_an_answer_without_a_position() -> None:
     cabinet = Cabinet()
     assert cabinet.ask(replace(MONITORING, session=Session.IDLE)) is None
     assert cabinet.ask(MONITORING) == FriCommand(0, 2)
 
 
-def test_fri_1_gets_the_commanded_position_mirrored() -> None:
+def test_a_monitoring_cabinet_with_fri_1_gets_its_own_commanded_position_back() -> None:
     cabinet = Cabinet()
     answer = cabinet.ask(replace(MONITORING, version=1, commanded_q=IPO))
     assert answer is not None
@@ -63,7 +63,7 @@ def test_only_outputs_that_the_cabinet_has_are_written_in_its_own_type(message: 
     assert isinstance(answer.io["open"], bool)
 
 
-def test_only_each_third_message_is_answered_with_a_multiplier_of_three() -> None:
+def test_with_a_multiplier_of_three_only_each_third_message_is_answered() -> None:
     cabinet = Cabinet()
     answers = [cabinet.ask(replace(MONITORING, multiplier=3)) for _ in range(6)]
     assert [answer is None for answer in answers] == [True, True, False, True, True, False]
@@ -92,7 +92,7 @@ def test_an_answer_with_torques_repeats_the_cabinets_own_position() -> None:
     assert (answer.q, answer.tau) == (IPO, (1.0,) * 7)
 
 
-def test_a_torque_that_is_not_updated_becomes_a_braking_torque_and_later_no_answer() -> None:
+def test_a_torque_that_is_not_updated_is_replaced_by_a_braking_torque_and_later_no_answer_is_sent() -> None:
     cabinet = torque_cabinet()
     active = begin_torques(cabinet)
     q = iter(np.linspace(Q, np.add(Q, 0.025), 26)[1:])  # The joints move at 0.2 rad/s.
@@ -101,7 +101,7 @@ def test_a_torque_that_is_not_updated_becomes_a_braking_torque_and_later_no_answ
     assert torques == [1.0] * 4 + [-4.0] * 16 + [None] * 5
 
 
-def test_a_braking_torque_keeps_the_rate_limit_or_5000_nm_s_if_the_limit_is_lower() -> None:
+def test_a_braking_torque_changes_at_most_by_the_rate_limit_or_by_5000_nm_s_if_the_limit_is_lower() -> None:
     for rate, change in ((6000.0, 30.0), (100.0, 25.0)):
         cabinet = torque_cabinet(rate=rate)
         active, still, ones = begin_torques(cabinet), (0.0,) * 7, (1.0,) * 7
@@ -113,7 +113,7 @@ def test_a_braking_torque_keeps_the_rate_limit_or_5000_nm_s_if_the_limit_is_lowe
         assert torques[-1] == pytest.approx(-80.0)
 
 
-def test_commands_without_an_overlay_brake_for_as_long_as_they_come() -> None:
+def test_a_session_sends_braking_torques_as_long_as_commands_without_torques_come() -> None:
     cabinet = torque_cabinet()
     active = begin_torques(cabinet)
     for q in np.linspace(Q, np.add(Q, 0.1), 101)[1:]:  # The joints move at 0.2 rad/s.
@@ -124,7 +124,7 @@ def test_commands_without_an_overlay_brake_for_as_long_as_they_come() -> None:
         assert answer.tau == pytest.approx((-4.0,) * 7)
 
 
-def test_a_measured_jump_does_not_count_as_a_velocity_beyond_the_limit() -> None:
+def test_a_jump_of_the_measured_position_counts_as_at_most_the_velocity_limit() -> None:
     limits = np.full(7, 100.0), np.full(7, 2.0)
     cabinet = Cabinet(ArmSession("left", "cabinet", None, CommandKind.TORQUE, *limits))
     for q in (Q, np.add(Q, 0.5), np.add(Q, -0.5)):
@@ -140,7 +140,7 @@ def test_no_torque_is_beyond_the_limit() -> None:
     assert answer.tau == (0.5,) * 7
 
 
-def test_torques_are_refused_for_a_cabinet_with_too_long_a_period() -> None:
+def test_torques_are_refused_for_a_cabinet_whose_period_is_too_long() -> None:
     cabinet = torque_cabinet()
     begin_torques(cabinet)
     assert cabinet.ask(replace(WAITING, command=CommandKind.TORQUE, multiplier=2)) is None
@@ -149,7 +149,7 @@ def test_torques_are_refused_for_a_cabinet_with_too_long_a_period() -> None:
     assert sentence(fault) == "left: the cabinet asks every 10 ms; allowed for torques: 5 at most"
 
 
-def test_a_dropped_session_is_reported_and_the_arm_follows_no_more() -> None:
+def test_the_end_of_a_session_is_a_fault_and_the_arm_follows_no_more() -> None:
     cabinet = Cabinet()
     cabinet.ask(WAITING)
     cabinet.ask(ACTIVE)
@@ -164,7 +164,7 @@ def test_a_dropped_session_is_reported_and_the_arm_follows_no_more() -> None:
     assert fault.detail["session"] == "monitoring ready"
 
 
-def test_late_commands_are_refused_for_both_arms_which_stop_as_certified() -> None:
+def test_if_one_arms_command_is_late_the_commands_of_both_are_refused_and_the_arms_stop_as_certified() -> None:
     cabinet, still, ones = Cabinet(), (0.0,) * 7, (1.0,) * 7
     cabinet.ask(WAITING)
     cabinet.ask(ACTIVE)
@@ -186,13 +186,13 @@ def test_late_commands_are_refused_for_both_arms_which_stop_as_certified() -> No
     stop = np.array([answer.q for answer in answers if answer and answer.q])
     assert np.diff(stop, axis=0).min() >= 0.0, "it goes on, slower and slower"
     np.testing.assert_allclose(stop[-1], state.rest, atol=1e-9)
-    # A reference that begins there is followed again.
+    # A reference that begins at this posture of rest is followed again.
     now = cabinet.now
     assert follow({"left": cabinet.session}, {"left": ArmCommand(now, now, now + 0.002, state.rest, still, ones)})
     assert cabinet.session.path.end == now + 0.002
 
 
-def test_an_arm_that_rests_before_lost_messages_are_caught_up_begins_to_move_again_without_a_jump() -> None:
+def test_an_arm_that_rests_while_its_answers_still_catch_up_begins_to_move_again_without_a_jump() -> None:
     cabinet, fives, a = Cabinet(), (5.0,) * 7, 5.0
     cabinet.ask(WAITING)
     followed: list[tuple[float, ...]] = [IPO, IPO]
@@ -277,7 +277,7 @@ def test_a_stop_of_the_safety_controller_is_a_fault_while_the_session_goes_on(st
     assert fault.kind is FriReason.FRI_SESSION
 
 
-def test_an_older_message_is_not_answered_and_lost_ones_are_counted() -> None:
+def test_an_older_message_is_not_answered_and_lost_messages_are_counted() -> None:
     cabinet = Cabinet()
     for _ in range(3):
         cabinet.ask(MONITORING)

@@ -48,7 +48,7 @@ def test_an_arm_whose_cabinet_was_silent_during_motion_brakes_as_certified_and_f
     ask()
     assert not follows()
     assert not session.is_still(cabinet.now)
-    for _ in range(100):  # Another reference begins where this one will rest.
+    for _ in range(100):  # A new reference begins at the posture in which the braking arm will rest.
         now, rest = cabinet.now, session.state.rest
         session.follow(ArmCommand(now, now - 0.002, now + 0.003, rest, still, ones))
         ask()

@@ -10,7 +10,7 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_measured_arms_keep_their_distance_in_every_incident_of_one_arm(case: str) -> None:
+def test_measured_arms_keep_their_distance_in_every_incident_that_happens_to_one_arm(case: str) -> None:
     found = Case(case, 0.5).run()
     assert found.speed > 0.35
     assert found.margin >= 0.0
@@ -18,5 +18,5 @@ def test_measured_arms_keep_their_distance_in_every_incident_of_one_arm(case: st
 
 
 @pytest.mark.parametrize("case", ["cable pulled", "pendant stopped"])
-def test_the_other_arm_rests_within_0_2_s_after_an_incident(case: str) -> None:
+def test_both_arms_rest_within_0_2_s_after_one_of_them_was_disconnected_or_stopped(case: str) -> None:
     assert Case(case, 0.5).run().rest < 0.2

@@ -73,6 +73,6 @@ def test_the_instruction_for_the_operator_depends_on_the_session(session: Sessio
     assert "no FRI message" in what_is_missing(state, 11.0)
 
 
-def test_a_message_that_cannot_be_read_is_reported_unchanged() -> None:
+def test_the_problem_of_an_unreadable_message_is_reported_unchanged() -> None:
     state = replace(SILENT, newest=ACTIVE, arrival=10.0, problem="FRI 2 datagram whose checksum is wrong")
     assert what_is_missing(state, 11.0).endswith("30200: FRI 2 datagram whose checksum is wrong")

@@ -78,7 +78,7 @@ def test_a_message_written_by_hand_from_the_field_numbers_is_understood() -> Non
     assert (found.period, found.multiplier, found.ipo_q) == (0.005, 2, None)
 
 
-def test_packed_joints_are_understood_too() -> None:
+def test_joints_in_a_packed_field_are_understood_too() -> None:
     packed = _field(1, 2, bytes([56]) + b"".join(map(_double, Q)))
     assert read_monitoring(HEADER + _inner(3, _inner(1, packed)) + CONNECTION).q == Q
 
@@ -135,13 +135,13 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("case", list(REFUSED))
-def test_invalid_bytes_are_refused_with_a_message_of_what_is_allowed(case: str) -> None:
+def test_the_error_for_invalid_bytes_says_what_is_allowed(case: str) -> None:
     datagram, told = REFUSED[case]
     with pytest.raises(ProtocolError, match=told):
         read_monitoring(datagram)
 
 
-def test_a_name_that_is_not_text_is_read_too() -> None:
+def test_a_message_with_a_name_that_is_not_valid_text_is_read_too() -> None:
     datagram = write_monitoring(dataclasses.replace(MONITORING, version=1, io={"valve": True}))
     assert read_monitoring(datagram.replace(b"valve", b"val\xff\xfe")).io == {"val\ufffd\ufffd": True}
 
@@ -149,7 +149,7 @@ def test_a_name_that_is_not_text_is_read_too() -> None:
 @pytest.mark.slow
 @given(edits=st.lists(st.tuples(st.integers(0, 400), st.integers(0, 255)), max_size=8), end=st.integers(0, 400))
 @settings(derandomize=True, max_examples=500, deadline=None)
-def test_changed_bytes_are_read_or_refused_and_never_raise_anything_else(
+def test_a_message_with_changed_bytes_is_read_or_raises_a_protocol_error(
     edits: list[tuple[int, int]], end: int
 ) -> None:
     for version in (1, 2):

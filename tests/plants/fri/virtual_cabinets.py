@@ -46,8 +46,9 @@ class VirtualCabinets:
     ) -> None:
         """Make cabinets for a loop with this ``period`` and ``longest`` step [s].
 
-        The clocks of the cabinets ``drift`` apart by this share, and messages are up to ``jitter`` [s] late. Without
-        ``arms``, each arm is always at its commanded position, and torques do not move it.
+        ``drift`` is the relative difference of the rates of the cabinets' clocks. Messages are up to ``jitter`` [s]
+        late, and ``loss`` is the share of lost messages. Without ``arms``, each arm is always at its commanded
+        position, and torques do not move it.
         """
         self._robot, self._period, self._longest, self._random = robot, period, longest, np.random.default_rng(seed)
         self._jitter, self._loss = jitter, loss
