@@ -1,4 +1,4 @@
-"""A scheduler of dask with workers, as processes of this machine that only loopback reaches."""
+"""A Dask scheduler and its workers, as processes of this computer. They listen only on 127.0.0.1."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class DaskCluster:
 
     def _start(self, module: str, *options: str) -> subprocess.Popen[bytes]:
         command = (sys.executable, "-m", f"distributed.cli.{module}", "--host", "127.0.0.1", "--no-dashboard", *options)
-        # The workers find the modules of tests, and packages where this process finds them.
+        # With this path, the workers find the test modules, and the packages that this process finds.
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])}
         with (self._folder / f"{module}-{len(self._processes)}.log").open("wb") as log:
             process = subprocess.Popen(command, stdout=log, stderr=log, env=environment, cwd=self._folder)

@@ -47,7 +47,7 @@ class Driven:
         return reference
 
     def set_opening(self, arm: str, least: float, greatest: float) -> tuple[str, str] | None:
-        """Call this method of the controller, and give the new openings to the contract."""
+        """Call the controller's method ``set_opening``, and give the new openings to the contract."""
         refused = self.controller.set_opening(arm, least, greatest)
         self.contract.set_openings(self.controller.openings)
         return refused

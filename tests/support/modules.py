@@ -1,4 +1,4 @@
-"""Scripts outside the package, loaded as modules."""
+"""Functions that load scripts as modules, install small packages, and read blocks of code in the docs."""
 
 from __future__ import annotations
 
@@ -30,6 +30,6 @@ def load_script(path: str) -> ModuleType:
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # Dataclasses look here for the types of their fields.
+    sys.modules[spec.name] = module  # ``dataclasses`` looks up the types of fields here.
     spec.loader.exec_module(module)
     return module
