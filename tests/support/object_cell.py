@@ -41,9 +41,8 @@ _BLOCK = {"shape": "box", "size": (0.1, 0.04, 0.015), "position": (0.5, 0.25 + 0
 _DATA = load_config("config/dual_iiwa7.yaml").model_dump()
 _DATA["obstacles"]["block"] = _BLOCK
 CELL = Config.model_validate(_DATA)
-SETTINGS = CELL.control.model_copy(
-    update={"solve_time_limit": None}
-)  # Without this limit, no result depends on the clock.
+# Without this limit, no result depends on the clock.
+SETTINGS = CELL.control.model_copy(update={"solve_time_limit": None})
 
 
 def tips_at(y: float, tips: float) -> pin.SE3:
