@@ -17,7 +17,7 @@ from q2r2_control.summary.tick import Tick
 from q2r2_control.viewer.web import view
 from tests.support.processes import cell
 
-# If an engaged hand has been silent for the first time [s] of the run, each tick takes the second time [s].
+# If the hand of an engaged arm has been silent for _SILENT [s] of the run's time, each tick takes _STANDS [s].
 _SILENT, _STANDS = 0.5, 1.0
 
 

@@ -1,4 +1,4 @@
-"""The server of a headset's page: which page drives, and the samples that its messages become."""
+"""The server of a headset's page decides which page drives, and makes samples from the messages of that page."""
 
 from __future__ import annotations
 
@@ -186,7 +186,7 @@ def test_the_newest_picture_reaches_the_page_that_drives(listen: Listen) -> None
         wait_until(has_the_newest)
 
 
-def test_headset_check_shows_messages_of_the_page_and_its_address(listen: Listen) -> None:
+def test_headset_check_shows_the_address_of_the_page_and_the_messages_that_the_page_sends(listen: Listen) -> None:
     source, config = listen(silence=PATIENCE), WebXrInput.cell(cell())
     alone = watch_headset(source, config, 0.0, lambda check: None, lambda: False, CrossedHands(config.teleop.axes))
     assert f"open {source.url} in the headset's browser" in alone.advice
