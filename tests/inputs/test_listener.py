@@ -53,7 +53,7 @@ class Lines(logging.Logger):
         self.lines.append(f"{record.levelname} {record.getMessage()}")
 
 
-def test_the_first_line_about_a_host_is_written_at_once_and_then_one_line_a_second_counts_the_others() -> None:
+def test_the_first_line_about_a_host_is_written_at_once_and_later_one_line_a_second_counts_omitted_lines() -> None:
     lines = Lines()
     log = lines.log_of_hosts
     for index in range(3000):
@@ -144,7 +144,7 @@ SILENT = replace(BACK, registrations=({}, {}))
         pytest.param(QUIET, replace(SILENT, since=NOW - 2.1), Admission.REFUSE, id="waited in vain"),
     ],
 )
-def test_a_client_with_poses_replaces_a_driver_without_and_a_headset_that_comes_back_replaces_itself(
+def test_a_client_with_poses_replaces_a_driver_without_poses_and_a_returning_headset_replaces_its_old_connection(
     driver: Peer | None, newcomer: Peer, verdict: Admission
 ) -> None:
     decided, reason = decide(driver, newcomer, NOW)
@@ -153,7 +153,7 @@ def test_a_client_with_poses_replaces_a_driver_without_and_a_headset_that_comes_
         assert (newcomer.peer if verdict is Admission.ADMIT else driver.peer) in reason
 
 
-def test_a_driver_gives_way_only_after_the_timeout_that_stops_its_arms() -> None:
+def test_another_client_replaces_a_silent_driver_only_after_the_timeout_that_stops_the_arms() -> None:
     assert 2 * STREAM_TIMEOUT < QUIET_ALLOWED < 0.5 * SILENCE_ALLOWED
     assert WAIT_ALLOWED < POSES_ALLOWED
 

@@ -1,4 +1,4 @@
-"""Samples of hands: joining data that arrive separately, a queue for the loop, and poses that must not be followed.
+"""Samples of hands: how poses and inputs are joined, how the loop gets samples, and which poses it must not follow.
 
 Frozen poses and a moving frame are faults. Human motions are not.
 """
@@ -99,7 +99,7 @@ def faults(watched: Iterable[Watched]) -> set[tuple[str, HandFault]]:
 
 
 def moved(samples: Iterable[Message], by: Callable[[float, str], pin.SE3]) -> Iterator[Message]:
-    """Yield the poses as seen in a frame that moves. ``by`` is its motion at a time [s], for a hand."""
+    """Yield the poses as seen in a frame that moves. ``by(t, hand)`` is the frame's motion at the time ``t`` [s]."""
     for t, hand, pose in samples:
         assert isinstance(pose, HandPose)
         rotation = pin.Quaternion(pose.quaternion).matrix()

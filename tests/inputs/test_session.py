@@ -97,7 +97,7 @@ def test_a_registration_can_be_removed_and_removing_it_again_is_no_error(
     assert (session.published, session.subscribed) == ({}, {})
 
 
-def test_the_topic_list_has_a_type_of_two_parts_for_each_topic(session: HeadsetSession) -> None:
+def test_the_topic_list_has_the_type_of_each_topic_as_package_and_name(session: HeadsetSession) -> None:
     for topic in ("dice", "/cup"):
         session.receive(command(Dialect.ROS2, "__publish", topic=topic, message_name="geometry_msgs/Twist"))
     session.receive(command(Dialect.ROS2, "__topic_list"))
