@@ -1,4 +1,4 @@
-"""A RealSense camera without hardware: the software device of its own library, whose frames a test gives it."""
+"""A RealSense camera without hardware: a software device of pyrealsense2, which gets its frames from a test."""
 
 from __future__ import annotations
 

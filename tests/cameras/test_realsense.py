@@ -22,7 +22,7 @@ from tests.cameras.videos import HEIGHT, WIDTH, number_in, number_of_jpeg
 pytest.importorskip("pyrealsense2")
 pytest.importorskip("cv2")
 
-DEEP = np.arange(WIDTH * HEIGHT, dtype=np.uint16).reshape(HEIGHT, WIDTH) * 21  # It needs all 16 bits.
+DEEP = np.arange(WIDTH * HEIGHT, dtype=np.uint16).reshape(HEIGHT, WIDTH) * 21  # The values need all 16 bits.
 
 
 def camera(**changes: object) -> CameraConfig:
@@ -93,7 +93,7 @@ def test_a_camera_is_described_by_its_serial_number_its_name_and_its_formats() -
 
 
 @pytest.mark.parametrize("changes", [{"device": 0}, {"device": "a.mp4"}])
-def test_depth_is_refused_for_other_cameras(changes: dict[str, Any]) -> None:
+def test_depth_is_refused_for_a_camera_that_is_no_realsense(changes: dict[str, Any]) -> None:
     with pytest.raises(ConfigError, match="depth: allowed: with device: realsense:SERIAL"):
         camera(depth=True, **changes)
 

@@ -37,7 +37,7 @@ def test_a_picture_is_not_given_before_it_is_captured(tmp_path: Path) -> None:
         assert time.monotonic() >= shot.time
 
 
-def test_a_file_that_is_not_repeated_ends(tmp_path: Path) -> None:
+def test_a_video_that_is_not_repeated_ends_with_an_error(tmp_path: Path) -> None:
     device = open_device(camera_of(write_video(tmp_path / "numbers.avi", range(2)), repeat=False))
     assert [number_in(device.read().pixels) for _ in range(2)] == [0, 1]
     with pytest.raises(CameraError, match="the video has ended"):

@@ -1,4 +1,4 @@
-"""Videos whose pictures show their own number, so that a test knows when each was captured."""
+"""Videos whose pictures show their own number, so that a test knows when each picture was captured."""
 
 from __future__ import annotations
 
