@@ -124,7 +124,7 @@ def test_an_untrained_agent_moves_the_tools() -> None:
     assert not any("jump" in said for said in held)
 
 
-def test_the_arms_follow_small_actions_and_say_why_they_refuse_large_ones() -> None:
+def test_the_arms_follow_small_actions_and_the_environment_says_why_it_refuses_large_actions() -> None:
     env = shared()
     start = env.reset(seed=0)[0]["observation.state"]
     action = start.copy()
@@ -161,7 +161,8 @@ def test_a_slower_loop_needs_fewer_ticks_for_the_same_steps_and_keeps_the_promis
         ticks.append(next(taken) - before - 1)
         tools.append(observed["observation.tool"])
     assert ticks == [333, 33]
-    np.testing.assert_allclose(tools[0], tools[1], atol=0.02)  # Each tool is some ticks behind its targets.
+    # The tools lag behind their targets by some ticks, so their positions in the two loops differ.
+    np.testing.assert_allclose(tools[0], tools[1], atol=0.02)
     with pytest.raises(ConfigError, match=r"loop_rate = 20: allowed: 50 to 1000 Hz"):
         TaskEnv("grasp", loop_rate=20)
 
@@ -182,7 +183,7 @@ def time_of(env: TaskEnv) -> float:
     return observation.time
 
 
-def test_steps_end_at_frames_of_a_dataset_at_the_given_rate() -> None:
+def test_each_step_ends_at_the_time_of_the_next_frame_of_a_dataset_with_the_same_rate() -> None:
     env = shared()
     still = env.reset(seed=0)[0]["observation.state"]
     start = time_of(env)
