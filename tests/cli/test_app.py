@@ -68,7 +68,9 @@ def test_the_version_is_that_of_the_installed_package() -> None:
     ],
     ids=lambda value: " ".join(value) if isinstance(value, tuple) else "",
 )
-def test_bad_usage_ends_in_exit_code_2_and_one_line_that_names_it(arguments: tuple[str, ...], named: str) -> None:
+def test_bad_usage_ends_in_exit_code_2_and_one_line_that_names_the_fault(
+    arguments: tuple[str, ...], named: str
+) -> None:
     result = q2r2(*arguments)
     assert (result.exit_code, result.stdout, result.stderr.count("\n")) == (2, "", 1)
     assert result.stderr.startswith("q2r2: ")
@@ -123,7 +125,7 @@ def test_a_failed_task_of_the_demo_is_explained_and_changes_the_exit_code(
 
 
 @pytest.mark.slow
-def test_bench_times_free_motion_and_contact_or_the_work_motions_that_are_asked_for() -> None:
+def test_bench_measures_ticks_in_free_motion_and_in_contact_or_in_the_chosen_work_motions() -> None:
     result = q2r2("bench", "--no-peers", "--rounds", "1", "--solver", "osqp")
     assert all(text in result.stdout for text in ("free motion", "contact (!)", "q2r2_control", "p99"))
     assert all(text in result.stdout for text in ("by QP solver", "daqp", "osqp", "unsolved"))
@@ -133,7 +135,9 @@ def test_bench_times_free_motion_and_contact_or_the_work_motions_that_are_asked_
 
 
 @pytest.mark.parametrize("command", [("run", CELL), ("demo",), ("demo", "--plant", "fri")], ids=" ".join)
-def test_a_run_uses_the_solver_of_its_option(command: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_uses_the_solver_that_the_option_solver_names(
+    command: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
     chosen: list[str] = []
 
     def run_cell(config: Config, options: Any) -> Any:
@@ -147,7 +151,7 @@ def test_a_run_uses_the_solver_of_its_option(command: tuple[str, ...], monkeypat
     assert chosen == ["daqp", "osqp"]
 
 
-def test_trials_of_a_demo_use_the_solver_of_its_option(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_trials_of_a_demo_use_the_solver_that_the_option_solver_names(monkeypatch: pytest.MonkeyPatch) -> None:
     chosen: list[str] = []
 
     def try_tasks(tasks: Any, trial: partial[str], *given: Any) -> list[Any]:
@@ -159,7 +163,7 @@ def test_trials_of_a_demo_use_the_solver_of_its_option(monkeypatch: pytest.Monke
     assert chosen == ["osqp"]
 
 
-def test_a_soak_uses_the_solver_of_its_option_and_names_it() -> None:
+def test_a_soak_uses_and_reports_the_solver_that_the_option_solver_names() -> None:
     report = one_object(q2r2("soak", "--ticks", "100", "--solver", "osqp", "--json").stdout)
     assert (report["solver"], report["passed"]) == ("osqp", True)
 

@@ -16,7 +16,8 @@ from tests.cli.command import one_object, q2r2
 CELL = Path("config/dual_iiwa7.yaml")
 
 
-# On a busy machine, a picture may come late. One that is late by two periods can be neither judged well nor exported.
+# On a busy machine, a picture may come late. The rate is low, because a picture that is late by two periods can be
+# neither judged well nor exported.
 SLOW_FPS = 5.0
 
 
@@ -99,7 +100,7 @@ def test_a_run_of_arms_behind_cabinets_is_recorded_judged_and_exported_with_a_ca
 
 
 @pytest.mark.slow
-def test_a_policy_with_a_real_camera_ends_with_one_line_if_the_camera_gives_no_picture(tmp_path: Path) -> None:
+def test_a_run_of_a_policy_with_a_real_camera_ends_with_one_line_if_the_camera_gives_no_picture(tmp_path: Path) -> None:
     pytest.importorskip("cv2")
     size = {"width": WIDTH, "height": HEIGHT, "rate": FPS}
     cell = str(cell_with(tmp_path, {"front": {"device": "none.avi", **size}}))

@@ -1,4 +1,4 @@
-"""Commands that serve a headset: their messages about it, and their end."""
+"""Commands that serve a headset: what they print about the headset, and how they end."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ def bound_port(running: subprocess.Popen[str]) -> int:
 
 
 def fake_headset(port: int, duration: float) -> None:
-    """Run a headset in its own process, which engages both arms and circles."""
+    """Run a fake headset in its own process. It engages both arms, and its hands move in circles."""
     arguments = ["--port", str(port), "--duration", str(duration)]
     subprocess.run([sys.executable, "-m", "tests.support.fake_headset", *arguments], check=True, timeout=30)
 
 
 @pytest.mark.slow
-def test_headset_check_shows_a_headset_in_a_process_of_its_own() -> None:
+def test_headset_check_reports_the_messages_of_a_headset_in_another_process() -> None:
     with process("headset-check", "--port", "0", "--json") as running:
         fake_headset(bound_port(running), 1.5)
         running.send_signal(signal.SIGINT)

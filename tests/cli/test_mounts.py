@@ -30,8 +30,8 @@ def test_the_printed_mount_puts_the_right_tip_where_the_left_tip_was() -> None:
     assert max(report.off_mm) < 0.01
 
 
-def test_written_postures_give_the_mount_of_arms_without_cabinets(tmp_path: Path) -> None:
-    """The right base is not where the cell has it. Both arms touch the same points with tips beyond their tools."""
+def test_postures_in_a_file_give_the_mount_of_arms_without_cabinets(tmp_path: Path) -> None:
+    """The right base is not where the cell says. Both arms touch the same points, with tips 20 mm beyond the tools."""
     tip, off = np.array([0.0, 0.0, 0.02]), np.array([0.012, -0.03, 0.004])
     robot = Robot.from_config(load_config("config/dual_ur5.yaml"))
     data = robot.model.createData()
@@ -79,7 +79,7 @@ def test_postures_that_determine_no_mount_are_refused(tmp_path: Path, text: str,
     assert done.stderr.count("\n") == 1
 
 
-def test_for_a_missing_file_of_postures_mounts_prints_one_line_without_the_number_of_the_error() -> None:
+def test_mounts_prints_one_line_without_the_systems_error_number_if_the_file_of_postures_is_missing() -> None:
     done = q2r2("mounts", "config/dual_ur5.yaml", "--postures", "nope.txt")
     assert done.stderr.startswith("q2r2: --postures nope.txt: No such file or directory; allowed: a file with lines of")
 

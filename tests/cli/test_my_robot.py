@@ -1,4 +1,4 @@
-"""The page about your own robot, step by step. At its end, a robot that no shipped cell has moves."""
+"""The steps of docs/my_robot.md work as written. After the last step, a robot moves that is in no shipped cell."""
 
 from __future__ import annotations
 

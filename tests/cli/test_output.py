@@ -47,7 +47,7 @@ def test_figures_names_units_and_notes_are_complete_in_80_columns() -> None:
     assert f"{LINK}_{LINK}" in first
 
 
-def test_a_note_is_folded_on_a_terminal_only() -> None:
+def test_a_note_is_wrapped_only_on_a_terminal() -> None:
     note = "nothing arrives for 2 s, although the address and the port are those of the app"
     table = partial(figure_table, "hands", ("hand", "rate [Hz]"), [("left", 0.0)], [note])
     assert note not in printed(table())
@@ -112,14 +112,14 @@ def test_an_arm_that_refused_every_press_is_a_fault(summary: RunSummary) -> None
     assert replace(never, arms=engaged_later).broken == ()
 
 
-def test_several_reasons_of_a_verdict_have_a_line_each() -> None:
+def test_several_reasons_of_a_verdict_are_printed_in_separate_lines() -> None:
     late, idle = Rejection("max_delay", "late [s]"), Rejection("max_idle_share", "idle")
     assert verdict_markup(Verdict((late, idle))) == "[red]discard[/]:\n    late \\[s]\n    idle"
     assert verdict_markup(Verdict((late,))) == "[red]discard[/]: late \\[s]"
     assert verdict_markup(Verdict(())) == "[green]keep[/]"
 
 
-def test_the_output_of_a_run_begins_with_its_verdict_and_those_of_its_tasks(
+def test_the_output_of_a_run_begins_with_its_verdict_and_the_results_of_its_tasks(
     summary: RunSummary, capsys: pytest.CaptureFixture[str]
 ) -> None:
     tasks = (TaskResult("grasp", True, {}, ""), TaskResult("stack", False, {}, "it fell"))
@@ -227,7 +227,9 @@ def test_a_tool_that_did_not_follow_is_printed(summary: RunSummary) -> None:
     assert "256 mm from its reference: the tool did not follow" in text_of(away)
 
 
-def test_a_run_without_a_table_tells_every_ten_seconds_how_much_of_it_is_over(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_without_a_live_table_prints_every_ten_seconds_how_much_of_its_time_is_over(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     now, console = [100.0], Console(file=io.StringIO(), width=80, color_system=None)
     monkeypatch.setattr("q2r2_control.cli.output.time.monotonic", lambda: now[0])
     lines = ProgressLines("demo", 12.8, console)

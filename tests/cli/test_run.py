@@ -30,7 +30,7 @@ MODULE = "q2r2_control.cli.run"
 OPTIONS = (*FAST[2:], "--duration", "0.1")
 
 
-def test_a_cell_that_check_refuses_is_refused_with_the_same_lines(tmp_path: Path) -> None:
+def test_a_run_refuses_a_cell_that_check_refuses_and_prints_the_same_lines(tmp_path: Path) -> None:
     file = changed_cell(tmp_path, "home: [0.0204, 0.348,", "home: [0.0204, 1.0,")
     refused = q2r2("run", file, *OPTIONS)
     assert (refused.exit_code, refused.stdout) == (2, "")
@@ -78,7 +78,9 @@ def test_with_the_option_force_a_faulty_cell_runs_and_its_faults_are_printed(tmp
         ("torque", "0.7,", "| table_0; what was measured broke what was promised"),
     ],
 )
-def test_an_arm_that_begins_in_the_table_ends_with_exit_code_1(tmp_path: Path, mode: str, home: str, said: str) -> None:
+def test_a_run_in_which_an_arm_begins_inside_the_table_ends_with_exit_code_1(
+    tmp_path: Path, mode: str, home: str, said: str
+) -> None:
     file = changed_cell(tmp_path, "0.0204, 0.348,", f"0.0204, {home}")
     result = q2r2("run", file, "--mode", mode, "--fast", "--headless", "--duration", "0.1", "--force")
     assert result.exit_code == 1
@@ -129,7 +131,9 @@ def test_an_empty_task_is_refused(tmp_path: Path) -> None:
     assert "--task is empty; allowed: some words, or no --task" in result.stderr
 
 
-def test_with_rt_one_line_names_the_refusals_of_the_system_and_the_run_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_with_the_option_rt_one_line_names_what_the_system_refuses_and_the_run_goes_on(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     refusal = "real time: no SCHED_FIFO: Operation not permitted; the run goes on without"
 
     @contextmanager
@@ -250,7 +254,7 @@ def test_without_graphics_one_line_says_so_and_everything_else_is_recorded(
 
 
 @pytest.mark.slow
-def test_a_plant_without_pictures_is_named_and_recorded_without_them(tmp_path: Path) -> None:
+def test_a_run_whose_plant_has_no_pictures_says_so_and_is_recorded_without_pictures(tmp_path: Path) -> None:
     result = q2r2("run", CELL, *OPTIONS, "--record", str(tmp_path / "recordings"))
     assert result.exit_code == 0
     assert "no pictures are recorded: the kinematic plant has none; allowed: --plant mujoco\n" in result.stderr
@@ -271,7 +275,7 @@ def test_a_policy_that_fails_makes_the_run_fail(policy: str, code: int, told: st
     assert told in " ".join([result.stdout, result.stderr])
 
 
-def test_a_policy_without_its_input_is_refused_with_the_missing_option() -> None:
+def test_the_option_policy_without_the_policy_input_is_refused_and_the_missing_option_is_named() -> None:
     result = q2r2("run", CELL, *OPTIONS, "--policy", "json:dumps")
     told = "--policy cannot be used with --input scripted, which is the cell's input; add --input policy\n"
     assert (result.exit_code, result.stderr) == (2, f"q2r2: {told}")
