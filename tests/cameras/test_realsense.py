@@ -53,7 +53,7 @@ def test_colour_and_depth_have_the_time_of_their_capture(clock: StoppedClock) ->
     assert (colour.time, depth.time) == pytest.approx((99.8, 99.9), abs=1e-3)
 
 
-def test_without_depth_only_colour_is_read_and_turned(clock: StoppedClock) -> None:
+def test_without_depth_only_the_colour_picture_is_read_and_turned(clock: StoppedClock) -> None:
     source = SoftwareRealSense()
     device = RealSense(camera(rotation=90, width=HEIGHT, height=WIDTH), source.device)
     source.show_depth(DEEP, clock.time())

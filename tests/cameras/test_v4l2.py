@@ -83,7 +83,9 @@ def answer(file: int, request: int, data: bytes) -> bytes:
         raise OSError(errno.EINVAL, "no more entries") from error
 
 
-def test_all_formats_sizes_and_rates_are_listed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_all_formats_sizes_and_rates_of_a_v4l2_device_are_listed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(v4l2, "ioctl", answer)
     (tmp_path / "video0").touch()
     assert list(map(str, v4l2.formats_of(str(tmp_path / "video0")))) == [

@@ -32,7 +32,7 @@ def offered(monkeypatch: pytest.MonkeyPatch, *typed: Any) -> list[Any]:
     return seen
 
 
-def test_the_next_try_offers_given_answers_but_not_accepted_defaults(
+def test_the_next_try_offers_answers_that_were_typed_but_no_defaults_that_were_accepted(
     file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seen = offered(monkeypatch, 0.4, None, None, None)
@@ -65,7 +65,7 @@ def test_an_answer_of_another_type_is_not_offered(file: Path, monkeypatch: pytes
     assert seen == [0.1]
 
 
-def test_nothing_is_asked_offered_or_kept_if_all_defaults_are_accepted(
+def test_with_the_option_yes_no_question_is_asked_and_the_kept_answers_do_not_change(
     file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     offered(monkeypatch, 0.4)

@@ -85,7 +85,7 @@ def test_a_cell_with_an_external_controller_is_not_run_without_ros(tmp_path: Pat
     )
 
 
-def test_a_wrong_key_ends_in_one_line_that_names_file_key_and_what_is_allowed(tmp_path: Path) -> None:
+def test_for_a_wrong_key_in_the_yaml_one_line_names_the_file_the_key_and_what_is_allowed(tmp_path: Path) -> None:
     result = q2r2("run", changed_cell(tmp_path, "obstacles:", "obstructions:"))
     assert (result.exit_code, result.stderr.count("\n")) == (2, 1)
     assert re.search(r"cell.yaml, line \d+: obstructions: unknown key; allowed here: .*obstacles", result.stderr)
@@ -102,7 +102,7 @@ def test_a_fast_run_prints_one_json_object_and_nothing_else() -> None:
 
 
 @pytest.mark.parametrize("option", ["--plant fri", "--viewer", "--rt", "--duration 4", "--seed 3", "--record rec"])
-def test_trials_of_a_demo_refuse_options_of_a_single_run(option: str) -> None:
+def test_options_of_a_single_run_are_refused_for_trials_of_a_demo(option: str) -> None:
     done = q2r2("demo", "grasp", "--seeds", "2", *option.split())
     assert done.exit_code == 2
     assert f"{option.split()[0]}" in done.stderr

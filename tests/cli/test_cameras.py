@@ -115,7 +115,7 @@ def test_a_run_of_a_policy_with_a_real_camera_ends_with_one_line_if_the_camera_g
     assert "no pictures of front: real cameras keep real time; allowed: without --fast\n" in fast.stderr
 
 
-def test_without_a_cell_the_devices_of_this_computer_are_listed() -> None:
+def test_without_a_cell_the_command_cameras_lists_the_devices_of_this_computer() -> None:
     result = q2r2("cameras")
     assert result.exit_code == 0
     assert result.stdout.startswith(("/dev/video", "no V4L2 camera on this computer\n"))

@@ -50,7 +50,7 @@ def test_a_safety_stop_ends_a_session_and_lasts_a_second() -> None:
 
 
 @pytest.mark.slow
-def test_enter_at_the_terminal_stops_all_overlays_and_starts_them_again(fri_cell: str) -> None:
+def test_a_press_of_enter_stops_all_overlays_and_the_next_press_starts_them_again(fri_cell: str) -> None:
     ours, theirs = os.openpty()
     # The first terminal that a new session opens becomes its controlling terminal.
     opening = f"import os; os.dup2(os.open({os.ttyname(theirs)!r}, os.O_RDWR), 0)"
@@ -87,7 +87,7 @@ def test_overlays_that_the_pendant_stopped_start_only_after_its_next_key_press()
     assert all(cabinet._overlay for cabinet in cabinets.values())
 
 
-def test_messages_contain_the_number_of_messages_per_answer(fri_cell: str) -> None:
+def test_each_message_of_a_cabinet_says_how_many_messages_come_per_answer(fri_cell: str) -> None:
     port = load_config(fri_cell).fri["left"].port
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
         client.bind(("127.0.0.1", port))

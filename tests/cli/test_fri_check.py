@@ -31,7 +31,7 @@ def test_jitter_is_measured_against_the_cabinets_period_even_if_messages_are_mis
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("cabinets")
-def test_the_messages_of_both_cabinets_are_described_and_a_cabinet_that_does_not_command_changes_the_exit_code(
+def test_fri_check_describes_both_cabinets_and_exits_with_1_if_a_cabinet_is_not_in_commanding_active(
     fri_cell: str,
 ) -> None:
     done = q2r2("fri-check", fri_cell, "--duration", "1", "--json")

@@ -68,7 +68,7 @@ def test_a_headset_server_on_every_network_names_the_address_for_the_app_and_the
 
 
 @pytest.mark.slow
-def test_a_host_outside_the_cells_headset_allow_is_refused(tmp_path: Path) -> None:
+def test_a_host_outside_the_networks_in_headset_allow_is_refused(tmp_path: Path) -> None:
     cell = tmp_path / "cell.yaml"
     cell.write_text(Path(CELL).read_text(encoding="utf-8").replace("allow: null", "allow: [10.0.0.0/8]"), "utf-8")
     with process("headset-check", str(cell), "--host", "0.0.0.0", "--port", "0", "--json") as running:
@@ -80,7 +80,7 @@ def test_a_host_outside_the_cells_headset_allow_is_refused(tmp_path: Path) -> No
     assert "only 10.0.0.0/8 can drive the arms" in stderr
 
 
-def test_headset_check_gives_advice_if_nothing_comes() -> None:
+def test_headset_check_gives_advice_if_no_data_arrive() -> None:
     result = q2r2("headset-check", "--port", "0", "--duration", "2.3", "--json")
     assert result.exit_code == 1
     advice = "\n".join(one_object(result.stdout)["advice"])

@@ -27,7 +27,7 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-def test_each_episode_has_a_row_and_a_line_with_the_reasons(recordings: Path) -> None:
+def test_judge_prints_a_row_for_each_episode_and_the_reasons_for_a_discarded_episode(recordings: Path) -> None:
     result = q2r2("judge", str(recordings))
     assert (result.exit_code, result.stderr) == (0, "")
     assert "episodes: 1 kept, 1 discarded" in result.stdout

@@ -90,7 +90,7 @@ def test_a_run_in_which_an_arm_begins_inside_the_table_ends_with_exit_code_1(
 @pytest.mark.parametrize(
     ("change", "code"), [({}, 0), ({"uncertified_ticks": 3}, 1), ({"at_rest": False}, 1)], ids=["none", "proof", "rest"]
 )
-def test_the_exit_code_agrees_with_the_verdict(
+def test_the_exit_code_of_a_run_agrees_with_its_verdict(
     monkeypatch: pytest.MonkeyPatch, change: dict[str, Any], code: int
 ) -> None:
     def as_if(*given: Any) -> CellRun:
@@ -105,7 +105,9 @@ def test_the_exit_code_agrees_with_the_verdict(
 
 
 @pytest.mark.parametrize("command", [("run", CELL, *OPTIONS), ("demo", "--fast", "--headless")])
-def test_a_folder_that_cannot_be_written_is_refused_before_the_run(command: tuple[str, ...], tmp_path: Path) -> None:
+def test_a_folder_for_recordings_that_cannot_be_written_is_refused_before_the_run(
+    command: tuple[str, ...], tmp_path: Path
+) -> None:
     (tmp_path / "file").touch()
     result = q2r2(*command, "--record", str(tmp_path / "file" / "recordings"))
     assert (result.exit_code, result.stdout, result.stderr.count("\n")) == (2, "", 1)
@@ -125,7 +127,7 @@ def full(*given: object) -> Path:
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
-def test_an_empty_task_is_refused(tmp_path: Path) -> None:
+def test_an_empty_text_for_the_option_task_is_refused(tmp_path: Path) -> None:
     result = q2r2("run", CELL, *OPTIONS, "--record", str(tmp_path), "--task", " ")
     assert result.exit_code == 2
     assert "--task is empty; allowed: some words, or no --task" in result.stderr
@@ -206,7 +208,7 @@ def test_the_seed_of_a_demo_displaces_only_the_parts_of_its_task(tmp_path: Path)
 
 
 @pytest.mark.parametrize("other", [("--plant", "fri"), ("--seeds", "1")])
-def test_a_spread_that_would_move_nothing_is_refused(other: tuple[str, str]) -> None:
+def test_the_option_spread_is_refused_if_it_would_displace_no_part(other: tuple[str, str]) -> None:
     result = q2r2("demo", "grasp", "--spread", "0.01", *other)
     assert result.exit_code == 2
     assert "--spread cannot be used with --" in result.stderr
@@ -241,7 +243,7 @@ def test_the_pictures_of_a_demo_become_videos_in_an_export(tmp_path: Path) -> No
 
 
 @pytest.mark.slow
-def test_without_graphics_one_line_says_so_and_everything_else_is_recorded(
+def test_if_the_computer_cannot_draw_pictures_one_line_says_so_and_everything_else_is_recorded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("MUJOCO_GL", "nothing")
@@ -297,7 +299,7 @@ class Still:
 
 
 @pytest.mark.slow
-def test_a_policy_of_the_working_folder_runs_and_is_refused_with_another_input(
+def test_a_policy_in_the_working_folder_runs_but_is_refused_together_with_another_input(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "still_policy.py").write_text(POLICY)

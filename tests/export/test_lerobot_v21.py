@@ -137,7 +137,7 @@ def test_the_video_of_a_camera_has_openpis_name_for_the_camera_and_shows_every_f
             assert np.abs(found.astype(float) - wanted).mean() < 6
 
 
-def test_modality_json_cuts_state_and_action_into_the_parts_of_the_robot(dataset: Path) -> None:
+def test_modality_json_says_which_numbers_of_state_and_action_belong_to_which_part_of_the_robot(dataset: Path) -> None:
     modality = json.loads((dataset / "meta/modality.json").read_text())
     for what in ("state", "action"):
         cut = {name: POSITIONS[part["start"] : part["end"]] for name, part in modality[what].items()}

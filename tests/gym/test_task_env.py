@@ -111,7 +111,7 @@ def test_a_seed_places_the_parts_and_equal_actions_then_have_equal_results() -> 
     assert 0.0 < np.abs(seen[0][0] - seen[2][0]).max() <= 0.02
 
 
-def test_an_untrained_agent_moves_the_tools() -> None:
+def test_random_actions_of_an_untrained_agent_move_the_tools() -> None:
     env = make()
     env.reset(seed=0)
     env.action_space.seed(0)

@@ -84,7 +84,7 @@ def test_while_one_headset_drives_others_are_refused_with_a_reason_and_the_log_h
     assert "refused: 127.0.0.1:" in lines[0]
 
 
-def test_a_headset_that_comes_back_after_a_silently_lost_link_drives_at_once_as_a_new_connection(
+def test_a_headset_that_reconnects_after_an_unnoticed_loss_drives_at_once_as_a_new_connection(
     server: HeadsetServer, clock: HandClock, caplog: pytest.LogCaptureFixture
 ) -> None:
     with driving(server) as lost:
@@ -109,7 +109,7 @@ def keep_alive(headset: FakeHeadset, server: HeadsetServer, clock: HandClock) ->
     eventually(lambda: server._client is not None and server._client.last_frame == clock.now)
 
 
-def test_a_newcomer_that_sends_nothing_is_refused_after_two_seconds(server: HeadsetServer, clock: HandClock) -> None:
+def test_a_new_client_that_sends_nothing_is_refused_after_two_seconds(server: HeadsetServer, clock: HandClock) -> None:
     with connect(server) as idle, connect(server, source=ELSEWHERE) as second:
         clock.advance(1.5)
         keep_alive(idle, server, clock)

@@ -145,7 +145,9 @@ def test_a_headset_that_does_not_read_gets_only_the_newest_vibration_and_the_nex
         assert next_topic(second) == "q2r_right_hand_haptic_feedback"
 
 
-def test_a_listener_gets_every_message_in_order_and_poll_then_returns_nothing(clock: HandClock) -> None:
+def test_a_listener_gets_every_message_in_order_and_poll_returns_nothing_for_a_server_with_a_listener(
+    clock: HandClock,
+) -> None:
     heard: list[Watched] = []
     with running(HeadsetServer(port=0, clock=clock, listener=heard.append)) as server, connect(server) as headset:
         for index in range(100):

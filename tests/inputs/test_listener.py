@@ -32,7 +32,7 @@ from q2r2_control.inputs.listener import (
 INFO, WARNING = logging.INFO, logging.WARNING
 
 
-def test_a_rate_limit_allows_its_count_in_each_period_and_saves_nothing_for_the_next_period() -> None:
+def test_a_rate_limit_allows_the_same_count_in_each_period_even_if_the_period_before_was_not_used() -> None:
     limit = RateLimit(3, 0.5)
     assert [limit.take(10.0) for _ in range(5)] == [True, True, True, False, False]
     assert not limit.is_open(10.25)
@@ -66,7 +66,7 @@ def test_the_first_line_about_a_host_is_written_at_once_and_later_one_line_a_sec
     assert lines.lines == [*first, "WARNING line 2999 (999 more left out)"]
 
 
-def test_a_line_that_came_too_early_is_written_later_and_the_most_important_line_is_kept() -> None:
+def test_lines_within_the_same_second_are_written_later_as_one_line_and_the_most_important_is_kept() -> None:
     lines = Lines()
     log = lines.log_of_hosts
     log.write("a", INFO, "connected", 10.0)
@@ -81,7 +81,7 @@ def test_a_line_that_came_too_early_is_written_later_and_the_most_important_line
     assert lines.lines[2:] == ["WARNING refused (1 more left out)"]
 
 
-def test_each_of_eight_hosts_has_lines_of_its_own_and_all_further_hosts_share_one_line() -> None:
+def test_the_log_has_separate_lines_for_eight_hosts_and_one_common_line_for_all_further_hosts() -> None:
     lines = Lines()
     for index in range(100):
         lines.log_of_hosts.write(f"host {index}", WARNING, f"line {index}", 10.0)

@@ -220,7 +220,7 @@ def test_bytes_that_cannot_be_a_frame_are_refused_with_a_reason(stream: bytes, r
         frames(stream)
 
 
-def test_frames_before_a_fault_are_not_lost() -> None:
+def test_frames_before_invalid_bytes_are_still_read() -> None:
     decoder = FrameDecoder()
     decoder.feed(ABC + b"\xff\xff\xff\xff")
     assert decoder.next_frame() == WireFrame("/abc", b"xyz", terminated=False)

@@ -44,7 +44,7 @@ def sent(policy: PolicyInput, *arguments: Any) -> ActionChunk:
     return chunk
 
 
-def test_the_policy_input_is_a_policy_source() -> None:
+def test_the_policy_input_implements_the_interface_of_a_policy_source() -> None:
     assert isinstance(opened(), PolicySource)
 
 
@@ -107,7 +107,7 @@ def test_the_fault_of_unusable_actions_is_named_in_one_line(
     assert "\n" not in text
 
 
-def test_a_quaternion_that_is_not_a_rotation_is_named() -> None:
+def test_the_fault_of_an_action_names_a_quaternion_that_is_not_a_rotation() -> None:
     poses = np.tile([0.5, 0.2, 0.3, 0.0, 0.0, 0.0, 1.0], (1, 2))
     poses[0, 13] = 0.0
     chunk = sent(opened(ActionSpace.TOOL), poses, [0.0])

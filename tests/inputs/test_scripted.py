@@ -29,7 +29,7 @@ def flat(samples: list[HandSample]) -> list[tuple[object, ...]]:
     return [(s.hand, s.pose_stamp, s.inputs, *s.position.tolist(), *s.quaternion.tolist()) for s in samples]
 
 
-def test_equal_seeds_give_equal_samples_for_any_times_of_polling() -> None:
+def test_equal_seeds_give_equal_samples_however_often_the_loop_polls() -> None:
     often, seldom = (play(ScriptedInput("grasp", human=True, seed=3), 6.0, dt) for dt in (0.001, 0.1))
     assert len(seldom) > 500
     assert flat(often)[: len(seldom)] == flat(seldom)
@@ -126,7 +126,7 @@ def test_a_wrong_setting_is_refused_with_what_is_allowed(arguments: dict[str, ob
 
 
 @pytest.mark.parametrize("trajectory", ["circle", "meet"])
-def test_the_hands_for_iiwa_arms_move_exactly_as_the_trajectory_is_written_without_scaling(trajectory: str) -> None:
+def test_scripted_hands_for_a_cell_of_iiwa_arms_move_exactly_as_without_a_cell(trajectory: str) -> None:
     written = flat(play(ScriptedInput(trajectory), 4.0))
     for name in ("dual_iiwa7", "dual_iiwa14", "iiwa7"):
         assert flat(play(ScriptedInput.from_config(load_config(f"config/{name}.yaml"), trajectory), 4.0)) == written
@@ -151,7 +151,7 @@ def test_the_home_positions_of_the_way_points_equal_those_of_the_tools_in_the_sh
 
 
 @pytest.mark.parametrize("work", WORKS.values(), ids=WORKS)
-def test_every_work_has_rising_times_and_ends_at_home_with_open_grippers(work: HandWork) -> None:
+def test_the_way_points_of_every_work_have_rising_times_and_end_at_home_with_open_grippers(work: HandWork) -> None:
     for hand, points in work.tools.items():
         times = [point[0] for point in points]
         assert times == sorted(set(times))
@@ -254,7 +254,7 @@ def test_shaky_hands_tremble_twice_as_far_as_calm_hands_and_at_a_lower_frequency
     assert most == pytest.approx(2.0 * least, rel=0.2)
 
 
-def test_hands_reach_for_the_parts_where_the_seed_has_shifted_them() -> None:
+def test_hands_reach_for_the_parts_at_the_positions_to_which_the_seed_has_shifted_them() -> None:
     places = {seed: place_of(seed, 0.02) for seed in range(20)}
     assert len(set(places.values())) == 20
     assert 0.015 < np.abs(list(places.values())).max() <= 0.02

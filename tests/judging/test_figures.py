@@ -159,7 +159,7 @@ class TestArms:
 
 
 class TestIdle:
-    def test_a_tool_that_rests_or_trembles_or_is_not_engaged_is_idle(self) -> None:
+    def test_a_tool_that_rests_or_trembles_or_is_not_engaged_counts_as_idle(self) -> None:
         tremor = 4e-4 * np.sin(60.0 * frame_times())[:, None] * np.ones(3)
         path = np.linspace(0.0, 0.5, 400)[:, None] * np.ones(3)
         assert idle_share(episode(path=path)) == pytest.approx(0.0)

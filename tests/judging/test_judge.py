@@ -55,7 +55,7 @@ def clean(folder: Path) -> Path:
     return record_episode(folder / "clean", hands(SEED))
 
 
-def test_clean_work_is_kept(clean: Path) -> None:
+def test_an_episode_of_clean_work_is_kept(clean: Path) -> None:
     found = judged(clean)
     assert found.verdict.line == "keep"
     for arm in found.figures.arms.values():

@@ -50,7 +50,7 @@ class Page(HTMLParser):
 
 
 @pytest.mark.slow
-def test_the_page_fetches_nothing_and_each_episode_has_a_row_with_its_verdict_and_a_section() -> None:
+def test_the_report_page_loads_no_other_files_and_has_a_row_and_a_section_for_each_episode() -> None:
     text = page_of([moving(), judged(episode())], "<script>alert(1)</script> & {braces}")
     page = Page(text)
     assert not page.all("link")

@@ -201,7 +201,7 @@ def test_the_command_lerobot_teleoperate_lets_the_scripted_hands_move_the_arms(f
     assert np.ptp(rows["q"], axis=0).max() > 0.01
 
 
-def test_a_recorded_dataset_has_the_numbers_of_the_export_of_the_same_run(folder: Path) -> None:
+def test_a_dataset_that_lerobot_records_has_the_same_numbers_as_an_export_of_the_same_run(folder: Path) -> None:
     more = ("--dataset.num_episodes=1", "--dataset.episode_time_s=10", "--play_sounds=false")
     run(command("lerobot-record", folder, *HANDS, *dataset_options(folder, "waved"), *more), folder)
     (made,) = folder.glob("waved*")

@@ -51,7 +51,7 @@ def rows_of(folder: Path) -> list[dict[str, object]]:
     return rows
 
 
-def test_info_names_every_number_and_describes_its_content(dataset: Path) -> None:
+def test_info_json_names_every_number_and_has_the_counts_of_episodes_frames_and_tasks(dataset: Path) -> None:
     info = json.loads((dataset / "meta" / "info.json").read_text())
     assert (info["codebase_version"], info["fps"], info["robot_type"]) == ("v3.0", FPS, "two_arms")
     assert (info["total_episodes"], info["total_frames"], info["total_tasks"]) == (3, 125, 2)

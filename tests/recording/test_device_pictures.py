@@ -209,7 +209,7 @@ def test_when_the_process_of_a_camera_is_killed_the_run_goes_on(tmp_path: Path) 
     assert done.summary.fault is None
 
 
-def test_a_camera_that_cannot_be_opened_is_named_before_the_run(tmp_path: Path) -> None:
+def test_an_error_names_a_camera_that_cannot_be_opened_before_the_run_begins(tmp_path: Path) -> None:
     with (
         CameraStreams({"front": front(tmp_path / "none.avi")}) as streams,
         pytest.raises(CameraError, match=r"cameras\.front\.device: .*none\.avi: no such file"),

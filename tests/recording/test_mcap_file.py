@@ -128,7 +128,9 @@ def test_a_recording_has_the_same_content_after_it_was_rewritten_by_a_writer(
     assert len(names) > 8
 
 
-def test_a_file_in_which_ticks_are_far_from_their_hand_samples_is_refused(file: Path, tmp_path: Path) -> None:
+def test_a_file_that_is_sorted_by_topic_so_that_ticks_come_without_their_hand_samples_is_refused(
+    file: Path, tmp_path: Path
+) -> None:
     """Each chunk of the file has messages of one topic only. A replay of a tick without its samples would differ."""
     again = written_again(file, tmp_path / "again.mcap", by_topic(file), chunk_size=10_000)
     with pytest.raises(RecordingError, match="mcap sort puts them in order"):

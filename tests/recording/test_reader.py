@@ -60,7 +60,7 @@ def events(*told: tuple[float, ReasonKind]) -> list[Event]:
 
 
 @pytest.mark.parametrize(("told", "expected"), CASES.values(), ids=CASES)
-def test_episodes_are_those_that_the_operator_began_and_rated(
+def test_a_recording_has_the_episodes_that_the_operator_began_with_the_operators_ratings(
     told: list[tuple[float, ReasonKind]], expected: list[tuple[float, float, bool, bool | None]]
 ) -> None:
     spans = spans_of(events(*told))

@@ -317,7 +317,7 @@ def test_messages_that_do_not_fit_into_the_full_queue_are_lost_and_counted(tmp_p
     assert nodes.recorder.written.messages == nodes.recorder.count - nodes.recorder.overflows
 
 
-def test_a_recording_of_another_controller_is_refused_in_one_line(tmp_path: Path) -> None:
+def test_reading_a_recording_of_an_external_controller_raises_an_error(tmp_path: Path) -> None:
     nodes = NodesOnFile(tmp_path, parse_config(yaml.safe_dump(external()), "the cell"))
     play(nodes, 5)
     with pytest.raises(RecordingError, match="recorded with controller: external"):

@@ -88,7 +88,9 @@ def test_number_and_name_of_each_subtask_are_in_the_file(file: Path) -> None:
     assert replay(file).difference is None
 
 
-def test_a_press_in_the_last_subtask_is_refused_with_its_name(tmp_path: Path) -> None:
+def test_in_the_last_subtask_a_press_for_the_next_one_is_refused_and_the_refusal_names_the_subtask(
+    tmp_path: Path,
+) -> None:
     file = recorded(tmp_path, (), (0.2, 0.4), NAMES[:2], duration=0.6)
     assert told_in(file)[-1] == (TeleopReason.LAST_SUBTASK, {"name": "grasp the cube"})
 

@@ -109,7 +109,7 @@ def test_a_request_to_pause_an_arm_that_is_paused_already_is_answered_for_a_shor
     assert words(idle, told=(Event(0.9, "left", "idle", "idle", pause),)) == "not engaged yet; already paused"
 
 
-def test_a_reason_uses_the_operators_name_of_a_control(robot: Robot) -> None:
+def test_a_reason_names_a_control_as_the_operator_knows_it(robot: Robot) -> None:
     paused = tick_at(robot, 1.0, engaged=False)
     pressed = Event(0.5, "left", "pausing", "paused", Reason.of(TeleopReason.PRESSED, control="lower button"))
     assert words(paused, told=(pressed,)) == "A or X"
@@ -119,7 +119,7 @@ def press(tick: Tick, bindings: Mapping[str, str] = {}, device: DeviceWords = QU
     return ArmWords(JOINTS, BindingSettings.model_validate(bindings), device).next_press(tick, "left")
 
 
-def test_the_next_press_depends_on_state_and_gripper(robot: Robot) -> None:
+def test_the_text_about_the_next_press_depends_on_the_state_of_the_arm_and_of_its_gripper(robot: Robot) -> None:
     engaged, paused = tick_at(robot, 1.0), tick_at(robot, 1.0, engaged=False)
     assert press(engaged) == "press A or X to pause, press B or Y to close the gripper"
     closed = {arm: ArmTarget(None, 0.0) for arm in paused.targets}
@@ -127,7 +127,7 @@ def test_the_next_press_depends_on_state_and_gripper(robot: Robot) -> None:
     assert press(replace(paused, connected=False)) == "nothing: no headset is connected"
 
 
-def test_the_next_press_is_that_of_the_bound_control(robot: Robot) -> None:
+def test_the_text_about_the_next_press_names_the_control_that_is_bound(robot: Robot) -> None:
     engaged, paused = tick_at(robot, 1.0), tick_at(robot, 1.0, engaged=False)
     swapped = {"lower": "gripper_toggle", "upper": "pause_toggle"}
     assert press(paused, swapped) == "press B or Y to engage, press A or X to close the gripper"

@@ -62,7 +62,7 @@ def admitted(door: Door, origin: str, token: str) -> bool:
     return True
 
 
-def test_only_our_own_page_connects(door: Door) -> None:
+def test_only_the_servers_own_page_may_connect(door: Door) -> None:
     own = f"http://127.0.0.1:{door.port}"
     token = token_of(door)
     assert admitted(door, own, token)

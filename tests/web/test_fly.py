@@ -116,7 +116,7 @@ def test_a_key_whose_release_is_never_reported_moves_a_hand_only_for_a_short_tim
     assert flown(page, down, ("keyup", ctrl | {"ctrlKey": False})) == 0.0
 
 
-def test_a_button_counts_as_held_while_other_keys_are_pressed_but_not_long_after_the_last_event_of_a_key(
+def test_a_held_button_stays_held_while_other_keys_are_pressed_but_only_for_a_limited_time(
     open_page: Open, listen: Listen
 ) -> None:
     page = open_page(str(listen().url), "")
@@ -126,7 +126,7 @@ def test_a_button_counts_as_held_while_other_keys_are_pressed_but_not_long_after
     assert held[-10:] == [False] * 10
 
 
-def test_a_tap_between_two_messages_is_in_the_next_message_if_it_comes_soon_and_only_for_its_own_hand(
+def test_a_tap_between_two_messages_is_in_the_next_message_if_this_is_sent_soon_and_for_the_same_hand(
     open_page: Open, listen: Listen
 ) -> None:
     page = open_page(str(listen().url), "")
@@ -187,7 +187,7 @@ def test_the_page_sends_hands_while_it_draws_nothing_but_only_for_a_limited_time
     wait_until(lambda: page.evaluate("draw() || 1") and sent(page) > before + 10)
 
 
-def test_hands_are_lost_when_the_page_loses_the_focus_and_only_the_focus_brings_them_back(
+def test_hands_are_lost_when_the_page_loses_the_focus_and_come_back_only_when_it_has_the_focus_again(
     open_page: Open, listen: Listen
 ) -> None:
     page = open_page(str(listen().url), STANDING)

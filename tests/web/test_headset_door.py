@@ -85,7 +85,7 @@ def test_a_certificate_is_renewed_before_it_expires_or_if_an_address_of_the_serv
     assert "cannot be read" in str(made("10.0.0.7")[1])
 
 
-def test_each_address_of_this_computer_has_a_url_a_qr_code_and_a_name_in_the_certificate(
+def test_each_address_of_this_computer_has_a_url_a_qr_code_and_an_entry_in_the_certificate(
     listen: Listen, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     networks = ("192.168.1.5", "10.0.0.7")

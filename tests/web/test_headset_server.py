@@ -24,7 +24,7 @@ from tests.web.headset_page import Listen, Page, hand, samples
 NOISE = np.random.default_rng(3)
 
 
-def test_a_hand_arrives_as_the_page_sent_it_with_all_controls(listen: Listen) -> None:
+def test_the_pose_and_all_controls_of_a_hand_arrive_as_the_page_sent_them(listen: Listen) -> None:
     source = listen()
     with closing(Page(source)) as page:
         sent = hand(1.0, True, False, True) | {"axes": [0.1, -0.2, 0.3, 0.4]}
@@ -58,7 +58,7 @@ def test_a_missing_or_guessed_pose_and_a_moved_frame_are_faults_of_the_sample(
         assert samples(source, len)[0].fault is fault
 
 
-def test_of_messages_that_come_together_the_newest_pose_counts_and_no_press_is_lost(listen: Listen) -> None:
+def test_if_several_messages_arrive_at_once_the_newest_pose_counts_and_no_press_is_lost(listen: Listen) -> None:
     source = listen()
     with closing(Page(source)) as page:
         page.send(left=hand(0.0))

@@ -70,7 +70,7 @@ def shown(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> Iterator[Shown]:
     server.stop()
 
 
-def test_cameras_have_the_order_of_the_cell_whichever_picture_comes_first(shown: Shown) -> None:
+def test_pictures_of_cameras_are_shown_in_the_order_of_the_cell_whichever_comes_first(shown: Shown) -> None:
     assert len(shown.cameras) > 1
     for name in reversed(shown.cameras):
         shown.show(pictures={name: b"picture"})
@@ -79,7 +79,7 @@ def test_cameras_have_the_order_of_the_cell_whichever_picture_comes_first(shown:
     assert places == sorted(places)
 
 
-def test_buttons_of_grippers_stand_above_the_pictures_of_cameras(shown: Shown) -> None:
+def test_buttons_of_grippers_are_above_the_pictures_of_cameras(shown: Shown) -> None:
     shown.show(pictures={shown.cameras[0]: b"picture"})
     shown.page.wait_until(lambda: shown.cameras[0] in shown.page.words)
     shown.page.button("left: close or open the gripper")
