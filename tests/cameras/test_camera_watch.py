@@ -10,7 +10,7 @@ from q2r2_control.config.recording import CameraConfig
 from q2r2_control.wording import sentence
 
 CAMERA = CameraConfig(device=0, width=64, height=48, rate=20.0)
-LATENCY = 0.1  # [s]
+LATENCY = 0.1  # Time from the capture of a picture to its receipt [s].
 
 
 def watch() -> CameraWatch:

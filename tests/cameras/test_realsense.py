@@ -1,4 +1,4 @@
-"""Colour and depth of a RealSense camera, from the software device of its library: no camera is needed."""
+"""Colour and depth of a RealSense camera come from the software device of its library, so no camera is needed."""
 
 from __future__ import annotations
 

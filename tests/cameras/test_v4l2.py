@@ -1,4 +1,4 @@
-"""Formats of V4L2 devices, by the structures of the kernel's <linux/videodev2.h>.
+"""The formats of V4L2 devices are read in the structures of the kernel's <linux/videodev2.h>.
 
 The computers that run the tests have no camera, so a function answers instead of a driver. It builds the same
 structures with ctypes, whose fields have names. The test therefore finds a number at a wrong offset.
@@ -58,7 +58,7 @@ class FrameInterval(ctypes.Structure):
 
 
 def request_number(number: int, structure: type[ctypes.Structure]) -> int:
-    """The kernel's _IOWR('V', number, structure)."""
+    """Return the request that the kernel's macro _IOWR('V', number, structure) makes."""
     return 3 << 30 | ctypes.sizeof(structure) << 16 | ord("V") << 8 | number
 
 

@@ -1,4 +1,4 @@
-"""``q2r2 cameras``, which takes a picture with each camera of a cell and says which give none, and why."""
+"""``q2r2 cameras`` takes a picture with each camera of a cell. It says which cameras give no picture, and why."""
 
 from __future__ import annotations
 

@@ -99,7 +99,7 @@ def test_a_cell_that_passes_all_steps_is_signed_off_and_may_run(
     cell: Path, virtual: Callable[..., None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     virtual()
-    # Nearer postures are sufficient without noise, and slow arms reach them sooner.
+    # Without noise, postures that are nearer to each other are sufficient, and slow arms reach them sooner.
     monkeypatch.setattr("q2r2_control.pipeline.commissioning._SPREAD", 0.4 * _SPREAD)
     before = q2r2("run", str(cell), "--input", "scripted")
     assert before.exit_code == 2

@@ -18,7 +18,7 @@ WIDE = (10.0,) * 7
 
 def test_jitter_is_measured_against_the_cabinets_period_even_if_messages_are_missing() -> None:
     cabinet = Cabinet(CabinetSettings(*(WIDE,) * 5, period=0.005), StillArm((0.5,) * 7))
-    # One message is a millisecond late. One message is lost before the last message.
+    # The fourth message is 1 ms late, and the fifth message is lost.
     times = [0.0, 0.005, 0.010, 0.016, 0.026]
     sent = [cabinet.send(0.0) for _ in range(6)]
     heard = [(sent[index], time) for index, time in zip((0, 1, 2, 3, 5), times, strict=True)]

@@ -1,4 +1,4 @@
-"""A run refuses a cell in which the check finds a fault, unless it is forced."""
+"""A run refuses a cell in which the check finds a fault, unless the option --force is given."""
 
 from __future__ import annotations
 

@@ -65,7 +65,7 @@ def test_the_checks_of_gymnasium_pass(space: ActionSpace) -> None:
 
 
 def script(task: str, env: TaskEnv, step: int) -> npt.NDArray[np.float32]:
-    """Return the action of a step that does the same as the demo's hands: tool poses and openings."""
+    """Return the action (tool poses and openings) with which a step does the same as the demo's hands."""
     work, t, poses, openings = WORKS[task], step / RATE, [], []
     for arm in SIDES:
         points = work.tools.get(arm, ((1.0, *HOME[arm], 0.0, 0.0),))

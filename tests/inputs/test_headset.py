@@ -1,4 +1,4 @@
-"""The headset server over real TCP: its messages to the app, clients with faults, and that the loop never waits."""
+"""The headset server over real TCP sends messages to the app, drops faulty clients, and never lets the loop wait."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The report of headset-check: the direction of each hand's movement, and advice if data are missing."""
+"""The report of headset-check names the direction of each hand's movement, and gives advice if data are missing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The listener of the headset server: bounded rates, a log with few lines, who may drive, and texts about addresses."""
+"""The headset server's listener bounds rates, logs few lines, decides who drives, and makes texts about addresses."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_a_rate_limit_allows_the_same_count_in_each_period_even_if_the_period_be
 
 
 class Lines(logging.Logger):
-    """A logger that keeps its lines, and the log that writes them."""
+    """A logger that keeps its lines, and :attr:`log_of_hosts`, which writes to this logger."""
 
     def __init__(self) -> None:
         super().__init__("lines")

@@ -209,7 +209,7 @@ def test_human_hands_that_carry_a_light_box_are_not_taken_for_a_moving_frame(
 
 
 def snatch(t: float) -> pin.SE3:
-    """Return the motion of both hands: 0.2 m to and fro, at 18 m/s^2 up to 1.2 m/s, and each time a sudden stop."""
+    """Return a motion to and fro by 0.2 m. It accelerates at 18 m/s^2 up to 1.2 m/s, and stops suddenly each time."""
     stroke, phase = divmod(t, 0.4)
     ramp = 1.2 / 18.0
     way = min(9.0 * min(phase, ramp) ** 2 + 1.2 * max(phase - ramp, 0.0), 0.2)

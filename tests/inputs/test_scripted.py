@@ -1,4 +1,4 @@
-"""Scripted hands: the properties on which the demo and the tests of tracking rely."""
+"""Scripted hands have the properties on which the demo and the tests of tracking rely."""
 
 from __future__ import annotations
 

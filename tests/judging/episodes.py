@@ -106,9 +106,9 @@ def frame_times(seconds: float = 4.0) -> Array:
 
 # Rate of ticks [Hz]. It is low, and substeps are longer than by default, because ticks take most of a test's time.
 RATE = 250.0
-DURATION = 4.0  # [s]
-PRESS, START = 0.2, 0.5  # [s]
-_PRESSED = 0.1  # [s]
+DURATION = 4.0  # Duration of a recorded episode [s].
+PRESS, START = 0.2, 0.5  # Times at which the press and the motion of the hands begin [s].
+_PRESSED = 0.1  # Duration of a press [s].
 _BINDINGS = {"trigger": "toggle", "grip": "discard", "stick_up": "mark", "stick_down": "success"}
 EPISODES = TeleopSettings.model_validate({"bindings": {name: f"record_{does}" for name, does in _BINDINGS.items()}})
 

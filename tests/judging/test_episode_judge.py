@@ -75,7 +75,7 @@ class PatientRun:
 
 
 def names_of(judged: list[Judged]) -> list[list[str]]:
-    """Return the names of each episode's reasons."""
+    """Return, for each episode, the names of the reasons to discard it."""
     return [[reason.name for reason in one.verdict.reasons] for one in judged]
 
 

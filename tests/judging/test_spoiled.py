@@ -65,7 +65,7 @@ def test_an_unspoiled_episode_with_pictures_is_kept_and_its_pictures_come_on_tim
 
 
 def test_an_episode_of_a_smooth_circle_with_a_small_camera_is_kept(tmp_path: Path) -> None:
-    """The speed of the tools hardly changes, so the pictures agree almost equally well with many different lags."""
+    """The tools' speed hardly changes, so pictures fit many lags almost equally well. The judge finds no large lag."""
     needs_opengl()
     front = CameraConfig(position=(1.9, 0.0, 1.0), look_at=(0.4, 0.0, 0.3), width=64, height=48, rate=30.0)
     loop = pipeline("circle", "mujoco", cameras={"front": front})

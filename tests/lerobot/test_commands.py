@@ -42,7 +42,7 @@ ROLLS_OUT = Path(sys.executable).with_name("lerobot-rollout").exists()
 
 
 def command(program: str, folder: Path, *options: str) -> list[str]:
-    """Return a command of lerobot whose robot is a cell, which is recorded in ``folder``."""
+    """Return a command of lerobot whose robot is a cell. Its run is recorded in ``folder``."""
     robot = {"type": "q2r2_cell", "cell": folder / "cell.yaml", "simulated_time": "true", "rate": FPS}
     robot |= {"record": folder / "recordings"}
     return [str(Path(sys.executable).with_name(program)), *(f"--robot.{key}={robot[key]}" for key in robot), *options]
@@ -216,7 +216,7 @@ def test_a_dataset_that_lerobot_records_has_the_same_numbers_as_an_export_of_the
 
 
 def test_the_command_lerobot_replay_repeats_the_motion_of_a_dataset(folder: Path, exported: Path) -> None:
-    rate = 500  # A slower loop follows a target less closely [Hz].
+    rate = 500  # Rate of the loop [Hz]. A slower loop follows a target less closely.
     write_cell(folder, {"loop_rate_hz: auto": f"loop_rate_hz: {rate}.0"})
     options = ("--dataset.repo_id=q2r2/circle", f"--dataset.root={exported}", "--dataset.episode=0")
     run(command("lerobot-replay", folder, *options, "--play_sounds=false"), folder)

@@ -142,7 +142,7 @@ def test_arms_behind_ros_follow_actions_too(tmp_path: Path, monkeypatch: pytest.
 
 
 def assert_follows_behind(robot: Robot, module: str, *arguments: str) -> None:
-    """Assert that the arms of another program follow. The program is started here, and may take long to start."""
+    """Assert that arms behind another program follow. The program is started here, and may take long to start."""
     program = subprocess.Popen([sys.executable, "-m", module, *arguments], cwd=ROOT, env=os.environ)
     try:
         while not robot.is_connected:

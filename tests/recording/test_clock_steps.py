@@ -1,4 +1,4 @@
-"""Clocks that are changed while a recording is made."""
+"""The steps of a clock that is set while a recording is made are found."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Recordings that another program has rewritten, with its own chunks and order."""
+"""Recordings can be read after another program has rewritten them with its own chunks and order."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from q2r2_control.recording.tick_rows import SAMPLE_FIELDS, tick_type
 from tests.recording.runs import ARMS, JOINTS, file_of, pipeline, record
 
 _One = tuple[Schema | None, Channel, McapMessage]
-DURATION = 0.7  # A run of this duration has more ticks than a TickAssembly keeps back [s].
+DURATION = 0.7  # Duration of a run [s]. The run has more ticks than a TickAssembly keeps back.
 
 
 class Read(NamedTuple):
@@ -138,7 +138,7 @@ def test_a_file_that_is_sorted_by_topic_so_that_ticks_come_without_their_hand_sa
 
 
 def test_a_cut_file_of_another_writer_is_read_up_to_the_cut(file: Path, ours: Read, tmp_path: Path) -> None:
-    """Only one tick is left out: the tick of which the last whole chunk has some messages, but not all."""
+    """Only one tick is left out. The last whole chunk has some of this tick's messages, but not all of them."""
     again = written_again(file, tmp_path / "again.mcap", in_order(file), chunk_size=3_000)
     data, cut, lengths = again.read_bytes(), tmp_path / "cut.mcap", []
     for size in np.linspace(0.3, 0.95, 25) * len(data):

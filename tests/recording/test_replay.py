@@ -175,7 +175,7 @@ def test_the_replay_of_a_run_that_a_fault_ended_ends_with_the_same_fault(tmp_pat
 
 
 class SometimesLate:
-    """A solver without a solution for every seventh problem, as if it had taken too long."""
+    """A solver that returns no solution for every seventh problem, as if it had taken too long."""
 
     def __init__(self, solver: Solver) -> None:
         self._solver, self.count = solver, 0

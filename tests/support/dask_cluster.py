@@ -14,7 +14,7 @@ from tests.support.modules import ROOT
 
 
 class DaskCluster:
-    """A scheduler and workers as processes. :meth:`close` ends only these processes."""
+    """A Dask scheduler and workers, each in its own process. :meth:`close` ends only these processes."""
 
     def __init__(self, folder: Path) -> None:
         self._folder, self._processes = folder, list[subprocess.Popen[bytes]]()
@@ -59,7 +59,7 @@ class DaskCluster:
 
 
 def _wait(process: subprocess.Popen[bytes], condition: Callable[[], bool]) -> None:
-    """Wait until ``condition`` holds, however long the process takes; fail if the process ends before."""
+    """Wait until ``condition`` holds, however long the process takes. Fail if the process ends before that."""
     while not condition():
         assert process.poll() is None, f"{process.args!r} ended"
         time.sleep(0.05)

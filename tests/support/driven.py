@@ -37,7 +37,7 @@ class Driven:
         self.q, self.v, self.a = q, np.zeros_like(q) if v is None else v, np.zeros_like(q)
 
     def drive(self, seconds: float, towards: Scenario | Targets | None = None) -> Reference:
-        """Step for ``seconds`` [s] towards fixed or moving targets, and return the last reference."""
+        """Step the controller for ``seconds`` [s] towards fixed or moving targets, and return the last reference."""
         for _ in range(max(round(seconds / self.dt), 1)):
             targets = towards(self.ticks * self.dt, self.start) if callable(towards) else towards or {}
             reference = self.controller.step(targets, self.dt)

@@ -26,7 +26,7 @@ from tests.support.reasons import kinds
 
 START = {"left": (0.3, 0.2, 1.1), "right": (0.3, -0.2, 1.1)}  # Positions of the hands [m].
 PERIOD = 1.0 / 72.0  # Period of samples [s].
-PRESS = 0.12  # Duration of a press, which is longer than a chord's window [s].
+PRESS = 0.12  # Duration of a press [s]. It is longer than the window of a chord.
 NOISE = 2e-5  # Noise of a position [m].
 _PATIENCE = 60.0  # Longest wait in real time [s].
 _AT_REST = 0.5  # Time in which a released arm comes to rest [s].
@@ -99,7 +99,7 @@ class Operator:
         eventually(lambda: self._server.statistics.peer is None)
 
     def wait_until_read(self) -> None:
-        """Wait until the server has read all messages, which it answers in their order."""
+        """Wait until the server has read all messages. It answers in order, so one more answer shows this."""
         assert self.headset is not None
         self.headset.send(self.headset.command("__topic_list"))
         self.headset.read_until("__topic_list", _PATIENCE)
@@ -215,7 +215,7 @@ class InStepRun:
 
     @property
     def states(self) -> set[str]:
-        """Return the states of both arms at the end."""
+        """Return the states of both arms at the end of the script."""
         return set(self.ticks[-1].states.values())
 
     @property

@@ -14,14 +14,14 @@ from q2r2_control.config.cell import Config
 from q2r2_control.config.cell_file import load_config
 
 TABLE = 0.2  # Height of the table's top [m].
-# This is a block of the demo, gripped 13 mm above its middle.
+# BLOCK is a block of the demo. The gripper holds it 13 mm above the block's middle.
 BLOCK: dict[str, Any] = {"box": (0.04, 0.04, 0.06), "at": (0.0, 0.0, 0.013), "mass": 0.1}
 GRIP = TABLE + 0.03 + 0.013  # Height of a tool that has gripped the block on the table [m].
 _DOWN = pin.rpy.rpyToMatrix(np.pi, 0.0, np.pi)  # The tools point down as at home.
 
 
 def cell(left: dict[str, Any] | None, right: dict[str, Any] | None = None) -> Config:
-    """Return the shipped cell with an object in each gripper, or None. No result depends on the clock."""
+    """Return the shipped cell with these objects for the grippers, or None. No result depends on the clock."""
     data = load_config("config/dual_iiwa7.yaml").model_dump()
     data["arms"]["left"]["gripper"]["object"], data["arms"]["right"]["gripper"]["object"] = left, right
     data["control"]["solve_time_limit"] = None

@@ -37,7 +37,7 @@ class PageClient:
         self.buttons: dict[str, str] = {}  # Identifiers of buttons by label.
         self.drawn: set[str] = set()  # Names of drawn meshes.
         self.pictures: list[bytes] = []  # Pictures of cameras, in the order of their arrival.
-        # The page ignores presses of a browser that has not sent its camera.
+        # The page ignores presses of a browser that has not sent its camera, so this client sends a camera.
         self.send("ViewerCameraMessage", **_CAMERA)
 
     def __enter__(self) -> Self:

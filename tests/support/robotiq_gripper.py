@@ -17,7 +17,7 @@ _STEP = 25  # Change of the gripper's position in one step. The full range is 25
 
 
 class SimulatedGripper:
-    """A context manager with a thread that serves the gripper. ``stop`` drops the connection, ``start`` restores it."""
+    """A context manager with a thread that serves the gripper. ``stop`` drops and ``start`` restores the connection."""
 
     def __init__(self, framer: FramerType = FramerType.SOCKET) -> None:
         self._framer, self.port = framer, 0

@@ -20,7 +20,7 @@ def pose_error(wanted: pin.SE3, pose: pin.SE3) -> Array:
 
 
 DT = 0.001
-_ROUNDING = 1e-9  # [Nm]
+_ROUNDING = 1e-9  # Tolerance for rounding errors [Nm].
 _NO_REPORT = StepReport(StepStatus.OK, (), (), ("", ""), np.inf, True, False, 0.0, 0.0)
 
 

@@ -56,7 +56,7 @@ def _finger(side: str, y: float, yaw: float, drive: str) -> str:
 
 
 def hand_urdf() -> str:
-    """Return the hand as a model of a tool, with its frame between the tips."""
+    """Return the URDF of the hand as a tool. The tool frame is between the tips."""
     return (
         f'<robot name="turning_hand"><link name="palm">{_shape("0 0 0.045", "0 0 0", 0.035, 0.05)}</link>'
         + _finger("one", -1.0, np.pi, "drive")

@@ -14,7 +14,7 @@ from q2r2_control.inputs.way_points import minimum_jerk
 from q2r2_control.types import SIDES, Array
 
 START = {"left": np.array([0.35, 0.2, 1.1]), "right": np.array([0.35, -0.2, 1.1])}
-PERIOD = 1.0 / 72.0  # [s]
+PERIOD = 1.0 / 72.0  # Period of samples [s].
 
 # The common motion: a function of the time [s] that returns the pose of the object, relative to its pose at 0 s.
 Motion = Callable[[float], pin.SE3]

@@ -34,7 +34,7 @@ ARGUMENTS = [
 # This style hides the warning that drawing is slow, because the warning covers an arm.
 HIDDEN = "[class*=mantine-Notification] {display: none !important}"
 VIEW = {"width": 680, "height": 360}
-PATIENCE = 600.0  # Timeout far above what a page takes when a processor draws it beside ten other programs [s].
+PATIENCE = 600.0  # Timeout [s]. A page needs far less, even if a processor draws it beside ten other programs.
 
 
 _URL = r"(?:page:|webxr: open) (http\S+)\n"
@@ -75,7 +75,7 @@ class WebRun:
         self._process.send_signal(signal.SIGINT)
 
     def kill(self) -> None:
-        """End a run that a failed test has left, which would occupy a processor during the next test."""
+        """End a run that a failed test has left. Otherwise it would occupy a processor during the next test."""
         self._process.kill()
         self._process.communicate()
 
@@ -126,7 +126,7 @@ def wait_for(page: Page, text: str) -> None:
 
 
 def tool(page: Page, arm: int = 0) -> Array:
-    """Return the position (3,) of a tool from the panel [m]."""
+    """Return the position (3,) of a tool that the panel shows [m]."""
     return np.array([float(number) for number in table(page)["tool [m]"][arm].split()])
 
 
@@ -140,7 +140,7 @@ def pixels(page: Page) -> Array:
 
 
 def on_screen(page: Page, point: Array) -> tuple[float, float]:
-    """Return where the first view shows a point (3,) of the world [m], in the page's pixels."""
+    """Return the pixel of the page at which the first view shows a point (3,) of the world [m]."""
     robot = Robot.from_config(cell())
     eye, middle = first_view(robot.model, robot.home)
     forward = (middle - eye) / np.linalg.norm(middle - eye)
@@ -181,9 +181,9 @@ def drag(page: Page, arm: str, to: float, at: Array | None = None) -> None:
 
 
 def on_arrow(page: Page, arm: str, along: float, at: Array | None = None) -> tuple[float, float]:
-    """Return the pixel of a point on the arrow of a tool, ``along`` its z axis [m].
+    """Return the pixel of a point on the arrow of a tool. The point is at ``along`` [m] on the tool's z axis.
 
-    The tool has its rotation at home, and the position ``at`` (3,) [m], by default that at home.
+    The tool has the rotation that it has at home. Its position is ``at`` (3,) [m], by default its position at home.
     """
     robot = Robot.from_config(cell())
     pose = robot.tool_pose(robot.home, arm)

@@ -203,7 +203,7 @@ def test_hands_are_lost_when_the_page_loses_the_focus_and_come_back_only_when_it
     wait_until(lambda: page.evaluate("draw() || window.hands.at(-1).pose"))
 
 
-# JavaScript that stops the clock and counts pictures. It reports each picture as finished when the page asks for it.
+# JavaScript that stops the clock and counts pictures. It reports each picture as finished when the page asks.
 COUNTING = """(() => {
     window.clock = performance.now();
     performance.now = () => window.clock;

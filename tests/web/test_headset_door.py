@@ -1,4 +1,4 @@
-"""Who may open a headset's page: hosts, tokens and certificates; and headsets on a USB cable."""
+"""Hosts, tokens and certificates decide who may open a headset's page. A headset may also use a USB cable."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A run does not change, and its loop does not wait, if there are many pages, slow or hostile pages, or frozen ones."""
+"""Many pages, and slow, hostile or frozen pages, do not change a run and do not let its loop wait."""
 
 from __future__ import annotations
 

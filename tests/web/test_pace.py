@@ -1,4 +1,4 @@
-"""The advice for a browser that sends the positions of a dragged tool too slowly."""
+"""A browser that sends the positions of a dragged tool too slowly gets advice."""
 
 from __future__ import annotations
 

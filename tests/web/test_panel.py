@@ -1,4 +1,4 @@
-"""The content of the panel of the page: its order, its words, and what is left out."""
+"""What the panel of the page shows, in which order and in which words, and what it leaves out."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pictures of a cell's cameras come to its page."""
+"""The page of a run shows the pictures of the cell's cameras."""
 
 from __future__ import annotations
 

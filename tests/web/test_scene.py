@@ -1,4 +1,4 @@
-"""The first view of the page."""
+"""The first view of the page shows all joints of both arms."""
 
 from __future__ import annotations
 
