@@ -1,4 +1,4 @@
-"""A RealSense camera without hardware: the software device of its own library, whose frames a test gives it."""
+"""A RealSense camera without hardware: a software device of pyrealsense2, which gets its frames from a test."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 
 from tests.cameras.videos import HEIGHT, WIDTH, numbered
 
-SERIAL, FPS, UNIT = "042", 30, 1e-4  # Unit of depth [m].
+SERIAL, FPS, UNIT = "042", 30, 1e-4  # Serial number, frames per second, unit of depth [m].
 
 
 class SoftwareRealSense:
@@ -35,11 +35,11 @@ class SoftwareRealSense:
         return stream
 
     def show(self, number: int, time_of_day: float) -> None:
-        """Give a frame of colour that shows a ``number``, captured at a time [s]."""
+        """Give a colour frame that shows ``number`` and was captured at ``time_of_day`` [s]."""
         self._give(self._colour, self._of_colour, numbered(number, self._size), time_of_day)
 
     def show_depth(self, depth: npt.NDArray[np.uint16], time_of_day: float) -> None:
-        """Give a frame of depth (height, width), in multiples of :data:`UNIT`, captured at a time [s]."""
+        """Give a depth frame (height, width), in multiples of :data:`UNIT`, captured at ``time_of_day`` [s]."""
         self._give(self._depth, self._of_depth, depth, time_of_day)
 
     def _give(self, sensor: Any, profile: Any, pixels: npt.NDArray[Any], time_of_day: float) -> None:

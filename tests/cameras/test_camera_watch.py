@@ -10,7 +10,7 @@ from q2r2_control.config.recording import CameraConfig
 from q2r2_control.wording import sentence
 
 CAMERA = CameraConfig(device=0, width=64, height=48, rate=20.0)
-LATENCY = 0.1  # [s]
+LATENCY = 0.1  # Time from the capture of a picture to its receipt [s].
 
 
 def watch() -> CameraWatch:
@@ -38,7 +38,7 @@ def test_a_camera_with_small_jitter_is_not_reported_and_misses_no_picture() -> N
     assert watched.missing == 0
 
 
-def test_a_camera_that_stops_is_reported_once_with_its_reason_and_again_when_it_is_back() -> None:
+def test_a_camera_that_stops_is_reported_once_with_the_reason_and_its_return_is_reported_too() -> None:
     watched = watch()
     told(watched, every(0.05, 0.0, 1.0))
     assert watched.look(100.95 + LATENCY + 0.99) == []
@@ -49,14 +49,14 @@ def test_a_camera_that_stops_is_reported_once_with_its_reason_and_again_when_it_
     assert watched.missing == 39
 
 
-def test_a_camera_that_gives_no_picture_at_all_misses_all_of_them() -> None:
+def test_if_a_camera_gives_no_picture_at_all_every_due_picture_counts_as_missing() -> None:
     watched = watch()
     assert [sentence(one) for one in watched.look(101.5)] == ["camera front: no picture for 1.5 s"]
     watched.finish(102.0)
     assert watched.missing == 40
 
 
-def test_a_slow_camera_is_reported_once_until_it_is_fast_enough() -> None:
+def test_a_slow_camera_is_reported_once_and_again_only_after_it_was_fast_enough() -> None:
     watched = watch()
     assert told(watched, every(0.05, 0.0, 3.0)) == []
     assert told(watched, every(0.1, 3.0, 8.0)) == ["camera front: 15.7 pictures a second instead of 20"]
@@ -72,7 +72,7 @@ def test_pictures_of_another_size_are_reported_once() -> None:
     assert told(watched, every(0.05, 2.0, 3.0)) == []
 
 
-def test_pictures_that_are_received_late_but_steadily_do_not_count_as_a_stop() -> None:
+def test_a_camera_whose_pictures_are_received_late_but_steadily_does_not_count_as_stopped() -> None:
     watched = watch()
     for time in every(0.05, 0.0, 3.0):
         assert watched.add(100.0 + time, 160.0 + time, 64, 48) == [] or time == 0.0
@@ -94,7 +94,7 @@ def test_missing_pictures_are_counted_whatever_the_jitter_and_the_exact_rate(fps
 @pytest.mark.parametrize(
     ("fps", "kept"), [(30.0, 300), (29.97, 300), (60.0, 300), (45.0, 300), (120.0, 300), (15.0, 150)]
 )
-def test_a_camera_that_is_too_fast_is_thinned_out_to_its_rate(fps: float, kept: int) -> None:
+def test_pictures_of_a_camera_that_is_too_fast_are_thinned_out_to_the_configured_rate(fps: float, kept: int) -> None:
     thinning = Thinning(30.0)
     times = [at / fps + (0.004 if at % 2 else 0.0) for at in range(round(10 * fps))]
     assert sum(map(thinning.keeps, times)) == pytest.approx(10.0 * min(fps, 30.0), abs=2)

@@ -6,7 +6,8 @@ import pytest
 
 from q2r2_control.cameras.loop_times import LoopTimes, TickTime
 
-TICKS = ((10.0, 10.0), (10.01, 10.01), (10.05, 10.05))  # By the computer's clock and by that of the loop [s].
+# The time of each tick by the computer's clock, and by the loop's clock [s].
+TICKS = ((10.0, 10.0), (10.01, 10.01), (10.05, 10.05))
 
 
 def times_of(ticks: tuple[tuple[float, float], ...] = TICKS) -> LoopTimes:

@@ -31,16 +31,18 @@ pytest.importorskip("cv2")
         pytest.param(100_500.0, 99.9, id="a stamp of the future does not count"),
     ],
 )
-def test_the_time_of_a_picture_is_that_of_its_driver_if_this_time_is_possible(stamp_ms: float, captured: float) -> None:
+def test_a_picture_has_the_time_that_the_driver_stamped_if_this_time_is_possible(
+    stamp_ms: float, captured: float
+) -> None:
     from q2r2_control.cameras.device import capture_time
 
     assert capture_time(100.0, stamp_ms, 0.1) == pytest.approx(captured)
 
 
 class Stream(BaseHTTPRequestHandler):
-    """A network camera whose pictures show numbers, in Motion JPEG by HTTP."""
+    """A network camera that sends Motion JPEG over HTTP. Each picture shows its own number."""
 
-    sent: dict[int, float]  # By number, the time just before it was sent [s].
+    sent: dict[int, float]  # By number, the time just before the picture was sent [s].
     paths: list[str]  # The paths of all requests.
 
     def do_GET(self) -> None:
@@ -90,19 +92,21 @@ def test_a_network_camera_of_another_size_is_refused(address: str) -> None:
         open_device(CameraConfig(device=address, width=WIDTH, height=2 * HEIGHT))
 
 
-def test_a_variable_of_the_environment_completes_an_address(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_environment_variable_in_an_address_is_replaced_by_its_value(
+    address: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("CAMERA_STREAM", "stream.mjpg")
     secret = address.replace("stream.mjpg", "$CAMERA_STREAM")
     open_device(CameraConfig(device=secret, width=WIDTH, height=HEIGHT)).close()
     assert Stream.paths == ["/stream.mjpg"]
 
 
-def test_no_message_has_the_password_of_an_address() -> None:
+def test_an_error_about_an_address_does_not_contain_its_password() -> None:
     with pytest.raises(CameraError, match=r"http://127\.0\.0\.1:9/stream: no stream of pictures") as error:
         open_device(CameraConfig(device="http://me:secret@127.0.0.1:9/stream"))
     assert "secret" not in str(error.value)
 
 
-def test_a_name_that_is_not_a_device_is_named_with_the_reason() -> None:
+def test_the_fault_of_a_name_that_is_no_camera_gives_the_reason() -> None:
     assert str(fault_of("/dev/video250")).startswith("no such device; allowed: ")
     assert fault_of("/dev/null") == "no camera: it is no V4L2 device"

@@ -1,4 +1,4 @@
-"""Colour and depth of a RealSense camera, from the software device of its library: no camera is needed."""
+"""Colour and depth of a RealSense camera come from the software device of its library, so no camera is needed."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tests.cameras.videos import HEIGHT, WIDTH, number_in, number_of_jpeg
 pytest.importorskip("pyrealsense2")
 pytest.importorskip("cv2")
 
-DEEP = np.arange(WIDTH * HEIGHT, dtype=np.uint16).reshape(HEIGHT, WIDTH) * 21  # It needs all 16 bits.
+DEEP = np.arange(WIDTH * HEIGHT, dtype=np.uint16).reshape(HEIGHT, WIDTH) * 21  # The values need all 16 bits.
 
 
 def camera(**changes: object) -> CameraConfig:
@@ -53,7 +53,7 @@ def test_colour_and_depth_have_the_time_of_their_capture(clock: StoppedClock) ->
     assert (colour.time, depth.time) == pytest.approx((99.8, 99.9), abs=1e-3)
 
 
-def test_without_depth_only_colour_is_read_and_turned(clock: StoppedClock) -> None:
+def test_without_depth_only_the_colour_picture_is_read_and_turned(clock: StoppedClock) -> None:
     source = SoftwareRealSense()
     device = RealSense(camera(rotation=90, width=HEIGHT, height=WIDTH), source.device)
     source.show_depth(DEEP, clock.time())
@@ -93,7 +93,7 @@ def test_a_camera_is_described_by_its_serial_number_its_name_and_its_formats() -
 
 
 @pytest.mark.parametrize("changes", [{"device": 0}, {"device": "a.mp4"}])
-def test_depth_is_refused_for_other_cameras(changes: dict[str, Any]) -> None:
+def test_depth_is_refused_for_a_camera_that_is_no_realsense(changes: dict[str, Any]) -> None:
     with pytest.raises(ConfigError, match="depth: allowed: with device: realsense:SERIAL"):
         camera(depth=True, **changes)
 

@@ -1,4 +1,4 @@
-"""Formats of V4L2 devices, by the structures of the kernel's <linux/videodev2.h>.
+"""The formats of V4L2 devices are read in the structures of the kernel's <linux/videodev2.h>.
 
 The computers that run the tests have no camera, so a function answers instead of a driver. It builds the same
 structures with ctypes, whose fields have names. The test therefore finds a number at a wrong offset.
@@ -58,7 +58,7 @@ class FrameInterval(ctypes.Structure):
 
 
 def request_number(number: int, structure: type[ctypes.Structure]) -> int:
-    """The kernel's _IOWR('V', number, structure)."""
+    """Return the request that the kernel's macro _IOWR('V', number, structure) makes."""
     return 3 << 30 | ctypes.sizeof(structure) << 16 | ord("V") << 8 | number
 
 
@@ -83,7 +83,9 @@ def answer(file: int, request: int, data: bytes) -> bytes:
         raise OSError(errno.EINVAL, "no more entries") from error
 
 
-def test_all_formats_sizes_and_rates_are_listed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_all_formats_sizes_and_rates_of_a_v4l2_device_are_listed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(v4l2, "ioctl", answer)
     (tmp_path / "video0").touch()
     assert list(map(str, v4l2.formats_of(str(tmp_path / "video0")))) == [

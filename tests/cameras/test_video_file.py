@@ -30,21 +30,21 @@ def test_each_picture_has_the_time_at_which_the_file_shows_it(tmp_path: Path) ->
     np.testing.assert_allclose([shot.time - shots[0].time for shot in shots], np.arange(12) / FPS, atol=1e-6)
 
 
-def test_a_picture_is_not_given_before_it_is_captured(tmp_path: Path) -> None:
+def test_no_picture_is_given_before_the_time_of_its_capture(tmp_path: Path) -> None:
     device = open_device(camera_of(write_video(tmp_path / "numbers.avi", range(3))))
     for _ in range(3):
         shot = device.read()
         assert time.monotonic() >= shot.time
 
 
-def test_a_file_that_is_not_repeated_ends(tmp_path: Path) -> None:
+def test_a_video_that_is_not_repeated_ends_with_an_error(tmp_path: Path) -> None:
     device = open_device(camera_of(write_video(tmp_path / "numbers.avi", range(2)), repeat=False))
     assert [number_in(device.read().pixels) for _ in range(2)] == [0, 1]
     with pytest.raises(CameraError, match="the video has ended"):
         device.read()
 
 
-def test_pictures_are_turned_clockwise(tmp_path: Path) -> None:
+def test_the_rotation_of_a_camera_turns_its_pictures_clockwise(tmp_path: Path) -> None:
     path = write_video(tmp_path / "numbers.avi", range(2))
     turned = camera_of(path, rotation=90, width=HEIGHT, height=WIDTH)
     device = open_device(turned)
@@ -63,14 +63,14 @@ def test_pictures_are_turned_clockwise(tmp_path: Path) -> None:
         ({"rotation": 90}, "gives no 64x48; the nearest that it gives is 48x64; allowed: width: 48, height: 64"),
     ],
 )
-def test_the_error_for_a_file_of_another_size_names_its_size(
+def test_the_error_for_a_video_of_another_size_names_the_size_of_the_video(
     tmp_path: Path, changes: dict[str, object], says: str
 ) -> None:
     with pytest.raises(CameraError, match=says):
         open_device(camera_of(write_video(tmp_path / "numbers.avi", range(2)), **changes))
 
 
-def test_a_file_that_is_missing_or_no_video_is_named(tmp_path: Path) -> None:
+def test_the_error_names_a_file_that_is_missing_or_is_no_video(tmp_path: Path) -> None:
     (tmp_path / "text.mp4").write_text("no video")
     for name, says in (("none.mp4", "no such file"), ("text.mp4", "no video that OpenCV can read")):
         with pytest.raises(CameraError, match=says) as error:

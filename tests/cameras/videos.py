@@ -1,4 +1,4 @@
-"""Videos whose pictures show their own number, so that a test knows when each was captured."""
+"""Videos whose pictures show their own number, so that a test knows when each picture was captured."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from PIL import Image
 
 WIDTH, HEIGHT = 64, 48  # [pixels]
 FPS = 25.0  # [pictures/s]
-# A picture that is late by two periods can be neither judged well nor exported. Even busy machines keep this rate.
+# Even busy machines keep this rate. A picture that is late by two periods can be neither judged well nor exported.
 SLOW_FPS = 5.0  # [pictures/s]
 _BITS = 8  # The number of bits of a picture's number. Each bit is a bright or dark column of pixels.
 _MIDDLE = 128

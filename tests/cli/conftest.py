@@ -21,7 +21,7 @@ def _no_notice_of_compiling(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(autouse=True)
 def _no_lines_of_progress(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A busy computer may take so long for a command that it would print lines about its progress."""
+    """A command that takes long on a busy computer prints lines about its progress, so these are switched off."""
     monkeypatch.setattr("q2r2_control.cli.output._BETWEEN_LINES_S", math.inf)
 
 

@@ -19,7 +19,7 @@ def file(tmp_path: Path) -> Path:
 
 
 def offered(monkeypatch: pytest.MonkeyPatch, *typed: Any) -> list[Any]:
-    """Answer the next questions by ``typed``, where None accepts the default. Return a list that gets the defaults."""
+    """Answer the next questions by ``typed``, where None accepts the default. Return a list of the offered defaults."""
     seen: list[Any] = []
     left = list(typed)
 
@@ -32,7 +32,7 @@ def offered(monkeypatch: pytest.MonkeyPatch, *typed: Any) -> list[Any]:
     return seen
 
 
-def test_the_next_try_offers_given_answers_but_not_accepted_defaults(
+def test_the_next_try_offers_answers_that_were_typed_but_no_defaults_that_were_accepted(
     file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seen = offered(monkeypatch, 0.4, None, None, None)
@@ -49,7 +49,7 @@ def test_the_next_try_offers_given_answers_but_not_accepted_defaults(
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{", '{"about": {"left": "panda"}, "answers": {"height": 3.0}}'])
-def test_a_file_about_another_subject_and_a_damaged_file_are_not_offered(
+def test_answers_in_a_damaged_file_or_in_a_file_about_another_subject_are_not_offered(
     text: str, file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file.write_text(text)
@@ -58,14 +58,14 @@ def test_a_file_about_another_subject_and_a_damaged_file_are_not_offered(
     assert seen == [0.1]
 
 
-def test_an_answer_of_another_kind_is_not_offered(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_answer_of_another_type_is_not_offered(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file.write_text('{"about": {"left": "iiwa7"}, "answers": {"height": "high"}}')
     seen = offered(monkeypatch, None)
     assert RememberedAnswers(file, ABOUT).ask("height", 0.1) == 0.1
     assert seen == [0.1]
 
 
-def test_nothing_is_asked_offered_or_kept_if_all_defaults_are_accepted(
+def test_with_the_option_yes_no_question_is_asked_and_the_kept_answers_do_not_change(
     file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     offered(monkeypatch, 0.4)

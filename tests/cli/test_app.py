@@ -68,7 +68,9 @@ def test_the_version_is_that_of_the_installed_package() -> None:
     ],
     ids=lambda value: " ".join(value) if isinstance(value, tuple) else "",
 )
-def test_bad_usage_ends_in_exit_code_2_and_one_line_that_names_it(arguments: tuple[str, ...], named: str) -> None:
+def test_bad_usage_ends_in_exit_code_2_and_one_line_that_names_the_fault(
+    arguments: tuple[str, ...], named: str
+) -> None:
     result = q2r2(*arguments)
     assert (result.exit_code, result.stdout, result.stderr.count("\n")) == (2, "", 1)
     assert result.stderr.startswith("q2r2: ")
@@ -83,7 +85,7 @@ def test_a_cell_with_an_external_controller_is_not_run_without_ros(tmp_path: Pat
     )
 
 
-def test_a_wrong_key_ends_in_one_line_that_names_file_key_and_what_is_allowed(tmp_path: Path) -> None:
+def test_for_a_wrong_key_in_the_yaml_one_line_names_the_file_the_key_and_what_is_allowed(tmp_path: Path) -> None:
     result = q2r2("run", changed_cell(tmp_path, "obstacles:", "obstructions:"))
     assert (result.exit_code, result.stderr.count("\n")) == (2, 1)
     assert re.search(r"cell.yaml, line \d+: obstructions: unknown key; allowed here: .*obstacles", result.stderr)
@@ -100,7 +102,7 @@ def test_a_fast_run_prints_one_json_object_and_nothing_else() -> None:
 
 
 @pytest.mark.parametrize("option", ["--plant fri", "--viewer", "--rt", "--duration 4", "--seed 3", "--record rec"])
-def test_trials_of_a_demo_refuse_options_of_a_single_run(option: str) -> None:
+def test_options_of_a_single_run_are_refused_for_trials_of_a_demo(option: str) -> None:
     done = q2r2("demo", "grasp", "--seeds", "2", *option.split())
     assert done.exit_code == 2
     assert f"{option.split()[0]}" in done.stderr
@@ -123,7 +125,7 @@ def test_a_failed_task_of_the_demo_is_explained_and_changes_the_exit_code(
 
 
 @pytest.mark.slow
-def test_bench_times_free_motion_and_contact_or_the_work_motions_that_are_asked_for() -> None:
+def test_bench_measures_ticks_in_free_motion_and_in_contact_or_in_the_chosen_work_motions() -> None:
     result = q2r2("bench", "--no-peers", "--rounds", "1", "--solver", "osqp")
     assert all(text in result.stdout for text in ("free motion", "contact (!)", "q2r2_control", "p99"))
     assert all(text in result.stdout for text in ("by QP solver", "daqp", "osqp", "unsolved"))
@@ -133,7 +135,9 @@ def test_bench_times_free_motion_and_contact_or_the_work_motions_that_are_asked_
 
 
 @pytest.mark.parametrize("command", [("run", CELL), ("demo",), ("demo", "--plant", "fri")], ids=" ".join)
-def test_a_run_uses_the_solver_of_its_option(command: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_uses_the_solver_that_the_option_solver_names(
+    command: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
     chosen: list[str] = []
 
     def run_cell(config: Config, options: Any) -> Any:
@@ -147,7 +151,7 @@ def test_a_run_uses_the_solver_of_its_option(command: tuple[str, ...], monkeypat
     assert chosen == ["daqp", "osqp"]
 
 
-def test_trials_of_a_demo_use_the_solver_of_its_option(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_trials_of_a_demo_use_the_solver_that_the_option_solver_names(monkeypatch: pytest.MonkeyPatch) -> None:
     chosen: list[str] = []
 
     def try_tasks(tasks: Any, trial: partial[str], *given: Any) -> list[Any]:
@@ -159,7 +163,7 @@ def test_trials_of_a_demo_use_the_solver_of_its_option(monkeypatch: pytest.Monke
     assert chosen == ["osqp"]
 
 
-def test_a_soak_uses_the_solver_of_its_option_and_names_it() -> None:
+def test_a_soak_uses_and_reports_the_solver_that_the_option_solver_names() -> None:
     report = one_object(q2r2("soak", "--ticks", "100", "--solver", "osqp", "--json").stdout)
     assert (report["solver"], report["passed"]) == ("osqp", True)
 

@@ -1,4 +1,4 @@
-"""``q2r2 cameras``, which takes a picture with each camera of a cell and says which give none, and why."""
+"""``q2r2 cameras`` takes a picture with each camera of a cell. It says which cameras give no picture, and why."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def test_a_run_of_arms_behind_cabinets_is_recorded_judged_and_exported_with_a_ca
 
 
 @pytest.mark.slow
-def test_a_policy_with_a_real_camera_ends_with_one_line_if_the_camera_gives_no_picture(tmp_path: Path) -> None:
+def test_a_run_of_a_policy_with_a_real_camera_ends_with_one_line_if_the_camera_gives_no_picture(tmp_path: Path) -> None:
     pytest.importorskip("cv2")
     size = {"width": WIDTH, "height": HEIGHT, "rate": FPS}
     cell = str(cell_with(tmp_path, {"front": {"device": "none.avi", **size}}))
@@ -110,7 +110,7 @@ def test_a_policy_with_a_real_camera_ends_with_one_line_if_the_camera_gives_no_p
     assert "no pictures of front: real cameras keep real time; allowed: without --fast\n" in fast.stderr
 
 
-def test_without_a_cell_the_devices_of_this_computer_are_listed() -> None:
+def test_without_a_cell_the_command_cameras_lists_the_devices_of_this_computer() -> None:
     result = q2r2("cameras")
     assert result.exit_code == 0
     assert result.stdout.startswith(("/dev/video", "no V4L2 camera on this computer\n"))

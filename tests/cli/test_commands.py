@@ -24,7 +24,7 @@ def first_sentence(text: str) -> str:
 
 
 @pytest.mark.parametrize("arguments", [("--help",), (), ("rum",)], ids=["help", "no command", "a wrong command"])
-def test_the_help_imports_nothing_that_commands_need(arguments: tuple[str, ...]) -> None:
+def test_the_help_imports_no_library_that_only_commands_need(arguments: tuple[str, ...]) -> None:
     code = (
         f"import atexit, sys; sys.argv = ['q2r2', *{arguments!r}]\n"
         f"atexit.register(lambda: print('imported:', *(name for name in {HEAVY!r} if name in sys.modules)))\n"
@@ -42,7 +42,7 @@ def test_the_help_lists_every_command_with_the_first_sentence_of_its_function(co
 
 
 @EACH_COMMAND
-def test_the_example_of_a_command_stands_in_its_help_and_is_understood(command: ListedCommand) -> None:
+def test_the_example_of_a_command_is_in_its_help_and_its_options_exist(command: ListedCommand) -> None:
     loaded = load(command)
     if isinstance(loaded, typer.core.TyperGroup):
         assert all(

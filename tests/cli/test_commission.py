@@ -99,7 +99,7 @@ def test_a_cell_that_passes_all_steps_is_signed_off_and_may_run(
     cell: Path, virtual: Callable[..., None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     virtual()
-    # Nearer postures are sufficient without noise, and slow arms reach them sooner.
+    # Without noise, postures that are nearer to each other are sufficient, and slow arms reach them sooner.
     monkeypatch.setattr("q2r2_control.pipeline.commissioning._SPREAD", 0.4 * _SPREAD)
     before = q2r2("run", str(cell), "--input", "scripted")
     assert before.exit_code == 2
@@ -116,7 +116,7 @@ def test_a_cell_that_passes_all_steps_is_signed_off_and_may_run(
     for load in kept["steps"]["load"]:
         assert load["identified_kg"] == pytest.approx(load["expected_kg"], abs=0.01)
     after = q2r2("run", str(cell), "--input", "scripted", "--trajectory", "nowhere")
-    assert "nowhere" in after.stderr  # The run got as far as this fault.
+    assert "nowhere" in after.stderr  # The run was allowed, and ended at this wrong option.
     assert "joints at a tenth of their speed" in after.stderr
     assert "a tenth" not in q2r2("run", str(cell), "--trajectory", "nowhere", "--full-speed").stderr
     cell.write_text(cell.read_text(encoding="utf-8").replace("192.0.2.1", "192.0.2.2"), encoding="utf-8")
@@ -154,7 +154,7 @@ def test_a_commissioning_over_real_sockets_and_processes_goes_through_all_steps(
         assert stop["tool_speed_mm_s"] > 10.0
 
 
-def test_with_i_know_a_cell_runs_without_a_sign_off(cell: Path) -> None:
+def test_with_the_option_i_know_a_cell_runs_without_a_sign_off(cell: Path) -> None:
     done = q2r2("run", str(cell), "--input", "scripted", "--trajectory", "nowhere", "--i-know")
     assert "nowhere" in done.stderr
 
@@ -184,14 +184,16 @@ def test_the_operator_may_repeat_the_step_cabinets_after_a_poor_connection_or_a_
     assert told in line
 
 
-def test_joints_that_an_operator_does_not_recognise_end_the_commissioning(
+def test_the_commissioning_ends_if_the_operator_does_not_recognise_the_joints_that_moved(
     cell: Path, virtual: Callable[..., None]
 ) -> None:
     virtual()
     assert "the right arm's joints are not those that moved" in refused(cell, ["", "y", "", "n"])
 
 
-def test_an_arm_that_was_not_guided_needs_the_answer_confirm(cell: Path, virtual: Callable[..., None]) -> None:
+def test_for_an_arm_that_was_not_guided_the_operator_has_to_answer_confirm(
+    cell: Path, virtual: Callable[..., None]
+) -> None:
     virtual(guided=0.0)
     code, lines, _ = commission(cell, ["", "y", "confirm", "", "again", "", "n"])
     assert code == 1
@@ -209,7 +211,7 @@ def test_the_end_of_the_input_ends_the_commissioning(
 
 
 @pytest.mark.slow
-def test_an_arm_that_does_not_move_ends_the_commissioning_in_the_motion_step(
+def test_the_commissioning_ends_in_the_motion_step_if_an_arm_does_not_move(
     cell: Path, virtual: Callable[..., None]
 ) -> None:
     virtual(partial(slow_run, arm=StuckArm))
@@ -217,7 +219,7 @@ def test_an_arm_that_does_not_move_ends_the_commissioning_in_the_motion_step(
     assert line.startswith("q2r2: motion: left_A1: commanded")
 
 
-def test_a_tool_that_is_heavier_than_its_model_ends_the_commissioning_in_the_load_step(
+def test_the_commissioning_ends_in_the_load_step_if_a_tool_is_heavier_than_its_model(
     cell: Path, virtual: Callable[..., None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     virtual()
@@ -227,7 +229,7 @@ def test_a_tool_that_is_heavier_than_its_model_ends_the_commissioning_in_the_loa
     assert refused(cell, TO_THE_END).startswith("q2r2: load: the left arm carries 1.86 kg")
 
 
-def test_arms_that_go_on_when_their_program_is_killed_end_the_commissioning(
+def test_the_commissioning_ends_if_arms_go_on_moving_when_their_program_is_killed(
     cell: Path, virtual: Callable[..., None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     virtual(stopped_mm=5.0)
@@ -260,7 +262,9 @@ def interrupted(virtual: Callable[..., None]) -> Iterator[list[PendantCabinets]]
     signal.signal(signal.SIGINT, handler)
 
 
-def test_ctrl_c_brings_the_arms_to_rest_first(cell: Path, interrupted: list[PendantCabinets]) -> None:
+def test_ctrl_c_brings_the_arms_to_rest_before_it_ends_the_commissioning(
+    cell: Path, interrupted: list[PendantCabinets]
+) -> None:
     assert "motion: stopped by Ctrl-C" in refused(cell, TO_THE_END)
     for arm in SIDES:
         assert interrupted[0].cabinets[arm].trips == []
@@ -268,7 +272,7 @@ def test_ctrl_c_brings_the_arms_to_rest_first(cell: Path, interrupted: list[Pend
         assert np.abs(path.rest - path.at(path.end)).max() < 1e-9
 
 
-def test_a_measured_mount_is_written_into_the_cell_after_a_question(
+def test_a_measured_mount_is_written_into_the_cell_if_the_operator_agrees(
     cell: Path, virtual: Callable[..., None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     virtual()

@@ -39,7 +39,7 @@ def test_a_port_that_another_program_uses_is_a_fault_with_a_cure(free_cell: str)
     assert "cure: another headset.port in the YAML" in result.stdout
 
 
-def test_a_missing_or_too_old_package_is_named_with_its_pip_line() -> None:
+def test_a_missing_or_too_old_package_is_named_with_the_pip_command_that_installs_it() -> None:
     wanted = ["numpy>=999", "no-such-package-of-ours>=1", "scipy>=1", "no-such-extra>=1; extra == 'dev'"]
     found = list(doctor._packages(wanted))
     assert [finding.what.partition(":")[0] for finding in found] == ["numpy", "no-such-package-of-ours"]
@@ -55,7 +55,7 @@ def test_a_missing_extra_is_named_with_the_commands_that_need_it() -> None:
     assert not finding.stops_arms
 
 
-def test_every_named_extra_exists_in_the_package() -> None:
+def test_every_extra_that_the_doctor_names_exists_in_the_package() -> None:
     extras = metadata("q2r2_control").get_all("Provides-Extra") or []
     assert set(doctor._NEEDS_EXTRA) <= set(extras)
 

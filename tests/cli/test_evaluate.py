@@ -42,7 +42,7 @@ class Resting(Replayed):
 
 
 def rows_of_scripted_hands(task: str) -> Array:
-    """Return joint positions of the reference and openings (n, size), at the rate of the actions."""
+    """Return the reference's joint positions and the openings (n, size) of a scripted run, at the rate of actions."""
     config = coarse()
     robot, rows = Robot.from_config(config), list[Array]()
     pipeline = Pipeline(config, robot, ScriptedInput(task), MujocoPlant(robot, config), CommandMode.POSITION)
@@ -79,7 +79,7 @@ def test_a_policy_that_cannot_be_loaded_is_refused_in_one_line_before_any_trial(
     assert len(result.stderr.splitlines()) == 1
 
 
-def test_the_seed_moves_the_parts_of_a_trial(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_seed_of_a_trial_displaces_the_parts_of_its_task(monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[tuple[float, ...]] = []
 
     def note(config: object, *given: object) -> str:

@@ -23,7 +23,7 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> Sequence[Path]:
 
 
 @pytest.mark.slow
-def test_a_folder_of_recordings_becomes_tables_and_trim_leaves_out_the_time_before_the_engagement(
+def test_a_folder_of_recordings_becomes_tables_and_the_option_trim_omits_the_time_before_the_engagement(
     recordings: Sequence[Path], tmp_path: Path
 ) -> None:
     lengths = []
@@ -48,7 +48,7 @@ def test_the_training_config_of_openpi_is_printed_after_the_dataset(recordings: 
     assert (tmp_path / "circle/data/chunk-000/episode_000001.parquet").exists()
 
 
-def test_hdf5_has_the_next_frames_actions_unless_an_option_changes_this(
+def test_an_hdf5_file_has_the_actions_of_the_next_frame_unless_an_option_changes_this(
     recordings: Sequence[Path], tmp_path: Path
 ) -> None:
     h5py = pytest.importorskip("h5py", reason="the extra export is not installed")
@@ -63,7 +63,7 @@ def test_hdf5_has_the_next_frames_actions_unless_an_option_changes_this(
     assert (actions["usual", 1] != actions["plain", 0]).any()
 
 
-def test_a_bad_recording_is_left_out_and_changes_the_exit_code_unless_it_is_skipped(
+def test_a_bad_recording_is_left_out_and_changes_the_exit_code_unless_the_option_skip_bad_is_given(
     recordings: Sequence[Path], tmp_path: Path
 ) -> None:
     (tmp_path / "notes.mcap").write_text("no recording\n")
@@ -92,7 +92,7 @@ def test_discarded_episodes_are_left_out_unless_an_option_keeps_them(
     assert set(contents(tmp_path / "both")) == {f"{recordings[1].stem}.csv", "lost.csv", "units.json"}
 
 
-def test_an_interrupted_export_leaves_no_half_files_and_the_next_export_completes_it(
+def test_an_interrupted_export_leaves_no_incomplete_dataset_and_the_next_export_completes_it(
     recordings: Sequence[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def interrupted(*given: Any) -> None:

@@ -50,7 +50,7 @@ def test_a_safety_stop_ends_a_session_and_lasts_a_second() -> None:
 
 
 @pytest.mark.slow
-def test_enter_at_the_terminal_stops_all_overlays_and_starts_them_again(fri_cell: str) -> None:
+def test_a_press_of_enter_stops_all_overlays_and_the_next_press_starts_them_again(fri_cell: str) -> None:
     ours, theirs = os.openpty()
     # The first terminal that a new session opens becomes its controlling terminal.
     opening = f"import os; os.dup2(os.open({os.ttyname(theirs)!r}, os.O_RDWR), 0)"
@@ -87,7 +87,7 @@ def test_overlays_that_the_pendant_stopped_start_only_after_its_next_key_press()
     assert all(cabinet._overlay for cabinet in cabinets.values())
 
 
-def test_messages_contain_the_number_of_messages_per_answer(fri_cell: str) -> None:
+def test_each_message_of_a_cabinet_says_how_many_messages_come_per_answer(fri_cell: str) -> None:
     port = load_config(fri_cell).fri["left"].port
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
         client.bind(("127.0.0.1", port))
@@ -97,7 +97,7 @@ def test_messages_contain_the_number_of_messages_per_answer(fri_cell: str) -> No
 
 
 @pytest.mark.parametrize("arguments", [(), ("--source-port", "0")], ids=["client's port", "any port"])
-def test_messages_come_from_the_cabinets_address_and_its_clients_port_unless_an_option_differs(
+def test_messages_come_from_the_cabinets_address_and_its_clients_port_unless_an_option_changes_the_port(
     fri_cell: str, arguments: tuple[str, ...]
 ) -> None:
     port = load_config(fri_cell).fri["left"].port
@@ -128,7 +128,7 @@ def test_a_rehearsal_begins_when_all_cabinets_send(tmp_path: Path, monkeypatch: 
 
 
 @pytest.mark.slow
-def test_a_rehearsal_whose_cabinets_cannot_begin_gives_the_reason(fri_cell: str) -> None:
+def test_a_rehearsal_whose_cabinets_cannot_begin_raises_an_error_with_the_reason(fri_cell: str) -> None:
     port = load_config(fri_cell).fri["left"].port
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("127.0.0.2", port))
@@ -158,7 +158,7 @@ def test_a_run_says_that_it_waits_for_a_cabinet_and_ctrl_c_ends_the_wait(fri_cel
     assert plant.is_released(), "nothing keeps the ports"
 
 
-def test_for_a_cabinets_port_that_another_program_uses_fri_cabinet_prints_one_line(fri_cell: str) -> None:
+def test_fri_cabinet_prints_one_line_if_another_program_uses_the_port_of_a_cabinet(fri_cell: str) -> None:
     port = load_config(fri_cell).fri["right"].port
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("127.0.0.3", port))
@@ -176,13 +176,13 @@ def test_for_a_cabinets_port_that_another_program_uses_fri_cabinet_prints_one_li
         ((CELL, "--mode", "torque"), "answered every 10 ms: allowed with torques: 5 ms or less"),
     ],
 )
-def test_for_a_wrong_option_fri_cabinet_prints_one_line(arguments: tuple[str, ...], told: str) -> None:
+def test_fri_cabinet_prints_one_line_about_a_wrong_option(arguments: tuple[str, ...], told: str) -> None:
     done = q2r2("fri-cabinet", *arguments)
     assert (done.exit_code, done.stderr.count("\n")) == (2, 1)
     assert told in done.stderr
 
 
-def test_a_wrong_cabinet_is_named_with_what_is_allowed(tmp_path: Path) -> None:
+def test_check_names_a_wrong_setting_of_a_cabinet(tmp_path: Path) -> None:
     text = Path(CELL).read_text(encoding="utf-8")
     for wrong, told in (("address: 127.0.0.2", "address: here"), ("version: null", "version: 3")):
         file = tmp_path / "cell.yaml"
@@ -192,13 +192,13 @@ def test_a_wrong_cabinet_is_named_with_what_is_allowed(tmp_path: Path) -> None:
         assert "fri.left." in done.stderr
 
 
-def test_a_demo_on_another_plant_is_refused() -> None:
+def test_a_demo_on_the_kinematic_plant_is_refused() -> None:
     done = q2r2("demo", "--plant", "kinematic")
     assert done.exit_code == 2
     assert "--plant 'kinematic': allowed: mujoco, fri" in done.stderr
 
 
-def test_a_wait_for_a_simulated_plant_is_refused() -> None:
+def test_the_option_wait_is_refused_for_a_simulated_plant() -> None:
     done = q2r2("run", "config/dual_iiwa7.yaml", "--input", "scripted", "--wait", "5")
     assert done.exit_code == 2
     assert "--wait cannot be used with --plant mujoco" in done.stderr

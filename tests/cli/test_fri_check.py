@@ -18,7 +18,7 @@ WIDE = (10.0,) * 7
 
 def test_jitter_is_measured_against_the_cabinets_period_even_if_messages_are_missing() -> None:
     cabinet = Cabinet(CabinetSettings(*(WIDE,) * 5, period=0.005), StillArm((0.5,) * 7))
-    # One message is a millisecond late. Before the last one, one message is lost.
+    # The fourth message is 1 ms late, and the fifth message is lost.
     times = [0.0, 0.005, 0.010, 0.016, 0.026]
     sent = [cabinet.send(0.0) for _ in range(6)]
     heard = [(sent[index], time) for index, time in zip((0, 1, 2, 3, 5), times, strict=True)]
@@ -31,7 +31,7 @@ def test_jitter_is_measured_against_the_cabinets_period_even_if_messages_are_mis
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("cabinets")
-def test_the_messages_of_both_cabinets_are_described_and_a_cabinet_that_does_not_command_changes_the_exit_code(
+def test_fri_check_describes_both_cabinets_and_exits_with_1_if_a_cabinet_is_not_in_commanding_active(
     fri_cell: str,
 ) -> None:
     done = q2r2("fri-check", fri_cell, "--duration", "1", "--json")
@@ -47,7 +47,7 @@ def test_the_messages_of_both_cabinets_are_described_and_a_cabinet_that_does_not
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("cabinets")
-def test_a_line_says_whether_each_modbus_gripper_answers_and_none_is_moved(fri_cell: str) -> None:
+def test_a_line_says_whether_each_modbus_gripper_answers_and_no_gripper_is_moved(fri_cell: str) -> None:
     cell = read_yaml(Path(fri_cell).read_text(encoding="utf-8"))
     with SimulatedGripper() as simulated:
         for arm, port in (("left", simulated.port), ("right", 1)):
@@ -61,13 +61,13 @@ def test_a_line_says_whether_each_modbus_gripper_answers_and_none_is_moved(fri_c
     assert simulated.written == []
 
 
-def test_for_a_silent_cabinet_fri_check_prints_one_line(fri_cell: str) -> None:
+def test_fri_check_prints_one_line_if_a_cabinet_is_silent(fri_cell: str) -> None:
     done = q2r2("fri-check", fri_cell, "--wait", "0.1")
     assert done.exit_code == 2
     assert "left: no FRI message from cabinet 127.0.0.2 on port" in done.stderr.splitlines()[-1]
 
 
-def test_for_a_cell_without_cabinets_fri_check_prints_one_line() -> None:
+def test_fri_check_prints_one_line_for_a_cell_without_cabinets() -> None:
     done = q2r2("fri-check", "config/dual_iiwa7.yaml")
     assert done.exit_code == 2
     assert "fri.left: missing; allowed: the cabinet of each arm" in done.stderr.splitlines()[-1]

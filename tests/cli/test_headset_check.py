@@ -1,4 +1,4 @@
-"""Commands that serve a headset: their messages about it, and their end."""
+"""Commands that serve a headset: what they print about the headset, and how they end."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ def bound_port(running: subprocess.Popen[str]) -> int:
 
 
 def fake_headset(port: int, duration: float) -> None:
-    """Run a headset in its own process, which engages both arms and circles."""
+    """Run a fake headset in its own process. It engages both arms, and its hands move in circles."""
     arguments = ["--port", str(port), "--duration", str(duration)]
     subprocess.run([sys.executable, "-m", "tests.support.fake_headset", *arguments], check=True, timeout=30)
 
 
 @pytest.mark.slow
-def test_headset_check_shows_a_headset_in_a_process_of_its_own() -> None:
+def test_headset_check_reports_the_messages_of_a_headset_in_another_process() -> None:
     with process("headset-check", "--port", "0", "--json") as running:
         fake_headset(bound_port(running), 1.5)
         running.send_signal(signal.SIGINT)
@@ -68,7 +68,7 @@ def test_a_headset_server_on_every_network_names_the_address_for_the_app_and_the
 
 
 @pytest.mark.slow
-def test_a_host_outside_the_cells_headset_allow_is_refused(tmp_path: Path) -> None:
+def test_a_host_outside_the_networks_in_headset_allow_is_refused(tmp_path: Path) -> None:
     cell = tmp_path / "cell.yaml"
     cell.write_text(Path(CELL).read_text(encoding="utf-8").replace("allow: null", "allow: [10.0.0.0/8]"), "utf-8")
     with process("headset-check", str(cell), "--host", "0.0.0.0", "--port", "0", "--json") as running:
@@ -80,7 +80,7 @@ def test_a_host_outside_the_cells_headset_allow_is_refused(tmp_path: Path) -> No
     assert "only 10.0.0.0/8 can drive the arms" in stderr
 
 
-def test_headset_check_gives_advice_if_nothing_comes() -> None:
+def test_headset_check_gives_advice_if_no_data_arrive() -> None:
     result = q2r2("headset-check", "--port", "0", "--duration", "2.3", "--json")
     assert result.exit_code == 1
     advice = "\n".join(one_object(result.stdout)["advice"])

@@ -18,7 +18,7 @@ IDLE = "max_idle_share: 0.5 "
 
 @pytest.fixture(scope="module")
 def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with a recording that is kept, and one that ends before anything moves."""
+    """Return a folder with a recording that is kept, and a recording that ends before anything moves."""
     folder = tmp_path_factory.mktemp("recordings")
     for name, duration in (("a", 3.0), ("b", 0.5)):
         file = record_episode(folder / name, hands(2), duration)
@@ -27,7 +27,7 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-def test_each_episode_has_a_row_and_a_line_with_the_reasons(recordings: Path) -> None:
+def test_judge_prints_a_row_for_each_episode_and_the_reasons_for_a_discarded_episode(recordings: Path) -> None:
     result = q2r2("judge", str(recordings))
     assert (result.exit_code, result.stderr) == (0, "")
     assert "episodes: 1 kept, 1 discarded" in result.stdout
@@ -38,7 +38,7 @@ def test_each_episode_has_a_row_and_a_line_with_the_reasons(recordings: Path) ->
     assert result.stdout.splitlines()[-1] == f"{discarded}: {judged.verdict.line}"
 
 
-def test_json_has_every_number_and_every_reason(recordings: Path, tmp_path: Path) -> None:
+def test_the_json_of_judge_has_every_figure_and_every_reason(recordings: Path, tmp_path: Path) -> None:
     episodes = one_object(q2r2("judge", str(recordings), "--json").stdout)["episodes"]
     assert [episode["verdict"] for episode in episodes] == ["keep", "discard"]
     assert [reason["name"] for reason in episodes[1]["reasons"]] == ["max_idle_share"]
@@ -87,7 +87,7 @@ def test_a_file_that_cannot_be_read_is_discarded_and_the_others_are_judged(recor
 class TestARunThatIsRecorded:
     OPTIONS = ("--trajectory", "line", "--human", "--seed", "5", "--duration", "3")
 
-    def test_judging_one_file_prints_its_verdict_and_keeps_it_beside_the_file(self, tmp_path: Path) -> None:
+    def test_the_verdict_is_in_the_summary_of_the_run_and_in_a_file_beside_the_recording(self, tmp_path: Path) -> None:
         result = q2r2(*FAST, *self.OPTIONS, "--record", str(tmp_path))
         assert result.exit_code == 0
         (episode,) = one_object(result.stdout)["judge"]
@@ -100,7 +100,7 @@ class TestARunThatIsRecorded:
         with AnyReader([kept.parent]) as bag:  # The file can still be read.
             assert bag.message_count > 0
 
-    def test_the_verdict_is_one_line_before_the_figures(self, tmp_path: Path) -> None:
+    def test_the_verdict_is_printed_as_one_line_before_the_figures(self, tmp_path: Path) -> None:
         options = [option for option in (*FAST, *self.OPTIONS) if option != "--json"]
         cell = changed_cell(tmp_path, IDLE, "max_idle_share: 0.01 ")
         result = q2r2(options[0], cell, *options[2:], "--record", str(tmp_path / "here"))
@@ -111,7 +111,7 @@ class TestARunThatIsRecorded:
         assert [reason.name for reason in judged.verdict.reasons] == ["max_idle_share"]
         assert verdict == f"verdict: {judged.verdict.line}"
 
-    def test_a_verdict_that_cannot_be_kept_does_not_change_the_exit_code(
+    def test_a_verdict_that_cannot_be_written_does_not_change_the_exit_code(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr("q2r2_control.judging.judge.VERDICT_FILE", "x" * 300)

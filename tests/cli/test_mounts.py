@@ -16,7 +16,7 @@ from tests.cli.command import one_object, q2r2
 POINTS = np.array([[0.5, 0.1, 0.3], [0.6, -0.2, 0.3], [0.4, 0.0, 0.5]])
 
 
-def test_the_printed_mount_puts_the_right_tip_where_the_left_tip_was() -> None:
+def test_with_the_printed_mount_the_right_tip_is_at_the_points_that_the_left_tip_touched() -> None:
     cell = load_config("config/dual_iiwa7_fri.yaml")
     mount = next(arm.mount for side, arm in cell.arms.items() if side == "right")
     assumed = pin.SE3(pin.rpy.rpyToMatrix(*mount.rpy), np.array(mount.position))
@@ -30,8 +30,8 @@ def test_the_printed_mount_puts_the_right_tip_where_the_left_tip_was() -> None:
     assert max(report.off_mm) < 0.01
 
 
-def test_written_postures_give_the_mount_of_arms_without_cabinets(tmp_path: Path) -> None:
-    """The right base is not where the cell has it. Both arms touch the same points with tips beyond their tools."""
+def test_postures_in_a_file_give_the_mount_of_arms_without_cabinets(tmp_path: Path) -> None:
+    """The right base is not where the cell says. Both arms touch the same points, with tips 20 mm beyond the tools."""
     tip, off = np.array([0.0, 0.0, 0.02]), np.array([0.012, -0.03, 0.004])
     robot = Robot.from_config(load_config("config/dual_ur5.yaml"))
     data = robot.model.createData()
@@ -79,7 +79,7 @@ def test_postures_that_determine_no_mount_are_refused(tmp_path: Path, text: str,
     assert done.stderr.count("\n") == 1
 
 
-def test_for_a_missing_file_of_postures_mounts_prints_one_line_without_the_number_of_the_error() -> None:
+def test_mounts_prints_one_line_without_the_systems_error_number_if_the_file_of_postures_is_missing() -> None:
     done = q2r2("mounts", "config/dual_ur5.yaml", "--postures", "nope.txt")
     assert done.stderr.startswith("q2r2: --postures nope.txt: No such file or directory; allowed: a file with lines of")
 
@@ -97,13 +97,13 @@ def test_tips_that_did_not_touch_the_same_points_give_no_mount(tmp_path: Path) -
     assert "position:" not in done.stdout
 
 
-def test_arms_without_cabinets_need_the_file_of_postures() -> None:
+def test_mounts_needs_a_file_of_postures_for_arms_without_cabinets() -> None:
     done = q2r2("mounts", "config/dual_ur5.yaml")
     assert done.exit_code == 2
     assert "fri: missing; allowed: each arm's cabinet, as {port: 30200}, or --postures FILE" in done.stderr
 
 
-def test_a_count_of_points_together_with_a_file_of_postures_is_refused(tmp_path: Path) -> None:
+def test_the_option_points_together_with_a_file_of_postures_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "touched.txt"
     file.write_text(3 * (12 * "0 " + "\n"))
     done = q2r2("mounts", "config/dual_ur5.yaml", "--postures", str(file), "--points", "3")

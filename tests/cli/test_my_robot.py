@@ -1,4 +1,4 @@
-"""The page about your own robot, step by step. At its end, a robot that no shipped cell has moves."""
+"""The steps of docs/my_robot.md work as written. After the last step, a robot moves that is in no shipped cell."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ PAGE = "docs/my_robot.md"
 
 
 @pytest.mark.slow
-def test_the_yaml_and_commands_of_the_page_lead_from_a_urdf_to_arms_that_follow(
+def test_the_yaml_and_commands_in_my_robot_md_make_a_cell_from_a_urdf_and_its_arms_follow(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)

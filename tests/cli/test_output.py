@@ -36,7 +36,7 @@ def printed(table: Table, width: int = 80, terminal: bool = True) -> str:
     return console.file.getvalue()
 
 
-def test_figures_names_units_and_notes_are_complete_in_80_columns() -> None:
+def test_a_table_in_80_columns_has_complete_figures_names_units_and_notes() -> None:
     columns = ("joint", "min [rad]", "speed [rad/s]", "says")
     row = (f"{LINK}_{LINK}", -12.566, "10.472", "nothing is wrong with this joint as far as is known")
     text = printed(figure_table("one arm [m]", columns, [("a heading [x]",), row], ["[rad] is a unit, not a style"]))
@@ -47,7 +47,7 @@ def test_figures_names_units_and_notes_are_complete_in_80_columns() -> None:
     assert f"{LINK}_{LINK}" in first
 
 
-def test_a_note_is_folded_on_a_terminal_only() -> None:
+def test_a_note_is_wrapped_only_on_a_terminal() -> None:
     note = "nothing arrives for 2 s, although the address and the port are those of the app"
     table = partial(figure_table, "hands", ("hand", "rate [Hz]"), [("left", 0.0)], [note])
     assert note not in printed(table())
@@ -101,7 +101,7 @@ def test_the_verdict_names_the_faults_or_says_that_there_are_none(summary: RunSu
     )
 
 
-def test_an_arm_that_refused_every_press_is_a_fault(summary: RunSummary) -> None:
+def test_a_run_in_which_an_arm_refused_every_press_has_a_fault(summary: RunSummary) -> None:
     refused = Event(
         6.0, "left", "paused", "paused", Reason(TeleopReason.NOT_ENGAGED, cause=Reason(TeleopReason.TOOL_UNKNOWN))
     )
@@ -112,14 +112,14 @@ def test_an_arm_that_refused_every_press_is_a_fault(summary: RunSummary) -> None
     assert replace(never, arms=engaged_later).broken == ()
 
 
-def test_several_reasons_of_a_verdict_have_a_line_each() -> None:
+def test_several_reasons_of_a_verdict_are_printed_in_separate_lines() -> None:
     late, idle = Rejection("max_delay", "late [s]"), Rejection("max_idle_share", "idle")
     assert verdict_markup(Verdict((late, idle))) == "[red]discard[/]:\n    late \\[s]\n    idle"
     assert verdict_markup(Verdict((late,))) == "[red]discard[/]: late \\[s]"
     assert verdict_markup(Verdict(())) == "[green]keep[/]"
 
 
-def test_the_output_of_a_run_begins_with_its_verdict_and_those_of_its_tasks(
+def test_the_output_of_a_run_begins_with_its_verdict_and_the_results_of_its_tasks(
     summary: RunSummary, capsys: pytest.CaptureFixture[str]
 ) -> None:
     tasks = (TaskResult("grasp", True, {}, ""), TaskResult("stack", False, {}, "it fell"))
@@ -158,7 +158,7 @@ def test_the_summary_is_short_without_verbose_but_never_hides_faults(summary: Ru
         assert figure in wrong
 
 
-def test_an_arm_that_was_not_paused_by_its_button_is_named_with_the_reason(
+def test_the_summary_gives_the_reason_if_anything_but_its_button_paused_an_arm(
     summary: RunSummary,
 ) -> None:
     reason, press = Reason.of(CommonReason.LOOP_STALLED, duration=0.4), Reason.of(TeleopReason.PRESSED, control="lower")
@@ -176,7 +176,7 @@ def test_an_arm_that_was_not_paused_by_its_button_is_named_with_the_reason(
     assert f"{sentence(refusal)}, at 6.00 s" in text
 
 
-def test_late_and_missed_ticks_and_the_pair_that_held_a_gripper_are_printed(summary: RunSummary) -> None:
+def test_the_summary_has_late_and_missed_ticks_and_the_pair_that_held_a_gripper_back(summary: RunSummary) -> None:
     assert "ticks late by" not in text_of(summary)
     assert "gripper held" not in text_of(summary)
     held = replace(summary.arms["left"], gripper_held_s=1.25, gripper_held_by=("left_finger_0", "block_0"))
@@ -188,7 +188,7 @@ def test_late_and_missed_ticks_and_the_pair_that_held_a_gripper_are_printed(summ
     assert "1.25 s, by left_finger_0 | block_0" in row
 
 
-def test_a_failed_task_is_printed_with_the_lateness_of_the_loop(summary: RunSummary) -> None:
+def test_if_a_task_fails_and_the_loop_was_late_a_line_says_how_late(summary: RunSummary) -> None:
     failed, done = TaskResult("grasp", False, {}, "bar: fell 30 mm"), TaskResult("stack", True, {}, "")
     late = replace(summary, lateness_us=Percentiles(60.0, 310.0, 239_400.0))
     line = late_line(late, [done, failed])
@@ -204,7 +204,7 @@ def test_a_failed_task_is_printed_with_the_lateness_of_the_loop(summary: RunSumm
     assert late_line(summary, [failed]) is None, "simulated time is never late"
 
 
-def test_no_task_succeeds_if_measured_links_met_or_no_stop_was_certified_or_a_tool_did_not_follow(
+def test_no_task_counts_as_successful_if_links_touched_or_a_stop_was_not_certified_or_a_tool_did_not_follow(
     summary: RunSummary,
 ) -> None:
     done = TaskResult("stack", True, {}, "")
@@ -221,13 +221,15 @@ def test_no_task_succeeds_if_measured_links_met_or_no_stop_was_certified_or_a_to
     assert failed.reason == "fell; 3 ticks without a certificate"
 
 
-def test_a_tool_that_did_not_follow_is_printed(summary: RunSummary) -> None:
+def test_the_summary_names_a_tool_that_did_not_follow_its_reference(summary: RunSummary) -> None:
     assert "did not follow" not in text_of(summary)
     away = replace(summary, arms=summary.arms | {"left": replace(summary.arms["left"], end_error_mm=256.4)})
     assert "256 mm from its reference: the tool did not follow" in text_of(away)
 
 
-def test_a_run_without_a_table_tells_every_ten_seconds_how_much_of_it_is_over(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_without_a_live_table_prints_every_ten_seconds_how_much_of_its_time_is_over(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     now, console = [100.0], Console(file=io.StringIO(), width=80, color_system=None)
     monkeypatch.setattr("q2r2_control.cli.output.time.monotonic", lambda: now[0])
     lines = ProgressLines("demo", 12.8, console)

@@ -1,4 +1,4 @@
-"""A run refuses a cell in which the check finds a fault, unless it is forced."""
+"""A run refuses a cell in which the check finds a fault, unless the option --force is given."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ MODULE = "q2r2_control.cli.run"
 OPTIONS = (*FAST[2:], "--duration", "0.1")
 
 
-def test_a_cell_that_check_refuses_is_refused_with_the_same_lines(tmp_path: Path) -> None:
+def test_a_run_refuses_a_cell_that_check_refuses_and_prints_the_same_lines(tmp_path: Path) -> None:
     file = changed_cell(tmp_path, "home: [0.0204, 0.348,", "home: [0.0204, 1.0,")
     refused = q2r2("run", file, *OPTIONS)
     assert (refused.exit_code, refused.stdout) == (2, "")
@@ -78,7 +78,9 @@ def test_with_the_option_force_a_faulty_cell_runs_and_its_faults_are_printed(tmp
         ("torque", "0.7,", "| table_0; what was measured broke what was promised"),
     ],
 )
-def test_an_arm_that_begins_in_the_table_ends_with_exit_code_1(tmp_path: Path, mode: str, home: str, said: str) -> None:
+def test_a_run_in_which_an_arm_begins_inside_the_table_ends_with_exit_code_1(
+    tmp_path: Path, mode: str, home: str, said: str
+) -> None:
     file = changed_cell(tmp_path, "0.0204, 0.348,", f"0.0204, {home}")
     result = q2r2("run", file, "--mode", mode, "--fast", "--headless", "--duration", "0.1", "--force")
     assert result.exit_code == 1
@@ -88,7 +90,7 @@ def test_an_arm_that_begins_in_the_table_ends_with_exit_code_1(tmp_path: Path, m
 @pytest.mark.parametrize(
     ("change", "code"), [({}, 0), ({"uncertified_ticks": 3}, 1), ({"at_rest": False}, 1)], ids=["none", "proof", "rest"]
 )
-def test_the_exit_code_agrees_with_the_verdict(
+def test_the_exit_code_of_a_run_agrees_with_its_verdict(
     monkeypatch: pytest.MonkeyPatch, change: dict[str, Any], code: int
 ) -> None:
     def as_if(*given: Any) -> CellRun:
@@ -103,7 +105,9 @@ def test_the_exit_code_agrees_with_the_verdict(
 
 
 @pytest.mark.parametrize("command", [("run", CELL, *OPTIONS), ("demo", "--fast", "--headless")])
-def test_a_folder_that_cannot_be_written_is_refused_before_the_run(command: tuple[str, ...], tmp_path: Path) -> None:
+def test_a_folder_for_recordings_that_cannot_be_written_is_refused_before_the_run(
+    command: tuple[str, ...], tmp_path: Path
+) -> None:
     (tmp_path / "file").touch()
     result = q2r2(*command, "--record", str(tmp_path / "file" / "recordings"))
     assert (result.exit_code, result.stdout, result.stderr.count("\n")) == (2, "", 1)
@@ -123,13 +127,15 @@ def full(*given: object) -> Path:
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
-def test_an_empty_task_is_refused(tmp_path: Path) -> None:
+def test_an_empty_text_for_the_option_task_is_refused(tmp_path: Path) -> None:
     result = q2r2("run", CELL, *OPTIONS, "--record", str(tmp_path), "--task", " ")
     assert result.exit_code == 2
     assert "--task is empty; allowed: some words, or no --task" in result.stderr
 
 
-def test_with_rt_one_line_names_the_refusals_of_the_system_and_the_run_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_with_the_option_rt_one_line_names_what_the_system_refuses_and_the_run_goes_on(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     refusal = "real time: no SCHED_FIFO: Operation not permitted; the run goes on without"
 
     @contextmanager
@@ -202,7 +208,7 @@ def test_the_seed_of_a_demo_displaces_only_the_parts_of_its_task(tmp_path: Path)
 
 
 @pytest.mark.parametrize("other", [("--plant", "fri"), ("--seeds", "1")])
-def test_a_spread_that_would_move_nothing_is_refused(other: tuple[str, str]) -> None:
+def test_the_option_spread_is_refused_if_it_would_displace_no_part(other: tuple[str, str]) -> None:
     result = q2r2("demo", "grasp", "--spread", "0.01", *other)
     assert result.exit_code == 2
     assert "--spread cannot be used with --" in result.stderr
@@ -237,7 +243,7 @@ def test_the_pictures_of_a_demo_become_videos_in_an_export(tmp_path: Path) -> No
 
 
 @pytest.mark.slow
-def test_without_graphics_one_line_says_so_and_everything_else_is_recorded(
+def test_if_the_computer_cannot_draw_pictures_one_line_says_so_and_everything_else_is_recorded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("MUJOCO_GL", "nothing")
@@ -250,7 +256,7 @@ def test_without_graphics_one_line_says_so_and_everything_else_is_recorded(
 
 
 @pytest.mark.slow
-def test_a_plant_without_pictures_is_named_and_recorded_without_them(tmp_path: Path) -> None:
+def test_a_run_whose_plant_has_no_pictures_says_so_and_is_recorded_without_pictures(tmp_path: Path) -> None:
     result = q2r2("run", CELL, *OPTIONS, "--record", str(tmp_path / "recordings"))
     assert result.exit_code == 0
     assert "no pictures are recorded: the kinematic plant has none; allowed: --plant mujoco\n" in result.stderr
@@ -271,7 +277,7 @@ def test_a_policy_that_fails_makes_the_run_fail(policy: str, code: int, told: st
     assert told in " ".join([result.stdout, result.stderr])
 
 
-def test_a_policy_without_its_input_is_refused_with_the_missing_option() -> None:
+def test_the_option_policy_without_the_policy_input_is_refused_and_the_missing_option_is_named() -> None:
     result = q2r2("run", CELL, *OPTIONS, "--policy", "json:dumps")
     told = "--policy cannot be used with --input scripted, which is the cell's input; add --input policy\n"
     assert (result.exit_code, result.stderr) == (2, f"q2r2: {told}")
@@ -293,7 +299,7 @@ class Still:
 
 
 @pytest.mark.slow
-def test_a_policy_of_the_working_folder_runs_and_is_refused_with_another_input(
+def test_a_policy_in_the_working_folder_runs_but_is_refused_together_with_another_input(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "still_policy.py").write_text(POLICY)

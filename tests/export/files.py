@@ -28,7 +28,7 @@ from tests.recording.runs import ARMS, JOINTS, file_of, pipeline, record
 from tests.support.processes import Watch, cell
 
 EPOCH = 1_700_000_000_000_000_000  # [ns]
-CHUNK = 7  # ticks
+CHUNK = 7  # Number of ticks in a chunk.
 
 
 def brightness(number: int) -> int:
@@ -55,11 +55,11 @@ def write_recording(
 ) -> Path:
     """Write a recording with ticks at ``times`` [ns] since its start, and return its path.
 
-    In tick k, every measured joint is at -k [rad], every joint of the reference is at k [rad], and the x of each tool
-    at the reference is k [m]. ``numbers`` has the ticks' numbers if some ticks were lost. In the ticks ``engaged``, the
-    left arm is engaged, and the x of its target is 1000 + k [m]. In the ticks ``moving``, the reference moves.
-    ``openings`` has the values (arms,) of a field by the field's name. ``pictures`` has, by camera, the times [ns] at
-    which pictures were taken; each picture is brighter than the last.
+    In tick k, every measured joint is at -k [rad], every joint of the reference is at k [rad], and the x coordinate
+    of each tool at the reference is k [m]. ``numbers`` has the ticks' numbers if some ticks were lost. In the ticks
+    ``engaged``, the left arm is engaged, and the x coordinate of its target is 1000 + k [m]. In the ticks ``moving``,
+    the reference moves. ``openings`` has the values (arms,) of a field by the field's name. ``pictures`` has, by
+    camera, the times [ns] at which pictures were taken; each picture is brighter than the last.
     """
     config = cell().model_copy(update={"cameras": dict(cameras or {})})
     how, cameras_of, notes = ("position", ("position",), EPOCH, False), tuple(config.cameras), {"task": "to count"}
@@ -113,7 +113,7 @@ def press(hand: str, t: float) -> HandInputs:
 def record_step(folder: Path, duration: float = DURATION) -> Run:
     """Record a run with both arms engaged and a step of the hands.
 
-    The plant's joints are always where the reference was one tick earlier.
+    The positions of the plant's joints always equal those of the reference one tick earlier.
     """
     loop = pipeline(source=PlayedInput(step_of_the_hand, press, {side: EvenSampling(100.0) for side in SIDES}))
     watch = Watch(loop)

@@ -23,7 +23,7 @@ from tests.support.pictures import needs_opengl
 
 pytestmark = pytest.mark.slow
 
-MOVED = 1e-4  # In [m] and [rad].
+MOVED = 1e-4  # Smallest change that counts as a motion [m or rad].
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"  # These bytes begin the data of a chunk.
 
 
@@ -41,7 +41,7 @@ def first_moved(joints: npt.NDArray[np.floating]) -> int:
     return first
 
 
-def test_a_step_of_the_hand_is_in_action_and_observation_at_the_stated_frames_of_an_episode(run: Run) -> None:
+def test_a_step_of_the_hand_appears_in_the_actions_and_observations_of_the_right_frames(run: Run) -> None:
     poses = {i: tick.targets["left"].pose for i, tick in enumerate(run.ticks)}
     asked = {i: pose.translation[1] for i, pose in poses.items() if pose is not None}
     engaged = min(asked)
@@ -49,7 +49,7 @@ def test_a_step_of_the_hand_is_in_action_and_observation_at_the_stated_frames_of
     command = first_moved(np.array([tick.reference.q for tick in run.ticks]))
     closing = next(i for i, tick in enumerate(run.ticks) if tick.command.grippers["left"] < 1.0)
     assert engaged < target <= command
-    # At the loop's own rate, each tick is a frame, and this plant is where the reference was a tick before.
+    # At the loop's own rate, each tick is a frame. The joints of this plant are where the reference was a tick before.
     whole = make_episode(run.file, FrameSampling(fps=int(RATE)))
     y = whole.vectors["action.tool"][:, whole.names["action.tool"].index("left_y")]
     joints = [whole.names["action"].index(name) for name in whole.names["observation.velocity"]]
@@ -78,7 +78,7 @@ def test_an_episode_has_the_pictures_of_its_frames(tmp_path: Path) -> None:
     assert (len(shown), shown[0].shape) == (episode.frames, episode.cameras[CAMERA].size)
 
 
-def test_actions_that_are_positions_come_as_many_frames_earlier_as_asked_for(run: Run) -> None:
+def test_position_actions_come_earlier_by_the_number_of_frames_in_the_option_ahead(run: Run) -> None:
     plain, ahead = (make_episode(run.file, FrameSampling(fps=30, ahead=frames)) for frames in (0, 2))
     assert (plain.ahead, ahead.ahead, ahead.frames) == (0, 2, plain.frames)
     for name, rows in plain.vectors.items():
@@ -98,7 +98,7 @@ def test_an_impossible_rate_is_refused(fps: int) -> None:
         FrameSampling(fps=fps)
 
 
-def test_an_interrupted_export_goes_on_with_its_finished_episodes(run: Run, tmp_path: Path) -> None:
+def test_an_export_that_goes_on_after_an_interruption_keeps_its_finished_episodes(run: Run, tmp_path: Path) -> None:
     files = [run.file, Path(shutil.copy(run.file, tmp_path / "copy.mcap"))]
     kept = tmp_path / "kept"
     kept.mkdir()
@@ -137,7 +137,7 @@ def test_a_killed_worker_raises_an_error_of_one_line_and_the_next_export_goes_on
     last.unlink()
     made_at = [other.stat().st_mtime_ns for other in others]
     gate = tmp_path / "gate"
-    os.mkfifo(gate)  # No process reads it, so that a worker stays in the middle of its episode.
+    os.mkfifo(gate)  # No process reads this pipe, so a worker stays in the middle of its episode.
 
     def kill(done: int) -> None:
         if done == len(others):

@@ -63,7 +63,7 @@ def read_as_replay_buffer(folder: Path) -> tuple[dict[str, Any], list[int]]:
     return arrays, ends.tolist()
 
 
-def test_a_folder_of_recordings_is_one_store_with_the_actions_of_the_next_frames(
+def test_a_folder_of_recordings_becomes_one_store_with_the_actions_of_the_next_frames(
     recordings: Sequence[Path], tmp_path: Path
 ) -> None:
     out = tmp_path / "store"
@@ -83,7 +83,7 @@ def test_a_folder_of_recordings_is_one_store_with_the_actions_of_the_next_frames
     assert {one["action_ahead_frames"] for one in root.attrs["episodes"]} == {1}
 
 
-def test_pictures_of_a_store_are_pixels_frame_by_frame(tmp_path: Path) -> None:
+def test_a_store_has_the_pixels_of_the_picture_of_each_frame(tmp_path: Path) -> None:
     episodes, store = [with_pictures(plain, number) for number, plain in enumerate(EPISODES[:2])], format_named("zarr")
     files = [tmp_path / str(number) for number in range(2)]
     for episode, file in zip(episodes, files, strict=True):
@@ -100,7 +100,7 @@ def test_pictures_of_a_store_are_pixels_frame_by_frame(tmp_path: Path) -> None:
     assert zarr.open_group(str(tmp_path / "store"), mode="r")["data"][depth].attrs["unit"] == 1e-3
 
 
-def test_a_store_has_the_subtask_of_each_frame_and_the_names_by_episode(tmp_path: Path) -> None:
+def test_a_store_has_the_subtask_of_each_frame_and_the_names_of_the_subtasks_of_each_episode(tmp_path: Path) -> None:
     store, files = format_named("zarr"), [tmp_path / "0", tmp_path / "1"]
     for episode, file in zip(TOLD, files, strict=False):
         store.write(episode, file)
@@ -119,7 +119,7 @@ def test_a_store_has_the_subtask_of_each_frame_and_the_names_by_episode(tmp_path
     ],
     ids=["a camera less", "other joints"],
 )
-def test_episodes_with_different_numbers_are_not_joined_to_a_store(
+def test_episodes_with_different_cameras_or_joints_are_not_joined_to_one_store(
     changes: dict[str, Any], told: str, tmp_path: Path
 ) -> None:
     store, files = format_named("zarr"), [tmp_path / "0", tmp_path / "1"]

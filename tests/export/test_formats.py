@@ -44,7 +44,7 @@ def export(name: str, episodes: Sequence[EpisodeVectors], folder: Path, recordin
     return folder / "made"
 
 
-def test_each_recording_has_a_table_with_a_line_for_each_frame(tmp_path: Path) -> None:
+def test_each_recording_becomes_a_table_with_a_line_for_each_frame(tmp_path: Path) -> None:
     made = export("csv", EPISODES, tmp_path, ["run-1", "run-2", "run-3"])
     assert sorted(file.name for file in made.iterdir()) == ["run-1.csv", "run-2.csv", "run-3.csv", "units.json"]
     rows = read(made / "run-2.csv")
@@ -57,7 +57,7 @@ def test_each_recording_has_a_table_with_a_line_for_each_frame(tmp_path: Path) -
     assert [frame for frame, said in enumerate(succeeded) if said == "True"] == [EPISODES[0].frames - 1]
 
 
-def test_the_unit_of_each_column_of_numbers_is_beside_the_tables(tmp_path: Path) -> None:
+def test_a_file_beside_the_tables_has_the_unit_of_each_column_of_numbers(tmp_path: Path) -> None:
     units = json.loads((export("csv", EPISODES, tmp_path, ["run-1"]) / "units.json").read_text())
     numbers = {
         f"{feature}.{name}": unit
@@ -68,7 +68,7 @@ def test_the_unit_of_each_column_of_numbers_is_beside_the_tables(tmp_path: Path)
     assert {"rad", "0 closed .. 1 open"} <= set(units.values())
 
 
-def test_two_recordings_with_one_name_are_refused(tmp_path: Path) -> None:
+def test_two_recordings_with_the_same_name_are_refused(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match=r"run\.mcap: two recordings have this name"):
         export("csv", EPISODES, tmp_path, ["run", "run"])
 
@@ -80,7 +80,8 @@ def test_a_table_has_the_subtask_of_each_line(tmp_path: Path) -> None:
     assert list(rows[0]) == [*HEAD, "subtask_index", "subtask"]
     found = [(int(row["subtask_index"]), row["subtask"]) for row in rows]
     assert found == [(0, "grasp the cube")] * 10 + [(1, "place")] * 15
-    assert len(read(made / "run-3.csv")) == TOLD[2].frames  # ``read`` checks that it has no columns for subtasks.
+    # ``read`` checks that this file has no columns for subtasks.
+    assert len(read(made / "run-3.csv")) == TOLD[2].frames
 
 
 POSITIONS = ("left_A1", "left_gripper")
@@ -99,7 +100,7 @@ EPISODES_FOR_ACT = [
 ]
 
 
-def test_each_episode_is_an_hdf5_file_with_the_data_that_act_needs(tmp_path: Path) -> None:
+def test_each_episode_becomes_an_hdf5_file_with_the_data_that_act_needs(tmp_path: Path) -> None:
     h5py = pytest.importorskip("h5py", reason="the extra export is not installed")
     made = export("hdf5", EPISODES_FOR_ACT, tmp_path, ["a", "b"])
     for number, episode in enumerate(EPISODES_FOR_ACT):
@@ -131,7 +132,7 @@ def test_an_hdf5_file_has_the_subtask_of_each_frame_and_the_names_of_the_subtask
         assert list(file["subtask_index"].attrs["names"]) == ["grasp the cube", "place"]
 
 
-def test_robomimic_finds_the_same_numbers_in_one_file_of_links(tmp_path: Path) -> None:
+def test_one_file_with_links_to_all_episodes_gives_robomimic_the_same_numbers(tmp_path: Path) -> None:
     h5py = pytest.importorskip("h5py", reason="the extra export is not installed")
     made = export("hdf5", EPISODES_FOR_ACT, tmp_path, ["a", "b"])
     moved = made.rename(tmp_path / "elsewhere")
@@ -168,7 +169,7 @@ def shard(folder: Path, recording: str, cell: str, features: dict[str, Any]) -> 
         pytest.param("two_arms", {"action": ACTION, video_key(CAMERA): VIDEO}, "has not the cameras", id="a camera"),
     ],
 )
-def test_episodes_of_different_robots_are_not_one_dataset(
+def test_episodes_of_different_robots_are_not_joined_to_one_dataset(
     cell: str, features: dict[str, Any], what: str, tmp_path: Path
 ) -> None:
     shards = [

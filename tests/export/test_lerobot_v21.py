@@ -1,6 +1,6 @@
-"""A LeRobotDataset v2.1 has every number, picture and task in the places where openpi and GR00T look for them.
+"""A LeRobotDataset v2.1 has every number, picture and task where openpi and GR00T look for them.
 
-The loaders themselves read it in tests/lerobot.
+In tests/lerobot, LeRobot itself reads such a dataset.
 """
 
 from __future__ import annotations
@@ -126,7 +126,7 @@ def test_the_readme_has_lerobots_names_and_tells_that_actions_are_of_later_frame
         assert row in card
 
 
-def test_every_frame_is_at_its_time_in_the_video_of_the_camera_under_openpis_name(dataset: Path) -> None:
+def test_the_video_of_a_camera_has_openpis_name_for_the_camera_and_shows_every_frame_at_its_time(dataset: Path) -> None:
     for camera, name in (("front", "cam_high"), ("hand", "cam_left_wrist")):
         file = dataset / f"videos/chunk-000/observation.images.{name}/episode_000001.mp4"
         with av.open(str(file)) as video:
@@ -137,7 +137,7 @@ def test_every_frame_is_at_its_time_in_the_video_of_the_camera_under_openpis_nam
             assert np.abs(found.astype(float) - wanted).mean() < 6
 
 
-def test_modality_json_cuts_state_and_action_into_the_parts_of_the_robot(dataset: Path) -> None:
+def test_modality_json_says_which_numbers_of_state_and_action_belong_to_which_part_of_the_robot(dataset: Path) -> None:
     modality = json.loads((dataset / "meta/modality.json").read_text())
     for what in ("state", "action"):
         cut = {name: POSITIONS[part["start"] : part["end"]] for name, part in modality[what].items()}
@@ -151,7 +151,7 @@ def test_modality_json_cuts_state_and_action_into_the_parts_of_the_robot(dataset
     assert modality["annotation"] == {"human.action.task_description": {}}
 
 
-def test_the_config_for_openpi_is_python_and_leaves_grippers_absolute(dataset: Path) -> None:
+def test_the_config_for_openpi_is_valid_python_and_leaves_grippers_absolute(dataset: Path) -> None:
     config = openpi_config(dataset)
     ast.parse(config)
     assert "make_bool_mask(4, -2)" in config
@@ -185,7 +185,7 @@ def camera(**where: str) -> CameraConfig:
         ),
     ],
 )
-def test_a_camera_gets_the_name_that_openpi_uses_for_its_place(
+def test_a_camera_gets_the_name_that_openpi_uses_for_a_wrist_camera_or_a_high_camera(
     cameras: Mapping[str, CameraConfig], names: dict[str, str]
 ) -> None:
     assert openpi_names({name: Waves(1, 0, config=config) for name, config in cameras.items()}) == names  # type: ignore[misc]
@@ -199,7 +199,7 @@ def test_without_pyarrow_one_line_says_how_to_install_it(tmp_path: Path, monkeyp
     assert install_line("export") in result.stderr
 
 
-def test_the_example_moves_the_actions_of_each_episode_and_nothing_else(
+def test_the_example_ahead_py_shifts_the_actions_of_each_episode_and_changes_nothing_else(
     dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("sys.argv", ["ahead.py", str(dataset), str(tmp_path / "ahead")])
@@ -213,7 +213,7 @@ def test_the_example_moves_the_actions_of_each_episode_and_nothing_else(
         assert before.schema == after.schema
 
 
-def test_the_example_repeats_the_last_action_of_each_episode_in_a_table_of_several() -> None:
+def test_the_example_ahead_py_repeats_the_last_action_of_each_episode_if_a_table_has_several_episodes() -> None:
     table = pa.table({"action": [0, 1, 2, 10, 11], "episode_index": [0, 0, 0, 1, 1]})
     shifted = load_script("examples/learning/ahead.py").shifted
     assert shifted(table, 1)["action"].to_pylist() == [1, 2, 2, 11, 11]

@@ -1,6 +1,6 @@
-"""Frames are evenly spaced. Observations are the newest known ones, and commands the first that followed.
+"""Frames are evenly spaced in time. Each frame has the newest observation, and the first command that followed.
 
-Their features have the numbers that their names say, and a frame has the newest picture at or before it.
+The features have the numbers that their names say, and a frame has the newest picture at or before it.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def recording(path: Path, times: list[int], **what: Any) -> Recording:
 
 
 @pytest.mark.parametrize("fps", [1, 24, 30, 60, 200, 1000])
-def test_observations_are_those_of_the_newest_tick_and_commands_those_of_the_next_tick(
+def test_a_frame_has_the_observations_of_the_newest_tick_and_the_commands_of_the_next_tick(
     fps: int, tmp_path: Path
 ) -> None:
     # The ticks are about a millisecond apart, and one of them is 70 ms late.
@@ -77,7 +77,7 @@ def test_the_operators_targets_are_used_where_they_exist_and_openings_belong_to_
         pytest.param(range(12, 15), range(40, 43), 12, 42, id="with a pause in between"),
     ],
 )
-def test_trimmed_frames_begin_and_end_where_an_arm_is_engaged_or_moves(
+def test_trimmed_frames_begin_and_end_while_an_arm_is_engaged_or_moves(
     engaged: range, moving: range, first: int, last: int, tmp_path: Path
 ) -> None:
     whole = recording(tmp_path, [*range(60)], engaged=engaged, moving=moving)
@@ -159,7 +159,7 @@ def test_every_number_has_the_name_of_its_joint_or_gripper() -> None:
         np.testing.assert_array_equal(vectors[feature][:, columns], given[what].astype(np.float32))
 
 
-def test_tools_are_where_the_measured_joints_put_them() -> None:
+def test_observed_tool_poses_agree_with_the_measured_joint_positions() -> None:
     given = frames()
     vectors, names = features(given, robot())
     for arm in robot().arms:
@@ -169,7 +169,7 @@ def test_tools_are_where_the_measured_joints_put_them() -> None:
             assert np.linalg.norm(pin.log6(off).vector) < 1e-5
 
 
-def test_tool_deltas_lead_from_each_target_to_the_next_and_are_zero_at_the_last() -> None:
+def test_each_tool_delta_is_the_motion_from_a_target_to_the_next_one_and_the_last_delta_is_zero() -> None:
     vectors, names = features(frames(), robot())
     for arm in robot().arms:
         targets = vectors["action.tool"][:, [names["action.tool"].index(f"{arm}_{number}") for number in POSE_FIELDS]]
@@ -182,7 +182,7 @@ def test_tool_deltas_lead_from_each_target_to_the_next_and_are_zero_at_the_last(
         assert not deltas[-1].any()
 
 
-def test_quaternions_do_not_jump_and_targets_have_the_signs_of_the_tools() -> None:
+def test_quaternions_do_not_change_sign_between_frames_and_those_of_targets_have_the_signs_of_the_tools() -> None:
     flipped = 0
     for seed in range(5):
         given = frames(seed)

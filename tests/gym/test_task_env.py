@@ -65,7 +65,7 @@ def test_the_checks_of_gymnasium_pass(space: ActionSpace) -> None:
 
 
 def script(task: str, env: TaskEnv, step: int) -> npt.NDArray[np.float32]:
-    """Return the action of a step that does the same as the demo's hands: tool poses and openings."""
+    """Return the action (tool poses and openings) with which a step does the same as the demo's hands."""
     work, t, poses, openings = WORKS[task], step / RATE, [], []
     for arm in SIDES:
         points = work.tools.get(arm, ((1.0, *HOME[arm], 0.0, 0.0),))
@@ -111,7 +111,7 @@ def test_a_seed_places_the_parts_and_equal_actions_then_have_equal_results() -> 
     assert 0.0 < np.abs(seen[0][0] - seen[2][0]).max() <= 0.02
 
 
-def test_an_untrained_agent_moves_the_tools() -> None:
+def test_random_actions_of_an_untrained_agent_move_the_tools() -> None:
     env = make()
     env.reset(seed=0)
     env.action_space.seed(0)
@@ -124,7 +124,7 @@ def test_an_untrained_agent_moves_the_tools() -> None:
     assert not any("jump" in said for said in held)
 
 
-def test_the_arms_follow_small_actions_and_say_why_they_refuse_large_ones() -> None:
+def test_the_arms_follow_small_actions_and_the_environment_says_why_it_refuses_large_actions() -> None:
     env = shared()
     start = env.reset(seed=0)[0]["observation.state"]
     action = start.copy()
@@ -161,7 +161,8 @@ def test_a_slower_loop_needs_fewer_ticks_for_the_same_steps_and_keeps_the_promis
         ticks.append(next(taken) - before - 1)
         tools.append(observed["observation.tool"])
     assert ticks == [333, 33]
-    np.testing.assert_allclose(tools[0], tools[1], atol=0.02)  # Each tool is some ticks behind its targets.
+    # The tools lag behind their targets by some ticks, so their positions in the two loops differ.
+    np.testing.assert_allclose(tools[0], tools[1], atol=0.02)
     with pytest.raises(ConfigError, match=r"loop_rate = 20: allowed: 50 to 1000 Hz"):
         TaskEnv("grasp", loop_rate=20)
 
@@ -182,7 +183,7 @@ def time_of(env: TaskEnv) -> float:
     return observation.time
 
 
-def test_steps_end_at_frames_of_a_dataset_at_the_given_rate() -> None:
+def test_each_step_ends_at_the_time_of_the_next_frame_of_a_dataset_with_the_same_rate() -> None:
     env = shared()
     still = env.reset(seed=0)[0]["observation.state"]
     start = time_of(env)

@@ -56,13 +56,13 @@ def test_all_addresses_of_connected_networks_are_named_and_the_default_routes_ad
     assert reachable_addresses("192.168.1.5") == ("192.168.1.5",)
 
 
-def test_a_computer_without_a_network_has_a_text_instead_of_an_address(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_on_a_computer_without_a_network_a_text_is_shown_instead_of_an_address(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("socket.if_nameindex", list)
     monkeypatch.setattr("q2r2_control.inputs.addresses._way_out", lambda *_: None)
     assert reachable_addresses("0.0.0.0") == (NO_NETWORK,)
 
 
-def test_a_server_can_listen_on_the_addresses_of_this_computer() -> None:
+def test_a_server_can_listen_on_every_address_that_is_named_for_this_computer() -> None:
     for address in reachable_addresses("0.0.0.0"):
         if address != NO_NETWORK:
             socket.create_server((address, 0)).close()

@@ -1,4 +1,4 @@
-"""Clients over real TCP: which are served, which wait or are refused, and that none disturbs the driving headset."""
+"""Clients over real TCP are served, wait or are refused. No client disturbs the headset that drives the arms."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def driving(server: HeadsetServer, source: str = HERE) -> Iterator[FakeHeadset]:
 
 
 def move(headset: FakeHeadset, server: HeadsetServer, x: float = 0.0) -> None:
-    """Send a pose of the headset until it arrives."""
+    """Send a pose of the left hand, and wait until it has arrived."""
     headset.send(headset.pose("left", (x, 0.0, 0.0), IDENTITY))
     assert collect(server, 1)[-1].position[0] == x
 
@@ -67,7 +67,7 @@ def drives(server: HeadsetServer, headset: FakeHeadset) -> bool:
     return server.statistics.peer == "{}:{}".format(*headset.socket.getsockname())
 
 
-def test_while_one_headset_drives_others_are_refused_with_a_reason_and_eight_hosts_get_one_line_each(
+def test_while_one_headset_drives_others_are_refused_with_a_reason_and_the_log_has_a_line_for_eight_hosts(
     server: HeadsetServer, clock: HandClock, caplog: pytest.LogCaptureFixture
 ) -> None:
     hosts = [f"127.0.0.{number}" for number in range(1, 14)]
@@ -79,12 +79,12 @@ def test_while_one_headset_drives_others_are_refused_with_a_reason_and_eight_hos
             clock.advance(A_LINE_LATER)
             move(first, server)
         assert server.connected
-        lines = warnings(caplog)  # Read before the driver ends its connection, since this may give another line.
+        lines = warnings(caplog)  # The log is read before the driver ends its connection, since the end may add a line.
     assert [f"headset {host}:" in line for host, line in zip(hosts, lines, strict=False)] == [True] * 8
     assert "refused: 127.0.0.1:" in lines[0]
 
 
-def test_a_headset_that_comes_back_after_a_silently_lost_link_drives_at_once_as_a_new_connection(
+def test_a_headset_that_reconnects_after_an_unnoticed_loss_drives_at_once_as_a_new_connection(
     server: HeadsetServer, clock: HandClock, caplog: pytest.LogCaptureFixture
 ) -> None:
     with driving(server) as lost:
@@ -109,7 +109,7 @@ def keep_alive(headset: FakeHeadset, server: HeadsetServer, clock: HandClock) ->
     eventually(lambda: server._client is not None and server._client.last_frame == clock.now)
 
 
-def test_a_newcomer_that_sends_nothing_is_refused_after_two_seconds(server: HeadsetServer, clock: HandClock) -> None:
+def test_a_new_client_that_sends_nothing_is_refused_after_two_seconds(server: HeadsetServer, clock: HandClock) -> None:
     with connect(server) as idle, connect(server, source=ELSEWHERE) as second:
         clock.advance(1.5)
         keep_alive(idle, server, clock)
@@ -118,7 +118,7 @@ def test_a_newcomer_that_sends_nothing_is_refused_after_two_seconds(server: Head
         assert drives(server, idle)
 
 
-def test_at_most_four_hosts_wait_and_of_each_only_the_newest_connection(server: HeadsetServer) -> None:
+def test_at_most_four_hosts_can_wait_and_only_the_newest_connection_of_each_host_waits(server: HeadsetServer) -> None:
     hosts = [f"127.0.0.{number}" for number in range(2, 7)]
     with connect(server):
         waiting = [connect(server, source=host) for host in (*hosts[:4], hosts[0])]
@@ -131,7 +131,7 @@ def test_at_most_four_hosts_wait_and_of_each_only_the_newest_connection(server: 
         headset.close()
 
 
-def test_data_of_a_waiting_client_reach_no_arm_and_its_faults_end_only_its_own_connection(
+def test_data_of_a_waiting_client_reach_no_arm_and_a_fault_of_this_client_ends_only_its_own_connection(
     server: HeadsetServer, clock: HandClock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with driving(server) as first:
@@ -160,7 +160,7 @@ def test_after_the_server_has_stood_still_a_headset_that_sends_does_not_count_as
     frozen: list[bool] = []
 
     def look_and_stand_still(timeout: float) -> list[Any]:
-        """Freeze the process after it has read the second headset's bytes. Meanwhile the first one's bytes arrive."""
+        """Freeze the process after it has read bytes of the second headset. Meanwhile, the first one's bytes arrive."""
         found = look(timeout)
         if found and not frozen:
             frozen.append(True)
@@ -191,7 +191,8 @@ def test_a_flood_of_connections_does_not_keep_another_host_from_being_served(
         assert not drives(server, headset), "no more than 20 in 0.05 s"
 
         def has_had_its_turn() -> bool:
-            # If the server's thread did not run between two steps above, it accepted only twenty connections in both.
+            # If the server's thread did not run between two steps above, it accepted only 20 connections in both steps.
+            # The headset then has to wait for more steps.
             clock.advance(0.0501)
             time.sleep(0.02)
             return drives(server, headset)

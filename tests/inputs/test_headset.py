@@ -1,4 +1,4 @@
-"""The headset server over real TCP: its messages to the app, clients with faults, and that the loop never waits."""
+"""The headset server over real TCP sends messages to the app, drops faulty clients, and never lets the loop wait."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ every_dialect = pytest.mark.parametrize("dialect", DIALECTS)
 
 @every_dialect
 @pytest.mark.parametrize("slash", [False, True], ids=["bare names", "leading slash"])
-def test_a_headset_gets_a_handshake_and_answers_and_its_hands_arrive(
+def test_a_headset_gets_a_handshake_and_answers_and_the_poses_of_its_hands_arrive(
     server: HeadsetServer, dialect: str, slash: bool
 ) -> None:
     with FakeHeadset(server.address, dialect, slash) as headset:
@@ -80,7 +80,7 @@ def test_a_sample_has_the_time_of_receipt_and_the_statistics_keep_the_headsets_o
     assert (last.stamp, last.frame_id) == (12.0000005, "headset")
 
 
-def test_a_server_with_nothing_to_send_sends_a_keepalive_and_no_bytes_are_delayed_to_be_joined(
+def test_a_server_with_nothing_to_send_sends_a_keepalive_and_the_socket_does_not_delay_small_messages(
     server: HeadsetServer, clock: HandClock
 ) -> None:
     with connect(server) as headset:
@@ -91,7 +91,9 @@ def test_a_server_with_nothing_to_send_sends_a_keepalive_and_no_bytes_are_delaye
 
 
 @every_dialect
-def test_vibrations_arrive_as_two_floats_that_are_clipped_to_0_to_1(server: HeadsetServer, dialect: str) -> None:
+def test_vibrations_arrive_as_two_floats_that_are_clipped_to_the_range_from_0_to_1(
+    server: HeadsetServer, dialect: str
+) -> None:
     with registered(server, dialect) as headset:
         server.send_haptic(HapticFeedback("left", frequency=0.5, amplitude=7.0))
         payload = headset.read_until(HAPTIC)
@@ -116,7 +118,7 @@ def test_vibrations_without_a_headset_or_a_subscription_are_dropped(server: Head
     server.send_haptic(HapticFeedback("left", 1.0, 1.0))
 
 
-def test_a_headset_that_does_not_read_gets_only_the_newest_vibration_and_the_next_headset_gets_nothing(
+def test_a_headset_that_does_not_read_gets_only_the_newest_vibration_and_the_next_headset_gets_no_old_one(
     server: HeadsetServer,
 ) -> None:
     with registered(server) as headset:
@@ -143,7 +145,9 @@ def test_a_headset_that_does_not_read_gets_only_the_newest_vibration_and_the_nex
         assert next_topic(second) == "q2r_right_hand_haptic_feedback"
 
 
-def test_a_listener_gets_every_message_in_order_and_poll_then_returns_nothing(clock: HandClock) -> None:
+def test_a_listener_gets_every_message_in_order_and_poll_returns_nothing_for_a_server_with_a_listener(
+    clock: HandClock,
+) -> None:
     heard: list[Watched] = []
     with running(HeadsetServer(port=0, clock=clock, listener=heard.append)) as server, connect(server) as headset:
         for index in range(100):
@@ -214,7 +218,7 @@ def cut_off(headset: FakeHeadset, clock: HandClock) -> None:
     headset.close()
 
 
-# One case of each kind of fault. Other tests check more cases of wrong frames and sessions.
+# There is one case of each kind of fault. Other tests check more cases of wrong frames and sessions.
 FAULTS: dict[str, tuple[Callable[[FakeHeadset, HandClock], object], str]] = {
     "silence": (lambda _, clock: clock.advance(2.1 - A_LINE_LATER), "no frame for 2 s"),
     "oversized frame": (lambda one, _: one.send(struct.pack("<I1sI", 1, b"a", 1 << 20)), "at most 1048576"),
@@ -228,7 +232,7 @@ FAULTS: dict[str, tuple[Callable[[FakeHeadset, HandClock], object], str]] = {
 
 
 @pytest.mark.parametrize("fault", list(FAULTS))
-def test_a_client_with_a_fault_is_dropped_with_one_line_and_the_next_client_is_served(
+def test_a_client_with_a_fault_is_dropped_with_one_line_in_the_log_and_the_next_client_is_served(
     server: HeadsetServer, clock: HandClock, fault: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     break_down, reason = FAULTS[fault]
@@ -261,7 +265,7 @@ def test_a_connection_that_ends_between_frames_is_not_a_fault(
     assert server.statistics.last_disconnect == "closed by the headset"
 
 
-def test_an_unexpected_exception_is_logged_and_ends_only_that_connection(
+def test_an_unexpected_exception_is_logged_and_ends_only_the_connection_in_which_it_was_raised(
     server: HeadsetServer, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     with monkeypatch.context() as patch, connect(server) as headset:
@@ -286,7 +290,9 @@ def test_poll_and_send_haptic_do_not_wait_for_the_locks_of_other_threads(server:
         assert not asked.is_alive()
 
 
-def test_an_address_that_cannot_be_bound_is_named_and_the_default_is_loopback(server: HeadsetServer) -> None:
+def test_the_error_names_an_address_that_cannot_be_bound_and_the_default_address_is_loopback(
+    server: HeadsetServer,
+) -> None:
     assert HeadsetServer().address == ("127.0.0.1", 10000)
     for host, port in (server.address, ("no such host", 0), ("127.0.0.1", 70000)):
         with pytest.raises(InputError, match=f"cannot listen on {host}:{port}"):

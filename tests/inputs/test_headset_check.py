@@ -1,4 +1,4 @@
-"""The report of headset-check: the direction of each hand's movement, and advice if data are missing."""
+"""The report of headset-check names the direction of each hand's movement, and gives advice if data are missing."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_only_the_movement_of_the_last_half_second_counts() -> None:
 
 
 @pytest.mark.parametrize("value", [np.nan, 1e308], ids=str)
-def test_hostile_positions_neither_raise_nor_hide_the_real_positions(value: float) -> None:
+def test_hostile_positions_neither_raise_an_error_nor_hide_the_real_positions(value: float) -> None:
     movement = moved(WORLD, (0.1, 0.0, 0.0))
     movement.add(HandSample("left", np.full(3, value), np.zeros(4), 5.41))
     movement.in_words(5.42)
@@ -154,7 +154,7 @@ class TwoHands:
 
     def poll(self, now: float) -> list[HandSample]:
         places = (("left", self._left_y), ("right", -self._left_y))
-        stamps = np.arange(now - 4.0, now, 0.0125)  # All at once, as if the server had collected them.
+        stamps = np.arange(now - 4.0, now, 0.0125)  # All samples come at once, as if the server had collected them.
         made = [(hand, y, t) for t in stamps.tolist() for hand, y in places]
         return [HandSample(hand, np.array([0.3, y, 1.0]), np.array([0, 0, 0, 1.0]), t) for hand, y, t in made]
 

@@ -1,4 +1,4 @@
-"""The listener of the headset server: bounded rates, a log with few lines, who may drive, and texts about addresses."""
+"""The headset server's listener bounds rates, logs few lines, decides who drives, and makes texts about addresses."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from q2r2_control.inputs.listener import (
 INFO, WARNING = logging.INFO, logging.WARNING
 
 
-def test_a_rate_limit_allows_its_count_in_each_period_and_saves_nothing_for_the_next_period() -> None:
+def test_a_rate_limit_allows_the_same_count_in_each_period_even_if_the_period_before_was_not_used() -> None:
     limit = RateLimit(3, 0.5)
     assert [limit.take(10.0) for _ in range(5)] == [True, True, True, False, False]
     assert not limit.is_open(10.25)
@@ -42,7 +42,7 @@ def test_a_rate_limit_allows_its_count_in_each_period_and_saves_nothing_for_the_
 
 
 class Lines(logging.Logger):
-    """A logger that keeps its lines, and the log that writes them."""
+    """A logger that keeps its lines, and :attr:`log_of_hosts`, which writes to this logger."""
 
     def __init__(self) -> None:
         super().__init__("lines")
@@ -53,7 +53,7 @@ class Lines(logging.Logger):
         self.lines.append(f"{record.levelname} {record.getMessage()}")
 
 
-def test_the_first_line_about_a_host_is_written_at_once_and_then_one_line_a_second_counts_the_others() -> None:
+def test_the_first_line_about_a_host_is_written_at_once_and_later_one_line_a_second_counts_omitted_lines() -> None:
     lines = Lines()
     log = lines.log_of_hosts
     for index in range(3000):
@@ -66,7 +66,7 @@ def test_the_first_line_about_a_host_is_written_at_once_and_then_one_line_a_seco
     assert lines.lines == [*first, "WARNING line 2999 (999 more left out)"]
 
 
-def test_a_line_that_came_too_early_is_written_later_and_the_most_important_line_is_kept() -> None:
+def test_lines_within_the_same_second_are_written_later_as_one_line_and_the_most_important_is_kept() -> None:
     lines = Lines()
     log = lines.log_of_hosts
     log.write("a", INFO, "connected", 10.0)
@@ -81,7 +81,7 @@ def test_a_line_that_came_too_early_is_written_later_and_the_most_important_line
     assert lines.lines[2:] == ["WARNING refused (1 more left out)"]
 
 
-def test_each_of_eight_hosts_has_lines_of_its_own_and_all_further_hosts_share_one_line() -> None:
+def test_the_log_has_separate_lines_for_eight_hosts_and_one_common_line_for_all_further_hosts() -> None:
     lines = Lines()
     for index in range(100):
         lines.log_of_hosts.write(f"host {index}", WARNING, f"line {index}", 10.0)
@@ -144,7 +144,7 @@ SILENT = replace(BACK, registrations=({}, {}))
         pytest.param(QUIET, replace(SILENT, since=NOW - 2.1), Admission.REFUSE, id="waited in vain"),
     ],
 )
-def test_a_client_with_poses_replaces_a_driver_without_and_a_headset_that_comes_back_replaces_itself(
+def test_a_client_with_poses_replaces_a_driver_without_poses_and_a_returning_headset_replaces_its_old_connection(
     driver: Peer | None, newcomer: Peer, verdict: Admission
 ) -> None:
     decided, reason = decide(driver, newcomer, NOW)
@@ -153,7 +153,7 @@ def test_a_client_with_poses_replaces_a_driver_without_and_a_headset_that_comes_
         assert (newcomer.peer if verdict is Admission.ADMIT else driver.peer) in reason
 
 
-def test_a_driver_gives_way_only_after_the_timeout_that_stops_its_arms() -> None:
+def test_another_client_replaces_a_silent_driver_only_after_the_timeout_that_stops_the_arms() -> None:
     assert 2 * STREAM_TIMEOUT < QUIET_ALLOWED < 0.5 * SILENCE_ALLOWED
     assert WAIT_ALLOWED < POSES_ALLOWED
 

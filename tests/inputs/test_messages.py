@@ -64,7 +64,9 @@ def pose_with_frame(dialect: Dialect, frame_id: bytes) -> bytes:
 
 
 @every_dialect
-def test_messages_are_read_as_they_were_sent_including_the_stamp_and_a_w_of_minus_one(dialect: Dialect) -> None:
+def test_messages_are_read_as_they_were_sent_including_the_stamp_and_a_quaternion_with_w_minus_one(
+    dialect: Dialect,
+) -> None:
     pose, twist, inputs = (decode(kind, payload[dialect], dialect) for kind, payload in PAYLOADS.items())
     assert isinstance(pose, HandPose)
     assert isinstance(twist, HandTwist)
@@ -100,7 +102,7 @@ def test_no_payload_fits_both_dialects_and_poses_of_equal_size_differ_by_the_nul
 
 @every_dialect
 @every_kind
-def test_a_payload_of_any_other_length_is_refused(kind: MessageType, dialect: Dialect) -> None:
+def test_a_payload_of_a_wrong_length_is_refused(kind: MessageType, dialect: Dialect) -> None:
     payload = PAYLOADS[kind][dialect]
     for wrong in (*(payload[:length] for length in range(len(payload))), payload + b"\0", payload + bytes(8)):
         with pytest.raises(ProtocolError, match="bytes"):
@@ -177,7 +179,7 @@ def frames(*chunks: bytes) -> list[WireFrame]:
     return found
 
 
-def test_a_frame_has_the_bytes_of_the_protocol_and_only_one_nul_is_removed() -> None:
+def test_a_frame_has_the_bytes_of_the_protocol_and_only_one_nul_is_removed_from_its_destination() -> None:
     assert encode_frame("/abc", b"xyz") == ABC
     assert frames(ABC) == [WireFrame("/abc", b"xyz", terminated=False)]
     assert frames(KEEPALIVE) == [WireFrame("", b"", terminated=False)]
@@ -218,7 +220,7 @@ def test_bytes_that_cannot_be_a_frame_are_refused_with_a_reason(stream: bytes, r
         frames(stream)
 
 
-def test_frames_before_a_fault_are_not_lost() -> None:
+def test_frames_before_invalid_bytes_are_still_read() -> None:
     decoder = FrameDecoder()
     decoder.feed(ABC + b"\xff\xff\xff\xff")
     assert decoder.next_frame() == WireFrame("/abc", b"xyz", terminated=False)

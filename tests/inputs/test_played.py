@@ -1,4 +1,4 @@
-"""Errors of a headset that are added to exact poses: noise and uneven times, and other errors only if asked for."""
+"""The errors of a headset are added to exact poses: noise and uneven times, and other errors only if wanted."""
 
 from __future__ import annotations
 

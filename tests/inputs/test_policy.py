@@ -44,7 +44,7 @@ def sent(policy: PolicyInput, *arguments: Any) -> ActionChunk:
     return chunk
 
 
-def test_the_policy_input_is_a_policy_source() -> None:
+def test_the_policy_input_implements_the_interface_of_a_policy_source() -> None:
     assert isinstance(opened(), PolicySource)
 
 
@@ -59,7 +59,7 @@ def test_joint_positions_of_an_action_become_tool_poses_and_a_posture() -> None:
     assert [chunk.grippers[arm][0] for arm in robot().arms] == [0.3, 1.0]
 
 
-def test_a_recording_returns_a_chunk_exactly_as_it_was_given() -> None:
+def test_a_chunk_of_actions_is_exactly_the_same_after_it_was_written_as_json_and_read() -> None:
     chunk = sent(opened(), np.tile(robot().home / 3.0, (3, 1)), [0.1, 0.2, 0.3])
     again = ActionChunk.from_json(json.loads(json.dumps(chunk.as_json())))
     assert again.as_json() == chunk.as_json()
@@ -107,7 +107,7 @@ def test_the_fault_of_unusable_actions_is_named_in_one_line(
     assert "\n" not in text
 
 
-def test_a_quaternion_that_is_not_a_rotation_is_named() -> None:
+def test_the_fault_of_an_action_names_a_quaternion_that_is_not_a_rotation() -> None:
     poses = np.tile([0.5, 0.2, 0.3, 0.0, 0.0, 0.0, 1.0], (1, 2))
     poses[0, 13] = 0.0
     chunk = sent(opened(ActionSpace.TOOL), poses, [0.0])
@@ -176,13 +176,13 @@ def test_the_traceback_of_a_policy_is_logged_once_for_each_error(caplog: pytest.
     assert "_ask" not in first, "the traceback begins in the policy"
 
 
-def test_a_policy_that_returns_none_is_a_fault_that_says_so() -> None:
+def test_if_a_policy_returns_none_the_fault_of_its_actions_says_so() -> None:
     told = asked(of_function(lambda seen: None))
     assert told.endswith("the policy returned None; allowed: an array of actions (n, size)")
 
 
 @pytest.mark.parametrize("error", [SystemExit(3), GeneratorExit()], ids=repr)
-def test_a_policy_that_raises_an_exit_is_a_fault_and_is_called_again(error: BaseException) -> None:
+def test_an_exit_that_a_policy_raises_is_a_fault_and_the_policy_is_called_again(error: BaseException) -> None:
     def leaves(observation: Observation) -> Array:
         raise error
 
@@ -230,6 +230,6 @@ def test_a_policy_is_found_by_its_name_in_the_working_directory(
 
 
 @pytest.mark.parametrize("more", [{"space": "joints"}, {"rate": 0.0}, {"rate": 1000.0}], ids=str)
-def test_a_space_or_rate_that_is_not_allowed_is_named(more: dict[str, Any]) -> None:
+def test_a_wrong_action_space_or_rate_raises_an_error_with_what_is_allowed(more: dict[str, Any]) -> None:
     with pytest.raises(ConfigError, match="allowed: "):
         PolicyInput(**more)

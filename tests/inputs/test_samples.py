@@ -1,4 +1,4 @@
-"""Samples of hands: joining data that arrive separately, a queue for the loop, and poses that must not be followed.
+"""Samples of hands: how poses and inputs are joined, how the loop gets samples, and which poses it must not follow.
 
 Frozen poses and a moving frame are faults. Human motions are not.
 """
@@ -99,7 +99,7 @@ def faults(watched: Iterable[Watched]) -> set[tuple[str, HandFault]]:
 
 
 def moved(samples: Iterable[Message], by: Callable[[float, str], pin.SE3]) -> Iterator[Message]:
-    """Yield the poses as seen in a frame that moves. ``by`` is its motion at a time [s], for a hand."""
+    """Yield the poses as seen in a frame that moves. ``by(t, hand)`` is the frame's motion at the time ``t`` [s]."""
     for t, hand, pose in samples:
         assert isinstance(pose, HandPose)
         rotation = pin.Quaternion(pose.quaternion).matrix()
@@ -128,7 +128,7 @@ def test_a_pose_that_stays_equal_to_the_last_bit_is_frozen_whatever_its_stamp() 
     assert faults(handed_on(TwoHands(rest, 1, (0.0, 0.0), tremor=False, noise=1e-7).samples(2.0))) == set()
 
 
-def test_a_hand_that_is_moved_by_keys_may_rest_without_noise() -> None:
+def test_a_hand_that_keys_move_does_not_count_as_frozen_if_it_rests_without_noise() -> None:
     (_, _, pose), *_ = resting()
     watch = HandsWatch()
     virtual = Reception("q2r_left_hand_pose", "left", pose, virtual=True)
@@ -209,7 +209,7 @@ def test_human_hands_that_carry_a_light_box_are_not_taken_for_a_moving_frame(
 
 
 def snatch(t: float) -> pin.SE3:
-    """Return the motion of both hands: 0.2 m to and fro, at 18 m/s^2 up to 1.2 m/s, and each time a sudden stop."""
+    """Return a motion to and fro by 0.2 m. It accelerates at 18 m/s^2 up to 1.2 m/s, and stops suddenly each time."""
     stroke, phase = divmod(t, 0.4)
     ramp = 1.2 / 18.0
     way = min(9.0 * min(phase, ramp) ** 2 + 1.2 * max(phase - ramp, 0.0), 0.2)

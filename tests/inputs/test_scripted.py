@@ -1,4 +1,4 @@
-"""Scripted hands: the properties on which the demo and the tests of tracking rely."""
+"""Scripted hands have the properties on which the demo and the tests of tracking rely."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ def flat(samples: list[HandSample]) -> list[tuple[object, ...]]:
     return [(s.hand, s.pose_stamp, s.inputs, *s.position.tolist(), *s.quaternion.tolist()) for s in samples]
 
 
-def test_equal_seeds_give_equal_samples_for_any_times_of_polling() -> None:
+def test_equal_seeds_give_equal_samples_however_often_the_loop_polls() -> None:
     often, seldom = (play(ScriptedInput("grasp", human=True, seed=3), 6.0, dt) for dt in (0.001, 0.1))
     assert len(seldom) > 500
     assert flat(often)[: len(seldom)] == flat(seldom)
 
 
-def test_stamps_are_by_the_callers_clock_and_never_later_than_now() -> None:
+def test_stamps_are_times_of_the_callers_clock_and_never_later_than_the_time_of_the_poll() -> None:
     script = ScriptedInput("circle", human=True)
     script.start()
     last = dict.fromkeys(SIDES, -math.inf)
@@ -49,11 +49,11 @@ def test_stamps_are_by_the_callers_clock_and_never_later_than_now() -> None:
 @pytest.mark.slow
 @EVERY
 @pytest.mark.parametrize("hand", SIDES)
-def test_hands_move_smoothly_slowly_and_within_reach(trajectory: str, hand: str) -> None:
+def test_hands_move_smoothly_and_slowly_and_only_over_short_distances(trajectory: str, hand: str) -> None:
     script, dt = ScriptedInput(trajectory), 0.01
     poses = [script.hand_pose(hand, tick * dt) for tick in range(2100)]
     way = np.array([pose.translation - poses[0].translation for pose in poses])
-    # A hand with precision moves farther than its tool.
+    # In precision mode, a hand moves farther than its tool.
     lowest = -0.211 if trajectory == "peg" else -0.164 if trajectory in WORKS else 0.0
     assert way[:, 2].min() > lowest - 1e-9
     assert np.abs(way).max() <= (0.355 if trajectory == "carry" else 0.25) + 1e-9
@@ -79,7 +79,7 @@ def test_the_hands_rest_until_the_first_press_has_engaged_the_arms(trajectory: s
     assert np.ptp([s.position for s in samples if s.hand == "left"], axis=0).max() < 1e-12
 
 
-def test_the_right_hand_mirrors_the_left() -> None:
+def test_the_rotation_of_the_right_hand_mirrors_that_of_the_left_hand() -> None:
     script, reflection = ScriptedInput("rotate"), np.diag([1.0, -1.0, 1.0])
     for t in (0.0, 2.0, 5.0, 9.0, 13.0):
         left, right = (script.hand_pose(hand, 0.0).rotation.T @ script.hand_pose(hand, t).rotation for hand in SIDES)
@@ -126,7 +126,7 @@ def test_a_wrong_setting_is_refused_with_what_is_allowed(arguments: dict[str, ob
 
 
 @pytest.mark.parametrize("trajectory", ["circle", "meet"])
-def test_on_an_iiwa_the_motion_equals_the_written_motion_bit_for_bit(trajectory: str) -> None:
+def test_scripted_hands_for_a_cell_of_iiwa_arms_move_exactly_as_without_a_cell(trajectory: str) -> None:
     written = flat(play(ScriptedInput(trajectory), 4.0))
     for name in ("dual_iiwa7", "dual_iiwa14", "iiwa7"):
         assert flat(play(ScriptedInput.from_config(load_config(f"config/{name}.yaml"), trajectory), 4.0)) == written
@@ -144,14 +144,14 @@ def test_shorter_arms_move_shorter_distances_and_turn_by_the_same_angles() -> No
         np.testing.assert_allclose(ways[1], 0.82 / 1.12 * ways[0], rtol=1e-3)
 
 
-def test_the_home_of_the_way_points_is_where_the_tools_of_the_shipped_cell_are_at_home() -> None:
+def test_the_home_positions_of_the_way_points_equal_those_of_the_tools_in_the_shipped_cell() -> None:
     robot = Robot.from_config(load_config("config/dual_iiwa7.yaml"))
     for arm, home in HOME.items():
         np.testing.assert_allclose(robot.tool_pose(robot.home, arm).translation, home, atol=1e-4)
 
 
 @pytest.mark.parametrize("work", WORKS.values(), ids=WORKS)
-def test_every_work_has_rising_times_and_ends_at_home_with_open_grippers(work: HandWork) -> None:
+def test_the_way_points_of_every_work_have_rising_times_and_end_at_home_with_open_grippers(work: HandWork) -> None:
     for hand, points in work.tools.items():
         times = [point[0] for point in points]
         assert times == sorted(set(times))
@@ -162,7 +162,9 @@ def test_every_work_has_rising_times_and_ends_at_home_with_open_grippers(work: H
 
 
 @pytest.mark.parametrize("name", ["meet+grasp", "handover+stack"])
-def test_the_steps_of_several_works_are_in_order_and_each_begins_with_the_name_of_its_work(name: str) -> None:
+def test_the_steps_of_several_works_are_in_order_and_the_text_of_each_step_begins_with_the_name_of_its_work(
+    name: str,
+) -> None:
     trajectory = trajectory_named(name)
     begins, words = zip(*trajectory.steps, strict=True)
     assert begins == tuple(sorted(begins))
@@ -186,7 +188,7 @@ def test_works_in_sequence_do_the_same_as_each_work_alone() -> None:
         assert both.upper_presses[hand] == pytest.approx(presses)
 
 
-def test_with_precision_a_hand_moves_four_times_as_far_as_the_tool_and_pushes_its_stick() -> None:
+def test_in_precision_mode_a_hand_moves_four_times_as_far_as_the_tool_and_pushes_its_stick() -> None:
     trajectory, tool = trajectory_named("peg"), WayPoints(WORKS["peg"].tools["right"])
     ((begins, ends),) = trajectory.precise
     for first, last, farther in ((3.0, begins, 1.0), (begins, ends, 4.0), (ends, 24.0, 1.0)):
@@ -198,7 +200,7 @@ def test_with_precision_a_hand_moves_four_times_as_far_as_the_tool_and_pushes_it
     assert not trajectory_named("meet").precise
 
 
-def test_a_motion_reaches_its_way_points_in_time_and_rests_at_each() -> None:
+def test_a_motion_reaches_each_way_point_at_its_time_and_rests_there() -> None:
     way = WayPoints([(1.0, 0.0, 0.0, 0.0, 0.0, 0.0), (2.0, 0.1, 0.0, 0.2, 0.0, 0.0), (4.0, 0.1, -0.3, 0.2, 0.4, 1.2)])
     for t, place, tilt, turn in (
         (0.0, (0.0, 0.0, 0.0), 0.0, 0.0),
@@ -239,7 +241,7 @@ def test_the_headset_loses_shaky_hands_for_a_second_and_they_engage_again_and_co
         assert np.ptp(way, axis=0) == pytest.approx((0.14, 0.15, 0.148), abs=1e-3)
 
 
-def test_shaky_hands_tremble_twice_as_far_and_at_a_lower_frequency() -> None:
+def test_shaky_hands_tremble_twice_as_far_as_calm_hands_and_at_a_lower_frequency() -> None:
     def trembling(shaky: bool) -> tuple[float, float]:
         sampling = HeadsetSampling("left", 1, position_noise=0.0, tremor=True, shaky=shaky)
         x = [sampling.measured(pin.SE3.Identity(), t).translation[0] for t in np.arange(0.0, 10.0, 0.005)]
@@ -252,7 +254,7 @@ def test_shaky_hands_tremble_twice_as_far_and_at_a_lower_frequency() -> None:
     assert most == pytest.approx(2.0 * least, rel=0.2)
 
 
-def test_hands_reach_for_the_parts_where_the_seed_has_shifted_them() -> None:
+def test_hands_reach_for_the_parts_at_the_positions_to_which_the_seed_has_shifted_them() -> None:
     places = {seed: place_of(seed, 0.02) for seed in range(20)}
     assert len(set(places.values())) == 20
     assert 0.015 < np.abs(list(places.values())).max() <= 0.02
@@ -267,6 +269,6 @@ def test_hands_reach_for_the_parts_where_the_seed_has_shifted_them() -> None:
     np.testing.assert_allclose(elsewhere - plain, (x, y, 0.0), atol=1e-9)
 
 
-def test_work_without_parts_cannot_be_spread() -> None:
+def test_a_spread_of_parts_is_refused_for_a_trajectory_without_parts() -> None:
     with pytest.raises(ConfigError, match="'circle': has no parts to spread; allowed: "):
         ScriptedInput("circle", spread=0.01)

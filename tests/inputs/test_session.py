@@ -97,7 +97,7 @@ def test_a_registration_can_be_removed_and_removing_it_again_is_no_error(
     assert (session.published, session.subscribed) == ({}, {})
 
 
-def test_the_topic_list_has_a_type_of_two_parts_for_each_topic(session: HeadsetSession) -> None:
+def test_the_topic_list_has_the_type_of_each_topic_as_package_and_name(session: HeadsetSession) -> None:
     for topic in ("dice", "/cup"):
         session.receive(command(Dialect.ROS2, "__publish", topic=topic, message_name="geometry_msgs/Twist"))
     session.receive(command(Dialect.ROS2, "__topic_list"))
@@ -210,7 +210,7 @@ def test_a_client_that_registers_too_many_topics_is_dropped(session: HeadsetSess
 
 
 @pytest.mark.parametrize("name", ["q2r left", "//a", "a" * 300, "\n", "é"])
-def test_a_destination_that_no_topic_can_have_ends_the_session(session: HeadsetSession, name: str) -> None:
+def test_a_destination_that_is_no_valid_topic_name_ends_the_session(session: HeadsetSession, name: str) -> None:
     with pytest.raises(ProtocolError, match="not a topic name"):
         session.receive(frame(Dialect.ROS1, name, b"x"))
 
@@ -225,7 +225,7 @@ def test_a_client_that_leaves_too_many_answers_unread_is_dropped(session: Headse
 
 
 @every_dialect
-def test_vibrations_go_to_the_topic_as_the_client_wrote_it_in_the_clients_dialect(
+def test_vibrations_are_sent_in_the_clients_dialect_to_the_topic_name_that_the_client_wrote(
     session: HeadsetSession, dialect: Dialect
 ) -> None:
     session.receive(command(dialect, "__subscribe", topic="/" + HAPTIC, message_name="a/B"))
@@ -234,7 +234,9 @@ def test_vibrations_go_to_the_topic_as_the_client_wrote_it_in_the_clients_dialec
     assert answers(session) == [("/" + HAPTIC, header + bytes.fromhex("0000003f 0000803f"))]
 
 
-def test_no_vibrations_go_to_a_client_that_has_not_subscribed_or_has_unsubscribed(session: HeadsetSession) -> None:
+def test_no_vibrations_are_sent_to_a_client_that_has_not_subscribed_or_has_unsubscribed(
+    session: HeadsetSession,
+) -> None:
     session.queue_haptic(HapticFeedback("left", 0.5, 1.0))
     session.receive(command(Dialect.ROS2, "__subscribe", topic=HAPTIC, message_name="a/B"))
     session.queue_haptic(HapticFeedback("right", 0.5, 1.0))

@@ -58,7 +58,9 @@ def test_a_drag_moves_the_tool_by_the_same_distance_and_the_arm_pauses_when_the_
     [(Page(silent_at=0.4), "pose_silent"), (Page(gone_at=0.4), "connection_lost")],
     ids=["falls silent", "is gone"],
 )
-def test_a_page_that_falls_silent_or_is_gone_stops_the_arm(page: Page, reason: str) -> None:
+def test_the_arm_stops_if_the_page_that_drags_its_tool_falls_silent_or_loses_its_connection(
+    page: Page, reason: str
+) -> None:
     summary = page.loop.run(1.2, realtime=False)
     assert changes(list(summary.events), "left")[-1] == ("engaged", "lost", reason)
     assert page.tools[-1] == pytest.approx(page.tools[-100], abs=1e-6)

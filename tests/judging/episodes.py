@@ -1,4 +1,8 @@
-"""Episodes for tests. Some have no recording, so that every number can be chosen. Others are recorded from hands."""
+"""Episodes for tests.
+
+:func:`episode` makes an episode without a recording, so that a test can choose every number. :func:`record_episode`
+records a run in which hands move the arms.
+"""
 
 from __future__ import annotations
 
@@ -42,11 +46,11 @@ def episode(
     config: Config | None = None,
     **ticks: Any,
 ) -> Episode:
-    """Return an episode with both arms engaged at rest and a pose every 10 ms, unless said otherwise.
+    """Return an episode. By default, both arms are engaged at rest, and each hand has a pose every 10 ms.
 
-    ``path`` (m, 3) has the tool positions at the frames. ``hand_path`` (k, 3) has the positions of both hands at the
-    times ``received`` (k,); a tick takes each of them ``delay`` [s] later. ``ticks`` replaces columns of
-    :class:`Ticks`.
+    ``path`` (m, 3) has the tool positions at the frames [m]. ``hand_path`` (k, 3) has the positions of both hands [m]
+    at the times ``received`` (k,) [s]. A tick takes each of these positions ``delay`` [s] later. ``ticks`` replaces
+    columns of :class:`Ticks`.
     """
     count = round(seconds / DT)
     t: Array = DT * np.arange(1, count + 1, dtype=np.float64)
@@ -100,10 +104,11 @@ def frame_times(seconds: float = 4.0) -> Array:
     return np.asarray(DT * np.arange(1, round(seconds / DT) + 1)[::EVERY])
 
 
-RATE = 250.0  # A low rate, with longer substeps than by default, because ticks take most of a test's time [Hz].
-DURATION = 4.0  # [s]
-PRESS, START = 0.2, 0.5  # [s]
-_PRESSED = 0.1  # [s]
+# Rate of ticks [Hz]. It is low, and substeps are longer than by default, because ticks take most of a test's time.
+RATE = 250.0
+DURATION = 4.0  # Duration of a recorded episode [s].
+PRESS, START = 0.2, 0.5  # Times at which the press and the motion of the hands begin [s].
+_PRESSED = 0.1  # Duration of a press [s].
 _BINDINGS = {"trigger": "toggle", "grip": "discard", "stick_up": "mark", "stick_down": "success"}
 EPISODES = TeleopSettings.model_validate({"bindings": {name: f"record_{does}" for name, does in _BINDINGS.items()}})
 
@@ -195,7 +200,7 @@ def hands(
 ) -> PlayedInput:
     """Return hands of a headset that do random work unless a ``pose`` is given.
 
-    Samples are uneven, with noise, and some of them lost; the hands tremble.
+    Samples come at uneven times and have noise, and some of them are lost. The hands tremble.
     """
     timing = {hand: sampling(hand, seed, tremor=True, dropout_probability=0.002) for hand in SIDES}
     return played(pose or Work(seed), inputs, timing)

@@ -1,4 +1,4 @@
-"""Ways to spoil a copy of a recorded episode: faults that recorders, cameras and cables really have."""
+"""Functions that spoil a copy of a recorded episode, by faults that real recorders, cameras and cables have."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from q2r2_control.recording.messages import NANOSECONDS, Message, array, data_of
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.tick_rows import Rows, numbers_in, tick_type
 
-LATE = 0.2  # Delay of data that is late [s].
+LATE = 0.2  # Delay that these functions give to data [s].
 
 
 @dataclass
@@ -92,7 +92,7 @@ def frozen(contents: Contents) -> None:
 
 
 def late_pictures(contents: Contents) -> None:
-    """Let each picture show the cell of 200 ms ago, with right stamps."""
+    """Let each picture show the cell as it was 200 ms before the picture's stamp."""
     found = contents.pictures("left_wrist")
     seen = np.array([message.time for message in found])
     shown = [jpeg_in(found[max(int(np.searchsorted(seen, time - LATE * NANOSECONDS)) - 1, 0)]) for time in seen]
@@ -191,7 +191,7 @@ def one_spike(contents: Contents) -> None:
 
 
 def too_fast(contents: Contents) -> None:
-    """Let measured positions move at several times the possible speed of the joint, and back, without a jump."""
+    """Let the measured position of a joint deviate and return without a jump, at several times its speed limit."""
     ticks = np.arange(len(contents.rows))
     contents.rows["q"][:, 3] += 0.6 * np.exp(-0.5 * ((ticks - contents.middle.start) / (20.0)) ** 2)
 

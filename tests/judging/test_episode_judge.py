@@ -33,7 +33,7 @@ pytestmark = pytest.mark.slow
 
 # There is one episode with work, one that its operator discards, and one in which nothing moves.
 TOGGLED, GIVEN_UP = (1.0, 2.5, 3.0, 4.0, 6.0), 3.7
-VERDICTS_BY = {2.8: 1, 3.9: 1, 6.3: 2}  # At each of these times [s], the run waits until there are so many verdicts.
+VERDICTS_BY = {2.8: 1, 3.9: 1, 6.3: 2}  # At each of these times [s], the run waits for this number of verdicts.
 DURATION = 7.0
 FIRST = EpisodeSpan(1.0, 2.5, number=1)
 BEGINS, ENDS, DISCARDED = TeleopReason.EPISODE_BEGINS, TeleopReason.EPISODE_ENDS, TeleopReason.EPISODE_DISCARDED
@@ -75,7 +75,7 @@ class PatientRun:
 
 
 def names_of(judged: list[Judged]) -> list[list[str]]:
-    """Return the names of each episode's reasons."""
+    """Return, for each episode, the names of the reasons to discard it."""
     return [[reason.name for reason in one.verdict.reasons] for one in judged]
 
 
@@ -93,7 +93,7 @@ def test_each_verdict_equals_the_verdict_after_the_run(run: PatientRun) -> None:
     ]  # Episode 2 gets no verdict, since the operator has discarded it.
 
 
-def test_both_hands_feel_a_verdict_and_the_run_is_replayed_with_it(run: PatientRun) -> None:
+def test_both_hands_feel_each_verdict_and_a_replay_of_the_run_finds_no_difference(run: PatientRun) -> None:
     for pulse in (EPISODE_KEPT, EPISODE_REJECTED):
         felt = {one.hand for one in run.felt if (one.frequency, one.amplitude) == (pulse.frequency, pulse.amplitude)}
         assert felt == {"left", "right"}
@@ -139,7 +139,8 @@ def test_a_killed_judge_is_reported_once_and_the_run_goes_on(tmp_path: Path, cap
     assert [one.verdict.keep for one in judge(Recording(run.file))] == [True, False, False]
 
 
-# There are three episodes, 1 to 2.5, 3 to 4.5 and from 5 s on. The first succeeded and the second is discarded.
+# There are three episodes: from 1 to 2.5 s, from 3 to 4.5 s, and from 5 s on. The operator rates the first episode as a
+# success, and discards the second one.
 PARTS, SUCCEEDED, DISCARDED_AT, MARKED = (1.0, 2.5, 3.0, 4.5, 5.0), 2.7, 4.7, 1.7
 PARTS_DURATION = 7.0
 CONTROLS = operator(PARTS, DISCARDED_AT, MARKED, SUCCEEDED)
@@ -168,7 +169,9 @@ def test_each_episode_is_judged_only_by_its_own_content(judged: list[Judged]) ->
     assert [one.figures.arms["left"].gripper_changes for one in judged] == [1, 0, 0]
 
 
-def test_times_of_events_are_since_their_episode_began_and_the_page_names_it(file: Path, judged: list[Judged]) -> None:
+def test_times_of_events_count_from_the_start_of_their_episode_and_the_page_names_each_episode(
+    file: Path, judged: list[Judged]
+) -> None:
     marks = [(event.t, event.kind) for event in judged[0].episode.events]
     assert marks == [
         (pytest.approx(0.0, abs=0.02), "episode_begins"),
@@ -196,7 +199,7 @@ def test_kept_episodes_become_episodes_of_a_dataset_with_their_own_frames(file: 
         assert np.abs(near - state[0]).max(axis=1).min() < 1e-9
 
 
-def test_a_press_that_begins_an_episode_without_a_recording_is_reported_once() -> None:
+def test_without_a_recording_a_press_that_would_begin_an_episode_is_reported_once() -> None:
     loop = loop_of(hands(3, inputs=CONTROLS), teleop=EPISODES)
     summary = loop.run(1.5, realtime=False)
     assert [event.kind for event in summary.events].count(TeleopReason.NO_RECORDING) == 1

@@ -1,4 +1,4 @@
-"""Each number agrees with its definition, for episodes in which everything is known."""
+"""Each figure of an episode agrees with its definition. The test makes the episodes, so it knows the right values."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def hand(**what: Any) -> HandFigures:
 
 
 def without(begin: float, end: float) -> Array:
-    """Return times of poses that are 10 ms apart, with a gap."""
+    """Return times of poses that are 10 ms apart [s], with a gap from ``begin`` to ``end`` [s]."""
     t = np.arange(0.0, 4.0, 0.01)
     return t[(t <= begin + 1e-9) | (t >= end - 1e-9)]
 
@@ -42,7 +42,7 @@ def engaged_until(first: int, again: int) -> Flags:
 
 
 class TestHands:
-    def test_the_length_of_a_gap_is_exact_and_its_share_refers_to_the_engaged_time(self) -> None:
+    def test_the_length_of_a_gap_is_exact_and_the_dropout_share_is_relative_to_the_engaged_time(self) -> None:
         found = hand(received=without(1.0, 1.2), delay=0.03)
         assert (found.arm, found.dropouts) == ("left", 1)
         assert (found.sample_age_ms_p50, found.sample_age_ms_p99) == pytest.approx((30.0, 30.0))
@@ -86,7 +86,7 @@ class TestHands:
         assert hand_figures(of, "left", DROPOUT).dropouts == 2
         assert hand_figures(lossy, "left", DROPOUT).dropouts == 1  # The time after the last pose is a dropout.
 
-    def test_a_hand_whose_arm_is_never_engaged_has_no_shares(self) -> None:
+    def test_a_hand_whose_arm_is_never_engaged_has_no_pose_rate_and_no_figures_of_gaps(self) -> None:
         found = hand(engaged=NEVER)
         assert (found.pose_rate_hz, found.dropout_share, found.longest_gap_s) == (None, None, None)
 
@@ -99,13 +99,13 @@ class TestDelays:
     stamps = np.arange(0.0, 4.0, 1.0 / 75.0)
 
     @pytest.mark.parametrize("delay", [0.045, 0.1, 0.237])
-    def test_a_tool_that_repeats_its_hand_later_has_that_delay(self, delay: float) -> None:
+    def test_the_delay_of_a_tool_behind_its_hand_is_found(self, delay: float) -> None:
         later = wander(frame_times() - delay)
         found = delays(episode(path=later, received=self.stamps, hand_path=wander(self.stamps)), "left")
         assert found == pytest.approx((delay, delay), abs=1.5e-3)
 
     @pytest.mark.parametrize("stance", list(Stance))
-    def test_axes_stance_scale_and_rest_do_not_change_the_delay(self, stance: Stance) -> None:
+    def test_axes_stance_scale_and_time_at_rest_do_not_change_the_found_delay(self, stance: Stance) -> None:
         config = cell()
         teleop = config.teleop.model_copy(update={"stance": stance, "axes": ("+z", "-x", "+y"), "position_scale": 2.0})
         config = config.model_copy(update={"teleop": teleop})
@@ -134,7 +134,7 @@ class TestArms:
         assert found.position_error_mm_p99 == pytest.approx(30.0)
         assert found.rotation_error_deg_rms == 0.0
 
-    def test_the_leash_counts_while_it_drags_and_a_new_anchor_undoes_no_slip(self) -> None:
+    def test_only_time_in_which_the_leash_drags_counts_as_leashed_and_a_new_anchor_keeps_the_earlier_slip(self) -> None:
         slip = np.zeros((2000, 2))
         slip[500:1000, 0] = np.linspace(0.0, 0.2, 500)
         slip[1000:1500, 0], slip[1900:, 0] = 0.2, 0.05
@@ -159,14 +159,14 @@ class TestArms:
 
 
 class TestIdle:
-    def test_a_tool_that_rests_or_trembles_or_is_not_engaged_is_idle(self) -> None:
+    def test_a_tool_that_rests_or_trembles_or_is_not_engaged_counts_as_idle(self) -> None:
         tremor = 4e-4 * np.sin(60.0 * frame_times())[:, None] * np.ones(3)
         path = np.linspace(0.0, 0.5, 400)[:, None] * np.ones(3)
         assert idle_share(episode(path=path)) == pytest.approx(0.0)
         for idle in (episode(), episode(path=tremor), episode(path=path, engaged=NEVER)):
             assert idle_share(idle) == 1.0
 
-    def test_half_a_second_before_and_after_a_motion_or_a_change_of_the_gripper_is_not_idle(self) -> None:
+    def test_the_half_second_before_and_after_a_motion_or_a_change_of_the_gripper_does_not_count_as_idle(self) -> None:
         path, gripper = np.zeros((400, 3)), np.ones((2000, 2))
         path[150:, 0] = np.minimum(0.002 * np.arange(250), 0.2)
         assert idle_share(episode(path=path)) == pytest.approx(0.5, abs=0.02)
@@ -175,14 +175,14 @@ class TestIdle:
 
 
 class TestTiming:
-    def test_ticks_that_are_missing_in_the_file_are_lost_and_not_missed(self) -> None:
+    def test_ticks_that_are_missing_in_the_file_count_as_lost_and_not_as_missed(self) -> None:
         number = np.concatenate((np.arange(1000), np.arange(1100, 2100)))
         found = timing_figures(episode(number=number, t=DT * (number + 1.0)))
         assert (found.lost_ticks, found.missed_ticks, found.late_ticks) == (100, 0, 0)
         assert found.lost_share == pytest.approx(100 / 2100)
         assert found.longest_lost_s == pytest.approx(0.2)
 
-    def test_ticks_that_came_late_are_missed_and_not_lost(self) -> None:
+    def test_periods_that_a_late_loop_skipped_count_as_missed_ticks_and_not_as_lost_ticks(self) -> None:
         dt = np.full(2000, DT)
         dt[500], dt[600] = 10.0 * DT, 1.2 * DT
         found = timing_figures(episode(dt=dt, t=np.cumsum(dt)))
@@ -193,7 +193,7 @@ class TestTiming:
         assert not timing_figures(episode(following=~NEVER)).ended
 
 
-def test_each_pause_that_no_operator_asked_for_is_one_fault() -> None:
+def test_a_pause_that_no_operator_asked_for_is_one_fault_even_if_it_stops_both_arms() -> None:
     jumped = Reason.of(TeleopReason.HAND_JUMPED, distance=0.3)
     pressed, refused = Reason.of(TeleopReason.PRESSED, control="lower button"), Reason(TeleopReason.NOT_ENGAGED)
     events = [
@@ -224,17 +224,17 @@ def to_and_fro(seconds: float, noise: float = 0.0) -> tuple[Array, Array]:
     return t, place + np.random.default_rng(0).normal(0.0, noise, place.shape)
 
 
-def test_a_reach_of_minimum_jerk_has_the_value_of_the_definition() -> None:
-    # For x(s) = 10 s^3 - 15 s^4 + 6 s^5, the integral of the squared jerk is 720, and the peak speed 15 / 8.
+def test_the_dimensionless_jerk_of_a_minimum_jerk_motion_has_its_theoretical_value() -> None:
+    # For x(s) = 10 s^3 - 15 s^4 + 6 s^5, the integral of the squared jerk is 720, and the peak speed is 15 / 8.
     assert ldlj(reach(), FRAME) == pytest.approx(-np.log(720.0 / (15.0 / 8.0) ** 2), abs=0.12)
-    # The value does not depend on the size of a motion, but on stops and starts.
+    # The value does not depend on the size of a motion. It is lower if the motion stops and starts again.
     assert ldlj(reach(way=0.02), FRAME) == pytest.approx(ldlj(reach(way=0.5), FRAME), rel=1e-6)
     shorter = reach(0.25, 0.05)
     in_four = np.concatenate([shorter[:-1] + step * shorter[-1] for step in range(4)])
     assert ldlj(in_four, FRAME) < ldlj(reach(), FRAME) - 0.5
 
 
-def test_an_episode_twice_as_long_is_as_smooth_but_noise_changes_the_value() -> None:
+def test_smoothness_does_not_depend_on_the_length_of_an_episode_but_noise_makes_it_smaller() -> None:
     short, long, noisy = (
         smoothness(*to_and_fro(seconds, noise), np.ones(int(seconds / FRAME), dtype=bool))
         for seconds, noise in ((4.0, 0.0), (8.0, 0.0), (4.0, 1e-3))
@@ -245,7 +245,7 @@ def test_an_episode_twice_as_long_is_as_smooth_but_noise_changes_the_value() -> 
     assert noisy < short - 3.0
 
 
-def test_only_motion_while_engaged_counts() -> None:
+def test_only_the_motion_of_an_engaged_arm_counts_for_smoothness() -> None:
     t, place = to_and_fro(8.0)
     place[400:] = place[400]
     engaged = np.ones(800, dtype=bool)

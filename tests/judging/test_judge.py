@@ -1,4 +1,4 @@
-"""Clean episodes are kept. Each episode that was spoiled in one way is discarded for that reason."""
+"""Clean episodes are kept. An episode with one fault is discarded, and the verdict names this fault."""
 
 from __future__ import annotations
 
@@ -55,11 +55,11 @@ def clean(folder: Path) -> Path:
     return record_episode(folder / "clean", hands(SEED))
 
 
-def test_clean_work_is_kept(clean: Path) -> None:
+def test_an_episode_of_clean_work_is_kept(clean: Path) -> None:
     found = judged(clean)
     assert found.verdict.line == "keep"
     for arm in found.figures.arms.values():
-        # The filters delay by 35 ms, and the controller lags at the start of a motion.
+        # The filters delay the target by 35 ms. At the start of a motion, the tool lags behind the target.
         assert arm.hand_to_target_ms == pytest.approx(33.0, abs=6.0)
         assert arm.hand_to_tool_ms == pytest.approx(49.0, abs=8.0)
         assert arm.gripper_changes == 1
@@ -109,14 +109,16 @@ SPOILED: dict[str, tuple[PlayedInput, set[str]]] = {
 
 
 @pytest.mark.parametrize("what", SPOILED)
-def test_an_episode_that_is_spoiled_in_one_way_is_discarded_for_that_reason(what: str, folder: Path) -> None:
+def test_an_episode_with_one_fault_is_discarded_for_this_fault_only(what: str, folder: Path) -> None:
     source, reasons = SPOILED[what]
     found = judged(record_episode(folder / what, source))
     assert {reason.name for reason in found.verdict.reasons} == reasons, found.verdict.line
     assert found.verdict.word == "discard"
 
 
-def test_lost_ticks_are_named_and_their_samples_do_not_count_as_dropouts(clean: Path, tmp_path: Path) -> None:
+def test_lost_ticks_are_named_and_the_samples_that_were_lost_with_them_do_not_count_as_dropouts(
+    clean: Path, tmp_path: Path
+) -> None:
     found = judged(without_ticks(clean, tmp_path / "lost.mcap", 500, 25))
     assert {reason.name for reason in found.verdict.reasons} == {"max_lost_share", "max_lost_gap"}
     assert found.figures.timing.lost_ticks == 25
@@ -124,7 +126,7 @@ def test_lost_ticks_are_named_and_their_samples_do_not_count_as_dropouts(clean: 
     assert found.figures.timing.missed_ticks == 0
 
 
-def test_a_recording_whose_process_was_killed_has_only_that_reason(clean: Path, tmp_path: Path) -> None:
+def test_a_recording_whose_process_was_killed_is_discarded_for_this_reason_only(clean: Path, tmp_path: Path) -> None:
     found = judged(killed(clean, tmp_path / "killed.mcap", 800))
     assert [reason.name for reason in found.verdict.reasons] == ["needs_end"]
     assert found.figures.timing.ticks == 800
@@ -146,19 +148,21 @@ def test_a_damaged_recording_is_judged_by_the_part_before_the_damage(clean: Path
     assert "needs_end" in {reason.name for reason in judged(tmp_path / "cut.mcap").verdict.reasons}
 
 
-def test_a_run_in_which_no_arm_was_engaged_has_only_that_reason(tmp_path: Path) -> None:
+def test_a_run_in_which_no_arm_was_engaged_is_discarded_for_this_reason_only(tmp_path: Path) -> None:
     found = judged(record_episode(tmp_path, hands(SEED, inputs=lambda hand, t: HandInputs()), 0.5))
     assert [reason.name for reason in found.verdict.reasons] == ["never_engaged"]
 
 
 @pytest.mark.parametrize(("ticks", "says"), [(0, {"no_ticks", "needs_end"}), (1, {"needs_end"})])
-def test_one_tick_and_no_tick_make_no_episode(ticks: int, says: set[str], clean: Path, tmp_path: Path) -> None:
+def test_a_recording_with_one_tick_or_no_tick_is_discarded(
+    ticks: int, says: set[str], clean: Path, tmp_path: Path
+) -> None:
     found = judged(killed(clean, tmp_path / "few.mcap", ticks))
     assert {reason.name for reason in found.verdict.reasons} == says | {"never_engaged"}
     json.dumps(found.as_json(), allow_nan=False)
 
 
-def test_a_verdict_is_kept_beside_the_file_with_all_of_its_numbers(clean: Path, tmp_path: Path) -> None:
+def test_a_verdict_is_written_beside_its_recording_with_all_figures_and_thresholds(clean: Path, tmp_path: Path) -> None:
     file = Path(shutil.copy(clean, tmp_path))
     written = keep_verdicts([judged(file)])
     assert written == tmp_path / VERDICT_FILE
@@ -290,7 +294,7 @@ def test_cameras_with_the_same_finding_are_named_together_after_the_other_reason
 @pytest.mark.parametrize(
     ("name", "limit", "of", "figure", "at_it", "beyond", "says"), CASES, ids=[case[0] for case in CASES]
 )
-def test_a_number_beyond_its_threshold_is_the_only_reason(
+def test_an_episode_with_one_figure_beyond_its_threshold_is_discarded_for_this_figure_only(
     name: str, limit: float, of: str, figure: str, at_it: Any, beyond: Any, says: str
 ) -> None:
     settings = JudgeSettings.model_validate({name: limit})
@@ -308,7 +312,7 @@ def test_this_file_tests_every_threshold_of_episodes() -> None:
     assert set(JudgeSettings.model_fields) - tried == others | of_subtasks
 
 
-def test_a_failure_is_discarded_unless_failures_are_kept_but_a_run_that_ended_by_a_fault_always_is() -> None:
+def test_a_failed_episode_is_discarded_unless_failures_are_kept_and_a_run_that_a_fault_ended_is_discarded_too() -> None:
     assert verdict_of(changed(success=True), JudgeSettings()).keep
     failed = changed(success=False)
     assert [reason.name for reason in verdict_of(failed, JudgeSettings()).reasons] == ["keep_failed"]
@@ -317,7 +321,7 @@ def test_a_failure_is_discarded_unless_failures_are_kept_but_a_run_that_ended_by
     assert [reason.name for reason in verdict_of(ended, JudgeSettings()).reasons] == ["ended_by"]
 
 
-def test_a_missing_number_is_not_judged_and_a_number_that_is_not_finite_discards_the_episode() -> None:
+def test_a_missing_figure_is_not_judged_but_an_episode_with_a_figure_that_is_not_finite_is_discarded() -> None:
     assert verdict_of(changed("arm", ldlj=None, hand_to_tool_ms=None), JudgeSettings()).keep
     assert not verdict_of(changed("arm", ldlj=float("nan")), JudgeSettings()).keep
     assert not verdict_of(changed("arm", position_error_mm_rms=float("nan")), JudgeSettings()).keep

@@ -1,4 +1,4 @@
-"""The page needs no other files, accepts any names of recordings, and does not grow with their length."""
+"""The report page of the judge needs no other files, accepts any name of a recording, and can show any episode."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class Page(HTMLParser):
 
 
 @pytest.mark.slow
-def test_the_page_fetches_nothing_and_each_episode_has_a_row_with_its_verdict_and_a_section() -> None:
+def test_the_report_page_loads_no_other_files_and_has_a_row_and_a_section_for_each_episode() -> None:
     text = page_of([moving(), judged(episode())], "<script>alert(1)</script> & {braces}")
     page = Page(text)
     assert not page.all("link")
@@ -87,7 +87,7 @@ def test_any_episode_can_be_judged_and_plotted(of: Episode) -> None:
     ElementTree.fromstring(picture)
 
 
-def test_thinning_keeps_the_extremes() -> None:
+def test_a_thinned_curve_keeps_its_largest_and_its_smallest_value() -> None:
     t = np.linspace(0.0, 1.0, 12_345)
     values = np.zeros(len(t))
     values[777], values[9_999], values[5_000:5_100] = 5.0, -3.0, np.nan

@@ -1,4 +1,4 @@
-"""A clean episode with cameras is kept. Each copy that was spoiled in one way is discarded for that reason."""
+"""A clean episode with cameras is kept. Each copy with one added fault is discarded for this fault."""
 
 from __future__ import annotations
 
@@ -64,8 +64,8 @@ def test_an_unspoiled_episode_with_pictures_is_kept_and_its_pictures_come_on_tim
         assert camera.frozen_share == camera.black_share == camera.bad_pictures == 0
 
 
-def test_a_smooth_circle_before_a_small_camera_is_kept(tmp_path: Path) -> None:
-    """The speed hardly changes, so that many lags explain the pictures almost equally well."""
+def test_an_episode_of_a_smooth_circle_with_a_small_camera_is_kept(tmp_path: Path) -> None:
+    """The tools' speed hardly changes, so pictures fit many lags almost equally well. The judge finds no large lag."""
     needs_opengl()
     front = CameraConfig(position=(1.9, 0.0, 1.0), look_at=(0.4, 0.0, 0.3), width=64, height=48, rate=30.0)
     loop = pipeline("circle", "mujoco", cameras={"front": front})
@@ -74,13 +74,17 @@ def test_a_smooth_circle_before_a_small_camera_is_kept(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("what", NUMBERS)
-def test_an_episode_with_spoiled_numbers_is_discarded_for_that_reason(what: str, clean: Path, tmp_path: Path) -> None:
+def test_an_episode_with_a_fault_in_its_numbers_is_discarded_for_this_fault(
+    what: str, clean: Path, tmp_path: Path
+) -> None:
     spoil, reason = NUMBERS[what]
     assert reason in reasons(spoiled(clean, tmp_path / "spoiled.mcap", spoil))
 
 
 @pytest.mark.parametrize("what", CAMERAS)
-def test_an_episode_with_spoiled_pictures_is_discarded_for_that_reason(what: str, filmed: Path, tmp_path: Path) -> None:
+def test_an_episode_with_a_fault_in_its_pictures_is_discarded_for_this_fault(
+    what: str, filmed: Path, tmp_path: Path
+) -> None:
     spoil, reason = CAMERAS[what]
     assert reason in reasons(spoiled(filmed, tmp_path / "spoiled.mcap", spoil))
 
@@ -111,11 +115,11 @@ def test_an_episode_without_optional_data_is_kept(what: str, clean: Path, tmp_pa
     assert reasons(spoiled(clean, tmp_path / "harmless.mcap", HARMLESS[what])) == set()
 
 
-def test_one_lost_picture_is_not_a_reason(filmed: Path, tmp_path: Path) -> None:
+def test_one_lost_picture_is_no_reason_to_discard_an_episode(filmed: Path, tmp_path: Path) -> None:
     assert reasons(spoiled(filmed, tmp_path / "lost.mcap", one_picture_is_lost)) == set()
 
 
-def test_a_cell_may_require_a_task(clean: Path, tmp_path: Path) -> None:
+def test_an_episode_without_a_task_is_discarded_if_the_cell_requires_a_task(clean: Path, tmp_path: Path) -> None:
     file = spoiled(clean, tmp_path / "untold.mcap", without_task)
     assert reasons(file, JudgeSettings(needs_task=True)) == {"needs_task"}
 

@@ -1,4 +1,4 @@
-"""Hands that take over whenever they are asked: an input that ``lerobot-rollout`` finds by its entry point."""
+"""Hands that take over the arms whenever they are asked. ``lerobot-rollout`` finds this input by its entry point."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ from q2r2_control.types import SIDES, HandInputs, HandSample
 from tests.support.hands_input import PRESSED, RELEASED, HandsInput
 
 NAME, READY = "taking_over", "hands: have taken over"
-# After the first time without a poll, the next poll asks the hands anew. READY is printed after the second time [s].
+# After a time without a poll that is longer than _ASKED_ANEW [s], the next poll asks the hands to take over. READY is
+# printed _LATER [s] after this poll.
 _ASKED_ANEW, _LATER = 0.05, 0.3
 
 
 class TakingOver(HandsInput):
-    """Hands that press as soon as they are asked, and then move forwards. A printed line tells when they do."""
+    """Hands that press as soon as they are asked, and then move forwards. A printed line tells when they move."""
 
     def __init__(self) -> None:
         super().__init__()

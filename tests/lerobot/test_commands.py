@@ -33,7 +33,7 @@ from tests.lerobot import hands
 from tests.recording.runs import ROOT
 from tests.support.modules import blocks_of
 
-FPS = 25  # A frame has a whole number of ticks.
+FPS = 25  # At this rate, each frame has a whole number of ticks.
 TAKEOVERS = 100
 SPACE, TAB, ESCAPE = b" ", b"\t", b"\x1b"
 PACED = f"--fps={FPS}"
@@ -42,7 +42,7 @@ ROLLS_OUT = Path(sys.executable).with_name("lerobot-rollout").exists()
 
 
 def command(program: str, folder: Path, *options: str) -> list[str]:
-    """Return a command of lerobot whose robot is a cell, which is recorded in ``folder``."""
+    """Return a command of lerobot whose robot is a cell. Its run is recorded in ``folder``."""
     robot = {"type": "q2r2_cell", "cell": folder / "cell.yaml", "simulated_time": "true", "rate": FPS}
     robot |= {"record": folder / "recordings"}
     return [str(Path(sys.executable).with_name(program)), *(f"--robot.{key}={robot[key]}" for key in robot), *options]
@@ -73,7 +73,7 @@ CHANGES = {
 }
 
 
-# An ACT policy needs pictures, which are slow to make without a graphics card.
+# An ACT policy needs pictures. They are small, because a computer without a graphics card draws them slowly.
 CAMERA = "{position: [1.9, 0.0, 1.0], look_at: [0.4, 0.0, 0.3], width: 64, height: 48, rate: 25}"
 SEEN = f"{{front: {CAMERA}}}"
 
@@ -134,7 +134,7 @@ def default_interrupt() -> None:
 
 
 class Terminal:
-    """A program in its own terminal. Its lines are read one by one, and its keys are pressed."""
+    """A program in its own terminal. The test reads its lines one by one, and presses keys."""
 
     def __init__(self, arguments: list[str], folder: Path) -> None:
         self._controller, terminal = pty.openpty()
@@ -190,7 +190,7 @@ def rows_of(folder: Path) -> Rows:
     return np.concatenate([chunk.rows for chunk in recording_of(folder).chunks()])
 
 
-def test_teleoperate_lets_the_scripted_hands_drive_the_arms(folder: Path) -> None:
+def test_the_command_lerobot_teleoperate_lets_the_scripted_hands_move_the_arms(folder: Path) -> None:
     terminal = Terminal(command("lerobot-teleoperate", folder, PACED, *HANDS), folder)
     terminal.wait("Teleop loop time", 2 * FPS)
     terminal.interrupt()
@@ -201,7 +201,7 @@ def test_teleoperate_lets_the_scripted_hands_drive_the_arms(folder: Path) -> Non
     assert np.ptp(rows["q"], axis=0).max() > 0.01
 
 
-def test_a_recorded_dataset_has_the_numbers_of_the_export_of_the_same_run(folder: Path) -> None:
+def test_a_dataset_that_lerobot_records_has_the_same_numbers_as_an_export_of_the_same_run(folder: Path) -> None:
     more = ("--dataset.num_episodes=1", "--dataset.episode_time_s=10", "--play_sounds=false")
     run(command("lerobot-record", folder, *HANDS, *dataset_options(folder, "waved"), *more), folder)
     (made,) = folder.glob("waved*")
@@ -215,8 +215,8 @@ def test_a_recorded_dataset_has_the_numbers_of_the_export_of_the_same_run(folder
         np.testing.assert_array_equal(found, wanted[name][: len(found)])
 
 
-def test_replay_repeats_the_motion_of_a_dataset(folder: Path, exported: Path) -> None:
-    rate = 500  # A slower loop follows a target less closely [Hz].
+def test_the_command_lerobot_replay_repeats_the_motion_of_a_dataset(folder: Path, exported: Path) -> None:
+    rate = 500  # Rate of the loop [Hz]. A slower loop follows a target less closely.
     write_cell(folder, {"loop_rate_hz: auto": f"loop_rate_hz: {rate}.0"})
     options = ("--dataset.repo_id=q2r2/circle", f"--dataset.root={exported}", "--dataset.episode=0")
     run(command("lerobot-replay", folder, *options, "--play_sounds=false"), folder)
@@ -236,7 +236,9 @@ def test_replay_repeats_the_motion_of_a_dataset(folder: Path, exported: Path) ->
         assert np.degrees(angle) < 0.2
 
 
-def test_rollout_lets_a_policy_act_that_was_trained_on_an_export(seen: Path, trained: Path) -> None:
+def test_the_command_lerobot_rollout_lets_a_policy_that_was_trained_on_an_export_move_the_arms(
+    seen: Path, trained: Path
+) -> None:
     options = [f"--policy.path={trained}", "--play_sounds=false"]
     if ROLLS_OUT:
         options += ["--strategy.type=base", PACED, "--duration=4", "--task=to go round"]
@@ -256,7 +258,9 @@ def test_the_commands_in_the_docs_train_a_policy_and_let_it_act(tmp_path: Path) 
 
 
 @pytest.mark.skipif(not ROLLS_OUT, reason="lerobot has DAgger since 0.6")
-def test_takeovers_of_dagger_make_no_jump_and_every_frame_says_who_acted(seen: Path, trained: Path) -> None:
+def test_takeovers_in_dagger_make_no_target_jump_and_every_frame_says_who_moved_the_arms(
+    seen: Path, trained: Path
+) -> None:
     dagger = ("--strategy.type=dagger", "--strategy.record_autonomous=true", "--strategy.smooth_handover=false")
     teleop = (
         "--teleop.type=q2r2_hands",

@@ -31,7 +31,7 @@ ROOT = Path(__file__).resolve().parents[2]
 FPS = 30
 KEY = video_key(CAMERA)
 SEEN = [with_pictures(episode, number) for number, episode in enumerate(EPISODES)]
-SPANS = [(0, 40), (40, 65), (65, 125)]  # Frames of the episodes.
+SPANS = [(0, 40), (40, 65), (65, 125)]  # First frame of each episode, and first frame after it.
 BACKEND = "pyav"  # The default, torchcodec, needs the libraries of FFmpeg, which no wheel contains.
 
 
@@ -51,7 +51,7 @@ def rows_of(folder: Path) -> list[dict[str, object]]:
     return rows
 
 
-def test_info_names_every_number_and_describes_its_content(dataset: Path) -> None:
+def test_info_json_names_every_number_and_has_the_counts_of_episodes_frames_and_tasks(dataset: Path) -> None:
     info = json.loads((dataset / "meta" / "info.json").read_text())
     assert (info["codebase_version"], info["fps"], info["robot_type"]) == ("v3.0", FPS, "two_arms")
     assert (info["total_episodes"], info["total_frames"], info["total_tasks"]) == (3, 125, 2)
@@ -83,7 +83,7 @@ def test_every_episode_has_its_frames_its_task_and_its_recording(dataset: Path) 
     ]
 
 
-def test_the_loader_reads_every_frame_its_neighbours_the_ends_and_the_successes(dataset: Path) -> None:
+def test_the_loader_reads_every_frame_with_its_neighbours_and_the_ends_and_successes_of_episodes(dataset: Path) -> None:
     ahead = [(index + 1) / FPS for index in range(4)]
     loaded = LeRobotDataset("q2r2/test", root=dataset, delta_timestamps={"action": ahead})
     assert (loaded.num_episodes, loaded.num_frames, loaded.fps) == (3, 125, FPS)
@@ -129,7 +129,9 @@ def test_the_loader_gives_every_frame_its_picture(film: Path) -> None:
             assert np.abs(pixels - wanted).mean() < 6, index
 
 
-def test_equal_episodes_give_equal_bytes_also_after_an_interrupted_export(film: Path, tmp_path: Path) -> None:
+def test_equal_episodes_give_a_dataset_with_equal_bytes_even_after_an_interrupted_export(
+    film: Path, tmp_path: Path
+) -> None:
     (tmp_path / "again").mkdir()
     shards = [tmp_path / "again" / str(number) for number in range(len(SEEN))]
     for episode, shard in zip(SEEN, shards, strict=True):
@@ -162,7 +164,7 @@ def test_while_a_video_is_encoded_no_thread_has_priority_over_a_control_loop(tmp
     assert seen == {os.SCHED_OTHER}
 
 
-def test_a_dataset_has_the_features_that_the_docs_name(tmp_path: Path) -> None:
+def test_the_docs_name_every_feature_of_an_exported_dataset(tmp_path: Path) -> None:
     record_two(tmp_path / "recordings")
     out = tmp_path / "out"
     command = [sys.executable, "-m", "q2r2_control", "export", "lerobot", str(tmp_path / "recordings")]

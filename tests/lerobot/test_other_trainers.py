@@ -55,7 +55,7 @@ def test_robomimic_loads_every_step_with_its_pictures(cache: str | None, tmp_pat
     assert loaded[64]["dones"][-1] == 1.0
 
 
-def test_lerobot_accepts_v21_and_reads_every_number_and_picture(tmp_path: Path) -> None:
+def test_lerobot_accepts_a_dataset_of_v21_and_reads_every_number_and_picture(tmp_path: Path) -> None:
     made = export("lerobot-v2.1", SEEN, tmp_path, ["1", "2", "3"])
     convert_dataset("made", root=made.parent if OF_ALL else made, push_to_hub=False)
     loaded = LeRobotDataset("made", root=made, delta_timestamps={"action": [0.0, 1 / FPS]}, video_backend="pyav")

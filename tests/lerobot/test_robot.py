@@ -1,4 +1,4 @@
-"""A cell is a robot of lerobot: found by its name, with the features of the datasets, moved by its actions.
+"""A cell is a robot of lerobot. It is found by its name, has the features of the datasets, and follows actions.
 
 Run by ``make test-lerobot``, in an environment of its own.
 """
@@ -37,7 +37,8 @@ from tests.recording.runs import ROOT
 from tests.ros.processes import EXECUTABLES, as_arguments, environment_of
 
 register_third_party_plugins()
-# Required motion [rad], tolerance [rad] or part of an opening, and tries of at least a thirtieth of a second.
+# Required motion of a joint [rad]. Tolerance of a joint [rad] and of an opening [of 1]. Number of tries, each of which
+# takes at least 1/30 s.
 MOVED, NEAR, TRIES = 0.02, 0.004, 1800
 ROS_RATE = 200.0  # [Hz]
 
@@ -118,7 +119,7 @@ def test_in_simulated_time_a_robot_has_no_real_cameras(tmp_path: Path, caplog: p
     assert "no pictures of front: real cameras keep real time; allowed: simulated_time=false" in caplog.messages
 
 
-def test_arms_behind_cabinets_follow_actions_like_simulated_ones(tmp_path: Path) -> None:
+def test_arms_behind_cabinets_follow_actions_like_simulated_arms(tmp_path: Path) -> None:
     data = yaml.safe_load((ROOT / "config/dual_iiwa7_fri.yaml").read_text())
     for arm, port in zip(("left", "right"), free_ports(2), strict=True):
         data["fri"][arm]["port"] = port
@@ -141,7 +142,7 @@ def test_arms_behind_ros_follow_actions_too(tmp_path: Path, monkeypatch: pytest.
 
 
 def assert_follows_behind(robot: Robot, module: str, *arguments: str) -> None:
-    """Assert that the arms of another program follow. The program is started here, and may take long to start."""
+    """Assert that arms behind another program follow. The program is started here, and may take long to start."""
     program = subprocess.Popen([sys.executable, "-m", module, *arguments], cwd=ROOT, env=os.environ)
     try:
         while not robot.is_connected:

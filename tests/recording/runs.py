@@ -72,7 +72,7 @@ def pipeline(
     source: Input | None = None,
     **changes: object,
 ) -> Pipeline:
-    """Return a pipeline at :data:`RATE`. It has cameras only if ``changes`` has some, because pictures take long."""
+    """Return a pipeline at :data:`RATE`. It has cameras only if ``changes`` has some, because drawing takes long."""
     hands = source or ScriptedInput(trajectory, human=human, seed=3, frequency_hz=0.5)
     return pipeline_of({"loop_rate_hz": RATE, "cameras": {}, **changes}, hands, plant, mode)
 

@@ -1,7 +1,7 @@
 """A process beside the loop takes and records pictures.
 
-In simulated time, each picture is exactly on time. In real time, pictures never delay the loop, and lost ones are
-counted.
+In simulated time, each picture is exactly on time. In real time, pictures never delay the loop, and lost
+pictures are counted.
 """
 
 from __future__ import annotations
@@ -85,14 +85,14 @@ def test_in_simulated_time_there_is_a_picture_at_each_multiple_of_a_cameras_peri
     assert replay(file).difference is None
 
 
-def test_a_picture_shows_the_objects_at_their_places(tmp_path: Path) -> None:
+def test_a_picture_shows_a_moved_object_at_its_new_position(tmp_path: Path) -> None:
     needs_opengl()
     loop = loop_with(front=FRONT)
     plant = loop.plant
     assert isinstance(plant, MujocoPlant)
 
     def moves_a_block(tick: Tick) -> None:
-        if tick.t >= 0.5 * DURATION:  # MuJoCo lets the block sleep by then.
+        if tick.t >= 0.5 * DURATION:  # By then, MuJoCo has put the block to sleep.
             plant.data.joint("blue_block_free").qpos[:3] = (0.4, 0.0, 0.7)
 
     loop.listeners.append(moves_a_block)
@@ -112,7 +112,7 @@ def test_pictures_that_are_not_taken_in_time_are_lost_and_counted(tmp_path: Path
     def stopped_for_a_while(recorder: Recorder) -> Iterator[None]:
         pid = cameras_of(recorder).process.pid
         os.kill(pid, signal.SIGSTOP)
-        while cameras_of(recorder).due < 600:  # There are more pictures than the queue has room for.
+        while cameras_of(recorder).due < 600:  # So many pictures do not fit into the queue.
             yield
         os.kill(pid, signal.SIGCONT)
         taken.append(cameras_of(recorder).due)

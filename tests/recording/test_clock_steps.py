@@ -1,4 +1,4 @@
-"""Clocks that are changed while a recording is made."""
+"""The steps of a clock that is set while a recording is made are found."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def ticks(count: int = 20) -> tuple[npt.NDArray[np.int64], Array, Array]:
 
 
 @pytest.mark.parametrize("step", [5.0, 0.2, -0.01, -5.0])
-def test_a_changed_clock_is_found_with_its_time_and_size(step: float) -> None:
+def test_a_step_of_the_clock_is_found_with_its_time_and_its_size(step: float) -> None:
     numbers, t, dt = ticks()
     t[8:] += step
     assert np.flatnonzero(clock_steps(numbers, t, dt)).tolist() == [8]
@@ -25,10 +25,10 @@ def test_a_changed_clock_is_found_with_its_time_and_size(step: float) -> None:
     assert ("back" in clock_step_text(step)) == (step < 0.0)
 
 
-def test_late_ticks_lost_ticks_and_uneven_receipts_are_not_a_changed_clock() -> None:
+def test_late_ticks_lost_ticks_and_uneven_times_of_receipt_do_not_count_as_a_step_of_the_clock() -> None:
     numbers, t, dt = ticks()
     late, at_once = t.copy(), t.copy()
-    late[8:] += 2.0  # The loop reports this delay.
+    late[8:] += 2.0  # The late tick records this delay in its ``dt``.
     dt_of_late = dt.copy()
     dt_of_late[8] += 2.0
     at_once[5:9] = t[9]

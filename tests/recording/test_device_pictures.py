@@ -36,8 +36,8 @@ from tests.support.processes import alive, wait_until
 
 pytest.importorskip("cv2")
 
-COUNT = 200  # Pictures of the video.
-ENOUGH = 15  # Pictures of a run.
+COUNT = 200  # Number of pictures in the video.
+ENOUGH = 15  # A run ends after this number of pictures.
 
 
 def front(path: Path, **changes: object) -> CameraConfig:
@@ -46,7 +46,7 @@ def front(path: Path, **changes: object) -> CameraConfig:
 
 
 class RecordedRun:
-    """A run in real time whose camera is a video file, until it has enough pictures or ``during`` returns True."""
+    """A run in real time whose camera is a video file. It ends when ``during`` returns True."""
 
     def __init__(
         self,
@@ -97,7 +97,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> RecordedRun:
     return RecordedRun(folder, front(write_video(folder / "front.avi", range(COUNT))))
 
 
-def test_each_picture_is_stamped_with_its_capture_on_the_loops_clock(run: RecordedRun) -> None:
+def test_the_stamp_of_each_picture_is_the_time_of_its_capture_on_the_loops_clock(run: RecordedRun) -> None:
     recording = Recording(file_of(run.summary))
     pictures = list(recording.pictures("front"))
     assert len(pictures) == run.summary.pictures >= ENOUGH
@@ -122,7 +122,7 @@ def test_the_tick_of_a_picture_is_the_last_tick_before_its_capture(run: Recorded
         assert picture.tick + 1 == len(ticks) or picture.time < ticks[picture.tick + 1]
 
 
-def test_the_judge_reads_the_pictures_as_those_of_simulated_cameras(run: RecordedRun) -> None:
+def test_the_judge_reads_pictures_of_a_real_camera_like_those_of_a_simulated_camera(run: RecordedRun) -> None:
     episode = read_episode(Recording(file_of(run.summary)))
     assert len(episode.pictures["front"].t) == run.summary.pictures
     assert 0 <= camera_figures(episode)["front"].missing_pictures <= 1
@@ -130,7 +130,7 @@ def test_the_judge_reads_the_pictures_as_those_of_simulated_cameras(run: Recorde
     assert not episode.pictures["front"].other_size.any()
 
 
-def test_a_camera_that_stops_is_reported_once_and_in_the_episode_and_the_run_goes_on(
+def test_a_camera_that_stops_is_reported_once_in_the_log_and_in_the_episode_and_the_run_goes_on(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     after: list[int] = []
@@ -153,7 +153,7 @@ def test_a_camera_that_stops_is_reported_once_and_in_the_episode_and_the_run_goe
 
 
 def test_depth_is_recorded_and_exported_without_loss(tmp_path: Path) -> None:
-    deep = np.arange(WIDTH * HEIGHT, dtype=np.uint16).reshape(HEIGHT, WIDTH) * 21  # It needs all 16 bits.
+    deep = np.arange(WIDTH * HEIGHT, dtype=np.uint16).reshape(HEIGHT, WIDTH) * 21  # The values need all 16 bits.
     count = 0
 
     def with_depth(run: RecordedRun) -> bool:
@@ -209,7 +209,7 @@ def test_when_the_process_of_a_camera_is_killed_the_run_goes_on(tmp_path: Path) 
     assert done.summary.fault is None
 
 
-def test_a_camera_that_cannot_be_opened_is_named_before_the_run(tmp_path: Path) -> None:
+def test_an_error_names_a_camera_that_cannot_be_opened_before_the_run_begins(tmp_path: Path) -> None:
     with (
         CameraStreams({"front": front(tmp_path / "none.avi")}) as streams,
         pytest.raises(CameraError, match=r"cameras\.front\.device: .*none\.avi: no such file"),

@@ -1,4 +1,4 @@
-"""Recordings that another program has rewritten, with its own chunks and order."""
+"""Recordings can be read after another program has rewritten them with its own chunks and order."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from q2r2_control.recording.tick_rows import SAMPLE_FIELDS, tick_type
 from tests.recording.runs import ARMS, JOINTS, file_of, pipeline, record
 
 _One = tuple[Schema | None, Channel, McapMessage]
-DURATION = 0.7  # A run of this duration has more ticks than a TickAssembly keeps back [s].
+DURATION = 0.7  # Duration of a run [s]. The run has more ticks than a TickAssembly keeps back.
 
 
 class Read(NamedTuple):
@@ -118,7 +118,7 @@ WRITERS: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("settings", WRITERS.values(), ids=WRITERS)
-def test_a_file_reads_the_same_after_it_was_rewritten_by_a_writer(
+def test_a_recording_has_the_same_content_after_it_was_rewritten_by_a_writer(
     file: Path, ours: Read, tmp_path: Path, settings: dict[str, Any]
 ) -> None:
     again = written_again(file, tmp_path / "again.mcap", in_order(file), **settings)
@@ -128,15 +128,17 @@ def test_a_file_reads_the_same_after_it_was_rewritten_by_a_writer(
     assert len(names) > 8
 
 
-def test_ticks_without_the_samples_that_they_took_are_refused(file: Path, tmp_path: Path) -> None:
-    """Each chunk has messages of one topic only. A replay without the samples of a tick would be another run."""
+def test_a_file_that_is_sorted_by_topic_so_that_ticks_come_without_their_hand_samples_is_refused(
+    file: Path, tmp_path: Path
+) -> None:
+    """Each chunk of the file has messages of one topic only. A replay of a tick without its samples would differ."""
     again = written_again(file, tmp_path / "again.mcap", by_topic(file), chunk_size=10_000)
     with pytest.raises(RecordingError, match="mcap sort puts them in order"):
         read_of(again)
 
 
-def test_a_file_of_another_writer_reads_up_to_where_it_is_cut(file: Path, ours: Read, tmp_path: Path) -> None:
-    """Only one tick is left out: the tick of which the last whole chunk has some messages, but not all."""
+def test_a_cut_file_of_another_writer_is_read_up_to_the_cut(file: Path, ours: Read, tmp_path: Path) -> None:
+    """Only one tick is left out. The last whole chunk has some of this tick's messages, but not all of them."""
     again = written_again(file, tmp_path / "again.mcap", in_order(file), chunk_size=3_000)
     data, cut, lengths = again.read_bytes(), tmp_path / "cut.mcap", []
     for size in np.linspace(0.3, 0.95, 25) * len(data):
@@ -151,8 +153,8 @@ def test_a_file_of_another_writer_reads_up_to_where_it_is_cut(file: Path, ours: 
     assert lengths[-1] > 0.8 * len(ours.rows)
 
 
-def test_zeros_at_the_end_of_a_cut_file_are_its_end(file: Path, ours: Read, tmp_path: Path) -> None:
-    """A file system that loses its power may keep the length of a file, but not its last data."""
+def test_a_cut_file_that_ends_with_zeros_is_read_up_to_the_zeros(file: Path, ours: Read, tmp_path: Path) -> None:
+    """If the computer loses power, the file system may keep the length of a file, but not its last data."""
     cut, data = tmp_path / "cut.mcap", file.read_bytes()
     first = min(summary_of(file).chunk_indexes, key=lambda index: index.chunk_start_offset)
     cut.write_bytes(data[: first.chunk_start_offset + first.chunk_length] + bytes(50_000))
@@ -161,7 +163,9 @@ def test_zeros_at_the_end_of_a_cut_file_are_its_end(file: Path, ours: Read, tmp_
     assert ours.rows.startswith(read.rows)
 
 
-def test_a_file_with_a_wrong_byte_in_a_chunk_reads_up_to_it_and_says_so(file: Path, ours: Read, tmp_path: Path) -> None:
+def test_a_file_with_a_wrong_byte_is_read_up_to_the_damaged_chunk_and_an_error_reports_the_damage(
+    file: Path, ours: Read, tmp_path: Path
+) -> None:
     again = written_again(file, tmp_path / "again.mcap", in_order(file), chunk_size=30_000)
     chunks = sorted(index.chunk_start_offset + index.chunk_length for index in summary_of(again).chunk_indexes)
     data = bytearray(again.read_bytes())

@@ -1,4 +1,4 @@
-"""Finds recordings by the paths that a user gives, and reads their messages and episodes, also from cut files."""
+"""The reader finds recordings by the paths that a user gives, and reads their content, also from cut files."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def events(*told: tuple[float, ReasonKind]) -> list[Event]:
 
 
 @pytest.mark.parametrize(("told", "expected"), CASES.values(), ids=CASES)
-def test_episodes_are_those_that_the_operator_began_and_rated(
+def test_a_recording_has_the_episodes_that_the_operator_began_with_the_operators_ratings(
     told: list[tuple[float, ReasonKind]], expected: list[tuple[float, float, bool, bool | None]]
 ) -> None:
     spans = spans_of(events(*told))
@@ -73,7 +73,9 @@ def test_for_a_whole_run_the_operators_rating_replaces_the_check_of_its_task() -
         assert [span.success for span in spans_of(events(*told), run_succeeded=True)] == [success]
 
 
-def test_files_in_folders_are_in_the_order_of_their_names_and_no_file_is_taken_twice(tmp_path: Path) -> None:
+def test_recordings_in_folders_are_found_in_the_order_of_their_names_and_no_recording_is_found_twice(
+    tmp_path: Path,
+) -> None:
     for name in ("b", "a"):
         (tmp_path / name).mkdir()
         (tmp_path / name / f"{name}.mcap").touch()
@@ -86,7 +88,7 @@ def test_files_in_folders_are_in_the_order_of_their_names_and_no_file_is_taken_t
             recordings_in([path])
 
 
-def test_a_reader_that_is_slower_than_the_writer_ends(tmp_path: Path) -> None:
+def test_reading_a_file_that_is_still_written_ends_with_the_data_that_it_had_at_first(tmp_path: Path) -> None:
     """A verdict is computed from a file that goes on growing. Data that comes later is left for the next reading."""
     about = About.of(pipeline(), realtime=True, notes={}, cameras=())
     topic = messages.Topic(1, messages.STATE, messages.TEXT)
@@ -106,8 +108,8 @@ def test_a_reader_that_is_slower_than_the_writer_ends(tmp_path: Path) -> None:
         assert found == [0, 1, 2]
 
 
-def test_a_file_that_ends_anywhere_is_read_as_far_as_it_goes_and_is_not_damaged(tmp_path: Path) -> None:
-    """A killed writer leaves the beginning of a file, which may end in the middle of any record."""
+def test_a_file_that_ends_at_any_byte_is_read_up_to_its_end_and_does_not_count_as_damaged(tmp_path: Path) -> None:
+    """A killed writer leaves the first part of a file, which may end in the middle of any record."""
     about = About.of(pipeline(), realtime=True, notes={}, cameras=())
     topic = messages.Topic(1, messages.STATE, messages.TEXT)
     whole, cut = tmp_path / "whole.mcap", tmp_path / "cut.mcap"
@@ -146,7 +148,7 @@ def messages_or_fault(file: Path) -> list[messages.Message] | str | None:
         return None if found is None else found.group(0)
 
 
-def test_a_completed_file_with_a_record_beyond_its_end_is_damaged(tmp_path: Path) -> None:
+def test_a_completed_file_with_a_record_that_would_end_beyond_the_file_counts_as_damaged(tmp_path: Path) -> None:
     about = About.of(pipeline(), realtime=True, notes={}, cameras=())
     file = tmp_path / "file.mcap"
     with BagWriter(file, [messages.Topic(1, messages.STATE, messages.TEXT)], about) as bag:
@@ -174,7 +176,7 @@ POSITIONS, VELOCITIES, EFFORTS = (np.arange(first, first + 3, dtype=np.float64) 
     ],
     ids=["joint state", "trajectory"],
 )
-def test_a_filled_template_is_the_message_that_rosbags_writes(kind: str, example: Any) -> None:
+def test_a_filled_template_of_a_message_equals_the_message_that_rosbags_writes(kind: str, example: Any) -> None:
     numbers = np.random.default_rng(0).normal(size=(2, 9))
     for row, stamp, payload in zip(
         numbers, STAMPS.tolist(), messages.MessageTemplate(kind, example, 9).filled(numbers, STAMPS), strict=True
@@ -189,7 +191,7 @@ def test_a_filled_template_is_the_message_that_rosbags_writes(kind: str, example
         assert message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == stamp
 
 
-def test_every_number_of_a_tick_has_its_own_name_and_place() -> None:
+def test_every_number_of_a_tick_has_its_own_label_and_its_own_index() -> None:
     labels, kind = tick_labels(ARMS, NAMES), tick_type(len(ARMS), len(NAMES))
     assert len(set(labels)) == len(labels) == kind.itemsize // 8
     rows = np.arange(2 * len(labels), dtype=np.float64).view(kind)
@@ -216,7 +218,7 @@ def test_arrays_and_texts_are_read_as_written_and_an_array_of_another_length_is_
     assert messages.data_of(messages.text("grüezi"), messages.TEXT) == "grüezi"
 
 
-def test_an_unfinished_file_may_end_with_bytes_that_look_like_an_index_far_away(tmp_path: Path) -> None:
+def test_a_file_whose_last_bytes_point_to_an_index_beyond_its_end_counts_as_unfinished(tmp_path: Path) -> None:
     about, file = About.of(pipeline(), realtime=True, notes={}, cameras=()), tmp_path / "cut.mcap"
     with BagWriter(file, [messages.Topic(1, messages.STATE, messages.TEXT)], about) as bag:
         bag.write([messages.Message(1, 0, about.epoch, 0, messages.text("state"))])

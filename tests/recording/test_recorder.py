@@ -73,7 +73,7 @@ def test_rosbags_in_another_process_reads_every_topic_with_the_data_of_the_run(
     poses, targets = arms["filtered_hand"][asked, :3], arms["target"][asked, :3]
     hands = [tick.targets["left"].hand for tick in led]
     np.testing.assert_array_equal(poses, [hand.translation for hand in hands if hand is not None])
-    # In Side-by-Side mode and with scale 1, the target moves from its first position exactly as the hand does.
+    # With the stance ``side_by_side`` and scale 1, the target moves from its first position exactly as the hand does.
     assert np.ptp(poses, axis=0).max() > 0.005
     np.testing.assert_allclose(targets - targets[0], poses - poses[0], atol=1e-9)
 
@@ -83,7 +83,7 @@ def first_of_each_period(ticks: list[Tick], rate: float) -> list[Tick]:
     return [tick for tick, now, before in zip(ticks, periods, [-1, *periods], strict=False) if now > before]
 
 
-def test_standard_topics_may_come_with_every_tick(tmp_path: Path) -> None:
+def test_without_a_topic_rate_every_tick_writes_the_standard_topics(tmp_path: Path) -> None:
     loop = pipeline()
     with Recorder(tmp_path, "test", waits=True) as recorder:
         recorder.begin(About.of(loop, False, {}), loop.robot, None)
@@ -106,7 +106,9 @@ def test_a_clock_that_is_set_back_during_a_run_changes_no_time_in_the_file(
     np.testing.assert_allclose(np.diff(times), 1.0 / RATE, atol=1e-6)
 
 
-def test_the_folder_is_a_bag_of_version_nine_that_says_what_was_run(recorded: tuple[Path, list[Tick]]) -> None:
+def test_the_folder_of_a_recording_is_a_rosbag_of_version_nine_that_describes_the_run(
+    recorded: tuple[Path, list[Tick]],
+) -> None:
     file, ticks = recorded
     bag = yaml.safe_load((file.parent / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
     assert (bag["version"], bag["storage_identifier"]) == (9, "mcap")
@@ -150,7 +152,7 @@ def test_a_recorder_that_wrote_nothing_leaves_no_file(tmp_path: Path, caplog: py
     assert list((tmp_path / "full").iterdir()) == []
 
 
-def test_a_file_whose_writer_fails_before_the_first_message_is_whole_is_removed_with_its_folder(tmp_path: Path) -> None:
+def test_if_the_writer_fails_before_its_first_complete_message_its_file_and_folder_are_removed(tmp_path: Path) -> None:
     loop = pipeline()
     about, topic = About.of(loop, False, {}), Topic(1, STATE, TEXT)
     folder = tmp_path / "run"
@@ -166,7 +168,7 @@ def test_a_file_whose_writer_fails_before_the_first_message_is_whole_is_removed_
     assert not folder.exists()
 
 
-def test_a_file_with_messages_is_not_empty_although_what_stands_before_them_is_damaged(tmp_path: Path) -> None:
+def test_a_file_with_messages_does_not_count_as_empty_even_if_the_data_before_them_are_damaged(tmp_path: Path) -> None:
     file = file_of(record(tmp_path, pipeline(), 0.2))
     whole = file.read_bytes()
     assert not is_empty(file)
@@ -188,7 +190,7 @@ def test_a_file_whose_writer_was_killed_before_the_first_message_is_removed(tmp_
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_file_that_falls_behind_the_run_is_reported_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_writer_that_falls_behind_the_run_is_reported_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     loop = pipeline()
     with caplog.at_level(logging.WARNING), Recorder(tmp_path, "slow") as recorder:
         recorder.begin(About.of(loop, False, {}), loop.robot)
@@ -202,7 +204,9 @@ def test_a_file_that_falls_behind_the_run_is_reported_once(tmp_path: Path, caplo
     assert recorder.summary.lost_ticks == 0
 
 
-def test_runs_that_begin_within_one_second_get_a_folder_each(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_runs_that_begin_within_one_second_get_separate_folders(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(time, "time_ns", lambda: 1_700_000_000_000_000_000)
     files = [file_of(record(tmp_path, pipeline(), 0.2)) for _ in range(2)]
     assert len({file.parent for file in files}) == len(list(tmp_path.iterdir())) == 2
@@ -211,7 +215,7 @@ def test_runs_that_begin_within_one_second_get_a_folder_each(tmp_path: Path, mon
 
 
 @pytest.mark.parametrize("side", ["the loop's", "the writer's"])
-def test_a_recorder_that_fails_inside_does_not_end_the_run(
+def test_an_internal_error_of_the_recorder_does_not_end_the_run(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, side: str
 ) -> None:
     def spoil(recorder: Recorder) -> None:
@@ -229,7 +233,7 @@ def test_a_recorder_that_fails_inside_does_not_end_the_run(
     assert ended_line(caplog) == summary.fault
 
 
-def test_memory_is_flat_however_long_a_run_is(tmp_path: Path, recorded: tuple[Path, list[Tick]]) -> None:
+def test_the_recorder_needs_no_more_memory_in_a_longer_run(tmp_path: Path, recorded: tuple[Path, list[Tick]]) -> None:
     loop, tick = pipeline("circle", "mujoco"), recorded[1][200]
     held: list[tuple[int, int]] = []
     with Recorder(tmp_path, "long", waits=True) as recorder:
@@ -244,5 +248,5 @@ def test_memory_is_flat_however_long_a_run_is(tmp_path: Path, recorded: tuple[Pa
         tracemalloc.stop()
     assert recorder.summary.lost_ticks == 0
     for now, then in zip(held[-1], held[0], strict=True):
-        # At most 8 MB wait at any time. The ticks between the first and the last measurement have 18 MB when packed.
+        # At most 8 MB of ticks wait for the writer. The ticks between the first and the last measurement have 18 MB.
         assert now - then < 14e6

@@ -64,7 +64,7 @@ def test_a_replay_of_a_run_in_simulated_time_is_identical(
 def test_requests_that_a_program_made_are_repeated_in_the_replay(tmp_path: Path) -> None:
     loop = pipeline("circle", "kinematic", control=cell().control.model_copy(update={"moving_obstacles": ("hand",)}))
     tool = loop.robot.tool_pose(loop.robot.home, "left").translation
-    place = tuple((tool + np.array([0.0, 0.6, 0.0])).tolist())  # The place is so near that the arms slow down.
+    place = tuple((tool + np.array([0.0, 0.6, 0.0])).tolist())  # The obstacle is so near there that the arms slow down.
     changes = {"position_scale": 0.3, "workspace": {"left": BOX}, "filter": {"smoothing_delay": 0.05}}
     other = TeleopSettings.model_validate(loop.config.teleop.model_dump() | changes)
     asks = {
@@ -100,7 +100,7 @@ def test_a_replay_of_a_run_in_real_time_is_identical(tmp_path: Path) -> None:
     loop = pipeline("circle", "mujoco", "torque", human=True)
     file = file_of(record(tmp_path, loop, 1.2, realtime=True))
     result = replay(file)
-    # Whether the arms were engaged depends on this computer, because a loop that stalls pauses them.
+    # The arms may never be engaged if this computer is slow, because a loop that stalls pauses them.
     assert (result.difference, result.ended_by) == (None, None)
     assert result.ticks > 10
     recording = Recording(file)
@@ -108,7 +108,7 @@ def test_a_replay_of_a_run_in_real_time_is_identical(tmp_path: Path) -> None:
     assert 0 <= first - recording.about.epoch < 1_000_000_000, "Unix times, whatever the loop's clock is"
 
 
-def test_a_gripper_that_held_an_object_holds_it_in_the_replay(tmp_path: Path) -> None:
+def test_a_gripper_that_held_an_object_holds_the_object_in_the_replay_too(tmp_path: Path) -> None:
     flat = {"box": (0.06, 0.04, 0.015), "at": (0.0, 0.0, 0.0085), "mass": 0.1}
     config = object_cell(None, flat)
     loop = pipeline("grasp", "mujoco", source=ScriptedInput("grasp"), arms=config.arms, mujoco=config.mujoco)
@@ -160,7 +160,7 @@ class LosesItsSensors(KinematicPlant):
         return changed(state, q=np.full_like(state.q, np.nan)) if state.stamp > 1.0 else state
 
 
-def test_a_run_that_ended_by_a_fault_ends_by_the_same_fault_again(tmp_path: Path) -> None:
+def test_the_replay_of_a_run_that_a_fault_ended_ends_with_the_same_fault(tmp_path: Path) -> None:
     plant = LosesItsSensors(Robot.from_config(cell()), cell())
     recorders: list[Recorder] = []
     with pytest.raises(PlantError) as fault:
@@ -175,7 +175,7 @@ def test_a_run_that_ended_by_a_fault_ends_by_the_same_fault_again(tmp_path: Path
 
 
 class SometimesLate:
-    """A solver without a solution for every seventh problem, as if it had taken too long."""
+    """A solver that returns no solution for every seventh problem, as if it had taken too long."""
 
     def __init__(self, solver: Solver) -> None:
         self._solver, self.count = solver, 0
@@ -186,7 +186,7 @@ class SometimesLate:
         return QpSolution(None, 1.0) if self.count % 7 == 0 else solution
 
 
-def test_solutions_that_came_too_late_come_too_late_in_the_replay(tmp_path: Path) -> None:
+def test_qp_solutions_that_came_too_late_in_the_run_also_come_too_late_in_the_replay(tmp_path: Path) -> None:
     loop = pipeline(control=cell().control.model_copy(update={"solve_time_limit": None}))
     loop.controller._solver = SometimesLate(DaqpSolver(loop.robot.model.nv))
     file = file_of(record(tmp_path, loop, 1.2))
@@ -205,7 +205,7 @@ def test_solutions_that_came_too_late_come_too_late_in_the_replay(tmp_path: Path
     ],
     ids=["a sample", "the time of a tick", "the state in words"],
 )
-def test_a_flipped_bit_is_the_first_difference(
+def test_the_replay_names_a_flipped_bit_of_the_recording_as_the_first_difference(
     tmp_path: Path, circle: Path, topic: str, place: int, at: float, said: str
 ) -> None:
     flipped: list[int] = []

@@ -1,4 +1,4 @@
-"""Recordings of ROS nodes: the content of the file, and its use by judge, export and replay."""
+"""Recordings of ROS nodes: what the file contains, and how judge, export and replay use it."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ LATENCY = 100_000  # Time from a tick to the receipt of its messages [ns].
 
 
 class NodesOnFile:
-    """Records messages as nodes send them. All times ``at`` are since the beginning of the recording [ns]."""
+    """Records messages as ROS nodes send them. The times ``at`` count from the start of the recording [ns]."""
 
     def __init__(self, folder: Path, config: Config | None = None, room: int = ROOM) -> None:
         self.config = (config or cell()).model_copy(update={"loop_rate_hz": 250.0})
@@ -97,7 +97,7 @@ class NodesOnFile:
 
     def event(self, at: int, kind: ReasonKind, arm: str | None = "left") -> None:
         topic = names.RECORDER_EVENTS if arm is None else names.arm_events(arm)
-        event = Event(123.0, arm or "", "", "", Reason(kind))  # The clock of its sender is not used.
+        event = Event(123.0, arm or "", "", "", Reason(kind))  # Readers do not use this time of the sender's clock.
         self.put(topic, at, names.make(names.TEXT, json.dumps(event.as_json())))
 
 
@@ -161,7 +161,7 @@ def test_a_tick_has_the_reference_of_its_time_and_the_messages_received_by_then(
     assert ticks.samples[:, names.SAMPLE_FIELDS.index("x")].tolist() == list(range(40, 60))
 
 
-def test_a_target_that_ended_does_not_belong_to_later_ticks(nodes: NodesOnFile) -> None:
+def test_ticks_after_the_timeout_of_a_target_stream_have_no_target(nodes: NodesOnFile) -> None:
     play(nodes, 10, engaged=range(5, 15))
     later = 15 * PERIOD + round(STREAM_TIMEOUT * SECOND)
     nodes.flags(later - 1000, "left", True)
@@ -184,7 +184,7 @@ def test_a_tick_whose_reference_was_lost_counts_as_lost_but_its_events_are_kept(
     assert len(ticks.states) == 1
 
 
-def test_ticks_are_counted_once_joints_and_flags_are_known_and_the_count_goes_on_after_a_restart(
+def test_ticks_count_only_after_joints_and_flags_are_known_and_the_count_continues_after_a_restart(
     nodes: NodesOnFile,
 ) -> None:
     nodes.tick(PERIOD, 499, np.array(nodes.robot.home))
@@ -194,8 +194,8 @@ def test_ticks_are_counted_once_joints_and_flags_are_known_and_the_count_goes_on
     assert ticks.numbers.tolist() == list(range(20))
 
 
-def test_ticks_are_kept_although_the_robot_does_not_measure_some_numbers(nodes: NodesOnFile) -> None:
-    """A position that is not finite is in its tick too, so that the judge finds it."""
+def test_ticks_are_kept_even_if_the_robot_does_not_measure_some_numbers(nodes: NodesOnFile) -> None:
+    """A tick also keeps a position that is not finite, so that the judge finds it."""
     play(nodes, 5)
     nothing, q = np.full(len(nodes.joints), np.nan), np.array(nodes.robot.home)
     for place, position in ((10, q), (11, nothing)):
@@ -209,7 +209,7 @@ def test_ticks_are_kept_although_the_robot_does_not_measure_some_numbers(nodes: 
     assert np.isnan(ticks.rows["q"]).all(axis=1).tolist() == [False] * 6 + [True]
 
 
-def test_episodes_begin_and_end_by_events_of_arms_and_of_services(nodes: NodesOnFile) -> None:
+def test_events_of_arms_and_of_services_begin_and_end_episodes(nodes: NodesOnFile) -> None:
     for at, kind, arm in (
         *(
             (20, TeleopReason.EPISODE_BEGINS, "left"),
@@ -268,7 +268,7 @@ def test_a_step_of_the_joints_is_exported_in_the_frames_of_its_time(nodes: Nodes
 
 
 @pytest.mark.parametrize("step", [5 * SECOND, -SECOND // 4], ids=["forward", "back"])
-def test_an_episode_in_which_the_clock_was_set_is_discarded_and_only_the_other_is_exported(
+def test_an_episode_in_which_the_clock_was_set_is_discarded_but_the_next_episode_can_be_exported(
     nodes: NodesOnFile, tmp_path: Path, step: int
 ) -> None:
     nodes.event(1, TeleopReason.EPISODE_BEGINS)
@@ -306,7 +306,7 @@ def test_ticks_keep_their_references_if_the_clock_is_set_and_a_tick_or_a_referen
     assert sum(len(chunk.rows) for chunk in chunks) == 3 * (20 + 20)
 
 
-def test_messages_for_which_there_is_no_room_are_lost_and_counted(tmp_path: Path) -> None:
+def test_messages_that_do_not_fit_into_the_full_queue_are_lost_and_counted(tmp_path: Path) -> None:
     nodes = NodesOnFile(tmp_path, room=1 << 16)
     assert nodes.recorder.writer is not None
     os.kill(nodes.recorder.writer.pid, signal.SIGSTOP)
@@ -317,7 +317,7 @@ def test_messages_for_which_there_is_no_room_are_lost_and_counted(tmp_path: Path
     assert nodes.recorder.written.messages == nodes.recorder.count - nodes.recorder.overflows
 
 
-def test_a_recording_of_another_controller_is_refused_in_one_line(tmp_path: Path) -> None:
+def test_reading_a_recording_of_an_external_controller_raises_an_error(tmp_path: Path) -> None:
     nodes = NodesOnFile(tmp_path, parse_config(yaml.safe_dump(external()), "the cell"))
     play(nodes, 5)
     with pytest.raises(RecordingError, match="recorded with controller: external"):

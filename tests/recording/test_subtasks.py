@@ -88,7 +88,9 @@ def test_number_and_name_of_each_subtask_are_in_the_file(file: Path) -> None:
     assert replay(file).difference is None
 
 
-def test_a_press_in_the_last_subtask_is_refused_with_its_name(tmp_path: Path) -> None:
+def test_in_the_last_subtask_a_press_for_the_next_one_is_refused_and_the_refusal_names_the_subtask(
+    tmp_path: Path,
+) -> None:
     file = recorded(tmp_path, (), (0.2, 0.4), NAMES[:2], duration=0.6)
     assert told_in(file)[-1] == (TeleopReason.LAST_SUBTASK, {"name": "grasp the cube"})
 
@@ -103,7 +105,7 @@ def subtasks_of(judged: Judged) -> list[tuple[str, float]]:
     return [(one.name, one.duration_s) for one in judged.figures.subtasks]
 
 
-def test_subtasks_are_judged_by_their_own_lengths(file: Path) -> None:
+def test_subtasks_are_judged_by_their_own_durations(file: Path) -> None:
     settings = JudgeSettings(min_subtask_time=0.35, max_subtask_time=0.5, min_ldlj=None, max_idle_share=None)
     first, second = judge(Recording(file), settings)
     assert [name for name, _ in subtasks_of(first)] == list(NAMES)
@@ -131,7 +133,7 @@ def test_each_exported_frame_has_the_subtask_of_its_time(file: Path) -> None:
     assert len(first.subtask) == first.frames
 
 
-def test_subtasks_without_names_have_numbers_also_in_a_run_that_is_one_episode(tmp_path: Path) -> None:
+def test_subtasks_without_names_get_numbers_even_if_the_whole_run_is_one_episode(tmp_path: Path) -> None:
     file = recorded(tmp_path, (), (0.5, 0.9), (), duration=1.2)
     (span,) = spans_to_export(file)
     (judged,) = judge(Recording(file))
@@ -147,7 +149,7 @@ def test_a_recording_without_reports_of_subtasks_has_no_subtasks(tmp_path: Path)
         assert (episode.subtasks, episode.subtask, judged.figures.subtasks) == ((), (), [])
 
 
-def test_marks_of_a_program_are_found_although_no_control_marks_episodes(tmp_path: Path) -> None:
+def test_episodes_that_a_program_marks_are_found_even_if_no_control_is_bound_to_these_marks(tmp_path: Path) -> None:
     loop = pipeline("circle")
     asks = {0.2: Action.RECORD_TOGGLE, 0.4: Action.NEXT_SUBTASK, 0.6: Action.RECORD_TOGGLE}
 

@@ -1,4 +1,4 @@
-"""Faults of run, writer and disk: the other parts go on, and the file keeps the earlier data."""
+"""If the run, the writer or the disk fails, the other parts go on, and the file keeps the earlier data."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ from tests.support.processes import alive, children, wait_until
 
 pytestmark = pytest.mark.slow
 
-WRITTEN_LATER = 60.0  # Simulated duration; a listener ends the run earlier [s].
+WRITTEN_LATER = 60.0  # Simulated duration of a run [s]. A listener ends the run earlier.
 
 
 def script(loop: Pipeline, steps: Callable[[Recorder], Iterator[None]]) -> Callable[[Recorder], None]:
-    """Return a function that runs ``steps`` during a run of ``loop``, when it is called with the recorder.
+    """Return a function for the argument ``during`` of :func:`record`. It plays ``steps`` during the run of ``loop``.
 
-    At each tick the steps go on until they yield. The run ends when they return.
+    At each tick, the generator ``steps`` goes on until its next ``yield``. The run ends when the generator returns.
     """
 
     def begin(recorder: Recorder) -> None:
@@ -82,7 +82,7 @@ def test_while_the_writer_is_stopped_the_loop_goes_on_and_losses_are_counted(tmp
 
 
 @pytest.mark.parametrize("what", ["the process that writes it was ended by SIGKILL", "File too large"])
-def test_a_killed_writer_or_a_full_disk_ends_only_the_recording_and_keeps_the_written_data(
+def test_a_killed_writer_or_a_full_disk_ends_only_the_recording_and_the_written_data_are_kept(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, what: str
 ) -> None:
     felt: list[HapticFeedback] = []
@@ -115,7 +115,7 @@ def test_a_killed_writer_or_a_full_disk_ends_only_the_recording_and_keeps_the_wr
         assert read_elsewhere(file_in(tmp_path), tmp_path)["/q2r2/tick"]["count"] == summary.ticks
 
 
-def test_sent_data_are_read_before_they_are_written_so_that_a_killed_run_does_not_lose_them() -> None:
+def test_the_writer_reads_sent_data_ahead_so_that_a_killed_run_does_not_lose_them() -> None:
     taken: list[int] = []
     tick = PackedTick(bytes(1000), b"", "")
 
@@ -132,7 +132,7 @@ def test_sent_data_are_read_before_they_are_written_so_that_a_killed_run_does_no
     assert taken == list(range(20))
 
 
-def test_a_writer_that_hangs_at_the_end_is_killed_after_the_longest_wait(
+def test_a_writer_that_hangs_at_the_end_of_a_run_is_killed_after_a_timeout(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("q2r2_control.recording.recorder.PATIENCE", 0.1)
@@ -186,7 +186,7 @@ def started(*command: str, cwd: Path = ROOT, env: Mapping[str, str] = PATH) -> I
 
 
 def has_ticks(folder: Path) -> bool:
-    """Return whether a chunk of the recording in this folder exists already."""
+    """Return whether a recording in this folder already contains ticks."""
     try:
         return any(len(chunk.rows) for file in folder.glob("*/*.mcap") for chunk in Recording(file).chunks())
     except RecordingError:
@@ -194,7 +194,7 @@ def has_ticks(folder: Path) -> bool:
 
 
 @pytest.mark.parametrize("both", [False, True], ids=["the run alone", "the writer too"])
-def test_the_file_of_a_killed_run_opens_and_is_replayed(tmp_path: Path, both: bool) -> None:
+def test_the_file_of_a_killed_run_can_be_opened_and_replayed(tmp_path: Path, both: bool) -> None:
     with started("-c", RUN, str(tmp_path)) as running:
         assert running.stdout is not None
         while int(running.stdout.readline()) < 100:
@@ -202,7 +202,7 @@ def test_the_file_of_a_killed_run_opens_and_is_replayed(tmp_path: Path, both: bo
         wait_until(lambda: has_ticks(tmp_path))
         helpers = children(running.pid)
         assert len(helpers) == 2
-        if both:  # The writer is killed first, because it would notice the run's end.
+        if both:  # The writer is killed first. Otherwise it would notice the run's end, and close the file.
             for helper in helpers:
                 os.kill(helper, signal.SIGKILL)
         running.kill()
@@ -228,7 +228,7 @@ app()
 """
 
 
-def test_ctrl_c_ends_a_run_from_another_folder_and_the_recording_is_complete(tmp_path: Path) -> None:
+def test_ctrl_c_ends_a_run_in_another_folder_and_the_recording_is_complete(tmp_path: Path) -> None:
     cell = str(ROOT / "config/dual_iiwa7.yaml")
     options = ("run", cell, "--plant", "kinematic", "--headless", "--json", "--record", str(tmp_path / "recordings"))
     script, folder = tmp_path / "bin" / "q2r2", tmp_path / "folder"

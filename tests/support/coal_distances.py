@@ -1,4 +1,4 @@
-"""Distances as Coal measures them, without any kernel of this package."""
+"""Distances that the library Coal computes, without any kernel of this package."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from q2r2_control.types import Array
 
 
 def coal_distances(robot: Robot, geometry: pin.GeometryModel, q: Array) -> Array:
-    """Return the distance of every pair of ``geometry`` (pairs,) [m] at ``q`` (nv,)."""
+    """Return the distances of all pairs of ``geometry`` (pairs,) [m] at the posture ``q`` (nv,)."""
     data, distances = robot.model.createData(), geometry.createData()
     pin.computeDistances(robot.model, data, geometry, distances, q)
     return np.array([result.min_distance for result in distances.distanceResults])

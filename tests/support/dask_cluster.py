@@ -1,4 +1,4 @@
-"""A scheduler of dask with workers, as processes of this machine that only loopback reaches."""
+"""A Dask scheduler and its workers, as processes of this computer. They listen only on 127.0.0.1."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.support.modules import ROOT
 
 
 class DaskCluster:
-    """A scheduler and workers as processes. :meth:`close` ends only these processes."""
+    """A Dask scheduler and workers, each in its own process. :meth:`close` ends only these processes."""
 
     def __init__(self, folder: Path) -> None:
         self._folder, self._processes = folder, list[subprocess.Popen[bytes]]()
@@ -50,7 +50,7 @@ class DaskCluster:
 
     def _start(self, module: str, *options: str) -> subprocess.Popen[bytes]:
         command = (sys.executable, "-m", f"distributed.cli.{module}", "--host", "127.0.0.1", "--no-dashboard", *options)
-        # The workers find the modules of tests, and packages where this process finds them.
+        # With this path, the workers find the test modules, and the packages that this process finds.
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])}
         with (self._folder / f"{module}-{len(self._processes)}.log").open("wb") as log:
             process = subprocess.Popen(command, stdout=log, stderr=log, env=environment, cwd=self._folder)
@@ -59,7 +59,7 @@ class DaskCluster:
 
 
 def _wait(process: subprocess.Popen[bytes], condition: Callable[[], bool]) -> None:
-    """Wait until ``condition`` holds, however long the process takes; fail if the process ends before."""
+    """Wait until ``condition`` holds, however long the process takes. Fail if the process ends before that."""
     while not condition():
         assert process.poll() is None, f"{process.args!r} ended"
         time.sleep(0.05)

@@ -37,7 +37,7 @@ class Driven:
         self.q, self.v, self.a = q, np.zeros_like(q) if v is None else v, np.zeros_like(q)
 
     def drive(self, seconds: float, towards: Scenario | Targets | None = None) -> Reference:
-        """Step for ``seconds`` [s] towards fixed or moving targets, and return the last reference."""
+        """Step the controller for ``seconds`` [s] towards fixed or moving targets, and return the last reference."""
         for _ in range(max(round(seconds / self.dt), 1)):
             targets = towards(self.ticks * self.dt, self.start) if callable(towards) else towards or {}
             reference = self.controller.step(targets, self.dt)
@@ -47,7 +47,7 @@ class Driven:
         return reference
 
     def set_opening(self, arm: str, least: float, greatest: float) -> tuple[str, str] | None:
-        """Call this method of the controller, and give the new openings to the contract."""
+        """Call the controller's method ``set_opening``, and give the new openings to the contract."""
         refused = self.controller.set_opening(arm, least, greatest)
         self.contract.set_openings(self.controller.openings)
         return refused

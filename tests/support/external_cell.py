@@ -1,4 +1,4 @@
-"""The shipped cell with a commented block switched on, as the block's own comment describes."""
+"""The YAML of the shipped cell in which the block ``external`` or ``robot`` is no longer a comment."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ CELL = Path(__file__).resolve().parents[2] / "config" / "dual_iiwa7.yaml"
 
 
 def external_text() -> str:
-    """Return the YAML with its block ``external`` and all other comments."""
+    """Return the YAML in which the block ``external`` is active. All other comments stay."""
     text = _uncommented("external", CELL.read_text(encoding="utf-8"))
     assert "controller: builtin " in text
     return text.replace("controller: builtin ", "controller: external ")
 
 
 def robot_text() -> str:
-    """Return the YAML with its block ``robot`` and all other comments."""
+    """Return the YAML in which the block ``robot`` is active. All other comments stay."""
     return _uncommented("robot", CELL.read_text(encoding="utf-8").replace("robot: null ", "# "))
 
 

@@ -1,6 +1,7 @@
-"""A fake Quest2ROS headset: the app's bytes over TCP in both dialects, packed here and not by the code under test.
+"""A fake Quest2ROS headset. It sends the app's bytes over TCP, in the dialects of ROS 1 and ROS 2.
 
-As a process it engages both arms of a running server and circles:
+This file packs the bytes without the code under test. Run as a program, it engages both arms of a running server, and
+moves both hands in circles:
 
     python -m tests.support.fake_headset --port 10000 --duration 20
 """
@@ -43,7 +44,7 @@ class FakeHeadset:
         self._slash = "/" if slash else ""
         self._received = bytearray()
         deadline, here = time.monotonic() + connect_timeout, (source, 0) if source else None
-        while True:  # Like the app, this tries again while no server listens.
+        while True:  # Like the app, the headset tries again while no server listens.
             try:
                 self.socket = socket.create_connection(address, timeout=None, source_address=here)
                 break
@@ -157,7 +158,7 @@ class FakeHeadset:
 def pack_pose(
     dialect: str, position: Vector, quaternion: Quaternion, frame_id: str = "", stamp: tuple[int, int] = (12, 500)
 ) -> bytes:
-    """Return the bytes of a pose; ``stamp`` is that of the headset's own clock [s], [ns]."""
+    """Return the bytes of a pose; ``stamp`` is a time of the headset's own clock, as seconds and nanoseconds."""
     numbers = struct.pack("<7d", *position, *quaternion)
     name = frame_id.encode()
     if dialect == "ros1":
@@ -179,7 +180,7 @@ def pack_inputs(
 
 
 def main() -> int:
-    """Play scripted hands at RATE_HZ in real time to a server, which may close first."""
+    """Send the motion of scripted hands to a server, at RATE_HZ in real time. The server may close the connection."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--port", type=int, required=True)
     parser.add_argument("--duration", type=float, default=20.0, help="[s]")

@@ -1,4 +1,4 @@
-"""An input whose hands follow given paths. An early press engages both arms, and 75 samples come in a second."""
+"""An input whose hands follow given paths. A press at 0.1 s engages both arms. Each hand has 75 samples per second."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Path = Callable[[float], Array]
 
 
 class HandsInput:
-    """Hands along paths of position and rotation vector. A hand without a path stays where it is."""
+    """Hands that follow paths, which give position and rotation vector. A hand without a path rests."""
 
     controls = QUEST_CONTROLS
 

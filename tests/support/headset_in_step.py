@@ -26,11 +26,11 @@ from tests.support.reasons import kinds
 
 START = {"left": (0.3, 0.2, 1.1), "right": (0.3, -0.2, 1.1)}  # Positions of the hands [m].
 PERIOD = 1.0 / 72.0  # Period of samples [s].
-PRESS = 0.12  # Duration of a press, which is longer than a chord's window [s].
+PRESS = 0.12  # Duration of a press [s]. It is longer than the window of a chord.
 NOISE = 2e-5  # Noise of a position [m].
 _PATIENCE = 60.0  # Longest wait in real time [s].
-_AT_REST = 0.5  # Time after which an arm that was released has braked [s].
-_CREEP = 1e-5  # Largest motion of an arm that is held where it stopped [m].
+_AT_REST = 0.5  # Time in which a released arm comes to rest [s].
+_CREEP = 1e-5  # Largest distance of a stopped tool from the position at which it stopped [m].
 _FASTEST, _FASTEST_TURN = 2.0, 8.0  # Largest speed [m/s] and angular speed [rad/s] of a target.
 
 Script = Callable[["Operator"], Iterator[float]]
@@ -38,7 +38,11 @@ Sender = Callable[[str, Array, Array], bytes | None]  # The arguments are hand, 
 
 
 class Operator:
-    """The operator, whom the script changes. ``hands`` are poses in a frame whose own pose is ``frame``."""
+    """The operator, whose hands and buttons the script changes.
+
+    ``hands`` are the poses of the hands in a frame that the script can move. ``frame`` is the pose of this frame, as
+    the headset measures it.
+    """
 
     def __init__(self, server: HeadsetServer, plant: MujocoPlant) -> None:
         self.plant = plant
@@ -88,20 +92,20 @@ class Operator:
             self.wait_until_read()
 
     def lose(self, end: Callable[[FakeHeadset], None]) -> None:
-        """End the connection, and wait until the server has noticed it."""
+        """End the connection by the function ``end``, and wait until the server has noticed the loss."""
         assert self.headset is not None
         end(self.headset)
         self.headset = None
         eventually(lambda: self._server.statistics.peer is None)
 
     def wait_until_read(self) -> None:
-        """Wait until the server has read all messages, which it answers in their order."""
+        """Wait until the server has read all messages. It answers in order, so one more answer shows this."""
         assert self.headset is not None
         self.headset.send(self.headset.command("__topic_list"))
         self.headset.read_until("__topic_list", _PATIENCE)
 
     def press(self, *hands: str) -> Iterator[float]:
-        """Press the lower buttons, which engage and pause."""
+        """Press the lower buttons of ``hands``. A press engages a paused arm, and pauses an engaged arm."""
         self.lower |= set(hands)
         yield PRESS
         self.lower -= set(hands)
@@ -116,7 +120,7 @@ class Operator:
     ) -> Iterator[float]:
         """Move both hands by ``way`` [m] and ``turn`` [rad], as smoothly as people reach for something.
 
-        The right hand moves by 0.9 of that, because two human hands never move exactly alike.
+        The right hand moves by 0.9 of these amounts, because two human hands never move exactly alike.
         """
         steps, starts = max(round(seconds / PERIOD), 1), dict(self.hands)
         whole = pin.Motion(np.array(list(way)), np.array(list(turn)))
@@ -177,7 +181,7 @@ class HeadsetInStep:
 
 
 class InStepRun:
-    """A whole run of a script, with its ticks and events. It checks the contract, and that no arm catches up."""
+    """A complete run of a script. Each tick must keep the contract, and pass the check :class:`NoCatchUp`."""
 
     def __init__(
         self,
@@ -202,7 +206,7 @@ class InStepRun:
 
     @property
     def ticks(self) -> list[Tick]:
-        """Return the ticks of the script, without those after it in which the arms come to rest."""
+        """Return the ticks until the script ends. The later ticks, in which the arms come to rest, are left out."""
         return [tick for tick in self.watch.ticks if tick.following]
 
     def tool(self, arm: str) -> Array:
@@ -211,7 +215,7 @@ class InStepRun:
 
     @property
     def states(self) -> set[str]:
-        """Return the states of both arms at the end."""
+        """Return the states of both arms at the end of the script."""
         return set(self.ticks[-1].states.values())
 
     @property
@@ -219,7 +223,7 @@ class InStepRun:
         return [event for tick in self.ticks for event in tick.events]
 
     def reasons(self, destination: str) -> list[str]:
-        """Return the kinds of the reasons why an arm got into a state, or refused a press in that state."""
+        """Return the kinds of the reasons for which an arm got into the state ``destination``, or refused a press."""
         return [kinds(event.reason) for event in self.events if event.destination == destination]
 
 

@@ -14,7 +14,7 @@ from q2r2_control.types import HandSample
 from tests.support.fake_headset import FakeHeadset
 
 IDENTITY = (0.0, 0.0, 0.0, -1.0)
-A_LINE_LATER = 1.0  # Time after which a host gets another line in the log [s].
+A_LINE_LATER = 1.0  # Shortest time between two lines in the log about the same host [s].
 
 
 class HandClock:
@@ -29,7 +29,7 @@ class HandClock:
         return self.now
 
     def advance(self, seconds: float) -> None:
-        """Advance, and return when the server's thread has begun to wait for the network at the new time.
+        """Advance the clock. Return when the server's thread has begun to wait for the network at the new time.
 
         The thread reads the clock before and after each wait. After three readings, a wait has begun at the new time.
         """

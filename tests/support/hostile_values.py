@@ -1,4 +1,4 @@
-"""Values that no argument of a public call allows, or hardly any."""
+"""Values that no argument of a public function allows, or only a few arguments allow."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Scripts outside the package, loaded as modules."""
+"""Functions that load scripts as modules, install small packages, and read blocks of code in the docs."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def install(folder: Path, package: str, source: str, entries: str) -> None:
-    """Install a package of one module with its entry points, as pip does. It is found if ``folder`` is on the path."""
+    """Install a package of one module with its entry points, as pip does. ``folder`` has to be on the path."""
     (folder / f"{package}.py").write_text(source)
     (folder / f"{package}-1.0.dist-info").mkdir()
     (folder / f"{package}-1.0.dist-info/entry_points.txt").write_text(entries)
@@ -30,6 +30,6 @@ def load_script(path: str) -> ModuleType:
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # Dataclasses look here for the types of their fields.
+    sys.modules[spec.name] = module  # ``dataclasses`` looks up the types of fields in sys.modules.
     spec.loader.exec_module(module)
     return module

@@ -14,14 +14,14 @@ from q2r2_control.config.cell import Config
 from q2r2_control.config.cell_file import load_config
 
 TABLE = 0.2  # Height of the table's top [m].
-# This is a block of the demo, gripped 13 mm above its middle.
+# BLOCK is a block of the demo. The gripper holds it 13 mm above the block's middle.
 BLOCK: dict[str, Any] = {"box": (0.04, 0.04, 0.06), "at": (0.0, 0.0, 0.013), "mass": 0.1}
 GRIP = TABLE + 0.03 + 0.013  # Height of a tool that has gripped the block on the table [m].
 _DOWN = pin.rpy.rpyToMatrix(np.pi, 0.0, np.pi)  # The tools point down as at home.
 
 
 def cell(left: dict[str, Any] | None, right: dict[str, Any] | None = None) -> Config:
-    """Return the cell with these objects, in which nothing depends on the clock."""
+    """Return the shipped cell with these objects for the grippers, or None. No result depends on the clock."""
     data = load_config("config/dual_iiwa7.yaml").model_dump()
     data["arms"]["left"]["gripper"]["object"], data["arms"]["right"]["gripper"]["object"] = left, right
     data["control"]["solve_time_limit"] = None
@@ -35,12 +35,14 @@ def at(z: float, y: float = 0.25, x: float = 0.5) -> pin.SE3:
 
 _FRAME_TO_TIPS = 0.013  # Distance from the tool frame to the tips of the fingers [m].
 
-# Its nearest face is 35 mm from the tool's middle. The outer side of a finger is at 22 mm if closed, at 47 mm if open.
+# The block's nearest face is 35 mm from the middle between the fingers. The outer side of a finger is 22 mm from this
+# middle if the gripper is closed, and 47 mm if it is open.
 _BLOCK = {"shape": "box", "size": (0.1, 0.04, 0.015), "position": (0.5, 0.25 + 0.055, TABLE + 0.0075)}
 _DATA = load_config("config/dual_iiwa7.yaml").model_dump()
 _DATA["obstacles"]["block"] = _BLOCK
 CELL = Config.model_validate(_DATA)
-SETTINGS = CELL.control.model_copy(update={"solve_time_limit": None})  # No result depends on the clock.
+# Without this limit, no result depends on the clock.
+SETTINGS = CELL.control.model_copy(update={"solve_time_limit": None})
 
 
 def tips_at(y: float, tips: float) -> pin.SE3:

@@ -1,4 +1,4 @@
-"""A page without a browser: it receives what the page's server draws, and presses buttons."""
+"""A client of the page's server without a browser. It receives what the server draws, and presses buttons."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class PageClient:
         self.buttons: dict[str, str] = {}  # Identifiers of buttons by label.
         self.drawn: set[str] = set()  # Names of drawn meshes.
         self.pictures: list[bytes] = []  # Pictures of cameras, in the order of their arrival.
-        # The page ignores presses of a browser that has not sent its camera.
+        # The page ignores presses of a browser that has not sent its camera, so this client sends a camera.
         self.send("ViewerCameraMessage", **_CAMERA)
 
     def __enter__(self) -> Self:
@@ -61,7 +61,7 @@ class PageClient:
         return text in self.words
 
     def row(self, name: str) -> list[str]:
-        """Return a row of the panel's table, arm by arm."""
+        """Return the cells of a row of the panel's table, one for each arm."""
         found = re.search(rf">{re.escape(name)}</td>(.*?)</tr>", self.html)
         return [] if found is None else re.sub(r"<[^>]*>", "", found[1].replace("</td>", "|")).split("|")[:-1]
 
@@ -84,7 +84,7 @@ class PageClient:
         return uuid
 
     def order_of(self, what: str) -> float:
-        """Return the place, from the top of the panel, of the folder ``what`` or of the HTML with this text."""
+        """Return the position, from the top of the panel, of the folder ``what`` or of the HTML with this text."""
         named = [uuid for label, uuid in self._folders.items() if label == what]
         (uuid,) = named or [uuid for uuid, text in self._contents.items() if what in text]
         return self._orders[uuid]

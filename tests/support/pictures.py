@@ -19,6 +19,6 @@ def _can_draw() -> bool:
 
 
 def needs_opengl() -> None:
-    """Skips a test if there is no OpenGL without a window."""
+    """Skip the test if this computer cannot draw by OpenGL without a window."""
     if not _can_draw():
         pytest.skip("no OpenGL without a window: libegl1 and libgl1-mesa-dri are not installed")

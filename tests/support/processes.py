@@ -1,4 +1,4 @@
-"""Helpers of many tests: processes by their ids, the shipped cell, and a listener that checks the contract."""
+"""Helpers that many tests use: for processes and the shipped cell, and a listener that checks the contract."""
 
 from __future__ import annotations
 
@@ -67,7 +67,10 @@ _OTHER_BLOCKS = {
 
 
 def pipeline_of(changes: Mapping[str, object], source: Input, plant: Plant | str, mode: str) -> Pipeline:
-    """Return a pipeline for the shipped cell with ``changes`` of blocks. It shares the robot if it does not change."""
+    """Return a pipeline for the shipped cell. ``changes`` replaces blocks of the cell, by their keys.
+
+    If no change concerns the robot, the pipeline uses the shared robot of :func:`cell_robot`.
+    """
     config = cell().model_copy(update=dict(changes))
     if not changes.keys() <= _OTHER_BLOCKS:
         return Pipeline.from_config(config, input=source, plant=plant, mode=mode)
@@ -116,5 +119,5 @@ def speed(tick: Tick) -> float:
 
 
 def changes(events: list[Event], arm: str) -> list[tuple[str, str, str]]:
-    """Return the state changes of ``arm``: from, to, and the kinds of the reason."""
+    """Return the state changes of ``arm``, each as (old state, new state, kinds of the reason)."""
     return [(str(event.source), str(event.destination), kinds(event.reason)) for event in events if event.arm == arm]

@@ -1,4 +1,4 @@
-"""Reasons of events for assertions, as kinds instead of sentences."""
+"""Returns the kinds of the reasons of events, so that assertions need no sentences."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A simulated gripper on Modbus behind the server of pymodbus. It moves by a step whenever it is read."""
+"""A simulated Robotiq gripper, which pymodbus serves over Modbus. Its fingers move by one step at each reading."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from pymodbus.server import ModbusTcpServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 
 UNIT = 9
-_STEP = 25  # Change of the gripper's position between two of its steps [of 255].
+_STEP = 25  # Change of the gripper's position in one step. The full range is 255.
 
 
 class SimulatedGripper:
-    """A context manager with a thread that serves the gripper. ``stop`` drops the connection, ``start`` restores it."""
+    """A context manager with a thread that serves the gripper. ``stop`` drops and ``start`` restores the connection."""
 
     def __init__(self, framer: FramerType = FramerType.SOCKET) -> None:
         self._framer, self.port = framer, 0
@@ -37,7 +37,7 @@ class SimulatedGripper:
         self._waits = self.activation
 
     def activate(self) -> None:
-        """Become active, as from an earlier run."""
+        """Become active, as if an earlier run had activated the gripper."""
         self.request, self._waits = (1, *self.request[1:]), 0
 
     @property

@@ -1,4 +1,4 @@
-"""An impedance controller that drives a plant by torque, with bounds asserted at every step."""
+"""A loop in which an impedance controller moves a plant by torques. Each tick asserts the bounds of the torques."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def pose_error(wanted: pin.SE3, pose: pin.SE3) -> Array:
 
 
 DT = 0.001
-_ROUNDING = 1e-9  # [Nm]
+_ROUNDING = 1e-9  # Tolerance for rounding errors [Nm].
 _NO_REPORT = StepReport(StepStatus.OK, (), (), ("", ""), np.inf, True, False, 0.0, 0.0)
 
 
@@ -31,7 +31,7 @@ def reference(q: Array, v: Array | None = None, a: Array | None = None) -> Refer
 
 
 class TorqueLoop:
-    """A run with a tick of ``dt`` [s]. It starts at rest at the posture ``q`` (nv,) of the reference."""
+    """A run with a tick of ``dt`` [s]. It starts at rest at the posture ``q`` (nv,), which is also the reference."""
 
     def __init__(self, plant: MujocoPlant, robot: Robot, settings: ImpedanceSettings, q: Array, dt: float = DT) -> None:
         self.dt = dt
@@ -49,7 +49,7 @@ class TorqueLoop:
     def tick(self) -> TorqueCommand:
         """Do one tick, and assert every bound."""
         command = self.controller.step(self.reference, self.state, self.dt)
-        # A number that is not finite fails these as well.
+        # A torque that is not finite fails these assertions as well.
         assert (np.abs(command.tau) <= self._limit).all()
         assert np.abs(command.tau - self._last).max() <= self._change + _ROUNDING
         assert not command.report.held

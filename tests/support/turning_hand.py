@@ -1,8 +1,9 @@
 """A hand with turning fingers like those of a Robotiq 2F-85, on both arms of the shipped cell.
 
-Each finger hangs on a knuckle that the gripper turns by 0.8 rad. Its tip turns back by as much, so that it stays
-parallel, and a second knuckle follows. The tips are 14 mm farther out when the hand is closed. The axes are where the
-published drawings of that gripper have them. The shapes are simple and have about its size.
+The gripper turns the knuckle of each finger by 0.8 rad. The fingertip turns back by the same angle, so that both tips
+stay parallel, and a second knuckle turns with the first one. When the hand closes, the tips move 14 mm away from the
+palm. The axes are those in the published drawings of the 2F-85. The shapes are simple, and have about the size of the
+2F-85.
 """
 
 from __future__ import annotations
@@ -22,8 +23,8 @@ from q2r2_control.types import Array
 
 CLOSED, OPEN = 0.8, 0.0  # [rad]
 _TABLE = 0.2  # Height of the table's top [m].
-_FRAME_TO_OPEN_TIPS = 0.0107  # Distance from the frame to the open tips [m]. Closed tips are 14 mm farther.
-# The turn of each other joint as a multiple of the drive's turn.
+_FRAME_TO_OPEN_TIPS = 0.0107  # Distance from the tool frame to the tips of the open hand [m].
+# The angle of each other joint, as a multiple of the drive joint's angle.
 _FOLLOWERS = {"one_tip": -1.0, "one_inner": 1.0, "two_knuckle": 1.0, "two_tip": -1.0, "two_inner": 1.0}
 
 
@@ -55,7 +56,7 @@ def _finger(side: str, y: float, yaw: float, drive: str) -> str:
 
 
 def hand_urdf() -> str:
-    """Return the hand as a model of a tool, with its frame between the tips."""
+    """Return the URDF of the hand as a tool. The tool frame is between the tips."""
     return (
         f'<robot name="turning_hand"><link name="palm">{_shape("0 0 0.045", "0 0 0", 0.035, 0.05)}</link>'
         + _finger("one", -1.0, np.pi, "drive")
@@ -83,7 +84,7 @@ def above_table(tips: float) -> pin.SE3:
 
 
 class RealHands:
-    """The shapes of both hands where the URDF puts them at an opening, and not the space that they sweep."""
+    """The shapes of both hands, posed by the URDF for one opening. They do not include the space that fingers sweep."""
 
     def __init__(self, robot: Robot) -> None:
         self._robot, self._model = robot, pin.buildModelFromXML(robot.urdf)

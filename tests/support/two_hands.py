@@ -1,4 +1,4 @@
-"""Two human hands as a headset measures them: a common motion, and the deviation of each hand."""
+"""Two human hands as a headset measures them. They share one motion, and each hand deviates from it."""
 
 from __future__ import annotations
 
@@ -14,13 +14,14 @@ from q2r2_control.inputs.way_points import minimum_jerk
 from q2r2_control.types import SIDES, Array
 
 START = {"left": np.array([0.35, 0.2, 1.1]), "right": np.array([0.35, -0.2, 1.1])}
-PERIOD = 1.0 / 72.0  # [s]
+PERIOD = 1.0 / 72.0  # Period of samples [s].
 
-Motion = Callable[[float], pin.SE3]  # The common motion as a function of time, relative to its pose at 0 [s].
+# The common motion: a function of the time [s] that returns the pose of the object, relative to its pose at 0 s.
+Motion = Callable[[float], pin.SE3]
 
 
 class TwoHands:
-    """Both hands on one moving object. Each sways on its own, trembles, and is measured with noise.
+    """Both hands hold one moving object. Each hand sways on its own, trembles, and is measured with noise.
 
     ``sway``: RMS of each hand's own motion at 0.4 .. 2 Hz, along each axis [m] and about each axis [rad]. Hands that
     hold a cardboard box, which yields under the grips, sway by some millimetres and degrees.

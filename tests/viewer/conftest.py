@@ -1,4 +1,4 @@
-"""A tick of a run, for the tests of its views."""
+"""A tick of a run, for tests of the tables, pages and sentences about a run."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from q2r2_control.types import ArmTarget, Reference, RobotState, StepReport, Ste
 def tick_at(robot: Robot, t: float, distance: float = 0.1, engaged: bool = True) -> Tick:
     """Return a tick at time ``t`` [s] whose tools are 3 mm and 0.1 rad from their targets, if ``engaged``.
 
-    The nearest pair is ``distance`` [m] apart. The tightest pair, another one, has a margin of ``distance`` - 18 mm.
+    The nearest pair is ``distance`` [m] apart. Another pair has the smallest margin: ``distance`` - 18 mm.
     """
     zero = np.zeros(len(robot.joint_names))
     hand, arms = ("left_hand_0", "table_0"), ("left_link_5_0", "right_link_5_0")

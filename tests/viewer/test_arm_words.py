@@ -45,13 +45,15 @@ def words(tick: Tick, *binding: ActiveLimit, told: tuple[Event, ...] = ()) -> st
         ((NEAR_TABLE, NEAR_ARM), "held by left_link_5_0 | right_link_5_0, 82 mm to spare"),
     ],
 )
-def test_an_arm_away_from_its_target_is_held_by_a_limit_at_work(
+def test_for_an_arm_away_from_its_target_the_sentence_names_the_limit_that_holds_the_arm_back(
     robot: Robot, binding: tuple[ActiveLimit, ...], expected: str
 ) -> None:
     assert words(tick_at(robot, 1.0), *binding) == expected
 
 
-def test_an_arm_at_its_target_follows_whatever_limits_are_at_work(robot: Robot) -> None:
+def test_for_an_arm_at_its_target_the_sentence_says_that_the_arm_follows_whatever_limits_are_active(
+    robot: Robot,
+) -> None:
     tick = tick_at(robot, 1.0)
     targets = {arm: ArmTarget(pose, 1.0) for arm, pose in tick.tools.items()}
     assert words(replace(tick, targets=targets), FAST) == "follows the hand"
@@ -65,14 +67,14 @@ def test_an_arm_at_its_target_follows_whatever_limits_are_at_work(robot: Robot) 
         ("paused", "paused", TeleopReason.NO_RECORDING, TeleopReason.NO_RECORDING.template),
     ],
 )
-def test_an_arm_that_is_not_engaged_names_the_reason_of_its_stop(
+def test_for_an_arm_that_is_not_engaged_the_sentence_gives_the_reason_of_its_stop(
     robot: Robot, source: str, destination: str, kind: ReasonKind, expected: str
 ) -> None:
     paused = replace(tick_at(robot, 1.0, engaged=False), states={"left": destination, "right": "idle"})
     assert words(paused, told=(Event(0.5, "left", source, destination, Reason(kind)),)) == expected
 
 
-def test_the_sentence_before_the_first_event_and_while_aligning_says_so(robot: Robot) -> None:
+def test_the_sentence_says_that_an_arm_is_not_engaged_yet_or_aligns_or_that_the_run_ends(robot: Robot) -> None:
     paused = tick_at(robot, 1.0, engaged=False)
     assert words(paused) == "not engaged yet"
     aligning = replace(paused, states={"left": "aligning", "right": "aligning"})
@@ -82,7 +84,7 @@ def test_the_sentence_before_the_first_event_and_while_aligning_says_so(robot: R
     assert press(aligning) == "release both buttons to go on"
 
 
-def test_a_reason_stays_until_the_state_changes_with_a_refusal_beside_it(robot: Robot) -> None:
+def test_a_reason_stays_until_the_state_changes_and_the_reason_of_a_refusal_is_added_to_it(robot: Robot) -> None:
     lost = replace(tick_at(robot, 1.0, engaged=False), states={"left": "lost", "right": "lost"})
     silent = Event(0.5, "left", "engaged", "lost", Reason.of(TeleopReason.POSE_SILENT, timeout=0.15))
     changed = Event(0.6, "left", "lost", "lost", Reason(TeleopReason.CONTROL_CHANGED))
@@ -94,7 +96,7 @@ def test_a_reason_stays_until_the_state_changes_with_a_refusal_beside_it(robot: 
     assert words(lost, told=(silent, refused, paused)) == "a program asks for a pause"
 
 
-def test_a_pause_of_an_arm_that_holds_is_answered_for_a_short_time(robot: Robot) -> None:
+def test_a_request_to_pause_an_arm_that_is_paused_already_is_answered_for_a_short_time(robot: Robot) -> None:
     request, pause = Reason(TeleopReason.PAUSE_REQUESTED), Reason(TeleopReason.PAUSE_SERVICE)
     lost = replace(tick_at(robot, 1.0, engaged=False), states={"left": "lost", "right": "idle"})
     asked = Event(0.5, "left", "engaged", "engaged", request)
@@ -107,7 +109,7 @@ def test_a_pause_of_an_arm_that_holds_is_answered_for_a_short_time(robot: Robot)
     assert words(idle, told=(Event(0.9, "left", "idle", "idle", pause),)) == "not engaged yet; already paused"
 
 
-def test_a_reason_uses_the_operators_name_of_a_control(robot: Robot) -> None:
+def test_a_reason_names_a_control_as_the_operator_knows_it(robot: Robot) -> None:
     paused = tick_at(robot, 1.0, engaged=False)
     pressed = Event(0.5, "left", "pausing", "paused", Reason.of(TeleopReason.PRESSED, control="lower button"))
     assert words(paused, told=(pressed,)) == "A or X"
@@ -117,7 +119,7 @@ def press(tick: Tick, bindings: Mapping[str, str] = {}, device: DeviceWords = QU
     return ArmWords(JOINTS, BindingSettings.model_validate(bindings), device).next_press(tick, "left")
 
 
-def test_the_next_press_depends_on_state_and_gripper(robot: Robot) -> None:
+def test_the_text_about_the_next_press_depends_on_the_state_of_the_arm_and_of_its_gripper(robot: Robot) -> None:
     engaged, paused = tick_at(robot, 1.0), tick_at(robot, 1.0, engaged=False)
     assert press(engaged) == "press A or X to pause, press B or Y to close the gripper"
     closed = {arm: ArmTarget(None, 0.0) for arm in paused.targets}
@@ -125,7 +127,7 @@ def test_the_next_press_depends_on_state_and_gripper(robot: Robot) -> None:
     assert press(replace(paused, connected=False)) == "nothing: no headset is connected"
 
 
-def test_the_next_press_is_that_of_the_bound_control(robot: Robot) -> None:
+def test_the_text_about_the_next_press_names_the_control_that_is_bound(robot: Robot) -> None:
     engaged, paused = tick_at(robot, 1.0), tick_at(robot, 1.0, engaged=False)
     swapped = {"lower": "gripper_toggle", "upper": "pause_toggle"}
     assert press(paused, swapped) == "press B or Y to engage, press A or X to close the gripper"
@@ -134,7 +136,7 @@ def test_the_next_press_is_that_of_the_bound_control(robot: Robot) -> None:
     assert press(engaged, dead_man) == "let go of the grip to pause"
 
 
-def test_the_handles_of_a_page_are_its_device_even_before_they_are_dragged(robot: Robot) -> None:
+def test_for_a_page_the_sentences_name_its_arrows_and_rings_even_before_they_are_dragged(robot: Robot) -> None:
     waits = replace(tick_at(robot, 1.0, engaged=False), connected=False)
     made = ArmWords(JOINTS, web_cell(cell()).teleop.bindings, WebInput.controls.words)
     assert made.next_press(waits, "left").startswith("drag a tool's arrows or rings to engage")

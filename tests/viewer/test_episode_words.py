@@ -30,7 +30,7 @@ BEGINS, ENDS, DISCARDED = (
         ((), [BEGINS, SECOND], "records episode 1, subtask 2"),
     ],
 )
-def test_the_line_shows_the_episode_and_the_subtask_after_each_event(
+def test_the_line_about_a_recording_shows_the_episode_and_the_subtask_after_each_event(
     names: tuple[str, ...], told: list[Reason], text: str
 ) -> None:
     words = EpisodeWords(names)

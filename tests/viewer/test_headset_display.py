@@ -49,7 +49,7 @@ def test_the_scene_contains_the_parts_of_the_task_and_the_links_that_move_with_e
     assert scene["name"] == cell().name
     assert set(scene["parts"]) == set(cell().mujoco.objects)
     for joints in scene["hands"].values():
-        assert len(joints) >= 3  # The tool carries the last joint and the fingers.
+        assert len(joints) >= 3  # They include the arm's last joint and the finger joints.
     assert not set(scene["hands"]["left"]) & set(scene["hands"]["right"])
 
 

@@ -76,7 +76,7 @@ def test_the_table_shows_the_step_of_the_work_and_how_much_of_the_work_is_done(r
     assert "━" * 5 + "·" * 15 + " 25%" in text
 
 
-def test_the_table_shows_every_limit_that_was_at_work_since_the_table_was_last_drawn(robot: Robot) -> None:
+def test_the_table_shows_every_limit_that_was_active_since_the_table_was_last_drawn(robot: Robot) -> None:
     table = LiveTable("demo", ArmWords(JOINTS, BindingSettings()))
     tick = tick_at(robot, 0.0)
     report = replace(tick.reference.report, binding=(ActiveLimit(LimitKind.VELOCITY, ("left_A2",)),))

@@ -1,4 +1,4 @@
-"""Live pictures: a separate process takes those of a simulated camera, and a fault of this process gives one line."""
+"""Live pictures: a separate process takes the pictures of a simulated camera. If it ends, one line says so."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.support.processes import cell, wait_until
 
 
 @pytest.mark.slow
-def test_pictures_of_the_simulated_cell_come_and_one_line_says_if_their_process_has_ended(
+def test_pictures_of_a_simulated_camera_are_shown_and_one_line_says_if_the_process_that_takes_them_has_ended(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     camera = CameraConfig(position=(1.5, 0.0, 1.0), look_at=(0.4, 0.0, 0.3), width=64, height=48)
@@ -46,7 +46,7 @@ def test_pictures_of_the_simulated_cell_come_and_one_line_says_if_their_process_
     assert len([record for record in caplog.records if "no more pictures are shown" in record.message]) == 1
 
 
-def test_pictures_of_a_real_camera_are_shown_at_the_asked_rate_and_only_while_somebody_looks() -> None:
+def test_pictures_of_a_real_camera_are_shown_at_the_wanted_rate_and_only_while_somebody_watches() -> None:
     got: list[bytes] = []
     looks = True
     shown = ShownPictures(5.0, got.append, lambda: looks)

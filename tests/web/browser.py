@@ -1,4 +1,4 @@
-"""A run with its page in its own process, and Chromium that opens the page."""
+"""A process of a run that serves a page, and Chromium, which opens the page."""
 
 from __future__ import annotations
 
@@ -31,17 +31,17 @@ ARGUMENTS = [
     *("--no-sandbox", "--disable-gpu", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
     *("--disable-background-networking", "--disable-component-update", "--disable-sync", "--no-first-run"),
 ]
-# This hides a warning of slow drawing, which covers an arm.
+# This style hides the warning that drawing is slow, because the warning covers an arm.
 HIDDEN = "[class*=mantine-Notification] {display: none !important}"
 VIEW = {"width": 680, "height": 360}
-PATIENCE = 600.0  # Timeout far above what a page takes when a processor draws it beside ten other programs [s].
+PATIENCE = 600.0  # Timeout [s]. A page needs far less, even if a processor draws it beside ten other programs.
 
 
 _URL = r"(?:page:|webxr: open) (http\S+)\n"
 
 
 class WebRun:
-    """A run with its page, by :mod:`tests.web.slow_run` or another command."""
+    """The process of a run with its page, which :mod:`tests.web.slow_run` or another command starts."""
 
     def __init__(self, errors: Path, *command: str) -> None:
         self._errors = errors
@@ -51,7 +51,7 @@ class WebRun:
                 stdout=subprocess.PIPE,
                 stderr=file,
                 text=True,
-                # A background job of a shell ignores this signal.
+                # The background jobs of a shell ignore this signal, and the run would inherit this.
                 preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
             )
         wait_until(lambda: re.search(_URL, self.errors) or self._process.poll() is not None)
@@ -75,14 +75,17 @@ class WebRun:
         self._process.send_signal(signal.SIGINT)
 
     def kill(self) -> None:
-        """End a run that a failed test has left, which would occupy a processor during the next test."""
+        """End a run that a failed test has left. Otherwise it would occupy a processor during the next test."""
         self._process.kill()
         self._process.communicate()
 
 
 @contextmanager
 def one_processor() -> Iterator[None]:
-    """Confine browsers to one processor, because they draw by software and use all of them. Later processes get all."""
+    """Let browsers that start meanwhile use one processor only, because they draw by software and would use all.
+
+    Processes that start afterwards may use all processors again.
+    """
     processors = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {max(processors)})
     yield
@@ -90,7 +93,7 @@ def one_processor() -> Iterator[None]:
 
 
 def table(page: Page) -> dict[str, list[str]]:
-    """Return rows of the panel's table with the cells of the left and of the right arm."""
+    """Return the rows of the panel's table by name, each with the cells of the left and of the right arm."""
     rows = page.locator("table tr").evaluate_all("rows => rows.map(row => [...row.cells].map(cell => cell.innerText))")
     return {row[0]: row[1:] for row in rows}
 
@@ -123,7 +126,7 @@ def wait_for(page: Page, text: str) -> None:
 
 
 def tool(page: Page, arm: int = 0) -> Array:
-    """Return the position (3,) of a tool from the panel [m]."""
+    """Return the position (3,) of a tool that the panel shows [m]."""
     return np.array([float(number) for number in table(page)["tool [m]"][arm].split()])
 
 
@@ -137,7 +140,7 @@ def pixels(page: Page) -> Array:
 
 
 def on_screen(page: Page, point: Array) -> tuple[float, float]:
-    """Return where the first view shows a point (3,) of the world [m], in the page's pixels."""
+    """Return the pixel of the page at which the first view shows a point (3,) of the world [m]."""
     robot = Robot.from_config(cell())
     eye, middle = first_view(robot.model, robot.home)
     forward = (middle - eye) / np.linalg.norm(middle - eye)
@@ -156,11 +159,12 @@ def count(picture: Array, colour: tuple[float, float, float]) -> int:
 
 
 _TOUCHED = (255.0, 255.0, 64.0)  # Colour of a gizmo under the mouse.
-_HANDLE, _PULLED = 0.13, 0.07  # Place of a gizmo's arrow along the tool's z axis [m].
+# Points on a tool's z axis: where the mouse grabs the arrow, and to which it pulls the arrow [m].
+_HANDLE, _PULLED = 0.13, 0.07
 
 
 def grab(page: Page, arm: str, at: Array | None = None) -> None:
-    """Press the mouse on the arrow of a tool, and pull it; see :func:`on_arrow`."""
+    """Press the mouse button on the arrow of a tool, and pull the arrow; see :func:`on_arrow`."""
 
     def lights_up() -> bool:
         page.mouse.move(*on_arrow(page, arm, _HANDLE, at))
@@ -172,14 +176,14 @@ def grab(page: Page, arm: str, at: Array | None = None) -> None:
 
 
 def drag(page: Page, arm: str, to: float, at: Array | None = None) -> None:
-    """Move the mouse to the place where the arrow of a tool would be at ``to`` [m]; see :func:`on_arrow`."""
+    """Move the mouse to the point ``to`` [m] on the arrow of a tool; see :func:`on_arrow`."""
     page.mouse.move(*on_arrow(page, arm, to, at), steps=6)
 
 
 def on_arrow(page: Page, arm: str, along: float, at: Array | None = None) -> tuple[float, float]:
-    """Return the pixel of a point on the arrow of a tool, ``along`` its z axis [m].
+    """Return the pixel of a point on the arrow of a tool. The point is at ``along`` [m] on the tool's z axis.
 
-    The tool has its rotation at home, and the position ``at`` (3,) [m], by default that at home.
+    The tool has the rotation that it has at home. Its position is ``at`` (3,) [m], by default its position at home.
     """
     robot = Robot.from_config(cell())
     pose = robot.tool_pose(robot.home, arm)

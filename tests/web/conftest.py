@@ -46,7 +46,7 @@ def open_page(browser: BrowserContext) -> Iterator[Open]:
     pages: list[Page] = []
 
     def open_one(url: str, script: str | None = None) -> Page:
-        """Open a page. If ``script`` is given, it is the headset's page, and runs the script before its own scripts."""
+        """Open a page. With a ``script``, this is the headset's page, which runs ``script`` before its own scripts."""
         pages.append(browser.new_page())
         if script is not None:
             pages[-1].add_init_script(script)

@@ -28,7 +28,7 @@ def hand(x: float, *buttons: bool, **more: Any) -> dict[str, Any]:
 
 
 class Page:
-    """The connection of a page, which numbers its messages. The page itself has the number ``number``."""
+    """The connection of a page to the server. It numbers the messages. The page itself has the number ``number``."""
 
     def __init__(self, source: WebXrInput, number: str = "1") -> None:
         assert source.url is not None
@@ -64,7 +64,8 @@ def samples(source: WebXrInput, until: Callable[[list[HandSample]], object]) -> 
 
 def refused(source: WebXrInput, origin: str | None = None, query: str | None = None) -> bool:
     """Return whether the server refuses the socket."""
-    # The client of the package websockets reads and writes in two threads, which an SSL connection does not allow.
+    # An SSL connection must not be used by two threads, as the client of the package websockets does. So this function
+    # uses http.client.
     assert source.url is not None
     scheme, host, _, token, _ = urlsplit(source.url)
     connection = HTTPConnection(host, timeout=60.0)

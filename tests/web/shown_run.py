@@ -1,6 +1,6 @@
 """A stand-in for a run, without robot and loop, for tests of the headset's page.
 
-The test gives the states that the page shows, and sees the requests of its buttons.
+The test gives the states that the page shows, and sees the requests of the page's buttons.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class GivenDisplay:
 
 
 class ShownRun:
-    """Shows states on the page of an input, and keeps the requests of its buttons in ``asked``."""
+    """Shows states on the page of an input, and keeps the requests of the page's buttons in ``asked``."""
 
     def __init__(self, source: WebXrInput) -> None:
         self.asked: list[str] = []

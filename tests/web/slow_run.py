@@ -17,7 +17,7 @@ from q2r2_control.summary.tick import Tick
 from q2r2_control.viewer.web import view
 from tests.support.processes import cell
 
-# If an engaged hand has been silent for the first time [s] of the run, each tick takes the second time [s].
+# If the hand of an engaged arm has been silent for _SILENT [s] of the run's time, each tick takes _STANDS [s].
 _SILENT, _STANDS = 0.5, 1.0
 
 
@@ -54,7 +54,7 @@ def main(source: str, port: int, pause: float) -> None:
     hands = WebInput(slow) if is_web else make_input("scripted", config, trajectory=source)
     pipeline = Pipeline.from_config(config, input=hands, plant="kinematic")
     pipeline.listeners.append(slow.pass_by)
-    view._PERIOD = 0.2  # Drawing the page takes long, because no graphics card does it.
+    view._PERIOD = 0.2  # The page is drawn seldom, because drawing takes long without a graphics card.
     with view.PageView("127.0.0.1", port) as page:
         print(f"page: {page.begin(pipeline, 'slow', False)}", file=sys.stderr, flush=True)
         print(json.dumps(pipeline.run(realtime=False).as_json()))

@@ -111,7 +111,7 @@ def test_a_widget_accepts_only_values_of_its_type_and_range(gui: viser.GuiApi) -
         assert not any(admits(handle, {"value": 1.0, "min": -9.0}) or admits(handle, one) for one in CHANGES)
 
 
-def test_a_button_counts_at_most_ten_times_a_second_but_every_press_of_stop_counts(gui: viser.GuiApi) -> None:
+def test_at_most_ten_presses_of_a_button_count_in_a_second_but_every_press_of_stop_counts(gui: viser.GuiApi) -> None:
     now = 0.0
     messages, stops = BrowserMessages(lambda: now), []
     messages.watch(gui)
@@ -144,7 +144,7 @@ def test_the_stop_button_works_whatever_another_page_sends(page: Callable[[], Pa
 
 
 @pytest.mark.parametrize("attack", ["flood", "upload"])
-def test_a_flood_or_an_upload_ends_only_its_own_connection(
+def test_a_flood_of_messages_or_an_upload_ends_only_the_connection_of_its_sender(
     attack: str, page: Callable[[], PageClient], asked: list[object]
 ) -> None:
     with page() as hostile, page() as honest:

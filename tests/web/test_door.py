@@ -1,4 +1,4 @@
-"""Access control: pages of this machine itself, and from other machines only with the token."""
+"""Access control: a page of this computer may connect, and a page on another computer needs the token."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def door(request: pytest.FixtureRequest) -> Iterator[Door]:
 
 
 def status(door: Door, path: str = "/", **headers: str) -> int:
-    """Return the status of a requested page."""
+    """Return the HTTP status of the answer to a request."""
     connection = HTTPConnection("127.0.0.1", door.port)
     connection.request("GET", path, headers=headers)
     return connection.getresponse().status
@@ -62,7 +62,7 @@ def admitted(door: Door, origin: str, token: str) -> bool:
     return True
 
 
-def test_only_our_own_page_connects(door: Door) -> None:
+def test_only_the_servers_own_page_may_connect(door: Door) -> None:
     own = f"http://127.0.0.1:{door.port}"
     token = token_of(door)
     assert admitted(door, own, token)
@@ -74,14 +74,16 @@ def test_only_our_own_page_connects(door: Door) -> None:
         assert (status(door), status(door, f"/{token}")) == (403, 200)
     else:
         assert status(door) == 200
-        assert status(door, Host=f"example.org:{door.port}") == 403  # An attacker may have made this name lead here.
+        assert status(door, Host=f"example.org:{door.port}") == 403  # An attacker may have made this name point here.
         assert status(door, Host="example.org:9000") == 403
 
 
-def test_a_forwarded_port_is_admitted_and_another_name_is_told_what_is_allowed(door: Door) -> None:
+def test_a_page_through_a_forwarded_port_may_connect_and_the_refusal_of_another_host_says_what_is_allowed(
+    door: Door,
+) -> None:
     if door.token is not None:
         pytest.skip("beyond loopback the token decides")
-    assert status(door, Host="localhost:9000") == 200  # This address is that after ssh -L 9000:localhost:PORT.
+    assert status(door, Host="localhost:9000") == 200  # A browser sends this after ssh -L 9000:localhost:PORT.
     request = Request("/", Headers({"Host": "example.org:9000"}))
     assert door.refusal(request) == (
         "unknown Host 'example.org:9000'; allowed: 127.0.0.1, [::1], localhost, at any port, "
@@ -107,7 +109,7 @@ def test_the_tab_of_the_page_has_the_name_of_the_cell(encoding: str) -> None:
     assert response.headers["Content-Length"] == str(len(response.body))
 
 
-def test_only_a_few_pages_can_connect(door: Door) -> None:
+def test_only_a_few_pages_can_be_connected_at_the_same_time(door: Door) -> None:
     origin, token = f"http://127.0.0.1:{door.port}", token_of(door)
     pages = [connected(door, origin, token) for _ in range(12)]
     assert not admitted(door, origin, token)
@@ -115,7 +117,9 @@ def test_only_a_few_pages_can_connect(door: Door) -> None:
         page.close()
 
 
-def test_from_other_machines_the_page_comes_by_tls_and_is_neither_cached_nor_framed(tmp_path: Path) -> None:
+def test_other_computers_get_the_page_only_by_tls_and_may_neither_cache_it_nor_show_it_in_a_frame(
+    tmp_path: Path,
+) -> None:
     certificate, _ = own_certificate(tmp_path, ["192.168.1.5", "10.0.0.7"], datetime.now(UTC))
     far = Door("0.0.0.0", 0, str(certificate), ["192.168.1.5", "10.0.0.7"])
     token = token_of(far)
@@ -138,13 +142,13 @@ def test_from_other_machines_the_page_comes_by_tls_and_is_neither_cached_nor_fra
     server.stop()
 
 
-def test_a_port_that_another_program_uses_gives_one_clear_line() -> None:
+def test_a_port_that_another_program_uses_raises_an_error_with_what_is_allowed() -> None:
     door = Door("127.0.0.1", 0)
     with pytest.raises(
         ConfigError, match=f"cannot listen on 127.0.0.1 port {door.port}: .*allowed: a free port; --web-port 0 "
     ):
         Door("127.0.0.1", door.port)
-    with pytest.raises(ConfigError, match="cannot listen on"):  # A run finds it before it builds its controller.
+    with pytest.raises(ConfigError, match="cannot listen on"):  # A run notices this before it builds its controller.
         Page("127.0.0.1", door.port, print)
     door.socket.close()
 

@@ -1,4 +1,7 @@
-"""Keys and a gamepad move a hand on the page for headsets, through the same gate, anchor and leash."""
+"""On the page for headsets, keys and a gamepad move a virtual hand.
+
+Its poses pass the same gate, anchor and leash as those of a headset.
+"""
 
 from __future__ import annotations
 
@@ -17,8 +20,8 @@ STICK_FORWARD = """navigator.getGamepads = () => [{
     mapping: "standard", axes: [0, -1, 0, 0], buttons: Array.from({ length: 17 }, () => ({ pressed: false })) }]"""
 
 
-# Presses the key in ``window.pressed`` before each look of the page at its keys, so that the key is held however slowly
-# the page draws and sends.
+# JavaScript that presses the key ``window.pressed`` again each time before the page reads its keys. The key therefore
+# stays held, however slowly the page draws and sends.
 HOLDING = """() => {
     const look = setInterval.bind(window);
     window.setInterval = (then, period) => look(() => {
@@ -40,11 +43,11 @@ def let_go(page: Page, code: str) -> None:
 
 
 def targets_of_left(page: Page) -> Array:
-    """Return the target's position (3,) [m]."""
+    """Return the position (3,) of the left arm's target [m]."""
     return np.array(arms(page, "target")[0][:3])
 
 
-def test_keys_and_a_gamepad_engage_an_arm_move_it_and_pause_it_when_the_page_is_left(
+def test_keys_and_a_gamepad_engage_and_move_an_arm_which_stops_when_flying_by_keyboard_ends(
     open_page: Open, start: Start
 ) -> None:
     run = start(*RUN)
@@ -93,7 +96,7 @@ LOOKS = """async ([events, looks, unsent = 0]) => {
 
 
 def flown(page: Page, *events: tuple[str, Mapping[str, object]]) -> float:
-    """Return how far a hand has moved forward within 4 s of events of the keyboard [m]."""
+    """Return how far the left hand moves forwards in the 4 s after these events of the keyboard [m]."""
     return float(page.evaluate(LOOKS, [events, 200])["moved"])
 
 
@@ -106,14 +109,14 @@ def test_a_key_whose_release_is_never_reported_moves_a_hand_only_for_a_short_tim
     assert 0.05 < flown(page, down) < 0.12
     assert 0.05 < flown(page, down, repeated) < 0.12
     assert flown(page, repeated) == 0.0
-    # A browser on a Mac reports no release of W while Cmd is held. The other modifiers end a key as well.
+    # A browser on a Mac reports no release of W while Cmd is held. Each modifier key therefore ends the motion.
     for modifier in ("ctrlKey", "metaKey", "altKey"):
         assert flown(page, ("keydown", forward | {modifier: True})) == 0.0
     assert flown(page, down, ("keydown", ctrl), repeated) == 0.0
     assert flown(page, down, ("keyup", ctrl | {"ctrlKey": False})) == 0.0
 
 
-def test_a_button_stays_held_while_another_key_repeats_and_only_a_new_press_starts_it_again(
+def test_a_held_button_stays_held_while_other_keys_are_pressed_but_only_for_a_limited_time(
     open_page: Open, listen: Listen
 ) -> None:
     page = open_page(str(listen().url), "")
@@ -123,7 +126,7 @@ def test_a_button_stays_held_while_another_key_repeats_and_only_a_new_press_star
     assert held[-10:] == [False] * 10
 
 
-def test_a_tap_between_two_messages_is_in_the_next_one_which_comes_soon_and_only_for_its_own_hand(
+def test_a_tap_between_two_messages_is_in_the_next_message_if_this_is_sent_soon_and_for_the_same_hand(
     open_page: Open, listen: Listen
 ) -> None:
     page = open_page(str(listen().url), "")
@@ -134,16 +137,16 @@ def test_a_tap_between_two_messages_is_in_the_next_one_which_comes_soon_and_only
         return sum(page.evaluate(LOOKS, [events, 200, unsent])["held"])
 
     assert held(down, up) == 1
-    assert held(down, up, unsent=3) == 4  # The first three messages are left out.
+    assert held(down, up, unsent=3) == 4  # The first three messages are not sent.
     # The button is held for less than 150 ms. After that, the arm stops because messages are missing.
     assert held(down, up, unsent=200) == 6
     assert held(down, up, ("blur", {})) == 0
     assert held(down, up, ("keydown", {"code": "Digit2"})) == 0
-    assert held(down, ("keydown", {"code": "Digit2"})) == 0  # The same holds while it is held.
+    assert held(down, ("keydown", {"code": "Digit2"})) == 0  # The key is still held here.
     assert held(down, up, ("keydown", {"code": "KeyW", "ctrlKey": True})) == 0
 
 
-# The page draws only when the test calls ``draw``, and its messages are kept.
+# JavaScript that lets the page draw only when the test calls ``draw``, and keeps the messages that the page sends.
 STANDING = """(() => {
     const { now } = performance;
     window.later = 0;
@@ -170,7 +173,7 @@ def falls_silent(page: Page) -> None:
     assert sent(page) == before
 
 
-def test_hands_do_not_wait_for_the_drawing_but_end_when_nothing_is_drawn_for_long(
+def test_the_page_sends_hands_while_it_draws_nothing_but_only_for_a_limited_time(
     open_page: Open, listen: Listen
 ) -> None:
     page = open_page(str(listen().url), STANDING)
@@ -178,13 +181,13 @@ def test_hands_do_not_wait_for_the_drawing_but_end_when_nothing_is_drawn_for_lon
     page.click("#fly")
     page.evaluate("draw()")
     before = sent(page)
-    wait_until(lambda: sent(page) >= before + 3)  # The same picture stands meanwhile.
-    page.evaluate("window.later = 600")  # The picture is now older than it may be.
+    wait_until(lambda: sent(page) >= before + 3)  # Meanwhile, the page shows the same picture.
+    page.evaluate("window.later = 600")  # The picture is now older than is allowed.
     falls_silent(page)
     wait_until(lambda: page.evaluate("draw() || 1") and sent(page) > before + 10)
 
 
-def test_hands_are_lost_when_the_page_loses_the_focus_and_only_the_focus_brings_them_back(
+def test_hands_are_lost_when_the_page_loses_the_focus_and_come_back_only_when_it_has_the_focus_again(
     open_page: Open, listen: Listen
 ) -> None:
     page = open_page(str(listen().url), STANDING)
@@ -200,7 +203,7 @@ def test_hands_are_lost_when_the_page_loses_the_focus_and_only_the_focus_brings_
     wait_until(lambda: page.evaluate("draw() || window.hands.at(-1).pose"))
 
 
-# The clock stands still. Pictures are counted, and each is finished as soon as it is asked about.
+# JavaScript that stops the clock and counts pictures. It reports each picture as finished when the page asks.
 COUNTING = """(() => {
     window.clock = performance.now();
     performance.now = () => window.clock;
@@ -215,7 +218,8 @@ COUNTING = """(() => {
     };
     WebGL2RenderingContext.prototype.getSyncParameter = () => WebGL2RenderingContext.SIGNALED;
 })()"""
-# Returns how many pictures are drawn at the given times after the first one, which takes ``took`` [ms], and two widths.
+# JavaScript that draws a picture, which takes ``took`` [ms]. It returns how many pictures are drawn up to each of the
+# ``times`` after its start [ms], and the widths of these pictures.
 PICTURES = """async ([took, times]) => {
     const later = () => new Promise((then) => setTimeout(then, 1));
     const [begin, first] = [window.clock, window.pictures];
@@ -229,7 +233,7 @@ PICTURES = """async ([took, times]) => {
 }"""
 
 
-def test_a_picture_that_takes_long_is_followed_by_as_much_time_for_keys_and_gets_fewer_pixels(
+def test_after_a_picture_that_takes_long_keys_get_as_much_time_and_the_next_picture_has_fewer_pixels(
     open_page: Open, listen: Listen
 ) -> None:
     page = open_page(str(listen().url), COUNTING)
@@ -242,7 +246,7 @@ def test_a_picture_that_takes_long_is_followed_by_as_much_time_for_keys_and_gets
     drawn, widths = page.evaluate(PICTURES, [40, [41, 79, 81]])
     assert drawn == [1, 1, 2]
     assert widths[1] < widths[0]
-    # A rest is short, so that the operator sees the arms.
+    # The time without drawing is at most 100 ms, so that the operator sees the arms.
     assert page.evaluate(PICTURES, [400, [401, 499, 501]])[0] == [1, 1, 2]
 
 
@@ -257,7 +261,7 @@ ADVICE = """async ([times, now, silent]) => {
 }"""
 
 
-def test_a_slow_browser_is_named_with_its_rate_and_the_cure(open_page: Open, listen: Listen) -> None:
+def test_the_advice_about_a_slow_browser_has_its_rate_and_the_cure(open_page: Open, listen: Listen) -> None:
     page = open_page(str(listen().url), "")
     fast = [20 * tick for tick in range(100)]
     assert page.evaluate(ADVICE, [fast, 2000, False])[0] == ""
@@ -265,5 +269,5 @@ def test_a_slow_browser_is_named_with_its_rate_and_the_cure(open_page: Open, lis
     words, _ = page.evaluate(ADVICE, [slow, 2350, False])
     assert "no hand for 0.25 s, and arms stop after 0.15 s. It draws 4 pictures a second" in words
     assert "Make this window smaller" in words
-    # An arm that is lost for missing hands keeps the advice, and the browser is not blamed if it was fast enough.
+    # The advice stays while an arm is lost because no hands came. It does not blame a browser that was fast enough.
     assert "came too late, although this browser" in page.evaluate(ADVICE, [fast, 2000, True])[0]

@@ -19,7 +19,8 @@ EMULATOR = Path(os.environ.get("Q2R2_IWER", ".venv/iwer/package")) / "build" / "
 RUN = ("tests.web.headset_run", "0.004")
 LOWER = {"left": "x-button", "right": "a-button"}
 UPPER = {"left": "y-button", "right": "b-button"}
-# One browser opens both pages. A page in the driver's browser would count as the driver's own page, loaded again.
+# One browser opens both pages. This script hides the browser's storage from the second page. Otherwise that page would
+# count as the driver's own page, loaded again.
 ANOTHER_BROWSER = "Storage.prototype.getItem = () => null"
 ORANGE = (255.0, 107.0, 13.0)  # Colour of the rings on the drawn arms.
 
@@ -108,7 +109,7 @@ def test_hands_engage_the_arms_and_move_them_along_the_axes_of_the_room_and_feel
     wait_until_said(page, lambda: np.allclose(targets(page)[0] - before[0], [0.07, 0.05, 0.06], atol=2e-3))
     assert np.allclose(targets(page)[1] - before[1], 0.5 * np.array([0.07, 0.05, 0.06]), atol=2e-3)
     wait_for(page, "engaged", "follows the hand")
-    wait_until(lambda: count(pixels(page), ORANGE) > 5)  # The robot is visible, not only its board.
+    wait_until(lambda: count(pixels(page), ORANGE) > 5)  # The robot is visible, and not only the board with texts.
     # The alignment chord of the left hand stops both arms. Afterwards a press still pauses them.
     page.evaluate("hold(['x-button', 'y-button'], 'left', 1)")
     wait_for(page, "aligning")
@@ -119,13 +120,13 @@ def test_hands_engage_the_arms_and_move_them_along_the_axes_of_the_room_and_feel
     felt = page.evaluate("vibrations.filter(one => one.amplitude > 0).map(one => one.hand)")
     assert {"left", "right"} <= set(felt)
     assert page.evaluate("pulses") > 3
-    page.evaluate("document.getElementById('leave').click()")  # The emulator draws over the button.
+    page.evaluate("document.getElementById('leave').click()")  # The emulator covers the button.
     wait_until(lambda: not page.evaluate("Boolean(headset.activeSession)"))
     run.interrupt()
     assert run.end()["at_rest"]
 
 
-def test_the_arms_stop_until_a_new_press_in_whatever_way_the_hands_are_lost(enter: Any, start: Start) -> None:
+def test_if_the_hands_are_lost_for_any_reason_the_arms_stop_until_a_new_press(enter: Any, start: Start) -> None:
     run = start(*RUN)
     page = enter(run.url)
 
@@ -140,7 +141,8 @@ def test_the_arms_stop_until_a_new_press_in_whatever_way_the_hands_are_lost(ente
     frames(page, 20)
     wait_for(page, "lost")
     engage()
-    # The headset's menu hides the page, or the headset is taken off, while the socket accepts nothing.
+    # The page is hidden, as if the headset's menu were open or the headset taken off. Meanwhile, the socket accepts no
+    # message.
     page.evaluate("full = true, headset.updateVisibilityState('hidden')")
     frames(page, 5)
     page.evaluate("full = false")
@@ -162,7 +164,7 @@ def test_the_arms_stop_until_a_new_press_in_whatever_way_the_hands_are_lost(ente
     assert run.end()["at_rest"]
 
 
-def test_fingers_move_no_arm_after_the_controllers_were_laid_down(enter: Any, start: Start) -> None:
+def test_bare_hands_move_no_arm_after_the_operator_has_laid_down_the_controllers(enter: Any, start: Start) -> None:
     run = start(*RUN)
     page = enter(run.url)
     press(page, LOWER)
@@ -182,7 +184,7 @@ def test_fingers_move_no_arm_after_the_controllers_were_laid_down(enter: Any, st
     assert run.end()["at_rest"]
 
 
-def test_the_first_headset_drives_and_the_page_of_another_headset_says_so(
+def test_the_first_headset_drives_and_the_page_of_a_second_headset_says_that_another_one_drives(
     enter: Any, start: Start, open_page: Open
 ) -> None:
     run = start(*RUN)

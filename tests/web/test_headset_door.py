@@ -1,4 +1,4 @@
-"""Who may open a headset's page: hosts, tokens and certificates; and headsets on a USB cable."""
+"""Hosts, tokens and certificates decide who may open a headset's page. A headset may also use a USB cable."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from tests.web.headset_page import Listen, refused
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def test_only_the_servers_own_page_connects_and_from_other_machines_only_with_the_token(
+def test_only_the_servers_own_page_can_connect_and_on_other_computers_it_needs_the_token(
     listen: Listen,
 ) -> None:
     lines: list[str] = []
@@ -50,7 +50,7 @@ def test_only_the_servers_own_page_connects_and_from_other_machines_only_with_th
     assert not any("certificate" in line for line in lines)
 
 
-def test_a_token_stays_but_an_empty_or_cut_one_is_replaced(tmp_path: Path) -> None:
+def test_a_token_stays_for_later_runs_but_an_empty_or_cut_token_is_replaced(tmp_path: Path) -> None:
     token = installation_token(tmp_path)
     assert installation_token(tmp_path) == token
     file = tmp_path / "token"
@@ -61,7 +61,9 @@ def test_a_token_stays_but_an_empty_or_cut_one_is_replaced(tmp_path: Path) -> No
     assert file.stat().st_mode & 0o077 == 0, "the token is this user's only"
 
 
-def test_a_certificate_is_renewed_before_it_expires_or_if_it_does_not_name_an_address(tmp_path: Path) -> None:
+def test_a_certificate_is_renewed_before_it_expires_or_if_an_address_of_the_server_is_missing_in_it(
+    tmp_path: Path,
+) -> None:
     now = datetime(2026, 1, 1, tzinfo=UTC)
 
     def made(address: str, later: int = 0) -> tuple[bytes, str | None]:
@@ -83,7 +85,7 @@ def test_a_certificate_is_renewed_before_it_expires_or_if_it_does_not_name_an_ad
     assert "cannot be read" in str(made("10.0.0.7")[1])
 
 
-def test_each_address_of_this_computer_has_a_url_a_qr_code_and_a_name_in_the_certificate(
+def test_each_address_of_this_computer_has_a_url_a_qr_code_and_an_entry_in_the_certificate(
     listen: Listen, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     networks = ("192.168.1.5", "10.0.0.7")
@@ -136,7 +138,7 @@ def test_only_files_of_the_page_are_served(listen: Listen) -> None:
     assert status(f"{url}/../server.py") == status(f"{url}/%2e%2e/server.py") == status(f"{url}/__init__.py") == 404
 
 
-def test_hosts_outside_the_allowed_networks_get_nothing(listen: Listen) -> None:
+def test_hosts_outside_the_allowed_networks_get_neither_the_page_nor_a_connection(listen: Listen) -> None:
     allow = cell().headset.model_validate({"allow": ["10.0.0.0/8"]}).networks
     source = listen(allow=allow)
     assert status(str(source.url)) == 403
@@ -145,7 +147,7 @@ def test_hosts_outside_the_allowed_networks_get_nothing(listen: Listen) -> None:
 
 @pytest.mark.parametrize("make", [lambda: WebXrInput().start(), lambda: WebXrInput.from_config(cell())])
 @pytest.mark.parametrize("package", _PACKAGES)
-def test_a_missing_package_is_named_with_the_extra_that_has_it(
+def test_a_missing_package_is_named_with_the_extra_that_installs_it(
     package: str, make: Callable[[], object], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     found = {name: find_spec(name) for name in _PACKAGES if name != package}
@@ -154,13 +156,13 @@ def test_a_missing_package_is_named_with_the_extra_that_has_it(
         make()
 
 
-def test_the_extra_of_the_page_names_all_of_its_packages() -> None:
+def test_the_extra_web_names_all_packages_that_the_page_needs() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     named = {re.split("[<>=]", line)[0] for line in project["optional-dependencies"]["web"]}
     assert named.issuperset(_PACKAGES)
 
 
-def test_a_used_port_and_a_cable_with_another_host_and_a_bad_certificate_give_one_clear_line(
+def test_a_used_port_a_cable_with_another_host_and_a_bad_certificate_each_raise_a_clear_error(
     listen: Listen,
 ) -> None:
     source = listen()

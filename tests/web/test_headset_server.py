@@ -1,4 +1,4 @@
-"""The server of a headset's page: which page drives, and the samples that its messages become."""
+"""The server of a headset's page decides which page drives, and makes samples from the messages of that page."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.web.headset_page import Listen, Page, hand, samples
 NOISE = np.random.default_rng(3)
 
 
-def test_a_hand_arrives_as_the_page_sent_it_with_all_controls(listen: Listen) -> None:
+def test_the_pose_and_all_controls_of_a_hand_arrive_as_the_page_sent_them(listen: Listen) -> None:
     source = listen()
     with closing(Page(source)) as page:
         sent = hand(1.0, True, False, True) | {"axes": [0.1, -0.2, 0.3, 0.4]}
@@ -58,7 +58,7 @@ def test_a_missing_or_guessed_pose_and_a_moved_frame_are_faults_of_the_sample(
         assert samples(source, len)[0].fault is fault
 
 
-def test_of_messages_that_come_together_the_newest_pose_counts_and_no_press_is_lost(listen: Listen) -> None:
+def test_if_several_messages_arrive_at_once_the_newest_pose_counts_and_no_press_is_lost(listen: Listen) -> None:
     source = listen()
     with closing(Page(source)) as page:
         page.send(left=hand(0.0))
@@ -186,7 +186,7 @@ def test_the_newest_picture_reaches_the_page_that_drives(listen: Listen) -> None
         wait_until(has_the_newest)
 
 
-def test_headset_check_shows_messages_of_the_page_and_its_address(listen: Listen) -> None:
+def test_headset_check_shows_the_address_of_the_page_and_the_messages_that_the_page_sends(listen: Listen) -> None:
     source, config = listen(silence=PATIENCE), WebXrInput.cell(cell())
     alone = watch_headset(source, config, 0.0, lambda check: None, lambda: False, CrossedHands(config.teleop.axes))
     assert f"open {source.url} in the headset's browser" in alone.advice

@@ -1,4 +1,4 @@
-"""The headset's page on a screen: its texts and buttons. In VR: the board with the texts."""
+"""The texts and buttons of the headset's page on a screen, and the board that shows the texts in VR."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_each_press_of_the_buttons_home_pause_and_stop_reaches_the_run_once(run:
     wait_until(lambda: run.asked == ["home", "pause"])
     page.click("#stop")
     wait_until(lambda: run.asked == ["home", "pause", "stop"])
-    # The space key, which engages the arm of a hand that is moved by keys, presses no button again.
+    # The space key engages an arm here. It must not press the button again that was clicked last.
     page.click("#fly")
     page.keyboard.press("Space")
     page.wait_for_timeout(500)
@@ -128,7 +128,9 @@ def test_no_element_covers_another_one_on_a_phone(run: ShownRun, open_page: Open
     assert count(pixels(page), (230.0, 40.0, 40.0)) > 20  # The block is visible beside the words.
 
 
-def test_a_watching_page_sees_the_driver_and_the_state_and_may_only_stop(run: ShownRun, open_page: Open) -> None:
+def test_a_page_that_does_not_drive_shows_the_driver_and_the_state_and_can_only_stop_the_run(
+    run: ShownRun, open_page: Open
+) -> None:
     driver = opened(run, open_page)
     other = opened(run, open_page, ANOTHER_BROWSER)
     assert f"{run.source.statistics.peer} drives" in other.inner_text("#link")
@@ -161,7 +163,7 @@ def test_the_page_says_that_the_run_is_over_and_tries_to_connect_again(run: Show
     assert count(pixels(page), (230.0, 40.0, 40.0)) > 20  # The last picture stays.
     assert page.locator("#fly").is_disabled()
     assert page.locator("#keys").is_hidden()
-    # If somebody looks at the page again, it tries at once to connect.
+    # When the page gets the focus again, it tries to connect at once.
     page.evaluate("""() => {
         window.tries = 0;
         const Socket = WebSocket;

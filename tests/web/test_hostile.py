@@ -1,4 +1,4 @@
-"""A run does not change, and its loop does not wait, if there are many pages, slow or hostile pages, or frozen ones."""
+"""Many pages, and slow, hostile or frozen pages, do not change a run and do not let its loop wait."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ def test_a_slider_allows_no_speed_above_the_cells_speed_and_no_invalid_value(vie
     assert seen == [(1.0, 1.0), *[(0.5, 0.5)] * 5, (1.0, 0.5), (0.5, 0.5), (1.0, 0.5)]
 
 
-def test_a_flood_of_requests_is_thinned_out_but_stops_always_pass() -> None:
+def test_a_flood_of_requests_is_thinned_out_but_a_request_to_stop_always_passes() -> None:
     passed: list[object] = []
     answer = LimitedAnswers(passed.append, clock=lambda: 0.0)
     for _ in range(1000):

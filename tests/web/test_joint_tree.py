@@ -27,7 +27,7 @@ def colours(shown: ShownRobot, joint: str) -> set[tuple[int, int, int]]:
     return {colour for index, colour, _ in tree.meshes() if tree.model.names[index] == joint}
 
 
-def test_a_hand_is_drawn_without_its_envelope(shown: ShownRobot) -> None:
+def test_a_gripper_is_drawn_without_its_envelope(shown: ShownRobot) -> None:
     assert colours(shown, shown.fingers["left"][0]) == {BLACK, STEEL}
     assert {BLACK, STEEL} < colours(shown, "left_A7")
     assert colours(shown, "left_A7") == colours(shown, "right_A7")

@@ -1,4 +1,4 @@
-"""The advice for a browser that sends the positions of a dragged tool too slowly."""
+"""A browser that sends the positions of a dragged tool too slowly gets advice."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from q2r2_control.viewer.web.pace import BrowserPace
 
 
 class Browser:
-    """A browser that sends positions, and the measurement of its pace, by a clock that the test sets."""
+    """A browser that sends positions, and the measurement of its pace. The test sets the clock."""
 
     def __init__(self) -> None:
         self.now = 100.0

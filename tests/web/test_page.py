@@ -1,4 +1,4 @@
-"""A visitor's view of a run, and the buttons of the page, in a real browser."""
+"""What the page of a run shows in a real browser, and what its buttons do."""
 
 from __future__ import annotations
 
@@ -31,18 +31,20 @@ ORANGE = (255.0, 107.0, 13.0)  # Colour of the arms' rings.
 SLOW = "tests.web.slow_run"
 
 
-def test_the_page_shows_both_arms_and_its_buttons_end_the_run_in_rest(open_page: Open, start: Start) -> None:
+def test_the_page_shows_both_arms_and_its_buttons_end_the_run_with_the_arms_at_rest(
+    open_page: Open, start: Start
+) -> None:
     run = start(SLOW, "circle", "0", "0.002")
     page = open_page(run.url)
     wait_for(page, "certified")
     for arm in (0, 1):
         wait_for_row(page, "state", arm, "engaged")
-    # The rings of both arms, left and right of the middle, are missing in an empty scene.
+    # The arms have orange rings, left and right of the middle. An empty scene would show no ring.
     wait_until(lambda: all(count(half, ORANGE) > 5 for half in np.array_split(pixels(page), 2, axis=1)))
     page.get_by_text("Pause both arms").click()
     wait_for_row(page, "why", 1, "a program asks for a pause")
     assert table(page)["next"] == ["nothing: a script moves the hands"] * 2
-    # News without a change of state, such as those of a slider, do not hide the reason.
+    # Events without a change of state, such as that of a slider, do not hide the reason.
     page.get_by_text("Settings", exact=True).click()
     page.locator("input:visible").first.fill("50")
     page.locator("input:visible").first.press("Enter")
@@ -56,7 +58,7 @@ def test_the_page_shows_both_arms_and_its_buttons_end_the_run_in_rest(open_page:
     assert summary["at_rest"]
     kinds = [event["kind"] for event in summary["events"]]
     assert kinds.index("control_changed") < kinds.index("homing_arrived")
-    # The page that stays on the screen says so, and offers no button without effect.
+    # The page stays open. It says that the run is over, and hides the buttons that have no effect any more.
     wait_for(page, "The run is over after")
     assert not page.get_by_text("certified").is_visible()
     assert not page.get_by_text("Bring both arms home").is_visible()
@@ -68,7 +70,9 @@ def test_the_page_shows_both_arms_and_its_buttons_end_the_run_in_rest(open_page:
     assert again.end()["at_rest"]
 
 
-def test_a_page_drags_a_tool_like_a_hand_and_no_other_page_can_at_the_same_time(open_page: Open, start: Start) -> None:
+def test_a_page_drags_a_tool_like_a_hand_and_no_other_page_can_drag_at_the_same_time(
+    open_page: Open, start: Start
+) -> None:
     run = start(SLOW, "web", "0", "0.01")
     page, other = open_page(run.url), open_page(run.url)
     for one in (page, other):
@@ -86,7 +90,7 @@ def test_a_page_drags_a_tool_like_a_hand_and_no_other_page_can_at_the_same_time(
     other.mouse.down()
     drag(other, "right", 0.02)
     other.mouse.up()
-    # The first page goes on meanwhile, and a driver that is gone stops the arm.
+    # Meanwhile, the first page goes on dragging. When it is closed, the arm stops.
     moved = tool(page)
     drag(page, "left", 0.02)
     wait_until(lambda: np.linalg.norm(tool(other) - moved) > 0.02)
@@ -99,7 +103,9 @@ def test_a_page_drags_a_tool_like_a_hand_and_no_other_page_can_at_the_same_time(
     assert run.end()["at_rest"]
 
 
-def test_arrows_come_back_to_the_tool_when_the_drag_cannot_engage_any_more(open_page: Open, start: Start) -> None:
+def test_the_arrows_return_to_the_tool_when_the_drag_can_no_longer_engage_the_arm(
+    open_page: Open, start: Start
+) -> None:
     run = start(SLOW, "web", "0", "0.01")
     page = open_page(run.url)
     wait_for(page, "certified")
@@ -109,7 +115,7 @@ def test_arrows_come_back_to_the_tool_when_the_drag_cannot_engage_any_more(open_
         other.press("Pause both arms")
         wait_for_row(page, "why", 0, "a program asks for a pause")
     wait_for_row(page, "next", 0, "let go, then drag again to engage")
-    # The mouse, which is still down, drags no arrow. The arrow at the tool begins a new drag.
+    # The mouse button is still down, but the mouse drags no arrow. A press on the arrow at the tool begins a new drag.
     seen = []
     for to in (0.3, 0.45):
         drag(page, "left", to)
@@ -125,7 +131,7 @@ def test_arrows_come_back_to_the_tool_when_the_drag_cannot_engage_any_more(open_
     assert run.end()["at_rest"]
 
 
-def test_the_scene_and_the_panel_share_the_screen_of_a_phone(open_page: Open, start: Start) -> None:
+def test_on_a_phone_the_panel_is_below_the_scene(open_page: Open, start: Start) -> None:
     page = open_page(start(SLOW, "web", "0", "0.01").url)
     page.set_viewport_size({"width": 390, "height": 800})
     wait_for(page, "certified")
@@ -138,7 +144,7 @@ def test_the_scene_and_the_panel_share_the_screen_of_a_phone(open_page: Open, st
     assert (scene["width"], panel["width"]) == (390.0, 390.0)
 
 
-def test_a_replay_has_a_time_line_and_a_page_with_a_token_returns_after_a_reload(
+def test_the_page_of_a_replay_has_a_time_line_and_can_be_reloaded_with_its_token(
     open_page: Open, start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))  # The certificate is made here.

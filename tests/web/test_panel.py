@@ -1,4 +1,4 @@
-"""The content of the panel of the page: its order, its words, and what is left out."""
+"""What the panel of the page shows, in which order and in which words, and what it leaves out."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tests.viewer.conftest import tick_at
 
 
 class Shown:
-    """A panel of a run that the page drives, which draws each frame, and a page that shows it."""
+    """The panel of a run in which the page moves the arms, and a page that shows the panel. Every frame is drawn."""
 
     def __init__(self, robot: Robot, server: viser.ViserServer) -> None:
         self._robot = robot
@@ -70,7 +70,7 @@ def shown(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> Iterator[Shown]:
     server.stop()
 
 
-def test_cameras_have_the_order_of_the_cell_whichever_picture_comes_first(shown: Shown) -> None:
+def test_pictures_of_cameras_are_shown_in_the_order_of_the_cell_whichever_comes_first(shown: Shown) -> None:
     assert len(shown.cameras) > 1
     for name in reversed(shown.cameras):
         shown.show(pictures={name: b"picture"})
@@ -79,26 +79,26 @@ def test_cameras_have_the_order_of_the_cell_whichever_picture_comes_first(shown:
     assert places == sorted(places)
 
 
-def test_buttons_of_grippers_stand_above_the_pictures_of_cameras(shown: Shown) -> None:
+def test_buttons_of_grippers_are_above_the_pictures_of_cameras(shown: Shown) -> None:
     shown.show(pictures={shown.cameras[0]: b"picture"})
     shown.page.wait_until(lambda: shown.cameras[0] in shown.page.words)
     shown.page.button("left: close or open the gripper")
     assert shown.page.order_of("Grippers") < shown.page.order_of(shown.cameras[0])
 
 
-def test_pages_are_counted_from_1(shown: Shown) -> None:
+def test_the_first_page_has_the_number_1(shown: Shown) -> None:
     shown.page.wait_until(lambda: shown.page.says("this is page "))
     assert shown.page.says("this is page 1")
 
 
-def test_the_age_of_a_hand_is_blank_without_a_hand_and_long_after_its_last_pose(shown: Shown) -> None:
+def test_the_age_of_a_hands_newest_pose_is_blank_if_no_pose_has_come_for_a_long_time(shown: Shown) -> None:
     shown.show(ages={"left": 0.012})
     shown.page.wait_until(lambda: shown.page.row("hand's age") == ["12 ms", ""])
     shown.show(ages={"left": 36.9, "right": 1.5})
     shown.page.wait_until(lambda: shown.page.row("hand's age") == ["", "1500 ms"])
 
 
-def test_an_arm_that_is_lost_for_missing_poses_has_the_cure_beside_it(shown: Shown) -> None:
+def test_the_panel_shows_the_cure_beside_an_arm_that_is_lost_because_poses_are_missing(shown: Shown) -> None:
     shown.show()
     shown.page.wait_until(lambda: shown.page.row("state") == ["paused", "paused"])
     assert not shown.page.says("too late")

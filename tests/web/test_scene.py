@@ -1,4 +1,4 @@
-"""The first view of the page."""
+"""The first view of the page shows all joints of both arms."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.viewer.web.scene import FIELD_OF_VIEW, first_view
 
 
-def test_the_first_view_has_all_joints_in_a_square_and_the_left_arm_on_the_left(robot: Robot) -> None:
+def test_the_first_view_shows_all_joints_inside_a_square_and_the_left_arm_on_the_left(robot: Robot) -> None:
     eye, middle = first_view(robot.model, robot.home)
     forward = (middle - eye) / np.linalg.norm(middle - eye)
     right = np.cross(forward, [0.0, 0.0, 1.0])
