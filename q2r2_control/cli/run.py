@@ -289,7 +289,7 @@ def demo(
         input="scripted",
         plant=plant,
         mode=mode.value,
-        duration=min(positive("--duration", duration) or work.duration, work.duration),
+        duration=min((time for time in (positive("--duration", duration), work.duration) if time), default=None),
         fast=fast,
         input_options=given,
         table=table,
