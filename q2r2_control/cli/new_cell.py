@@ -24,6 +24,7 @@ from q2r2_control.config.cell import Config
 from q2r2_control.config.cell_file import load_config, parse_config
 from q2r2_control.config.yaml_text import yaml_of
 from q2r2_control.errors import ConfigError, Q2R2Error
+from q2r2_control.process.folders import check_file
 from q2r2_control.robot.compose import compose
 from q2r2_control.robot.description import LinkTree, joint_limits, load_description
 from q2r2_control.robot.floor import FLOOR
@@ -107,6 +108,7 @@ def new_cell(
         if one.exists():
             goes_on = f"q2r2 check {file} is enough if only the model has changed" if file.exists() else "delete it"
             raise ConfigError(f"{one}: exists; allowed: another name; {goes_on}")
+    check_file(file, "cell")
     if (robot is None) == (left is None and right is None):
         raise ConfigError("--left, --right or --robot: allowed: a model for each arm, or one that holds both")
     draft = _Draft(file, {"name": name}, xacro_args=named_values(xacro_arg or []))

@@ -301,3 +301,10 @@ def test_pairs_that_can_never_meet_are_written_to_new_files_only(tmp_path: Path)
     (file := tmp_path / "cell.srdf").write_text("mine", encoding="utf-8")
     assert "exists; give the name of a new file" in q2r2("check", CELL, "--pairs", str(file)).stderr
     assert file.read_text(encoding="utf-8") == "mine"
+
+
+def test_a_file_of_pairs_that_cannot_be_written_is_refused_before_the_samples(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    refused = q2r2("check", CELL, "--pairs", str(tmp_path / "file" / "a.srdf"), "--samples", "1000000000")
+    assert (refused.exit_code, refused.stderr.count("\n")) == (2, 1)
+    assert "a.srdf: Not a directory; allowed: a file in a folder" in refused.stderr

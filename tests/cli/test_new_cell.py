@@ -63,6 +63,14 @@ def test_an_existing_file_is_not_overwritten() -> None:
     assert Path("cell.yaml").read_text() == "mine"
 
 
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs a folder in which even root cannot write")
+def test_a_folder_that_cannot_be_written_is_refused_before_the_models_are_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir("/proc")
+    result = q2r2("new-cell", "cell", "--left", "missing.urdf", "--yes")
+    assert (result.exit_code, result.stderr.count("\n")) == (2, 1)
+    assert "cell cell.yaml: No such file or directory; allowed: a file in a folder" in result.stderr
+
+
 @pytest.mark.slow
 def test_links_without_masses_are_reported_as_left_to_do() -> None:
     Path("arm.urdf").write_text(re.sub(r"<inertial>.*?</inertial>", "", IIWA, flags=re.DOTALL))
