@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from q2r2_control.cli.cell_report import check_cell
+from q2r2_control.cli.cell_report import check_cell, cost_of_shapes
 from q2r2_control.config.bindings import Action, BindingSettings
 from q2r2_control.config.cell_file import load_config
 from q2r2_control.config.resources import find_resource
@@ -295,6 +295,20 @@ def test_check_says_which_pairs_may_touch() -> None:
     for note, allowed in zip(notes, cell.control.contact_allowed, strict=True):
         assert all(name in note for name in allowed.pair)
         assert f"inside by up to {1e3 * allowed.depth:g} mm" in note
+
+
+@pytest.mark.parametrize(
+    ("ticks", "says"),
+    [
+        ((49e-6, 31e-6), "320 pairs instead of 193, a tick at home 49 instead of 31 us"),
+        ((31e-6, 49e-6), "320 pairs instead of 193"),
+        ((31.2e-6, 31.1e-6), "320 pairs instead of 193"),
+    ],
+)
+def test_the_cost_of_further_shapes_has_a_time_only_if_ticks_were_found_longer(
+    ticks: tuple[float, float], says: str
+) -> None:
+    assert cost_of_shapes((320, 193), ticks) == says
 
 
 def test_pairs_that_can_never_meet_are_written_to_new_files_only(tmp_path: Path) -> None:
