@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from q2r2_control.config.arms import ArmConfig, FlangeConfig, PoseConfig, RobotConfig, ToolConfig
-from q2r2_control.errors import ConfigError, Q2R2Error
+from q2r2_control.errors import AllFaults, ConfigError, Q2R2Error
 from q2r2_control.robot.arm_chain import default_tip, end_of, named_joints
 from q2r2_control.robot.description import Description, LinkTree, joint_end, joint_limits, load_description, parse_srdf
 from q2r2_control.robot.pairs import hand_links
@@ -184,8 +184,10 @@ class ArmAssembly:
             hint = f"; not the arm's unless joints names it: {', '.join(others[:4])}" if others else ""
             expected = f"{len(config.home)} value(s), expected {len(names)}: {', '.join(names)}{hint}"
             raise ConfigError(f"{self.key}.home = {list(config.home)}: {expected}")
-        for index, joint in enumerate(self.joints):
-            check_position(joint, config.home[index], f"{self.key}.home[{index}]")
+        with AllFaults() as faults:
+            for index, joint in enumerate(self.joints):
+                with faults.of_part():
+                    check_position(joint, config.home[index], f"{self.key}.home[{index}]")
         return dict(zip(names, config.home, strict=True)) | self._open_gripper()
 
     def _open_gripper(self) -> dict[str, float]:

@@ -17,7 +17,7 @@ import pinocchio as pin
 
 from q2r2_control.config.arms import HeldObjectConfig
 from q2r2_control.config.cell import Config
-from q2r2_control.errors import ConfigError, RobotError, check_kind, shown
+from q2r2_control.errors import AllFaults, ConfigError, RobotError, check_kind, shown
 from q2r2_control.robot.cell_parts import check_position
 from q2r2_control.robot.coal_distances import CoalDistances
 from q2r2_control.robot.compose import compose
@@ -368,10 +368,13 @@ def _home_of(urdf: ET.Element, given: Mapping[str, float], where: str) -> dict[s
         if name not in joints:
             raise RobotError(f"{where}: home: no joint {shown(name)} that moves; joints: {', '.join(joints)}")
         check_kind(f"{where}: home of {name}", position, (float, int, np.number), "a number [rad or m]", RobotError)
-        try:
-            check_position(joints[name], float(position), f"home of {name}")
-        except ConfigError as error:
-            raise RobotError(f"{where}: {error}") from None
+    try:
+        with AllFaults() as faults:
+            for name, position in given.items():
+                with faults.of_part():
+                    check_position(joints[name], float(position), f"home of {name}")
+    except ConfigError as error:
+        raise RobotError(f"{where}: {error}", [f"{where}: {fault}" for fault in error.faults]) from None
     limits = {name: joint_limits(joint) for name, joint in joints.items()}
     followers = followers_of(urdf.findall("joint"), driven=given)
     usual = {
