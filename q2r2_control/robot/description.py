@@ -17,7 +17,7 @@ from q2r2_control.config.resources import find_resource
 from q2r2_control.errors import ConfigError, RobotError
 from q2r2_control.robot.followers import narrow_limits
 from q2r2_control.robot.packages import expand_xacro, package_file
-from q2r2_control.robot.urdf_forms import notes_on, scale_to_metres, unify
+from q2r2_control.robot.urdf_forms import LimitNote, notes_on, scale_to_metres, unify
 from q2r2_control.robot.urdf_parts import ATTRIBUTES, CONTINUOUS_RANGE
 
 EXAMPLE_ROBOT_DATA = "example-robot-data:"
@@ -51,7 +51,7 @@ class Description:
     urdf: ET.Element
     srdf: ET.Element | None
     file: Path
-    notes: tuple[str, ...] = ()  # Notes for the user on the model's URDF and SRDF.
+    notes: tuple[LimitNote, ...] = ()
 
     @property
     def name(self) -> str:

@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import pytest
@@ -261,6 +262,18 @@ def test_a_stop_that_needs_too_much_torque_is_a_note_and_no_fault(tmp_path: Path
     assert [f"NOTE {note}" for note in cell["notes"]] == [note]
     assert cell["stop_torques"][0]["stop"]["share_over"] > 0.09
     assert cell["stop_torques"][1]["stop"]["share_over"] == 0.0
+
+
+def test_joints_that_a_fault_finds_in_degrees_have_no_note_that_asks_for_their_units(tmp_path: Path) -> None:
+    urdf = ET.fromstring(find_resource("robots/iiwa7.urdf").read_text(encoding="utf-8"))
+    limits = {joint.get("name"): limit for joint in urdf.findall("joint") for limit in joint.findall("limit")}
+    for name in ("A3", "A4"):
+        limits[name].attrib.update(lower="-120", upper="120", velocity="130")
+    limits["A5"].set("velocity", "130")  # The range is in radians, so only the user knows the unit.
+    (tmp_path / "arm.urdf").write_text(ET.tostring(urdf, encoding="unicode"))
+    report = check_cell(one_arm(model=str(tmp_path / "arm.urdf")))
+    assert [fault.partition(":")[0] for fault in report.faults] == ["left_A3, left_A4"]
+    assert [note.partition(" has limits")[0] for note in report.notes if "degrees" in note] == ["left arm: A5"]
 
 
 def test_if_gravity_alone_needs_too_much_torque_the_note_does_not_advise_slower_stops(tmp_path: Path) -> None:

@@ -75,8 +75,8 @@ def test_an_empty_inertial_counts_as_no_inertial() -> None:
 )
 def test_suspicious_limits_are_reported_with_their_joint(parts: dict[str, str], said: str) -> None:
     (note,) = notes_on(ET.fromstring(ARM.format(**(USUAL | parts))))
-    assert note.startswith("turn ")
-    assert said in note
+    assert note.text.startswith("turn ")
+    assert said in note.text
 
 
 @pytest.mark.parametrize("safety", ["", "<safety_controller k_velocity='1'/>"])
