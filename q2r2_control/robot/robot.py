@@ -385,7 +385,7 @@ def _home_of(urdf: ET.Element, given: Mapping[str, float], where: str) -> dict[s
     return with_followers(usual | {name: float(position) for name, position in given.items()}, followers)
 
 
-def _text_of(path_or_text: str | os.PathLike[str], name_of_text: str) -> tuple[str, str, Path | None]:
+def _text_of(path_or_text: str | os.PathLike[str], name_of_text: str) -> tuple[str | bytes, str, Path | None]:
     """Return the text, its name in errors, and the folder of its file. The folder is None if there is no file."""
     if not isinstance(path_or_text, str | os.PathLike):
         raise RobotError(f"{shown(path_or_text)}: neither {name_of_text} nor the path of a file")
@@ -393,6 +393,6 @@ def _text_of(path_or_text: str | os.PathLike[str], name_of_text: str) -> tuple[s
         return path_or_text, name_of_text, None
     try:
         file = Path(path_or_text)
-        return file.read_text(encoding="utf-8"), str(file), file.parent
+        return file.read_bytes(), str(file), file.parent  # The first line of XML may name an encoding.
     except (OSError, ValueError) as error:
         raise RobotError(f"{str(path_or_text)[:200]!r}: neither XML nor a file that can be read: {error}") from error

@@ -164,7 +164,7 @@ def test_a_bad_value_is_named_with_what_is_allowed(tmp_path: Path, path: str, va
         ("[" * 5000, "not YAML"),
         ('"a\\nb": 1\nname: x\narms: {}\n', "a b = 1: unknown key"),
         ("? " + "k" * 9000 + "\n: 1\n", "k = 1: unknown key"),
-        (b"name: \xff\xfe\n", "cannot be read: 'utf-8' codec"),
+        (b"name: \xff\xfe\n", "is not a text file in UTF-8; allowed: a cell's YAML"),
     ],
     ids=lambda value: repr(value)[:40],
 )
