@@ -20,8 +20,21 @@ def install_line(extra: str) -> str:
     if extra == "lerobot" and is_checkout:
         folder = shlex.quote(str(_CHECKOUT))
         return f"make -C {folder} lerobot, which makes {folder}/.venv-lerobot of some gigabytes"
-    is_active = sys.prefix == sys.base_prefix or os.environ.get("VIRTUAL_ENV") == sys.prefix
-    pip = "pip" if is_active else f"{shlex.quote(sys.executable)} -m pip"
     if is_checkout:
-        return f"{pip} install -e '{_CHECKOUT}[{extra}]'"
-    return f"{pip} install 'q2r2_control[{extra}]'"
+        return f"{_pip()} install -e '{_CHECKOUT}[{extra}]'"
+    return f"{_pip()} install 'q2r2_control[{extra}]'"
+
+
+def plugin_line(package: str) -> str:
+    """Return the pip command that installs a ``package`` of the folder plugins/.
+
+    Without a checkout, the working directory has to be one.
+    """
+    folder = Path("plugins") / package
+    return f"{_pip()} install -e {shlex.quote(str(_CHECKOUT / folder if (_CHECKOUT / folder).is_dir() else folder))}"
+
+
+def _pip() -> str:
+    """Return the command that runs pip for this Python. It names this Python if its environment is not activated."""
+    is_active = sys.prefix == sys.base_prefix or os.environ.get("VIRTUAL_ENV") == sys.prefix
+    return "pip" if is_active else f"{shlex.quote(sys.executable)} -m pip"

@@ -16,12 +16,15 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 from q2r2_control.errors import ConfigError
+from q2r2_control.extras import plugin_line
 
 INPUTS = "q2r2_control.inputs"
 PLANTS = "q2r2_control.plants"
 PRESETS = "q2r2_control.presets"
 EXPORTS = "q2r2_control.exports"
 REASONS = "q2r2_control.reasons"
+# By group and name, the folders in plugins/ of packages that are not installed with this one.
+_OWN_PACKAGES = {(PLANTS, "franka"): "q2r2_franka", (EXPORTS, "zarr"): "q2r2_zarr"}
 
 
 def points_of(group: str) -> Mapping[str, EntryPoint]:
@@ -52,6 +55,12 @@ def names_of(group: str) -> tuple[str, ...]:
     return tuple(points_of(group))
 
 
+def package_to_install(group: str, name: str) -> str | None:
+    """Return a line that says how to install ``name`` of a group, if a package in plugins/ has it; otherwise None."""
+    package = _OWN_PACKAGES.get((group, name))
+    return None if package is None else f"it is in a package of its own: {plugin_line(package)}"
+
+
 def load_class(group: str, name: str) -> Any:
     """Return the class, the preset or the format called ``name``.
 
@@ -61,6 +70,8 @@ def load_class(group: str, name: str) -> Any:
     found = points_of(group)
     if name not in found:
         kind = group.rpartition(".")[2].removesuffix("s")
+        if (missing := package_to_install(group, name)) is not None:
+            raise ConfigError(f"{kind} {name}: {missing}")
         raise ConfigError(f"{kind} {name!r:.60}: allowed are {', '.join(found)}; installed as entry points {group}")
     try:
         return found[name].load()

@@ -19,8 +19,8 @@ from q2r2_control.config.cell_file import load_config
 from q2r2_control.config.recording import REALSENSE, CameraConfig
 from q2r2_control.errors import CameraError
 from q2r2_control.extras import install_line
+from q2r2_control.process.folders import check_folder
 from q2r2_control.process.helper_process import reason_of
-from q2r2_control.process.scheduling import check_folder
 
 _MEASURED = 1.0  # Time over which the rate of a camera is measured [s].
 _LONGEST = 5.0  # Longest time to wait for the last picture of this measurement [s].
@@ -64,7 +64,6 @@ def cameras(
     found = list(_found_devices())
     if configured:
         check_folder(output, "--output")
-        output.mkdir(parents=True, exist_ok=True)
     tried = [_tried(name, camera, output) for name, camera in configured.items()]
     if json:
         print(as_json_text({"devices": found, "cameras": tried}))

@@ -17,6 +17,7 @@ from q2r2_control.cli.output import ConfigFile, Json, as_json_text, counting, pr
 from q2r2_control.config.cell import Config
 from q2r2_control.config.cell_file import load_config
 from q2r2_control.errors import ConfigError, Q2R2Error
+from q2r2_control.process.folders import check_file
 from q2r2_control.robot.reachability import PairReach, Progress, nearest_approaches, srdf_of
 from q2r2_control.robot.robot import Robot
 from q2r2_control.viewer.tables import figure_table, print_table
@@ -38,13 +39,15 @@ def write_pairs(
 ) -> PairsWritten:
     """Find, in random postures, which pairs of a cell can meet. Write the other pairs as an SRDF into a new ``file``.
 
-    Raises :class:`ConfigError` if the file exists, or if the clearance is not above all distances in ``control``.
+    Raises :class:`ConfigError` if the file exists or cannot be written, or if the clearance is not above all distances
+    in ``control``.
     """
     key, least = config.control.largest_distance
     if not least < clearance <= 1.0:
         raise ConfigError(f"clearance = {clearance:g} m: allowed: above control.{key}, {least:g}, up to 1")
     if file.exists():
         raise ConfigError(f"{file}: exists; give the name of a new file")
+    check_file(file, "--pairs")
     robot = Robot.from_config(config)
     found = nearest_approaches(robot, samples, 0, clearance, progress)
     try:

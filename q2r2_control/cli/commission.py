@@ -27,6 +27,7 @@ from q2r2_control.pipeline.commissioning import LoadSurvey, StopReport, measure_
 from q2r2_control.pipeline.killed_run import measure_kill
 from q2r2_control.pipeline.slow_run import REST, STILL, SlowRun
 from q2r2_control.plants.fri.plant import FriPlant
+from q2r2_control.process.folders import check_file
 from q2r2_control.process.scheduling import real_time
 from q2r2_control.recording.about import program
 from q2r2_control.robot.commissioned import fingerprint, sign_off_file
@@ -272,6 +273,8 @@ def commission(
     Exit code 1 if a step is not passed; then no sign-off is written.
     """
     work = _Commissioning(find_resource(config), duration, tip)
+    sign_off = sign_off_file(work.file)
+    check_file(sign_off, "sign-off")
     logger = logging.getLogger("q2r2_control")
     try:
         with ExitStack() as stack:
@@ -281,12 +284,11 @@ def commission(
             stack.enter_context(real_time())
             work.run(stack)
         signed = work.signed()
-        file = sign_off_file(work.file)
-        file.write_text(as_json_text(signed) + "\n", encoding="utf-8")
+        sign_off.write_text(as_json_text(signed) + "\n", encoding="utf-8")
     except (Q2R2Error, KeyboardInterrupt, OSError) as error:
         why = "stopped by Ctrl-C" if isinstance(error, KeyboardInterrupt) else " ".join(str(error).split())
         print(f"q2r2: {work.step}: {why}; the cell is not commissioned", file=sys.stderr)
         raise Exit(1) from None
     if json:
         print(as_json_text(signed))
-    say(f"commissioned: {file}", Console(stderr=True))
+    say(f"commissioned: {sign_off}", Console(stderr=True))

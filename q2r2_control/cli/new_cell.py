@@ -24,6 +24,7 @@ from q2r2_control.config.cell import Config
 from q2r2_control.config.cell_file import load_config, parse_config
 from q2r2_control.config.yaml_text import yaml_of
 from q2r2_control.errors import ConfigError, Q2R2Error
+from q2r2_control.process.folders import check_file
 from q2r2_control.robot.compose import compose
 from q2r2_control.robot.description import LinkTree, joint_limits, load_description
 from q2r2_control.robot.floor import FLOOR
@@ -35,7 +36,7 @@ from q2r2_control.robot.pairs import CLEARANCE, link_of, links_moved_by, pair_na
 from q2r2_control.robot.reachability import nearest_approaches, srdf_text
 from q2r2_control.robot.robot import Robot
 from q2r2_control.robot.stop_torque import stop_torques
-from q2r2_control.robot.unchecked import moving_links
+from q2r2_control.robot.unchecked import links_of
 from q2r2_control.robot.urdf_parts import mimic_of
 from q2r2_control.types import Array
 from q2r2_control.viewer.tables import figure_table, print_table
@@ -107,6 +108,7 @@ def new_cell(
         if one.exists():
             goes_on = f"q2r2 check {file} is enough if only the model has changed" if file.exists() else "delete it"
             raise ConfigError(f"{one}: exists; allowed: another name; {goes_on}")
+    check_file(file, "cell")
     if (robot is None) == (left is None and right is None):
         raise ConfigError("--left, --right or --robot: allowed: a model for each arm, or one that holds both")
     draft = _Draft(file, {"name": name}, xacro_args=named_values(xacro_arg or []))
@@ -217,21 +219,25 @@ def _survey(draft: _Draft, models: dict[str, str], tips: dict[str, str | None], 
 
 
 def _enclose_drawings(draft: _Draft, yes: bool) -> None:
-    """If the user agrees, put capsules around the visual shapes of links that have a mass and no collision shape."""
-    moving = moving_links(Robot.from_config(draft.config()))
-    links = [link for link in moving if link.is_unchecked and link.drawn and not link.shaped]
-    names = ", ".join(link.name for link in links)
-    if not links or not (yes or typer.confirm(f"watch {names} by capsules around their drawings", default=True)):
+    """If the user agrees, put capsules around the visual shapes of bodies that have no collision shape."""
+    links = links_of(Robot.from_config(draft.config()))
+    names = [link.name for link in links if link.is_unchecked and link.drawn and not link.shaped]
+    question = f"watch {', '.join(names)} by capsules around their drawings"
+    if not names or not (yes or typer.confirm(question, default=True)):
         return
-    before = draft.data.get("capsules", {})
-    draft.data["capsules"] = before | {link.name: 1 for link in links}
-    try:
-        Robot.from_config(draft.config())
-    except Q2R2Error as error:
-        draft.notes.append(f"no capsules around drawings: {error}")
-        draft.data["capsules"] = before
-        return
-    draft.notes.append(f"{names}: drawn, without a collision shape, hence watched by capsules around the drawings")
+    enclosed = []
+    for name in names:
+        before = draft.data.get("capsules", {})
+        draft.data["capsules"] = before | {name: 1}
+        try:
+            Robot.from_config(draft.config())
+            enclosed.append(name)
+        except Q2R2Error as error:
+            draft.notes.append(f"no capsule around the drawing of {name}: {error}")
+            draft.data["capsules"] = before
+    if enclosed:
+        drawn = "drawn, without a collision shape, hence watched by capsules around the drawings"
+        draft.notes.append(f"{', '.join(enclosed)}: {drawn}")
 
 
 def _mount(draft: _Draft, distance: float | None, height: float | None, answers: RememberedAnswers) -> None:

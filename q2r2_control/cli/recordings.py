@@ -37,6 +37,7 @@ from q2r2_control.export.formats import FORMATS, format_named
 from q2r2_control.judging.judge import Judged, Judgement, Unreadable, discarded_episodes, judge_all, judgements_of
 from q2r2_control.judging.page import COLUMNS, page_of
 from q2r2_control.pipeline.pipeline import Pipeline
+from q2r2_control.process.folders import check_file
 from q2r2_control.process.places import chosen_place
 from q2r2_control.recording.reader import Recording, recordings_in
 from q2r2_control.recording.replay import replay as replay_recording
@@ -177,8 +178,7 @@ def report(
 
     Exit code 2 if a file cannot be read. The page names it.
     """
-    if output.is_dir() or not output.parent.is_dir():
-        raise ConfigError(f"--output {output}: allowed: a file in a folder that exists")
+    check_file(output, "--output")
     settings, files, found = _thresholds(config), recordings_in(recordings), list[Judged | Unreadable]()
     with counting("recordings") as progress:
         for one in judge_all(files, settings):

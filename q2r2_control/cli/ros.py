@@ -32,7 +32,8 @@ from q2r2_control.cli.output import (
 )
 from q2r2_control.config.cell import Config
 from q2r2_control.config.cell_file import load_config
-from q2r2_control.process.scheduling import StopRequest, check_folder, stop_on_signals
+from q2r2_control.process.folders import check_folder
+from q2r2_control.process.scheduling import StopRequest, stop_on_signals
 from q2r2_control.ros.launch.build import BuildError, build_interfaces
 from q2r2_control.ros.launch.processes import check_rclpy, in_ros, nodes_of, run_together
 from q2r2_control.ros.watching.findings import Finding, examine_environment, examine_set

@@ -19,7 +19,7 @@ from q2r2_control.judging.judge import Judged, judge, keep_verdicts
 from q2r2_control.pipeline.pipeline import Pipeline
 from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.plugins import PLANTS, load_class
-from q2r2_control.process.scheduling import check_folder
+from q2r2_control.process.folders import check_folder
 from q2r2_control.recording.about import About, anonymous
 from q2r2_control.recording.reader import Recording
 from q2r2_control.recording.recorder import ROOM, ROOM_WITH_PICTURES, Recorder, RecordingSummary

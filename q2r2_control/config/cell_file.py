@@ -31,8 +31,10 @@ def load_config(path: str | os.PathLike[str]) -> Config:
     file = find_resource(path)
     try:
         text = file.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
+    except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {_line(error)}") from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: is not a text file in UTF-8; allowed: a cell's YAML") from error
     return parse_config(text, path, file.absolute().parent, with_lines=True)
 
 

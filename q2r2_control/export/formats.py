@@ -23,7 +23,7 @@ from q2r2_control.export.lerobot import join_shards, require_lerobot, write_shar
 from q2r2_control.export.lerobot_v21 import join_v21, openpi_config, require_v21, write_v21
 from q2r2_control.export.sampling import CameraFrames, units_of
 from q2r2_control.extras import install_line
-from q2r2_control.plugins import EXPORTS, load_class, names_of
+from q2r2_control.plugins import EXPORTS, load_class, names_of, package_to_install
 
 # Pairs of names: of data in the HDF5 file, and of the feature from which the data comes.
 _DATA = (
@@ -176,6 +176,8 @@ def format_named(name: str) -> ExportFormat:
         return own
     others = names_of(EXPORTS)
     if name not in others:
+        if (missing := package_to_install(EXPORTS, name)) is not None:
+            raise ConfigError(f"export {name}: {missing}")
         raise ConfigError(f"export {name}: allowed: {', '.join((*FORMATS, *others))}")
     found = load_class(EXPORTS, name)
     if not isinstance(found, ExportFormat):

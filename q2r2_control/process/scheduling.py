@@ -1,4 +1,4 @@
-"""Prepare the process that runs a loop: real-time scheduling, signals, and folders for its files.
+"""Prepare the process that runs a loop: real-time scheduling and signals.
 
 Real-time scheduling needs permissions. Without them a run goes on without it, and one line says so.
 """
@@ -15,15 +15,10 @@ import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
-from pathlib import Path
-from tempfile import TemporaryFile
-
-from q2r2_control.errors import ConfigError
 
 # Under Linux with PREEMPT_RT, interrupts have the priority 50. The loop waits for some of them and needs a lower one.
 _PRIORITY = 40
 LONGEST_END = 5  # Time that a process may take to end after it has closed everything. SIGALRM ends it then [s].
-_LEAST_ROOM = 1 << 16  # Free space that a folder for recordings must have [bytes].
 _CURRENT, _FUTURE = 1, 2  # Flags of mlockall on Linux.
 # The system call sched_setattr of Linux: its number on each machine, and the layout of its structure, which has size,
 # policy, flags, nice, priority, runtime [ns], deadline [ns] and period [ns].
@@ -124,40 +119,6 @@ def _schedule_as_others(threads: Iterable[int]) -> None:
         for policy in (os.SCHED_OTHER | os.SCHED_RESET_ON_FORK, os.SCHED_OTHER):
             with suppress(OSError):
                 os.sched_setscheduler(thread, policy, os.sched_param(0))
-
-
-def new_folder(parent: Path, name: str, what: str) -> Path:
-    """Make a folder that did not exist before. Its ``name`` gets a number if several runs begin within one second.
-
-    Raises:
-        ConfigError: If the folder cannot be made. The message begins with ``what``.
-    """
-    for suffix in ("", *(f"-{number}" for number in range(2, 100))):
-        folder = parent / (name + suffix)
-        try:
-            folder.mkdir(parents=True)
-            return folder
-        except OSError as error:
-            # Any other error is final, for example if a parent is a file.
-            if not (isinstance(error, FileExistsError) and folder.exists()):
-                raise ConfigError(f"{what} {folder}: {error.strerror}") from error
-    raise ConfigError(f"{what} {parent / name}: exists, and so do 98 numbered ones")
-
-
-def check_folder(folder: Path, what: str) -> None:
-    """Make ``folder`` if it does not exist.
-
-    Raises:
-        ConfigError: If the folder cannot be made, or if nothing can be written in it. The message begins with ``what``.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with TemporaryFile(dir=folder) as file:
-            file.write(bytes(_LEAST_ROOM))
-            file.flush()
-    except OSError as error:
-        allowed = "allowed: a folder that can be written"
-        raise ConfigError(f"{what} {folder}: {error.strerror or error}; {allowed}") from error
 
 
 class StopRequest:

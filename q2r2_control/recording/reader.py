@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
-from mcap.exceptions import EndOfFile, McapError
+from mcap.exceptions import EndOfFile, InvalidMagic, McapError
 from mcap.records import Attachment, Metadata
 from mcap.summary import Summary
 from rosbags.serde import SerdeError
@@ -201,8 +201,10 @@ class Recording:
                     break
         except OSError as error:
             raise RecordingError(f"{self.file}: cannot be read: {error.strerror}") from error
+        except InvalidMagic as error:
+            raise RecordingError(f"{self.file}: not an MCAP file; allowed: a recording of q2r2 run --record") from error
         except BROKEN as error:
-            raise RecordingError(f"{self.file}: not an MCAP file, or damaged: {reason_of(error):.200}") from error
+            raise RecordingError(f"{self.file}: damaged: {reason_of(error):.200}") from error
         if not self.file.stat().st_size:
             raise RecordingError(f"{self.file}: the file is empty; allowed: a recording of q2r2 run --record")
         if not texts:

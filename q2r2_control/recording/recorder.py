@@ -17,8 +17,8 @@ from mcap.exceptions import EndOfFile
 from q2r2_control.config.recording import TOPIC_RATE, CameraConfig
 from q2r2_control.errors import ConfigError
 from q2r2_control.events import Reason
+from q2r2_control.process.folders import new_folder
 from q2r2_control.process.helper_process import HelperProcess, reason_of
-from q2r2_control.process.scheduling import new_folder
 from q2r2_control.recording.about import About, Conclusion
 from q2r2_control.recording.camera_recorder import CameraRecorder
 from q2r2_control.recording.mcap_file import McapFile

@@ -10,9 +10,17 @@ from pathlib import Path
 from typing import NamedTuple
 
 from q2r2_control.config.arms import ArmConfig, FlangeConfig, PoseConfig, RobotConfig, ToolConfig
-from q2r2_control.errors import ConfigError, Q2R2Error
+from q2r2_control.errors import AllFaults, ConfigError, Q2R2Error
 from q2r2_control.robot.arm_chain import default_tip, end_of, named_joints
-from q2r2_control.robot.description import Description, LinkTree, joint_end, joint_limits, load_description, parse_srdf
+from q2r2_control.robot.description import (
+    Description,
+    LinkTree,
+    joint_end,
+    joint_limits,
+    load_description,
+    parse_srdf,
+    read_xml,
+)
 from q2r2_control.robot.pairs import hand_links
 from q2r2_control.robot.urdf_parts import WORLD, fixed_joint, renamed, renamed_exclusions
 
@@ -160,7 +168,7 @@ class ArmAssembly:
             parts += mounted.model.exclusions
             if mounted.is_flat:
                 file = part.file.with_name(f"{name_of_stack([*carriers, part])}.srdf")
-                parts += parse_srdf(file.read_text(encoding="utf-8"), str(file)) if file.is_file() else []
+                parts += parse_srdf(read_xml(file), str(file)) if file.is_file() else []
             carriers.append(part)
         return renamed_exclusions(parts, self.name_in_cell)
 
@@ -184,8 +192,10 @@ class ArmAssembly:
             hint = f"; not the arm's unless joints names it: {', '.join(others[:4])}" if others else ""
             expected = f"{len(config.home)} value(s), expected {len(names)}: {', '.join(names)}{hint}"
             raise ConfigError(f"{self.key}.home = {list(config.home)}: {expected}")
-        for index, joint in enumerate(self.joints):
-            check_position(joint, config.home[index], f"{self.key}.home[{index}]")
+        with AllFaults() as faults:
+            for index, joint in enumerate(self.joints):
+                with faults.of_part():
+                    check_position(joint, config.home[index], f"{self.key}.home[{index}]")
         return dict(zip(names, config.home, strict=True)) | self._open_gripper()
 
     def _open_gripper(self) -> dict[str, float]:

@@ -165,11 +165,13 @@ def _home(urdf: ET.Element, arms: Mapping[str, ArmAssembly]) -> dict[str, float]
 
 def _check_resting(urdf: ET.Element, resting: Mapping[str, float], home: Mapping[str, float]) -> None:
     joints = {joint.get("name", ""): joint for joint in urdf.findall("joint") if joint.get("type") != "fixed"}
-    for name, position in resting.items():
-        if name not in joints or name in home:
-            allowed = ", ".join(joint for joint in joints if joint not in home)
-            raise ConfigError(f"robot.home.{name!s:.60}: no joint that rests; allowed: {allowed or 'none'}")
-        check_position(joints[name], position, f"robot.home.{name}")
+    with AllFaults() as faults:
+        for name, position in resting.items():
+            with faults.of_part():
+                if name not in joints or name in home:
+                    allowed = ", ".join(joint for joint in joints if joint not in home)
+                    raise ConfigError(f"robot.home.{name!s:.60}: no joint that rests; allowed: {allowed or 'none'}")
+                check_position(joints[name], position, f"robot.home.{name}")
 
 
 def _locked_at(urdf: ET.Element, given: Mapping[str, float]) -> dict[str, float]:

@@ -17,7 +17,7 @@ from q2r2_control.config.resources import find_resource
 from q2r2_control.errors import ConfigError, RobotError
 from q2r2_control.robot.followers import narrow_limits
 from q2r2_control.robot.packages import expand_xacro, package_file
-from q2r2_control.robot.urdf_forms import notes_on, scale_to_metres, unify
+from q2r2_control.robot.urdf_forms import LimitNote, notes_on, scale_to_metres, unify
 from q2r2_control.robot.urdf_parts import ATTRIBUTES, CONTINUOUS_RANGE
 
 EXAMPLE_ROBOT_DATA = "example-robot-data:"
@@ -51,7 +51,7 @@ class Description:
     urdf: ET.Element
     srdf: ET.Element | None
     file: Path
-    notes: tuple[str, ...] = ()  # Notes for the user on the model's URDF and SRDF.
+    notes: tuple[LimitNote, ...] = ()
 
     @property
     def name(self) -> str:
@@ -92,10 +92,10 @@ def load_description(
     elif xacro_args:
         raise ConfigError(f"{model}: xacro_args are for models that end in .xacro")
     else:
-        text = _read(file)
+        text = read_xml(file)
     urdf = parse_urdf(text, str(file), file.parent, packages)
     scale_to_metres(urdf.iterfind("link/collision/geometry/mesh"))
-    srdf = parse_srdf(_read(srdf_file), str(srdf_file)) if srdf_file is not None and srdf_file.is_file() else None
+    srdf = parse_srdf(read_xml(srdf_file), str(srdf_file)) if srdf_file is not None and srdf_file.is_file() else None
     return Description(urdf, srdf, file, tuple(notes_on(parse_srdf(text, str(file)))))
 
 
@@ -295,8 +295,12 @@ def _example_robot(name: str) -> tuple[Path, Path | None]:
     return folder / loader.urdf_subpath / loader.urdf_filename, srdf
 
 
-def _read(file: Path) -> bytes:
-    """Return the bytes of an XML file. Its first line may name an encoding."""
+def read_xml(file: Path) -> bytes:
+    """Return the bytes of an XML file. Its first line may name an encoding.
+
+    Raises:
+        RobotError: If the file cannot be read.
+    """
     try:
         return file.read_bytes()
     except OSError as error:

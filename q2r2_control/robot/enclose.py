@@ -49,15 +49,17 @@ def enclose_shapes(geometry: pin.GeometryModel, capsules: Mapping[str, int] | No
 
     Raises:
         RobotError: If a shape has no extent or no bounds.
-        ConfigError: If a link in ``capsules`` has no mesh.
+        ConfigError: If a link in ``capsules`` has no shape, or if it has no mesh and gets more than one capsule.
     """
     capsules = capsules or {}
     numbers = Counter(link_of(item.name) for item in geometry.geometryObjects)
     meshes = {link_of(one.name) for one in geometry.geometryObjects if isinstance(one.geometry, coal.BVHModelBase)}
     for link, count in capsules.items():
-        if link not in (meshes if count > 1 else numbers):
-            allowed = ", ".join(sorted(meshes)) or "none in this cell"
-            raise ConfigError(f"capsules.{link!s:.60}: no link with a mesh; allowed: {allowed}")
+        if link not in numbers:
+            allowed = ", ".join(sorted(numbers)) or "none in this cell"
+            raise ConfigError(f"capsules.{link!s:.60}: no link with a shape; allowed: {allowed}")
+        if count > 1 and link not in meshes:
+            raise ConfigError(f"capsules.{link} = {count}: this link has no mesh; allowed: 1")
     more = []
     for item in geometry.geometryObjects:
         fixed_box = isinstance(item.geometry, coal.Box) and item.parentJoint == 0

@@ -14,7 +14,7 @@ import pinocchio as pin
 from q2r2_control.config.resources import find_resource
 from q2r2_control.errors import ConfigError, RobotError
 from q2r2_control.robot.coal_distances import CoalDistances
-from q2r2_control.robot.description import LinkTree, joint_end, parse_srdf
+from q2r2_control.robot.description import LinkTree, joint_end, parse_srdf, read_xml
 from q2r2_control.robot.followers import followers_of
 from q2r2_control.types import Array
 
@@ -180,9 +180,9 @@ def exclusions_of_file(path: str, links: set[str]) -> list[ET.Element]:
     """
     file = find_resource(path)
     try:
-        found = parse_srdf(file.read_text(encoding="utf-8"), str(file)).findall("disable_collisions")
-    except (OSError, UnicodeDecodeError, RobotError) as error:
-        raise ConfigError(f"srdf = {path!r:.80}: cannot be read: {error!s:.200}") from error
+        found = parse_srdf(read_xml(file), str(file)).findall("disable_collisions")
+    except RobotError as error:
+        raise ConfigError(f"srdf = {path!r:.80}: {error!s:.200}") from error
     for link in (element.get(end, "") for element in found for end in ("link1", "link2")):
         if link not in links:
             raise ConfigError(f"srdf = {path!r:.80}: no link {link!r:.60} in this cell; q2r2 check --pairs writes one")

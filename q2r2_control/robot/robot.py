@@ -17,7 +17,7 @@ import pinocchio as pin
 
 from q2r2_control.config.arms import HeldObjectConfig
 from q2r2_control.config.cell import Config
-from q2r2_control.errors import ConfigError, RobotError, check_kind, shown
+from q2r2_control.errors import AllFaults, ConfigError, RobotError, check_kind, shown
 from q2r2_control.robot.cell_parts import check_position
 from q2r2_control.robot.coal_distances import CoalDistances
 from q2r2_control.robot.compose import compose
@@ -369,10 +369,13 @@ def _home_of(urdf: ET.Element, given: Mapping[str, float], where: str) -> dict[s
         if name not in joints:
             raise RobotError(f"{where}: home: no joint {shown(name)} that moves; joints: {', '.join(joints)}")
         check_kind(f"{where}: home of {name}", position, (float, int, np.number), "a number [rad or m]", RobotError)
-        try:
-            check_position(joints[name], float(position), f"home of {name}")
-        except ConfigError as error:
-            raise RobotError(f"{where}: {error}") from None
+    try:
+        with AllFaults() as faults:
+            for name, position in given.items():
+                with faults.of_part():
+                    check_position(joints[name], float(position), f"home of {name}")
+    except ConfigError as error:
+        raise RobotError(f"{where}: {error}", [f"{where}: {fault}" for fault in error.faults]) from None
     limits = {name: joint_limits(joint) for name, joint in joints.items()}
     followers = followers_of(urdf.findall("joint"), driven=given)
     usual = {
@@ -383,7 +386,7 @@ def _home_of(urdf: ET.Element, given: Mapping[str, float], where: str) -> dict[s
     return with_followers(usual | {name: float(position) for name, position in given.items()}, followers)
 
 
-def _text_of(path_or_text: str | os.PathLike[str], name_of_text: str) -> tuple[str, str, Path | None]:
+def _text_of(path_or_text: str | os.PathLike[str], name_of_text: str) -> tuple[str | bytes, str, Path | None]:
     """Return the text, its name in errors, and the folder of its file. The folder is None if there is no file."""
     if not isinstance(path_or_text, str | os.PathLike):
         raise RobotError(f"{shown(path_or_text)}: neither {name_of_text} nor the path of a file")
@@ -391,6 +394,6 @@ def _text_of(path_or_text: str | os.PathLike[str], name_of_text: str) -> tuple[s
         return path_or_text, name_of_text, None
     try:
         file = Path(path_or_text)
-        return file.read_text(encoding="utf-8"), str(file), file.parent
+        return file.read_bytes(), str(file), file.parent  # The first line of XML may name an encoding.
     except (OSError, ValueError) as error:
         raise RobotError(f"{str(path_or_text)[:200]!r}: neither XML nor a file that can be read: {error}") from error

@@ -1,7 +1,8 @@
-"""Find links that move with an arm and have no collision shape, so that nothing keeps them apart from other bodies.
+"""Find links that have no collision shape, so that nothing keeps them apart from other bodies.
 
 A certificate says nothing about such a link. Every part that commands arms calls :func:`check_watched`, which refuses
-a robot with such a link unless its cell names the link.
+a robot with such a link that moves with an arm, unless its cell names the link. A link that stands still gets a note,
+because it is drawn for looks in many models, and another part of the model often stands in front of it.
 """
 
 from __future__ import annotations
@@ -25,8 +26,8 @@ LIGHTEST_BODY = 0.015
 
 
 @dataclass(frozen=True, slots=True)
-class MovingLink:
-    """A link that moves with an arm's joints."""
+class CellLink:
+    """A link of a cell, and what its model says about its body."""
 
     name: str
     mass: float | None  # [kg]; None if the model has no mass.
@@ -34,12 +35,18 @@ class MovingLink:
     shaped: bool  # Whether it has a <collision>.
     # If a joint beside the arm moves this link: the joint of the arm that it mimics. The link is watched only at home.
     follows: str | None
-    arms: tuple[str, ...]  # The arms that move it.
+    arms: tuple[str, ...]  # The arms that move it; empty if the link stands still.
 
     @property
     def is_body(self) -> bool:
-        """Whether the link is a real body and not a frame: it has a mass, or it is drawn and no mass is known."""
-        return self.shaped or (self.drawn if self.mass is None else self.mass >= LIGHTEST_BODY)
+        """Whether the link is a real body and not a frame.
+
+        A link is a body if it has a mass, or if it is drawn and no mass is known. If the link stands still, its mass
+        says nothing, because models give any mass to such links.
+        """
+        if self.shaped or self.mass is None or not self.arms:
+            return self.shaped or self.drawn
+        return self.mass >= LIGHTEST_BODY
 
     @property
     def is_unchecked(self) -> bool:
@@ -63,8 +70,8 @@ class MovingLink:
         )
 
 
-def moving_links(robot: Robot) -> list[MovingLink]:
-    """Return all links that an arm of ``robot`` moves, including frames."""
+def links_of(robot: Robot) -> list[CellLink]:
+    """Return all links of ``robot``, including frames."""
     urdf = ET.fromstring(robot.urdf)
     tree, found = LinkTree(urdf, robot.name), []
     for link in urdf.findall("link"):
@@ -72,21 +79,20 @@ def moving_links(robot: Robot) -> list[MovingLink]:
         follows = robot.following_links.get(name)
         movers = {joint.get("name", "") for joint in tree.chain(name)} | {follows}
         arms = [arm for arm, its in robot.arms.items() if movers & {robot.joint_names[joint] for joint in its.joints}]
-        if arms:
-            masses = [float(mass.get("value", "0")) for mass in link.findall("inertial/mass")]
-            mass = sum(masses) if any(masses) else None
-            drawn, shaped = (link.find(tag) is not None for tag in ("visual", "collision"))
-            found.append(MovingLink(name, mass, drawn, shaped, follows, tuple(arms)))
+        masses = [float(mass.get("value", "0")) for mass in link.findall("inertial/mass")]
+        mass = sum(masses) if any(masses) else None
+        drawn, shaped = (link.find(tag) is not None for tag in ("visual", "collision"))
+        found.append(CellLink(name, mass, drawn, shaped, follows, tuple(arms)))
     return found
 
 
 def unchecked_faults(robot: Robot, in_cell: bool = True) -> list[str]:
-    """Return one line for each link or arm that keeps no distance to others, unless ``unchecked_links`` names it.
+    """Return one line for each moving link or arm that keeps no distance, unless ``unchecked_links`` names it.
 
     With ``in_cell`` the lines name keys of the cell's YAML as remedies, and without it arguments of
     :meth:`Robot.from_urdf`.
     """
-    named, moving = set(robot.unchecked_links), moving_links(robot)
+    named, moving = set(robot.unchecked_links), [link for link in links_of(robot) if link.arms]
     faults, told = [], set[str]()
     for arm in robot.arms:
         if (lacks := _lack_of(robot, arm)) is None:
@@ -109,17 +115,24 @@ def check_watched(robot: Robot, where: str, in_cell: bool = True) -> None:
 
 
 def unchecked_notes(robot: Robot) -> Iterator[str]:
-    """Yield lines about links that are not watched, because the cell names them or because they are light."""
-    moving = moving_links(robot)
-    at_home = [link.name for link in moving if link.name in robot.unchecked_links and link.shaped and link.follows]
-    watched = [link.name for link in moving if link.name in robot.unchecked_links and link.shaped and not link.follows]
+    """Yield lines about links that are not watched, because the cell names them, they stand still or they are light."""
+    links = links_of(robot)
+    named = [link for link in links if link.shaped and link.name in robot.unchecked_links]
+    at_home, watched = ([link.name for link in named if bool(link.follows) is follows] for follows in (True, False))
     if alone := [name for name in robot.unchecked_links if name not in (*at_home, *watched)]:
         yield f"unchecked_links: nothing keeps {', '.join(alone)} off anything"
     if at_home:
         yield f"unchecked_links: watched only where they are at home: {', '.join(at_home)}"
     if watched:
         yield f"unchecked_links: watched all the same, since they have collision shapes: {', '.join(watched)}"
-    if frames := [link.name for link in moving if link.drawn and not link.is_body]:
+    still = [link.name for link in links if link.is_unchecked and not link.arms]
+    if unguarded := [name for name in still if name not in robot.unchecked_links]:
+        around = f"capsules: {{{', '.join(f'{name}: 1' for name in unguarded)}}} around the drawings"
+        yield (
+            f"nothing keeps the arms off links that stand still and are drawn without a collision shape: "
+            f"{', '.join(unguarded)}; to change: <collision> in the model, {around}, or unchecked_links"
+        )
+    if frames := [link.name for link in links if link.drawn and not link.is_body]:
         lighter = f"drawn, without a collision shape, and lighter than {1e3 * LIGHTEST_BODY:g} g"
         yield f"not watched, since taken for frames ({lighter}): {', '.join(frames)}"
 

@@ -10,6 +10,7 @@ import math
 import re
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -40,22 +41,31 @@ def unify(root: ET.Element, where: str) -> None:
         _check_inertial(link, where)
 
 
-def notes_on(root: ET.Element) -> list[str]:
-    """Return a line for each joint whose limits a user should check. ``root`` is the model as it was written."""
+@dataclass(frozen=True, slots=True)
+class LimitNote:
+    """A line about limits of a joint that a user should check."""
+
+    joint: str
+    text: str
+    asks_for_units: bool  # True if the line asks whether the limits are in degrees.
+
+
+def notes_on(root: ET.Element) -> list[LimitNote]:
+    """Return notes on the joints whose limits a user should check. ``root`` is the model as it was written."""
     notes = []
     for joint in root.findall("joint"):
         name, limit = joint.get("name", ""), joint.find("limit")
         if (soft := _soft_limits(joint)) is not None:
             range_ = f"{soft[0]:g} .. {soft[1]:g}"
-            notes.append(
-                f"{name} may leave the soft limits of its safety_controller, {range_}; to keep them: its <limit>"
-            )
+            text = f"{name} may leave the soft limits of its safety_controller, {range_}; to keep them: its <limit>"
+            notes.append(LimitNote(name, text, asks_for_units=False))
         if limit is None or joint.get("type") != "revolute":
             continue
         lower, upper, speed = (float(limit.get(what, "0")) for what in ("lower", "upper", "velocity"))
         if max(-lower, upper) > LARGEST_ANGLE or speed > LARGEST_SPEED:
             limits = f"{lower:g} .. {upper:g} rad and {speed:g} rad/s"
-            notes.append(f"{name} has limits of {limits}; a URDF has radians: are these degrees?")
+            text = f"{name} has limits of {limits}; a URDF has radians: are these degrees?"
+            notes.append(LimitNote(name, text, asks_for_units=True))
     return notes
 
 

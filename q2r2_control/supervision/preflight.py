@@ -15,13 +15,17 @@ from q2r2_control.robot.urdf_forms import LARGEST_ANGLE, LARGEST_SPEED
 _NARROWEST = 1e-3  # The margins must leave each joint at least this range, which contains its home [rad or m].
 
 
-def _in_degrees(robot: Robot) -> list[str]:
-    """Return one line if joint limits seem to be in degrees instead of radians; otherwise an empty list."""
+def joints_in_degrees(robot: Robot) -> list[int]:
+    """Return the indices of the joints whose limits are in degrees instead of radians."""
     farthest = np.maximum(np.abs(robot.position_lower), np.abs(robot.position_upper))
     # If the position limit and the speed limit of a joint are both too large, they are in degrees.
     turned = (farthest > LARGEST_ANGLE) & (farthest <= np.rad2deg(LARGEST_ANGLE))
-    found = np.flatnonzero(turned & (robot.velocity_limit > LARGEST_SPEED)).tolist()
-    if not found:
+    return np.flatnonzero(turned & (robot.velocity_limit > LARGEST_SPEED)).tolist()
+
+
+def _in_degrees(robot: Robot) -> list[str]:
+    """Return one line if joint limits are in degrees instead of radians; otherwise an empty list."""
+    if not (found := joints_in_degrees(robot)):
         return []
     names = ", ".join(robot.joint_names[i] for i in found)
     lower, upper, fastest = (

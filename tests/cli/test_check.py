@@ -6,11 +6,12 @@ import os
 import re
 import subprocess
 import sys
+import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import pytest
 
-from q2r2_control.cli.cell_report import check_cell
+from q2r2_control.cli.cell_report import check_cell, cost_of_shapes
 from q2r2_control.config.bindings import Action, BindingSettings
 from q2r2_control.config.cell_file import load_config
 from q2r2_control.config.resources import find_resource
@@ -263,6 +264,18 @@ def test_a_stop_that_needs_too_much_torque_is_a_note_and_no_fault(tmp_path: Path
     assert cell["stop_torques"][1]["stop"]["share_over"] == 0.0
 
 
+def test_joints_that_a_fault_finds_in_degrees_have_no_note_that_asks_for_their_units(tmp_path: Path) -> None:
+    urdf = ET.fromstring(find_resource("robots/iiwa7.urdf").read_text(encoding="utf-8"))
+    limits = {joint.get("name"): limit for joint in urdf.findall("joint") for limit in joint.findall("limit")}
+    for name in ("A3", "A4"):
+        limits[name].attrib.update(lower="-120", upper="120", velocity="130")
+    limits["A5"].set("velocity", "130")  # The range is in radians, so only the user knows the unit.
+    (tmp_path / "arm.urdf").write_text(ET.tostring(urdf, encoding="unicode"))
+    report = check_cell(one_arm(model=str(tmp_path / "arm.urdf")))
+    assert [fault.partition(":")[0] for fault in report.faults] == ["left_A3, left_A4"]
+    assert [note.partition(" has limits")[0] for note in report.notes if "degrees" in note] == ["left arm: A5"]
+
+
 def test_if_gravity_alone_needs_too_much_torque_the_note_does_not_advise_slower_stops(tmp_path: Path) -> None:
     urdf = find_resource("robots/iiwa7.urdf").read_text(encoding="utf-8")
     assert urdf.count('velocity="2.268928" effort="110"') == 1  # Only A4 has this line.
@@ -297,7 +310,28 @@ def test_check_says_which_pairs_may_touch() -> None:
         assert f"inside by up to {1e3 * allowed.depth:g} mm" in note
 
 
+@pytest.mark.parametrize(
+    ("ticks", "says"),
+    [
+        ((49e-6, 31e-6), "320 pairs instead of 193, a tick at home 49 instead of 31 us"),
+        ((31e-6, 49e-6), "320 pairs instead of 193"),
+        ((31.2e-6, 31.1e-6), "320 pairs instead of 193"),
+    ],
+)
+def test_the_cost_of_further_shapes_has_a_time_only_if_ticks_were_found_longer(
+    ticks: tuple[float, float], says: str
+) -> None:
+    assert cost_of_shapes((320, 193), ticks) == says
+
+
 def test_pairs_that_can_never_meet_are_written_to_new_files_only(tmp_path: Path) -> None:
     (file := tmp_path / "cell.srdf").write_text("mine", encoding="utf-8")
     assert "exists; give the name of a new file" in q2r2("check", CELL, "--pairs", str(file)).stderr
     assert file.read_text(encoding="utf-8") == "mine"
+
+
+def test_a_file_of_pairs_that_cannot_be_written_is_refused_before_the_samples(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    refused = q2r2("check", CELL, "--pairs", str(tmp_path / "file" / "a.srdf"), "--samples", "1000000000")
+    assert (refused.exit_code, refused.stderr.count("\n")) == (2, 1)
+    assert "a.srdf: Not a directory; allowed: a file in a folder" in refused.stderr

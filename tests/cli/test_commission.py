@@ -154,6 +154,14 @@ def test_a_commissioning_over_real_sockets_and_processes_goes_through_all_steps(
         assert stop["tool_speed_mm_s"] > 10.0
 
 
+def test_a_sign_off_that_cannot_be_written_is_refused_before_the_first_step(cell: Path) -> None:
+    (file := cell.with_name("my_cell.commissioned.json")).mkdir()
+    code, lines, _ = commission(cell, [])
+    assert code == 2
+    assert lines[0].startswith(f"q2r2: sign-off {file}: Is a directory; allowed: a file in a folder")
+    assert len(lines) == 1
+
+
 def test_with_the_option_i_know_a_cell_runs_without_a_sign_off(cell: Path) -> None:
     done = q2r2("run", str(cell), "--input", "scripted", "--trajectory", "nowhere", "--i-know")
     assert "nowhere" in done.stderr

@@ -62,7 +62,19 @@ def test_a_report_is_one_page_about_all_recordings(recordings: Path, tmp_path: P
     for output in (tmp_path, tmp_path / "missing" / "report.html"):
         refused = q2r2("report", str(recordings), "--output", str(output))
         assert refused.exit_code == 2
-        assert f"--output {output}: allowed: a file in a folder that exists" in refused.stderr
+        assert f"--output {output}: " in refused.stderr
+        assert "allowed: a file in a folder that exists" in refused.stderr
+
+
+def test_a_page_that_cannot_be_written_is_refused_before_recordings_are_read(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    for output, why in ((tmp_path / "file" / "a.html", "Not a directory"), (tmp_path, "Is a directory")):
+        refused = q2r2("report", str(tmp_path / "no recordings"), "--output", str(output))
+        assert (refused.exit_code, refused.stderr.count("\n")) == (2, 1)
+        assert f"--output {output}: {why}; allowed: a file in a folder" in refused.stderr
+    missing = q2r2("report", str(tmp_path / "no recordings"), "--output", str(tmp_path / "new.html"))
+    assert "no recordings" in missing.stderr
+    assert [file.name for file in tmp_path.iterdir()] == ["file"], "the check leaves nothing behind"
 
 
 def test_a_file_that_cannot_be_read_is_discarded_and_the_others_are_judged(recordings: Path, tmp_path: Path) -> None:

@@ -63,6 +63,14 @@ def test_an_existing_file_is_not_overwritten() -> None:
     assert Path("cell.yaml").read_text() == "mine"
 
 
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs a folder in which even root cannot write")
+def test_a_folder_that_cannot_be_written_is_refused_before_the_models_are_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir("/proc")
+    result = q2r2("new-cell", "cell", "--left", "missing.urdf", "--yes")
+    assert (result.exit_code, result.stderr.count("\n")) == (2, 1)
+    assert "cell cell.yaml: No such file or directory; allowed: a file in a folder" in result.stderr
+
+
 @pytest.mark.slow
 def test_links_without_masses_are_reported_as_left_to_do() -> None:
     Path("arm.urdf").write_text(re.sub(r"<inertial>.*?</inertial>", "", IIWA, flags=re.DOTALL))
@@ -75,15 +83,29 @@ def test_links_without_masses_are_reported_as_left_to_do() -> None:
 
 
 @pytest.mark.slow
-def test_links_that_are_drawn_and_have_no_shape_are_watched_by_capsules_around_their_drawings(tmp_path: Path) -> None:
-    Path("arm.urdf").write_text(re.sub(r'<collision name="link_3.*?</collision>', "", IIWA, flags=re.DOTALL))
+@pytest.mark.parametrize("link", ["link_3", "link_0"], ids=["a link that moves", "the base"])
+def test_links_that_are_drawn_and_have_no_shape_are_watched_by_capsules_around_their_drawings(
+    link: str, tmp_path: Path
+) -> None:
+    Path("arm.urdf").write_text(re.sub(rf'<collision name="{link}.*?</collision>', "", IIWA, flags=re.DOTALL))
     result = q2r2("new-cell", "cell", "--left", "arm.urdf", "--yes", "--samples", "100")
     assert result.exit_code == 0, result.output
-    assert "NOTE left_link_3: drawn, without a collision shape, hence watched by capsules" in result.stdout
+    assert f"NOTE left_{link}: drawn, without a collision shape, hence watched by capsules" in result.stdout
     cell = load_config(tmp_path / "cell.yaml")
-    assert cell.capsules["left_link_3"] == 1
+    assert cell.capsules[f"left_{link}"] == 1
     watched = {link_of(name) for pair in pair_names(Robot.from_config(cell).collision_model) for name in pair}
-    assert "left_link_3" in watched
+    assert f"left_{link}" in watched
+
+
+@pytest.mark.slow
+def test_a_drawing_that_cannot_be_enclosed_leaves_the_others_their_capsules(tmp_path: Path) -> None:
+    bare = re.sub(r'<collision name="link_[03].*?</collision>', "", IIWA, flags=re.DOTALL)
+    Path("points.obj").write_text("v 0 0 0\n")
+    drawing = '<link name="link_0"><visual><geometry><mesh filename="points.obj"/></geometry></visual>'
+    Path("arm.urdf").write_text(re.sub(r'<link name="link_0">\s*', drawing, bare))
+    result = q2r2("new-cell", "cell", "--left", "arm.urdf", "--yes", "--samples", "100")
+    assert "NOTE no capsule around the drawing of left_link_0: " in result.stdout
+    assert load_config(tmp_path / "cell.yaml").capsules["left_link_3"] == 1
 
 
 @pytest.mark.slow

@@ -112,6 +112,8 @@ def test_a_folder_for_recordings_that_cannot_be_written_is_refused_before_the_ru
     result = q2r2(*command, "--record", str(tmp_path / "file" / "recordings"))
     assert (result.exit_code, result.stdout, result.stderr.count("\n")) == (2, "", 1)
     assert f"--record {tmp_path / 'file' / 'recordings'}: Not a directory; allowed: a folder" in result.stderr
+    result = q2r2(*command, "--record", str(tmp_path / "file"))
+    assert f"--record {tmp_path / 'file'}: is a file; allowed: a folder" in result.stderr
 
 
 def test_a_recording_that_ends_before_its_run_gives_exit_code_3(

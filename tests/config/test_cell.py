@@ -170,7 +170,7 @@ def test_the_error_about_a_wrong_value_names_its_key_and_says_what_is_allowed(
         ("[" * 5000, "not YAML"),
         ('"a\\nb": 1\nname: x\narms: {}\n', "a b = 1: unknown key"),
         ("? " + "k" * 9000 + "\n: 1\n", "k = 1: unknown key"),
-        (b"name: \xff\xfe\n", "cannot be read: 'utf-8' codec"),
+        (b"name: \xff\xfe\n", "is not a text file in UTF-8; allowed: a cell's YAML"),
     ],
     ids=lambda value: repr(value)[:40],
 )

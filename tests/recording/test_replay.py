@@ -248,7 +248,7 @@ def test_a_file_that_is_not_a_recording_or_belongs_to_another_cell_raises_an_err
     damaged[data.rindex(b"zstd", 0, len(data) // 2) + 50] ^= 1
     contents = {
         "damaged": (bytes(damaged), "damaged: "),
-        "text": (b"nothing of the kind", "not an MCAP file"),
+        "text": (b"nothing of the kind", "not an MCAP file; allowed: a recording of q2r2 run --record$"),
         "empty": (b"", "the file is empty"),
         "other": (data.replace(b"q2r2_control", b"q9r9_control"), "not a recording of q2r2 run --record"),
     }

@@ -11,6 +11,7 @@ import pinocchio as pin
 import pytest
 
 from q2r2_control.config.cell import Config
+from q2r2_control.config.cell_file import load_config
 from q2r2_control.config.resources import find_resource
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.compose import ComposedCell, compose
@@ -107,6 +108,26 @@ def test_an_invalid_arm_raises_an_error_of_one_line_with_the_key_and_what_is_all
     assert line in str(error.value)
     assert "arms.left" in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_all_joints_of_a_home_in_degrees_are_named_at_once() -> None:
+    with pytest.raises(ConfigError) as error:
+        compose(one_arm(home=[0, 20, 0, -90, 0, 60, 0]))
+    named = [fault.partition(" allows")[0] for fault in error.value.faults]
+    assert named == [f"arms.left.home[{at}] = {q}: joint A{at + 1}" for at, q in ((1, 20), (3, -90), (5, 60))]
+
+
+def test_all_resting_joints_outside_their_limits_are_named_at_once() -> None:
+    home = {"torso_lift_joint": 2.0, "head_1_joint": 90.0}
+    cell = load_config("config/tiago_dual.yaml")
+    assert cell.robot is not None
+    bent = cell.model_copy(update={"robot": cell.robot.model_copy(update={"home": home})})
+    with pytest.raises(ConfigError) as error:
+        compose(bent)
+    assert [fault.partition(":")[0] for fault in error.value.faults] == [
+        "robot.home.torso_lift_joint = 2",
+        "robot.home.head_1_joint = 90",
+    ]
 
 
 @pytest.mark.parametrize(

@@ -219,11 +219,14 @@ def test_a_cell_monitors_each_capsule_of_a_link() -> None:
 @pytest.mark.parametrize(
     ("capsules", "says"),
     [
-        ({"forearm_link": 2}, "capsules.forearm_link: no link with a mesh; allowed: left_base_link, left_forearm_link"),
-        ({"left_ee_link": 2}, "capsules.left_ee_link: no link with a mesh"),
+        (
+            {"forearm_link": 2},
+            "capsules.forearm_link: no link with a shape; allowed: floor, left_base_link, left_ee_link, left_fo",
+        ),
+        ({"left_ee_link": 2}, "capsules.left_ee_link = 2: this link has no mesh; allowed: 1"),
         ({"left_forearm_link": 5}, "capsules.left_forearm_link = 5"),
         ({"left_forearm_link": 0}, "capsules.left_forearm_link = 0"),
-        ({"left_elbow": 1}, "capsules.left_elbow: no link with a mesh"),
+        ({"left_elbow": 1}, "capsules.left_elbow: no link with a shape; allowed: floor, left_base_link, left_ee_link"),
     ],
     ids=["no link of the cell", "a box", "too many", "none", "one, of no link of the cell"],
 )

@@ -134,3 +134,11 @@ def test_an_invalid_home_is_refused(ur5: Path, home: object, said: str) -> None:
     with pytest.raises(RobotError, match=r".*") as error:
         Robot.from_urdf(ur5, {"left": "ee_link"}, home=home)  # type: ignore[arg-type]
     assert said in str(error.value)
+
+
+def test_all_joints_of_a_home_outside_their_limits_are_named_at_once(ur5: Path) -> None:
+    home = {"elbow_joint": 90.0, "wrist_1_joint": 0.0, "wrist_2_joint": -45.0}
+    with pytest.raises(RobotError) as error:
+        Robot.from_urdf(ur5, {"left": "ee_link"}, home=home)
+    named = [fault.partition(" = ")[0].rpartition(" of ")[2] for fault in error.value.faults]
+    assert named == ["elbow_joint", "wrist_2_joint"]

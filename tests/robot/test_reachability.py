@@ -54,11 +54,12 @@ def test_a_clearance_that_is_not_above_the_kept_distance_is_refused(tmp_path: Pa
     ("text", "fault"),
     [
         ('<robot><disable_collisions link1="table" link2="elbow"/></robot>', "no link 'elbow'"),
-        ("<robot>", "cannot be read"),
+        ("<robot>", "not XML: no element found"),
+        (b"\xff\xd8\xff\xe0", "not XML: not well-formed"),
     ],
 )
-def test_an_srdf_that_does_not_fit_its_cell_is_refused(tmp_path: Path, text: str, fault: str) -> None:
+def test_an_srdf_that_does_not_fit_its_cell_is_refused(tmp_path: Path, text: str | bytes, fault: str) -> None:
     file = tmp_path / "cell.srdf"
-    file.write_text(text)
+    file.write_bytes(text.encode() if isinstance(text, str) else text)
     with pytest.raises(ConfigError, match=fault):
         Robot.from_config(_with(CONFIG, srdf=str(file)))

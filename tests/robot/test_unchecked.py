@@ -85,6 +85,25 @@ def test_a_link_that_no_arm_moves_needs_no_shape() -> None:
     assert Robot.from_urdf(base, {"left": "l5"}).unchecked_links == ()
 
 
+def test_a_base_that_is_drawn_without_a_shape_is_named_in_a_note_until_the_user_decides() -> None:
+    urdf = arm().replace('<link name="l0"/>', f'<link name="l0">{weighs(0.0001)}{DRAWN}</link>')
+    robot = Robot.from_urdf(urdf, {"left": "l5"})
+    assert unchecked_faults(robot) == []
+    (note,) = unchecked_notes(robot)
+    assert "nothing keeps the arms off links that stand still and are drawn without a collision shape: l0; " in note
+    assert "capsules: {l0: 1} around the drawings, or unchecked_links" in note
+    named = Robot.from_urdf(urdf, {"left": "l5"}, unchecked_links=["l0"])
+    assert list(unchecked_notes(named)) == ["unchecked_links: nothing keeps l0 off anything"]
+
+
+def test_a_named_base_with_a_shape_is_still_monitored_and_a_note_says_so() -> None:
+    urdf = arm().replace('<link name="l0"/>', f'<link name="l0">{BALL}</link>')
+    robot = Robot.from_urdf(urdf, {"left": "l5"}, unchecked_links=["l0"])
+    assert list(unchecked_notes(robot)) == [
+        "unchecked_links: watched all the same, since they have collision shapes: l0"
+    ]
+
+
 def test_an_arm_without_monitored_pairs_is_refused_unless_unchecked_links_names_its_tool() -> None:
     neighbours = chain(BALL, BALL, "")
     with pytest.raises(RobotError, match=r"left arm: no pair of its shapes is monitored.* or unchecked_links=\['l3'\]"):
