@@ -65,7 +65,7 @@ def test_an_arm_follows_its_target_and_the_other_one_holds(cell: Cell, robot: Ro
 
 
 def test_pause_stop_and_home_work(cell: Cell, robot: Robot) -> None:
-    stream = cell.engage("left")
+    stream, requests = cell.engage("left"), cell.state("requests")
     stream.move("left", (0.0, 0.0, 0.06))
     assert cell.call("/cartesian_controller/pause", SetBool.Request(data=True)).success
     rest = cell.joints.wait_for_rest()
@@ -77,6 +77,7 @@ def test_pause_stop_and_home_work(cell: Cell, robot: Robot) -> None:
     cell.wait_until_there("left", robot.tool_pose(robot.home, "left"), 4e-3)
     wait_until(lambda: cell.state("homing_outcome") == {"kind": "homing_arrived"}, "the way home has ended")
     assert cell.state("fault") is None
+    assert cell.state("requests") == requests + 4, "scripted hands see by this number that they may press no more"
     assert cell.call("/cartesian_controller/stop").success
     wait_until(lambda: cell.state("phase") == "stopped", "the controller is stopped")
     assert (cell.state("fault"), cell.state("kind")) == ({"kind": "stop_service"}, "stop_service")

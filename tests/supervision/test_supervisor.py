@@ -145,6 +145,8 @@ def test_if_targets_of_one_linked_arm_end_both_hold_until_a_new_stream_of_each_b
     world.run(0.3, right=raised(right, 0.01))
     assert not world.supervisor.follows("right")
     assert [reason.root.kind for reason in world.supervisor.targets.ended.values()] == ["targets_ceased"] * 2
+    assert world.supervisor.ceased is not None
+    assert world.supervisor.ceased.root.kind == "targets_ceased"
     rest = world.tool("right")
     world.run(1.0, right=raised(right, 0.02))  # The other stream goes on.
     assert np.allclose(world.tool("right").translation, rest.translation, atol=1e-6)
@@ -152,6 +154,7 @@ def test_if_targets_of_one_linked_arm_end_both_hold_until_a_new_stream_of_each_b
     world.run(0.1, world.tool("left"), right=world.tool("right"))
     assert world.states == ["following"] * 2
     assert world.supervisor.targets.ended == {}
+    assert world.supervisor.ceased is None
 
 
 def test_a_target_just_after_the_timeout_does_not_hide_that_targets_had_ended(world: World) -> None:
@@ -209,6 +212,7 @@ def test_lost_joint_states_brake_the_arms_and_their_return_moves_nothing(world: 
     world.run(0.6, raised(tool, 0.1), sees=False)
     assert world.states == ["inactive"] * 2
     assert kinds(world.supervisor.fault) == "states_silent"
+    assert kinds(world.supervisor.ceased) == "joint_states: states_silent"
     assert np.abs(world.q - before).max() < 0.3
     rest = world.q
     world.run(1.0, raised(tool, 0.1))
