@@ -145,6 +145,9 @@ def test_if_targets_of_one_linked_arm_end_both_hold_until_a_new_stream_of_each_b
     world.run(0.3, right=raised(right, 0.01))
     assert not world.supervisor.follows("right")
     assert [reason.root.kind for reason in world.supervisor.targets.ended.values()] == ["targets_ceased"] * 2
+    words = [sentence(reason) for reason in world.supervisor.targets.ended.values()]
+    assert words[0] == "left holds because its targets have ceased"
+    assert words[1] == f"right holds because it is linked to left: {words[0]}", "no word stands twice"
     assert world.supervisor.ceased is not None
     assert world.supervisor.ceased.root.kind == "targets_ceased"
     rest = world.tool("right")
