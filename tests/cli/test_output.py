@@ -168,7 +168,12 @@ def test_an_arm_that_was_not_paused_by_its_button_is_named_with_the_reason(
     assert f"{sentence(reason)}, at 4.07 s" in row
     assert "right arm paused by" not in text
     again = Event(5.0, "left", "paused", "engaged", press)
-    assert "paused by" not in text_of(replace(summary, events=[paused, again]))
+    went_on = text_of(replace(summary, events=[paused, again]))
+    assert "at 4.07 s" in went_on, "a pause does not vanish because the arm was engaged again"
+    later = replace(paused, t=274.51)
+    text = text_of(replace(summary, events=[paused, again, later]))
+    (row,) = (line for line in text.splitlines() if "left arm paused by" in line)
+    assert "at 274.51 s, the last of 2 pauses" in row
     refusal = Reason(TeleopReason.NOT_ENGAGED, cause=Reason(TeleopReason.TOOL_UNKNOWN))
     refused = Event(6.0, "left", "paused", "paused", refusal)
     text = text_of(replace(summary, events=[again, refused]))
@@ -181,7 +186,7 @@ def test_late_and_missed_ticks_and_the_pair_that_held_a_gripper_are_printed(summ
     held = replace(summary.arms["left"], gripper_held_s=1.25, gripper_held_by=("left_finger_0", "block_0"))
     late = replace(summary, lateness_us=Percentiles(60.0, 310.0, 1204.0), overruns=3, missed_ticks=7, stretched_s=0.123)
     text = text_of(replace(late, arms=summary.arms | {"left": held}))
-    assert f"7 of {summary.ticks + 7}; the motion paused for them, 0.12 s in all" in text
+    assert f"7 of {summary.ticks + 7}; the motion took 0.12 s longer" in text
     assert "median 60 us, p99 310, max 1204; 3 by more than a period" in text
     (row,) = (line for line in text.splitlines() if "left gripper held for" in line)
     assert "1.25 s, by left_finger_0 | block_0" in row
