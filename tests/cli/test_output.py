@@ -66,6 +66,13 @@ def test_no_figure_is_cut_however_narrow_the_console_is() -> None:
     assert text.count("-2.967") == 2
 
 
+def test_a_unit_of_several_words_is_under_its_name() -> None:
+    text = printed(figure_table("runs", ("run", "error [mm RMS]", "load /core"), [("a", "2.3", "0.5")]))
+    assert "[mm RMS]" in text
+    assert "error [mm" not in text
+    assert "load /core" not in text
+
+
 def test_cells_of_a_table_have_no_line_break_if_another_program_reads_them() -> None:
     pair = "left_hand_e_base | right_hand_e_base"
     table = figure_table("pairs", ("pair", "why", "other pair"), [(pair, "keep", pair)])
