@@ -10,6 +10,7 @@ from typing import Annotated, TypeVar
 
 from rich.console import Console
 from rich.markup import escape
+from rich.table import Table
 from typer import Argument, Exit, Option
 
 from q2r2_control.cli.cell_run import check_window, show_window
@@ -152,21 +153,27 @@ def judge(
 
 
 def _print_verdicts(judged: Sequence[Judgement], unreadable: Sequence[Unreadable]) -> None:
-    # If a figure exists for several hands or arms, its column shows the worst number.
-    columns = [column for column in COLUMNS if column.name in _SHOWN]
     console = Console()
-    kept = sum(one.verdict.keep for one in judged)
-    rows = [(one.figures.name, one.verdict.word, *(column.text(one.figures) for column in columns)) for one in judged]
-    rows += [(one.file.stem, "discard", *("-" for _ in columns)) for one in unreadable]
-    title = f"episodes: {kept} kept, {len(rows) - kept} discarded"
     if judged:
-        print_table(figure_table(title, ("episode", "verdict", *(column.heading for column in columns)), rows), console)
+        print_table(verdict_table(judged, unreadable), console)
     for one in judged:
         if not one.verdict.keep:
             name = one.figures.file + ("" if one.figures.part is None else f" #{one.figures.part}")
             console.print(f"{escape(name)}: {verdict_markup(one.verdict)}", soft_wrap=True, highlight=False)
     for bad in unreadable:
         console.print(f"{escape(str(bad.file))}: [red]{escape(bad.line)}[/]", soft_wrap=True, highlight=False)
+
+
+def verdict_table(judged: Sequence[Judgement], unreadable: Sequence[Unreadable]) -> Table:
+    """Return a table with a row for each episode. Figures that no episode has are left out, so that names have room."""
+    # If a figure exists for several hands or arms, its column shows the worst number.
+    shown = [column for column in COLUMNS if column.name in _SHOWN]
+    columns = [column for column in shown if any(column.value(one.figures) is not None for one in judged)]
+    kept = sum(one.verdict.keep for one in judged)
+    rows = [(one.figures.name, one.verdict.word, *(column.text(one.figures) for column in columns)) for one in judged]
+    rows += [(one.file.stem, "discard", *("-" for _ in columns)) for one in unreadable]
+    title = f"episodes: {kept} kept, {len(rows) - kept} discarded"
+    return figure_table(title, ("episode", "verdict", *(column.heading for column in columns)), rows)
 
 
 def report(

@@ -10,8 +10,7 @@ from rich.text import Text
 
 from q2r2_control.events import Event
 from q2r2_control.summary.run_summary import ArmSummary, Percentiles, RunSummary, TorqueSummary
-from q2r2_control.teleop.arm_states import ArmState, is_fault
-from q2r2_control.teleop.reasons import TeleopReason
+from q2r2_control.teleop.arm_states import ArmState, is_fault, is_refusal
 from q2r2_control.viewer.tables import figure_table, times_real_time
 from q2r2_control.wording import sentence
 
@@ -79,12 +78,27 @@ def _result(summary: RunSummary) -> Iterator[tuple[str, str]]:
     if summary.min_distance_mm is not None and summary.closest_pair is not None:
         yield "nearest pair", f"{summary.min_distance_mm:.1f} mm, {' | '.join(summary.closest_pair)}"
     if summary.missed_ticks:
-        late = f"the motion paused for them, {summary.stretched_s:.2f} s in all"
-        yield "ticks missed", f"{summary.missed_ticks} of {summary.missed_ticks + summary.ticks}; {late}"
-    for name, event in _last_faults(summary).items():
-        label = f"{name} arm" if event.kind is TeleopReason.NOT_ENGAGED else f"{name} arm paused by"
-        yield label, f"[yellow]{escape(sentence(event.reason))}[/], at {event.t:.2f} s"
+        due = summary.missed_ticks + summary.ticks
+        yield "ticks missed", f"{summary.missed_ticks} of {due}; the motion took {summary.stretched_s:.2f} s longer"
+    yield from _faults(summary)
     yield "arms at the end", "at rest" if summary.at_rest else "[red]moving[/]"
+
+
+def _faults(summary: RunSummary) -> Iterator[tuple[str, str]]:
+    """Yield each arm's last pause by a fault, with the number of such pauses, and a refusal after which it holds."""
+    last = _last_faults(summary)
+    for name in summary.arms:
+        pauses = [event for event in summary.events if event.arm == name and is_fault(event) and not is_refusal(event)]
+        if pauses:
+            is_paused = last.get(name) == pauses[-1]
+            told = _moment(pauses[-1], "yellow" if is_paused else "default")
+            yield f"{name} arm paused by", told if len(pauses) == 1 else f"{told}, the last of {len(pauses)} pauses"
+        if name in last and is_refusal(last[name]):
+            yield f"{name} arm", _moment(last[name], "yellow")
+
+
+def _moment(event: Event, colour: str) -> str:
+    return f"[{colour}]{escape(sentence(event.reason))}[/], at {event.t:.2f} s"
 
 
 def _unusual(summary: RunSummary) -> Iterator[tuple[str, str]]:

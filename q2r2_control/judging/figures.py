@@ -15,6 +15,7 @@ from q2r2_control.judging.motion import ArmFigures, arm_figures, idle_share
 from q2r2_control.recording.about import LOOP
 from q2r2_control.recording.clock_steps import clock_steps
 from q2r2_control.recording.messages import hand_pose, loop_topics, target
+from q2r2_control.supervision.tick_pacer import MissedTicks
 from q2r2_control.teleop.arm_states import is_fault, is_refusal
 from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.types import Array, Flags
@@ -111,7 +112,7 @@ class TimingFigures:
     lost_share: float | None
     longest_lost_s: float  # The longest time span that has no tick in the file.
     late_ticks: int  # The number of ticks that come more than 1.5 periods after the tick before.
-    missed_ticks: int  # The number of whole periods that passed without a tick.
+    missed_ticks: int  # The number of ticks that were due and never came.
     missed_share: float | None  # The number of missed ticks divided by the number of ticks that were due.
     longest_tick_s: float | None  # The longest time between two ticks of the loop.
     compute_time_us_p99: float | None
@@ -254,7 +255,10 @@ def timing_figures(episode: Episode) -> TimingFigures:
     lost = np.diff(ticks.number, prepend=-1) - 1
     gaps = np.diff(ticks.t, prepend=0.0) - ticks.dt
     steps = clock_steps(ticks.number, ticks.t, ticks.dt)
-    missed = int(np.maximum(np.round(ticks.dt / period) - 1, 0).sum())
+    counter = MissedTicks()
+    for gap in (ticks.dt / period).tolist():
+        counter.add(gap)
+    missed = counter.count
     return TimingFigures(
         ticks=count,
         lost_ticks=int(lost.sum()),

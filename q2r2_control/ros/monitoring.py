@@ -17,7 +17,8 @@ from std_msgs.msg import String
 
 from q2r2_control.events import Reason
 from q2r2_control.ros.base_node import SENT_COMMAND_QOS, STEADY, STREAM_QOS
-from q2r2_control.ros.reasons import RosReason
+from q2r2_control.ros.reasons import LATENESS, NOT_EXPLAINED, RosReason
+from q2r2_control.teleop.arm_states import ArmState
 from q2r2_control.teleop.reasons import HOLD_REQUESTS
 
 _MAX_AGE = 0.1  # If the graph's last answer is older than this, the graph is asked again [s].
@@ -202,6 +203,7 @@ class HandListeners:
     def __init__(self, node: Node, hands: Sequence[str]) -> None:
         self._states, self._hands = NodeStates(node, namespace=node.get_namespace()), hands
         self._began = self._asked_at = 0.0  # Times of the first and of the last query of the graph [s].
+        self._requests: dict[str, int] = {}  # By controller, how often its services to hold were called at the start.
 
     def look(self) -> None:
         now = time.monotonic()
@@ -225,9 +227,38 @@ class HandListeners:
         engaged = [state["engaged"] for _, state, _ in self._arms() if state["hand"] == hand]
         return all(engaged) if engaged else None
 
+    def begin(self) -> None:
+        """Let the requests that controllers have served until now count no more."""
+        self._requests.clear()
+        self._new_requests()
+
     def asked_to_hold(self) -> bool:
-        """Return whether an arm's last event is a request to pause, reset or go home, or the result of a request."""
-        return any(state.get("last_event_kind") in HOLD_REQUESTS for _, state, _ in self._arms())
+        """Return whether a request to pause, reset, stop or go home was made.
+
+        It shows as an arm's last event, or as a call of a controller's service since :meth:`begin`. A controller that
+        was restarted counts its calls anew, and counts as such a request.
+        """
+        return self._new_requests() or any(
+            state.get("last_event_kind") in HOLD_REQUESTS for _, state, _ in self._arms()
+        )
+
+    def only_late(self) -> bool:
+        """Return whether each arm that is not engaged was lost only because a node stood still or data came late."""
+        ceased = {state["ceased_kind"] for state, _ in self._states.newest.values() if state.get("ceased_kind")}
+        return ceased <= LATENESS and all(
+            state.get("state") == ArmState.LOST
+            and state.get("paused_kind") in (LATENESS | NOT_EXPLAINED if ceased else LATENESS)
+            for _, state, _ in self._arms()
+            if not state["engaged"]
+        )
+
+    def lost(self) -> dict[str, str]:
+        """Return what each arm's node reports whose arm a fault or a request has stopped, by the node's name."""
+        return {name: state["message"] for name, state, _ in self._arms() if state.get("state") == ArmState.LOST}
+
+    def _new_requests(self) -> bool:
+        counts = {name: state["requests"] for name, (state, _) in self._states.newest.items() if "requests" in state}
+        return any(count != self._requests.setdefault(name, count) for name, count in counts.items())
 
     def _arms(self) -> list[tuple[str, dict[str, Any], float]]:
         """Return the name, the state and the state's age [s] for each arm's node that follows one of the hands."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from q2r2_control.events import ReasonKind
+from q2r2_control.events import CommonReason, ReasonKind
+from q2r2_control.supervision.reasons import SupervisionReason
+from q2r2_control.teleop.reasons import SILENCES
 
 
 class RosReason(ReasonKind):
@@ -71,3 +73,15 @@ class RosReason(ReasonKind):
     TARGET_LATE = "target_late", "{late:.2f} s late; its sender or this node stood still"
     TARGET_FRAME = "target_frame", "frame_id {frame!r}; allowed: {allowed!r}"
     TARGET_NOT_A_POSE = "target_not_a_pose", "not a finite pose with a unit quaternion"
+
+
+_R, _S = RosReason, SupervisionReason
+# Reasons that say only that a node stood still or that data came late. Nobody has to look at the arms after them.
+LATENESS: frozenset[ReasonKind] = SILENCES | {
+    *(_R.NODE_STALLED, _R.HAND_SILENT, _R.TRANSFORM_OLD),
+    *(CommonReason.LOOP_STALLED, _S.STATES_SILENT, _S.TARGETS_CEASED),
+}
+# Reasons of an arm's node that say that its controller does not follow, but not why. The controller knows why.
+NOT_EXPLAINED: frozenset[ReasonKind] = frozenset(
+    {_R.FOLLOWED_NO_MORE, _R.NOT_FOLLOWED, _R.NOT_ACKNOWLEDGED, _R.TOPIC_SILENT}
+)

@@ -59,8 +59,8 @@ class SupervisionReason(ReasonKind):
     )
     PUBLISHER_CHANGED = "publisher_changed", "another publisher took over{source}; the targets have to begin anew"
     TWO_PUBLISHERS = "two_publishers", "two publishers at a time{source}; allowed: one"
-    TARGETS_CEASED = "targets_ceased", "{arm}: targets{source} have ceased, the arm holds"
-    TARGETS_LINKED = "targets_linked", "{arm}: the arm holds because it is linked to {other}: {cause}"
+    TARGETS_CEASED = "targets_ceased", "{arm} holds because its targets{source} have ceased"
+    TARGETS_LINKED = "targets_linked", "{arm} holds because it is linked to {other}: {cause}"
 
 
 # Kinds of reasons that report no fault.

@@ -84,6 +84,8 @@ class Supervisor:
         self._standing = None if standstill is None else StandingArms(robot, standstill, self._origins.takers)
         self._stopped: Reason | None = None  # Why the arms stop until a reset; None if they do not.
         self._last: Reference | None = None
+        # Why arms that followed targets ceased to follow them; None after an arm follows targets again.
+        self.ceased: Reason | None = None
         self.phase = Phase.INACTIVE
         self.paused = False
         self.events: list[Reason] = []  # Events for the log. The writer of the log clears the list.
@@ -164,7 +166,10 @@ class Supervisor:
             tools.append(self._controller.tool_pose(arm))
             if self._external is None and self._watch.state is not None:
                 tools.append(self._robot.tool_pose(self._watch.state.q, arm))
-        return self.targets.offer(arm, pose, tools, now, number, self.no_targets, due)
+        refusal = self.targets.offer(arm, pose, tools, now, number, self.no_targets, due)
+        if refusal is None and pose is not None:
+            self.ceased = None
+        return refusal
 
     @property
     def no_targets(self) -> Reason | None:
@@ -199,7 +204,9 @@ class Supervisor:
             self._brake(Reason(SupervisionReason.JOINT_STATES, cause=fault))
         elif apart := self.skew.fault(now):
             self.start_over(apart, now)
-        self.events += self.targets.expire(now)
+        if ended := self.targets.expire(now):
+            self.events += ended
+            self.ceased = ended[-1]
         targets = self.homing.targets(self._last, dt) if self.homing.active else self.targets.at(now)
         self._last = reference = self._step(targets, dt, posture)
         if self.phase is Phase.ACTIVE:
@@ -347,6 +354,7 @@ class Supervisor:
 
     def _brake(self, why: Reason) -> None:
         self._forget_targets()
+        self.ceased = why
         self.events.append(why)
         if self.phase is Phase.ACTIVE:
             self.phase = Phase.BRAKING

@@ -21,7 +21,28 @@ import pinocchio as pin
 from q2r2_control.config.teleop import GuardSettings
 from q2r2_control.types import LONGEST_DT, Array
 
+_FORGETTING = 0.98  # By each tick, earlier lateness counts less by this factor.
 _ROUNDING = 1e-9  # The time before a punctual tick may exceed the period by this share of the period.
+
+
+class MissedTicks:
+    """Counts the ticks that were due and never came. A tick that only came late is not missed.
+
+    A tick that is late by more than half a period counts as missed at first. If the next one comes so much sooner that
+    the ticks are on their grid again, the count goes back.
+    """
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._behind = 0.0  # How far the ticks are behind their grid, without the missed ones [periods].
+
+    def add(self, gap: float) -> None:
+        """Take the time between two ticks [periods]."""
+        self._behind += gap - 1.0
+        missed = max(round(self._behind), -self.count)
+        self.count += missed
+        # Otherwise, two clocks that run differently would let ticks seem missed after some time.
+        self._behind = _FORGETTING * max(self._behind - missed, -0.5)
 
 
 class TickPacer:
@@ -37,11 +58,16 @@ class TickPacer:
             coasts: Whether the plant goes on at the last velocity while no command comes.
         """
         self.period = period
-        self.missed_ticks = 0  # Number of commands that were due and were not sent.
+        self._missed = MissedTicks()
         self.stretched = 0.0  # Time by which the motion is late because of late ticks [s].
         self._travel = velocity_limit * period  # The farthest that each joint may move in one period (n,) [rad].
         self._acceleration = acceleration_limit
         self._coasts = coasts
+
+    @property
+    def missed_ticks(self) -> int:
+        """The number of commands that were due and were not sent."""
+        return self._missed.count
 
     def step(self, gap: float, v: Array) -> float:
         """Return the time by which the reference advances [s], at most ``gap``.
@@ -50,10 +76,11 @@ class TickPacer:
             gap: Time since the last tick [s].
             v: Present joint velocities of the reference (n,) [rad/s].
         """
+        if not gap > 0.0:
+            return 0.0
+        self._missed.add(gap / self.period)
         if not gap > self.period * (1.0 + _ROUNDING):
-            return gap if gap > 0.0 else 0.0
-        # A tick that is less than half a period late is jitter. If it is later, commands count as missing.
-        self.missed_ticks += max(round(gap / self.period) - 1, 0)
+            return gap
         # For each joint, the time in which it can move at most as far as one period permits.
         longest = 2.0 * self._travel / (np.abs(v) + np.sqrt(v * v + 2.0 * self._acceleration * self._travel))
         step = min(gap, LONGEST_DT if self._coasts else max(self.period, float(longest.min())))

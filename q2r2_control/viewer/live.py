@@ -24,6 +24,8 @@ _REFRESH_RATE = 6.0  # Rate at which the table is drawn [Hz].
 # The thread that draws may compute for milliseconds. The loop gets the interpreter back from it after this time [s].
 _SWITCH_INTERVAL = 2e-5
 _LIMITS_SHOWN, _BAR = 4, 20  # Greatest number of limits that are named, and length of the progress bar [characters].
+_NAMES = len("gripper opening")  # Width of the column with the names of rows. No name is longer [characters].
+_WIDEST = 120  # The table is no wider than this [characters].
 _NEAR = 0.01  # A pair with a smaller margin is coloured [m].
 
 
@@ -81,7 +83,7 @@ class LiveTable:
         sys.setswitchinterval(min(before, _SWITCH_INTERVAL))
         live = Live(
             console=console,
-            get_renderable=self._drawn_table,
+            get_renderable=lambda: self._drawn_table(console.width),
             refresh_per_second=_REFRESH_RATE,
             transient=True,
             redirect_stdout=sys.stdout.isatty(),
@@ -94,28 +96,29 @@ class LiveTable:
             with suppress(OSError):  # The terminal may be closed.
                 live.stop()
 
-    def _drawn_table(self) -> Table | str:
+    def _drawn_table(self, width: int) -> Table | str:
         try:
-            return self.render()
+            return self.render(min(width, _WIDEST))
         except Exception as error:
             return f"no live table: {type(error).__name__}: {error}"
 
-    def render(self) -> Table:
-        """Return the table at this moment."""
+    def render(self, width: int) -> Table:
+        """Return the table at this moment, with columns whose widths depend only on ``width`` [characters]."""
         tick, (then, counted, reached), now = self._newest, self._drawn, time.monotonic()
         self._drawn = now, self._count, 0.0 if tick is None else tick.t
         passed = max(now - then, 1e-9)
         loop = f"{(self._drawn[1] - counted) / passed:.0f} Hz"
         if self._simulated_time:
             loop += f", {times_real_time((self._drawn[2] - reached) / passed)}"
-        table = Table(title=self._title, title_justify="left", min_width=76)
-        table.add_column("", style="dim")
+        table = Table(title=self._title, title_justify="left", width=width)
+        table.add_column("", style="dim", min_width=_NAMES)
         if tick is None:
             table.add_row("starting")
             return table
         arms = list(tick.tools)
-        for arm in arms:
-            table.add_column(arm, justify="right", min_width=14, overflow="fold")
+        for heading in (*arms, "")[:2]:
+            # Columns of equal shares do not change their widths as their texts change.
+            table.add_column(heading, justify="right", min_width=14, overflow="fold", ratio=1)
         if self._duration is not None:
             done = min(tick.t / self._duration, 1.0)
             bar = "━" * round(_BAR * done) + "·" * (_BAR - round(_BAR * done))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import fields
 from textwrap import wrap
@@ -15,6 +16,7 @@ from rich.text import Text
 
 Cell = Text | str | float | None
 _NARROWEST_NAME = 12  # A column of names is folded, but not to fewer characters than this.
+_UNIT = re.compile(r" (\[[^][]*\]|/\S*)$")
 _WIDEST = 1000  # Width with which the width of a whole table is measured [characters].
 
 
@@ -23,7 +25,7 @@ def figure_table(
 ) -> Table:
     """Return a table of figures and names under headings; ``notes`` are lines below it.
 
-    In a column with a unit or with numbers, the last word of the heading is the unit, and is put into a second line.
+    The unit at the end of a heading is put into a second line. A column with a unit or with numbers has figures.
     Such a column is aligned to the right and is never cut. In other columns, text that is too long continues in the
     next line. A row of one cell is the heading of the rows below. If the console is too narrow, the table is wider than
     the console. It therefore has to be printed by :func:`print_table`.
@@ -33,12 +35,12 @@ def figure_table(
     look: Any = {"box": box.SIMPLE_HEAD, "padding": (0, 1, 0, 0), "pad_edge": False, "min_width": len(title)}
     table = Table(title=Text(title), title_justify="left", **look)
     for index, column in enumerate(columns):
-        name, _, unit = column.rpartition(" ")
+        name, unit = _split_heading(column)
         numbers = any(isinstance(row[index], int | float) for row in given if len(row) > index)
-        figures = index > 0 and (numbers or unit.startswith(("[", "/")))
+        figures = index > 0 and (numbers or bool(unit))
         cells = [row[index].plain for row in rows if len(row) > max(index, 1)]
         if figures:
-            width = max(map(len, (*column.split(), *cells)))
+            width = max(map(len, (*name.split(), unit, *cells)))
             heading = "\n".join([*wrap(name, width), unit])
         else:
             heading, width = column, min(max(map(len, (column, *cells))), _NARROWEST_NAME)
@@ -68,6 +70,12 @@ def print_table(table: Table, console: Console) -> None:
     console.print(table, soft_wrap=False, crop=False)
     if notes is not None and table.caption is None:
         console.print(notes, soft_wrap=True, highlight=False)
+
+
+def _split_heading(column: str) -> tuple[str, str]:
+    """Return the name and the unit of a heading such as "error [mm RMS]" or "force /N"; "" if it has no unit."""
+    found = _UNIT.search(column)
+    return (column, "") if found is None else (column[: found.start()], found[1])
 
 
 def record_table(title: str, records: Sequence[Any], notes: Sequence[str] = ()) -> Table:

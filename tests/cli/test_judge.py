@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from rosbags.highlevel import AnyReader
 
+from q2r2_control.cli.recordings import verdict_table
 from q2r2_control.judging.judge import judge
 from q2r2_control.recording.reader import Recording
 from tests.cli.command import FAST, changed_cell, one_object, q2r2
+from tests.cli.test_output import printed
 from tests.judging.episodes import hands, record_episode
 
 IDLE = "max_idle_share: 0.5 "
@@ -50,6 +53,17 @@ def test_the_json_of_judge_has_every_figure_and_every_reason(recordings: Path, t
     lenient = changed_cell(tmp_path, IDLE, "max_idle_share: null ")
     episodes = one_object(q2r2("judge", str(recordings), "--config", lenient, "--json").stdout)["episodes"]
     assert [episode["verdict"] for episode in episodes] == ["keep", "keep"]
+
+
+def test_a_name_of_the_table_is_whole_in_80_columns(recordings: Path) -> None:
+    judged = [one for file in sorted(recordings.rglob("*.mcap")) for one in judge(Recording(file))]
+    name = "20261130-132353-demo"
+    named = [replace(one, figures=replace(one.figures, file=f"{name}.mcap")) for one in judged]
+    assert all(one.figures.name == name for one in named)
+    text = printed(verdict_table(named, []))
+    assert text.count(name) == 2
+    assert max(map(len, text.splitlines())) <= 80
+    assert "success" not in text, "a figure that no episode has takes no room"
 
 
 @pytest.mark.slow

@@ -67,6 +67,13 @@ def test_no_figure_is_cut_however_narrow_the_console_is() -> None:
     assert text.count("-2.967") == 2
 
 
+def test_a_unit_of_several_words_is_under_its_name() -> None:
+    text = printed(figure_table("runs", ("run", "error [mm RMS]", "load /core"), [("a", "2.3", "0.5")]))
+    assert "[mm RMS]" in text
+    assert "error [mm" not in text
+    assert "load /core" not in text
+
+
 def test_cells_of_a_table_have_no_line_break_if_another_program_reads_them() -> None:
     pair = "left_hand_e_base | right_hand_e_base"
     table = figure_table("pairs", ("pair", "why", "other pair"), [(pair, "keep", pair)])
@@ -169,7 +176,12 @@ def test_the_summary_gives_the_reason_if_anything_but_its_button_paused_an_arm(
     assert f"{sentence(reason)}, at 4.07 s" in row
     assert "right arm paused by" not in text
     again = Event(5.0, "left", "paused", "engaged", press)
-    assert "paused by" not in text_of(replace(summary, events=[paused, again]))
+    went_on = text_of(replace(summary, events=[paused, again]))
+    assert "at 4.07 s" in went_on, "a pause does not vanish because the arm was engaged again"
+    later = replace(paused, t=274.51)
+    text = text_of(replace(summary, events=[paused, again, later]))
+    (row,) = (line for line in text.splitlines() if "left arm paused by" in line)
+    assert "at 274.51 s, the last of 2 pauses" in row
     refusal = Reason(TeleopReason.NOT_ENGAGED, cause=Reason(TeleopReason.TOOL_UNKNOWN))
     refused = Event(6.0, "left", "paused", "paused", refusal)
     text = text_of(replace(summary, events=[again, refused]))
@@ -182,7 +194,7 @@ def test_the_summary_has_late_and_missed_ticks_and_the_pair_that_held_a_gripper_
     held = replace(summary.arms["left"], gripper_held_s=1.25, gripper_held_by=("left_finger_0", "block_0"))
     late = replace(summary, lateness_us=Percentiles(60.0, 310.0, 1204.0), overruns=3, missed_ticks=7, stretched_s=0.123)
     text = text_of(replace(late, arms=summary.arms | {"left": held}))
-    assert f"7 of {summary.ticks + 7}; the motion paused for them, 0.12 s in all" in text
+    assert f"7 of {summary.ticks + 7}; the motion took 0.12 s longer" in text
     assert "median 60 us, p99 310, max 1204; 3 by more than a period" in text
     (row,) = (line for line in text.splitlines() if "left gripper held for" in line)
     assert "1.25 s, by left_finger_0 | block_0" in row

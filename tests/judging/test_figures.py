@@ -182,6 +182,10 @@ class TestTiming:
         assert found.lost_share == pytest.approx(100 / 2100)
         assert found.longest_lost_s == pytest.approx(0.2)
 
+    def test_ticks_that_came_late_but_on_their_grid_are_not_missed(self) -> None:
+        dt = np.tile((1.6 * DT, 0.4 * DT), 1000)
+        assert timing_figures(episode(dt=dt, t=np.cumsum(dt))).missed_ticks == 0
+
     def test_periods_that_a_late_loop_skipped_count_as_missed_ticks_and_not_as_lost_ticks(self) -> None:
         dt = np.full(2000, DT)
         dt[500], dt[600] = 10.0 * DT, 1.2 * DT

@@ -129,6 +129,7 @@ def test_a_node_that_stood_still_during_a_tick_sends_no_target_from_before_the_s
     before, held = len(rig.targets), rig.newest()
     assert held.translation[0] > TOOL.translation[0] + 0.05  # The arm was moving.
     rig.wait(lambda: rig.state["last_event_kind"] == RosReason.NODE_STALLED, "it has gone on")
+    assert rig.state["paused_kind"] == RosReason.NODE_STALLED
     mover.join()
     assert len(rig.targets) == before
     rig.engage()

@@ -15,6 +15,7 @@ import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from q2r2_control.ros.launch.build import INTERFACES, BuildError, Interfaces, build, interface_packages, missing_tools
+from q2r2_control.ros.launch.build import build_interfaces as in_this_environment
 from tests.ros.conftest import need_ros
 from tests.ros.processes import ROOT
 
@@ -73,6 +74,21 @@ def test_packages_of_a_sourced_install_are_kept_and_a_package_built_beside_it_is
     command = ["bash", "-c", 'source "$0" && "$1" -c "$2"', str(setup_file), str(python), script]
     run = subprocess.run(command, env=os.environ | sourced, capture_output=True, text=True, timeout=60)
     assert run.stdout.split() == [str(packages / "quest2ros"), "12"], run.stderr
+
+
+def test_each_build_says_which_of_how_many_packages_it_is(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """The builds themselves are left out, because they take minutes."""
+    built: list[str] = []
+    monkeypatch.setattr("q2r2_control.ros.launch.build.build", lambda package, prefix, log: built.append(package.name))
+    monkeypatch.setattr("q2r2_control.ros.launch.build.missing_tools", lambda prefix: [])
+    monkeypatch.setattr(
+        Interfaces, "found_in", lambda package: tmp_path if package.name in ["lbr_fri_idl", *built] else None
+    )
+    lines: list[str] = []
+    in_this_environment(lines.append)
+    said = [line.split(",")[0] for line in lines if "building" in line]
+    assert said == [f"{name}: building package {NAMES.index(name) + 1} of 4" for name in built]
+    assert built == ["control_msgs", "quest2ros", "tf2_msgs"]
 
 
 @pytest.mark.slow

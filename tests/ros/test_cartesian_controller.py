@@ -67,7 +67,7 @@ def test_an_arm_follows_its_target_while_the_other_arm_holds(cell: Cell, robot: 
 def test_the_services_pause_and_stop_bring_the_arms_to_rest_and_the_service_home_moves_them_home(
     cell: Cell, robot: Robot
 ) -> None:
-    stream = cell.engage("left")
+    stream, requests = cell.engage("left"), cell.state("requests")
     stream.move("left", (0.0, 0.0, 0.06))
     assert cell.call("/cartesian_controller/pause", SetBool.Request(data=True)).success
     rest = cell.joints.wait_for_rest()
@@ -79,6 +79,7 @@ def test_the_services_pause_and_stop_bring_the_arms_to_rest_and_the_service_home
     cell.wait_until_there("left", robot.tool_pose(robot.home, "left"), 4e-3)
     wait_until(lambda: cell.state("homing_outcome") == {"kind": "homing_arrived"}, "the way home has ended")
     assert cell.state("fault") is None
+    assert cell.state("requests") == requests + 4, "scripted hands see by this number that they may press no more"
     assert cell.call("/cartesian_controller/stop").success
     wait_until(lambda: cell.state("phase") == "stopped", "the controller is stopped")
     assert (cell.state("fault"), cell.state("kind")) == ({"kind": "stop_service"}, "stop_service")

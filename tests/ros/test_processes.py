@@ -101,6 +101,8 @@ def test_the_command_in_the_readme_moves_both_arms_and_stops(node: Any, robot: R
     home = joints.q
     arms = robot.arms.values()
     wait_until(lambda: all(np.abs(joints.q - home)[arm.joints].max() > 0.05 for arm in arms), "both arms move")
+    # The line has the node's name once, and neither its process's name nor a time.
+    assert re.match(r"\[(left|right)_q2r2_arm_controller\] INFO: engaged", up.wait_for("engaged: lower button"))
     started = children(up.pid)
     assert len(started) == len(nodes_of(CONFIG, "scripted")) == 4
     assert up.interrupt(60.0) == 0

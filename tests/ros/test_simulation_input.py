@@ -136,9 +136,10 @@ class PlayedHand(SimulationInput):
 
     def __init__(self, trajectory: str, context: Any) -> None:
         super().__init__(context=context, cli_args=as_arguments("side:=left", f"trajectory:={trajectory}"))
-        self.arm = {"hand": "left", "engaged": False, "ready": True, "last_event_kind": "reset_service"}
+        self.arm = {"hand": "left", "engaged": False, "ready": True, "last_event_kind": "reset_service", "message": ""}
+        self.controller = {"requests": 3, "ceased_kind": ""}
         self.presses, self._held = 0, False
-        self._hand_publishers: Any = SimpleNamespace(publish_sample=self._count, subscribers=lambda hand: 1)
+        self._hand_publishers: Any = SimpleNamespace(publish_sample=self._count, subscribers=lambda hand: 1, sent={})
 
     def _count(self, sample: HandSample, *_: object) -> None:
         self.presses += sample.inputs.button_lower and not self._held
@@ -147,7 +148,10 @@ class PlayedHand(SimulationInput):
     def play(self, until: float, **said: object) -> int:
         self.arm |= said
         while self.now < until:
-            self._listeners._states.newest["/arm"] = self.arm, time.monotonic()
+            self._listeners._states.newest |= {
+                "/arm": (self.arm, time.monotonic()),
+                "/controller": (self.controller, time.monotonic()),
+            }
             self.now += 0.02
             self._tick()
         return self.presses
@@ -170,4 +174,58 @@ def test_the_last_press_of_a_script_may_pause_an_arm_and_engages_no_arm(engaged:
     hand.play(0.9)
     assert hand.play(9.0, engaged=True, last_event_kind="pressed") == 1
     assert hand.play(60.0, engaged=engaged) == 1 + engaged
+    hand.destroy_node()
+
+
+def following_hand(context: Any) -> PlayedHand:
+    """Return a hand that has moved its arm for longer than the time in which it engages the arm after any stop."""
+    hand = PlayedHand("circle", context)
+    hand.play(0.9)
+    hand.play(20.0, engaged=True, state="engaged", last_event_kind="pressed")
+    return hand
+
+
+def lost(kind: str, **more: object) -> dict[str, object]:
+    return {"engaged": False, "state": "lost", "last_event_kind": kind, "paused_kind": kind} | more
+
+
+@pytest.mark.parametrize(
+    ("kind", "ceased", "presses"),
+    [
+        ("node_stalled", "targets_ceased", 1),
+        ("hand_silent", "", 1),
+        ("followed_no_more", "loop_stalled", 1),
+        ("not_acknowledged", "states_silent", 1),
+        ("followed_no_more", "", 0),
+        ("followed_no_more", "controller_stands", 0),
+        ("node_stalled", "new_receiver", 0),
+        ("hand_jumped", "targets_ceased", 0),
+        ("several_publishers", "targets_ceased", 0),
+        ("pause_service", "targets_ceased", 0),
+    ],
+)
+def test_a_lost_arm_is_engaged_again_only_if_something_was_late(
+    kind: str, ceased: str, presses: int, context: Any
+) -> None:
+    hand = following_hand(context)
+    hand.controller["ceased_kind"] = ceased
+    assert hand.play(21.0, **lost(kind)) == 1 + presses
+    hand.destroy_node()
+
+
+def test_a_lost_arm_is_not_engaged_by_the_script_after_a_call_of_a_controller_service(context: Any) -> None:
+    hand = following_hand(context)
+    hand.controller |= {"requests": 4, "ceased_kind": "targets_ceased"}
+    assert hand.play(30.0, **lost("node_stalled")) == 1
+    hand.destroy_node()
+
+
+def test_a_lost_arm_that_is_ready_too_late_is_left_to_a_person_who_is_told_how(context: Any) -> None:
+    hand = following_hand(context)
+    assert hand.play(22.9, **lost("hand_silent", ready=False)) == 1
+    assert hand._advice is None
+    assert hand.play(30.0, ready=True, message="ready to engage") == 1
+    assert "call /arm/engage" in hand.health()[1]
+    hand.play(31.0, engaged=True, state="engaged")
+    assert hand._advice is None
     hand.destroy_node()

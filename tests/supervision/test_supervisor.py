@@ -148,6 +148,11 @@ def test_if_the_targets_of_one_linked_arm_end_both_arms_hold_until_each_gets_a_n
     world.run(0.3, right=raised(right, 0.01))
     assert not world.supervisor.follows("right")
     assert [reason.root.kind for reason in world.supervisor.targets.ended.values()] == ["targets_ceased"] * 2
+    words = [sentence(reason) for reason in world.supervisor.targets.ended.values()]
+    assert words[0] == "left holds because its targets have ceased"
+    assert words[1] == f"right holds because it is linked to left: {words[0]}", "no word stands twice"
+    assert world.supervisor.ceased is not None
+    assert world.supervisor.ceased.root.kind == "targets_ceased"
     rest = world.tool("right")
     world.run(1.0, right=raised(right, 0.02))  # The right arm's stream goes on.
     assert np.allclose(world.tool("right").translation, rest.translation, atol=1e-6)
@@ -155,6 +160,7 @@ def test_if_the_targets_of_one_linked_arm_end_both_arms_hold_until_each_gets_a_n
     world.run(0.1, world.tool("left"), right=world.tool("right"))
     assert world.states == ["following"] * 2
     assert world.supervisor.targets.ended == {}
+    assert world.supervisor.ceased is None
 
 
 def test_a_target_just_after_the_timeout_does_not_hide_that_targets_had_ended(world: World) -> None:
@@ -212,6 +218,7 @@ def test_the_loss_of_joint_states_brakes_the_arms_and_the_return_of_the_states_m
     world.run(0.6, raised(tool, 0.1), sees=False)
     assert world.states == ["inactive"] * 2
     assert kinds(world.supervisor.fault) == "states_silent"
+    assert kinds(world.supervisor.ceased) == "joint_states: states_silent"
     assert np.abs(world.q - before).max() < 0.3
     rest = world.q
     world.run(1.0, raised(tool, 0.1))

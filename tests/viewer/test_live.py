@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import pty
 import sys
@@ -31,7 +32,7 @@ def test_the_table_shows_states_errors_distances_and_grippers_of_the_newest_tick
     table = LiveTable("demo", ArmWords(JOINTS, BindingSettings()))
     table(tick_at(robot, 1.0, engaged=False))
     table(replace(tick_at(robot, 2.0, distance=0.0234), held_grippers={"left": ("left_finger_0", "block_0")}))
-    text = printed(table.render(), 120)
+    text = printed(table.render(120), 120)
     for expected in (
         *("demo", "engaged", "3.0 mm", "5.73 deg", "50 %", "23.4 mm", "left_hand_0 | table_0", "2.0 s"),
         *("5.4 mm to spare", "left_link_5_0 | right_link_5_0", "left_finger_0 | block_0"),
@@ -46,7 +47,7 @@ def test_the_table_shows_the_episode_and_the_subtask_that_are_recorded(robot: Ro
     begun = (Reason(TeleopReason.EPISODE_BEGINS), Reason.of(TeleopReason.SUBTASK_BEGINS, number=2, name="grasp"))
     told = [Event(1.0, "left", "paused", "paused", reason) for reason in begun]
     table(replace(tick_at(robot, 1.0), events=told))
-    assert "records episode 1, subtask 2: grasp [the] cube" in printed(table.render(), 160)
+    assert "records episode 1, subtask 2: grasp [the] cube" in printed(table.render(160), 160)
 
 
 def test_the_table_cuts_off_no_name_and_no_progress_in_80_columns(robot: Robot) -> None:
@@ -55,14 +56,28 @@ def test_the_table_cuts_off_no_name_and_no_progress_in_80_columns(robot: Robot) 
     pair = ("right_hand_e_finger_1_envelope_0", "left_hand_e_finger_1_envelope_0")
     report = replace(tick.reference.report, closest_pair=pair)
     table(replace(tick, reference=replace(tick.reference, report=report)))
-    assert "…" not in printed(table.render(), 80)
+    assert "…" not in printed(table.render(80), 80)
+
+
+@pytest.mark.parametrize("columns", [80, 200])
+def test_the_columns_keep_their_widths_as_their_texts_change(columns: int, robot: Robot) -> None:
+    table, tick = LiveTable("demo", ArmWords(JOINTS, BindingSettings())), tick_at(robot, 2.5)
+    widths = set()
+    for pair in (("a", "b"), ("right_hand_e_finger_1_envelope_0", "left_hand_e_finger_1_envelope_0")):
+        report = replace(tick.reference.report, closest_pair=pair)
+        table(replace(tick, reference=replace(tick.reference, report=report)))
+        console = Console(file=(file := io.StringIO()), width=columns)
+        console.print(table.render(columns))
+        heading = next(line for line in file.getvalue().splitlines() if "left" in line)
+        widths.add(tuple(index for index, letter in enumerate(heading) if letter == "┃"))
+    assert len(widths) == 1, "a table whose columns jump is hard to read"
 
 
 def test_the_table_shows_each_arm_s_session_with_its_cabinet(robot: Robot) -> None:
     table = LiveTable("demo", ArmWords(JOINTS, BindingSettings()))
     sessions = {"left": "commanding active, connection good, drives active", "right": "not heard"}
     table(replace(tick_at(robot, 0.0), sessions=sessions))
-    text = printed(table.render(), 160)
+    text = printed(table.render(160), 160)
     assert "not heard" in text
     assert sessions["left"] in text
 
@@ -71,7 +86,7 @@ def test_the_table_shows_the_step_of_the_work_and_how_much_of_the_work_is_done(r
     steps = ((0.0, "stack: the left hand reaches for a block"), (2.0, "stack: it grasps"), (3.0, "stack: it lifts"))
     table = LiveTable("demo", ArmWords(JOINTS, BindingSettings()), steps, 10.0)
     table(tick_at(robot, 2.5))
-    text = printed(table.render(), 120)
+    text = printed(table.render(120), 120)
     assert "stack: it grasps" in text
     assert "━" * 5 + "·" * 15 + " 25%" in text
 
@@ -82,8 +97,8 @@ def test_the_table_shows_every_limit_that_was_active_since_the_table_was_last_dr
     report = replace(tick.reference.report, binding=(ActiveLimit(LimitKind.VELOCITY, ("left_A2",)),))
     table(replace(tick, reference=replace(tick.reference, report=report)))
     table(tick)
-    assert "left_A2 velocity" in printed(table.render(), 120)
-    assert "left_A2 velocity" not in printed(table.render(), 120)
+    assert "left_A2 velocity" in printed(table.render(120), 120)
+    assert "left_A2 velocity" not in printed(table.render(120), 120)
 
 
 class Terminal:

@@ -95,7 +95,8 @@ class ArmFeedback:
         self.haptics = HapticPulses(values.teleop.haptics)
         # The last event in words, and the kind of the reason from which it follows.
         self.last_line, self.last_kind = "not engaged yet", ""
-        self.paused = "not engaged yet"  # The last event after which the arm holds.
+        # The last event after which the arm holds, in words, and the kind of the reason from which it follows.
+        self.paused, self.paused_kind = "not engaged yet", ""
         self._drawn = TargetMarkers(arm, values.tool_frame, values.world_frame)
         self._markers = node.create_publisher(Marker, "visualization_marker", 10)
         self._shown = 0.0
@@ -108,7 +109,7 @@ class ArmFeedback:
     def tell(self, event: Event) -> None:
         self.last_line, self.last_kind = event_line(event), str(event.reason.root.kind)
         if event.destination in AT_REST and not is_refusal(event):
-            self.paused = self.last_line
+            self.paused, self.paused_kind = self.last_line, self.last_kind
         self._node.get_logger().info(self.last_line)
         self.haptics.start_pulse(event)
         self._events.publish(String(data=json.dumps(event.as_json())))

@@ -64,7 +64,8 @@ def build_interfaces(report: Callable[[str], None], force: bool = False) -> None
     """
     prefix = Path(sys.prefix)
     held = []  # Packages of this environment.
-    for package in interface_packages():
+    packages = interface_packages()
+    for number, package in enumerate(packages, start=1):
         folder = package.found_in()
         own = folder is None or folder.resolve().is_relative_to(prefix.resolve())
         if own:
@@ -75,7 +76,8 @@ def build_interfaces(report: Callable[[str], None], force: bool = False) -> None
         if missing := missing_tools(prefix):
             raise BuildError(f"{package.name} not built: missing {'; '.join(missing)}")
         log = prefix / "share" / "q2r2_control" / "log" / f"{package.name}.log"
-        report(f"{package.name}: building, about half a minute")
+        place = f"package {number} of {len(packages)}"
+        report(f"{package.name}: building {place}, in half a minute to two minutes, by how busy the computer is")
         began = time.monotonic()
         build(package, prefix, log)
         if package.found_in() is None:

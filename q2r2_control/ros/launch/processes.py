@@ -32,6 +32,9 @@ _END_TIMEOUTS = {signal.SIGINT: 5.0, signal.SIGTERM: 3.0}
 # The function is looked up here, because few calls are safe between fork and exec.
 _prctl = ctypes.CDLL(None).prctl if sys.platform == "linux" else None
 _NAMESPACE = re.compile(r"/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", re.ASCII)
+# The log lines of a process begin with the name of the node. They are therefore passed on without the process's name.
+_LOG_FORMAT = {"RCUTILS_CONSOLE_OUTPUT_FORMAT": "[{name}] {severity}: {message}"}
+_LOG_LINE = re.compile(r"\[[\w.]+\] (DEBUG|INFO|WARN|ERROR|FATAL): ")
 _PR_SET_PDEATHSIG = 1
 _EXECUTABLES = "q2r2_control.ros.launch.executables"
 
@@ -137,7 +140,9 @@ class UpError(Q2R2Error):
 
 
 def run_together(nodes: Sequence[NodeProcess], say: Callable[[str], None]) -> int:
-    """Start ``nodes`` and pass each line that they print to ``say``, after the node's name; returns the exit code.
+    """Start ``nodes`` and pass each line that they print to ``say``, after a name; returns the exit code.
+
+    The name is that of the node whose log contains the line, or else that of the process.
 
     Ctrl-C or SIGTERM ends all of them. The exit code is then 0, or 3 if a node reports by this code that its recording
     failed. If a node ends by itself, this is reported at once, the others are ended, and the exit code is 1. No node is
@@ -196,7 +201,7 @@ def _start(node: NodeProcess) -> subprocess.Popen[str]:
         stderr=subprocess.STDOUT,
         text=True,
         errors="replace",
-        env=os.environ | {"PYTHONUNBUFFERED": "1"},
+        env=_LOG_FORMAT | os.environ | {"PYTHONUNBUFFERED": "1"},  # The user's own format stays.
         start_new_session=True,
         preexec_fn=None if _prctl is None else lambda: _end_with(parent),
     )
@@ -216,7 +221,7 @@ def _end_with(parent: int) -> None:
 
 def _read(name: str, process: subprocess.Popen[str], say: Callable[[str], None]) -> None:
     for line in process.stdout or ():
-        say(f"[{name}] {line.rstrip()}")
+        say(line.rstrip() if _LOG_LINE.match(line) else f"[{name}] {line.rstrip()}")
 
 
 def _watch(running: Mapping[str, subprocess.Popen[str]], stop: StopRequest, say: Callable[[str], None]) -> str | None:

@@ -224,6 +224,7 @@ class BaseArmController(BaseNode):
             "gripper": self.gripper.state,
             "last_event": self.feedback.last_line,
             "last_event_kind": self.feedback.last_kind,
+            "paused_kind": self.feedback.paused_kind,
         }
         if self._refusal is not None:
             level, reason = self._refusal

@@ -114,6 +114,7 @@ class CartesianControllerNode(ManagedNode):
         self._clock_of_ticks = TickClock(self._period)
         self._reference: Reference | None = None
         self._commanding, self._advances = False, 0  # ``_advances`` counts the ticks in which time has passed.
+        self._requests = 0  # Number of calls of the services that let arms hold, stop or go home.
         # Every safe target is sent if another controller follows them. Nodes that only listen get one at intervals,
         # because they need only the newest one.
         every = 1 if self._is_external else max(round(_SAFE_TARGET_PERIOD * rate), 1)
@@ -200,11 +201,13 @@ class CartesianControllerNode(ManagedNode):
             self.report_health()
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        self._requests += 1
         self._supervisor.pause(request.data)
         self.report_health()  # Nodes that listen to the reports need the new state at once.
         return _answer(response, None)
 
     def _serve(self, act: Callable[[], Reason | None], request: Any, response: Any) -> Any:
+        self._requests += 1
         refusal: Reason | None = self._deactivated
         if self.is_active or act == self._stop:
             other = None if act == self._stop or self._commanding else self._others.commander()
@@ -226,6 +229,8 @@ class CartesianControllerNode(ManagedNode):
             "lifecycle": self.lifecycle_state,
             "fault": None if fault is None else fault.as_json(),
             "homing_outcome": None if homed is None else homed.as_json(),
+            "ceased_kind": "" if supervisor.ceased is None else str(supervisor.ceased.root.kind),
+            "requests": self._requests,
             "loop_rate_hz": self.tick_rate(),
             "missed_ticks": self._loop.pacer.missed_ticks,
             "sent": self._output.sent,

@@ -23,6 +23,9 @@ _SHORTEST, _LONGEST = 0.001, 0.02  # Shortest and longest time between two check
 _BEFORE_PRESS, _BEFORE_MOTION = FIRST_PRESS - 0.1, START - 0.05
 # Time after the first motion of the hands in which an arm that stops is engaged again, while other nodes start [s].
 _SETTLES = 6.0
+# After that time, an arm is engaged again only if it can be engaged within this time after it followed last [s]. A node
+# that stood still goes on sooner. A node that was killed counts as a second publisher for this time.
+_RECOVERS = 3.0
 _MODES = {
     "all": (MessageType.POSE, MessageType.INPUTS, MessageType.TWIST),
     "teleop": (MessageType.POSE, MessageType.INPUTS),
@@ -35,8 +38,10 @@ class SimulationInput(BaseNode):
 
     The script starts when every hand that it plays has a subscriber. The hands rest until the arms' nodes report that
     they can be engaged. Then the buttons are pressed. They are pressed again if an arm is not engaged when the hands
-    would move, or if it stops in the first six seconds. After that time, and after an arm's ``~/pause``, ``~/reset`` or
-    motion home, only a person can engage an arm. The script's own presses may still pause an arm.
+    would move, or if it stops in the first six seconds. After that time, they are pressed again only if arms stopped
+    because a node stood still or data came late, and can be engaged again within three seconds. After any other stop,
+    and after a request to pause, reset, stop or go home, only a person can engage an arm. A line in the log then says
+    how. The script's own presses may still pause an arm.
     """
 
     ticks = True
@@ -59,8 +64,10 @@ class SimulationInput(BaseNode):
         self._starts = True  # Whether presses may still engage the arms.
         self._pressed = False  # Whether the buttons were pressed once to engage the arms.
         self._moves = False  # Whether the hands move.
-        # Until this time, the script starts again and presses again if the arms do not follow [s].
+        # Until this time, arms are engaged again after any stop except a request [s].
         self._until = math.inf
+        self._followed = -math.inf  # Time at which all arms followed last [s].
+        self._advice: str | None = None  # How a person can engage the arms; None if the script or the arms go on.
         self._not_to_press: set[str] | None = None  # Hands that do not press; None if that is not decided yet.
         self._rewind(self.now)
         self._timer = self.create_tick(_LONGEST, self._tick)
@@ -72,6 +79,8 @@ class SimulationInput(BaseNode):
             return WARN, f"waits for a subscriber of the {' and the '.join(missing)} hand", values
         if self._starts and (unready := self._listeners.unready()) is not None:
             return WARN, f"waits: {unready}", values
+        if self._advice is not None:
+            return WARN, self._advice, values
         return OK, self._title, values
 
     def _missing(self) -> list[str]:
@@ -89,6 +98,7 @@ class SimulationInput(BaseNode):
         now = self.now
         if self._starts:
             self._engage(now)
+        self._advise(now)
         for sample in self._script.poll(now):
             self._publish(sample)
         wait = min(max(self._script.due() - self.now, _SHORTEST), _LONGEST)
@@ -100,29 +110,47 @@ class SimulationInput(BaseNode):
 
         At the beginning of the script, the hands rest.
         """
-        self._listeners.look()
+        if now <= self._until:
+            self._listeners.look()  # Later, the arms are known, and the graph need not be asked any more.
         t = now - self._began
         # The last event of an arm may be a request before the first press. Such a request does not count.
         self._pressed = self._pressed or (self._not_to_press is not None and t >= _BEFORE_MOTION)
-        if now > self._until or (self._pressed and self._listeners.asked_to_hold()):
+        following = [hand for hand in self._hands if self._listeners.engaged(hand) is not False]
+        if all_follow := len(following) == len(self._hands):
+            self._followed = now
+        recovers = all_follow or (now - self._followed <= _RECOVERS and bool(self._listeners.lost()))
+        if not self._pressed:
+            self._listeners.begin()
+        elif self._listeners.asked_to_hold() or not (recovers or now <= self._until):
             self._starts = False
             if not self._moves:
                 self._not_to_press = set(self._hands)
             return
         if t < _BEFORE_PRESS or (self._not_to_press is not None and t < _BEFORE_MOTION):
             return
-        following = [hand for hand in self._hands if self._listeners.engaged(hand) is not False]
+        may_press = now <= self._until or self._listeners.only_late()
         if self._not_to_press is None:
-            if self._listeners.unready() is None:
+            if may_press and self._listeners.unready() is None:
                 # A press would pause arms that are engaged already.
                 self._not_to_press = {hand for hand in following if self._listeners.engaged(hand)}
             else:
                 self._rewind(now)
-        elif len(following) == len(self._hands) or (self._moves and following):
+        elif all_follow or (self._moves and following):
             # While an arm follows, moving hands do not go back to the start, because that would be a jump.
             self._moves, self._until = True, min(self._until, now + _SETTLES)
-        else:
+        elif may_press:
             self._rewind(now)
+
+    def _advise(self, now: float) -> None:
+        """Log one line if the script presses no more and arms stay stopped."""
+        lost = {} if self._starts else self._listeners.lost()
+        if not lost:
+            self._advice = None
+        elif self._advice is None and now - self._followed > _RECOVERS:
+            arms = ", ".join(f"{name}: {message}" for name, message in lost.items())
+            calls = " and ".join(f"{name}/engage" for name in lost)
+            self._advice = f"presses no more; call {calls}, or end all nodes and start them again ({arms})"
+            self.get_logger().warning(self._advice)
 
     def _rewind(self, now: float) -> None:
         self._script = self._make_script()
@@ -130,7 +158,7 @@ class SimulationInput(BaseNode):
         self._began, self._not_to_press, self._moves = now, None, False
 
     def _publish(self, sample: HandSample) -> None:
-        would_engage = not self._starts and self._listeners.engaged(sample.hand) is False
+        would_engage = (self._moves or not self._starts) and self._listeners.engaged(sample.hand) is False
         if would_engage or (not self._moves and sample.hand in (self._not_to_press or ())):
             sample = replace(sample, inputs=replace(sample.inputs, button_lower=False))
         self._hand_publishers.publish_sample(sample, self._frame, partial(self._twist, sample))
