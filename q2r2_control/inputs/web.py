@@ -20,7 +20,7 @@ _BINDINGS = BindingSettings(
     device={"drag": Action.DEAD_MAN, "gripper": Action.GRIPPER_TOGGLE},
 )
 _WORDS = DeviceWords(
-    nouns={"drag": "a tool's arrows or rings", "gripper": '"close or open the gripper"'},
+    nouns={"drag": "a tool's arrows or rings", "gripper": "the gripper's button"},
     verbs={"drag": "drag"},
     absent="",
 )

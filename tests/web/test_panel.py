@@ -86,6 +86,14 @@ def test_buttons_of_grippers_are_above_the_pictures_of_cameras(shown: Shown) -> 
     assert shown.page.order_of("Grippers") < shown.page.order_of(shown.cameras[0])
 
 
+def test_advice_and_buttons_of_grippers_stand_above_the_table(shown: Shown) -> None:
+    """A small window shows only the top of the panel."""
+    shown.show(Event(0.9, "left", "engaged", "lost", Reason.of(TeleopReason.POSE_SILENT, timeout=0.15)))
+    advice = "The positions of the dragged tool came too late."
+    shown.page.wait_until(lambda: shown.page.says(advice))
+    assert shown.page.order_of("Grippers") < shown.page.order_of(advice) < shown.page.order_of("tightest pair")
+
+
 def test_the_first_page_has_the_number_1(shown: Shown) -> None:
     shown.page.wait_until(lambda: shown.page.says("this is page "))
     assert shown.page.says("this is page 1")

@@ -107,11 +107,13 @@ class Panel:
         else:
             self._add_buttons(gui)
         self._banner = gui.add_html("", visible=False, order=-1.0)
-        self._table = gui.add_html("")
-        self._episodes = gui.add_html("", visible=False)
+        # A small window shows only the top of the panel. Buttons are above lines that come and go, so that none moves.
         if driving is not None:
             with gui.add_folder("Grippers"):
                 driving.add_buttons(gui)
+        self._advice = gui.add_html("", visible=False)
+        self._table = gui.add_html("")
+        self._episodes = gui.add_html("", visible=False)
         self._cameras = gui.add_html("", visible=False)
         self._pictures: Mapping[str, bytes] = {}  # The newest pictures by camera.
         self._pictured: Mapping[str, bytes] = self._pictures  # The pictures that are shown.
@@ -213,6 +215,7 @@ class Panel:
         self._banner.visible = True
         if self._newest is not None:
             self._table.content = self._drawn(self._newest, [], over=True)
+            self._advice.visible = False
 
     def show(self, frame: Frame) -> None:
         """Draw the table, and send the values of sliders that were moved. Both are done only once per ``_PERIOD``."""
@@ -226,6 +229,7 @@ class Panel:
             self._times.append(1e6 * slowest)
             binding, self._binding = list(self._binding), {}
             self._table.content = self._drawn(frame, binding)
+            self._advise(frame)
             if self._told and not self._setup.replayed:  # In a replay, each frame has only the last events.
                 self._episodes.content, self._episodes.visible = table(self._told[-_EPISODES:]), True
             if (pictures := self._pictures) is not self._pictured:
@@ -268,6 +272,17 @@ class Panel:
         )
         return f"<div style='{STYLE}'><table style='width:100%'>{cells}</table>{self._below(frame, over)}</div>"
 
+    def _advise(self, frame: Frame) -> None:
+        """Show what is wrong and who drives. An unchanged text is not sent again."""
+        silent = any(self._words.is_silent(frame.tick, arm) for arm in frame.tick.tools)
+        slowness = "" if self._driving is None else self._driving.slowness(silent)
+        driver = frame.driver if self._driving is None else self._driving.words
+        lines = [coloured(text, RED) for text in (frame.notice, slowness) if text]
+        lines += [escape(driver)] if driver else []
+        content = f"<div style='{STYLE}'>{'<br>'.join(lines)}</div>" if lines else ""
+        if content != self._advice.content:
+            self._advice.content, self._advice.visible = content, bool(lines)
+
     def _next(self, tick: Tick, arm: str) -> str:
         """Return what the operator of an arm can do next."""
         moves = tick.states[arm] in (ArmState.ENGAGED, ArmState.PAUSING)
@@ -283,14 +298,6 @@ class Panel:
         plots: list[str] = []
         if not over:
             lines.append(f"a stop is {certified}; status {escape(str(report.status))}")
-            driver = self._driving.words if self._driving is not None else frame.driver
-            if driver:
-                lines.insert(0, escape(driver))
-            silent = any(self._words.is_silent(tick, arm) for arm in tick.tools)
-            if self._driving is not None and (slowness := self._driving.slowness(silent)):
-                lines.insert(0, coloured(slowness, RED))
-            if frame.notice:
-                lines.insert(0, coloured(frame.notice, RED))
         if not over and not self._setup.replayed:
             rate, top = self._rates[-1], self._setup.config.nominal_rate_hz
             plots.append(plot(f"loop, {rate:.0f} Hz", self._rates, 1.2 * top))
