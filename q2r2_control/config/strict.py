@@ -121,6 +121,8 @@ def _line(fault: ErrorDetails, model: type[BaseModel]) -> str:
         has = "allowed: a list with one more entry" if isinstance(fault["loc"][-1], int) else "and has no default"
         return f"{key}: missing, {has}"
     allowed = allowed_instead(fault)
+    if fault["type"] in _ALLOWED and _takes_null(fault["loc"], model):
+        allowed += ", or null"
     if fault["type"] == "extra_forbidden":
         keys = _keys_at(fault["loc"][:-1], model)
         meant = get_close_matches(str(fault["loc"][-1]), keys, n=1)
@@ -138,8 +140,20 @@ def allowed_instead(fault: ErrorDetails) -> str:
     return text if words is None else f"allowed: {words.format(**fault.get('ctx', {}))}"
 
 
+def _takes_null(location: tuple[int | str, ...], root: type[BaseModel]) -> bool:
+    """Return True if the key at ``location`` in ``root`` may also be null."""
+    *block, key = location or ("",)  # The location is empty if the whole model is of the wrong type.
+    field = getattr(_model_at(tuple(block), root), "model_fields", {}).get(key)
+    return field is not None and type(None) in get_args(field.annotation)
+
+
 def _keys_at(location: tuple[int | str, ...], root: type[BaseModel]) -> list[str]:
     """Return the names of the keys that the model at ``location`` in ``root`` accepts."""
+    return sorted(getattr(_model_at(location, root), "model_fields", {}))
+
+
+def _model_at(location: tuple[int | str, ...], root: type[BaseModel]) -> Any:
+    """Return the model of the block at ``location`` in ``root``, or another type if there is no model."""
     model: Any = root
     for part in location:
         annotation = model.model_fields[part].annotation if part in getattr(model, "model_fields", {}) else None
@@ -149,7 +163,7 @@ def _keys_at(location: tuple[int | str, ...], root: type[BaseModel]) -> list[str
             continue
         arguments = [given for given in getattr(annotation, "__args__", ()) if given is not type(None)]
         model = arguments[-1] if arguments else annotation
-    return sorted(getattr(model, "model_fields", {}))
+    return model
 
 
 Network = IPv4Network | IPv6Network

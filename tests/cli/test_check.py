@@ -107,7 +107,7 @@ def test_check_and_run_list_all_faults_of_a_file(tmp_path: Path) -> None:
     lines = [
         f"q2r2: {file}, line 4: control.solvr = 'daqp': unknown key; did you mean solver? allowed here: ",
         f"q2r2: {file}, line 2: arms.left.home.6 = 'up': allowed: a number",
-        f"q2r2: {file}, line 3: floor = 'low': allowed: a number",
+        f"q2r2: {file}, line 3: floor = 'low': allowed: a number, or null",
         f"q2r2: {file}, line 4: control.min_distance = -1: allowed: 0 or more",
     ]
     checked, ran = q2r2("check", str(file)), q2r2("run", str(file), "--headless")

@@ -129,6 +129,7 @@ def test_a_misspelt_key_is_named_before_the_key_that_is_therefore_missing(tmp_pa
         # Values that are not numbers, or not the intended ones, are refused.
         ("control.acceleration_limit", math.nan, "finite number"),
         ("control.position_margin", "0.01 rad", "allowed: a number"),
+        ("recording.topic_rate", "fast", "allowed: a number, or null"),
         ("control.priority", "middle", "allowed here: equal, left, right"),
         ("arms.middle", {"model": "iiwa7", "home": [0] * 7}, "'left' or 'right'"),
         # These values belong to a cell with another controller.
