@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from q2r2_control.control.safety.reference_history import look_back, remember, rest_always
+from q2r2_control.control.safety.reference_history import look_back, remember, rest_always, turning
 from tests.control.cells import NAMES, cell, kernel_data, kernel_model
 
 H = 0.02  # Duration of a step, so long that joints move far between two kept postures [s].
@@ -51,3 +51,14 @@ def test_a_window_that_was_off_knows_only_the_past_since_it_is_on_again() -> Non
         history.window[1] = window
         remember(history, robot.home, still, still, H)
         assert history.window[0] == known
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_turning_of_a_joint_counts_the_motions_of_all_joints_that_carry_it(name: str) -> None:
+    motion = np.random.default_rng(4).uniform(0.0, 1.0, cell(name).robot.model.nv)
+    for joint, carriers in enumerate(cell(name).robot.model.supports):
+        if joint == 0:
+            continue
+        before = sum(motion[carrier - 1] for carrier in carriers if carrier not in (0, joint))
+        expected = motion[joint - 1] * (motion[joint - 1] + 2.0 * before)
+        assert turning(kernel_model(name).safety.collision, motion, joint - 1) == pytest.approx(expected)

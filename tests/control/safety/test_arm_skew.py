@@ -1,0 +1,61 @@
+"""Pairs that count as far apart keep their distance, wherever on its path each of the two arms is."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from q2r2_control.control.safety.arm_skew import is_far, write_way
+from q2r2_control.control.safety.reference_history import look_back, remember, rest_always
+from q2r2_control.control.safety.speed_bound import write_deviations
+from q2r2_control.control.safety.stop_certificate import write_step
+from q2r2_control.control.safety.stop_rollout import SHAPES, begin_rollout
+from tests.control.cells import NAMES, cell, distances, kernel_data, kernel_model, random_posture
+from tests.control.safety.motions import ACCELERATION, H, motion_of
+
+WINDOW, PAIRS = 0.03, 8  # Largest delay of one arm behind the other arm [s], and number of pairs of each motion.
+
+
+@pytest.mark.parametrize("shape", range(SHAPES), ids=["together", "arm by arm", "own"])
+@pytest.mark.parametrize("name", NAMES)
+def test_no_pair_comes_closer_than_the_bound_of_far_pairs_wherever_each_arm_is_on_its_path(
+    name: str, shape: int
+) -> None:
+    random, robot, model = np.random.default_rng(91), cell(name).robot, kernel_model(name).safety
+    right, kept = robot.arms["right"].joints, model.min_distance.copy()
+    used: list[float] = []
+    for number in range(12):
+        # Arms at rest, and arms that have moved at a constant velocity. Then they accelerate for one step.
+        v = (number % 2) * 0.3 * random.uniform(-robot.velocity_limit, robot.velocity_limit)
+        v_next = v + random.uniform(-1.0, 1.0, robot.model.nv) * ACCELERATION * H
+        motion = motion_of(name, random_posture(robot, random), v, v_next, shape)
+        data = kernel_data(name, motion.q, v).safety
+        data.candidate.q[:], data.candidate.v[:] = motion.q_next, v_next
+        data.candidate.deceleration[:] = motion.deceleration
+        data.history.window[1] = WINDOW
+        past = [motion.q - (WINDOW - k * H) * v for k in range(round(WINDOW / H) + 1)]
+        rest_always(data.history, past[0])
+        for q in past[:-1]:
+            remember(data.history, q, v, v, H)
+        duration = begin_rollout(data)
+        write_step(data, H)
+        time = write_deviations(model, data, H, duration)
+        look_back(model.collision, data.history, motion.q, v)
+        write_way(model, data, H, duration)
+        path = np.concatenate([past[::5], motion.step()[::7], motion.stop(9)])
+        both = np.repeat(path, len(path), axis=0)
+        both[:, right] = np.tile(path[:, right], (len(path), 1))
+        pairs = random.choice(np.flatnonzero(model.of_two_arms == 1), PAIRS, replace=False)
+        now, nearest = distances(cell(name), motion.q[None], pairs=pairs)[0], distances(cell(name), both, pairs=pairs)
+        for p, distance, least in zip(pairs.tolist(), now, nearest.min(axis=0), strict=True):
+            data.distance[p] = distance
+            low, high = distance - 1.0, distance + 1.0  # The greatest distance that counts as kept is between them [m].
+            while high - low > 1e-9:
+                model.min_distance[p] = 0.5 * (low + high)
+                low, high = (
+                    (model.min_distance[p], high) if is_far(model, data, p, time) else (low, model.min_distance[p])
+                )
+            model.min_distance[p] = kept[p]
+            assert least >= low - 1e-8
+            used.append((distance - least) / (distance - low))
+    assert max(used) > 0.2, "a bound that nothing comes near would examine every pair more closely"

@@ -1,0 +1,24 @@
+"""The bound on how far an obstacle can have moved since its report is the fastest motion that its bounds allow."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from q2r2_control.control.safety.protective_distance import ObstacleData, reach
+from tests.control.cells import behind
+
+
+@pytest.mark.parametrize("slower", [0.0, 0.1, 0.5], ids="slower by {} m/s".format)
+def test_the_reach_of_an_obstacle_is_that_of_its_fastest_allowed_motion(slower: float) -> None:
+    """The obstacle gains speed evenly from its report on, until it has its greatest speed."""
+    speed, rise = 0.5, 0.2
+    empty, one = np.zeros(1), np.zeros(2, dtype=np.int64)
+    values = {"speed": speed, "slower": slower, "rise": rise}
+    arrays = {name: np.full(1, values[name]) if name in values else empty for name in ObstacleData._fields}
+    obstacles = behind(ObstacleData(**arrays | {"first": one}))
+    t = np.linspace(0.0, 0.6, 3001)
+    speeds = speed - slower * np.clip(1.0 - t / rise, 0.0, 1.0)
+    moved = np.concatenate([[0.0], np.cumsum(0.5 * (speeds[1:] + speeds[:-1]) * np.diff(t))])
+    bounds = np.array([reach(obstacles, 0, instant) for instant in t])
+    np.testing.assert_allclose(bounds, moved, rtol=0, atol=1e-7)
