@@ -223,9 +223,13 @@ def test_a_lost_arm_is_not_engaged_by_the_script_after_a_call_of_a_controller_se
 def test_a_lost_arm_that_is_ready_too_late_is_left_to_a_person_who_is_told_how(context: Any) -> None:
     hand = following_hand(context)
     assert hand.play(22.9, **lost("hand_silent", ready=False)) == 1
-    assert hand._advice is None
+    assert "engage" not in hand.health()[1]
     assert hand.play(30.0, ready=True, message="ready to engage") == 1
     assert "call /arm/engage" in hand.health()[1]
-    hand.play(31.0, engaged=True, state="engaged")
-    assert hand._advice is None
+    hand.play(40.0, engaged=True, state="engaged")
+    assert "engage" not in hand.health()[1]
+    hand.play(42.9, **lost("hand_silent"))
+    assert "engage" not in hand.health()[1], "a person may engage the arm again before the line comes"
+    hand.play(43.1)
+    assert "call /arm/engage" in hand.health()[1]
     hand.destroy_node()

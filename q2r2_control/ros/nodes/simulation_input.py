@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -96,8 +96,11 @@ class SimulationInput(BaseNode):
             self._rewind(self.now)  # The script begins now.
             self.get_logger().info(f"plays {self._title}")
         now = self.now
+        following = [hand for hand in self._hands if self._listeners.engaged(hand) is not False]
+        if len(following) == len(self._hands):
+            self._followed = now
         if self._starts:
-            self._engage(now)
+            self._engage(now, following)
         self._advise(now)
         for sample in self._script.poll(now):
             self._publish(sample)
@@ -105,7 +108,7 @@ class SimulationInput(BaseNode):
         self._timer.timer_period_ns = int(1e9 * wait)
         self._timer.reset()
 
-    def _engage(self, now: float) -> None:
+    def _engage(self, now: float, following: Sequence[str]) -> None:
         """Restart the script until the arms are ready, and then until they follow.
 
         At the beginning of the script, the hands rest.
@@ -115,9 +118,7 @@ class SimulationInput(BaseNode):
         t = now - self._began
         # The last event of an arm may be a request before the first press. Such a request does not count.
         self._pressed = self._pressed or (self._not_to_press is not None and t >= _BEFORE_MOTION)
-        following = [hand for hand in self._hands if self._listeners.engaged(hand) is not False]
-        if all_follow := len(following) == len(self._hands):
-            self._followed = now
+        all_follow = len(following) == len(self._hands)
         recovers = all_follow or (now - self._followed <= _RECOVERS and bool(self._listeners.lost()))
         if not self._pressed:
             self._listeners.begin()
