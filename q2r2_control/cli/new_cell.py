@@ -286,13 +286,14 @@ def _place(draft: _Draft, answers: RememberedAnswers) -> None:
     config = draft.config()
     robot = Robot.from_config(config)
     least = config.control.min_distance
-    own = [
-        pair
-        for pair in pair_names(robot.collision_model)
-        if robot.roles[link_of(pair[0])].arms & robot.roles[link_of(pair[1])].arms
-    ]
+    near_by_construction = []  # Pairs within an arm, and of an arm with a part of its robot that stands still.
+    for pair in pair_names(robot.collision_model):
+        links = link_of(pair[0]), link_of(pair[1])
+        one, other = (robot.roles[link].arms for link in links)
+        if one & other or (not (one and other) and FLOOR not in links):
+            near_by_construction.append(pair)
     pairs = []
-    for links, (nearest, farthest) in spreads_of(robot, own).items():
+    for links, (nearest, farthest) in spreads_of(robot, near_by_construction).items():
         if farthest < least + _BARELY and nearest > 1e-3:
             pairs.append({"pair": list(links), "distance": math.floor(1e3 * nearest) / 1e3})
         elif farthest < least + _BARELY:

@@ -98,6 +98,18 @@ def test_links_that_are_drawn_and_have_no_shape_are_watched_by_capsules_around_t
 
 
 @pytest.mark.slow
+def test_a_part_of_the_robot_that_stands_beside_an_arm_by_construction_gets_its_own_distance(tmp_path: Path) -> None:
+    pillar = """<link name="pillar"><collision><geometry><sphere radius="0.02"/></geometry></collision></link>
+      <joint name="stands" type="fixed"><parent link="link_0"/><child link="pillar"/><origin xyz="0.11 0 0.16"/></joint>
+    </robot>"""
+    Path("arm.urdf").write_text(IIWA.replace("</robot>", pillar))
+    result = q2r2("new-cell", "cell", "--left", "arm.urdf", "--yes", "--samples", "100")
+    assert result.exit_code == 0, result.output
+    (pair,) = load_config(tmp_path / "cell.yaml").control.pairs
+    assert (set(pair.pair), pair.distance) == ({"left_link_1", "left_pillar"}, 0.016)
+
+
+@pytest.mark.slow
 def test_a_drawing_that_cannot_be_enclosed_leaves_the_others_their_capsules(tmp_path: Path) -> None:
     bare = re.sub(r'<collision name="link_[03].*?</collision>', "", IIWA, flags=re.DOTALL)
     Path("points.obj").write_text("v 0 0 0\n")
