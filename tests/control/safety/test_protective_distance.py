@@ -13,10 +13,9 @@ from tests.control.cells import behind
 def test_the_reach_of_an_obstacle_is_that_of_its_fastest_allowed_motion(slower: float) -> None:
     """The obstacle gains speed evenly from its report on, until it has its greatest speed."""
     speed, rise = 0.5, 0.2
-    empty, one = np.zeros(1), np.zeros(2, dtype=np.int64)
-    values = {"speed": speed, "slower": slower, "rise": rise}
-    arrays = {name: np.full(1, values[name]) if name in values else empty for name in ObstacleData._fields}
-    obstacles = behind(ObstacleData(**arrays | {"first": one}))
+    empty, none = np.zeros(1), np.zeros(2, dtype=np.int64)
+    bounds_of_speed = np.full(1, speed), np.full(1, slower), np.full(1, rise)
+    obstacles = behind(ObstacleData(none, *bounds_of_speed, empty, empty, empty, empty, empty))
     t = np.linspace(0.0, 0.6, 3001)
     speeds = speed - slower * np.clip(1.0 - t / rise, 0.0, 1.0)
     moved = np.concatenate([[0.0], np.cumsum(0.5 * (speeds[1:] + speeds[:-1]) * np.diff(t))])
