@@ -277,4 +277,4 @@ def test_the_example_of_an_external_controller_answers_a_target(processes: Proce
     while commands.empty() and example.running:
         targets.publish(stamped_pose(target, "world", 0.0))
         time.sleep(0.1)
-    assert example.wait_for("target") == "target 50.0 mm away"
+    assert example.wait_for("mm away") == "target 50.0 mm away"
