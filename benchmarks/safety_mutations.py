@@ -30,6 +30,7 @@ TESTS = {  # By the folder of a row's line, the tests that run for the row.
         "tests/control/test_moving_obstacles.py",
         "tests/control/test_arm_skew.py",
         "tests/control/test_live_settings.py",
+        "tests/control/test_openings.py",
     ),
     "q2r2_control/control/": ("tests/control",),
     "q2r2_control/supervision/": ("tests/supervision", "tests/test_stalls.py"),
