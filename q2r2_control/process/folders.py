@@ -35,7 +35,7 @@ def check_folder(folder: Path, what: str) -> None:
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        _write_nothing_lasting(folder)
+        _try_to_write(folder)
     except OSError as error:
         fault = "is a file" if isinstance(error, FileExistsError) else error.strerror or error
         raise ConfigError(f"{what} {folder}: {fault}; allowed: a folder that can be written") from error
@@ -52,14 +52,14 @@ def check_file(file: Path, what: str) -> None:
             with file.open("ab"):
                 pass
         else:
-            _write_nothing_lasting(file.parent)
+            _try_to_write(file.parent)
     except OSError as error:
         allowed = "allowed: a file in a folder that exists and can be written"
         raise ConfigError(f"{what} {file}: {error.strerror or error}; {allowed}") from error
 
 
-def _write_nothing_lasting(folder: Path) -> None:
-    """Write a file in ``folder`` that is gone when this function returns."""
+def _try_to_write(folder: Path) -> None:
+    """Write a file in ``folder`` that is gone when this function returns; raises OSError if this is impossible."""
     with TemporaryFile(dir=folder) as file:
         file.write(bytes(_LEAST_ROOM))
         file.flush()

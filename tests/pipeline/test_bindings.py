@@ -49,7 +49,7 @@ def watched(hands: HandsInput, duration: float, plant: str = "kinematic", **bind
 
 
 def played(*pushed: tuple[float, str]) -> list[Tick]:
-    """Run the hands. A push of the trigger stops the arms, and a push of the grip moves them home."""
+    """Return the ticks of a run whose hands push controls. The trigger stops the arms, and the grip moves them home."""
     return watched(PlayingHands(*pushed), 6.0, trigger="stop", grip="home").ticks
 
 

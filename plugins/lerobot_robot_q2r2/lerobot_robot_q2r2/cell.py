@@ -1,4 +1,4 @@
-"""A cell as a robot of lerobot. lerobot reads observations from it, and sends actions to it, as to other robots.
+"""A robot for lerobot that drives a cell. lerobot reads its observations and sends it actions, as with other robots.
 
 The features of this robot have the same names and order as those of ``q2r2 export lerobot``. Therefore a policy that
 was trained on such a dataset can drive it.
