@@ -5,7 +5,13 @@ import pytest
 
 from q2r2_control.control.safety.joint_limits import ACCELERATION, next_velocity_box
 from q2r2_control.control.safety.safety_data import SafetyData
-from q2r2_control.control.safety.safety_filter import FOLLOWED, STOPPED, apply_safety_filter, certify_start
+from q2r2_control.control.safety.safety_filter import (
+    FOLLOWED,
+    SEPARATION,
+    STOPPED,
+    apply_safety_filter,
+    certify_start,
+)
 from q2r2_control.control.safety.stop_rollout import brake
 from q2r2_control.types import Array
 from tests.control.cells import cell, distances, kernel_data, kernel_model
@@ -40,11 +46,12 @@ def test_a_solution_within_the_velocity_box_and_far_from_collisions_is_executed_
     assert data.active.used[0] == 0
 
 
-def test_a_solution_beyond_the_velocity_box_is_clamped_for_each_joint_and_the_joint_is_named() -> None:
+@pytest.mark.parametrize("direction", [1.0, -1.0])
+def test_a_solution_beyond_the_velocity_box_is_clamped_for_each_joint_and_the_joint_is_named(direction: float) -> None:
     data, wish = started(), V.copy()
-    wish[3] = 1e12
+    wish[3] = direction * 1e12
     assert moved(data, wish) == FOLLOWED
-    assert data.state.v[3] == pytest.approx(V[3] + 10.0 * H)
+    assert data.state.v[3] == pytest.approx(V[3] + direction * 10.0 * H)
     np.testing.assert_array_equal(np.delete(data.state.v, 3), np.delete(V, 3))
     assert data.active.used[0] == 1
     assert (data.active.kind[0], data.active.subject[0]) == (ACCELERATION, 3)
@@ -66,3 +73,18 @@ def test_an_unusable_solution_is_not_executed() -> None:
     data = started()
     assert moved(data, V, usable=False) == STOPPED
     assert (np.abs(data.state.v) <= np.abs(V)).all()
+
+
+def test_if_nothing_can_be_certified_each_pair_that_is_too_close_is_named() -> None:
+    data = started()
+    data.state.v[:] = 0.0
+    pairs = np.argsort(data.distance)[:2].tolist()
+    kept = MODEL.min_distance.copy()
+    try:
+        MODEL.min_distance[pairs] = data.distance[pairs] + 0.01
+        assert moved(data, np.full(14, np.nan)) == STOPPED
+    finally:
+        MODEL.min_distance[:] = kept
+    active = data.active
+    named = [subject for kind, subject in zip(active.kind, active.subject, strict=True) if kind == SEPARATION]
+    assert named == sorted(pairs)

@@ -1,27 +1,39 @@
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
+from typing import NamedTuple
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from q2r2_control.config.control import ControllerSettings
+from q2r2_control.control.geometry.collision import CollisionData, update_placements
+from q2r2_control.control.geometry.pair_distance import measure
+from q2r2_control.control.kernel_model import KernelModel, kernel_model_of
+from q2r2_control.control.safety.safety_data import INSTANTS
 from q2r2_control.control.safety.safety_filter import measure_pairs
 from q2r2_control.control.safety.separation_rows import write_separation_rows
 from q2r2_control.control.safety.speed_bound import update_body_velocities
 from q2r2_control.control.safety.stop_rollout import TOGETHER, write_stop
 from q2r2_control.types import Array
-from tests.control.cells import NAMES, cell, distances, kernel_data, kernel_model, random_posture
+from tests.control.cells import NAMES, behind, cell, distances, kernel_data, kernel_model, placed, random_posture
 
 APPROACH = kernel_model("dual_iiwa7").safety.approach
 STOP_DISTANCE = float(APPROACH.stop_distance[0])
 H = 0.001
+SAME_DISTANCE = 0.002  # An instant has a row if its distance exceeds the least distance by no more than this [m].
+SAME_POINT = 0.005  # An end has a row of its own if it is farther than this from the closest point [m].
+CLEAR = 2e-5  # A condition that holds or fails by less than this is not judged [m].
 
 
 class Seen:
     """The measured distances and the written rows in one state. In the known stop, all joints stop together."""
 
-    def __init__(self, name: str, q: Array, v: Array) -> None:
-        model, data = kernel_model(name).safety, kernel_data(name, q, v).safety
+    def __init__(self, name: str, q: Array, v: Array, kernels: KernelModel | None = None) -> None:
+        model, data = (kernels or kernel_model(name)).safety, kernel_data(name, q, v).safety
         update_body_velocities(model.collision, data.collision, v, data.velocities)
         write_stop(model, q, v, TOGETHER, data.certified)
         self.closest = measure_pairs(model, data)
@@ -30,7 +42,10 @@ class Seen:
         used = int(rows.used[0])
         self.matrix, self.lower, self.pair = rows.matrix[:used], rows.lower[:used], rows.pair[:used]
         np.testing.assert_allclose(np.linalg.norm(self.matrix, axis=1), 1.0, rtol=0, atol=1e-9)
-        self.duration = float(np.max(np.abs(v) / data.certified))
+        self.stops_after = np.abs(v) / data.certified  # (nv,) Time until each joint is at rest [s].
+        self.duration = float(np.max(self.stops_after))
+        self.angular, self.approach = data.velocities.angular, model.approach
+        self.acceleration = model.limits.acceleration
 
 
 def _state(name: str, seed: int, speed: float) -> tuple[Array, Array]:
@@ -132,3 +147,145 @@ def test_velocities_that_satisfy_the_rows_use_up_free_distance_no_faster_than_th
                 assert excess < 2e-4
     assert kept > 10
     assert broken > 10
+
+
+class _Candidate(NamedTuple):
+    """A row that the documented rule allows, and by how much the conditions hold under which it is written."""
+
+    row: Array  # (nv,) Unit vector.
+    lower: float  # [rad/s]
+    margin: float  # The smallest margin of the conditions [m]; the row is missing if it is negative.
+
+
+class _Rule:
+    """The rows of one pair of capsules by the formulas in the module's docstring, from distances of postures."""
+
+    def __init__(self, name: str, seen: Seen, q: Array, v: Array, p: int) -> None:
+        self._cell, self._seen, self._q, self._v, self._p = cell(name), seen, q, v, p
+        self._bodies = self._cell.pairs.first[p], self._cell.pairs.second[p]
+        spins = seen.angular[self._cell.bodies.joint[list(self._bodies)]]
+        look_ahead = 0.5 * seen.duration + 1.0 / float(seen.approach.gain[0])
+        self._data = placed(self._cell, q)
+        self._turned = float(np.linalg.norm(spins[0] - spins[1])) * look_ahead  # [rad]
+
+    def candidates(self, straight: bool) -> Iterator[_Candidate]:
+        """Yield the rows in the order in which they are written.
+
+        If the paths of the pair are ``straight``, the end of the stop is computed from the gradient at its start.
+        """
+        whole, duration = self._distance, self._seen.duration
+        instants = [i for i in INSTANTS if not straight or i in (INSTANTS[0], INSTANTS[-1])]
+        moved = {i: self._moved(duration * i / INSTANTS[-1]) for i in instants}
+        postures = {i: self._q if straight else self._q + moved[i] for i in instants}
+        tangents = {i: moved[i] if straight else 0.0 * moved[i] for i in instants}
+        gradient = self._gradient(whole, self._q)
+        ahead = {i: whole(postures[i]) + float(gradient @ tangents[i]) for i in instants}
+        least = min(ahead.values())
+        for i in instants:
+            t = duration * i / INSTANTS[-1]
+            lever = max(t - 0.5 * t * t / duration, 0.5 * H) + 0.5 * H
+            if ahead[i] > least + SAME_DISTANCE or (i > 0 and lever <= H):
+                continue
+            first = self._candidate(whole, postures[i], tangents[i], lever, least, np.inf)
+            yield first
+            if first.margin < 0.0:
+                continue
+            closest = self._closest(postures[i])
+            for body in (0, 1):
+                for end in ("start", "end"):
+                    distance = partial(self._end_distance, body, end)
+                    apart = float(np.linalg.norm(self._end(body, end, postures[i]) - closest[body]))
+                    near = whole(postures[i]) + self._turned * apart + SAME_POINT - distance(postures[i])
+                    conditions = min(near, apart - SAME_POINT)
+                    yield self._candidate(distance, postures[i], tangents[i], lever, least, conditions)
+
+    def _candidate(
+        self, distance: Callable[[Array], float], at: Array, tangent: Array, lever: float, least: float, margin: float
+    ) -> _Candidate:
+        approach, v, gradient = self._seen.approach, self._v, self._gradient(distance, at)
+        gain, stop = float(approach.gain[0]), float(approach.stop_distance[self._p])
+        rate = float(gradient @ v)
+        free = distance(at) + float(gradient @ tangent) - stop
+        change = float(np.abs(gradient) @ self._seen.acceleration) * H * lever
+        allowed = -gain * H * min(free, least - stop) - min(50.0 * H, 1.0) * max(free - least + stop, 0.0)
+        slow, zone = float(approach.contact_speed[self._p]), float(approach.contact_zone[self._p])
+        if slow < np.inf:
+            allowed = max(allowed, -H * max(slow, gain * (free - zone)))
+        size = float(np.linalg.norm(gradient))
+        binds = allowed - (H * rate - change)
+        return _Candidate(gradient / size, (rate + (allowed - H * rate) / lever) / size, min(margin, binds))
+
+    def _moved(self, t: float) -> Array:
+        """Return the path of each joint in the first ``t`` [s] of the stop (nv,) [rad]."""
+        ends = np.maximum(self._seen.stops_after, 1e-12)
+        ran = np.minimum(t, ends)
+        return np.asarray(self._v * ran * (1.0 - 0.5 * ran / ends))
+
+    def _distance(self, q: Array) -> float:
+        return float(measure(self._cell.collision, self._at(q), self._p))
+
+    def _at(self, q: Array) -> CollisionData:
+        """Return the placements of the bodies at ``q``; the next call overwrites them."""
+        update_placements(self._cell.collision, self._data, q)
+        return self._data
+
+    def _end(self, body: int, end: str, q: Array) -> Array:
+        posed = self._at(q).posed
+        return np.array((posed.start if end == "start" else posed.end)[self._bodies[body]])
+
+    def _end_distance(self, body: int, end: str, q: Array) -> float:
+        """Return the distance of one end of the segment of ``body`` from the other body [m]."""
+        posed, other = self._at(q).posed, self._bodies[1 - body]
+        point, start, along = self._end(body, end, q), posed.start[other], posed.end[other] - posed.start[other]
+        length = float(along @ along)
+        share = min(max(float((point - start) @ along) / length, 0.0), 1.0) if length > 0.0 else 0.0
+        radii = self._cell.bodies.radius[list(self._bodies)]
+        return float(np.linalg.norm(point - start - share * along) - radii.sum())
+
+    def _closest(self, q: Array) -> tuple[Array, Array]:
+        data = self._at(q)
+        measure(self._cell.collision, data, self._p)
+        return np.array(data.contact.first), np.array(data.contact.second)
+
+    @staticmethod
+    def _gradient(distance: Callable[[Array], float], q: Array) -> Array:
+        steps = 1e-6 * np.eye(len(q))
+        return np.array([distance(q + step) - distance(q - step) for step in steps]) / 2e-6
+
+
+def _difference(seen: Seen, p: int, candidates: Iterable[_Candidate]) -> str:
+    """Return what distinguishes the rows of pair ``p`` from the ``candidates``; "" if they agree."""
+    written = [(seen.matrix[i], seen.lower[i]) for i in np.flatnonzero(seen.pair == p)]
+    for one in candidates:
+        agrees = bool(written) and np.allclose(written[0][0], one.row, rtol=0, atol=1e-4)
+        if agrees and abs(written[0][1] - one.lower) <= 1e-4 * (1.0 + abs(one.lower)):
+            if one.margin < -CLEAR:
+                return "a row is too much"
+            written.pop(0)
+        elif one.margin > CLEAR:
+            return f"a row is missing or different: {one.lower}, {[lower for _, lower in written]}"
+    return "rows that nothing explains" if written else ""
+
+
+@pytest.mark.parametrize(("may_touch", "fast"), [(False, range(10, 17)), (True, range(15, 21))])
+def test_the_rows_of_a_pair_are_exactly_those_of_the_documented_rule(may_touch: bool, fast: range) -> None:
+    name = "dual_panda"
+    model = behind(kernel_model_of(cell(name).robot, ControllerSettings()))
+    if may_touch:
+        model.safety.approach.contact_speed[:], model.safety.approach.contact_zone[:] = 0.02, 0.03
+    most, straight_pairs = 0, 0
+    for seed, speed in [*((seed, 0.4) for seed in fast), *((seed, 0.05) for seed in range(6, 14))]:
+        q, v = _state(name, seed, speed)
+        seen = Seen(name, q, v, model)
+        for p in sorted(set(seen.pair.tolist())):
+            if cell(name).bodies.box[cell(name).pairs.second[p]]:
+                continue
+            if _least_free(name, q, v, seen.duration, p) < 1e-3:
+                continue  # The rows of a pair that is too close have another rule.
+            rule = _Rule(name, seen, q, v, p)
+            differences = {straight: _difference(seen, p, rule.candidates(straight)) for straight in (True, False)}
+            assert "" in differences.values(), (seed, p, differences)
+            most = max(most, int((seen.pair == p).sum()))
+            straight_pairs += not differences[True]
+    assert most > len(INSTANTS)  # Some ends have rows of their own.
+    assert straight_pairs > 0
