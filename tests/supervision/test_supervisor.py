@@ -110,6 +110,13 @@ def test_each_reason_why_arms_cannot_be_activated_is_logged_once(world: World) -
     assert list(map(kinds, world.supervisor.events)) == ["joint_states: other", "joint_states: loop_stalled"]
 
 
+def test_arms_that_are_stopped_again_while_they_rest_are_reset_at_once(world: World) -> None:
+    for _ in range(2):
+        world.supervisor.stop(Reason(CommonReason.OTHER))
+        assert world.states == ["stopped"] * 2
+    assert world.supervisor.reset() is None
+
+
 def test_arms_that_were_stopped_before_their_activation_are_activated_only_after_a_reset(world: World) -> None:
     world.supervisor.stop(Reason(CommonReason.OTHER))
     world.run(0.5)
