@@ -196,9 +196,13 @@ def _capsules_note(config: Config, robot: Robot) -> str:
 
 
 def cost_of_shapes(pairs: Sequence[int], ticks: Sequence[float]) -> str:
-    """Return what further shapes cost: the monitored ``pairs``, and the time of a tick if it was found longer.
+    """Return a text about the cost of the additional shapes in the cell's ``capsules``.
 
-    ``pairs`` and ``ticks`` [s] have two numbers: with and without the shapes.
+    It names both numbers of monitored pairs. It names both times of a tick only if a tick takes longer with the shapes.
+
+    Args:
+        pairs: The number of monitored pairs with and without the additional shapes.
+        ticks: The time of a tick with and without the additional shapes [s].
     """
     cost = f"{pairs[0]} pairs instead of {pairs[1]}"
     tick, before = (round(1e6 * time) for time in ticks)

@@ -67,7 +67,7 @@ def gripper(controller: CartesianController) -> Cell:
     return Cell(controller)
 
 
-def test_the_monitored_interval_shrinks_around_a_closed_gripper_and_stays_while_the_gripper_rests(
+def test_the_interval_of_openings_shrinks_around_a_closed_gripper_and_does_not_change_while_it_rests(
     gripper: Cell,
 ) -> None:
     gripper.run(0.0, 0.5)

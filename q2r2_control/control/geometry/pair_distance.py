@@ -205,9 +205,10 @@ _HALVINGS = 40  # Number of steps of the bisection.
 
 @kernel
 def measure_smooth(model: CollisionModel, data: CollisionData, p: int, smoothing: float) -> float:
-    """Return the smooth signed distance [m] of pair ``p``, whose cores do not meet, and fill ``data.contact``.
+    """Return the smooth signed distance [m] of pair ``p``, and fill ``data.contact``.
 
-    ``smoothing`` is e [m^2].
+    The core of a capsule is its segment, and the core of a rounded box is the box without the rounding. The two cores
+    must not touch. ``smoothing`` is the weight e of the small cost in the module's docstring [m^2].
     """
     bodies, posed, contact = model.bodies, data.posed, data.contact
     first, second = model.pairs.first[p], model.pairs.second[p]

@@ -70,10 +70,10 @@ class LimitedAnswers:
 
 
 def main(requests: Iterator[Any], answer: Callable[[Any], None]) -> None:
-    """Run the process. It answers with :class:`Ready`, and then with the requests of browsers.
+    """Run the process. It sends :class:`Ready` when the page is served, and then passes on what browsers ask for.
 
     Args:
-        requests: The setup, and then the frames. When they end, the run is over.
+        requests: The messages from the run: first the setup, then the frames. When they end, the run is over.
         answer: Sends data to the run.
 
     Raises:
