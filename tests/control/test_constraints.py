@@ -119,7 +119,7 @@ def test_a_hard_constraint_keeps_an_elbow_above_a_plane_that_it_would_otherwise_
     assert min(plane.elbow(at) for at in q) > plane.height - 1e-4
 
 
-def test_a_hard_row_that_no_step_satisfies_brakes_the_arms_and_the_report_names_its_constraint(robot: Robot) -> None:
+def test_if_no_step_satisfies_a_hard_row_the_arms_brake_and_the_report_names_the_rows_constraint(robot: Robot) -> None:
     fast = Answers(lambda nv: (np.eye(nv)[:1], np.full(1, 100.0)), hard=True)
     controller = CartesianController(robot, constraints=[fast])
     moving, _ = driven(controller, 100)

@@ -156,7 +156,7 @@ def _swings(random: np.random.Generator, count: int, dip: float) -> Iterator[Mot
             return
 
 
-def test_a_step_within_which_a_pair_comes_too_close_is_refused_even_if_the_pair_is_apart_at_both_ends() -> None:
+def test_a_step_is_refused_if_a_pair_comes_too_close_within_it_even_if_the_pair_is_apart_at_both_ends() -> None:
     swings = list(_swings(np.random.default_rng(21), 8, dip=5e-4))
     assert len(swings) == 8
     for motion in swings:
