@@ -176,7 +176,7 @@ def _notes_on_models(config: Config, in_degrees: Collection[str]) -> list[str]:
 def _capsules_note(config: Config, robot: Robot) -> str:
     """Return a note about links with several shapes.
 
-    It has the number of shapes and the :func:`cost_of_shapes`, with and without these shapes.
+    It has the number of shapes of each link, and the text of :func:`cost_of_shapes`.
     """
     names = [link_of(item.name) for item in robot.collision_model.geometryObjects]
     shapes = ", ".join(f"{link} {names.count(link)}" for link in config.capsules)
@@ -189,7 +189,8 @@ def _capsules_note(config: Config, robot: Robot) -> str:
             controller = CartesianController(its, settings.without_contact())
         controller.reset(its.home)
         steps.append(partial(controller.step, {}, 1e-3))
-    # Other programs only lengthen a tick, so the least times are compared. Turns let both meet the same programs.
+    # Other programs only lengthen a tick, so the least times are compared. The two controllers take turns, so that
+    # other programs disturb both of them alike.
     ticks = np.min([[timeit.timeit(step, number=1) for step in steps] for _ in range(_TICKS)], axis=0).tolist()
     cost = cost_of_shapes([len(its.collision_model.collisionPairs) for its in robots], ticks)
     return f"capsules: shapes of {shapes}; {cost}"

@@ -122,7 +122,10 @@ class ObjectPairs:
         self._write(np.where(np.isfinite(kept), np.minimum(self.kept, kept), self.kept))
 
     def _within_reach(self) -> Array:
-        """Return d - S - buffer of the objects' pairs [m]; see the module's docstring."""
+        """Return the greatest distance that each of the objects' pairs may keep now [m].
+
+        It is d - S - buffer, see the module's docstring.
+        """
         return np.asarray(provable_distances(self._safety, self._data)[self._range] - self._buffer)
 
     def _write(self, kept: Array) -> None:
@@ -245,7 +248,10 @@ class LiveSettings:
         self._crowded = bool((self._stops < wanted).any())
 
     def _lasting(self) -> Array:
-        """Return d - S of every monitored pair (p,) [m]; see the module's docstring."""
+        """Return the distance that each monitored pair provably keeps during the known stop (p,) [m].
+
+        It is d - S, see the module's docstring.
+        """
         return provable_distances(self._safety, self._data)[: len(self._goal)]
 
     def _gains_of(self, settings: ControllerSettings) -> tuple[Array, ...]:

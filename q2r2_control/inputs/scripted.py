@@ -103,9 +103,9 @@ def _line(t: float, frequency: float) -> tuple[Array, Array]:
 
 
 def _rotate(t: float, frequency: float) -> tuple[Array, Array]:
-    """Return the hand's displacement at ``t``: it turns by 30 degrees and back, about x, y and z one after the other.
+    """Return the hand's displacement at ``t`` in a motion that turns the hand by 30 degrees and back.
 
-    Meanwhile the hand is 0.05 m above its start.
+    The hand turns about x, y and z one after the other. Meanwhile it is 0.05 m above its start.
     """
     phase = _phase(t, frequency)
     turn = np.zeros(3)

@@ -122,7 +122,7 @@ def _postures(robot: Robot, start: Array) -> Iterator[Array]:
 
 @dataclass(frozen=True, slots=True)
 class StopReport:
-    """The stop of an arm after its hand let go, or after the program was killed."""
+    """The stop of an arm after its hand has released the button, or after the program was killed."""
 
     arm: str
     cause: str
@@ -146,12 +146,15 @@ class StopReport:
 
 
 def measure_stop(run: SlowRun, arm: str) -> StopReport:
-    """Let a simulated hand move ``arm`` upwards and let go, like an operator's hand, and check the stop."""
+    """Let a simulated hand move ``arm`` upwards and release its button, as an operator would, and check the stop."""
     return let_go_report(run.robot, arm, run.let_go([arm], LED)).check()
 
 
 def let_go_report(robot: Robot, arm: str, moments: list[Moment]) -> StopReport:
-    """Return the report on a stop. In ``moments``, a hand moves ``arm`` and lets go, and the arm comes to rest."""
+    """Return the report on a stop.
+
+    In ``moments``, a hand moves ``arm`` and releases its button, and the arm comes to rest.
+    """
     led = [index for index, moment in enumerate(moments) if moment.engaged[arm]]
     if not led:
         raise PlantError(f"the {arm} arm did not follow the hand")

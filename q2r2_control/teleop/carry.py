@@ -2,7 +2,7 @@
 
 The hand is anchored to a frame in the middle between both tools. At the beginning, the axes of this frame are parallel
 to those of the world. Both tools keep their poses in this frame. No target jumps at the beginning, and both targets
-move exactly as one rigid body, except for the small correction of :class:`RelationKeeper`. If an arm is held up, a
+move exactly as one rigid body, except for the small correction of :class:`RelationKeeper`. If an arm cannot follow, a
 leash keeps the frame near this arm. This leash is shorter than the leash of one arm, so that the load is neither torn
 nor crushed.
 """

@@ -47,7 +47,7 @@ class JointLimits(NamedTuple):
     upper: Array  # (nv,) Greatest positions, with the margin [rad].
     velocity: Array  # (nv,) [rad/s]
     acceleration: Array  # (nv,) [rad/s^2]
-    longest_step: float  # H [s]
+    longest_step: float  # The longest step H of the proof above [s].
     return_speed: float  # Inward speed of a joint outside its limits [rad/s].
 
 

@@ -119,7 +119,9 @@ def fastest_approach(velocities: BodyVelocities, first: int, second: int) -> flo
 
 @kernel
 def write_deviations(model: SafetyModel, data: SafetyData, h: float, duration: float) -> float:
-    """Write rho + kappa of every joint [rad or m], for a step of ``h`` [s] and a stop of ``duration`` [s].
+    """Write the bound rho + kappa on every joint's deviation from motion at constant velocity [rad or m].
+
+    It is for a step of ``h`` [s] and a stop of ``duration`` [s].
 
     The travel of the joints in the step and the stop has to be written before. Returns h + T / 2 [s].
     """
