@@ -20,8 +20,9 @@ _REACHED, _BEHIND = 0.2, 0.8
 # Largest displacements of A1 .. A7 from the first posture [rad]. A1 stays, because turning it changes no torque.
 _SPREAD = np.array([0.0, 0.1, 0.2, 0.25, 0.4, 0.5, 0.5])
 _TRIES = 40
-LED = 2.0  # Time of the upward motion before the hand lets go [s].
-_LATENCY = 0.15  # Longest time from when a hand lets go until the arm brakes: the time-out of a silent hand [s].
+LED = 2.0  # Time of the upward motion before the hand releases its button [s].
+# Longest time from the release of the hand's button until the arm brakes: the timeout of a silent hand [s].
+_LATENCY = 0.15
 LEAST_SPEED = 0.01  # Least speed of the tool from which a stop is measured [m/s].
 _STANDS = 1e-3  # Joints nearer than this to their final positions count as resting [rad].
 

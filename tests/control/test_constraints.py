@@ -146,7 +146,7 @@ def test_a_given_solution_that_breaks_a_hard_row_is_not_executed(robot: Robot) -
 
 
 class NoLess:
-    """A constraint that keeps the next velocities at least as fast as ``along`` in the direction of ``along``."""
+    """A constraint: in the direction of ``along``, the next joint velocities are at least as fast as ``along``."""
 
     hard = True
     along: Array | None = None

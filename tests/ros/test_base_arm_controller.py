@@ -219,7 +219,7 @@ def test_a_gripper_counts_as_closed_when_the_result_of_its_goal_says_stalled(
 
     def execute(goal: Any) -> Any:
         goals.put(goal.request.command)
-        goal.abort()  # Real grippers abort a goal if they are held up.
+        goal.abort()  # Real grippers abort a goal if an object stops their fingers.
         return action.Result(stalled=stalls)
 
     with spun_node(domain, "gripper") as other:

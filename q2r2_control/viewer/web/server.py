@@ -20,8 +20,8 @@ from q2r2_control.viewer.web.scene import CellScene
 
 _NICENESS = 10  # The process gets a low priority, since the loop comes first.
 _LAST_WORDS = 0.5  # Time in which browsers are told that the run is over, before their connections are closed [s].
-# Number of answers that are allowed per second, and number that are allowed at once. A page that moves two hands sends
-# 220 per second.
+# Number of answers that are allowed per second, and number that may come in one burst. A page that moves two hands
+# sends 220 answers per second.
 _RATE, _BURST = 500.0, 50.0
 
 

@@ -341,7 +341,7 @@ def test_in_a_stop_arm_by_arm_each_arm_takes_the_time_of_its_slowest_joint(seed:
 @given(seed=SEEDS)
 @settings(derandomize=True, max_examples=200, deadline=None)
 def test_every_kind_of_stop_keeps_position_limits_at_every_moment(shape: int, seed: int) -> None:
-    """Each joint starts at, or below, the speed that property P allows at its distance from the limit.
+    """Each joint starts at, or below, the speed that condition P of joint_limits.py allows at this distance.
 
     A slow joint that stops together with a fast joint moves for a long time, and must not drift beyond its limit.
     """
