@@ -20,7 +20,7 @@ d - S as above. Arms that rest within the buffer are not pushed apart.
 infinity. When an object is gripped, each of its pairs keeps d - S - buffer, or the distance of its class if that is
 less. The known stop is then certified with the object too, so that the object never has to be refused. The kept
 distance grows with later values of d and S, and never falls. If two objects overlap when the second object is gripped,
-it is assumed that both hands hold one and the same object. Its two bodies are not kept apart until one hand lets go.
+it is assumed that both hands hold the same object. Its two bodies are not kept apart until one hand releases it.
 
 **Gains** and weights change linearly to their new values: all arrays of the tasks that differ between the old and the
 new settings, and the gain of the separation rows. The certificate reads none of them.

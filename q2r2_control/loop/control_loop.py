@@ -250,8 +250,8 @@ class ControlLoop:
     ) -> dict[str, float]:
         """Return the openings to be commanded, and find out whether the grippers hold something.
 
-        While the arms do not move, nothing is certified, and a gripper gets the wanted opening, for instance to let go
-        of an object. If a gripper did not get its wanted opening before the arms stopped, it does not move farther in
+        While the arms do not move, nothing is certified, and a gripper gets the wanted opening, for instance to release
+        an object. If a gripper did not get its wanted opening before the arms stopped, it does not move farther in
         that direction.
         """
         if not self._owns_plant and self.supervisor.phase not in _PROVEN:

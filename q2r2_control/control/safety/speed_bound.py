@@ -2,7 +2,7 @@
 
 The bound S with the reach of joints (stop_certificate.py) treats every joint as if it moved one body straight towards
 the other body. For most pairs of two moving arms, a bound from the speeds of the bodies suffices. Joints that stop
-together keep the direction of their motion, and arms that move alike do not close in at all.
+together keep the direction of their motion, and arms that move in the same way come no closer at all.
 
 **Speed.** A geometry lies in the ball of radius s around its middle. With the middle moving at u and the link turning
 at w, no point of it is faster than |u| + |w| s. The distance of two geometries therefore falls no faster than |u_2 -
