@@ -1,7 +1,7 @@
-"""Settings that colcon needs beside pyproject.toml to build an ament_python package, and the README as others show it.
+"""Settings that cannot be in pyproject.toml, and the README as package registries show it.
 
-Two keys stand here. The first does since colcon cannot read it from pyproject.toml, the second since no spelling of it
-there suits both the setuptools of Ubuntu 24.04 and new ones.
+colcon cannot read ``python_requires`` from pyproject.toml. For ``license``, no spelling in pyproject.toml is accepted
+by both the setuptools of Ubuntu 24.04 and newer ones. The links of the README have to be changed for other sites.
 """
 
 import re
@@ -10,14 +10,17 @@ from pathlib import Path
 
 from setuptools import setup
 
-with suppress(ImportError):  # before Python 3.11, which pip then refuses in one line, by python_requires
+with suppress(ImportError):  # Python before 3.11 has no tomllib. pip then refuses it in one line, by python_requires.
     import tomllib
 
 HERE = Path(__file__).resolve().parent
 
 
 def readme() -> str:
-    """README.md, whose links into the repository lead to ``urls.Repository``, or are text where there is none."""
+    """Return README.md, in which links to files of the repository lead to ``urls.Repository``.
+
+    Without this URL, each of these links is replaced by its text.
+    """
     repository = None
     with suppress(NameError):
         project = tomllib.loads((HERE / "pyproject.toml").read_text(encoding="utf-8"))["project"]

@@ -14,7 +14,7 @@ class ElbowTask:
     def cost(self, q: Array, v: Array) -> tuple[Array, Array]:
         """Return H and g of the cost 1/2 v' H v + g' v.
 
-        The cost is least if the joint's velocity is 2/s times the angle that is left to turn.
+        The cost is least if the joint's velocity is 2/s times the remaining angle.
         """
         H, g = np.zeros((len(q), len(q))), np.zeros(len(q))
         H[self.joint, self.joint] = 0.1

@@ -1,7 +1,8 @@
-"""Start the nodes of q2r2 ros up, for ROS: ``ros2 launch q2r2_control teleop.launch.py config:=... input:=...
-robot:=...``.
+"""Start the nodes of ``q2r2 ros up`` by ROS's own command.
 
-With ``record:=FOLDER`` it is recorded.
+    ros2 launch q2r2_control teleop.launch.py config:=... input:=... robot:=...
+
+With ``record:=FOLDER``, the run is recorded.
 """
 
 from launch import LaunchDescription
@@ -14,7 +15,7 @@ from q2r2_control.ros.launch.processes import ROBOTS, nodes_of
 
 
 def generate_launch_description():
-    """All nodes; when one ends all end, and none is started again."""
+    """Return the description of all nodes. If one node ends, all nodes end, and no node is started again."""
     return LaunchDescription(
         [
             DeclareLaunchArgument("config", default_value="config/dual_iiwa7.yaml", description="YAML of the cell"),
@@ -48,7 +49,7 @@ def _nodes(context):
             executable=node.name,
             namespace=namespace,
             output="screen",
-            # Typed, since launch would otherwise read a text that looks like a number as one.
+            # Each value has a type. Otherwise, launch would read a text that looks like a number as a number.
             parameters=[
                 {key: ParameterValue(value, value_type=type(value)) for key, value in node.parameters.items()},
                 {"use_sim_time": sim_time},

@@ -27,7 +27,7 @@ class ConfigError(Q2R2Error):
 
 
 class AllFaults:
-    """Collects the errors of several parts, so that a user reads all of them at once.
+    """Collects the errors of several parts, so that a user reads all of them together.
 
     An error in ``with faults.of_part():`` ends that part only. The end of ``with AllFaults() as faults:`` raises a
     single error as it is, and several errors as one :class:`ConfigError`.

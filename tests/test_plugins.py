@@ -37,7 +37,7 @@ def test_a_package_that_is_installed_while_the_program_runs_is_found(
 
 
 @pytest.mark.parametrize(("group", "name"), [(EXPORTS, "zarr"), (PLANTS, "franka")])
-def test_a_name_of_a_package_beside_this_one_is_answered_by_the_line_that_installs_it(
+def test_the_error_for_the_name_of_a_plugin_in_this_repository_has_the_line_that_installs_the_plugin(
     group: str, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(plugins, "points_of", lambda group: {})

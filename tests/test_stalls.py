@@ -134,7 +134,7 @@ def test_if_states_are_lost_while_the_arms_brake_the_old_states_are_no_longer_us
     assert np.abs(rest.q - watch.ticks[-1].reference.q).max() < 0.05
 
 
-def test_a_plant_that_sends_no_more_states_gets_a_last_command_that_stops_the_arms() -> None:
+def test_if_a_plant_sends_no_more_states_its_last_command_stops_the_arms() -> None:
     plant = RecordingPlant()
     loop = swinging(plant, "velocity")
 

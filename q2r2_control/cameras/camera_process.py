@@ -39,7 +39,7 @@ class DepthShot(NamedTuple):
 
     time: float  # Time of its capture, by the monotonic clock [s].
     png: bytes  # A 16-bit number for each pixel: the depth in multiples of ``unit``; 0 where it is not known.
-    unit: float  # The depth for which the number 1 stands [m].
+    unit: float  # The depth that the number 1 means [m].
 
 
 class CameraLost(NamedTuple):

@@ -15,7 +15,7 @@ from q2r2_control.config.recording import CameraConfig
 from q2r2_control.errors import CameraError
 from q2r2_control.process.helper_process import HelperProcess, reason_of
 
-_WAITING = 256  # So many pictures of a camera may wait until they are taken. If more come, the oldest are lost.
+_WAITING = 256  # Greatest number of pictures of a camera that wait until they are taken. The oldest are lost first.
 _READY = 120.0  # Longest time until a camera gives its first picture, on a computer that is busy [s].
 _Item = TypeVar("_Item")
 _LOOKS = 0.02  # Time between two checks whether a picture has come [s].
@@ -46,7 +46,7 @@ class CameraStream:
         return self.process.fault if self._lost is None or self.process.fault else self._lost.why
 
     def hear(self, hearer: Callable[[CameraShot], None]) -> None:
-        """Let ``hearer`` get each picture, in the thread that receives them."""
+        """Call ``hearer`` with each picture from now on, in the thread that receives the pictures."""
         self._hearers.append(hearer)
 
     def take(self) -> list[tuple[float, CameraShot]]:

@@ -15,8 +15,8 @@ from q2r2_control.events import Reason, ReasonKind
 # A camera has stopped if no picture came for the longer of these two times: a number of its periods, and a time [s].
 _STOPPED_PERIODS, _STOPPED_AFTER = 5.0, 1.0
 _WINDOW = 2.0  # Time over which the rate of a camera is measured [s].
-# A picture counts as missing if the sum of delays is at least 1 - _NEARLY periods. The second number is the share of
-# this sum that still counts at the next picture.
+# The delays of successive pictures are added up. If the sum is at least 1 - _NEARLY periods, a picture counts as
+# missing. Only the share _REMEMBERS of the sum still counts at the next picture.
 _NEARLY, _REMEMBERS = 0.3, 0.9
 # Shares of the rate. A camera becomes slow below the first share, and is no longer slow from the second share on.
 _SLOW, _FAST_ENOUGH = 0.8, 0.9

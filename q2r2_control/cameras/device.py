@@ -29,7 +29,7 @@ class Capture(NamedTuple):
 class DepthCapture(NamedTuple):
     time: float  # Time of the capture, by the monotonic clock of this computer [s].
     pixels: npt.NDArray[np.uint16]  # (height, width) Depth in multiples of ``unit``; 0 where it is not known.
-    unit: float  # The depth for which the number 1 stands [m].
+    unit: float  # The depth that the number 1 means [m].
 
 
 class CameraDevice(Protocol):

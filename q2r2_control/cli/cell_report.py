@@ -176,7 +176,7 @@ def _notes_on_models(config: Config, in_degrees: Collection[str]) -> list[str]:
 def _capsules_note(config: Config, robot: Robot) -> str:
     """Return a note about links with several shapes.
 
-    It has the number of shapes and the :func:`cost_of_shapes`, with and without these shapes.
+    It has the number of shapes of each link, and the text of :func:`cost_of_shapes`.
     """
     names = [link_of(item.name) for item in robot.collision_model.geometryObjects]
     shapes = ", ".join(f"{link} {names.count(link)}" for link in config.capsules)
@@ -189,16 +189,21 @@ def _capsules_note(config: Config, robot: Robot) -> str:
             controller = CartesianController(its, settings.without_contact())
         controller.reset(its.home)
         steps.append(partial(controller.step, {}, 1e-3))
-    # Other programs only lengthen a tick, so the least times are compared. Turns let both meet the same programs.
+    # Other programs only lengthen a tick, so the least times are compared. The two controllers take turns, so that
+    # other programs disturb both of them alike.
     ticks = np.min([[timeit.timeit(step, number=1) for step in steps] for _ in range(_TICKS)], axis=0).tolist()
     cost = cost_of_shapes([len(its.collision_model.collisionPairs) for its in robots], ticks)
     return f"capsules: shapes of {shapes}; {cost}"
 
 
 def cost_of_shapes(pairs: Sequence[int], ticks: Sequence[float]) -> str:
-    """Return what further shapes cost: the monitored ``pairs``, and the time of a tick if it was found longer.
+    """Return a text about the cost of the additional shapes in the cell's ``capsules``.
 
-    ``pairs`` and ``ticks`` [s] have two numbers: with and without the shapes.
+    It names both numbers of monitored pairs. It names both times of a tick only if a tick takes longer with the shapes.
+
+    Args:
+        pairs: The number of monitored pairs with and without the additional shapes.
+        ticks: The time of a tick with and without the additional shapes [s].
     """
     cost = f"{pairs[0]} pairs instead of {pairs[1]}"
     tick, before = (round(1e6 * time) for time in ticks)

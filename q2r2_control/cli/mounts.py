@@ -40,7 +40,7 @@ class MountReport:
     rpy: list[float]  # Roll, pitch and yaw of the mount in the world frame [rad].
     moved_mm: float  # Distance between this mount and the mount in the cell.
     turned_deg: float  # Angle between this mount and the mount in the cell.
-    off_mm: list[float]  # Distance that remains between the tips at each point.
+    off_mm: list[float]  # Distance between the two tips at each touched point, after the fit.
 
     @property
     def fault(self) -> str | None:

@@ -45,7 +45,7 @@ _ANSWERS = Path("new-cell.answers.json")  # The file that stores the answers, in
 _FITS = 8  # Largest number of rows in the printed table of capsules.
 _LEAST_JOINTS = 3  # Least number of joints of an arm.
 _OFF_FLOOR = 0.03  # For each link there must be a posture in which it is at least this far from the floor [m].
-# If a pair's distance cannot exceed its kept distance by at least this, the pair gets an exception [m].
+# If a pair's distance cannot exceed its kept distance by at least this, the pair gets a kept distance of its own [m].
 _BARELY = 0.003
 
 Model = Annotated[str | None, Option(metavar="MODEL", help="URDF, xacro, MJCF, package:// or example-robot-data:NAME.")]

@@ -45,7 +45,10 @@ def plausible(numbers: Array) -> bool:
 
 @numpy_kernel
 def clip_errors(errors: Array, position: float, rotation: float) -> BoolArray:
-    """Shorten ``errors`` (k, 6) to at most ``position`` [m] and ``rotation`` [rad]; return which were longer (k,)."""
+    """Shorten ``errors`` (k, 6) to at most ``position`` [m] and ``rotation`` [rad].
+
+    Returns True for each error that was longer (k,).
+    """
     clipped = np.zeros(len(errors), dtype=np.bool_)
     for i in range(len(errors)):
         nearer = position / max(size_of(errors[i, :3]), position)
@@ -197,7 +200,11 @@ def impedance_torque(
 
 @numpy_kernel
 def _add_springs(model: ImpedanceModel, data: ImpedanceData, q: Array, v: Array) -> None:
-    """Add J' (K e + D e') + N posture of all arms to ``data.torque``, and write ``data.repulsion`` of the limits."""
+    """Add the impedance torques of all arms to ``data.torque``, and write ``data.repulsion`` of the limits.
+
+    The torque of an arm is J' (K e + D e') + N t_p. The first part is the Cartesian impedance. The second part is the
+    null-space impedance: the torque t_p of the posture, projected by N into the nullspace of the tool's motion.
+    """
     _update_tools(model, data, q)
     copy(clip_errors(data.error, model.largest_error[0], model.largest_error[1]), data.clipped)
     M_inverse, stiffness, posture = np.linalg.inv(data.M), np.zeros(6), np.zeros(len(q))

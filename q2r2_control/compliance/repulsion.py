@@ -69,7 +69,7 @@ from q2r2_control.robot.obstacle_bodies import with_obstacle_bodies
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Interval
 
-_LONGEST_PERIOD = 0.002  # T [s]
+_LONGEST_PERIOD = 0.002  # The longest period T of a tick [s].
 _STIFFEST = 0.25 / _LONGEST_PERIOD**2  # Largest sum k / m [1/s^2].
 _MOST_DAMPED = 0.5 / _LONGEST_PERIOD  # Largest sum c / m [1/s].
 # The shell of a pair is its kept distance. Inside the shell, the damping rises from 0 to its value over this distance.
@@ -91,7 +91,7 @@ class RepulsionModel(NamedTuple):
     """Data that do not change between ticks."""
 
     collision: CollisionModel
-    smoothing: Array  # (p,) The number e of pair_distance.py [m^2].
+    smoothing: Array  # (p,) The weight e that smooths the distance, see pair_distance.py [m^2].
     deep: Array  # (p,) Smaller distances than this are measured exactly [m].
     shell: Array  # (p,) Distance that the pair keeps [m].
     stiffness: float  # [N/m]

@@ -45,7 +45,8 @@ LASTING = frozenset(
 class Gesture(StrEnum):
     """How a control is used.
 
-    ``DOWN`` is the start of a press, and has no action. But if the control pauses an arm, the arm stops already then.
+    ``DOWN`` is the start of a press, and has no action. However, if the control pauses an arm, the arm already stops at
+    ``DOWN``.
     """
 
     DOWN = "down"

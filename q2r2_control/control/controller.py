@@ -39,7 +39,7 @@ _TARGETS = "a pin.SE3 or None by arm, such as {'left': pose}"
 
 
 class CartesianController(WatchedPairs):
-    """QP differential inverse kinematics for all arms of a cell at once, with a certified stop at every tick.
+    """QP differential inverse kinematics for all arms of a cell together, with a certified stop at every tick.
 
     The contract holds for every sequence of targets and every dt in (0, 0.1] s. All numbers are finite, and no
     exception is raised. Joints keep their limits of position, velocity and acceleration. Every monitored pair keeps its

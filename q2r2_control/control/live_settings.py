@@ -20,7 +20,7 @@ d - S as above. Arms that rest within the buffer are not pushed apart.
 infinity. When an object is gripped, each of its pairs keeps d - S - buffer, or the distance of its class if that is
 less. The known stop is then certified with the object too, so that the object never has to be refused. The kept
 distance grows with later values of d and S, and never falls. If two objects overlap when the second object is gripped,
-it is assumed that both hands hold one and the same object. Its two bodies are not kept apart until one hand lets go.
+it is assumed that both hands hold the same object. Its two bodies are not kept apart until one hand releases it.
 
 **Gains** and weights change linearly to their new values: all arrays of the tasks that differ between the old and the
 new settings, and the gain of the separation rows. The certificate reads none of them.
@@ -122,7 +122,10 @@ class ObjectPairs:
         self._write(np.where(np.isfinite(kept), np.minimum(self.kept, kept), self.kept))
 
     def _within_reach(self) -> Array:
-        """Return d - S - buffer of the objects' pairs [m]; see the module's docstring."""
+        """Return the greatest distance that each of the objects' pairs may keep now [m].
+
+        It is d - S - buffer, see the module's docstring.
+        """
         return np.asarray(provable_distances(self._safety, self._data)[self._range] - self._buffer)
 
     def _write(self, kept: Array) -> None:
@@ -245,7 +248,10 @@ class LiveSettings:
         self._crowded = bool((self._stops < wanted).any())
 
     def _lasting(self) -> Array:
-        """Return d - S of every monitored pair (p,) [m]; see the module's docstring."""
+        """Return the distance that each monitored pair provably keeps during the known stop (p,) [m].
+
+        It is d - S, see the module's docstring.
+        """
         return provable_distances(self._safety, self._data)[: len(self._goal)]
 
     def _gains_of(self, settings: ControllerSettings) -> tuple[Array, ...]:

@@ -155,8 +155,8 @@ class LiftJudge(Judge):
     def __init__(self, part: str) -> None:
         super().__init__(part)
         self._start: tuple[float, float, float] | None = None  # The position at the start [m].
-        # How long the part has been held up now, and at most [s]; its greatest height above the start [m]; the time for
-        # which it has lain at the start again [s].
+        # Four numbers: the time for which the part has been held up until now, and the longest such time [s]; the
+        # greatest height of the part above the start [m]; the time for which it has lain at the start again [s].
         self._held = self._longest = self._height = self._lain = 0.0
         self._away = (0.0, 0.0)  # The distance from the start, sideways and in height [m].
 
@@ -256,8 +256,9 @@ class HandoverJudge(Judge):
     def __init__(self, part: str, giver: int, taker: int) -> None:
         super().__init__(part)
         self._giver, self._taker = giver, taker
-        # The times for which the giver held the part, and both hands held it [s]; for which the taker has held it far
-        # enough away now, and at most [s]; the greatest distance from where the giver let go [m].
+        # Five numbers: the times for which the giver held the part, and for which both hands held it [s]; the time for
+        # which the taker has held it far enough away until now, and the longest such time [s]; the greatest distance of
+        # the part from the position at which the giver let go [m].
         self._by_giver = self._by_both = self._alone = self._longest = self._farthest = 0.0
         self._given: tuple[float, float, float] | None = None  # The position at which the giver let go [m].
 

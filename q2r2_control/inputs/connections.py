@@ -31,7 +31,8 @@ KEEPALIVE_AFTER = 1.0  # The server sends a keepalive if it has sent nothing for
 # A driver that sends no whole frame for longer than this is dropped [s]. The app sends a keepalive after 1 s.
 SILENCE_ALLOWED = 2.0
 TURN = 0.05  # Longest wait for the network. Timeouts are checked this often [s].
-_RECEIVE_BYTES = 1 << 12  # Bytes to read at once, about 40 messages. The control loop can run between two reads.
+# Greatest number of bytes in one read, about 40 messages. The control loop can run between two reads.
+_RECEIVE_BYTES = 1 << 12
 MAX_FRAMES_PER_SECOND = 2000  # The app sends about 450. More would take processor time from the control loop.
 
 _LOG = logging.getLogger("q2r2_control.inputs.headset")

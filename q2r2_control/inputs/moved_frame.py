@@ -128,7 +128,9 @@ class MovedFrame:
         # Since this pair, the left hand has stayed within _NEAR of its position in the pair. It is set if ``_pairs`` is
         # not empty.
         self._near: HandPair
-        self._suspected: float | None = None  # When a step was detected that may be an alignment [s]; None if not so.
+        # The time at which a step of the hands' frame was detected that may be the operator's alignment [s]; None if
+        # there is no such step.
+        self._suspected: float | None = None
         self._bad_until = -math.inf  # Until this time, poses have a fault [s].
 
     def take_inputs(self, hand: str, inputs: HandInputs, now: float) -> None:

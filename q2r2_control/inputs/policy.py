@@ -31,7 +31,7 @@ from q2r2_control.types import POSE_FIELDS, QUEST_CONTROLS, ActionChunk, Array, 
 
 MOTION_FIELDS = ("x", "y", "z", "rx", "ry", "rz")
 _GAPS = 0.002, 0.5  # Least and greatest time from one action to the next [s].
-_MOST = 1000  # Greatest number of actions that may be sent at once.
+_MOST = 1000  # Greatest number of actions in one chunk.
 _NO_OPERATOR = replace(QUEST_CONTROLS, words=replace(QUEST_CONTROLS.words, nobody="a policy moves the arms"))
 _KEPT = 20  # Number of chunks that are kept between two ticks. If more come, the newest ones are kept.
 _JOINED = 1.0  # Longest time that the end of a run waits for a policy that still computes [s].

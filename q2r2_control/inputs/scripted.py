@@ -103,9 +103,9 @@ def _line(t: float, frequency: float) -> tuple[Array, Array]:
 
 
 def _rotate(t: float, frequency: float) -> tuple[Array, Array]:
-    """Return the hand's displacement at ``t``: it turns by 30 degrees and back, about x, y and z one after the other.
+    """Return the hand's displacement at ``t`` in a motion that turns the hand by 30 degrees and back.
 
-    Meanwhile the hand is 0.05 m above its start.
+    The hand turns about x, y and z one after the other. Meanwhile it is 0.05 m above its start.
     """
     phase = _phase(t, frequency)
     turn = np.zeros(3)
@@ -199,8 +199,8 @@ def trajectory_named(name: str, place: tuple[float, float] | None = None) -> Han
 _PLACES = 7  # Second seed. It makes the shifts independent of other random numbers with the same first seed.
 _PACE = 1.25  # Speed of hasty hands, as a multiple of the speed in the trajectory.
 _HESITATIONS, _HESITATES = 3, 0.4  # Number of hesitations, and the duration of each [s].
-# Times since the headset has lost the hands [s]: when it sees them again, when they engage the arms, when they begin to
-# carry again, and when they go on with the work.
+# Four delays after the headset loses the hands [s]: until the headset sees the hands again, until the hands engage the
+# arms, until the hands begin to carry again, and until the hands continue the work.
 _LOST, _ENGAGES, _CARRIES, _GOES_ON = 1.0, 1.3, 1.6, 2.1
 # Range of the fraction of the work after which the headset loses the hands. No tool presses on a part so early.
 _EARLY = (0.1, 0.45)

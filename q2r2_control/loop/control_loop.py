@@ -250,8 +250,9 @@ class ControlLoop:
     ) -> dict[str, float]:
         """Return the openings to be commanded, and find out whether the grippers hold something.
 
-        While the arms do not move, nothing is certified, and a gripper gets the wanted opening, for instance to let go
-        of an object. If a gripper was held up before the arms stopped, it does not go on in that direction.
+        While the arms do not move, nothing is certified, and a gripper gets the wanted opening, for instance to release
+        an object. If a gripper did not get its wanted opening before the arms stopped, it does not move farther in
+        that direction.
         """
         if not self._owns_plant and self.supervisor.phase not in _PROVEN:
             self._limiter, self.holding = None, {}
@@ -290,7 +291,8 @@ class ControlLoop:
 def without_proof(wanted: float, before: tuple[float, float] | None) -> float:
     """Return the opening that a gripper gets while the arms do not move, and nothing is certified.
 
-    A gripper gets the wanted opening. If it was held up before, it does not go on in that direction.
+    A gripper gets the wanted opening. If it did not get its wanted opening before, it does not move farther in that
+    direction.
 
     Args:
         wanted: The wanted opening.

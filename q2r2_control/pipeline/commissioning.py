@@ -20,8 +20,9 @@ _REACHED, _BEHIND = 0.2, 0.8
 # Largest displacements of A1 .. A7 from the first posture [rad]. A1 stays, because turning it changes no torque.
 _SPREAD = np.array([0.0, 0.1, 0.2, 0.25, 0.4, 0.5, 0.5])
 _TRIES = 40
-LED = 2.0  # Time of the upward motion before the hand lets go [s].
-_LATENCY = 0.15  # Longest time from when a hand lets go until the arm brakes: the time-out of a silent hand [s].
+LED = 2.0  # Time of the upward motion before the hand releases its button [s].
+# Longest time from the release of the hand's button until the arm brakes: the timeout of a silent hand [s].
+_LATENCY = 0.15
 LEAST_SPEED = 0.01  # Least speed of the tool from which a stop is measured [m/s].
 _STANDS = 1e-3  # Joints nearer than this to their final positions count as resting [rad].
 
@@ -122,7 +123,7 @@ def _postures(robot: Robot, start: Array) -> Iterator[Array]:
 
 @dataclass(frozen=True, slots=True)
 class StopReport:
-    """The stop of an arm after its hand let go, or after the program was killed."""
+    """The stop of an arm after its hand has released the button, or after the program was killed."""
 
     arm: str
     cause: str
@@ -146,12 +147,15 @@ class StopReport:
 
 
 def measure_stop(run: SlowRun, arm: str) -> StopReport:
-    """Let a simulated hand move ``arm`` upwards and let go, like an operator's hand, and check the stop."""
+    """Let a simulated hand move ``arm`` upwards and release its button, as an operator would, and check the stop."""
     return let_go_report(run.robot, arm, run.let_go([arm], LED)).check()
 
 
 def let_go_report(robot: Robot, arm: str, moments: list[Moment]) -> StopReport:
-    """Return the report on a stop. In ``moments``, a hand moves ``arm`` and lets go, and the arm comes to rest."""
+    """Return the report on a stop.
+
+    In ``moments``, a hand moves ``arm`` and releases its button, and the arm comes to rest.
+    """
     led = [index for index, moment in enumerate(moments) if moment.engaged[arm]]
     if not led:
         raise PlantError(f"the {arm} arm did not follow the hand")

@@ -428,7 +428,8 @@ class Pipeline(RequestedRun):
             self.controller.withdraw(step.reference)
         compute_time = time.perf_counter() - began
         self._recorder.add_latency(samples, self._clock.read())
-        # A simulated plant advances by no more than this time at once. Its time stands still for the rest of the gap.
+        # In one tick, the time of a simulated plant advances by at most ``_longest_advance``. If more time has passed
+        # since the last tick, the plant skips the rest.
         advance = min(gap, self._longest_advance)
         self.plant.advance(advance)
         self._plant_clock.give(advance)

@@ -151,7 +151,10 @@ class SlowRun:
         return self._end()
 
     def let_go(self, arms: Sequence[str], duration: float) -> list[Moment]:
-        """Let the hands of ``arms`` move up for ``duration`` [s], and let go. Return the moments from rest to rest."""
+        """Let the hands of ``arms`` move up for ``duration`` [s], and then release the buttons.
+
+        Return the moments from rest to rest.
+        """
         self._begin()
         self._hands.held = tuple(self._pipeline.teleop.hand_of(arm) for arm in arms)
         try:

@@ -17,7 +17,7 @@ from q2r2_control.plugins import PLANTS, load_class
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import ArmTiming, Array, Command, CommandMode, RobotState, is_number
 
-# Longest time that one call of ``advance`` lets pass [s]. A loop that is farther behind must not catch up at once.
+# Longest time that one call of ``advance`` lets pass [s]. A loop that is farther behind must not catch up in one call.
 MAX_ADVANCE = 1.0
 
 

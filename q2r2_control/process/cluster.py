@@ -94,7 +94,7 @@ class Cluster:
         return Needs(hash_of_sources(), os.getcwd(), ((str(path), path.stat().st_size),), probe)
 
     def _compare(self, client: Any, needs: Needs, work: Callable[[Any], Any]) -> None:
-        """Raise :class:`ConfigError` if a worker has other versions or files, or does several jobs at once."""
+        """Raise :class:`ConfigError` if a worker has other versions or files, or does several jobs at the same time."""
         threads = client.nthreads()
         if not threads:
             raise self._error("it has no workers; start some: dask worker ADDRESS --nthreads 1")

@@ -120,7 +120,8 @@ class HelperProcess:
         would also keep its output pipe open. The end of this pipe shows that the process has ended.
         """
         self._killed = True
-        if self._process.returncode is None:  # Otherwise, another process may have its number by now.
+        # If the return code is set, the process has ended. The system may have given its ID to another process.
+        if self._process.returncode is None:
             with suppress(OSError):  # The process group has ended.
                 os.killpg(self.pid, signal.SIGKILL)
         self._queue.put(None)

@@ -13,7 +13,9 @@ from q2r2_control.types import Array
 
 # A smaller difference between the clock and the loop's own time is not a step, because messages arrive unevenly [s].
 _NOTED = 0.1
-_SHARE = 0.5  # This share of the time of lost ticks is added to ``_NOTED``, because the dt of lost ticks is not known.
+# After lost ticks, the threshold is ``_NOTED`` plus this share of their estimated duration, because the dt of a lost
+# tick is not known.
+_SHARE = 0.5
 
 
 def clock_steps(numbers: npt.NDArray[np.int64], t: Array, dt: Array) -> Array:

@@ -43,7 +43,7 @@ _BEHIND, _CAUGHT_UP = 2.0, 1.0
 # The same as ROOM, for recordings of ROS nodes with pictures [bytes]. An uncompressed picture has a megabyte.
 ROOM_WITH_PICTURES = 64 << 20
 _LAST_NUMBER = 2**32 - 1
-_BATCH = 16  # The number of ticks that are sent at once.
+_BATCH = 16  # The number of ticks that are sent together.
 _LONGEST_FAULT = 500  # A longer text of the fault that ended a run is cut off [characters].
 
 _logger = logging.getLogger(__name__)

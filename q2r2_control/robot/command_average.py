@@ -1,7 +1,7 @@
 """The moving average that keeps commands within a limit of jerk: its window, and the distance that it needs.
 
 A robot may refuse positions whose acceleration changes too quickly, even if the acceleration itself is allowed. The
-reference of the controller bounds accelerations by A and lets them change at once. Commands are therefore the mean of
+accelerations of the controller's reference are at most A, but they may jump. Commands are therefore the mean of
 the references of a window W [s] until now.
 
 **Jerk.** The mean of n references in equal periods h changes its acceleration in a period by the difference of two

@@ -102,9 +102,10 @@ def _top(floor: pin.GeometryObject) -> float:
 def _lowest(model: pin.Model, data: pin.Data, item: pin.GeometryObject) -> float | None:
     """Return the least height of any point of a capsule or sphere [m]; None if no joint changes its height.
 
-    Joints that turn about vertical axes or slide along level axes do not change heights. The origin of the first other
-    joint therefore keeps its height, and the bodies that this joint carries lie in a ball around it. ``data`` has the
-    frames and Jacobians at the neutral posture.
+    Joints that turn about vertical axes or slide along level axes do not change heights. Take the first joint of the
+    chain that can change a height. The height of its origin is constant, because no joint before it changes heights.
+    The bodies that this joint moves always lie in a ball around its origin. ``data`` has the frames and Jacobians at
+    the neutral posture.
     """
     height, world_axes = None, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
     reach = float(np.linalg.norm(item.placement.translation)) + item.geometry.radius

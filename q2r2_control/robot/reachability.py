@@ -26,10 +26,12 @@ from q2r2_control.types import Array
 # of its postures or pairs that are done; the number of all its postures or pairs.
 Progress = Callable[[str, int, int], None]
 
-_STARTS = 8  # Number of nearest samples of each pair that are followed downhill.
-_STEPS = 30  # Greatest number of steps downhill.
-_FLAT = 1e-6  # If the relative progress of a step downhill is smaller, the descent ends.
-_BATCH, _FEW = 250, 4  # Number of postures in a batch, and of batches before pairs are first followed downhill.
+# For each pair of bodies, the search keeps this number of random postures, those with the smallest distances. From each
+# of them, it descends along the gradient of the distance.
+_STARTS = 8
+_STEPS = 30  # Greatest number of steps of a descent.
+_FLAT = 1e-6  # If the relative progress of a step is smaller, the descent ends.
+_BATCH, _FEW = 250, 4  # Number of postures in a batch, and number of batches before the first descent for each pair.
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +91,7 @@ class _Search:
         self.names = pair_names(self._geometry)
         self.nearest = np.full(len(self.names), np.inf)  # The least distance of each pair so far (pairs,) [m].
         self._left = np.arange(len(self.names))  # The indices of the pairs that are still examined.
-        # The postures of each pair from which the search goes downhill, and their distances, the nearest first.
+        # The postures from which the search descends for each pair, and their distances. The nearest posture is first.
         self._starts = np.zeros((len(self.names), _STARTS, self._model.nv))
         self._at = np.full((len(self.names), _STARTS), np.inf)
         self._distances = CoalDistances(self._model, self._geometry)

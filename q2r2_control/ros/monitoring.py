@@ -228,7 +228,7 @@ class HandListeners:
         return all(engaged) if engaged else None
 
     def begin(self) -> None:
-        """Let the requests that controllers have served until now count no more."""
+        """Ignore the requests that controllers have served until now."""
         self._requests.clear()
         self._new_requests()
 
@@ -253,7 +253,10 @@ class HandListeners:
         )
 
     def lost(self) -> dict[str, str]:
-        """Return what each arm's node reports whose arm a fault or a request has stopped, by the node's name."""
+        """Return the reports of those arms' nodes whose arm is lost, because a fault or a request has stopped it.
+
+        The keys are the names of the nodes.
+        """
         return {name: state["message"] for name, state, _ in self._arms() if state.get("state") == ArmState.LOST}
 
     def _new_requests(self) -> bool:

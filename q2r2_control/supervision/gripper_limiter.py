@@ -88,8 +88,8 @@ class GripperLimiter:
             refused = self._controller.set_opening(arm, *_hull(gripper.needed(), gripper.around(goal)))
         gripper.answered(goal, free, refused is None, now)
         self.changed |= self._controller.openings[arm] != accepted
-        # If the accepted interval contains all openings that are needed, the gripper does not count as held up,
-        # although a smaller interval cannot be certified yet.
+        # If the accepted interval contains all openings that are needed, the gripper does not count as held, although a
+        # smaller interval cannot be certified yet.
         if refused is None or (free and _holds(accepted, gripper.needed(0.5))):
             self.held.pop(arm, None)
         else:

@@ -170,7 +170,7 @@ _PATIENCE = 5.0  # The tools may arrive by this time later than their targets [s
 
 
 class ToolHoming:
-    """Moves all tools home at the same time, on straight lines. If the QP holds a tool up, homing ends there."""
+    """Moves all tools home at the same time, on straight lines. If the QP keeps a tool from its path, homing ends."""
 
     def __init__(self, home: Mapping[str, pin.SE3], tool_pose: Callable[[str], pin.SE3]) -> None:
         """Prepare the motion to the poses ``home``. ``tool_pose`` returns the tool pose of an arm in the reference."""
@@ -245,7 +245,7 @@ class Homing:
         """End the motion home if the arms have arrived or cannot go on. Return the outcome; None if it goes on.
 
         Args:
-            reference: The newest reference. If the arms are held up, the outcome names the tightest pair of the
+            reference: The newest reference. If the arms cannot move on, the outcome names the tightest pair of the
                 reference.
         """
         kind = None if self._motion is None else self._motion.outcome

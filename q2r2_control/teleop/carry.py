@@ -2,7 +2,7 @@
 
 The hand is anchored to a frame in the middle between both tools. At the beginning, the axes of this frame are parallel
 to those of the world. Both tools keep their poses in this frame. No target jumps at the beginning, and both targets
-move exactly as one rigid body, except for the small correction of :class:`RelationKeeper`. If an arm is held up, a
+move exactly as one rigid body, except for the small correction of :class:`RelationKeeper`. If an arm cannot follow, a
 leash keeps the frame near this arm. This leash is shorter than the leash of one arm, so that the load is neither torn
 nor crushed.
 """
@@ -59,11 +59,11 @@ class CarriedTools:
 class RelationKeeper:
     """Shifts the target of the carried tool so that the tools, like their targets, keep their relative pose.
 
-    Each arm lags behind its target by some millimetres, and the two arms by different distances. Each tool pose gives
-    one pose of the frame between the tools. So that both poses agree, a first-order loop shifts the carried tool's
-    frame by c:
+    Each arm lags behind its target by some millimetres, and the two lags differ. There is one frame between the tools,
+    and its pose can be computed from either tool pose. The two results differ a little. A first-order loop reduces this
+    difference: it adds a shift c to the frame from which the carried tool's target is computed.
 
-        dc/dt = g (frame of the leading tool - frame of the carried tool),  |c| bounded.
+        dc/dt = g (frame by the leading tool's pose - frame by the carried tool's pose),  |c| bounded.
     """
 
     def __init__(self) -> None:

@@ -13,7 +13,7 @@ from q2r2_control.types import HandInputs
 
 # If a control has been held since the first reading, the operator is told after this time [s].
 _STUCK_AFTER = 1.0
-# A control counts as held above the first travel, and as let go below the second one. In between nothing changes.
+# A control counts as held above the first travel, and as released below the second one. In between nothing changes.
 _HELD, _LET_GO = 0.6, 0.4
 
 
@@ -33,14 +33,14 @@ def travel(control: str, inputs: HandInputs) -> float:
 
 
 def _is_held(control: str, inputs: HandInputs, was_held: bool) -> bool:
-    """Return whether a control is held. A reading of NaN counts as let go."""
+    """Return whether a control is held. A reading of NaN counts as a released control."""
     return travel(control, inputs) >= (_LET_GO if was_held else _HELD)
 
 
 class HeldControls:
     """The actions of one hand that last while their control is held.
 
-    A control counts only after a reading of this connection has shown it let go. A reading of NaN counts as let go.
+    A control counts only after a reading of this connection has shown it released. A reading of NaN counts as released.
     """
 
     def __init__(self, bindings: BindingSettings) -> None:
@@ -52,7 +52,7 @@ class HeldControls:
         self.forget()
 
     def forget(self) -> None:
-        """Count all controls as let go. A control counts again only after a reading has shown it let go."""
+        """Count all controls as released. A control counts again only after a reading has shown it released."""
         self._seen_let_go: set[str] = set()
         self.actions: frozenset[Action] = frozenset()
 
@@ -101,7 +101,7 @@ class GestureRecognizer:
             control.mute()
 
     def forget(self) -> None:
-        """Drop all gestures and readings. A control counts again only after a reading has shown it let go."""
+        """Drop all gestures and readings. A control counts again only after a reading has shown it released."""
         self.chord = False  # Whether both buttons were pressed together, and one of them is still held.
         self._first = -math.inf  # Time of the first reading after this call [s].
         self._told_stuck = False
@@ -165,7 +165,8 @@ class _Control:
         self.forget()
 
     def forget(self) -> None:
-        # The control counts as held until a reading shows it let go. Only a press that was seen from its start counts.
+        # The control counts as held until a reading shows it released. Only a press that was seen from its start
+        # counts.
         self.down = True
         self.seen_up = False
         self.cancel()

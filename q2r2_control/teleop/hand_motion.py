@@ -39,7 +39,8 @@ class HandMotion:
         self._motion, self._unslipped = RelativeMotion.of(settings), RelativeMotion.of(settings)
         self._shares: Shares = (1.0, 1.0)
         self.filtered: Pose | None = None  # The filtered pose of the hand from which the last target was computed.
-        # The newest pose of the hand, and the target that it would have without leash and workspace since the anchor.
+        # The newest pose of the hand, not filtered. The second pose is the target that would follow from this pose if
+        # neither leash nor workspace had held the target back since the anchor.
         self._newest: tuple[Pose, Pose] | None = None
         self._bound_one_tool()
 

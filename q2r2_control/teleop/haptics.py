@@ -42,7 +42,8 @@ EPISODE_DISCARDED = Pulse(0.2, 0.65, 0.25, "an episode is discarded, or failed")
 EPISODE_REJECTED = Pulse(0.15, 0.7, 0.5, "the verdict on an episode: discard")
 STOPPED = Pulse(0.9, 0.9, 0.25, "stopped, by the control that stops")
 FAULT = Pulse(1.0, 1.0, 0.3, "lost: stopped by a fault (lost data, a jump, a stop), or a press that was refused")
-# The weakest vibration comes first. If two are due at once, the stronger one is felt. The docs show this table.
+# The weakest vibration comes first. If two are due at the same time, the stronger one is felt. The docs show this
+# table.
 VOCABULARY = (
     *(NEAR, SLIP, CONTACT, LIMIT, PAUSED, EPISODE_ENDS, ENGAGED, EPISODE_KEPT, EPISODE_BEGINS, GRASP, HOMING),
     *(EPISODE_DISCARDED, EPISODE_REJECTED, STOPPED, FAULT),

@@ -130,8 +130,8 @@ class PolicyMotion:
     def advance(self, tool: Pose | None, now: float) -> Reason | None:
         """Change to the plan that is due at ``now``.
 
-        If something holds the arm up, the leash keeps the target near the tool. A new chunk may begin at this target,
-        or at the pose to which the last chunk would have led.
+        If something keeps the arm from following, the leash keeps the target near the tool. A new chunk may begin at
+        this target, or at the pose to which the last chunk would have led.
 
         Args:
             tool: The tool pose at the controller's reference (world frame); None if not known.

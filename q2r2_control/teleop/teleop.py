@@ -34,9 +34,9 @@ class Teleop:
     ``gate.timeout``. With ``linked`` the other arm stops as well. Only a new press engages an arm again. The alignment
     chord of either hand stops both arms, because it moves the frame in which the poses of both hands are measured.
 
-    If several presses come at once, a stop is carried out first, then the alignment chord, then a pause, then the
-    others. Either hand may ask for the actions that concern both arms. While :attr:`homing` is True, the caller moves
-    the arms home.
+    If several presses come in the same tick, a stop is carried out first, then the alignment chord, then a pause, then
+    the others. Either hand may ask for the actions that concern both arms. While :attr:`homing` is True, the caller
+    moves the arms home.
 
     :meth:`update` never raises because of its input. Samples may be of unknown hands, old, repeated or in bursts, and
     ``now`` may be any number.

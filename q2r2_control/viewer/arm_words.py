@@ -35,7 +35,8 @@ class Told(NamedTuple):
     def after(self, event: Event) -> Told:
         """Return the events that say why the arm is in its state after one more ``event``.
 
-        An event that changes the state replaces all earlier ones. Other events replace no change of state.
+        If ``event`` changes the arm's state, it replaces all earlier events. Otherwise the last change of state is
+        kept. A refusal, or a request to pause an arm that already holds, is added to this change.
         """
         if event.source != event.destination:
             return Told(event)

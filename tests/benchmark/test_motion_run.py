@@ -59,7 +59,7 @@ class Standing:
         return self._q.copy(), np.zeros(len(self._q))
 
 
-def test_the_figures_of_a_controller_that_stands_still_follow_from_its_targets(robot: Robot) -> None:
+def test_for_a_controller_without_motion_the_figures_equal_those_computed_from_its_targets(robot: Robot) -> None:
     ends = round(SHORT.ends / DT)
     figures = run_motion(Standing(jerked=ends - 100, failing=ends - 50), robot, SHORT)
     # The target moves by 10 mm at a constant speed, so the root mean square of the error is 10 / sqrt(3).
@@ -84,7 +84,7 @@ def test_the_arms_stand_still_in_a_tick_without_a_solution(robot: Robot, raises:
     assert not run.v[3].any()
 
 
-def test_what_happens_during_the_approach_is_not_measured(robot: Robot) -> None:
+def test_the_figures_do_not_contain_events_during_the_approach(robot: Robot) -> None:
     began = round(SHORT.begins / DT)
     figures = run_motion(Standing(jerked=began - 100, failing=began - 50), robot, SHORT)
     assert (figures.max_acceleration, figures.failures) == (0.0, 0)
@@ -98,7 +98,7 @@ def test_a_tool_within_10_mm_of_the_goal_has_arrived(robot: Robot, goal: float, 
     assert run_motion(Standing(), robot, replace(away, has_goal=False)).arrival_s is None
 
 
-def test_a_tool_that_leaves_the_goal_has_arrived_only_when_it_has_finally_returned(robot: Robot) -> None:
+def test_if_a_tool_leaves_the_goal_again_its_arrival_is_the_time_of_its_last_return(robot: Robot) -> None:
     way = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
     there_and_back = replace(SHORT, path=lambda t, home: home + 0.2 * min(t, 0.2 - t) * way)
     figures = run_motion(OwnController(robot, CONFIG), robot, there_and_back)

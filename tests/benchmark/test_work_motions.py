@@ -30,7 +30,7 @@ def ways(motion: WorkMotion, start: dict[str, pin.SE3]) -> Array:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("motion", WORK_MOTIONS.values(), ids=WORK_MOTIONS)
-def test_targets_begin_at_home_move_smoothly_at_bounded_speed_and_end_at_rest(
+def test_targets_begin_at_home_and_move_smoothly_at_bounded_speed_and_end_at_rest(
     motion: WorkMotion, start: dict[str, pin.SE3]
 ) -> None:
     way = ways(motion, start)

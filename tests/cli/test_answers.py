@@ -65,7 +65,7 @@ def test_an_answer_of_another_type_is_not_offered(file: Path, monkeypatch: pytes
     assert seen == [0.1]
 
 
-def test_with_the_option_yes_no_question_is_asked_and_the_kept_answers_do_not_change(
+def test_the_option_yes_prevents_all_questions_and_does_not_change_the_kept_answers(
     file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     offered(monkeypatch, 0.4)

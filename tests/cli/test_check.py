@@ -264,7 +264,7 @@ def test_a_stop_that_needs_too_much_torque_is_a_note_and_no_fault(tmp_path: Path
     assert cell["stop_torques"][1]["stop"]["share_over"] == 0.0
 
 
-def test_joints_that_a_fault_finds_in_degrees_have_no_note_that_asks_for_their_units(tmp_path: Path) -> None:
+def test_if_a_fault_says_that_limits_are_in_degrees_no_note_asks_for_the_units_of_these_limits(tmp_path: Path) -> None:
     urdf = ET.fromstring(find_resource("robots/iiwa7.urdf").read_text(encoding="utf-8"))
     limits = {joint.get("name"): limit for joint in urdf.findall("joint") for limit in joint.findall("limit")}
     for name in ("A3", "A4"):
@@ -318,7 +318,7 @@ def test_check_says_which_pairs_may_touch() -> None:
         ((31.2e-6, 31.1e-6), "320 pairs instead of 193"),
     ],
 )
-def test_the_cost_of_further_shapes_has_a_time_only_if_ticks_were_found_longer(
+def test_the_text_about_additional_shapes_has_times_only_if_ticks_take_longer_with_these_shapes(
     ticks: tuple[float, float], says: str
 ) -> None:
     assert cost_of_shapes((320, 193), ticks) == says

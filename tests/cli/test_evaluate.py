@@ -57,7 +57,7 @@ def rows_of_scripted_hands(task: str) -> Array:
 
 
 @pytest.mark.slow
-def test_a_policy_that_repeats_scripted_hands_grasps_and_a_policy_that_rests_does_not(
+def test_a_policy_grasps_if_it_repeats_scripted_hands_and_does_not_grasp_if_it_rests(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "replayed_policy.py").write_text(POLICY)

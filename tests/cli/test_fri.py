@@ -71,7 +71,7 @@ def test_a_press_of_enter_stops_all_overlays_and_the_next_press_starts_them_agai
     os.close(theirs)
 
 
-def test_overlays_that_the_pendant_stopped_start_only_after_its_next_key_press() -> None:
+def test_if_the_pendant_stops_the_overlays_they_start_again_only_after_its_next_key_press() -> None:
     ones = (1.0,) * 7
     settings = CabinetSettings(ones, ones, ones, ones, ones)
     cabinets = {arm: Cabinet(settings, StillArm((0.0,) * 7)) for arm in ("left", "right")}

@@ -72,7 +72,7 @@ def test_a_folder_that_cannot_be_written_is_refused_before_the_models_are_read(m
 
 
 @pytest.mark.slow
-def test_links_without_masses_are_reported_as_left_to_do() -> None:
+def test_a_fault_of_the_written_cell_names_links_without_masses_as_left_to_do() -> None:
     Path("arm.urdf").write_text(re.sub(r"<inertial>.*?</inertial>", "", IIWA, flags=re.DOTALL))
     result = q2r2("new-cell", "cell", "--left", "arm.urdf", "--yes", "--samples", "100")
     assert result.exit_code == 1
@@ -84,7 +84,7 @@ def test_links_without_masses_are_reported_as_left_to_do() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("link", ["link_3", "link_0"], ids=["a link that moves", "the base"])
-def test_links_that_are_drawn_and_have_no_shape_are_watched_by_capsules_around_their_drawings(
+def test_drawn_links_without_a_shape_are_monitored_with_capsules_around_their_drawings(
     link: str, tmp_path: Path
 ) -> None:
     Path("arm.urdf").write_text(re.sub(rf'<collision name="{link}.*?</collision>', "", IIWA, flags=re.DOTALL))
@@ -98,7 +98,7 @@ def test_links_that_are_drawn_and_have_no_shape_are_watched_by_capsules_around_t
 
 
 @pytest.mark.slow
-def test_a_part_of_the_robot_that_stands_beside_an_arm_by_construction_gets_its_own_distance(tmp_path: Path) -> None:
+def test_if_a_fixed_part_of_the_robot_is_always_near_an_arm_this_pair_gets_its_own_distance(tmp_path: Path) -> None:
     pillar = """<link name="pillar"><collision><geometry><sphere radius="0.02"/></geometry></collision></link>
       <joint name="stands" type="fixed"><parent link="link_0"/><child link="pillar"/><origin xyz="0.11 0 0.16"/></joint>
     </robot>"""
@@ -110,7 +110,7 @@ def test_a_part_of_the_robot_that_stands_beside_an_arm_by_construction_gets_its_
 
 
 @pytest.mark.slow
-def test_a_drawing_that_cannot_be_enclosed_leaves_the_others_their_capsules(tmp_path: Path) -> None:
+def test_if_a_drawing_cannot_be_enclosed_the_other_drawings_still_get_capsules(tmp_path: Path) -> None:
     bare = re.sub(r'<collision name="link_[03].*?</collision>', "", IIWA, flags=re.DOTALL)
     Path("points.obj").write_text("v 0 0 0\n")
     drawing = '<link name="link_0"><visual><geometry><mesh filename="points.obj"/></geometry></visual>'

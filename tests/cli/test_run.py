@@ -78,7 +78,7 @@ def test_with_the_option_force_a_faulty_cell_runs_and_its_faults_are_printed(tmp
         ("torque", "0.7,", "| table_0; what was measured broke what was promised"),
     ],
 )
-def test_a_run_in_which_an_arm_begins_inside_the_table_ends_with_exit_code_1(
+def test_if_an_arm_begins_inside_the_table_the_run_ends_with_exit_code_1(
     tmp_path: Path, mode: str, home: str, said: str
 ) -> None:
     file = changed_cell(tmp_path, "0.0204, 0.348,", f"0.0204, {home}")
@@ -258,7 +258,7 @@ def test_if_the_computer_cannot_draw_pictures_one_line_says_so_and_everything_el
 
 
 @pytest.mark.slow
-def test_a_run_whose_plant_has_no_pictures_says_so_and_is_recorded_without_pictures(tmp_path: Path) -> None:
+def test_if_the_plant_has_no_pictures_the_run_says_so_and_is_recorded_without_pictures(tmp_path: Path) -> None:
     result = q2r2("run", CELL, *OPTIONS, "--record", str(tmp_path / "recordings"))
     assert result.exit_code == 0
     assert "no pictures are recorded: the kinematic plant has none; allowed: --plant mujoco\n" in result.stderr

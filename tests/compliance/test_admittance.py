@@ -245,7 +245,7 @@ def _loop(goals: dict[str, pin.SE3 | None], dt: float, ticks: int) -> Iterator[A
 
 @pytest.mark.slow
 @AXES
-def test_a_push_in_mujoco_moves_the_tool_by_the_sum_of_what_admittance_and_servos_yield(
+def test_a_push_in_mujoco_moves_the_tool_by_the_sum_of_the_displacements_of_admittance_and_servos(
     axis: int,
 ) -> None:
     push = _wrench(axis, 20.0 if axis < 3 else 5.0)

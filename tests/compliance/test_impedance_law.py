@@ -118,7 +118,10 @@ def damping(stiffness: Array, inertia: Array, ratio: float) -> Array:
 def arm_torque(
     arm: str, settings: ImpedanceSettings, wanted: tuple[Array, Array], measured: tuple[Array, Array]
 ) -> Array:
-    """Return the torque (7,) [Nm] of one arm's spring and posture, computed from the formulas of the papers."""
+    """Return the torque (7,) [Nm] of one arm, computed from the formulas of the papers.
+
+    It is the torque of the Cartesian impedance plus the torque of the null-space impedance.
+    """
     model, joints, frame = ROBOT.model, ROBOT.arms[arm].joints, ROBOT.arms[arm].frame_id
     (q_wanted, v_wanted), (q, v) = wanted, measured
     jacobians = []

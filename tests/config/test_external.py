@@ -41,7 +41,7 @@ UNCLEAR = {
 
 
 @pytest.mark.parametrize(("text", "says"), UNCLEAR.values(), ids=UNCLEAR)
-def test_a_cell_that_does_not_say_clearly_which_controller_moves_which_arm_is_refused(
+def test_a_cell_is_refused_if_it_does_not_say_clearly_which_controller_moves_which_arm(
     tmp_path: Path, text: str, says: str
 ) -> None:
     assert fault(tmp_path, text).startswith(says)

@@ -119,7 +119,7 @@ def test_a_hard_constraint_keeps_an_elbow_above_a_plane_that_it_would_otherwise_
     assert min(plane.elbow(at) for at in q) > plane.height - 1e-4
 
 
-def test_a_hard_row_that_no_step_satisfies_brakes_the_arms_and_the_report_names_its_constraint(robot: Robot) -> None:
+def test_if_no_step_satisfies_a_hard_row_the_arms_brake_and_the_report_names_the_rows_constraint(robot: Robot) -> None:
     fast = Answers(lambda nv: (np.eye(nv)[:1], np.full(1, 100.0)), hard=True)
     controller = CartesianController(robot, constraints=[fast])
     moving, _ = driven(controller, 100)
@@ -146,7 +146,7 @@ def test_a_given_solution_that_breaks_a_hard_row_is_not_executed(robot: Robot) -
 
 
 class NoLess:
-    """A constraint that keeps the next velocities at least as fast as ``along`` in the direction of ``along``."""
+    """A constraint: in the direction of ``along``, the next joint velocities are at least as fast as ``along``."""
 
     hard = True
     along: Array | None = None

@@ -97,7 +97,7 @@ def test_the_margin_of_a_report_refers_to_the_distances_kept_at_that_tick(
 
 
 @pytest.mark.slow
-def test_an_object_that_overlaps_the_table_when_it_is_gripped_never_overlaps_the_table_more(robot: Robot) -> None:
+def test_if_an_object_overlaps_the_table_when_it_is_gripped_the_overlap_never_grows(robot: Robot) -> None:
     large = cell({"box": (0.04, 0.04, 0.08), "at": (0.0, 0.0, 0.013)})
     controller = CartesianController(Robot.from_config(large), large.control.timed(realtime=False))
     run = Driven(controller)

@@ -57,12 +57,12 @@ def test_a_part_that_python_calls_is_compiled_as_a_whole_and_gives_the_same_resu
     assert not isinstance(compiled(third.overloads).library, _PartLibrary)
 
 
-def test_a_kernel_that_python_has_called_can_become_part_of_another_kernel(chain: tuple[Any, Any, Any]) -> None:
+def test_after_a_call_from_python_a_kernel_can_become_part_of_another_kernel(chain: tuple[Any, Any, Any]) -> None:
     third, _, difference = chain
     assert (third(6.0), difference(6.0)) == (2.0, 1.0)
 
 
-def test_a_kernel_that_uses_max_and_that_python_has_called_can_become_part_of_two_kernels() -> None:
+def test_after_a_call_from_python_a_kernel_that_uses_max_can_become_part_of_two_kernels() -> None:
     @kernel
     def at_least_one(x: float) -> float:
         return max(x, 1.0) + max(int(x), 3)
@@ -96,7 +96,7 @@ def test_a_part_that_cannot_be_compiled_raises_an_exception_and_the_next_kernel_
     assert typeof(1.0) in next(iter(third.overloads))
 
 
-def test_a_kernel_that_python_calls_while_another_kernel_is_compiled_gives_the_right_result(
+def test_if_python_calls_a_kernel_while_another_kernel_is_compiled_the_result_is_right(
     chain: tuple[Any, Any, Any],
 ) -> None:
     third, _, difference = chain

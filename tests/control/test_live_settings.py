@@ -100,7 +100,9 @@ def test_a_smaller_separation_gain_slows_approaching_arms_and_no_velocity_jumps(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in LIVE if name != "min_distance"])
-def test_a_controller_with_a_changed_setting_moves_exactly_like_one_that_was_made_with_this_value(name: str) -> None:
+def test_after_a_change_of_a_setting_a_controller_moves_exactly_like_a_controller_made_with_this_setting(
+    name: str,
+) -> None:
     """Both motions are equal to the bit.
 
     The arms first block each other, so the right arm gives way. Then both targets are out of reach.
@@ -166,7 +168,7 @@ def test_a_reset_to_a_posture_with_close_bodies_reduces_kept_distances_so_that_t
 
 
 @pytest.mark.slow
-def test_arms_within_their_buffer_rest_after_a_reset_and_the_buffer_grows_as_they_move_apart(
+def test_after_a_reset_arms_within_their_buffer_rest_and_the_buffer_grows_as_they_move_apart(
     controller: CartesianController,
 ) -> None:
     run = Driven(controller)
@@ -224,7 +226,7 @@ def test_a_change_that_is_not_allowed_is_refused_with_the_reason_and_changes_not
     assert controller.settings is before
 
 
-def test_a_min_distance_that_the_home_posture_does_not_keep_is_refused_with_the_name_of_the_pair(
+def test_a_min_distance_is_refused_with_the_name_of_the_pair_if_the_home_posture_does_not_keep_it(
     controller: CartesianController,
 ) -> None:
     nearest = min(controller.robot.distances(controller.robot.home), key=lambda pair: pair.distance)

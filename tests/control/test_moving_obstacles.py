@@ -110,7 +110,7 @@ def test_if_no_more_reports_on_an_obstacle_come_the_arms_come_to_rest_and_the_re
     assert max(np.abs(controller.step(circle(0.002 * tick, start), 0.002).v).max() for tick in range(500)) > 0.05
 
 
-def test_an_arm_moves_only_where_a_hand_that_is_no_longer_reported_cannot_have_arrived(
+def test_if_a_hand_is_no_longer_reported_an_arm_moves_only_where_the_hand_cannot_have_arrived(
     controller: CartesianController,
 ) -> None:
     """The target leads away from the obstacle. As long as reports come, the arm may move there."""
@@ -155,7 +155,7 @@ def test_a_new_obstacle_in_front_of_a_moving_arm_is_named_and_the_arm_brakes_alo
         before = now
 
 
-def test_a_new_box_that_never_moves_stops_an_arm_like_a_fixed_obstacle_until_the_box_is_removed(
+def test_a_new_box_without_motion_stops_an_arm_like_a_fixed_obstacle_until_the_box_is_removed(
     controller: CartesianController,
 ) -> None:
     start = controller.tool_pose("left")
@@ -175,7 +175,7 @@ def test_a_new_box_that_never_moves_stops_an_arm_like_a_fixed_obstacle_until_the
     assert np.linalg.norm(controller.tool_pose("left").translation - goal) < 2e-3
 
 
-def test_an_arm_with_a_hand_too_near_can_only_move_away_and_the_other_arm_can_move_freely(
+def test_if_a_hand_is_too_near_to_an_arm_this_arm_can_only_move_away_and_the_other_arm_moves_freely(
     controller: CartesianController,
 ) -> None:
     start = {arm: controller.tool_pose(arm) for arm in controller.robot.arms}

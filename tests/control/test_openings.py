@@ -46,7 +46,7 @@ def height(controller: CartesianController) -> float:
     return float(controller.tool_pose("left").translation[2])
 
 
-def test_a_closed_gripper_moves_to_a_pose_beside_a_block_where_a_gripper_that_may_open_cannot_go(
+def test_beside_a_block_a_closed_gripper_reaches_a_pose_that_a_gripper_which_may_open_cannot_reach(
     controller: CartesianController,
 ) -> None:
     run = Driven(controller)

@@ -98,7 +98,7 @@ def test_arms_in_torque_mode_wipe_with_the_wanted_force_and_find_the_hole_for_th
 
 
 @pytest.mark.parametrize("mode", list(SHOWN))
-def test_arms_whose_hands_move_to_the_same_point_stop_before_the_arms_touch(mode: CommandMode) -> None:
+def test_if_both_hands_move_to_the_same_point_the_arms_stop_before_they_touch(mode: CommandMode) -> None:
     played = Played("clash", mode)
     assert played.results["clash"].reason == ""
     led = [[tick.targets[arm].pose for arm in ("left", "right")] for tick in played.ticks]

@@ -44,7 +44,7 @@ def test_lifting_succeeds_if_the_part_is_held_up_for_a_second_and_put_back() -> 
     assert judge.measured() == pytest.approx(measured)
 
 
-def test_a_part_that_has_lain_for_a_second_after_it_was_put_back_may_be_moved_again() -> None:
+def test_one_second_after_a_part_was_put_back_it_may_be_moved_again() -> None:
     lain = [LIES, GRIPPED, HELD, GRIPPED, BACK, BACK]
     elsewhere = (1.0, 0.3, 0.2, TABLE)
     assert play(LiftJudge("part"), [*lain, HELD, elsewhere]).faults() == []

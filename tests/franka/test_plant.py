@@ -7,7 +7,7 @@ import pytest
 from q2r2_control import ConfigError, Robot, load_config
 
 
-def test_a_jerk_limit_that_the_mean_of_five_positions_cannot_keep_is_refused() -> None:
+def test_a_jerk_limit_is_refused_if_the_mean_of_five_positions_cannot_keep_it() -> None:
     pytest.importorskip("pylibfranka", reason="pip install -e plugins/q2r2_franka")
     from q2r2_franka.plant import FrankaPlant
 

@@ -42,7 +42,7 @@ def test_positions_keep_the_jerk_limit_even_if_the_acceleration_jumps_by_twice_i
 
 
 @pytest.mark.parametrize("lost", [1, 2, 5, 15])
-def test_a_robot_that_got_no_commands_comes_back_to_the_path_within_the_limits(lost: int) -> None:
+def test_if_a_robot_got_no_commands_it_comes_back_to_the_path_within_the_limits(lost: int) -> None:
     random = np.random.default_rng(lost)
     sent, entries, passed = PositionStream(MIDDLE), list[Entry](), list[Array]()
     for i, q in enumerate(restless_path(2.0, random)):

@@ -58,7 +58,7 @@ def test_a_connection_that_ends_during_motion_stops_both_arms_until_a_new_press(
 
 
 @pytest.mark.parametrize("alive", [False, True], ids=["silent", "silent but for keepalives and buttons"])
-def test_a_headset_that_stops_sending_poses_during_motion_stops_both_arms_within_the_timeout(alive: bool) -> None:
+def test_if_a_headset_sends_no_more_poses_during_motion_both_arms_stop_within_the_timeout(alive: bool) -> None:
     stopped = []
 
     def script(op: Operator) -> Iterator[float]:

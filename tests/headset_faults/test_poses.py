@@ -60,7 +60,7 @@ def test_a_jump_of_the_poses_moves_no_arm_and_stops_both_arms(hands: tuple[str, 
     assert run.states == {"engaged"}
 
 
-def test_a_step_of_the_frame_that_is_too_small_for_all_gates_moves_no_arm() -> None:
+def test_a_step_of_the_frame_moves_no_arm_even_if_no_gate_finds_a_jump_of_a_hand() -> None:
     def script(op: Operator) -> Iterator[float]:
         yield from op.engage()
         yield 0.2

@@ -67,7 +67,7 @@ def drives(server: HeadsetServer, headset: FakeHeadset) -> bool:
     return server.statistics.peer == "{}:{}".format(*headset.socket.getsockname())
 
 
-def test_while_one_headset_drives_others_are_refused_with_a_reason_and_the_log_has_a_line_for_eight_hosts(
+def test_if_one_headset_drives_other_headsets_are_refused_with_a_reason_and_the_log_names_eight_hosts(
     server: HeadsetServer, clock: HandClock, caplog: pytest.LogCaptureFixture
 ) -> None:
     hosts = [f"127.0.0.{number}" for number in range(1, 14)]
@@ -84,7 +84,7 @@ def test_while_one_headset_drives_others_are_refused_with_a_reason_and_the_log_h
     assert "refused: 127.0.0.1:" in lines[0]
 
 
-def test_a_headset_that_reconnects_after_an_unnoticed_loss_drives_at_once_as_a_new_connection(
+def test_if_a_headset_reconnects_after_an_unnoticed_loss_it_drives_at_once_as_a_new_connection(
     server: HeadsetServer, clock: HandClock, caplog: pytest.LogCaptureFixture
 ) -> None:
     with driving(server) as lost:

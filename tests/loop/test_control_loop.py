@@ -112,7 +112,7 @@ def test_arms_that_lost_their_session_brake_from_measured_states_until_a_state_j
         pytest.param((0.0, 0.6), 0.9, 0.9, id="less closed to that one"),
     ],
 )
-def test_a_gripper_that_was_held_may_only_move_back_while_the_arms_are_at_rest(
+def test_while_the_arms_rest_a_gripper_that_did_not_get_its_wanted_opening_may_only_move_back(
     before: tuple[float, float] | None, wanted: float, granted: float
 ) -> None:
     assert without_proof(wanted, before) == granted

@@ -61,7 +61,7 @@ def test_it_is_an_error_if_a_joint_does_not_follow_or_if_other_joints_move_with_
 
 
 @pytest.mark.slow
-def test_an_arm_whose_hand_lets_go_stops_within_its_certified_stop_plus_the_latency(config: Config) -> None:
+def test_if_a_hand_lets_go_its_arm_stops_within_the_certified_stop_plus_the_latency(config: Config) -> None:
     with slow_run(config) as run:
         report = measure_stop(run, "left")
     assert report.tool_speed_mm_s == pytest.approx(30.0, abs=1.0)

@@ -1,4 +1,4 @@
-"""Hands move beyond the edge of reach, over a network that delays samples in bursts. No arm ever lurches."""
+"""Hands move beyond the edge of reach, over a network that delays samples in bursts. No tool stands still meanwhile."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.support.processes import Watch, cell
 
 SECONDS, RATE = 37.0, 72.0  # Duration [s], and rate of the hands [Hz].
 LET_THROUGH = 1.0  # Time between two delays of the network [s].
-# Delays of the network [s]. Six of seven delays hold up ten samples. The seventh is longer than the gate's timeout.
+# Delays of the network [s]. In six of seven delays, ten samples wait. The seventh is longer than the gate's timeout.
 HELD_UP = 0.13, 0.165
 FROM, BEYOND = -0.15, 0.15  # Range of the targets relative to the edge of reach [m].
 # Longest time in which a target may move while its tool does not, for example where the target reverses [s].
@@ -29,7 +29,7 @@ _WAITS = 0.4  # An operator whose arm does not follow presses after this time [s
 
 
 class Bursts(SampleTiming):
-    """Samples at an even rate. All samples that a delay holds up arrive together at its end."""
+    """Samples at an even rate. All samples that wait during a delay of the network arrive together at its end."""
 
     def __init__(self) -> None:
         self._t = 0.0

@@ -133,7 +133,7 @@ class LeftUpperPresses(ScriptedInput):
 
 
 @pytest.mark.slow
-def test_a_gripper_that_the_limiter_keeps_from_closing_counts_as_holding_no_object(
+def test_if_the_limiter_keeps_a_gripper_from_closing_the_gripper_counts_as_holding_no_object(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(GripperLimiter, "limit", lambda *_: {"left": 0.5, "right": 1.0})

@@ -68,7 +68,7 @@ class LeadingThread:
 
 
 @pytest.mark.slow
-def test_a_run_whose_arms_hardly_rise_is_not_killed_and_the_error_asks_for_free_space_above_them(
+def test_if_the_arms_hardly_rise_the_run_is_not_killed_and_the_error_asks_for_free_space_above_them(
     config: Config, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     slow = config.model_copy(update={"control": config.control.model_copy(update={"max_linear_speed": 0.005})})

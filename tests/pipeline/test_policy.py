@@ -172,7 +172,7 @@ def touching(plant: MujocoPlant) -> set[str]:
     return {name for body in bodies if (name := plant.model.body(body).name).startswith(SIDES)}
 
 
-def test_a_policy_that_would_make_the_arms_collide_causes_no_contact_and_the_summary_names_the_pair() -> None:
+def test_if_a_policy_would_make_the_arms_collide_nothing_touches_and_the_summary_names_the_pair() -> None:
     policy, touched = PolicyInput(), set[str]()
     loop = pipeline(source=policy, plant="mujoco")
     plant, home, goal = loop.plant, loop.robot.home, colliding(loop)

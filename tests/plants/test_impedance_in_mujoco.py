@@ -70,7 +70,9 @@ def along(axis: int, force: float = FORCE) -> Array:
 @pytest.mark.parametrize(
     ("name", "axis"), [("home", 0), ("reaching far", 1), ("drawn in", 2), ("high", 0), ("elbow out", 1)]
 )
-def test_a_push_moves_the_tool_by_force_over_stiffness(bare: MujocoPlant, robot: Robot, name: str, axis: int) -> None:
+def test_a_push_moves_the_tool_by_the_force_divided_by_the_stiffness(
+    bare: MujocoPlant, robot: Robot, name: str, axis: int
+) -> None:
     loop = TorqueLoop(bare, robot, SETTINGS, posture(robot, name), SLOW)
     bare.push("left", along(axis), 60.0)
     loop.settle()

@@ -36,7 +36,9 @@ def test_joint_space_inertia_and_gravity_equal_the_controllers_model(plant: Mujo
     np.testing.assert_allclose(plant.data.qfrc_bias[index], gravity, atol=1e-5)
 
 
-def test_each_joint_has_the_share_of_its_rotor_inertia_that_the_cell_sets(config: Config, robot: Robot) -> None:
+def test_the_rotor_inertia_of_each_joint_is_multiplied_by_the_rotor_share_of_the_cell(
+    config: Config, robot: Robot
+) -> None:
     share = config.mujoco.model_copy(update={"rotor_share": 0.25})
     lighter = MujocoPlant(robot, config.model_copy(update={"mujoco": share}))
     for name, armature in zip(robot.joint_names, robot.model.armature, strict=True):

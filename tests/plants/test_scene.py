@@ -38,9 +38,7 @@ def test_every_finger_pad_has_a_contact_pair_with_the_table_and_the_friction_of_
     np.testing.assert_array_equal(of_pads, np.tile(model.geom_solref[table], (len(pads), 1)))
 
 
-def test_a_soft_object_under_a_force_is_compressed_by_the_force_over_its_stiffness(
-    robot: Robot, config: Config
-) -> None:
+def test_a_force_compresses_a_soft_object_by_the_force_divided_by_its_stiffness(robot: Robot, config: Config) -> None:
     plant = MujocoPlant(robot, config)
     sponge, heights = plant.model.body("sponge").id, []
     for force in (0.0, 5.0, 10.0):

@@ -24,7 +24,10 @@ _ROUNDING = 1e-9
 
 
 def cost_of(problem: QpProblem, v: Array) -> float:
-    """Return f at velocities ``v`` (nv,) [rad/s]. Hard rows have no cost in it."""
+    """Return the cost f, which the module's docstring defines, at velocities ``v`` (nv,) [rad/s].
+
+    Hard rows have no part in this cost.
+    """
     soft = len(problem.rows_lower) - problem.hard
     slack = np.maximum(problem.rows_lower - problem.rows @ v, 0.0)[:soft]
     softness = row_softness(problem.H, problem.rows)[:soft]

@@ -80,7 +80,7 @@ def _every(solver: str, name: str) -> pytest.ParameterSet:
 
 
 @pytest.mark.parametrize(("solver", "name"), [_every(solver, name) for solver in NAMES for name in MOTIONS])
-def test_with_every_solver_arms_keep_the_contract_come_to_rest_and_follow_as_well_as_with_daqp(
+def test_with_every_solver_arms_keep_the_contract_and_come_to_rest_and_follow_as_well_as_with_daqp(
     solver: str, name: str
 ) -> None:
     run = motion(solver, name)

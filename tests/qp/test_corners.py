@@ -109,7 +109,9 @@ def test_every_tick_from_an_extreme_state_is_solved_and_keeps_the_contract(solve
 
 @pytest.mark.parametrize("sign", [1.0, -1.0], ids=["upper", "lower"])
 @pytest.mark.parametrize("solver", each_solver())
-def test_a_joint_at_its_limit_that_still_moves_towards_it_brakes_as_hard_as_possible(solver: str, sign: float) -> None:
+def test_a_joint_at_its_limit_brakes_as_hard_as_possible_if_it_still_moves_towards_the_limit(
+    solver: str, sign: float
+) -> None:
     controller = controller_with(solver)
     settings = controller.settings
     braking = ROBOT.capped_acceleration(settings.acceleration_limit)

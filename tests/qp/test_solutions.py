@@ -195,7 +195,7 @@ def test_daqp_called_through_qpsolvers_finds_the_same_solutions_as_daqp_called_d
 
 
 def test_slacks_of_the_public_problem_equal_the_violations_of_rows_and_have_the_same_cost() -> None:
-    """The solution x = [v; s] of the problem that ``CartesianController.problem`` returns costs the same as f at v."""
+    """The solution x = [v; s] of the problem that ``CartesianController.problem`` returns has the cost f(v)."""
     for motion in ("targets that cross", "recovery from penetration"):
         for problem in problems_of(motion):
             nv, public = len(problem.g), slack_problem(problem)

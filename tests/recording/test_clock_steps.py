@@ -25,7 +25,7 @@ def test_a_step_of_the_clock_is_found_with_its_time_and_its_size(step: float) ->
     assert ("back" in clock_step_text(step)) == (step < 0.0)
 
 
-def test_late_ticks_lost_ticks_and_uneven_times_of_receipt_do_not_count_as_a_step_of_the_clock() -> None:
+def test_neither_late_nor_lost_ticks_nor_uneven_times_of_receipt_count_as_a_step_of_the_clock() -> None:
     numbers, t, dt = ticks()
     late, at_once = t.copy(), t.copy()
     late[8:] += 2.0  # The late tick records this delay in its ``dt``.

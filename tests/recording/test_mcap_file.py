@@ -128,7 +128,7 @@ def test_a_recording_has_the_same_content_after_it_was_rewritten_by_a_writer(
     assert len(names) > 8
 
 
-def test_a_file_that_is_sorted_by_topic_so_that_ticks_come_without_their_hand_samples_is_refused(
+def test_a_file_is_refused_if_it_is_sorted_by_topic_because_its_ticks_come_without_hand_samples(
     file: Path, tmp_path: Path
 ) -> None:
     """Each chunk of the file has messages of one topic only. A replay of a tick without its samples would differ."""

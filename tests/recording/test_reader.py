@@ -60,7 +60,7 @@ def events(*told: tuple[float, ReasonKind]) -> list[Event]:
 
 
 @pytest.mark.parametrize(("told", "expected"), CASES.values(), ids=CASES)
-def test_a_recording_has_the_episodes_that_the_operator_began_with_the_operators_ratings(
+def test_the_events_of_a_recording_give_the_episodes_of_its_operator_and_their_ratings(
     told: list[tuple[float, ReasonKind]], expected: list[tuple[float, float, bool, bool | None]]
 ) -> None:
     spans = spans_of(events(*told))
@@ -148,7 +148,7 @@ def messages_or_fault(file: Path) -> list[messages.Message] | str | None:
         return None if found is None else found.group(0)
 
 
-def test_a_completed_file_with_a_record_that_would_end_beyond_the_file_counts_as_damaged(tmp_path: Path) -> None:
+def test_if_a_record_of_a_completed_file_would_end_beyond_the_file_the_file_counts_as_damaged(tmp_path: Path) -> None:
     about = About.of(pipeline(), realtime=True, notes={}, cameras=())
     file = tmp_path / "file.mcap"
     with BagWriter(file, [messages.Topic(1, messages.STATE, messages.TEXT)], about) as bag:
@@ -218,7 +218,9 @@ def test_arrays_and_texts_are_read_as_written_and_an_array_of_another_length_is_
     assert messages.data_of(messages.text("grüezi"), messages.TEXT) == "grüezi"
 
 
-def test_a_file_whose_last_bytes_point_to_an_index_beyond_its_end_counts_as_unfinished(tmp_path: Path) -> None:
+def test_if_the_last_bytes_of_a_file_point_to_an_index_beyond_its_end_the_file_counts_as_unfinished(
+    tmp_path: Path,
+) -> None:
     about, file = About.of(pipeline(), realtime=True, notes={}, cameras=()), tmp_path / "cut.mcap"
     with BagWriter(file, [messages.Topic(1, messages.STATE, messages.TEXT)], about) as bag:
         bag.write([messages.Message(1, 0, about.epoch, 0, messages.text("state"))])

@@ -141,7 +141,9 @@ class FaultyHands(ScriptedInput):
     _now = 0.0
 
 
-def test_lost_connections_numbers_that_are_not_finite_and_faults_of_the_input_are_replayed(tmp_path: Path) -> None:
+def test_a_replay_repeats_lost_connections_and_numbers_that_are_not_finite_and_faults_of_the_input(
+    tmp_path: Path,
+) -> None:
     teleop = TeleopSettings.model_validate({"bindings": {"device": {"pedal": "record_mark"}}})
     file = file_of(record(tmp_path, pipeline(source=FaultyHands("circle"), teleop=teleop), 1.3))
     result = replay(file)
@@ -160,7 +162,7 @@ class LosesItsSensors(KinematicPlant):
         return changed(state, q=np.full_like(state.q, np.nan)) if state.stamp > 1.0 else state
 
 
-def test_the_replay_of_a_run_that_a_fault_ended_ends_with_the_same_fault(tmp_path: Path) -> None:
+def test_if_a_fault_ended_a_run_its_replay_ends_with_the_same_fault(tmp_path: Path) -> None:
     plant = LosesItsSensors(Robot.from_config(cell()), cell())
     recorders: list[Recorder] = []
     with pytest.raises(PlantError) as fault:

@@ -115,7 +115,7 @@ def test_the_body_for_a_wider_interval_of_openings_contains_the_body_for_an_inte
         assert body.part(ALL_OF_THE_WAY) == (0.0, 1.0)
 
 
-def test_if_closed_and_open_positions_are_unknown_bodies_cover_all_positions_of_fingers() -> None:
+def test_bodies_cover_all_positions_of_fingers_if_closed_and_open_positions_are_unknown() -> None:
     made = Robot.from_config(HAND_E)
     plain = Robot.from_urdf(made.urdf, {arm.name: arm.tool_frame for arm in made.arms.values()})
     assert plain.finger_bodies == ()

@@ -140,7 +140,9 @@ def cell(tmp_path_factory: pytest.TempPathFactory) -> Config:
 
 
 @pytest.mark.parametrize("opening", [0.0, 0.4, 1.0])
-def test_a_fingertip_is_in_every_model_where_its_chain_of_mimics_puts_it(cell: Config, opening: float) -> None:
+def test_in_every_model_a_fingertip_is_at_the_position_that_its_chain_of_mimic_joints_gives(
+    cell: Config, opening: float
+) -> None:
     joint_tree = pytest.importorskip("q2r2_control.viewer.joint_tree", reason="needs trimesh", exc_type=ImportError)
     robot = Robot.from_config(cell)
     finger = 0.5 * opening
@@ -161,7 +163,7 @@ def test_a_fingertip_is_in_every_model_where_its_chain_of_mimics_puts_it(cell: C
     assert np.linalg.norm(at - start - along * (end - start)) <= radius - 0.01 + 1e-6
 
 
-def test_a_simulated_fingertip_starts_where_its_chain_of_mimics_puts_it(cell: Config) -> None:
+def test_a_simulated_fingertip_starts_at_the_position_that_its_chain_of_mimic_joints_gives(cell: Config) -> None:
     robot = Robot.from_config(cell)
     plant = MujocoPlant(robot, cell)
     try:

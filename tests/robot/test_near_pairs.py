@@ -72,7 +72,7 @@ def test_the_warning_contains_python_code_that_prevents_the_warning(
         ("tiago_dual", {"left": "hand_left_grasping_frame", "right": "hand_right_grasping_frame"}),
     ],
 )
-def test_if_pairs_are_too_near_at_home_and_other_links_hardly_part_two_needed_changes_are_named(
+def test_two_needed_changes_are_named_if_pairs_are_too_near_at_home_and_other_links_hardly_part(
     model: str, tools: dict[str, str], caplog: pytest.LogCaptureFixture
 ) -> None:
     file = load_description(f"example-robot-data:{model}").file
@@ -96,7 +96,7 @@ def test_an_srdf_that_names_the_pair_prevents_the_warning(ur5: Path, caplog: pyt
     assert made(ur5, caplog, srdf=f'<robot name="ur5">{both}</robot>')[1] == []
 
 
-def test_the_warning_about_a_pair_that_other_postures_bring_apart_proposes_another_home(
+def test_if_other_postures_bring_a_pair_apart_the_warning_about_it_proposes_another_home(
     ur5: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     bent = {"elbow_joint": 2.9, "shoulder_lift_joint": -1.2}
@@ -136,7 +136,7 @@ def test_an_invalid_home_is_refused(ur5: Path, home: object, said: str) -> None:
     assert said in str(error.value)
 
 
-def test_all_joints_of_a_home_outside_their_limits_are_named_at_once(ur5: Path) -> None:
+def test_one_error_names_all_joints_of_a_home_outside_their_limits(ur5: Path) -> None:
     home = {"elbow_joint": 90.0, "wrist_1_joint": 0.0, "wrist_2_joint": -45.0}
     with pytest.raises(RobotError) as error:
         Robot.from_urdf(ur5, {"left": "ee_link"}, home=home)

@@ -26,7 +26,7 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> PairsWritten:
     return write_pairs(CONFIG, tmp_path_factory.mktemp("pairs") / "cell.srdf", 2000, 0.05)
 
 
-def test_only_pairs_that_no_posture_brings_near_are_left_unmonitored(found: PairsWritten) -> None:
+def test_a_pair_is_left_unmonitored_only_if_no_posture_brings_its_bodies_near_each_other(found: PairsWritten) -> None:
     assert found.never
     assert min(pair.nearest for pair in found.never) > 0.05
     robot, pruned = Robot.from_config(CONFIG), Robot.from_config(_with(CONFIG, srdf=found.file))

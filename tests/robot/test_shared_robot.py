@@ -181,7 +181,7 @@ def test_the_commands_check_and_run_accept_a_cell_whose_arms_are_parts_of_one_ro
     assert all(arm["position_error_mm_rms"] < 20.0 for arm in summary["arms"].values())
 
 
-def test_both_arms_can_carry_the_same_tool_whose_names_get_the_prefix_of_their_side() -> None:
+def test_if_both_arms_have_the_same_tool_the_names_in_each_tool_get_the_prefix_of_its_arms_side() -> None:
     cell = copy.deepcopy(BAXTER)
     fingers = {"joints": ["finger_joint_1", "finger_joint_2"], "open_position": 0.025}
     for arm in cell["arms"].values():

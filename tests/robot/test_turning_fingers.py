@@ -171,7 +171,7 @@ def test_a_body_contains_the_positions_between_samples_even_if_there_are_few_sam
         assert outside(moved(chain, body.ends, at), capsule, body.radius) <= 0.0
 
 
-def test_a_capsule_is_inside_another_one_if_the_balls_at_both_of_its_ends_are() -> None:
+def test_a_capsule_is_inside_another_capsule_if_the_balls_at_both_of_its_ends_are_inside() -> None:
     outer = Capsules(np.zeros((1, 3)), np.array([[0.0, 0.0, 0.1]]), np.array([0.02]))
     inside = Capsules(np.array([[0.005, 0.0, 0.0]]), np.array([[0.0, 0.004, 0.1]]), np.array([0.014]))
     assert not sticks_out(inside, outer).any()

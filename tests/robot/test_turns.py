@@ -48,7 +48,9 @@ def test_the_position_of_a_joint_with_limits_is_never_changed(robot: Any) -> Non
     assert counter.counted(np.array([0.0, -3.1, 0.0]), PERIOD)[1] == -3.1
 
 
-def test_after_a_pause_in_which_a_joint_may_have_made_half_a_turn_its_report_is_used_unchanged(robot: Any) -> None:
+def test_if_a_joint_may_have_made_half_a_turn_since_its_last_report_the_new_report_is_used_unchanged(
+    robot: Any,
+) -> None:
     counter = TurnCounter(robot)
     counter.counted(np.array([3.1, 0.0, 3.1]), 0.0)
     found = counter.counted(np.array([-3.1, 0.0, -3.1]), 0.8)

@@ -159,7 +159,7 @@ def test_an_arm_needs_the_pose_of_its_tool_and_a_gripper_needs_its_server(rig: A
     assert rig.state["gripper"] == "open"
 
 
-def test_the_services_pause_and_reset_and_a_second_publisher_of_targets_pause_the_arm(
+def test_each_of_the_services_pause_and_reset_pauses_the_arm_and_so_does_a_second_publisher_of_targets(
     rig: ArmRig, node: Any, processes: Processes
 ) -> None:
     rig.start(processes)
@@ -219,7 +219,7 @@ def test_a_gripper_counts_as_closed_when_the_result_of_its_goal_says_stalled(
 
     def execute(goal: Any) -> Any:
         goals.put(goal.request.command)
-        goal.abort()  # Real grippers abort a goal if they are held up.
+        goal.abort()  # Real grippers abort a goal if an object stops their fingers.
         return action.Result(stalled=stalls)
 
     with spun_node(domain, "gripper") as other:

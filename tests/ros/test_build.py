@@ -76,7 +76,9 @@ def test_packages_of_a_sourced_install_are_kept_and_a_package_built_beside_it_is
     assert run.stdout.split() == [str(packages / "quest2ros"), "12"], run.stderr
 
 
-def test_each_build_says_which_of_how_many_packages_it_is(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_the_line_of_each_build_has_the_number_of_its_package_and_the_number_of_all_packages(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     """The builds themselves are left out, because they take minutes."""
     built: list[str] = []
     monkeypatch.setattr("q2r2_control.ros.launch.build.build", lambda package, prefix, log: built.append(package.name))

@@ -81,7 +81,7 @@ def test_a_second_publisher_of_commands_stops_both_arms_and_is_named(driven: Dri
     wait_until(lambda: driven.call("/cartesian_controller/reset").success, "a reset when it has ceased")
 
 
-def test_a_receiver_that_stands_still_while_joint_states_go_on_stops_both_arms_and_is_named(
+def test_if_a_receiver_stands_still_while_joint_states_come_both_arms_stop_and_the_receiver_is_named(
     node: Any, processes: Processes, robot: Robot
 ) -> None:
     """This test is the receiver. It acknowledges all commands, and passes them on until it stands still."""

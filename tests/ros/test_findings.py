@@ -153,7 +153,7 @@ def test_the_report_says_which_computers_nodes_can_find(variables: dict[str, str
 
 
 @pytest.mark.parametrize(("name", "told"), [("rmw_zenoh_cpp", True), ("rmw_fastrtps_cpp", False)])
-def test_a_middleware_without_acknowledgements_gets_a_note_that_a_hanging_receiver_is_not_noticed(
+def test_for_a_middleware_without_acknowledgements_a_note_says_that_hanging_receivers_are_not_found(
     name: str, told: bool
 ) -> None:
     _, findings = examine_environment({"RMW_IMPLEMENTATION": name, "ROS_DOMAIN_ID": "-1"})

@@ -156,7 +156,9 @@ def test_a_goal_that_the_gripper_refuses_ends_the_request(bench: Bench) -> None:
     assert bench.client.state == "closed"
 
 
-def test_a_gripper_with_a_command_topic_waits_for_a_grant_and_counts_both_of_two_presses_before_it(domain: int) -> None:
+def test_before_a_grant_a_gripper_with_a_command_topic_gets_no_command_and_counts_both_of_two_presses(
+    domain: int,
+) -> None:
     with closing(Bench(domain, GripperType.FLOAT64_MULTI_ARRAY, "/fingers")) as bench:
         bench.client.toggle(time.monotonic())
         bench.client.toggle(time.monotonic())

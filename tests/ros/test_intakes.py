@@ -82,7 +82,7 @@ def test_a_late_target_is_passed_on_as_none_and_reported(context: Any, robot: Ro
     node.destroy_node()
 
 
-def test_a_target_whose_stamp_lies_before_a_standstill_of_its_sender_is_not_used(
+def test_a_target_is_not_used_if_its_sender_stood_still_after_the_stamp_of_the_target(
     context: Any, robot: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     node = BaseNode("intake", context=context)
@@ -132,7 +132,7 @@ def test_a_late_command_does_not_move_the_simulated_robot_and_is_reported(defaul
     node.destroy_node()
 
 
-def test_joint_states_of_single_arms_are_merged_once_all_joints_are_known(context: Any, robot: Robot) -> None:
+def test_joint_states_of_single_arms_are_merged_as_soon_as_all_joints_are_known(context: Any, robot: Robot) -> None:
     given = as_arguments(*(f"{arm}.joint_states_topic:=/{arm}/joint_states" for arm in robot.arms))
     node = BaseNode("intake", context=context, cli_args=given)
     intake = JointIntake(node, robot)

@@ -49,7 +49,7 @@ def test_no_guard_trips_and_no_command_jumps_however_the_sessions_end(release: s
     assert soak.moved > 1.0
 
 
-def test_a_session_that_begins_while_the_arms_still_brake_gets_no_command_of_the_stop(domain: int) -> None:
+def test_if_a_session_begins_while_the_arms_still_brake_it_gets_no_command_of_the_stop(domain: int) -> None:
     with virtual_lbrs("for Jazzy", domain) as virtual:
         Operator(virtual)
         left, supervisor = virtual.drivers["left"], virtual.node._supervisor
@@ -138,7 +138,7 @@ def test_command_topics_without_a_namespace_for_each_driver_are_refused(
 
 
 @pytest.mark.parametrize("release", TOPICS)
-def test_the_release_that_a_drivers_topics_belong_to_is_reported_once(
+def test_the_release_of_a_driver_is_recognised_by_its_topics_and_reported_once(
     release: str, context: Any, robot: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     node, told, (_, name) = BaseNode("controller", context=context), list[str](), TOPICS[release]

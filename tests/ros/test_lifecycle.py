@@ -128,7 +128,7 @@ def test_the_controller_activates_where_another_node_left_the_arms_once_this_nod
 
 
 @pytest.mark.parametrize("output", ["velocity", "torque"])
-def test_arms_with_velocity_or_torque_commands_rest_when_the_controller_is_deactivated_or_activated(
+def test_with_velocity_or_torque_commands_the_arms_rest_when_the_controller_is_deactivated_or_activated(
     domain: int, module_processes: Processes, processes: Processes, robot: Robot, output: str, tmp_path: Path
 ) -> None:
     module_processes.end_all()  # The nodes of this process have the same names.

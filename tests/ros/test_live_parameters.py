@@ -169,7 +169,7 @@ def test_a_subclass_may_mirror_its_arm_and_give_its_filter_in_samples(context: A
     made.destroy_node()
 
 
-def test_an_arm_whose_tool_pose_comes_on_a_topic_pauses_when_the_topic_is_silent(
+def test_if_the_tool_pose_of_an_arm_comes_on_a_topic_the_arm_pauses_when_the_topic_is_silent(
     rig: ArmRig, node: Any, processes: Processes
 ) -> None:
     rig.sends_tool = False

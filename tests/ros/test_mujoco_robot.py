@@ -62,7 +62,7 @@ def trajectory(robot: Robot, q: np.ndarray, names: tuple[str, ...] | None = None
     )
 
 
-def test_each_link_has_the_pose_in_its_parents_frame_that_robot_state_publisher_would_publish(
+def test_in_its_parents_frame_each_link_has_the_pose_that_robot_state_publisher_would_publish(
     cell: Cell, robot: Robot
 ) -> None:
     joints = [joint for joint in ElementTree.fromstring(robot.urdf) if joint.tag == "joint"]

@@ -140,7 +140,7 @@ print(executables._executable("hangs")(), 0.0 < left() <= 2.0)
 
 
 @pytest.mark.parametrize(("hangs", "said", "code"), [("hangs", "", -signal.SIGALRM), ("ends", "0 True\n", 0)])
-def test_a_node_that_ends_drops_its_priority_and_ends_in_time_even_if_its_middleware_hangs(
+def test_before_its_end_a_node_drops_its_priority_and_it_ends_in_time_even_if_its_middleware_hangs(
     hangs: str, said: str, code: int
 ) -> None:
     command = [sys.executable, "-c", HANGS, hangs]
@@ -275,7 +275,7 @@ def test_the_executor_delivers_latched_messages_and_runs_no_cancelled_tick(
     assert ticking.log == []
 
 
-def test_a_subscription_that_a_message_destroys_gets_no_further_message(
+def test_if_a_callback_destroys_a_subscription_this_subscription_gets_no_further_message(
     ticking: Ticking, executor: TickExecutor
 ) -> None:
     subscriptions: list[Any] = []

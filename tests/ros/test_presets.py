@@ -131,7 +131,7 @@ def start_arm(node: Any, processes: Processes, arm: str, mode: str) -> ArmRig:
     given = {
         **{"preset": PRESET, "mode": mode, "ctrl_prefix": prefix, "controller_node": "/theirs"},
         **{"base_frame_id": f"{arm}_link_0", "world_frame_id": "world", "teleop.linked": False},
-        **{"teleop.leash.distance": 0.0},  # An arm that lags on a machine with other load is not held up.
+        **{"teleop.leash.distance": 0.0},  # Without a leash, no target waits for an arm that is late.
     }
     processes.start_node(f"{arm}_arm_controller", *patient(given))
     return rig
@@ -213,7 +213,7 @@ def test_moveit_servo_is_switched_to_poses_after_each_of_its_starts(node: Any, m
 
 
 @pytest.mark.parametrize("name", ["fzi", "mayr", "crisp", "kuka_lbr_clik"])
-def test_a_preset_that_no_test_runs_differs_from_the_tested_preset_only_in_names_and_requests(name: str) -> None:
+def test_each_untested_preset_differs_from_the_tested_preset_only_in_names_and_requests(name: str) -> None:
     preset, run = PRESETS[name], PRESETS[PRESET]
     assert (preset.hold, preset.guard, preset.takes_targets) == (run.hold, run.guard, run.takes_targets)
     assert preset.command_type is None

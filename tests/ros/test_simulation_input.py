@@ -220,7 +220,7 @@ def test_a_lost_arm_is_not_engaged_by_the_script_after_a_call_of_a_controller_se
     hand.destroy_node()
 
 
-def test_a_lost_arm_that_is_ready_too_late_is_left_to_a_person_who_is_told_how(context: Any) -> None:
+def test_if_a_lost_arm_is_ready_too_late_only_a_person_can_engage_it_and_the_report_says_how(context: Any) -> None:
     hand = following_hand(context)
     assert hand.play(22.9, **lost("hand_silent", ready=False)) == 1
     assert "engage" not in hand.health()[1]

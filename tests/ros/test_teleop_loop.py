@@ -71,7 +71,7 @@ def test_homing_ends_with_the_outcome_that_the_controller_reports_or_else_with_a
         ((True, "done"), "lost: not_homing: homing_not_begun"),
     ],
 )
-def test_homing_that_the_controller_does_not_begin_ends_with_a_fault(
+def test_if_the_controller_does_not_begin_homing_the_homing_ends_with_a_fault(
     answer: tuple[bool, str] | None, event: str
 ) -> None:
     way = WayHome()

@@ -119,7 +119,7 @@ def test_after_a_jump_of_the_target_the_velocity_stays_within_the_limits_of_the_
 
 
 @pytest.mark.parametrize("state", [ArmState.PAUSED, ArmState.LOST])
-def test_an_arm_that_is_paused_or_lost_brakes_and_then_gets_velocity_zero_as_long_as_it_holds(
+def test_a_paused_or_lost_arm_brakes_and_then_gets_velocity_zero_as_long_as_it_holds(
     state: ArmState, driven: Driven
 ) -> None:
     moving(driven)

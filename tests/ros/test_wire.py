@@ -137,7 +137,7 @@ def test_transforms_of_several_senders_are_read_correctly() -> None:
                 assert pin.XYZQUATToSE3(np.array(one.numbers)).isApprox(pose, 1e-12)
 
 
-def test_each_link_has_the_pose_in_its_parents_frame_that_it_has_in_mujoco(robot: Robot) -> None:
+def test_in_its_parents_frame_each_link_has_the_same_pose_as_in_mujoco(robot: Robot) -> None:
     plant = MujocoPlant(robot, load_config(CONFIG))
     plant.reset(robot.home + 0.2)
     model, data = plant.model, plant.data

@@ -174,7 +174,7 @@ class VirtualLbrs:
 
 
 class Operator:
-    """An operator who presses a moment after both arms are ready, and lets go a moment after they are not."""
+    """An operator who presses a moment after both arms are ready, and releases a moment after they are not."""
 
     def __init__(self, virtual: VirtualLbrs) -> None:
         self._virtual, self._random = virtual, virtual.random

@@ -229,7 +229,7 @@ def test_a_histogram_ignores_numbers_that_are_not_finite_and_counts_numbers_beyo
 
 
 @pytest.mark.parametrize(("off", "followed"), [(0.0, True), (0.256, False)])
-def test_an_arm_whose_tool_is_far_from_its_reference_at_the_end_counts_as_not_following(
+def test_if_a_tool_is_far_from_its_reference_at_the_end_its_arm_counts_as_not_following(
     statistics: RunStatistics, off: float, followed: bool
 ) -> None:
     led = {arm: statistics.robot.tool_pose(statistics.robot.home, arm) for arm in SIDES}

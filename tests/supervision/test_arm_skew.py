@@ -73,7 +73,7 @@ def test_if_lags_differ_for_too_long_the_arm_that_is_behind_is_named() -> None:
     assert sentence(fault) == "right: 20 ms behind the other arm; allowed: 11 ms"
 
 
-def test_arms_whose_lags_differ_from_the_beginning_are_stopped_after_a_tenth_of_a_second() -> None:
+def test_if_lags_differ_since_the_first_tick_the_arms_are_stopped_after_a_tenth_of_a_second() -> None:
     watch, found = SkewWatch(), []
     for now in (5.0, 5.09, 5.11):
         watch.observe(timings(left=4.0), now)
@@ -108,7 +108,7 @@ def test_both_arms_brake_while_one_is_behind_and_go_on_when_it_has_caught_up(
     assert controller.tool_pose("left").translation[2] == pytest.approx(left.translation[2] + 0.05, abs=1e-3)
 
 
-def test_arms_whose_lags_stay_different_are_stopped_and_hold_when_the_lags_are_equal_again(
+def test_if_lags_stay_different_the_arms_are_stopped_and_hold_even_if_the_lags_become_equal_again(
     robot: Robot, controller: CartesianController
 ) -> None:
     world = World(robot, controller)

@@ -129,7 +129,7 @@ def test_the_pair_that_is_farthest_below_its_own_required_distance_is_named(robo
 
 
 @pytest.mark.parametrize(("joint", "by"), [(0, 0.1), (6, 0.4)], ids=["by a distance", "by an angle alone"])
-def test_an_arm_whose_tool_stays_away_from_its_reference_gets_a_new_reference_at_the_measured_tool(
+def test_if_a_tool_stays_away_from_its_reference_the_arm_gets_a_new_reference_at_the_measured_tool(
     world: World, joint: int, by: float
 ) -> None:
     moved = world.robot.home.copy()
@@ -175,7 +175,7 @@ def test_an_arm_may_lag_behind_its_reference_but_an_arm_that_moves_away_from_it_
     assert world.supervisor.phase is Phase.BRAKING
 
 
-def test_an_arm_whose_targets_end_during_motion_comes_to_rest_without_moving_back(world: World) -> None:
+def test_if_the_targets_of_an_arm_end_during_motion_the_arm_comes_to_rest_without_moving_back(world: World) -> None:
     tool, heights = world.controller.tool_pose("left"), []
     q = world.robot.home.copy()
     for tick in range(round(1.5 / DT)):

@@ -67,7 +67,7 @@ def gripper(controller: CartesianController) -> Cell:
     return Cell(controller)
 
 
-def test_the_monitored_interval_shrinks_around_a_closed_gripper_and_stays_while_the_gripper_rests(
+def test_the_interval_of_openings_shrinks_around_a_closed_gripper_and_does_not_change_while_it_rests(
     gripper: Cell,
 ) -> None:
     gripper.run(0.0, 0.5)
@@ -140,7 +140,7 @@ def test_the_body_beside_a_gripper_that_was_forced_open_is_named_and_the_gripper
         assert gripper.granted["left"] == wanted
 
 
-def test_a_limiter_that_resumes_monitors_a_gripper_at_once_at_its_commanded_and_measured_openings(
+def test_after_resume_a_gripper_is_monitored_at_once_from_its_commanded_to_its_measured_opening(
     controller: CartesianController,
 ) -> None:
     controller.reset(controller.robot.home)
@@ -202,7 +202,7 @@ def test_turning_fingers_close_only_as_far_as_the_table_allows_and_go_on_when_th
     assert controller.tool_pose("left").translation[2] > above_table(0.006).translation[2] + 0.005
 
 
-def test_a_gripper_whose_monitored_interval_may_not_shrink_does_not_count_as_held_up(gripper: Cell) -> None:
+def test_a_closed_gripper_does_not_count_as_held_if_its_interval_of_openings_may_not_shrink(gripper: Cell) -> None:
     controller = gripper.controller
     gripper.run(0.0, 0.05)
     with patch.object(controller, "set_opening", return_value=("finger", "table")):

@@ -134,7 +134,7 @@ def test_homing_can_be_interrupted_and_the_arms_then_come_to_rest_at_once(
     assert np.abs(world.state.q - at).max() < 0.04
 
 
-def test_homing_that_its_caller_ends_is_recorded_as_interrupted(robot: Robot, controller: CartesianController) -> None:
+def test_if_its_caller_ends_homing_the_outcome_is_interrupted(robot: Robot, controller: CartesianController) -> None:
     world = World(robot, controller, robot.home + 0.05)
     homing = world.supervisor.homing
     assert world.supervisor.go_home() is None
@@ -170,7 +170,7 @@ def test_homing_ends_if_only_the_straight_path_is_allowed_and_this_path_is_not_f
     assert homing.outcome is CommonReason.HOMING_NO_WAY
 
 
-def test_homing_waits_for_an_arm_that_is_held_up_and_then_ends_with_this_reason(robot: Robot) -> None:
+def test_if_an_arm_cannot_move_homing_waits_for_it_and_then_ends_with_this_reason(robot: Robot) -> None:
     settings = load_config(CONFIG).control
     homing = JointHoming(robot, lambda: (robot.distance_values, kept_distances(robot, settings).values), robot.home)
     q = robot.home.copy()
@@ -193,7 +193,7 @@ def test_homing_waits_for_an_arm_that_is_held_up_and_then_ends_with_this_reason(
         pytest.param(pin.SE3(pin.exp3(np.array([0.0, 0.0, 0.6])), np.zeros(3)), id="0.6 rad away, at 0.3 rad/s"),
     ],
 )
-def test_homing_of_tools_that_are_held_up_ends_five_seconds_after_the_tools_were_due_at_home(
+def test_if_the_tools_do_not_reach_home_homing_ends_five_seconds_after_they_were_due_at_home(
     robot: Robot, away: pin.SE3
 ) -> None:
     home = robot.tool_pose(robot.home, "left")
@@ -275,7 +275,7 @@ def test_a_path_home_avoids_a_moving_obstacle_at_the_position_that_was_reported(
     assert np.abs(world.state.q - controller.robot.home).max() < 0.004
 
 
-def test_a_moving_obstacle_that_enters_the_path_home_holds_the_arms_up_until_homing_ends(
+def test_if_a_moving_obstacle_enters_the_path_home_the_arms_wait_until_homing_ends(
     in_the_way: tuple[CartesianController, Array, Array],
 ) -> None:
     controller, turned, middle = in_the_way

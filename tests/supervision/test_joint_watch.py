@@ -152,7 +152,7 @@ def test_creeping_arms_are_not_settled_and_resting_arms_are_settled_after_the_se
     assert not watch.settled(now + SETTINGS.state_timeout + 1e-6), "the newest state is too old"
 
 
-def test_arms_whose_session_is_lost_may_brake_from_joint_states_that_still_arrive(joints: Joints) -> None:
+def test_if_their_session_is_lost_arms_may_brake_from_joint_states_that_still_arrive(joints: Joints) -> None:
     joints.watch.lose(Reason.of(CommonReason.LOOP_STALLED, duration=1.0))
     assert joints.fault() is CommonReason.LOOP_STALLED
     assert joints.watch.believed
@@ -163,7 +163,7 @@ def test_arms_whose_session_is_lost_may_brake_from_joint_states_that_still_arriv
     assert not joints.watch.believed
 
 
-def test_arms_that_lose_their_session_during_another_fault_may_not_brake_from_their_states(joints: Joints) -> None:
+def test_if_arms_lose_their_session_during_another_fault_they_may_not_brake_from_their_states(joints: Joints) -> None:
     joints.watch.observe(Reason.of(RosReason.BAD_JOINT_STATES, text="elbow is missing"), joints.now)
     joints.watch.lose(Reason.of(CommonReason.LOOP_STALLED, duration=1.0))
     assert not joints.watch.believed

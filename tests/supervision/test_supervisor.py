@@ -236,7 +236,7 @@ def test_the_loss_of_joint_states_brakes_the_arms_and_the_return_of_the_states_m
     assert kinds(world.supervisor.events[1]) == "joint_states: states_silent"
 
 
-def test_an_arm_with_a_joint_that_cannot_bear_gravity_is_stopped_and_the_reason_tells_the_torque(
+def test_if_a_joint_cannot_bear_gravity_its_arm_is_stopped_and_the_reason_tells_the_torque(
     world: World, robot: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(robot, "torque_limit", np.full_like(robot.torque_limit, 1e-3))
@@ -358,7 +358,7 @@ def test_arms_that_only_lag_behind_their_commands_do_not_count_as_off_their_refe
     assert world.supervisor.follows("left")
 
 
-def test_arms_that_brake_near_each_other_rest_at_the_end_of_their_stop_and_do_not_move_apart_by_themselves(
+def test_if_arms_brake_near_each_other_they_rest_after_their_stop_and_do_not_move_apart_by_themselves(
     world: World, controller: CartesianController
 ) -> None:
     world.q = np.array([-0.8, 0.42, -0.69, -1.49, 0.43, 1.12, -0.28, 0.52, 0.47, 0.18, -1.31, -0.02, 1.32, 0.36])

@@ -76,7 +76,7 @@ def test_two_publishers_that_alternate_are_found_at_the_third_and_fifth_message(
     assert all(count >= 2 for count in found[4:])
 
 
-def test_numbers_may_be_skipped_and_numbers_of_a_new_publisher_count_as_one_break_for_a_time() -> None:
+def test_skipped_numbers_are_no_break_and_the_numbers_of_a_new_publisher_count_as_one_break_for_a_time() -> None:
     assert not any(breaks([7, 8, 9, 20, 21, 60, 61]))
     found = breaks([*range(500, 520), *range(1, 150)])
     assert found[19:21] == [0, 1]

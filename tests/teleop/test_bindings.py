@@ -71,7 +71,7 @@ def test_controls_that_are_pressed_and_released_during_motion_make_no_target_jum
     assert driver.states == ENGAGED
 
 
-def test_an_arm_that_is_engaged_while_the_control_for_precision_is_held_moves_precisely_at_once() -> None:
+def test_if_the_control_for_precision_is_held_while_an_arm_is_engaged_the_arm_moves_precisely_at_once() -> None:
     driver = hands.operator(bindings={"grip": "precision"})
     driver.run(0.1)
     driver.held = {"grip": 1.0}

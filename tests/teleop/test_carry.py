@@ -167,7 +167,7 @@ class TestItEnds:
         driver.assert_holds()
 
     @pytest.mark.parametrize("linked", [True, False])
-    def test_a_fault_of_the_hand_that_moves_both_tools_ends_carrying(self, linked: bool) -> None:
+    def test_carrying_ends_if_the_hand_that_moves_both_tools_has_a_fault(self, linked: bool) -> None:
         driver = carrying(linked=linked)
         driver.silent = {"left"}
         driver.run(0.3)

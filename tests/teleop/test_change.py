@@ -24,7 +24,9 @@ def settings(driver: Operator, **changes: object) -> TeleopSettings:
 
 
 @pytest.mark.parametrize("changes", CHANGES.values(), ids=CHANGES)
-def test_an_arm_whose_settings_change_during_motion_goes_on_without_a_jump(changes: dict[str, object]) -> None:
+def test_if_the_settings_of_an_arm_change_during_motion_the_arm_goes_on_without_a_jump(
+    changes: dict[str, object],
+) -> None:
     driver = engaged()
     move = waving(driver)
     history = driver.run(0.4, move)

@@ -62,7 +62,7 @@ def test_an_event_causes_one_vibration_that_ends(happens: Event, pulse: Pulse) -
     assert haptics.at(9.0, "left") is None
 
 
-def test_a_vibration_comes_when_a_pause_begins_and_none_comes_when_the_pause_is_confirmed() -> None:
+def test_a_vibration_comes_when_a_pause_begins_and_no_vibration_comes_when_the_pause_is_confirmed() -> None:
     haptics = HapticPulses()
     haptics.start_pulse(event("pausing", "paused", TeleopReason.PRESSED))
     assert haptics.at(1.0, "left") is None

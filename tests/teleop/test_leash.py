@@ -221,10 +221,13 @@ RATE = 500.0  # Rate of the loop [Hz].
 
 @pytest.mark.slow
 @pytest.mark.parametrize("out", OUT.values(), ids=OUT)
-def test_an_arm_that_cannot_move_farther_rests_and_then_follows_the_hand_back_at_once_without_a_lurch(
+def test_a_blocked_arm_rests_and_then_follows_the_returning_hand_at_once_without_a_fast_motion(
     out: Array,
 ) -> None:
-    """The left hand moves away smoothly within 2.5 s, trembles there, and comes back by ``BACK`` at ``HELD``."""
+    """Within 2.5 s, the left hand moves away smoothly. Then it trembles in place.
+
+    At the time ``HELD``, it begins to come back by the distance ``BACK``.
+    """
     farthest = float(np.linalg.norm(out))
 
     def hand(t: float) -> Array:

@@ -95,7 +95,7 @@ def test_the_first_target_after_a_pause_has_the_measured_position_and_the_last_t
         np.testing.assert_allclose(first.rotation, carried[arm], atol=1e-9)
 
 
-def test_a_thousand_pauses_in_which_the_hand_moves_do_not_move_the_target_off_the_tool() -> None:
+def test_the_target_still_begins_at_the_tool_after_a_thousand_pauses_in_which_the_hand_moves() -> None:
     teleop, tool, now = Teleop(TeleopSettings(), ("left",)), pose(0.5, 0.1, 0.4, (3.0, 0.2, 0.1)), 0.0
     random, hand, firsts = np.random.default_rng(0), pose(), []
     for press in range(2001):

@@ -142,7 +142,7 @@ def test_the_contract_finds_a_joint_that_cannot_stop_before_its_limit(robot: Rob
     assert "stop_position" in contract.observe(moved(q, np.zeros(14), FASTEST, apart), DT)
 
 
-def test_pairs_that_recover_must_not_come_closer_again_and_must_keep_their_distance_once_apart(
+def test_recovering_pairs_must_not_come_closer_and_must_keep_their_distance_as_soon_as_they_have_it(
     robot: Robot, apart: StepReport
 ) -> None:
     q, v = in_penetration(robot)

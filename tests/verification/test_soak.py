@@ -293,7 +293,7 @@ def test_a_wrong_reported_distance_is_found_by_coal() -> None:
     assert [found.promise for found in report.broken] == ["reported distance off Coal's"]
 
 
-def test_arms_that_come_too_close_are_found_at_ticks_between_ticks_and_during_stops() -> None:
+def test_arms_that_come_too_close_are_found_at_ticks_and_between_ticks_and_during_stops() -> None:
     """The controller keeps 20 mm, but the contract is checked with 150 mm."""
     report = soak(lambda reference: reference, 0, 1000, settings=SETTINGS.model_copy(update={"min_distance": 0.15}))
     promises = {found.promise for found in report.broken}

@@ -49,7 +49,7 @@ def test_the_first_violation_of_each_promise_is_kept_with_its_seed() -> None:
     assert [(one.promise, one.seed) for one in found.broken] == [("room", 1), ("speed", 2)]
 
 
-def test_a_value_that_is_not_a_number_stays_the_worst_value_and_the_largest_growth_of_memory_is_kept() -> None:
+def test_the_value_nan_stays_the_worst_value_and_the_largest_growth_of_memory_is_kept() -> None:
     values = [margin(0.9, 1), margin(math.nan, 2, 1), margin(0.99, 3)]
     growths = (0.5, 2.5, 1.0)
     reports = [report(seed, margins=[values[seed]], memory_growth_mb=growths[seed]) for seed in range(3)]

@@ -51,7 +51,7 @@ def test_for_an_arm_away_from_its_target_the_sentence_names_the_limit_that_holds
     assert words(tick_at(robot, 1.0), *binding) == expected
 
 
-def test_for_an_arm_at_its_target_the_sentence_says_that_the_arm_follows_whatever_limits_are_active(
+def test_whatever_limits_are_active_the_sentence_says_of_an_arm_at_its_target_that_it_follows(
     robot: Robot,
 ) -> None:
     tick = tick_at(robot, 1.0)
@@ -96,7 +96,7 @@ def test_a_reason_stays_until_the_state_changes_and_the_reason_of_a_refusal_is_a
     assert words(lost, told=(silent, refused, paused)) == "a program asks for a pause"
 
 
-def test_a_request_to_pause_an_arm_that_is_paused_already_is_answered_for_a_short_time(robot: Robot) -> None:
+def test_if_a_paused_arm_is_asked_to_pause_the_answer_is_shown_for_a_short_time(robot: Robot) -> None:
     request, pause = Reason(TeleopReason.PAUSE_REQUESTED), Reason(TeleopReason.PAUSE_SERVICE)
     lost = replace(tick_at(robot, 1.0, engaged=False), states={"left": "lost", "right": "idle"})
     asked = Event(0.5, "left", "engaged", "engaged", request)

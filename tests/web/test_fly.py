@@ -233,7 +233,7 @@ PICTURES = """async ([took, times]) => {
 }"""
 
 
-def test_after_a_picture_that_takes_long_keys_get_as_much_time_and_the_next_picture_has_fewer_pixels(
+def test_after_a_slow_picture_keys_get_the_same_time_and_the_next_picture_has_fewer_pixels(
     open_page: Open, listen: Listen
 ) -> None:
     page = open_page(str(listen().url), COUNTING)

@@ -162,7 +162,7 @@ def test_the_extra_web_names_all_packages_that_the_page_needs() -> None:
     assert named.issuperset(_PACKAGES)
 
 
-def test_a_used_port_a_cable_with_another_host_and_a_bad_certificate_each_raise_a_clear_error(
+def test_the_error_is_clear_for_a_used_port_and_for_a_cable_with_a_host_and_for_a_bad_certificate(
     listen: Listen,
 ) -> None:
     source = listen()

@@ -1,8 +1,8 @@
 """The connection to one robot by pylibfranka. Only this module and hand.py call this library.
 
 pylibfranka keeps Python's global lock while it waits for a state. With one thread for each arm, the threads would delay
-each other. The process therefore waits for the sockets of all robots at once by ``select``, and reads a state only when
-it has come. pylibfranka does not say which socket it uses. The socket is therefore found among the files that a
+each other. The process therefore waits for the sockets of all robots together by ``select``, and reads a state only
+when it has come. pylibfranka does not say which socket it uses. The socket is therefore found among the files that a
 connection opens.
 """
 

@@ -205,9 +205,10 @@ _HALVINGS = 40  # Number of steps of the bisection.
 
 @kernel
 def measure_smooth(model: CollisionModel, data: CollisionData, p: int, smoothing: float) -> float:
-    """Return the smooth signed distance [m] of pair ``p``, whose cores do not meet, and fill ``data.contact``.
+    """Return the smooth signed distance [m] of pair ``p``, and fill ``data.contact``.
 
-    ``smoothing`` is e [m^2].
+    The core of a capsule is its segment, and the core of a rounded box is the box without the rounding. The two cores
+    must not touch. ``smoothing`` is the weight e of the small cost in the module's docstring [m^2].
     """
     bodies, posed, contact = model.bodies, data.posed, data.contact
     first, second = model.pairs.first[p], model.pairs.second[p]
@@ -223,7 +224,10 @@ def measure_smooth(model: CollisionModel, data: CollisionData, p: int, smoothing
 
 @kernel
 def _segment_segment(a0: Array, a1: Array, b0: Array, b1: Array, smoothing: float, contact: Contact) -> float:
-    """Return D of two segments [m]. The quadratic is strictly convex, so no case is degenerate."""
+    """Return the smooth distance D of two segments, as the module's docstring defines it [m].
+
+    The quadratic function that is minimised is strictly convex, so no case is degenerate.
+    """
     aa, bb, ab, ar, br = products(a0, a1, b0, b1)
     aa, bb, ar, br = aa + smoothing, bb + smoothing, ar - 0.5 * smoothing, br + 0.5 * smoothing
     s = clamp((ab * br - ar * bb) / (aa * bb - ab * ab), 0.0, 1.0)
@@ -243,7 +247,10 @@ def _segment_segment(a0: Array, a1: Array, b0: Array, b1: Array, smoothing: floa
 def _segment_box(
     a0: Array, a1: Array, posed: BodyPlacements, half: Array, box: int, smoothing: float, contact: Contact
 ) -> float:
-    """Return D of a segment and a box [m]. The slope of D^2 rises strictly with s, so bisection finds its zero."""
+    """Return the smooth distance D of a segment and a box, as the module's docstring defines it [m].
+
+    The slope of D^2 rises strictly with s, so bisection finds its zero.
+    """
     axes, centre, start, along = posed.rotation[box], posed.start[box], contact.local[0], contact.local[1]
     _into_box_frame(a0, a1, centre, axes, contact.local)
     along -= start

@@ -47,7 +47,7 @@ class JointLimits(NamedTuple):
     upper: Array  # (nv,) Greatest positions, with the margin [rad].
     velocity: Array  # (nv,) [rad/s]
     acceleration: Array  # (nv,) [rad/s^2]
-    longest_step: float  # H [s]
+    longest_step: float  # The longest step H of the proof above [s].
     return_speed: float  # Inward speed of a joint outside its limits [rad/s].
 
 
@@ -66,7 +66,7 @@ class VelocityBox(NamedTuple):
 
 @kernel
 def fastest_towards(room: float, v: float, a: float, h: float, longest: float, return_speed: float) -> float:
-    """Return the largest next velocity towards a limit that keeps P [rad/s]; see the proof above.
+    """Return the largest next velocity towards a limit that keeps the condition P of the proof above [rad/s].
 
     It is the solution w of w^2/(2a) + (H + h/2) w = room - v h / 2. Outside the limit it is negative, a motion inward.
 
@@ -92,7 +92,7 @@ def fastest_towards(room: float, v: float, a: float, h: float, longest: float, r
 def next_velocity_box(limits: JointLimits, q: Array, v: Array, h: float, box: VelocityBox) -> bool:
     """Write ``box`` for a step of ``h`` [s] from ``q`` (nv,) [rad] and ``v`` (nv,) [rad/s].
 
-    Returns False if a joint is outside P, so that it recovers.
+    Returns False if a joint violates the condition P of the module's docstring, so that it recovers.
     """
     inside = True
     for j in range(q.shape[0]):
@@ -105,7 +105,7 @@ def next_velocity_box(limits: JointLimits, q: Array, v: Array, h: float, box: Ve
         up = min(up, limits.velocity[j])
         down = max(down, -limits.velocity[j])
         if up < slowest or down > fastest or up < down:
-            # A joint that is outside P only by rounding does not count as recovering.
+            # A joint that violates the condition P only by rounding does not count as recovering.
             scale = 1e-9 * (1.0 + abs(v[j]))
             if up < slowest - scale or down > fastest + scale or up < down - scale:
                 inside = False

@@ -37,9 +37,11 @@ from q2r2_control.control.kernel_pointers import KernelPointer, pointee
 from q2r2_control.control.safety.safety_data import SafetyData, SafetyModel
 from q2r2_control.types import Array
 
-# R [s]. A newer report counts as this old, so that the kept distance does not jump if reports come more often.
+# The age R of a usual report [s]. A newer report counts as this old, so that the kept distance does not jump if reports
+# come more often.
 REPORT_AGE = 0.1
-# Least value of T_0 while all reports are new [s]. T_0 has this value if arms are close to an obstacle.
+# Least value of the time T_0 of a stop, while all reports are new [s]. T_0 has this value if arms are close to an
+# obstacle.
 _LEAST_STOP = 0.05
 _LOST = 0.5  # If a report is older than this, it does not tell which motion leads away from the obstacle [s].
 _SHARE = 0.5  # Share of the free distance to an obstacle that the obstacle's reach may take.
@@ -49,7 +51,7 @@ _OPENING = 1e-4
 
 
 class ObstacleData(NamedTuple):
-    """The moving obstacles o, and their pairs, which are the last n of all pairs."""
+    """Data of the o moving obstacles, and of their n pairs, which are the last ones of all pairs."""
 
     first: IntArray  # (o + 1,) Index of each obstacle's first pair among the n pairs; the last entry is n.
     speed: Array  # (o,) Greatest speed of any point [m/s].
@@ -59,7 +61,7 @@ class ObstacleData(NamedTuple):
     kept: Array  # (n,) Distance that each pair keeps [m]; minus infinity if the pair does not count now.
     buffer: Array  # (n,) The QP stops the pair at the kept distance plus this [m].
     velocity: Array  # (nv,) Velocity limits without an obstacle nearby [rad/s].
-    stop_time: Array  # (1,) T_0 [s].
+    stop_time: Array  # (1,) The time T_0 of a stop, see the module's docstring [s].
 
 
 @kernel

@@ -187,7 +187,10 @@ def _some_stop_certified(model: SafetyModel, data: SafetyData, h: float, shapes:
 
 @kernel
 def _mix(data: SafetyData, share: float, h: float) -> None:
-    """Write the candidate as a mixture of the known stop and a ``share`` of the wanted velocities."""
+    """Write the candidate's velocities, and the positions that follow from them.
+
+    The velocities are (1 - ``share``) times those of the known stop plus ``share`` times the wanted ones.
+    """
     state, candidate = data.state, data.candidate
     for j in range(state.q.shape[0]):
         braked, wanted = data.braked[j], data.wanted[j]
@@ -197,7 +200,10 @@ def _mix(data: SafetyData, share: float, h: float) -> None:
 
 @kernel
 def _note_active(data: SafetyData) -> float:
-    """List the limits, pairs and tools that hold the new velocities back; return a row's largest violation [rad/s]."""
+    """List the limits, pairs and tools that limit the new velocities.
+
+    Returns the largest violation of all separation rows [rad/s]; 0 if every row is satisfied.
+    """
     v, box, rows, active = data.state.v, data.box, data.rows, data.active
     count = 0
     for j in range(v.shape[0]):

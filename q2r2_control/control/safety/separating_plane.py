@@ -92,7 +92,9 @@ def stays_beyond(
 
 @kernel
 def curvature(pairs: Pairs, p: int, travel: Array, then: Array, share: float) -> float:
-    """Return K_1 + K_2 [m] for joints that travel ``travel`` (nv,) plus a ``share`` of ``then`` (nv,) [rad or m].
+    """Return the remainder K_1 + K_2 of the module's claim [m].
+
+    The travel of the joints is ``travel`` (nv,) plus a ``share`` of ``then`` (nv,) [rad or m].
 
     The joints of a pair are listed from the base outwards.
     """

@@ -2,7 +2,7 @@
 
 The bound S with the reach of joints (stop_certificate.py) treats every joint as if it moved one body straight towards
 the other body. For most pairs of two moving arms, a bound from the speeds of the bodies suffices. Joints that stop
-together keep the direction of their motion, and arms that move alike do not close in at all.
+together keep the direction of their motion, and arms that move in the same way come no closer at all.
 
 **Speed.** A geometry lies in the ball of radius s around its middle. With the middle moving at u and the link turning
 at w, no point of it is faster than |u| + |w| s. The distance of two geometries therefore falls no faster than |u_2 -
@@ -119,7 +119,9 @@ def fastest_approach(velocities: BodyVelocities, first: int, second: int) -> flo
 
 @kernel
 def write_deviations(model: SafetyModel, data: SafetyData, h: float, duration: float) -> float:
-    """Write rho + kappa of every joint [rad or m], for a step of ``h`` [s] and a stop of ``duration`` [s].
+    """Write the bound rho + kappa on every joint's deviation from motion at constant velocity [rad or m].
+
+    It is for a step of ``h`` [s] and a stop of ``duration`` [s].
 
     The travel of the joints in the step and the stop has to be written before. Returns h + T / 2 [s].
     """

@@ -52,9 +52,10 @@ def write_stop(model: SafetyModel, q: Array, v: Array, shape: int, deceleration:
 
 @kernel
 def _least_deceleration(limits: JointLimits, j: int, q: float, v: float) -> float:
-    """Return the least constant deceleration of joint ``j`` that keeps P (joint_limits.py) until the joint rests.
+    """Return the least constant deceleration of joint ``j`` that keeps its position limits until the joint rests.
 
-    If no deceleration keeps P, return the joint's acceleration limit.
+    The condition P of joint_limits.py holds in this motion. If no deceleration keeps P, return the joint's acceleration
+    limit.
     """
     room = (limits.upper[j] - q if v > 0.0 else q - limits.lower[j]) - limits.longest_step * abs(v)
     if room <= 0.0:

@@ -109,7 +109,10 @@ def keeps_tool_speed(model: SafetyModel, data: SafetyData, h: float) -> bool:
 
 @kernel
 def fastest_tool(model: SafetyModel, data: SafetyData, i: int, h: float) -> float:
-    """Return B of tool ``i``, see the module's claim [m/s]."""
+    """Return the bound B of tool ``i`` [m/s], which the claim in the module's docstring defines.
+
+    In the step and in the stop after it, the tool is never faster than the greater of B and its present speed.
+    """
     parent, v_next, deceleration = model.collision.chain.parent, data.candidate.v, data.candidate.deceleration
     _write_columns(model, data, i)
     fastest, longest = 0.0, 0.0
@@ -134,7 +137,10 @@ def fastest_tool(model: SafetyModel, data: SafetyData, i: int, h: float) -> floa
 
 @kernel
 def drift(model: SafetyModel, i: int, v: Array, v_next: Array) -> float:
-    """Return c of tool ``i`` for joints that have ``v``, ``v_next`` (nv,) or a speed in between [m/s^2]."""
+    """Return the rate c of the module's docstring for tool ``i`` [m/s^2].
+
+    The velocity of each joint lies between ``v`` (nv,) and ``v_next`` (nv,).
+    """
     parent, total = model.collision.chain.parent, 0.0
     j = model.tools.joint[i]
     while j != 0:

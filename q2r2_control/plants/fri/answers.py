@@ -209,7 +209,8 @@ class AnswerTimes:
         before = standing if heard < first or newest is None else self._heard(heard)
         lag = (wanted - before.time) / self._period - 1.0  # The lag as a number of answers.
         ramp = CATCH_UP_RAMP * self._period
-        # The greatest additional rate that, if it falls by CATCH_UP_RAMP per second, reaches 0 together with the lag.
+        # The additional rate falls by CATCH_UP_RAMP per second. This is the greatest rate with which it reaches 0
+        # together with the lag.
         excess = math.copysign(math.sqrt(2.0 * ramp * abs(lag) + 0.25 * ramp * ramp) - 0.5 * ramp, lag)
         excess = min(max(excess, -CATCH_UP), CATCH_UP)
         rate = min(max(1.0 + excess, before.rate - ramp), before.rate + ramp)

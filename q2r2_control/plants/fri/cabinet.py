@@ -1,4 +1,4 @@
-"""A simulated Sunrise cabinet: its session, its guards and its arm. The caller passes the time in.
+"""A simulated Sunrise cabinet: its session, its guards and its arm. The caller passes the time.
 
 It serves to test clients, and is not a model of KUKA's controller. The states and their conditions follow the public
 client kits. Where the kits say nothing, such as how many answers a client may miss, the simulation is too strict

@@ -36,7 +36,7 @@ from q2r2_control.types import Array, Command, CommandMode
 # After a stall of this process, a client that commands still gets the messages that are late by up to this time [s].
 # Earlier messages are left out, as if the cabinets had been silent.
 _LONGEST_STALL = 1.0
-_LONGEST_CATCH_UP = 0.05  # Longest time that the simulation catches up at once [s]. More is dropped.
+_LONGEST_CATCH_UP = 0.05  # Longest time that the simulation catches up in one step [s]. More is dropped.
 _LOOK_AGAIN = 2e-4  # Time between two checks for an answer, while the next message waits for it [s].
 _ROUNDING = 1e-6  # Relative tolerance of durations.
 _SAG = 1e-3  # A cabinet allows positions this far beyond the robot's limits, because the simulated arm sags [rad].

@@ -169,7 +169,7 @@ class FriCell:
     def _ahead(self) -> float:
         """The time from a tick to the end of the motion that it adds to the path [s].
 
-        If no tick and no command is later than the recent ones, the time of no answer is after this end.
+        If no tick and no command comes later than the recent ones, every answer is for a time before this end.
         """
         return self._longest_tick + self._margin - _MARGIN
 

@@ -93,9 +93,9 @@ class ArmFeedback:
     def __init__(self, node: BaseNode, arm: str, values: ArmParameters, hand: HandIntake) -> None:
         self._node, self._hand = node, hand
         self.haptics = HapticPulses(values.teleop.haptics)
-        # The last event in words, and the kind of the reason from which it follows.
+        # The text of the last event, and the kind of this event's reason.
         self.last_line, self.last_kind = "not engaged yet", ""
-        # The last event after which the arm holds, in words, and the kind of the reason from which it follows.
+        # The text of the last event that left the arm holding, and the kind of this event's reason.
         self.paused, self.paused_kind = "not engaged yet", ""
         self._drawn = TargetMarkers(arm, values.tool_frame, values.world_frame)
         self._markers = node.create_publisher(Marker, "visualization_marker", 10)

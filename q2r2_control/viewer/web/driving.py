@@ -24,7 +24,7 @@ _Gizmos = dict[str, viser.TransformControlsHandle]  # By arm.
 
 
 class Driving:
-    """Lets pages drag the tools. The page that drags first drives until it lets go.
+    """Lets pages drag the tools. The page that drags first drives until it releases its tools.
 
     Until then the other pages only watch, and show no gizmos. A browser sends nothing while the mouse rests. Therefore
     the page that drives is asked again and again for an answer, which its script gives. At each answer, a sample of

@@ -20,8 +20,8 @@ from q2r2_control.viewer.web.scene import CellScene
 
 _NICENESS = 10  # The process gets a low priority, since the loop comes first.
 _LAST_WORDS = 0.5  # Time in which browsers are told that the run is over, before their connections are closed [s].
-# Number of answers that are allowed per second, and number that are allowed at once. A page that moves two hands sends
-# 220 per second.
+# Number of answers that are allowed per second, and number that may come in one burst. A page that moves two hands
+# sends 220 answers per second.
 _RATE, _BURST = 500.0, 50.0
 
 
@@ -70,10 +70,10 @@ class LimitedAnswers:
 
 
 def main(requests: Iterator[Any], answer: Callable[[Any], None]) -> None:
-    """Run the process. It answers with :class:`Ready`, and then with the requests of browsers.
+    """Run the process. It sends :class:`Ready` when the page is served, and then passes on what browsers ask for.
 
     Args:
-        requests: The setup, and then the frames. When they end, the run is over.
+        requests: The messages from the run: first the setup, then the frames. When they end, the run is over.
         answer: Sends data to the run.
 
     Raises:

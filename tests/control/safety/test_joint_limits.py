@@ -30,7 +30,7 @@ def _box(q: Array, v: Array, bounds: JointLimits, h: float) -> tuple[VelocityBox
 
 
 def _stoppable(room: Array, v: Array, bounds: JointLimits) -> npt.NDArray[np.bool_]:
-    """Return by joint whether property P of joint_limits.py holds towards one limit, except for rounding errors."""
+    """Return by joint whether condition P of joint_limits.py holds towards one limit, except for rounding errors."""
     return np.where(
         v <= 0.0, room >= -EXACT, v**2 / (2 * bounds.acceleration) + bounds.longest_step * v <= room + EXACT
     )
@@ -42,7 +42,7 @@ def _keeps_p(q: Array, v: Array, bounds: JointLimits) -> bool:
 
 
 def _fastest_in_p(room: Array, bounds: JointLimits) -> Array:
-    """Return the largest speed for which property P holds at the distance ``room`` from the limit."""
+    """Return the largest speed for which condition P of joint_limits.py holds at the distance ``room`` from a limit."""
     a, H = bounds.acceleration, bounds.longest_step
     return np.minimum(bounds.velocity, -a * H + np.sqrt((a * H) ** 2 + 2 * a * np.maximum(room, 0.0)))
 
@@ -117,7 +117,10 @@ def test_the_velocity_bound_is_the_largest_velocity_from_which_a_joint_can_still
 
 
 def _recover(q: Array, v: Array, bounds: JointLimits, choose: Choice, seconds: float) -> tuple[Array, Array]:
-    """Return positions and velocities (t, n) of joints that start outside P. Check the acceleration at every step."""
+    """Return positions and velocities (t, n) of joints. Condition P of joint_limits.py does not hold at their start.
+
+    The acceleration is checked at every step.
+    """
     random, h = np.random.default_rng(7), bounds.longest_step
     positions, velocities = [q], [v]
     for _ in range(int(seconds / h)):

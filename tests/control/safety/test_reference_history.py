@@ -41,7 +41,7 @@ def test_no_joint_was_farther_from_its_present_position_during_the_window_than_t
         assert (history.travel <= 3.0 * travel + 1e-6).all(), "the bound is not far too large"
 
 
-def test_a_window_that_was_off_knows_only_the_past_since_it_is_on_again() -> None:
+def test_a_window_that_is_switched_on_again_begins_at_0_and_grows_by_each_step() -> None:
     robot, data = cell(NAMES[0]).robot, kernel_data(NAMES[0], cell(NAMES[0]).robot.home).safety
     history, still = data.history, np.zeros(robot.model.nv)
     history.window[1] = WINDOW

@@ -84,7 +84,7 @@ def still_hand(q: Array, random: np.random.Generator) -> Array:
 @pytest.mark.parametrize(
     ("shape", "speed"), [(TOGETHER, 2.0), (OWN, 0.2)], ids=["the ways are curved", "joints rest one after the other"]
 )
-def test_the_bound_holds_for_a_hand_that_rests_on_a_moving_arm_and_moves_while_the_arm_stops(
+def test_the_bound_holds_if_a_hand_rests_at_first_while_its_arm_moves_and_then_moves_while_the_arm_stops(
     shape: int, speed: float
 ) -> None:
     random, robot = np.random.default_rng(62), cell("dual_iiwa7").robot
@@ -132,7 +132,7 @@ def test_the_deviation_of_a_joint_includes_the_motion_of_the_joints_that_carry_i
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_carried_marks_exactly_the_pairs_whose_bodies_share_a_moving_joint(name: str) -> None:
+def test_the_array_carried_marks_exactly_the_pairs_whose_bodies_share_a_moving_joint(name: str) -> None:
     model, pairs, bodies = cell(name).robot.model, cell(name).pairs, cell(name).bodies
     movers = [set(model.supports[int(joint)]) - {0} for joint in bodies.joint]
     together = [bool(movers[first] & movers[second]) for first, second in zip(pairs.first, pairs.second, strict=True)]

@@ -156,7 +156,7 @@ def _swings(random: np.random.Generator, count: int, dip: float) -> Iterator[Mot
             return
 
 
-def test_a_step_within_which_a_pair_comes_too_close_is_refused_even_if_the_pair_is_apart_at_both_ends() -> None:
+def test_a_step_is_refused_if_a_pair_comes_too_close_within_it_even_if_the_pair_is_apart_at_both_ends() -> None:
     swings = list(_swings(np.random.default_rng(21), 8, dip=5e-4))
     assert len(swings) == 8
     for motion in swings:
@@ -341,7 +341,7 @@ def test_in_a_stop_arm_by_arm_each_arm_takes_the_time_of_its_slowest_joint(seed:
 @given(seed=SEEDS)
 @settings(derandomize=True, max_examples=200, deadline=None)
 def test_every_kind_of_stop_keeps_position_limits_at_every_moment(shape: int, seed: int) -> None:
-    """Each joint starts at, or below, the speed that property P allows at its distance from the limit.
+    """Each joint starts at, or below, the speed that condition P of joint_limits.py allows at this distance.
 
     A slow joint that stops together with a fast joint moves for a long time, and must not drift beyond its limit.
     """

@@ -96,7 +96,7 @@ def test_a_row_that_no_velocity_can_break_causes_no_message(name: str, capfd: py
         assert solver.solve(problem).v is not None
 
 
-def test_what_a_solver_prints_while_it_is_made_goes_to_stderr(
+def test_texts_that_a_solver_prints_while_it_is_made_go_to_stderr(
     capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class Loud:

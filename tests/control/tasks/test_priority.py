@@ -42,7 +42,7 @@ def test_two_arms_with_a_priority_come_to_rest(name: str, duration: float) -> No
 
 
 @pytest.mark.parametrize("priority", ["left", "right"])
-def test_the_arm_with_priority_moves_to_a_target_that_both_arms_have_nearly_as_fast_as_alone(priority: str) -> None:
+def test_if_both_arms_have_one_target_the_arm_with_priority_reaches_it_nearly_as_fast_as_alone(priority: str) -> None:
     times = {}
     for case in ("alone", "against the other"):
         run = Driven(controller_of(priority), dt=0.005)

@@ -98,7 +98,7 @@ def test_the_path_ends_with_the_certified_stop_if_the_loop_stands_still() -> Non
     assert np.abs(a).max() <= 10.0 + 1e-6
 
 
-def test_a_path_that_brakes_during_a_motion_stops_as_certified_from_the_end_of_that_motion() -> None:
+def test_if_a_path_brakes_during_a_motion_the_certified_stop_begins_at_the_end_of_this_motion() -> None:
     path, certified = ReferencePath(0.0, np.zeros(2)), ReferencePath(0.0, np.zeros(2))
     for each in (path, certified):
         each.extend(0.01, np.array([0.0, 0.0]), np.array([1.0, 0.02]), np.array([5.0, 0.1]))

@@ -60,7 +60,7 @@ def commanding(settings: CabinetSettings = SETTINGS) -> tuple[Cabinet, Client]:
     return cabinet, client
 
 
-def test_a_session_with_punctual_answers_reaches_monitoring_and_after_the_start_of_the_overlay_commanding() -> None:
+def test_with_punctual_answers_a_session_is_monitored_and_the_start_of_the_overlay_leads_to_commanding() -> None:
     cabinet, client = Cabinet(SETTINGS, StillArm(HOME)), Client()
     seen: list[Session] = []
     for period in range(200):

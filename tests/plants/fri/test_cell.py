@@ -292,7 +292,7 @@ class ShiftedArm(SimulatedArm):
 
 
 @pytest.mark.slow
-def test_arms_whose_measured_state_is_not_trusted_are_braked_at_every_tick(config: Config, robot: Robot) -> None:
+def test_if_the_measured_state_is_not_trusted_the_arms_are_braked_at_every_tick(config: Config, robot: Robot) -> None:
     arms = SimulatedArms(robot, config)
     arms.arms["left"] = left = ShiftedArm(arms, "left")
     pipeline = make_loop(config, mode=CommandMode.TORQUE, jitter=0.0004, arms=arms)

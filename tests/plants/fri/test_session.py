@@ -192,7 +192,7 @@ def test_if_one_arms_command_is_late_the_commands_of_both_are_refused_and_the_ar
     assert cabinet.session.path.end == now + 0.002
 
 
-def test_an_arm_that_rests_while_its_answers_still_catch_up_begins_to_move_again_without_a_jump() -> None:
+def test_if_an_arm_rests_while_its_answers_still_catch_up_it_begins_to_move_again_without_a_jump() -> None:
     cabinet, fives, a = Cabinet(), (5.0,) * 7, 5.0
     cabinet.ask(WAITING)
     followed: list[tuple[float, ...]] = [IPO, IPO]
@@ -230,7 +230,7 @@ def test_an_arm_that_rests_while_its_answers_still_catch_up_begins_to_move_again
     assert np.abs(accelerations).max() <= (1.0 + CATCH_UP) ** 2 * a + CATCH_UP_RAMP * a * 0.05
 
 
-def test_an_arm_that_begins_to_move_while_answers_are_lost_begins_from_rest() -> None:
+def test_if_an_arm_begins_to_move_while_answers_are_lost_it_begins_from_rest() -> None:
     cabinet, fives, a = Cabinet(), (5.0,) * 7, 5.0
     cabinet.ask(WAITING)
     cabinet.ask(ACTIVE)
@@ -304,7 +304,7 @@ def test_a_repeated_message_gets_the_same_answer_and_moves_nothing() -> None:
     assert heard[True] == heard[False]
 
 
-def test_a_cabinet_of_another_version_than_in_the_yaml_is_not_answered_and_is_reported() -> None:
+def test_if_a_cabinet_has_another_version_than_the_yaml_it_is_reported_and_gets_no_answer() -> None:
     cabinet = Cabinet(ArmSession("left", "cabinet", version=1))
     assert cabinet.ask(MONITORING) is None
     fault = cabinet.session.state.fault(cabinet.now)

@@ -15,7 +15,7 @@ from tests.plants.fri.asking_cabinet import ACTIVE, IPO, MONITORING, WAITING, Ca
 
 @pytest.mark.parametrize("silence", [0.15, 6.0])
 @pytest.mark.parametrize("loop", ["goes on", "stands still"])
-def test_an_arm_whose_cabinet_was_silent_during_motion_brakes_as_certified_and_follows_only_from_rest(
+def test_if_a_cabinet_is_silent_during_motion_its_arm_brakes_as_certified_and_follows_only_from_rest(
     silence: float, loop: str
 ) -> None:
     cabinet, ones, still = Cabinet(), (1.0,) * 7, (0.0,) * 7
@@ -80,7 +80,7 @@ def test_a_session_that_restarted_during_a_silence_gets_the_cabinets_own_positio
     assert answer.q == pytest.approx(Q, abs=1e-15)
 
 
-def test_an_arm_whose_cabinet_becomes_idle_during_motion_is_not_moved_any_more() -> None:
+def test_if_a_cabinet_becomes_idle_during_motion_its_arm_is_not_moved_any_more() -> None:
     cabinet = Cabinet()
     cabinet.ask(WAITING)
     cabinet.ask(ACTIVE)
