@@ -172,12 +172,12 @@ def test_a_jump_of_the_target_is_not_extrapolated_as_a_motion() -> None:
 
 
 def test_an_even_turn_is_extrapolated_if_the_sender_is_as_slow_as_a_headset() -> None:
-    line, period, speed = TargetExtrapolator(), 1.0 / 72.0, 0.5  # [s], [rad/s]
+    line, period, velocity = TargetExtrapolator(), 1.0 / 72.0, np.array([0.3, -0.4, 0.5])  # [s], [rad/s]
     for k in range(5):
-        line.put(pin.SE3(pin.exp3(np.array([0.0, 0.0, speed * k * period])), np.zeros(3)), k * period)
+        line.put(pin.SE3(pin.exp3(velocity * k * period), np.zeros(3)), k * period)
     found = line.at(4.5 * period)
     assert found is not None
-    np.testing.assert_allclose(pin.log3(found.rotation), [0.0, 0.0, 4.5 * speed * period], atol=1e-9)
+    np.testing.assert_allclose(pin.log3(found.rotation), 4.5 * period * velocity, atol=1e-9)
 
 
 def test_a_motion_is_extrapolated_by_at_most_two_and_a_half_periods_of_the_sender() -> None:
