@@ -3,8 +3,9 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 
-# Only one call of pip runs at a time, even if make runs with -j.
-PIP    := flock $(VENV) $(BIN)/python -m pip install --quiet --disable-pip-version-check
+# Only one call of pip runs at a time, even if make runs with -j. Python compiles a module when it is first imported. If
+# pip compiled all modules, most of them in vain, the installation would need nearly twice as much processor time.
+PIP    := flock $(VENV) $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile
 
 .PHONY: setup demo test test-slow test-ros test-ros-slow test-soak lerobot lerobot-ros test-lerobot test-lerobot-ros test-learning test-franka test-web web-setup chromium lint lint-page bench docs picture page-picture soak wheel release-check arena clean
 .DEFAULT_GOAL := setup
