@@ -188,7 +188,7 @@ def column(dataset: LeRobotDataset, name: str) -> Array:
 
 
 def mean_episode(dataset: LeRobotDataset) -> Array:
-    """Return the mean of all episodes as actions (n, size). Their number n is that of a chunk of the policy."""
+    """Return the mean actions of all episodes (n, size). n is the number of actions in a chunk of the policy."""
     actions, frames = actions_of(dataset), column(dataset, "frame_index")
     return np.array([actions[frames == frame].mean(axis=0) for frame in range(CHUNK)])
 

@@ -68,8 +68,8 @@ class StrictModel(BaseModel):
     def model_validate_json(cls, json_data: str | bytes | bytearray, **options: Any) -> Self:
         return validated(cls, f"{cls.__name__}: ", json_data, as_json=True, **options)
 
-    # With this attribute, pydantic takes this initialiser for its own. Otherwise it would call the initialiser for
-    # settings within settings too, and an error that is raised there could not name the full key.
+    # This attribute tells pydantic that this initialiser is not a custom one. Otherwise, pydantic would call this
+    # initialiser for nested settings too, and an error that is raised there could not name the full key.
     __init__.__pydantic_base_init__ = True  # type: ignore[attr-defined]
 
     def __setattr__(self, name: str, value: object) -> None:

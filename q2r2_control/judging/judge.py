@@ -254,8 +254,8 @@ def discarded_episodes(file: Path, pictures: bool) -> dict[int, str]:
 def _discarded(file: Path, pictures: bool, absolute: Path, changed: int) -> dict[int, str]:
     """Return the result of :func:`discarded_episodes`.
 
-    ``absolute`` and ``changed``, the file's modification time, are only part of the cache's key. A worker process of a
-    cluster lives long, and may see different files with the same name.
+    The function does not use ``absolute`` and ``changed``, the file's modification time. They belong to the key of the
+    cache, because a worker process of a cluster lives long, and may see different files with the same name.
     """
     judged = judge(open_recording(file), pictures=pictures)
     return {one.figures.part or 0: one.verdict.line for one in judged if not one.verdict.keep}

@@ -193,7 +193,11 @@ def _set_arm_joints(spec: mujoco.MjSpec, robot: Robot, config: MujocoConfig) -> 
 
 
 def _set_grippers(spec: mujoco.MjSpec, robot: Robot, config: Config) -> None:
-    """Add a servo for each finger joint, couple the joints of a gripper like its gear, and let contacts hold a box."""
+    """Add a servo for each finger joint, couple the joints of each gripper, and set the friction of its fingers.
+
+    The gear of a gripper becomes equality constraints. A joint that mimics a finger joint follows this joint, and all
+    finger joints have the same position. With the friction, the fingers can hold a box.
+    """
     robot_urdf = ET.fromstring(robot.urdf)
     for side, arm in config.arms.items():
         gripper, names = arm.gripper, robot.arms[side].finger_joints

@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 FLUSH_PERIOD = 0.5  # Time between two flushes of the file [s]. If this process is killed, at most this time is lost.
 READ_AHEAD = 4 << 20  # Largest size of the requests that were read from the pipe and wait to be written [bytes].
 _NICENESS = 10  # The niceness of this process. With it, the loop has a higher priority.
-# A tick belongs to the next period if that period begins within this share of a period. Times are rounded, so the tick
-# may seem to come a little too early.
+# Times are rounded, so a tick may seem to come a little before the period of the topics to which it belongs. A tick
+# therefore belongs to the next period if that period begins within this share of a period.
 _ROUNDING = 1e-6
 _LAST_TIME = (2**31 - 1) * NANOSECONDS  # The latest time of a stamp [ns].
 _HAND, _POSE_STAMP, _INPUTS_STAMP, _X, _BUTTONS = (

@@ -207,9 +207,9 @@ class Robot:
     ) -> Robot:
         """Return a robot from any URDF.
 
-        Joints that an arm carries beyond its own joints move its fingers, and the links that carry these joints are
-        its tool. No link counts as an obstacle. A warning names pairs that would block the arm at home, and pairs
-        that overlap only there.
+        Movable joints behind the last joint of an arm count as joints of its fingers. The links to which these joints
+        are attached, and all links behind them, are the arm's tool. No link counts as an obstacle. A warning names
+        pairs that would block the arm at home, and pairs that overlap only there.
 
         Args:
             path_or_xml: The URDF as a file or a text.

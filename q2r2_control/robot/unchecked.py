@@ -50,7 +50,7 @@ class CellLink:
 
     @property
     def is_unchecked(self) -> bool:
-        """Whether the link is a body that is not watched at its real pose."""
+        """Whether the link is a body that is not watched, or is watched only at its pose at home."""
         return self.is_body and (not self.shaped or self.follows is not None)
 
     def fault(self, in_cell: bool) -> str:

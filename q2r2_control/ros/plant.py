@@ -50,7 +50,12 @@ class _PlantNode(BaseNode):
 
 
 class RosPlant:
-    """A plant whose arms start where they stand. Missing or bad joint states, or a new receiver, bring them to rest."""
+    """A plant whose arms start where they stand.
+
+    The arms come to rest if joint states are missing or bad, if no node receives the commands, or if another node sends
+    commands. They also come to rest if a further node begins to receive commands while the newest command is far from
+    the measured joints.
+    """
 
     modes: tuple[CommandMode, ...] = (CommandMode.POSITION,)
     realtime_only = True

@@ -49,7 +49,7 @@ class MeasuredLags:
             return dict.fromkeys(measured, 0.0)
         times, postures = np.array([t for t, _ in self._past]), np.array([place for _, place in self._past])
         found = {arm: self._possible(arm, t, times, postures, q) for arm, t in measured.items()}
-        # The largest of the arms' least possible lags.
+        # Each arm has a smallest possible lag. This is the largest of these lags.
         reached = max(float(lags.min()) for lags in found.values())
         return {arm: float(lags[np.abs(lags - reached).argmin()]) for arm, lags in found.items()}
 

@@ -36,7 +36,7 @@ _STATE_GAP = 0.045  # After a longer gap between two states the window begins ag
 
 @dataclass(frozen=True, slots=True)
 class StandstillLimits:
-    """How much commanded motion must be missing, in [rad] of joints or in [m] of a tool, and for how long."""
+    """Distances [rad] of joints or [m] of a tool, and times, above which an arm counts as standing still."""
 
     least: float  # The command must move at least this far within the window.
     ahead: float  # The command at the beginning of the window must be at least this far from the measured arm.

@@ -27,8 +27,8 @@ def run_soaks(
 ) -> SoakReport:
     """Run a soak of ``ticks`` ticks with each of one or more ``seeds``.
 
-    If ``policy`` is True, a hostile policy moves the arms through the whole pipeline. Except for the growth of memory,
-    which is measured, the report is the same at any ``place``.
+    If ``policy`` is True, a hostile policy moves the arms through the whole pipeline. The report does not depend on the
+    ``place`` where the soaks run, except for the growth of memory, which is measured.
     """
     reports = []
     with closing(place.results(partial(soak_with, config, ticks, policy), seeds)) as results:

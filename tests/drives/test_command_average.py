@@ -156,7 +156,7 @@ def test_in_torque_mode_pairs_keep_no_additional_distance_because_of_a_jerk_limi
     assert (loop.controller.kept_distances == plain.controller.kept_distances).all()
 
 
-def test_a_jerk_limit_is_refused_for_a_plant_that_executes_stops_itself_but_does_not_average_commands() -> None:
+def test_a_jerk_limit_is_refused_if_the_plant_executes_its_own_stops_and_does_not_average_commands() -> None:
     config = load_config("config/dual_iiwa7_fri.yaml")
     config = config.model_copy(update={"control": config.control.model_copy(update={"jerk_limit": 5000.0})})
     with pytest.raises(ConfigError, match=r"control.jerk_limit: allowed: null, since FriPlant does not keep it"):

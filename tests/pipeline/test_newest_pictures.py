@@ -205,7 +205,7 @@ def test_a_simulated_camera_gives_one_picture_in_each_of_its_periods() -> None:
 
 
 def compare_pictures() -> None:
-    """Compare the pictures that a policy sees with those of the same plant at the same tick."""
+    """Compare pictures that a policy gets with pictures that are drawn directly from the plant at the same tick."""
     from q2r2_control.plants.mujoco import MujocoPlant
     from q2r2_control.plants.mujoco_cameras import CellPictures
 

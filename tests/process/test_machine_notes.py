@@ -1,4 +1,4 @@
-"""Notes about the kernel, and about a network card from the output of ``ip`` and ``ethtool``."""
+"""Notes about a kernel or a network card that may delay answers to a robot, from files, ``ip`` and ``ethtool``."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_there_is_no_note_about_a_card_about_which_nothing_is_known(prints: Call
     assert card_notes("no_such_card") == []
 
 
-def test_addresses_of_this_computer_need_no_note() -> None:
+def test_there_is_no_note_about_a_network_card_for_addresses_of_this_computer() -> None:
     assert network_notes(["127.0.0.1", "::1"]) == []
 
 

@@ -148,7 +148,7 @@ def messages_or_fault(file: Path) -> list[messages.Message] | str | None:
         return None if found is None else found.group(0)
 
 
-def test_if_a_record_of_a_completed_file_would_end_beyond_the_file_the_file_counts_as_damaged(tmp_path: Path) -> None:
+def test_a_completed_file_counts_as_damaged_if_one_of_its_records_would_end_beyond_the_file(tmp_path: Path) -> None:
     about = About.of(pipeline(), realtime=True, notes={}, cameras=())
     file = tmp_path / "file.mcap"
     with BagWriter(file, [messages.Topic(1, messages.STATE, messages.TEXT)], about) as bag:

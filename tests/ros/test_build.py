@@ -1,4 +1,4 @@
-"""The ROS packages: message packages with their type hashes, how they are built, and the repository under colcon."""
+"""Builds of ROS packages: the message packages with the hashes of their types, and this repository with colcon."""
 
 from __future__ import annotations
 

@@ -66,7 +66,7 @@ def stopped(moving: Cockpit, what: str, fault: float) -> JointRecorder:
 
 
 def assert_only_a_press_moves(moving: Cockpit, joints: JointRecorder) -> None:
-    """Assert that nothing moves before a press, that the press moves nothing, and that the arms then follow."""
+    """Assert that the arms rest before a press, that no tool moves at the press, and that the arms then follow."""
     posture, began = joints.q, time.monotonic()
     time.sleep(AWHILE)
     moving.wait_until_up()

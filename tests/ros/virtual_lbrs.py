@@ -221,7 +221,8 @@ def virtual_lbrs(release: str, domain: int, seed: int = 0) -> Iterator[VirtualLb
         try:
             with patch.object(joint_outputs, "WatchedPublisher", DirectPublisher):
                 node = CartesianControllerNode()
-            node.get_logger().set_level(LoggingSeverity.FATAL)  # The end of a session is not a fault of the test.
+            # Sessions end on purpose in these tests. The node's warnings about this are not shown.
+            node.get_logger().set_level(LoggingSeverity.FATAL)
             yield VirtualLbrs(node, Robot.from_config(load_config(cell)), release, seed)
             node.get_logger().set_level(LoggingSeverity.UNSET)
             node.destroy_node()

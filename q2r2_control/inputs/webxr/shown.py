@@ -89,6 +89,6 @@ class FromRun(TypedDict):
 
     scene: NotRequired[ShownScene]
     state: NotRequired[ShownState]
-    acknowledged: NotRequired[int]  # Comes with a state: the number of the newest message that the page has sent.
+    acknowledged: NotRequired[int]  # Each state comes with the number of the newest message from the page.
     vibration: NotRequired[ShownVibration]
     driver: NotRequired[str]  # The page that drives. Only pages that watch get this field.

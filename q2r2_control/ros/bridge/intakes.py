@@ -83,7 +83,8 @@ class TargetIntake:
             self.topics[arm] = topic
         self.publishers = Publishers(node, self.topics.values())
         self._delays = {arm: DelayWatch(STREAM_TIMEOUT) for arm in robot.arms}
-        self._stamps = {arm: DelayWatch(_LATEST) for arm in robot.arms}  # The delays since targets were made.
+        # The delay of each target from its stamp to its receipt.
+        self._stamps = {arm: DelayWatch(_LATEST) for arm in robot.arms}
         self._newest = dict.fromkeys(robot.arms, (0, 0.0))  # Stamp of the last target [ns], and its age at receipt [s].
         # By arm, why its last target was not used, and the time of that [s].
         self._refused: dict[str, tuple[Reason, float]] = {}
@@ -203,9 +204,11 @@ class JointIntake:
         self._turns = TurnCounter(robot)
         self.state: RobotState | None = None  # The newest state of all arms.
         self._own_names: set[str] = set()  # Topics on which the arms' own names have come.
-        self.theirs: dict[str, str] = {}  # By our name of a joint, the different name that its driver uses.
-        # What drivers report: why arms do not follow, or None; and for a measured posture (nv,), the posture at which
-        # the drivers hold the arms (nv,) [rad], or None.
+        # By our name of a joint, the name that the driver uses for it. Joints with equal names are left out.
+        self.theirs: dict[str, str] = {}
+        # Two functions that return what drivers report. The first one returns why arms do not follow, or None. The
+        # second one gets a measured posture (nv,), and returns the posture at which the drivers hold the arms (nv,)
+        # [rad], or None.
         self.driver_fault: Callable[[], Reason | None] = lambda: None
         self.driver_held: Callable[[Array], Array | None] = lambda q: None
 

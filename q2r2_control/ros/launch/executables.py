@@ -11,7 +11,8 @@ import sys
 from collections.abc import Callable
 from importlib import import_module
 
-# By executable, a module of ``nodes``, and in it the class of a node or a function that runs several nodes.
+# For each executable: the name of a module of ``nodes``, and the name of a class or function in this module. The class
+# is that of a node. The function runs several nodes.
 NODES = {
     "tcp_endpoint": ("tcp_endpoint", "TcpEndpoint"),
     "SimulationInput": ("simulation_input", "SimulationInput"),
@@ -31,8 +32,8 @@ def _executable(name: str) -> Callable[[], int]:
     def run() -> int:
         sys.argv[0] = name
         signal.signal(signal.SIGINT, signal.SIG_DFL)
-        # The signal is allowed only now. q2r2 ros up has blocked it, so that it does not interrupt the start of the
-        # interpreter either.
+        # SIGINT is unblocked only now. q2r2 ros up has blocked it, because a SIGINT at the start of the interpreter
+        # would cause a traceback.
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
         module, made = NODES[name]
         imported = import_module(f"q2r2_control.ros.nodes.{module}")

@@ -20,7 +20,7 @@ def set_up_middleware(environment: MutableMapping[str, str]) -> None:
     """Add the variables for Fast DDS before ``rclpy.init``. The user's own settings and another middleware stay."""
     if not environment.get("RMW_IMPLEMENTATION", _FAST_DDS).startswith(_FAST_DDS):
         return
-    # ROS_LOCALHOST_ONLY overrides the range, and switches shared memory on against any profile.
+    # ROS_LOCALHOST_ONLY overrides the discovery range. With it, shared memory is used even if a profile disables it.
     if _PROFILES_FILE in environment or _TRANSPORTS in environment or environment.get("ROS_LOCALHOST_ONLY") == "1":
         return
     if environment.get(_RANGE) != "LOCALHOST":

@@ -139,7 +139,7 @@ def test_gradients_and_bounds_on_changes_of_distances_are_right_for_prismatic_jo
         assert abs(here - there) <= _way_bound(arrays, np.abs(other - q))[0] + 1e-12
 
 
-def test_a_shape_that_no_kernel_measures_is_refused_by_name() -> None:
+def test_the_error_about_a_shape_that_no_kernel_can_measure_names_the_shape_and_its_kind() -> None:
     model = pin.GeometryModel()
     model.addGeometryObject(pin.GeometryObject("funnel", 0, pin.SE3.Identity(), coal.Cone(0.1, 0.2)))
     with pytest.raises(RobotError, match=r"funnel.*Cone.*capsule, sphere, box"):

@@ -47,7 +47,7 @@ def waiting_cabinets(
         return None
 
     def serve(cabinet: Cabinet, address: str, port: int) -> None:
-        schedule_thread_first(_PRIORITY)  # The system permits this priority.
+        schedule_thread_first(_PRIORITY)  # If the system refuses this priority, the thread keeps its scheduler.
         due = time.monotonic()
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
             opened.bind((address, 0))
