@@ -46,6 +46,16 @@ _STALLED_AFTER = 0.3  # A gripper that does not move by _MOVES within this time 
 _MOVES = 0.004  # Least motion of a gripper that counts, as a share of the stroke.
 _OUTSIDE = 0.02  # A goal that exceeds the stroke by this share of it still counts as the stroke's end.
 _CLOSED = 0.05  # Closed position in goals, as in Quest2ROS2; 0 is fully open [m].
+# The parts x y z w of the product of two unit quaternions, the first of which is inverted. Each part is a sum over the
+# products of the parts w x y z of both, with these factors.
+_INVERSE_TIMES = np.array(
+    [
+        [[0.0, 1.0, 0.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, -1.0], [0.0, 0.0, 1.0, 0.0]],
+        [[0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0]],
+        [[0.0, 0.0, 0.0, 1.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [-1.0, 0.0, 0.0, 0.0]],
+        np.eye(4),
+    ]
+)
 
 
 @dataclass(slots=True)
@@ -313,14 +323,9 @@ class LinkTransforms:
 
     def at(self, data: Any, t: float) -> bytes:
         """Return the message for a ``mujoco.MjData`` at ``t`` [s]."""
-        turned = data.xquat[self._parents]
         away = data.xpos[self._bodies] - data.xpos[self._parents]
         numbers = np.empty((len(self._bodies), 7))
-        # A vector a that is turned back by a unit quaternion (w, u) is a - 2 w (u x a) + 2 u x (u x a).
-        w, u = turned[:, :1], turned[:, 1:]
-        across = np.cross(u, away)
-        numbers[:, :3] = away - 2.0 * w * across + 2.0 * np.cross(u, across)
-        its_w, its_u = data.xquat[self._bodies, :1], data.xquat[self._bodies, 1:]  # MuJoCo has w first.
-        numbers[:, 3:6] = w * its_u - its_w * u - np.cross(u, its_u)
-        numbers[:, 6:] = w * its_w + (u * its_u).sum(axis=1, keepdims=True)
+        numbers[:, :3] = np.einsum("nij,ni->nj", data.xmat.reshape(-1, 3, 3)[self._parents], away)
+        turned, its = data.xquat[self._parents], data.xquat[self._bodies]
+        numbers[:, 3:] = np.einsum("kij,ni,nj->nk", _INVERSE_TIMES, turned, its)
         return self._template.fill(numbers.ravel().tolist(), t)
