@@ -75,8 +75,24 @@ class GripperServer:
     node.
     """
 
-    def __init__(self, node: Node, topic: str, command: Callable[[float], None], refuse: Callable[[str], None]) -> None:
-        self._command, self._refuse = command, refuse
+    def __init__(
+        self,
+        node: Node,
+        topic: str,
+        measure: Callable[[], tuple[float, float]],
+        command: Callable[[float], None],
+        refuse: Callable[[str], None],
+    ) -> None:
+        """Make the server.
+
+        Args:
+            node: The node that offers the action.
+            topic: The name of the action.
+            measure: Returns the gripper's opening, from 0 closed to 1 open, and its effort [N].
+            command: Takes the opening to which the gripper has to move.
+            refuse: Takes one line that says why a goal is refused.
+        """
+        self._measure, self._command, self._refuse = measure, command, refuse
         self._motion: _Motion | None = None
         self._newest: ServerGoalHandle | None = None
         self.server = ActionServer(
@@ -90,8 +106,11 @@ class GripperServer:
             cancel_callback=lambda _: CancelResponse.ACCEPT,
         )
 
-    def update(self, now: float, opening: float, effort: float) -> None:
-        """Continue with the goal at ``now`` [s], with the gripper's measured ``opening`` 0..1 and ``effort`` [N]."""
+    def update(self, now: float) -> None:
+        """Continue with the goal, if there is one, at ``now`` [s]."""
+        if self._newest is None and self._motion is None:
+            return
+        opening, effort = self._measure()
         position = _CLOSED * (1.0 - opening)
         if self._newest is not None:
             if self._motion is not None:
@@ -101,8 +120,7 @@ class GripperServer:
             self._newest = None
             self._command(self._motion.goal)
         motion = self._motion
-        if motion is None:
-            return
+        assert motion is not None
         if abs(opening - motion.seen) > _MOVES:
             motion.seen, motion.moved_at = opening, now
         reached = abs(opening - motion.goal) <= _REACHED
@@ -165,6 +183,7 @@ class MujocoRobot(BaseNode):
             arm: GripperServer(
                 self,
                 f"q2r2/{arm}_gripper/gripper_cmd",
+                partial(self._cell.gripper_state, arm),
                 partial(self._cell.command_gripper, arm),
                 partial(self._note, f"{arm}_gripper"),
             )
@@ -255,19 +274,18 @@ class MujocoRobot(BaseNode):
         state = cell.advance(now)
         self.ticked += 1
         stamp = self.now
-        q = np.concatenate([state.q, cell.finger_positions()])
-        v = np.concatenate([state.v, cell.finger_velocities()])
+        q = state.q.tolist() + cell.finger_positions().tolist()
+        v = state.v.tolist() + cell.finger_velocities().tolist()
         # Fingers get the effort 0, because it is not measured.
-        tau = np.concatenate([state.tau, np.zeros(len(q) - len(state.tau))])
-        self._joint_states.publish(self._measured.fill([*q.tolist(), *v.tolist(), *tau.tolist()], stamp))
+        tau = state.tau.tolist() + [0.0] * len(cell.fingers)
+        self._joint_states.publish(self._measured.fill(q + v + tau, stamp))
         if state.tau_external is not None and now >= self._external_due:
             # The due times are on a grid, half a tick early, so that a tick that comes early by jitter counts.
             self._external_due = max(self._external_due + self._external_period, now - 0.5 * self._period)
             if self._external.get_subscription_count():
                 self._external.publish(self._felt.fill(state.tau_external.tolist(), stamp))
-        openings = cell.plant.gripper_openings()
-        for arm, gripper in self._grippers.items():
-            gripper.update(now, openings[arm], cell.gripper_force(arm))
+        for gripper in self._grippers.values():
+            gripper.update(now)
 
     def _publish_transforms(self) -> None:
         self._tf.publish(self._moving.at(self._cell.plant.data, self.now))
