@@ -187,7 +187,7 @@ class PoseRateLimiter:
             dt = self._pacer.step(gap, np.array([self._linear.speed, self._angular.speed]))
         self._now = now
         at = self.pose
-        if target is None or not np.isfinite(target.homogeneous).all():
+        if target is None or not all(map(math.isfinite, pin.SE3ToXYZQUATtuple(target))):
             self._target, limited = None, False
             shift, turn = (motion.towards(np.zeros(3), dt)[0] for motion in (self._linear, self._angular))
         else:
