@@ -225,7 +225,10 @@ class PoseTopic:
             source = self._publishers.source(self.topic)
             self.problem = Reason.of(RosReason.TOPIC_SILENT, topic=self.topic, source=source, age=now - received)
             return None
-        placement = self._tree.find(frame, self._world) if frame else Placement(pin.SE3.Identity(), math.inf)
+        if frame in ("", self._world):
+            placement: Placement | None = Placement(pin.SE3.Identity(), math.inf)
+        else:
+            placement = self._tree.find(frame, self._world)
         if self._pose is None:
             self.problem = Reason.of(RosReason.TOPIC_NOT_A_POSE, topic=self.topic)
         elif placement is None:
