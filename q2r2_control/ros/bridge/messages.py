@@ -181,9 +181,11 @@ def robot_state(message: JointState | JointNumbers, names: Sequence[str], t: flo
             continue
         if len(numbers) != len(message.name):
             return f"{len(numbers)} {field} values for {len(message.name)} joints"
-        numbers = measured(field, numbers[order])
-        if not math.isfinite(sum(numbers.tolist())) and not np.isfinite(numbers).all():
-            return f"{field} of {names[int(np.argmin(np.isfinite(numbers)))]} is not finite"
+        numbers = numbers[order]
+        if not math.isfinite(sum(numbers.tolist())):  # Most often this is enough to know that all are finite.
+            numbers = measured(field, numbers)
+            if not np.isfinite(numbers).all():
+                return f"{field} of {names[int(np.argmin(np.isfinite(numbers)))]} is not finite"
         values.append(numbers)
     return RobotState(q=values[0], v=values[1], tau=values[2], tau_external=None, stamp=t)
 
