@@ -216,7 +216,8 @@ class JointIntake:
             on_message = partial(self._on_message, take, look, topic, joint_state_reader())
             self._node.create_subscription(JointState, topic, on_message, STREAM_QOS, raw=True)
         if self._external_topic:
-            self._node.create_subscription(JointState, self._external_topic, self._on_external, STREAM_QOS)
+            on_external = partial(self._on_external, joint_state_reader())
+            self._node.create_subscription(JointState, self._external_topic, on_external, STREAM_QOS, raw=True)
 
     def source(self) -> str:
         """Return the publishers of the oldest joint states, for the middle of a sentence."""
@@ -315,15 +316,20 @@ class JointIntake:
         """Store the external torques of all joints (nv,) [Nm]."""
         self._external, self._external_stamp = torques, self._node.now
 
-    def _on_external(self, message: JointState) -> None:
+    def _on_external(self, read: Callable[[Any], JointNumbers], data: bytes | JointState) -> None:
+        try:
+            message = read(data)
+        except SerdeError:  # Another node is at fault.
+            self._node.drop(self._external_topic, f"{len(bytes(data))} bytes")
+            return
         if not set(message.name) >= set(self._joint_names):
             return  # The message is about another robot.
-        effort = dict(zip(message.name, message.effort, strict=False))
+        effort = dict(zip(message.name, message.effort.tolist(), strict=False))
         torques = np.array([effort.get(name, math.nan) for name in self._joint_names])
         if len(message.effort) == len(message.name) and np.isfinite(torques).all():
             self.take_external(torques)
         else:
-            self._node.drop(self._external_topic, f"{list(message.effort)!s:.60}")
+            self._node.drop(self._external_topic, f"{message.effort.tolist()!s:.60}")
 
 
 class Fingers:
