@@ -213,12 +213,12 @@ class SimulatedCell:
         # Without this limit, a torque that nobody renews would push for ever.
         if self._tau is not None and now - self._last_command > self._hold_after:
             self._back_to_servos()
-        zero = np.zeros_like(self.robot.home)
         if self._tau is not None:
             state = self.plant.state()
             command = Command(CommandMode.TORQUE, state.q, state.v, self._tau, self._openings)
         else:
             self._follower.advance(now, dt)
+            zero = np.zeros(len(self._columns))
             command = Command(CommandMode.POSITION, self._follower.q, self._follower.v, zero, self._openings)
         self.plant.apply(command)
         self.plant.advance(dt)
@@ -238,7 +238,7 @@ class SimulatedCell:
             return f"due in {delay:g} s; allowed: 0 .. 1"
         return None
 
-    def _find(self, names: tuple[str, ...]) -> tuple[list[int], Array] | str:
+    def _find(self, names: tuple[str, ...]) -> tuple[Array, Array] | str:
         """Return, for the cell's joints in ``names``, their indices in ``names`` and in arrays (nv,).
 
         If the names cannot be used, the result is a text that says why.
@@ -247,4 +247,4 @@ class SimulatedCell:
             return "a joint is named twice"
         if not (ours := [place for place, name in enumerate(names) if name in self._columns]):
             return f"none of its joints is one of {', '.join(self._columns)}"[:200]
-        return ours, np.array([self._columns[names[place]] for place in ours])
+        return np.array(ours), np.array([self._columns[names[place]] for place in ours])
