@@ -1,6 +1,6 @@
 """An executor for nodes that tick: it sleeps until a tick, takes the messages that have arrived, and runs the tick.
 
-Messages and ticks bypass rclpy's wait set. rclpy runs everything else, such as services. On two busy cores with both
+Messages and timers bypass rclpy's wait set. rclpy runs everything else, such as services. On two busy cores with both
 arms moving, this needs 1.1 cores for 167 joint commands per second. With ``SingleThreadedExecutor`` it was 1.7 cores
 for 53. The ``EventsExecutor`` of rclpy 7.1 fails with a ``SystemError`` if a callback gets the times of a message.
 
