@@ -99,8 +99,7 @@ class TargetOutput:
 
     def take_fault(self, now: float) -> Reason | None:
         """Check the subscribers. If the controller is no longer there, return the reason once."""
-        # The graph may list some subscribers before the publisher can send to them.
-        listeners = max(self._publisher.listeners, self._node.handle.get_count_subscribers(self.topic))
+        listeners = self._present()
         if listeners > self._listeners or listeners == 0:
             self._appeared_at = now
             if not self.following:
@@ -142,10 +141,7 @@ class TargetOutput:
                 In PAUSED a message ends the stream. Without this message, the built-in controller also holds linked
                 arms.
         """
-        # A subscriber that has appeared since ``take_fault`` must not get a target. Only those to which the publisher
-        # can send count here.
-        appeared = self._publisher.listeners > self._listeners
-        if self._unknown or appeared or (self._is_twist and base is None):
+        if self._unknown or self._present() > self._listeners or (self._is_twist and base is None):
             if self._is_twist:  # The controller would continue at the last velocity, so it is told to stop.
                 self.forget(now)
             return None
@@ -188,6 +184,10 @@ class TargetOutput:
             self._publisher.publish(still, time.monotonic())
         self.following, self.last_sent, self._sent_at = False, None, -math.inf
         self.guard.reset(None, now)
+
+    def _present(self) -> int:
+        """Return the number of subscribers. The graph may list some before the publisher can send to them."""
+        return max(self._publisher.listeners, self._node.handle.get_count_subscribers(self.topic))
 
     def _holds(self, tool: pin.SE3 | None, state: ArmState, now: float) -> bool:
         if self.guard.pose is None:
