@@ -70,7 +70,8 @@ class MujocoPlant:
         self.data: mujoco.MjData = mujoco.MjData(self.model)
         self._qpos, self._qvel = self.data.qpos, self.data.qvel
         self._bias, self._ctrl = self.data.qfrc_bias, self.data.ctrl
-        self._robot = robot
+        self._robot, self._least_torque = robot, -robot.torque_limit
+        self._arm_ctrl = self._ctrl[: len(robot.joint_names)]
         self._timestep = config.mujoco.timestep
         self._window: mujoco.viewer.Handle | None = None
         self._grippers = GripperMotion(config)
@@ -261,8 +262,7 @@ class MujocoPlant:
         return torque
 
     def _drive_arms(self, torque: Array) -> None:
-        limit = self._robot.torque_limit
-        self._ctrl[: len(torque)] = np.minimum(np.maximum(torque, -limit), limit)
+        np.minimum(np.maximum(torque, self._least_torque), self._robot.torque_limit, out=self._arm_ctrl)
 
     def _drive_fingers(self) -> None:
         for side, fingers in self._fingers.items():

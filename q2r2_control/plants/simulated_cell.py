@@ -104,8 +104,9 @@ class SimulatedCell:
             robot.home, robot.capped_acceleration(config.control.acceleration_limit), robot.velocity_limit
         )
         self.fingers = [joint for arm in robot.arms.values() for joint in arm.finger_joints]
-        self._finger_q = [self.plant.model.joint(name).qposadr[0] for name in self.fingers]
-        self._finger_v = [self.plant.model.joint(name).dofadr[0] for name in self.fingers]
+        joints = [self.plant.model.joint(name) for name in self.fingers]
+        self._finger_q = np.array([joint.qposadr[0] for joint in joints], dtype=int)
+        self._finger_v = np.array([joint.dofadr[0] for joint in joints], dtype=int)
         self._finger_actuators = {
             arm: [self.plant.model.actuator(joint).id for joint in its.finger_joints] for arm, its in robot.arms.items()
         }
@@ -175,17 +176,23 @@ class SimulatedCell:
         """Open (1) or close (0) an arm's gripper."""
         self._openings[arm] = opening
 
-    def gripper_force(self, arm: str) -> float:
-        """Return the largest force of the arm's finger servos [N, or Nm if the fingers turn]; 0 without a gripper."""
-        return float(np.abs(self.plant.data.actuator_force[self._finger_actuators[arm]]).max(initial=0.0))
+    def gripper_state(self, arm: str) -> tuple[float, float]:
+        """Return the opening of an arm's gripper, from 0 closed to 1 open, and the largest force of its finger servos.
+
+        The force is in N, or in Nm if the fingers turn.
+        """
+        force = np.abs(self.plant.data.actuator_force[self._finger_actuators[arm]]).max()
+        return self.plant.gripper_openings()[arm], float(force)
 
     def finger_positions(self) -> Array:
         """Return the positions of the joints ``fingers`` (n,) [m or rad]."""
-        return np.array(self.plant.data.qpos[self._finger_q])
+        positions: Array = self.plant.data.qpos[self._finger_q]
+        return positions
 
     def finger_velocities(self) -> Array:
         """Return the velocities of the joints ``fingers`` (n,) [m/s or rad/s]."""
-        return np.array(self.plant.data.qvel[self._finger_v])
+        velocities: Array = self.plant.data.qvel[self._finger_v]
+        return velocities
 
     def advance(self, now: float) -> RobotState:
         """Take all physics steps that are due at ``now`` [s], and return the measured state."""
@@ -206,12 +213,12 @@ class SimulatedCell:
         # Without this limit, a torque that nobody renews would push for ever.
         if self._tau is not None and now - self._last_command > self._hold_after:
             self._back_to_servos()
-        zero = np.zeros_like(self.robot.home)
         if self._tau is not None:
             state = self.plant.state()
             command = Command(CommandMode.TORQUE, state.q, state.v, self._tau, self._openings)
         else:
             self._follower.advance(now, dt)
+            zero = np.zeros(len(self._columns))
             command = Command(CommandMode.POSITION, self._follower.q, self._follower.v, zero, self._openings)
         self.plant.apply(command)
         self.plant.advance(dt)
@@ -231,7 +238,7 @@ class SimulatedCell:
             return f"due in {delay:g} s; allowed: 0 .. 1"
         return None
 
-    def _find(self, names: tuple[str, ...]) -> tuple[list[int], Array] | str:
+    def _find(self, names: tuple[str, ...]) -> tuple[Array, Array] | str:
         """Return, for the cell's joints in ``names``, their indices in ``names`` and in arrays (nv,).
 
         If the names cannot be used, the result is a text that says why.
@@ -240,4 +247,4 @@ class SimulatedCell:
             return "a joint is named twice"
         if not (ours := [place for place, name in enumerate(names) if name in self._columns]):
             return f"none of its joints is one of {', '.join(self._columns)}"[:200]
-        return ours, np.array([self._columns[names[place]] for place in ours])
+        return np.array(ours), np.array([self._columns[names[place]] for place in ours])

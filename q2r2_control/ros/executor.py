@@ -1,6 +1,6 @@
 """An executor for nodes that tick: it sleeps until a tick, takes the messages that have arrived, and runs the tick.
 
-Messages and ticks bypass rclpy's wait set. rclpy runs everything else, such as services. On two busy cores with both
+Messages and timers bypass rclpy's wait set. rclpy runs everything else, such as services. On two busy cores with both
 arms moving, this needs 1.1 cores for 167 joint commands per second. With ``SingleThreadedExecutor`` it was 1.7 cores
 for 53. The ``EventsExecutor`` of rclpy 7.1 fails with a ``SystemError`` if a callback gets the times of a message.
 
@@ -39,7 +39,7 @@ class TickGroup(MutuallyExclusiveCallbackGroup):
 
 
 class TickExecutor(SingleThreadedExecutor):
-    """Runs the ``tick_group`` of each node itself. rclpy runs all other callbacks every 50 ms."""
+    """Runs the ``tick_group`` of each node itself, and all timers. rclpy runs all other callbacks every 50 ms."""
 
     def __init__(self, *, context: Context | None = None) -> None:
         super().__init__(context=context)
@@ -47,9 +47,10 @@ class TickExecutor(SingleThreadedExecutor):
         self._subscriptions: list[Any] = []  # Subscriptions, each with the number of arguments of its callback.
         self._streams: list[Any] = []  # The subscriptions that have a publisher. Others need not be looked at.
         self._ticks: list[Any] = []  # The timers of ticks.
+        self._slow_timers: list[Any] = []  # All other timers, except those with a coroutine, which rclpy has to run.
         self._served_at = -math.inf  # Time of the last look at services, slow timers and silent topics [s].
         self._simulated = False  # See _is_simulated.
-        self._rest = _RestOfNodes([])
+        self._rest = _RestOfNodes([], [])
 
     def add_node(self, node: Any) -> bool:
         node.tick_group.is_taken = self._changed = True
@@ -69,17 +70,13 @@ class TickExecutor(SingleThreadedExecutor):
         if (sleep := self._time_left(longest)) > 0.0:
             time.sleep(sleep)
         self.take_messages()
-        for timer in self._ticks:
-            if self._changed:
-                break
-            if timer.is_ready():
-                timer.handle.call_timer()
-                timer.callback()
+        self._run_timers(self._ticks)
         if (now := time.monotonic()) - self._served_at >= _SERVED:
             self._served_at, self._streams, self._simulated = now, self._subscriptions, self._is_simulated()
             self.take_messages()  # This also takes messages of a publisher that has come and gone meanwhile.
             if not self._changed:
                 self._streams = [one for one in self._streams if one[0].handle.get_publisher_count()]
+            self._run_timers(self._slow_timers)
             if self._changed or self._tasks or self._rest.is_ready():
                 self._serve()
 
@@ -94,6 +91,14 @@ class TickExecutor(SingleThreadedExecutor):
                 if (taken := one.handle.take_message(one.msg_type, one.raw)) is None:
                     break
                 one.callback(*taken[:arguments])
+
+    def _run_timers(self, timers: list[Any]) -> None:
+        for timer in timers:
+            if self._changed:
+                return  # The list is out of date, and this timer may have been destroyed.
+            if timer.is_ready():
+                timer.handle.call_timer()
+                timer.callback()
 
     def _time_left(self, longest: float) -> float:
         if self._simulated:
@@ -118,22 +123,26 @@ class TickExecutor(SingleThreadedExecutor):
         nodes: list[Any] = list(self.get_nodes())
         groups = [(node, node.tick_group) for node in nodes]
         self._ticks = [one for node, group in groups for one in node.timers if one.callback_group is group]
+        others = [one for node, group in groups for one in node.timers if one.callback_group is not group]
+        self._slow_timers = [one for one in others if not inspect.iscoroutinefunction(one.callback)]
         streams = [one for node, group in groups for one in node.subscriptions if one.callback_group is group]
         self._streams = self._subscriptions = [(one, _arguments(one.callback)) for one in streams]
-        self._rest, self._simulated = _RestOfNodes(nodes), self._is_simulated()
+        self._rest, self._simulated = _RestOfNodes(nodes, self._slow_timers), self._is_simulated()
 
 
 class _RestOfNodes:
     """The callbacks of nodes that belong to no :class:`TickGroup`. rclpy executes them."""
 
-    def __init__(self, nodes: list[Any]) -> None:
+    def __init__(self, nodes: list[Any], without: list[Any]) -> None:
+        """Leave out the timers ``without``, which the executor runs itself."""
         groups = [node.tick_group for node in nodes]
 
         def others(kind: str) -> list[Any]:
             found = (one for node in nodes for one in getattr(node, kind))
             return [one for one in found if one.callback_group not in groups]
 
-        self._subscriptions, self._timers = others("subscriptions"), others("timers")
+        self._subscriptions = others("subscriptions")
+        self._timers = [one for one in others("timers") if one not in without]
         self._clients, self._services, self._waitables = others("clients"), others("services"), others("waitables")
         # Guard conditions are not waited for, because a wait would clear their trigger, and rclpy would not see it.
         self._has_guards = any(list(node.guards) for node in nodes)

@@ -187,17 +187,18 @@ class PoseRateLimiter:
             dt = self._pacer.step(gap, np.array([self._linear.speed, self._angular.speed]))
         self._now = now
         at = self.pose
-        if target is None or not np.isfinite(target.homogeneous).all():
+        if target is None or not all(map(math.isfinite, pin.SE3ToXYZQUATtuple(target))):
             self._target, limited = None, False
             shift, turn = (motion.towards(np.zeros(3), dt)[0] for motion in (self._linear, self._angular))
         else:
             last, self._target = self._target or at, target
             # In a late step, the pose follows only this fraction of the target's motion now. The rest counts as lag.
             share = dt / gap
-            lag, moved = last.translation - at.translation, target.translation - last.translation
-            shift, slow = self._linear.follow(lag + (1.0 - share) * moved, share * moved, dt)
-            lag, moved = pin.log3(last.rotation @ at.rotation.T), pin.log3(target.rotation @ last.rotation.T)
-            turn, slow_turn = self._angular.follow(lag + (1.0 - share) * moved, share * moved, dt)
+            start, end = last.translation, target.translation
+            shift, slow = self._linear.follow(start - at.translation, end - start, share, dt)
+            start, end = last.rotation, target.rotation
+            lag, moved = pin.log3(start @ at.rotation.T), pin.log3(end @ start.T)
+            turn, slow_turn = self._angular.follow(lag, moved, share, dt)
             limited = slow or slow_turn
         self.clipped += limited
         rotation = pin.Quaternion(pin.exp3(turn) @ at.rotation).normalized()
@@ -215,14 +216,17 @@ class _Limited:
     def speed(self) -> float:
         return math.hypot(*self.velocity)
 
-    def follow(self, lag: Array, moved: Array, dt: float) -> tuple[Array, bool]:
+    def follow(self, lag: Array, moved: Array, share: float, dt: float) -> tuple[Array, bool]:
         """Return the step towards a moving target (3,) [m or rad], and whether a limit has reduced the step.
 
         Args:
             lag: Vector from the pose to the target (3,) [m or rad].
-            moved: Displacement of the target in this step (3,) [m or rad].
+            moved: Displacement of the target since the last step (3,) [m or rad].
+            share: Share of this displacement that the pose follows in this step. The rest counts as lag.
             dt: Duration of the step [s].
         """
+        if share < 1.0:
+            lag, moved = lag + (1.0 - share) * moved, share * moved
         own, (fastest, a) = moved / dt, self.limits
         if math.hypot(*own) > fastest:
             lag, own = lag + moved, np.zeros(3)

@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-
-import numpy as np
+from operator import mul
 
 from q2r2_control.config.teleop import axes_matrix
 from q2r2_control.events import Reason
-from q2r2_control.quaternions import se3_of
+from q2r2_control.quaternions import inverse, product
 from q2r2_control.teleop.gate import pose_of
 from q2r2_control.teleop.reasons import TeleopReason
-from q2r2_control.types import SIDES, Array, HandSample
+from q2r2_control.types import SIDES, HandSample
 from q2r2_control.wording import sentence
 
 CROSSED_FOR = 3.0  # The hands count as crossed if they were crossed at every moment of this time [s].
 CROSSED = Reason.of(TeleopReason.HANDS_CROSSED, time=CROSSED_FOR)
 _BY = 0.1  # Hands are crossed if each is on the wrong side of the other by at least this distance [m].
 _AGREES = 0.5  # Least cosine between each controller's pointing direction and the mean direction of both.
+_Level = tuple[float, float]  # The x and y parts of a vector, in world axes.
 _NEWEST = 0.2  # A pose that is older than this does not count [s].
 
 
@@ -38,8 +38,9 @@ class CrossedHands:
 
     def __init__(self, axes: Sequence[str]) -> None:
         """``axes`` are the signed axes of the setting ``teleop.axes``, from the input's frame to the world frame."""
-        self._axes: Array = axes_matrix(axes)
-        self._hands: dict[str, tuple[float, Array, Array]] = {}  # By hand: time [s], position [m], pointing direction.
+        self._forward, self._left = axes_matrix(axes)[:2].tolist()  # The world's x and y axes, in the input's frame.
+        # By hand: time [s], and the horizontal parts of its position [m] and of its pointing direction.
+        self._hands: dict[str, tuple[float, _Level, _Level]] = {}
         self._since = math.inf  # Time since which the hands have been crossed [s]; infinite if they are not crossed.
         self._at = -math.inf  # Time of the newest sample at which both hands were judged [s].
 
@@ -50,9 +51,9 @@ class CrossedHands:
             self._hands.pop(sample.hand, None)
             self._since = math.inf
             return
-        placement = se3_of(pose)
-        points = self._axes @ placement.rotation @ self._axes.T[:, 0]
-        self._hands[sample.hand] = stamp, self._axes @ placement.translation, points
+        position, rotation = pose
+        *points, _ = product(product(rotation, (*self._forward, 0.0)), inverse(rotation))
+        self._hands[sample.hand] = stamp, self._level(position), self._level(points)
         if stamp - self._at > _NEWEST:  # Both hands have not been judged for too long.
             self._since = math.inf
         if self._hands.keys() == {*SIDES}:
@@ -66,18 +67,21 @@ class CrossedHands:
         """Return the sentence about crossed hands at ``now`` [s], or None if they are not crossed."""
         return sentence(CROSSED) if self.crossed(now) else None
 
+    def _level(self, vector: Sequence[float]) -> _Level:
+        """Return the x and y parts, in world axes, of a vector in the input's frame."""
+        return sum(map(mul, self._forward, vector)), sum(map(mul, self._left, vector))
+
     def _judge(self, stamp: float) -> None:
         (left_at, left, left_points), (right_at, right, right_points) = (self._hands[hand] for hand in SIDES)
         if abs(left_at - right_at) > _NEWEST:
             self._since = math.inf
             return
         self._at = stamp
-        forward = (left_points + right_points)[:2]
-        length = float(np.linalg.norm(forward))
-        if length > 0.0:
-            forward = forward / length
-        agree = all(float(points[:2] @ forward) >= _AGREES for points in (left_points, right_points))
-        leftwards = (left - right)[:2] @ np.array([-forward[1], forward[0]])
+        x, y = left_points[0] + right_points[0], left_points[1] + right_points[1]
+        if (length := math.hypot(x, y)) > 0.0:
+            x, y = x / length, y / length
+        agree = all(points[0] * x + points[1] * y >= _AGREES for points in (left_points, right_points))
+        leftwards = (left[1] - right[1]) * x - (left[0] - right[0]) * y
         if not agree or leftwards > -_BY:
             self._since = math.inf
         else:

@@ -120,7 +120,8 @@ def _numbers(values: object, size: int) -> list[float] | None:
         vector = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
         return None
-    return vector.tolist() if vector.shape == (size,) and np.isfinite(vector).all() else None
+    numbers: list[float] = vector.tolist()
+    return numbers if vector.shape == (size,) and all(map(math.isfinite, numbers)) else None
 
 
 def _angle(one: Quaternion, other: Quaternion) -> float:

@@ -314,6 +314,23 @@ def test_the_executor_answers_services_and_runs_coroutines(ticking: Ticking, exe
     assert ticking.log == ["asks", "success: True"]
 
 
+@pytest.mark.parametrize("make", [BaseNode.create_tick, BaseNode.create_timer], ids=["a tick", "a slow timer"])
+def test_a_timer_that_another_one_destroys_does_not_run(make: Any, ticking: Ticking, executor: TickExecutor) -> None:
+    timers: list[Any] = []
+
+    def run() -> None:
+        ticking.log.append("ran")
+        while timers:
+            ticking.destroy_timer(timers.pop())
+
+    timers += [make(ticking, PERIOD, run) for _ in range(2)]
+    time.sleep(2.0 * PERIOD)  # Both timers are due now.
+    spin_until(executor, lambda: ticking.log)
+    for _ in range(3):
+        executor.spin_once(timeout_sec=0.05)
+    assert ticking.log == ["ran"]
+
+
 @pytest.mark.parametrize("make", [BaseNode.create_tick, BaseNode.create_timer], ids=["a tick's", "a slow timer's"])
 def test_the_executor_raises_the_error_of_a_callback(make: Any, ticking: Ticking, executor: TickExecutor) -> None:
     def fail() -> None:

@@ -88,11 +88,13 @@ class FrameTree:
         if (found := self._found.get((frame, within))) is not None:
             return found
         up = dict(self.upwards(within))
+        passed = []
         for name, placement in self.upwards(frame):
+            passed.append(name)
             if name in up:
                 pose, received = up[name].pose.inverse() * placement.pose, min(up[name].received, placement.received)
                 place = self._found[frame, within] = Placement(pose, received)
-                self._used.update(up, (name for name, _ in self.upwards(frame)))
+                self._used.update(up, passed)  # All ancestors of this common one are in ``up``.
                 self._all = False
                 return place  # The placement is remembered until the next transform, which clears all of them.
         self._all = True
@@ -225,7 +227,10 @@ class PoseTopic:
             source = self._publishers.source(self.topic)
             self.problem = Reason.of(RosReason.TOPIC_SILENT, topic=self.topic, source=source, age=now - received)
             return None
-        placement = self._tree.find(frame, self._world) if frame else Placement(pin.SE3.Identity(), math.inf)
+        if frame in ("", self._world):
+            placement: Placement | None = Placement(pin.SE3.Identity(), math.inf)
+        else:
+            placement = self._tree.find(frame, self._world)
         if self._pose is None:
             self.problem = Reason.of(RosReason.TOPIC_NOT_A_POSE, topic=self.topic)
         elif placement is None:

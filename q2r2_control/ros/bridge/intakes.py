@@ -9,6 +9,7 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 import pinocchio as pin
 from geometry_msgs.msg import PoseStamped
 from rosbags.serde import SerdeError
@@ -189,7 +190,7 @@ class JointIntake:
         self._others = {topic: tuple(set(robot.arms).difference(its)) for topic, its in self._topics.items()}
         self._stamps = np.full(len(robot.joint_names), -math.inf)  # Time of each joint's measurement (nv,) [s].
         # For each topic and list of names in a message, the names of our joints in it, and their indices.
-        self._parts: dict[tuple[str, tuple[str, ...]], tuple[list[str], list[int]]] = {}
+        self._parts: dict[tuple[str, tuple[str, ...]], tuple[list[str], npt.NDArray[np.intp]]] = {}
         self._periods = dict.fromkeys(self._topics, _LONGEST_PERIOD)  # By topic, the mean time between messages [s].
         self._names = {topic: [robot.joint_names[joint] for joint in joints] for topic, joints in self._joints.items()}
         what = 'external torques of all joints, for admittance and vibrations: effort of a JointState; "": none'
@@ -218,7 +219,8 @@ class JointIntake:
             on_message = partial(self._on_message, take, look, topic, joint_state_reader())
             self._node.create_subscription(JointState, topic, on_message, STREAM_QOS, raw=True)
         if self._external_topic:
-            self._node.create_subscription(JointState, self._external_topic, self._on_external, STREAM_QOS)
+            on_external = partial(self._on_external, joint_state_reader())
+            self._node.create_subscription(JointState, self._external_topic, on_external, STREAM_QOS, raw=True)
 
     def source(self) -> str:
         """Return the publishers of the oldest joint states, for the middle of a sentence."""
@@ -257,7 +259,7 @@ class JointIntake:
                 for name in self._names[topic]:
                     self.theirs.pop(name, None)
         elif names := self._named_otherwise(topic, message.name):
-            joints = list(self._joints[topic])
+            joints = self._joints[topic]
         else:
             return  # The message is about a gripper or another robot.
         now = self._node.now
@@ -268,13 +270,14 @@ class JointIntake:
         passed = min(now - float(self._stamps[joints].min()), _LONGEST_PERIOD)
         self._periods[topic] += _PERIOD_SHARE * (passed - self._periods[topic])
         self._stamps[joints] = now
-        self._values[:, joints] = part.q, part.v, part.tau
-        if missing := [name for name in self._names[topic] if self._stamps[self._joint_names.index(name)] == -math.inf]:
-            text = f"no joint {missing[0]}" + (f" and {len(missing) - 1} more" if len(missing) > 1 else "")
-            take(Reason.of(RosReason.BAD_JOINT_STATES, text=self._on_topic(topic, text)), now)
-            return
+        for values, numbers in zip(self._values, (part.q, part.v, part.tau), strict=True):
+            values[joints] = numbers
         oldest = float(self._stamps.min())
         if oldest == -math.inf:
+            unknown = self._stamps[self._joints[topic]] == -math.inf
+            if missing := [name for name, is_unknown in zip(self._names[topic], unknown, strict=True) if is_unknown]:
+                text = f"no joint {missing[0]}" + (f" and {len(missing) - 1} more" if len(missing) > 1 else "")
+                take(Reason.of(RosReason.BAD_JOINT_STATES, text=self._on_topic(topic, text)), now)
             return
         q, v, tau = self._values.copy()
         q = self._turns.counted(q, self._stamps)
@@ -289,14 +292,14 @@ class JointIntake:
     def _on_topic(self, topic: str, text: str) -> str:
         return text if len(self._topics) == 1 else f"{topic}: {text}"
 
-    def _part(self, topic: str, given: tuple[str, ...]) -> tuple[list[str], list[int]]:
+    def _part(self, topic: str, given: tuple[str, ...]) -> tuple[list[str], npt.NDArray[np.intp]]:
         """Return the names and indices of a topic's joints that a message has. Each arm may have its own publisher."""
         if (part := self._parts.get((topic, given))) is None:
             if len(self._parts) >= _PARTS:  # The cache fills only if a publisher sends other names each time.
                 self._parts.clear()
             pairs = zip(self._names[topic], self._joints[topic], strict=True)
-            found = [(name, int(joint)) for name, joint in pairs if name in given]
-            part = self._parts[topic, given] = [name for name, _ in found], [joint for _, joint in found]
+            found = {name: joint for name, joint in pairs if name in given}
+            part = self._parts[topic, given] = list(found), np.array(list(found.values()), dtype=np.intp)
         return part
 
     def _named_otherwise(self, topic: str, given: Sequence[str]) -> list[str]:
@@ -316,15 +319,20 @@ class JointIntake:
         """Store the external torques of all joints (nv,) [Nm]."""
         self._external, self._external_stamp = torques, self._node.now
 
-    def _on_external(self, message: JointState) -> None:
+    def _on_external(self, read: Callable[[Any], JointNumbers], data: bytes | JointState) -> None:
+        try:
+            message = read(data)
+        except SerdeError:  # Another node is at fault.
+            self._node.drop(self._external_topic, f"{len(bytes(data))} bytes")
+            return
         if not set(message.name) >= set(self._joint_names):
             return  # The message is about another robot.
-        effort = dict(zip(message.name, message.effort, strict=False))
+        effort = dict(zip(message.name, message.effort.tolist(), strict=False))
         torques = np.array([effort.get(name, math.nan) for name in self._joint_names])
         if len(message.effort) == len(message.name) and np.isfinite(torques).all():
             self.take_external(torques)
         else:
-            self._node.drop(self._external_topic, f"{list(message.effort)!s:.60}")
+            self._node.drop(self._external_topic, f"{message.effort.tolist()!s:.60}")
 
 
 class Fingers:

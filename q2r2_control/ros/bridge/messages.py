@@ -95,9 +95,9 @@ def pose_of_numbers(numbers: Sequence[float]) -> pin.SE3 | None:
     """Return the pose of a position and a quaternion x y z w; None as in :func:`pose_of`."""
     if not is_pose(numbers):
         return None
-    pose = np.array(numbers)
-    pose[3:] /= math.hypot(*numbers[3:])
-    return pin.XYZQUATToSE3(pose)
+    x, y, z, a, b, c, w = numbers
+    length = math.hypot(a, b, c, w)
+    return pin.XYZQUATToSE3((x, y, z, a / length, b / length, c / length, w / length))
 
 
 def hand_pose(message: PoseStamped | bytes) -> HandPose:
@@ -122,9 +122,9 @@ def pose_template(frame: str) -> Template:
 
 def fill_pose(template: Template, pose: pin.SE3, t: float) -> bytes:
     """Return the serialized message of a pose at ``t`` [s], with the contents of :func:`stamped_pose`."""
-    numbers = pin.SE3ToXYZQUAT(pose)
-    numbers[3:] /= math.hypot(*numbers[3:].tolist())
-    return template.fill(numbers.tolist(), t)
+    x, y, z, a, b, c, w = pin.SE3ToXYZQUATtuple(pose)
+    length = math.hypot(a, b, c, w)
+    return template.fill((x, y, z, a / length, b / length, c / length, w / length), t)
 
 
 def joint_state_template(names: Sequence[str], q: bool = True, v: bool = True, tau: bool = True) -> Template:
@@ -181,9 +181,11 @@ def robot_state(message: JointState | JointNumbers, names: Sequence[str], t: flo
             continue
         if len(numbers) != len(message.name):
             return f"{len(numbers)} {field} values for {len(message.name)} joints"
-        numbers = measured(field, numbers[order])
-        if not math.isfinite(sum(numbers.tolist())) and not np.isfinite(numbers).all():
-            return f"{field} of {names[int(np.argmin(np.isfinite(numbers)))]} is not finite"
+        numbers = numbers[order]
+        if not math.isfinite(sum(numbers.tolist())):  # Most often this is enough to know that all are finite.
+            numbers = measured(field, numbers)
+            if not np.isfinite(numbers).all():
+                return f"{field} of {names[int(np.argmin(np.isfinite(numbers)))]} is not finite"
         values.append(numbers)
     return RobotState(q=values[0], v=values[1], tau=values[2], tau_external=None, stamp=t)
 

@@ -46,6 +46,16 @@ _STALLED_AFTER = 0.3  # A gripper that does not move by _MOVES within this time 
 _MOVES = 0.004  # Least motion of a gripper that counts, as a share of the stroke.
 _OUTSIDE = 0.02  # A goal that exceeds the stroke by this share of it still counts as the stroke's end.
 _CLOSED = 0.05  # Closed position in goals, as in Quest2ROS2; 0 is fully open [m].
+# The parts x y z w of the product of two unit quaternions, the first of which is inverted. Each part is a sum over the
+# products of the parts w x y z of both, with these factors.
+_INVERSE_TIMES = np.array(
+    [
+        [[0.0, 1.0, 0.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, -1.0], [0.0, 0.0, 1.0, 0.0]],
+        [[0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0]],
+        [[0.0, 0.0, 0.0, 1.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [-1.0, 0.0, 0.0, 0.0]],
+        np.eye(4),
+    ]
+)
 
 
 @dataclass(slots=True)
@@ -65,8 +75,24 @@ class GripperServer:
     node.
     """
 
-    def __init__(self, node: Node, topic: str, command: Callable[[float], None], refuse: Callable[[str], None]) -> None:
-        self._command, self._refuse = command, refuse
+    def __init__(
+        self,
+        node: Node,
+        topic: str,
+        measure: Callable[[], tuple[float, float]],
+        command: Callable[[float], None],
+        refuse: Callable[[str], None],
+    ) -> None:
+        """Make the server.
+
+        Args:
+            node: The node that offers the action.
+            topic: The name of the action.
+            measure: Returns the gripper's opening, from 0 closed to 1 open, and its effort [N].
+            command: Takes the opening to which the gripper has to move.
+            refuse: Takes one line that says why a goal is refused.
+        """
+        self._measure, self._command, self._refuse = measure, command, refuse
         self._motion: _Motion | None = None
         self._newest: ServerGoalHandle | None = None
         self.server = ActionServer(
@@ -80,8 +106,11 @@ class GripperServer:
             cancel_callback=lambda _: CancelResponse.ACCEPT,
         )
 
-    def update(self, now: float, opening: float, effort: float) -> None:
-        """Continue with the goal at ``now`` [s], with the gripper's measured ``opening`` 0..1 and ``effort`` [N]."""
+    def update(self, now: float) -> None:
+        """Continue with the goal, if there is one, at ``now`` [s]."""
+        if self._newest is None and self._motion is None:
+            return
+        opening, effort = self._measure()
         position = _CLOSED * (1.0 - opening)
         if self._newest is not None:
             if self._motion is not None:
@@ -91,8 +120,7 @@ class GripperServer:
             self._newest = None
             self._command(self._motion.goal)
         motion = self._motion
-        if motion is None:
-            return
+        assert motion is not None
         if abs(opening - motion.seen) > _MOVES:
             motion.seen, motion.moved_at = opening, now
         reached = abs(opening - motion.goal) <= _REACHED
@@ -155,6 +183,7 @@ class MujocoRobot(BaseNode):
             arm: GripperServer(
                 self,
                 f"q2r2/{arm}_gripper/gripper_cmd",
+                partial(self._cell.gripper_state, arm),
                 partial(self._cell.command_gripper, arm),
                 partial(self._note, f"{arm}_gripper"),
             )
@@ -245,19 +274,18 @@ class MujocoRobot(BaseNode):
         state = cell.advance(now)
         self.ticked += 1
         stamp = self.now
-        q = np.concatenate([state.q, cell.finger_positions()])
-        v = np.concatenate([state.v, cell.finger_velocities()])
+        q = state.q.tolist() + cell.finger_positions().tolist()
+        v = state.v.tolist() + cell.finger_velocities().tolist()
         # Fingers get the effort 0, because it is not measured.
-        tau = np.concatenate([state.tau, np.zeros(len(q) - len(state.tau))])
-        self._joint_states.publish(self._measured.fill([*q.tolist(), *v.tolist(), *tau.tolist()], stamp))
+        tau = state.tau.tolist() + [0.0] * len(cell.fingers)
+        self._joint_states.publish(self._measured.fill(q + v + tau, stamp))
         if state.tau_external is not None and now >= self._external_due:
             # The due times are on a grid, half a tick early, so that a tick that comes early by jitter counts.
             self._external_due = max(self._external_due + self._external_period, now - 0.5 * self._period)
             if self._external.get_subscription_count():
                 self._external.publish(self._felt.fill(state.tau_external.tolist(), stamp))
-        openings = cell.plant.gripper_openings()
-        for arm, gripper in self._grippers.items():
-            gripper.update(now, openings[arm], cell.gripper_force(arm))
+        for gripper in self._grippers.values():
+            gripper.update(now)
 
     def _publish_transforms(self) -> None:
         self._tf.publish(self._moving.at(self._cell.plant.data, self.now))
@@ -313,14 +341,9 @@ class LinkTransforms:
 
     def at(self, data: Any, t: float) -> bytes:
         """Return the message for a ``mujoco.MjData`` at ``t`` [s]."""
-        turned = data.xquat[self._parents]
         away = data.xpos[self._bodies] - data.xpos[self._parents]
         numbers = np.empty((len(self._bodies), 7))
-        # A vector a that is turned back by a unit quaternion (w, u) is a - 2 w (u x a) + 2 u x (u x a).
-        w, u = turned[:, :1], turned[:, 1:]
-        across = np.cross(u, away)
-        numbers[:, :3] = away - 2.0 * w * across + 2.0 * np.cross(u, across)
-        its_w, its_u = data.xquat[self._bodies, :1], data.xquat[self._bodies, 1:]  # MuJoCo has w first.
-        numbers[:, 3:6] = w * its_u - its_w * u - np.cross(u, its_u)
-        numbers[:, 6:] = w * its_w + (u * its_u).sum(axis=1, keepdims=True)
+        numbers[:, :3] = np.einsum("nij,ni->nj", data.xmat.reshape(-1, 3, 3)[self._parents], away)
+        turned, its = data.xquat[self._parents], data.xquat[self._bodies]
+        numbers[:, 3:] = np.einsum("kij,ni,nj->nk", _INVERSE_TIMES, turned, its)
         return self._template.fill(numbers.ravel().tolist(), t)

@@ -103,7 +103,7 @@ class SimulationInput(BaseNode):
             self._engage(now, following)
         self._advise(now)
         for sample in self._script.poll(now):
-            self._publish(sample)
+            self._publish(sample, following)
         wait = min(max(self._script.due() - self.now, _SHORTEST), _LONGEST)
         self._timer.timer_period_ns = int(1e9 * wait)
         self._timer.reset()
@@ -158,8 +158,8 @@ class SimulationInput(BaseNode):
         self._script.start()
         self._began, self._not_to_press, self._moves = now, None, False
 
-    def _publish(self, sample: HandSample) -> None:
-        would_engage = (self._moves or not self._starts) and self._listeners.engaged(sample.hand) is False
+    def _publish(self, sample: HandSample, following: Sequence[str]) -> None:
+        would_engage = (self._moves or not self._starts) and sample.hand not in following
         if would_engage or (not self._moves and sample.hand in (self._not_to_press or ())):
             sample = replace(sample, inputs=replace(sample.inputs, button_lower=False))
         self._hand_publishers.publish_sample(sample, self._frame, partial(self._twist, sample))
