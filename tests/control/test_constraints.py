@@ -264,9 +264,14 @@ class Heavy:
     ("matrix", "told"),
     [
         (lambda n: -np.eye(n), "returned a matrix that is not positive semidefinite"),
+        # No entry is negative, but a difference of two neighbouring joints has a negative cost.
+        (
+            lambda n: np.eye(n) + 2.0 * (np.eye(n, k=1) + np.eye(n, k=-1)),
+            "returned a matrix that is not positive semidefinite",
+        ),
         (lambda n: np.eye(n) + np.triu(np.full((n, n), 0.01), 1), "returned a matrix that is not symmetric"),
     ],
-    ids=["negative", "not symmetric"],
+    ids=["negative", "indefinite", "not symmetric"],
 )
 def test_a_task_with_an_unusable_matrix_is_not_used_and_is_named_in_the_report(
     robot: Robot, matrix: Callable[[int], Array], told: str
