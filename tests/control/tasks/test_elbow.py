@@ -47,6 +47,30 @@ def test_the_cost_turns_the_elbow_towards_its_angle_and_does_not_move_the_tool()
         assert np.linalg.eigvalsh(H).min() > -1e-9
 
 
+def test_the_cost_decreases_to_zero_near_postures_without_a_swivel_angle() -> None:
+    robot, random, shares = cell("dual_iiwa7").robot, np.random.default_rng(33), []
+    task, data, arm = ElbowSwivel(robot, {"left": 0.4}), robot.model.createData(), robot.arms["left"]
+    for _ in range(300):
+        q = random_posture(robot, random)
+        pin.forwardKinematics(robot.model, data, q)
+        shoulder, elbow, wrist = (data.oMi[int(j) + 1].translation for j in arm.joints[[1, 3, 5]])
+        line = (wrist - shoulder) / np.linalg.norm(wrist - shoulder)
+        radius, sine = np.linalg.norm(np.cross(line, elbow - shoulder)), np.linalg.norm(line[:2])
+        share = min(radius / 0.05, 1.0) * min(sine / 0.2, 1.0)
+        if share > 0.6:
+            continue
+        steps = 1e-6 * np.eye(len(q))
+        turned = [task.angle("left", q + step) - task.angle("left", q - step) for step in steps]
+        gradient = np.array([np.arctan2(np.sin(angle), np.cos(angle)) for angle in turned]) / 2e-6
+        J = pin.computeFrameJacobian(robot.model, data, q, arm.frame_id, pin.LOCAL_WORLD_ALIGNED)
+        gradient -= J.T @ np.linalg.solve(J @ J.T + 1e-6 * np.eye(6), J @ gradient)
+        H, _ = task.cost(q, q)
+        np.testing.assert_allclose(H, share * 0.1 * np.outer(gradient, gradient), rtol=1e-3, atol=1e-5)
+        shares.append(share)
+    assert min(shares) < 0.4
+    assert len(shares) > 5
+
+
 def run(angles: dict[str, float | None], start: Array) -> tuple[ElbowSwivel, Array, float]:
     """Drive for 4 s with the start poses of the tools as targets, and check the contract at every tick.
 
