@@ -249,6 +249,23 @@ def test_a_task_that_raises_an_exception_in_a_step_changes_nothing_and_is_named_
     assert broken.report.faults == ("tasks[0] BrokenTask: cost raised ZeroDivisionError: ",)
 
 
+class NothingToKeep:
+    """A constraint whose only row every velocity satisfies."""
+
+    hard = True
+
+    def rows(self, q: Array, v: Array) -> tuple[Array, Array]:
+        return np.zeros((1, len(q))), np.zeros(1)
+
+
+def test_a_row_of_zeros_with_the_bound_0_is_accepted_and_changes_nothing(robot: Robot) -> None:
+    free, kept = CartesianController(robot), CartesianController(robot, constraints=[NothingToKeep()])
+    for tick in range(20):
+        reference = kept.step(crossing(robot, tick), DT)
+        assert reference.report.faults == ()
+        np.testing.assert_array_equal(reference.q, free.step(crossing(robot, tick), DT).q)
+
+
 class Heavy:
     """A task whose matrix changes after the task was accepted at home."""
 

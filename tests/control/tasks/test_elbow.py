@@ -56,7 +56,7 @@ def test_the_cost_decreases_to_zero_near_postures_without_a_swivel_angle() -> No
         shoulder, elbow, wrist = (data.oMi[int(j) + 1].translation for j in arm.joints[[1, 3, 5]])
         line = (wrist - shoulder) / np.linalg.norm(wrist - shoulder)
         radius, sine = np.linalg.norm(np.cross(line, elbow - shoulder)), np.linalg.norm(line[:2])
-        share = min(radius / 0.05, 1.0) * min(sine / 0.2, 1.0)
+        share = min(float(radius) / 0.05, 1.0) * min(float(sine) / 0.2, 1.0)
         if share > 0.6:
             continue
         steps = 1e-6 * np.eye(len(q))
