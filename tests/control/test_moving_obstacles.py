@@ -131,7 +131,7 @@ def test_if_a_hand_is_no_longer_reported_an_arm_moves_only_where_the_hand_cannot
 def test_a_report_has_its_age_at_receipt_plus_the_time_of_all_ticks_even_very_long_ticks(
     controller: CartesianController,
 ) -> None:
-    at = controller.tool_pose("left").translation + [0.0, 0.6, 0.0]
+    at = controller.tool_pose("left").translation + np.array([0.0, 0.6, 0.0])
     controller.move_obstacle("hand", hand(at, speed=0.2, age=0.5))
     assert controller.obstacle_reports["hand"].age == 0.5
     controller.step({}, 0.002)
@@ -164,6 +164,15 @@ def test_a_new_obstacle_in_front_of_a_moving_arm_is_named_and_the_arm_brakes_alo
         now = coal_distances.distances(controller.step(forward, 0.002).q, ahead).min()
         assert now >= before - 1e-9, "nothing moves towards it any more"
         before = now
+
+
+@pytest.mark.parametrize("speed", [0.0, 1.0])
+def test_only_an_obstacle_whose_reported_speed_is_0_counts_as_still(
+    controller: CartesianController, speed: float
+) -> None:
+    reported = hand(np.array([0.0, 2.0, 0.5]), speed)
+    controller.move_obstacle("hand", reported)
+    assert controller.still_obstacles == ({"hand": reported} if speed == 0.0 else {})
 
 
 def test_a_new_box_without_motion_stops_an_arm_like_a_fixed_obstacle_until_the_box_is_removed(
