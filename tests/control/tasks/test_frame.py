@@ -21,7 +21,7 @@ from q2r2_control.control.tasks.frame import (
     wanted_twist,
 )
 from q2r2_control.types import Array
-from tests.control.cells import NAMES, cell, kernel_data, kernel_model, placed, random_posture
+from tests.control.cells import NAMES, cell, kernel_model, placed, random_posture, reused_data
 from tests.support.driven import Driven
 
 MOTION = Motion(np.array([6.0, 5.0]), np.array([2.0, 5.0]), np.array([1.0, 2.5]), np.array([0.02]), np.ones(6))
@@ -89,7 +89,7 @@ def test_the_approach_speed_and_its_slope_are_continuous(gain: float, decelerati
 
 def _twist(tool: pin.SE3, target: pin.SE3, feed_forward: Array) -> Array:
     model, arm = kernel_model("dual_iiwa7").tasks, 1
-    data, targets = kernel_data("dual_iiwa7", np.zeros(14)).tasks, TaskTargets.empty(model, ControllerSettings())
+    data, targets = reused_data("dual_iiwa7", np.zeros(14)).tasks, TaskTargets.empty(model, ControllerSettings())
     data.rotation[arm], data.translation[arm] = tool.rotation, tool.translation
     targets.rotation[arm], targets.translation[arm] = target.rotation, target.translation
     targets.feed_forward[arm] = feed_forward
