@@ -135,7 +135,9 @@ def test_gradients_and_bounds_on_changes_of_distances_are_right_for_prismatic_jo
     assert arrays.pairs.joint.tolist() == [[1, 2, 3]]
     for _ in range(200):
         q, other = random_posture(arrays.robot, random), random_posture(arrays.robot, random)
-        np.testing.assert_allclose(_row(arrays, placed(arrays, q), 0), _differences(arrays, q, STEP)[:, 0], rtol=0, atol=1e-6)
+        np.testing.assert_allclose(
+            _row(arrays, placed(arrays, q), 0), _differences(arrays, q, STEP)[:, 0], rtol=0, atol=1e-6
+        )
         here, there = distances(arrays, np.array([q, other]))[:, 0]
         assert abs(here - there) <= _way_bound(arrays, np.abs(other - q))[0] + 1e-12
 

@@ -19,7 +19,17 @@ from q2r2_control.control.safety.separation_rows import write_separation_rows
 from q2r2_control.control.safety.speed_bound import update_body_velocities
 from q2r2_control.control.safety.stop_rollout import TOGETHER, write_stop
 from q2r2_control.types import Array
-from tests.control.cells import NAMES, CellArrays, behind, cell, distances, kernel_model, placed, random_posture, reused_data
+from tests.control.cells import (
+    NAMES,
+    CellArrays,
+    behind,
+    cell,
+    distances,
+    kernel_model,
+    placed,
+    random_posture,
+    reused_data,
+)
 
 APPROACH = kernel_model("dual_iiwa7").safety.approach
 STOP_DISTANCE = float(APPROACH.stop_distance[0])
