@@ -56,7 +56,7 @@ def test_arms_with_constant_targets_come_to_rest_whether_the_targets_are_reachab
 
 
 def test_a_tool_moves_to_a_reachable_target_and_stays_there(controller: CartesianController) -> None:
-    driven = Driven(controller)
+    driven = Driven(controller, dt=0.004)
     by = pin.SE3(pin.exp3(np.array([0.2, -0.3, 0.4])), np.array([0.05, 0.05, 0.15]))
     goal = {
         arm: pin.SE3(by.rotation @ pose.rotation, pose.translation + by.translation)
@@ -104,7 +104,7 @@ def test_a_joint_that_starts_outside_a_position_limit_returns_without_a_jump(
         pytest.skip(f"{robot.joint_names[joint]} there is in penetration too, which another test starts from")
     driven = Driven(controller, q)
     assert driven.drive(0.002).report.status is StepStatus.RECOVERING
-    reference, margin = driven.drive(3.0), controller.settings.position_margin
+    reference, margin = driven.drive(1.5), controller.settings.position_margin
     assert robot.position_lower[joint] + margin <= reference.q[joint] <= robot.position_upper[joint] - margin
 
 
@@ -161,7 +161,7 @@ def test_a_solver_that_never_answers_brings_the_arms_to_rest_along_the_certified
 
 
 def test_the_report_names_the_limits_that_hold_the_arms_back(controller: CartesianController) -> None:
-    report = Driven(controller, dt=0.005).drive(4.0, SCENARIOS["into the table"]).report
+    report = Driven(controller, dt=0.005).drive(3.0, SCENARIOS["into the table"]).report
     assert any("envelope" in name and "table" in name for name in map(limit_name, report.binding))
     assert "table" in "|".join(report.closest_pair)
     assert report.certified
