@@ -130,7 +130,8 @@ def test_a_file_that_ends_at_any_byte_is_read_up_to_its_end_and_does_not_count_a
             "no metadata q2r2_control",
             "killed before it had written",
         )
-    for size in range(begin, len(data)):
+    # The second chunk ends at each of its bytes. Everything else has the same kinds of records, each with several bytes.
+    for size in sorted({*range(*ends[:2]), *range(begin, len(data), 4), len(data) - 1}):
         cut.write_bytes(data[:size])
         recording = Recording(cut)
         found = [message.number for several in recording.messages() for message in several]
