@@ -110,18 +110,23 @@ def test_no_modules_import_each_other_in_a_circle() -> None:
         pytest.param(
             {
                 "viewer.headset_table": HEAVY,
-                "recording.writer": (*HEAVY, f"{PACKAGE}.pipeline"),
+                "recording.writer": (*HEAVY, f"{PACKAGE}.pipeline", "cv2"),
                 "inputs": HEAVY,
                 "teleop": HEAVY,
                 "plants": ("mujoco", "numba", "matplotlib"),
+                "viewer.headset_display": ("mujoco",),
+                "viewer.web.exchange": ("mujoco",),
             },
-            id="parts of a loop",
+            id="parts of a loop, and programs that only draw",
         ),
         pytest.param(
             dict.fromkeys(("ros.bridge.parameters", "ros.nodes.tcp_endpoint", "ros.nodes.base_arm_controller"), HEAVY),
             id="nodes",
         ),
-        pytest.param({"cli.run": ("matplotlib", "rclpy")}, id="a command that runs a cell"),
+        pytest.param(
+            {"cli.run": ("matplotlib", "rclpy"), "cli.run_recording": ("cv2",), "cli.cameras": ("cv2",)},
+            id="commands that run a cell, record it or list cameras",
+        ),
     ],
 )
 def test_importing_a_light_module_imports_nothing_heavy(modules_and_forbidden: dict[str, tuple[str, ...]]) -> None:

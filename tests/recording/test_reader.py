@@ -130,7 +130,7 @@ def test_a_file_that_ends_at_any_byte_is_read_up_to_its_end_and_does_not_count_a
             "no metadata q2r2_control",
             "killed before it had written",
         )
-    # The second chunk ends at each of its bytes. Everything else has the same kinds of records, each with several bytes.
+    # The file ends at every byte of the second chunk, and at every fourth byte of the other records.
     for size in sorted({*range(*ends[:2]), *range(begin, len(data), 4), len(data) - 1}):
         cut.write_bytes(data[:size])
         recording = Recording(cut)
