@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -114,11 +112,3 @@ def test_without_a_cell_the_command_cameras_lists_the_devices_of_this_computer()
     result = q2r2("cameras")
     assert result.exit_code == 0
     assert result.stdout.startswith(("/dev/video", "no V4L2 camera on this computer\n"))
-
-
-def test_opencv_is_not_imported_before_a_camera_is_used() -> None:
-    code = (
-        "import sys, q2r2_control.cli.run_recording, q2r2_control.cli.cameras, q2r2_control.recording.writer;"
-        "sys.exit('cv2' in sys.modules)"
-    )
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

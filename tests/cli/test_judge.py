@@ -23,7 +23,7 @@ IDLE = "max_idle_share: 0.5 "
 def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder with a recording that is kept, and a recording that ends before anything moves."""
     folder = tmp_path_factory.mktemp("recordings")
-    for name, duration in (("a", 3.0), ("b", 0.5)):
+    for name, duration in (("a", 2.0), ("b", 0.5)):
         file = record_episode(folder / name, hands(2), duration)
         file.rename(file.with_name(f"{name}.mcap"))
     return folder

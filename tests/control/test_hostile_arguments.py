@@ -28,19 +28,24 @@ def controller(robot: Robot) -> CartesianController:
     return CartesianController(robot, ControllerSettings(moving_obstacles=("hand",)))
 
 
+@pytest.fixture(scope="module")
+def shared_contract(controller: CartesianController) -> Contract:
+    return Contract(controller)
+
+
 @pytest.fixture
-def contract(robot: Robot, controller: CartesianController) -> Iterator[Contract]:
+def contract(robot: Robot, controller: CartesianController, shared_contract: Contract) -> Iterator[Contract]:
     """Let the arms move before and after the test, and check the contract. Return the contract."""
     controller.reset(robot.home)
-    contract = Contract(controller)
-    going_on(contract, controller)
-    yield contract
-    going_on(contract, controller)
+    shared_contract.start(robot.home)
+    going_on(shared_contract, controller)
+    yield shared_contract
+    going_on(shared_contract, controller)
 
 
 def going_on(contract: Contract, controller: CartesianController) -> None:
     pose = controller.tool_pose("left")
-    for _ in range(20):
+    for _ in range(10):
         contract.check(controller.step({"left": pin.SE3(pose.rotation, pose.translation + 0.1)}, 0.002), 0.002)
 
 
@@ -104,11 +109,11 @@ def test_targets_that_are_not_a_mapping_are_refused_and_nothing_moves(
          "opening from", "opening to", "holding arm", "obstacle name", "obstacle"],
 )  # fmt: skip
 def test_calls_other_than_a_tick_raise_only_our_errors_and_the_next_tick_keeps_the_contract(
-    robot: Robot, controller: CartesianController, hostile: Any, call: Any
+    robot: Robot, controller: CartesianController, shared_contract: Contract, hostile: Any, call: Any
 ) -> None:
     controller.reset(robot.home)
     with suppress(RobotError, ConfigError):
         call(controller, hostile)
     controller.reset(robot.home)
-    contract = Contract(controller)
-    contract.check(controller.step({}, 0.002), 0.002)
+    shared_contract.start(robot.home)
+    shared_contract.check(controller.step({}, 0.002), 0.002)

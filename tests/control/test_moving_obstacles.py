@@ -101,13 +101,13 @@ def test_if_no_more_reports_on_an_obstacle_come_the_arms_come_to_rest_and_the_re
     start = {arm: controller.tool_pose(arm) for arm in controller.robot.arms}
     far = start["left"].translation + np.array([0.0, 0.8, 0.0])
     controller.move_obstacle("hand", hand(far))
-    references = [controller.step(circle(0.002 * tick, start), 0.002) for tick in range(3000)]
-    assert np.abs(references[500].v).max() > 0.05
+    references = [controller.step(circle(0.002 * tick, start), 0.002) for tick in range(1500)]
+    assert np.abs(references[250].v).max() > 0.05
     assert np.abs(references[-1].v).max() < 1e-3
     assert references[-1].report.margin < 0.0
     assert "hand_0" in references[-1].report.tightest_pair
     controller.move_obstacle("hand", hand(far))
-    assert max(np.abs(controller.step(circle(0.002 * tick, start), 0.002).v).max() for tick in range(500)) > 0.05
+    assert max(np.abs(controller.step(circle(0.002 * tick, start), 0.002).v).max() for tick in range(250)) > 0.05
 
 
 def test_if_a_hand_is_no_longer_reported_an_arm_moves_only_where_the_hand_cannot_have_arrived(

@@ -49,10 +49,10 @@ def height(controller: CartesianController) -> float:
 def test_beside_a_block_a_closed_gripper_reaches_a_pose_that_a_gripper_which_may_open_cannot_reach(
     controller: CartesianController,
 ) -> None:
-    run = Driven(controller)
+    run = Driven(controller, dt=2 * DT)
     run.drive(2.0, {"left": BESIDE})
     assert height(controller) > BESIDE.translation[2] + 0.01
-    run = Driven(controller)
+    run = Driven(controller, dt=2 * DT)
     assert run.set_opening("left", 0.0, 0.0) is None
     run.drive(2.0, {"left": BESIDE})
     assert height(controller) == pytest.approx(BESIDE.translation[2], abs=5e-4)
@@ -61,7 +61,7 @@ def test_beside_a_block_a_closed_gripper_reaches_a_pose_that_a_gripper_which_may
 def test_a_gripper_may_open_only_partly_beside_a_block_and_may_open_fully_above_the_block(
     controller: CartesianController,
 ) -> None:
-    run = Driven(controller)
+    run = Driven(controller, dt=2 * DT)
     run.set_opening("left", 0.0, 0.0)
     run.drive(2.0, {"left": BESIDE})
     for opening in (1.0, 0.6):
@@ -142,12 +142,12 @@ def test_an_invalid_opening_or_an_unknown_arm_is_refused_with_the_reason(
 
 @pytest.mark.parametrize("below", [0.0, 5e-10])
 def test_fingers_exactly_at_their_kept_distance_can_move_away_again(robot: Robot, below: float) -> None:
-    run = Driven(CartesianController(robot, SETTINGS))
+    run = Driven(CartesianController(robot, SETTINGS), dt=2 * DT)
     run.set_opening("left", 0.0, 0.0)
     report = run.drive(2.0, {"left": BESIDE}).report
     assert "finger" in report.closest_pair[0] + report.closest_pair[1]
     kept = SETTINGS.distances.model_copy(update={"finger_obstacle": report.closest_distance + below})
-    near = Driven(CartesianController(robot, SETTINGS.model_copy(update={"distances": kept})), run.q)
+    near = Driven(CartesianController(robot, SETTINGS.model_copy(update={"distances": kept})), run.q, dt=2 * DT)
     near.set_opening("left", 0.0, 0.0)
     reference = near.drive(2.0, {"left": ABOVE})
     assert not reference.report.fallback

@@ -47,9 +47,9 @@ def solved_by(name: str, problem: qpsolvers.Problem) -> Array | None:
 
 def busy(controller: CartesianController, tick: int) -> None:
     """Change settings and move an obstacle between steps, so that some of the controller's values change with time."""
-    if tick == 100:
+    if tick == 50:
         assert controller.change({"position_gain": 4.0, "min_distance": 0.025}) is None
-    if tick % 50 == 10:
+    if tick % 25 == 5:
         shape: dict[str, Any] = {"shape": "sphere", "size": (0.05,), "speed": 0.2}
         pose = {"position": (0.9, 0.3 * math.sin(0.01 * tick), 0.6)}
         controller.move_obstacle("hand", MovingObstacle(**shape, **pose))
@@ -57,9 +57,9 @@ def busy(controller: CartesianController, tick: int) -> None:
 
 def test_reading_the_problem_does_not_change_a_run_in_any_bit(robot: Robot) -> None:
     read, unread = CartesianController(robot, KEPT), CartesianController(robot, KEPT)
-    for tick in range(300):
+    for tick in range(150):
         targets: Mapping[str, pin.SE3 | None] = crossing(robot, tick) if tick % 70 < 60 else {}
-        dt = (DT, 0.005, 0.001)[tick // 100]
+        dt = (DT, 0.005, 0.001)[tick // 50]
         for controller in (read, unread):
             busy(controller, tick)
         certified, stop, kept = read._certified, read.stop_deceleration, read.kept_distances
@@ -74,7 +74,7 @@ def test_reading_the_problem_does_not_change_a_run_in_any_bit(robot: Robot) -> N
 def test_the_problem_that_a_program_reads_is_the_problem_that_the_step_solves(robot: Robot) -> None:
     by_hand, controller = CartesianController(robot), CartesianController(robot)
     with_rows = 0
-    for tick in range(300):
+    for tick in range(200):
         targets = crossing(robot, tick)
         problem = by_hand.problem(targets, DT)
         with_rows += problem.G is not None

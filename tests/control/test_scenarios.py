@@ -24,7 +24,7 @@ from q2r2_control.verification.fault_injection import ATTACKS, STOPPING_FAULTS, 
 from tests.control.cells import pandas
 from tests.control.scenarios import SCENARIOS, Scenario, circle, crossing
 
-DURATION = 2.0  # [s]
+DURATION = 1.2  # [s]
 # A faulty solver fails in the last part of every period [s]. FAULT_SHARE is this part's fraction of the period.
 FAULT_PERIOD, FAULT_SHARE = 0.2, 0.2
 AGAINST_US = "against us"  # All attacks in turn, each for one period.

@@ -143,7 +143,7 @@ def test_a_whole_run_keeps_the_jerk_limit_in_every_tick(mode: CommandMode) -> No
     loop = Pipeline.from_config(limited(jerk), input=HandsInput(left=hasty, right=hasty), plant="kinematic", mode=mode)
     commands: list[Command] = []
     loop.listeners.append(lambda tick: commands.append(tick.command))
-    loop.run(1.5, realtime=False)
+    loop.run(1.0, realtime=False)
     q = np.array([command.q for command in commands])
     assert np.ptp(q, axis=0).max() > 0.1
     assert np.abs(np.diff(q, n=3, axis=0) / H**3).max() <= jerk * (1.0 + 1e-3)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import errno
 import gc
+import inspect
 import os
 import platform
 import struct
@@ -168,8 +169,9 @@ def test_if_a_signal_interrupts_the_handler_of_another_signal_its_own_handler_do
 
 
 @pytest.fixture
-def _nothing_frozen() -> Iterator[None]:
+def _nothing_frozen(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Unfreeze the objects that tests/conftest.py has frozen, and freeze them again after the test."""
+    monkeypatch.setattr(gc, "get_freeze_count", inspect.unwrap(gc.get_freeze_count))
     gc.unfreeze()
     yield
     gc.freeze()

@@ -130,7 +130,8 @@ def test_a_file_that_ends_at_any_byte_is_read_up_to_its_end_and_does_not_count_a
             "no metadata q2r2_control",
             "killed before it had written",
         )
-    for size in range(begin, len(data)):
+    # The file ends at every byte of the second chunk, and at every fourth byte of the other records.
+    for size in sorted({*range(*ends[:2]), *range(begin, len(data), 4), len(data) - 1}):
         cut.write_bytes(data[:size])
         recording = Recording(cut)
         found = [message.number for several in recording.messages() for message in several]

@@ -252,7 +252,7 @@ def test_if_limits_are_lowered_during_motion_the_pose_brakes_to_them_at_the_allo
         pytest.param([1.6, 0.6, 0.8] * 100, 0, id="a late tick and two that catch up"),
         pytest.param([10.0, 0.1, 0.9], 8, id="a stall after which one tick is made up"),
         pytest.param([3.0, 1.0, 2.0], 3, id="ticks that never came"),
-        pytest.param([1.0001] * 100_000, 0, id="a clock that runs differently"),
+        pytest.param([1.0001] * 30_000, 0, id="a clock that runs differently"),
     ],
 )
 def test_only_ticks_that_never_came_count_as_missed(gaps: list[float], missed: int) -> None:

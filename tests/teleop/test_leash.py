@@ -164,8 +164,8 @@ def test_the_noise_of_a_resting_hand_never_puts_the_target_at_the_tool() -> None
     tied, random = Tied(RelativeMotion(), distance=0.1, angle=0.5), np.random.default_rng(4)
     tied.go(along(0.001), 300)
     start, noise = tied.hand, np.zeros(6)
-    per_sample = round(0.0133 / DT)
-    for tick in range(round(15.0 / DT)):
+    per_sample = round(0.005 / DT)
+    for tick in range(1100 * per_sample):
         if tick % per_sample == 0:
             noise = random.normal(size=6) * [2e-4, 2e-4, 2e-4, 5e-4, 5e-4, 5e-4]
         tied.tick(moved(start, noise))

@@ -101,33 +101,35 @@ def _outside(points: Array, half: Array) -> Array:
     return np.asarray(np.linalg.norm(points - np.clip(points, -half, half), axis=-1))
 
 
-def _nearest_along(a0: Array, a1: Array, half: Array) -> float:
-    """Return the distance of a segment from a box.
+def _nearest_along(a0: Array, a1: Array, half: Array) -> Array:
+    """Return the distance of each segment from its box (n,). All arguments are (n, 3).
 
     The distance of a point from the box is convex along the segment, so bisection finds its minimum.
     """
-    low, high = 0.0, 1.0
+    low, high = np.zeros((len(a0), 1)), np.ones((len(a0), 1))
     for _ in range(100):
         middle = 0.5 * (low + high)
         point = a0 + middle * (a1 - a0)
-        falls = (point - np.clip(point, -half, half)) @ (a1 - a0) <= 0.0
-        low, high = (middle, high) if falls else (low, middle)
-    ends = a0 + np.array([[0.0], [low], [high], [1.0]]) * (a1 - a0)
-    return float(_outside(ends, half).min())
+        falls = ((point - np.clip(point, -half, half)) * (a1 - a0)).sum(axis=1, keepdims=True) <= 0.0
+        low, high = np.where(falls, middle, low), np.where(falls, high, middle)
+    ends = [_outside(a0 + share * (a1 - a0), half) for share in (0.0, low, high, 1.0)]
+    return np.asarray(np.min(ends, axis=0))
 
 
-def _boxes_and_segments(count: int, spread: float = 1.0) -> Iterator[tuple[Array, Array, Array]]:
+def _boxes_and_segments(count: int, spread: float = 1.0) -> Iterator[tuple[Array, Array, Array, float]]:
+    """Yield the ends of segments, half the sizes of boxes, and the distance of each segment from its box."""
     random = np.random.default_rng(2)
-    for _ in range(count):
-        half = random.uniform(0.02, 0.5, 3)
-        a0, a1 = random.uniform(-spread, spread, (2, 3))
-        yield a0, a1, half
+    half = np.empty((count, 3))
+    ends = np.empty((count, 2, 3))
+    for i in range(count):
+        half[i], ends[i] = random.uniform(0.02, 0.5, 3), random.uniform(-spread, spread, (2, 3))
+    a0, a1 = ends[:, 0], ends[:, 1]
+    yield from zip(a0, a1, half, _nearest_along(a0, a1, half).tolist(), strict=True)
 
 
 def test_the_distance_of_a_segment_outside_a_box_is_that_of_its_nearest_point() -> None:
     outside = 0
-    for a0, a1, half in _boxes_and_segments(1000):
-        expected = _nearest_along(a0, a1, half)
+    for a0, a1, half, expected in _boxes_and_segments(1000):
         if expected < 1e-6:
             continue
         outside += 1
@@ -173,8 +175,8 @@ def test_the_depth_of_a_segment_in_a_box_is_the_length_of_the_shortest_translati
     directions = np.random.default_rng(8).normal(size=(400, 3))
     directions = np.vstack([directions / np.linalg.norm(directions, axis=1, keepdims=True), np.eye(3), -np.eye(3)])
     entered = across = 0
-    for a0, a1, half in _boxes_and_segments(1000, spread=0.4):
-        if _nearest_along(a0, a1, half) > 1e-9:
+    for a0, a1, half, nearest in _boxes_and_segments(1000, spread=0.4):
+        if nearest > 1e-9:
             continue
         entered += 1
         answer = _to_box(a0, a1, half)

@@ -14,7 +14,7 @@ from q2r2_control.control.safety.safety_data import SafetyData, SafetyModel
 from q2r2_control.control.safety.speed_bound import write_deviations
 from q2r2_control.control.safety.stop_certificate import write_step
 from q2r2_control.control.safety.stop_rollout import SHAPES, begin_rollout
-from tests.control.cells import NAMES, cell, distances, kernel_data, kernel_model, random_posture
+from tests.control.cells import NAMES, cell, distances, kernel_model, random_posture, reused_data
 from tests.control.safety.motions import ACCELERATION, H, motion_of
 
 WINDOW, PAIRS = 0.03, 8  # Largest delay of one arm behind the other arm [s], and number of pairs of each motion.
@@ -32,7 +32,7 @@ def test_no_pair_comes_closer_than_any_proven_distance_wherever_each_arm_is_on_i
         v = (number % 2) * 0.3 * random.uniform(-robot.velocity_limit, robot.velocity_limit)
         v_next = v + random.uniform(-1.0, 1.0, robot.model.nv) * ACCELERATION * H
         motion = motion_of(name, random_posture(robot, random), v, v_next, shape)
-        data = kernel_data(name, motion.q, v).safety
+        data = reused_data(name, motion.q, v).safety
         data.candidate.q[:], data.candidate.v[:] = motion.q_next, v_next
         data.candidate.deceleration[:] = motion.deceleration
         data.history.window[1] = WINDOW

@@ -11,13 +11,13 @@ from q2r2_control.control.safety.speed_bound import BodyVelocities, fastest_appr
 from q2r2_control.control.safety.stop_certificate import write_step
 from q2r2_control.control.safety.stop_rollout import OWN, SHAPES, TOGETHER, begin_rollout
 from q2r2_control.types import Array
-from tests.control.cells import NAMES, cell, distances, kernel_data, kernel_model, placed, random_posture
+from tests.control.cells import NAMES, cell, distances, kernel_model, placed, random_posture, reused_data
 from tests.control.safety.motions import ACCELERATION, H, Motion, motion_of
 
 
 def prepared(name: str, motion: Motion) -> tuple[SafetyData, float]:
     """Return the data of the certificate before it examines pairs, and h + T / 2 [s], which the bound needs."""
-    model, data = kernel_model(name).safety, kernel_data(name, motion.q, motion.v).safety
+    model, data = kernel_model(name).safety, reused_data(name, motion.q, motion.v).safety
     data.distance[:] = distances(cell(name), motion.q[None])[0]
     data.candidate.q[:] = motion.q_next
     data.candidate.v[:] = motion.v_next
@@ -55,7 +55,7 @@ def test_velocities_of_bodies_are_the_rates_of_change_of_their_positions() -> No
     q, v = random_posture(robot, random), random.uniform(-1.0, 1.0, robot.model.nv)
     later, earlier = (placed(cell("dual_panda"), q + share * v).posed for share in (1e-6, -1e-6))
     moved = 0.5 * (later.start + later.end - earlier.start - earlier.end)
-    np.testing.assert_allclose(kernel_data("dual_panda", q, v).safety.velocities.middle, moved / 2e-6, atol=1e-8)
+    np.testing.assert_allclose(reused_data("dual_panda", q, v).safety.velocities.middle, moved / 2e-6, atol=1e-8)
 
 
 @pytest.mark.parametrize("shape", range(SHAPES), ids=["together", "arm by arm", "own"])
@@ -146,7 +146,7 @@ STEP = 1e-6  # Step of finite differences [s].
 
 def bounds_at(name: str, q: Array, v: Array) -> Array:
     """Return the bound on the approach speed of every pair (p,) [m/s]."""
-    model, data = kernel_model(name).safety.collision, kernel_data(name, q, v).safety
+    model, data = kernel_model(name).safety.collision, reused_data(name, q, v).safety
     bounds = np.zeros(len(model.pairs.first))
     _fastest_approaches(data.velocities, model.pairs.first, model.pairs.second, bounds)
     return bounds

@@ -238,12 +238,19 @@ def _turning_at_its_end(name: str, random: np.random.Generator, count: int) -> I
     """
     found = 0
     for motion in _motions_from(name, _too_close(cell(name), random, 2000), random):
-        low, high = 0.0, 1.0
+        known = distances(cell(name), motion.q[None])[0]
+
+        def stops(share: float, motion: Motion = motion, known: Array = known) -> bool:
+            v = share * motion.v
+            return _certified(name, motion_of(name, motion.q, v, v, TOGETHER), known)
+
+        if not stops(0.05):
+            continue
+        low, high = 0.05, 1.0
         for _ in range(20):
             share = 0.5 * (low + high)
-            v = share * motion.v
-            low, high = (share, high) if _certified(name, motion_of(name, motion.q, v, v, TOGETHER)) else (low, share)
-        if low > 0.05 and high < 1.0:
+            low, high = (share, high) if stops(share) else (low, share)
+        if high < 1.0:
             found += 1
             yield motion_of(name, motion.q, low * motion.v, low * motion.v, TOGETHER)
         if found == count:

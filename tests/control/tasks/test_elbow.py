@@ -77,7 +77,7 @@ def run(angles: dict[str, float | None], start: Array) -> tuple[ElbowSwivel, Arr
     Return the task, the final posture (nv,) [rad], and how far a tool has moved at most [m].
     """
     robot = cell("dual_iiwa7").robot
-    run = Driven(CartesianController(robot, ControllerSettings(tasks={"swivel": {"angles": angles}})), start)
+    run = Driven(CartesianController(robot, ControllerSettings(tasks={"swivel": {"angles": angles}})), start, dt=0.004)
     run.drive(4.0, run.start)
     assert np.abs(run.a).max() < 0.1
     tools = {arm: run.controller.tool_pose(arm).translation for arm in robot.arms}
@@ -144,7 +144,7 @@ def moved_by(settings: ControllerSettings) -> float:
     """
     robot = cell("dual_iiwa7").robot
     controller = CartesianController(robot, settings)
-    reference = Driven(controller).drive(2.0, lambda _, start: start)
+    reference = Driven(controller, dt=0.004).drive(2.0, lambda _, start: start)
     assert np.abs(reference.a).max() < 0.1
     return float(reference.q[2] - robot.home[2])
 

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -21,7 +23,7 @@ from q2r2_control.control.tasks.frame import (
     wanted_twist,
 )
 from q2r2_control.types import Array
-from tests.control.cells import NAMES, cell, kernel_data, kernel_model, placed, random_posture
+from tests.control.cells import NAMES, cell, kernel_model, placed, random_posture, reused_data
 from tests.support.driven import Driven
 
 MOTION = Motion(np.array([6.0, 5.0]), np.array([2.0, 5.0]), np.array([1.0, 2.5]), np.array([0.02]), np.ones(6))
@@ -87,9 +89,13 @@ def test_the_approach_speed_and_its_slope_are_continuous(gain: float, decelerati
         assert (after - here) / step == pytest.approx((here - before) / step, rel=1e-3)
 
 
+@cache
+def _targets() -> TaskTargets:
+    return TaskTargets.empty(kernel_model("dual_iiwa7").tasks, ControllerSettings())
+
+
 def _twist(tool: pin.SE3, target: pin.SE3, feed_forward: Array) -> Array:
-    model, arm = kernel_model("dual_iiwa7").tasks, 1
-    data, targets = kernel_data("dual_iiwa7", np.zeros(14)).tasks, TaskTargets.empty(model, ControllerSettings())
+    arm, data, targets = 1, reused_data("dual_iiwa7", np.zeros(14)).tasks, _targets()
     data.rotation[arm], data.translation[arm] = tool.rotation, tool.translation
     targets.rotation[arm], targets.translation[arm] = target.rotation, target.translation
     targets.feed_forward[arm] = feed_forward
@@ -137,7 +143,7 @@ def test_a_tool_moves_to_the_weighted_parts_of_a_target_and_the_posture_decides_
     along, about, reached, upright = PARTS[name]
     settings = ControllerSettings(position_weights=along, rotation_weights=about)
     controller = CartesianController(cell("dual_iiwa7").robot, settings)
-    driven = Driven(controller)
+    driven = Driven(controller, dt=0.004)
     by = pin.SE3(pin.rpy.rpyToMatrix(0.3, -0.2, 0.0) @ pin.rpy.rpyToMatrix(0.0, 0.0, 0.6), np.array([0.05, 0.06, 0.08]))
     goals = {
         arm: pin.SE3(pose.rotation @ by.rotation, pose.translation + by.translation)
@@ -160,7 +166,7 @@ def test_if_all_weights_of_the_tools_are_zero_the_joints_move_to_the_given_postu
     controller = CartesianController(robot, ControllerSettings(position_weights=(0, 0, 0), rotation_weights=(0, 0, 0)))
     driven = Driven(controller)
     wanted = robot.home + 0.1
-    for _ in range(4000):
-        reference = controller.step(driven.start, 0.002, wanted)
-        driven.contract.check(reference, 0.002)
+    for _ in range(1500):
+        reference = controller.step(driven.start, 0.004, wanted)
+        driven.contract.check(reference, 0.004)
     np.testing.assert_allclose(reference.q, wanted, atol=1e-3)

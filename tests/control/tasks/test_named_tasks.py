@@ -22,7 +22,7 @@ DOWN = (0.0, 0.0, -1.0)  # The z axis of a tool at home points down, so that its
 def driven(tasks: dict[str, Any], moved: dict[str, pin.SE3] | None = None, **settings: Any) -> Driven:
     """Drive for 5 s towards the start poses of the tools, displaced by ``moved``. Check the contract at every tick."""
     robot = cell("dual_iiwa7").robot
-    run = Driven(CartesianController(robot, ControllerSettings(tasks=tasks, **settings)))
+    run = Driven(CartesianController(robot, ControllerSettings(tasks=tasks, **settings)), dt=0.004)
     goals = {
         arm: pin.SE3(by.rotation @ pose.rotation, pose.translation + by.translation)
         for arm, pose in run.start.items()
