@@ -137,6 +137,8 @@ def test_a_report_has_its_age_at_receipt_plus_the_time_of_all_ticks_even_very_lo
     controller.step({}, 0.002)
     controller.step({}, 0.3)  # The arms move for a tenth of a second only, but all 0.3 s pass.
     assert controller.obstacle_reports["hand"].age == pytest.approx(0.802)
+    controller.brake(0.05)
+    assert controller.obstacle_reports["hand"].age == pytest.approx(0.852)
 
 
 def test_a_new_obstacle_in_front_of_a_moving_arm_is_named_and_the_arm_brakes_along_its_certified_stop(
