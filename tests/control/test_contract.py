@@ -225,11 +225,16 @@ def test_a_controller_that_starts_with_an_unproven_stop_has_no_certificate_until
     assert all(report.certified and report.margin >= 0.0 for report in reports)
 
 
-def test_the_step_in_which_a_pair_stops_being_too_close_is_the_last_without_a_certificate() -> None:
+@pytest.mark.parametrize("brakes", [False, True], ids=["steps", "a stop before each step"])
+def test_the_step_in_which_a_pair_stops_being_too_close_is_the_last_without_a_certificate(brakes: bool) -> None:
     robot = robot_of("iiwa7")
     settings = ControllerSettings(min_distance=float(robot.distance_values(robot.home).min()) + 1e-5)
     controller = CartesianController(robot, settings)
-    reports = [controller.step({}, 0.001).report for _ in range(100)]
+    reports = []
+    for _ in range(100):
+        if brakes:
+            controller.brake(1e-6)
+        reports.append(controller.step({}, 0.001).report)
     apart = next(tick for tick, report in enumerate(reports) if report.margin >= 0.0)
     assert apart > 0
     assert [tick for tick, report in enumerate(reports) if not report.certified] == list(range(apart + 1))
