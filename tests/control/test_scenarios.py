@@ -24,7 +24,8 @@ from q2r2_control.verification.fault_injection import ATTACKS, STOPPING_FAULTS, 
 from tests.control.cells import pandas
 from tests.control.scenarios import SCENARIOS, Scenario, circle, crossing
 
-DURATION = 1.2  # [s]
+# Duration of a run by the dt of its ticks, both in s. Long ticks need more time, because shares of ticks are compared.
+DURATION = {0.001: 1.2, 0.01: 2.0}
 # A faulty solver fails in the last part of every period [s]. FAULT_SHARE is this part's fraction of the period.
 FAULT_PERIOD, FAULT_SHARE = 0.2, 0.2
 AGAINST_US = "against us"  # All attacks in turn, each for one period.
@@ -137,7 +138,7 @@ def ticks_of(dt: float, jitter: bool) -> Iterator[float]:
     With jitter, a duration is between a fifth of ``dt`` and five times ``dt``.
     """
     random, t = np.random.default_rng(5), 0.0
-    while t < DURATION:
+    while t < DURATION[dt]:
         length = dt * 5.0 ** random.uniform(-1.0, 1.0) if jitter else dt
         t += length
         yield length
