@@ -24,8 +24,9 @@ from q2r2_control.verification.fault_injection import ATTACKS, STOPPING_FAULTS, 
 from tests.control.cells import pandas
 from tests.control.scenarios import SCENARIOS, Scenario, circle, crossing
 
-# Duration of a run by the dt of its ticks, both in s. Long ticks need more time, because shares of ticks are compared.
-DURATION = {0.001: 1.2, 0.01: 2.0}
+# Duration of a run [s], and that of a run with long ticks. Long ticks need more time, because the tests compare shares
+# of ticks.
+DURATION, DURATION_OF_LONG_TICKS, LONG_TICK = 1.2, 2.0, 0.01
 # A faulty solver fails in the last part of every period [s]. FAULT_SHARE is this part's fraction of the period.
 FAULT_PERIOD, FAULT_SHARE = 0.2, 0.2
 AGAINST_US = "against us"  # All attacks in turn, each for one period.
@@ -138,7 +139,8 @@ def ticks_of(dt: float, jitter: bool) -> Iterator[float]:
     With jitter, a duration is between a fifth of ``dt`` and five times ``dt``.
     """
     random, t = np.random.default_rng(5), 0.0
-    while t < DURATION[dt]:
+    duration = DURATION_OF_LONG_TICKS if dt >= LONG_TICK else DURATION
+    while t < duration:
         length = dt * 5.0 ** random.uniform(-1.0, 1.0) if jitter else dt
         t += length
         yield length
