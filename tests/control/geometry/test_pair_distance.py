@@ -5,6 +5,7 @@ import pytest
 
 from q2r2_control.control.geometry.collision import CollisionData, CollisionModel, update_placements
 from q2r2_control.control.geometry.pair_distance import (
+    _any_normal,
     at_least,
     distance_row,
     measure,
@@ -141,3 +142,12 @@ def test_while_a_bar_tilts_over_a_body_the_smooth_row_turns_gradually_and_the_ex
     assert np.abs(np.diff(exact)).max() > 0.1, "from one end to the other"
     assert np.abs(np.diff(smooth)).max() < 0.02
     np.testing.assert_allclose(smooth[[0, -1]], exact[[0, -1]], atol=0.02)
+
+
+def test_the_normal_of_two_segments_that_touch_is_perpendicular_to_both_segments() -> None:
+    random = np.random.default_rng(17)
+    for _ in range(50):
+        meeting, one, other = random.normal(size=(3, 3))
+        normal = np.zeros(3)
+        _any_normal(meeting - one, meeting + one, meeting - other, meeting + other, normal)
+        np.testing.assert_allclose([normal @ one, normal @ other, normal @ normal], [0.0, 0.0, 1.0], atol=1e-12)
