@@ -103,6 +103,9 @@ def run(
     takeover: Annotated[
         str | None, Option(metavar="NAME", help="With --input policy: input whose hands may take over.")
     ] = None,
+    recording: Annotated[
+        str | None, Option(metavar="FILE", help="With --input recording: the recording whose hands move the arms.")
+    ] = None,
     solver: Solver = None,
     host: Host = None,
     port: Port = None,
@@ -150,11 +153,12 @@ def run(
     web |= "web" in (source, takeover)
     asked: dict[str, object] = {"trajectory": trajectory, "host": host, "port": port}
     asked |= {"usb": usb or None, "certificate": certificate}
-    asked |= {"policy": policy, "takeover": takeover}
+    asked |= {"policy": policy, "takeover": takeover, "recording": recording}
     asked |= {"human": human or None, "seed": seed or None, "fast": fast or None}
     given = {option: value for option, value in asked.items() if value is not None}
     if unfit := [option for option in given if option not in options_of(source)]:
-        cure = "; add --input policy" if unfit[0] in ("policy", "takeover") else ""
+        cures = {"policy": "policy", "takeover": "policy", "recording": "recording"}
+        cure = f"; add --input {cures[unfit[0]]}" if unfit[0] in cures else ""
         usual = "" if input is not None else ", which is the cell's input"
         raise ConfigError(f"--{unfit[0]} cannot be used with --input {source}{usual}{cure}")
     if fast and duration is None:

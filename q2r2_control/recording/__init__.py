@@ -1,4 +1,4 @@
-"""Recordings of runs, or of messages of ROS nodes, as MCAP files: a writer in its own process, readers, and replay."""
+"""Record runs, or messages of ROS nodes, as MCAP files by a writer in its own process; read, replay and play them."""
 
 from __future__ import annotations
 

@@ -127,7 +127,10 @@ def replay(
         )
     cell, robot = cell_and_robot_of(recording, config)
     if plant is not None and getattr(load_class(PLANTS, plant), "realtime_only", False):
-        raise ConfigError(f"--plant {plant}: it keeps real time; allowed in a replay: {', '.join(_REPEATABLE)}")
+        raise ConfigError(
+            f"--plant {plant}: it keeps real time; allowed in a replay: {', '.join(_REPEATABLE)}; its arms follow the "
+            f"recorded hands with q2r2 run CELL --plant {plant} --input recording --recording {recording.file}"
+        )
     ticks = RecordedTicks(recording)
     pipeline = ReplayPipeline(cell, robot, ticks, about, plant)
     comparison = _Comparison(about, ticks) if compare or plant is None else None
