@@ -24,6 +24,7 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.supervision.joint_watch import watch_settings
 from q2r2_control.supervision.target_stream import StreamSettings
 from q2r2_control.types import SIDES, Array, CommandMode, RobotState
+from q2r2_control.verification.fault_injection import PushingSolver
 from q2r2_control.viewer.tables import figure_table
 
 _DT = 0.002  # Period of the ticks, if a row names no other one [s].
@@ -58,19 +59,6 @@ class _Blocker:
     def solve(self, problem: QpProblem) -> QpSolution:
         time.sleep(0.2)
         return QpSolution(np.zeros(len(problem.g)), 0.0)
-
-
-class _Pusher:
-    """A solver that drives all joints as fast as the limits allow, for a while in each direction."""
-
-    def __init__(self) -> None:
-        self._random, self._left, self._signs = np.random.default_rng(72), 0, np.ones(1)
-
-    def solve(self, problem: QpProblem) -> QpSolution:
-        if self._left == 0:
-            self._left, self._signs = 150, self._random.choice([-1.0, 1.0], len(problem.g))
-        self._left -= 1
-        return QpSolution(np.where(self._signs > 0.0, problem.upper, problem.lower), 0.0)
 
 
 def _crossing(controller: CartesianController) -> dict[str, pin.SE3 | None]:
@@ -118,7 +106,7 @@ def wild_arguments(robot: Robot, settings: Any) -> Iterator[Row]:
 def pushing_solver(robot: Robot, settings: Any) -> Iterator[Row]:
     for promise in (None, _TOOL_SPEED):
         given = settings.model_copy(update={"tool_speed_limit": promise})
-        controller, fastest = CartesianController(robot, given, solver=_Pusher()), 0.0
+        controller, fastest = CartesianController(robot, given, solver=PushingSolver(150)), 0.0
         data = robot.model.createData()
         for _ in range(900):
             reference = controller.step({}, _DT)

@@ -128,6 +128,20 @@ class FaultySolver:
         }[self.fault]
 
 
+class PushingSolver:
+    """A solver that drives all joints as fast as the box allows, for some ``ticks`` in each of many directions."""
+
+    def __init__(self, ticks: int) -> None:
+        self._random, self._ticks, self._left = np.random.default_rng(72), ticks, 0
+        self._signs = np.ones(1)
+
+    def solve(self, problem: QpProblem) -> QpSolution:
+        if self._left == 0:
+            self._left, self._signs = self._ticks, self._random.choice([-1.0, 1.0], len(problem.g))
+        self._left -= 1
+        return QpSolution(np.where(self._signs > 0.0, problem.upper, problem.lower), 0.0)
+
+
 @dataclass(frozen=True, slots=True)
 class Start:
     """The state to which a controller is reset."""

@@ -6,12 +6,13 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from q2r2_control import CartesianController, QpProblem, QpSolution, Robot, Solver
+from q2r2_control import CartesianController, Robot, Solver
 from q2r2_control.config.cell_file import load_config
 from q2r2_control.control.safety.stop_rollout import SHAPES
 from q2r2_control.control.safety.tool_speed import drift, fastest_tool
 from q2r2_control.types import Array, LimitKind
 from q2r2_control.verification.contract import Contract
+from q2r2_control.verification.fault_injection import PushingSolver
 from q2r2_control.verification.tool_speeds import MeasuredToolSpeeds
 from tests.control.cells import NAMES, cell, kernel_model, random_posture, reused_data
 from tests.control.safety.motions import ACCELERATION, H, Motion, motion_of
@@ -87,26 +88,13 @@ def test_the_drift_bounds_the_acceleration_of_a_tool_whose_joints_keep_their_spe
     assert max(shares) > 0.3, "a bound that nothing comes near would make arms slow"
 
 
-class Pushing:
-    """A solver that drives all joints as fast as the box allows, for a while in one direction, then in the other."""
-
-    def __init__(self) -> None:
-        self._random, self._left, self._signs = np.random.default_rng(72), 0, np.ones(1)
-
-    def solve(self, problem: QpProblem) -> QpSolution:
-        if self._left == 0:
-            self._left, self._signs = 80, self._random.choice([-1.0, 1.0], len(problem.g))
-        self._left -= 1
-        return QpSolution(np.where(self._signs > 0.0, problem.upper, problem.lower), 0.0)
-
-
 def limited(robot: Robot, solver: Solver | None = None) -> CartesianController:
     settings = load_config("config/dual_iiwa7.yaml").control.timed(realtime=False)
     return CartesianController(robot, settings.model_copy(update={"tool_speed_limit": LIMIT}), solver=solver)
 
 
 def test_with_a_solver_that_drives_joints_at_full_speed_no_tool_is_too_fast_at_or_between_ticks(robot: Robot) -> None:
-    controller = limited(robot, solver=Pushing())
+    controller = limited(robot, solver=PushingSolver(80))
     contract, fastest = Contract(controller, sample_all=True), 0.0
     for _ in range(240):
         reference = controller.step({}, DT)
@@ -140,7 +128,7 @@ def fast_start(robot: Robot) -> Array:
 
 
 def test_a_tool_that_starts_too_fast_is_braked_and_the_report_names_its_speed_limit(robot: Robot) -> None:
-    controller, v = limited(robot, solver=Pushing()), fast_start(robot)
+    controller, v = limited(robot, solver=PushingSolver(80)), fast_start(robot)
     controller.reset(robot.home, v)
     tools, before, certified = MeasuredToolSpeeds(robot), 3.0 * LIMIT, []
     for _ in range(220):
