@@ -25,7 +25,7 @@ from q2r2_control.summary.tick import Tick
 from q2r2_control.supervision.reasons import SupervisionReason
 from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.types import SIDES, CommandMode
-from tests.pipeline.loops import FreezingLoop
+from tests.pipeline.loops import FreezingLoop, when_moving
 from tests.plants.fri.soak import ACCELERATION, Soak, make_loop
 from tests.plants.fri.virtual_cabinets import VirtualCabinets
 
@@ -344,6 +344,15 @@ def test_arms_do_not_jump_however_sessions_end_and_every_session_begins_again(
     assert soak.ended == 4
     assert soak.moved > 0.3
     assert soak.faults == []
+
+
+def test_the_fault_of_a_cabinet_is_the_reason_why_its_arm_and_the_other_arm_pause(config: Config) -> None:
+    pipeline = make_loop(config)
+    plant = started(pipeline)
+    pipeline.listeners.append(when_moving(plant.cabinets["left"].stop))
+    summary = pipeline.run(2.0, realtime=False)
+    pauses = {event.arm: str(event.kind) for event in summary.events if event.source == "engaged"}
+    assert pauses == {"left": FriReason.FRI_SESSION, "right": FriReason.FRI_SESSION}
 
 
 def test_the_first_command_of_a_session_is_the_posture_in_which_the_cabinet_holds_its_arm(config: Config) -> None:
