@@ -30,18 +30,19 @@ class SimulatedArm:
     """One simulated FR3, which starts at a posture (7,) [rad]."""
 
     def __init__(self, arm: str, posture: Sequence[float], folder: Path, slowness: float) -> None:
+        self.name = arm
         self._command = [str(SIMULATOR), str(Path(__file__).with_name("simulated_arm.py")), ADDRESSES[arm]]
-        self._command += [str(folder / f"{arm}.xml"), *map(str, posture)]
+        self._command += [str(folder / f"{arm}.xml")]
         clock = str(Path(__file__).with_name("slow_clock"))
         self._environment = os.environ | {"PYTHONPATH": clock, "SLOWNESS": str(slowness)}
         self.lines: list[str] = []
         self._said = Condition()
-        self.start()
+        self.start(posture)
 
-    def start(self) -> None:
-        """Start the process, and wait until the robot listens."""
+    def start(self, posture: Sequence[float]) -> None:
+        """Start the process at a posture (7,) [rad], and wait until the robot listens."""
         self._process = subprocess.Popen(
-            self._command,
+            [*self._command, *map(str, posture)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,

@@ -109,8 +109,10 @@ class Operator(ScriptedInput):
             os.kill(arm.pid, signal.SIGSTOP)
             _later(stall, lambda: os.kill(arm.pid, signal.SIGCONT))
         else:
+            assert self.pipeline is not None
+            standing = self.pipeline.plant.state().q[self.pipeline.robot.arms[arm.name].joints]
             arm.kill()
-            threading.Thread(target=arm.start).start()
+            threading.Thread(target=arm.start, args=(standing,)).start()
 
 
 def _later(wait: float, do: Callable[[], None]) -> None:

@@ -7,16 +7,17 @@ import pytest
 from q2r2_control import ConfigError, Robot, load_config
 
 
-def test_a_jerk_limit_is_refused_if_the_mean_of_five_positions_cannot_keep_it() -> None:
+def test_a_jerk_limit_is_refused_if_the_mean_cannot_keep_it_or_pairs_would_not_keep_the_distance_of_the_mean() -> None:
     pytest.importorskip("pylibfranka", reason="pip install -e plugins/q2r2_franka")
     from q2r2_franka.plant import FrankaPlant
 
     config = load_config("plugins/q2r2_franka/dual_fr3.yaml")
     robot = Robot.from_config(config)
     assert FrankaPlant(robot, config).averages
-    stricter = config.model_copy(update={"control": config.control.model_copy(update={"jerk_limit": 1900.0})})
-    with pytest.raises(ConfigError, match=r"control.jerk_limit = 1900.0: allowed with robots: 1920 rad/s\^3 or more"):
-        FrankaPlant(robot, stricter)
+    for limit in (1199.0, 3000.0):
+        other = config.model_copy(update={"control": config.control.model_copy(update={"jerk_limit": limit})})
+        with pytest.raises(ConfigError, match=rf"control.jerk_limit = {limit}: allowed with robots: 1200 to 2962 rad"):
+            FrankaPlant(robot, other)
 
 
 def test_arms_move_at_a_tenth_of_their_speed_unless_all_robots_are_simulated_on_this_computer() -> None:

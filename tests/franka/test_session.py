@@ -22,17 +22,23 @@ class Arm:
     def __init__(self, mode: CommandMode = CommandMode.POSITION) -> None:
         self.session = ArmSession("left", "127.0.0.1", mode, limits.TORQUE)
         self.now, self.v = 0.0, (0.0,) * JOINTS
+        self.held, self.held_tau = Q, (0.0,) * JOINTS  # The last commands, which this robot always takes.
         self.session.hear(self._measured(), self.now)
         self.session.begin(np.array(Q), self.now)
 
     def _measured(self, cycles: int = 1) -> Measured:
         none = (0.0,) * JOINTS
-        return Measured(Mode.MOVE, "", cycles, Q, self.v, none, none, Q)
+        return Measured(Mode.MOVE, "", cycles, Q, self.v, none, none, self.held, self.held_tau)
 
     def ask(self, cycles: int = 1, ahead: float = 0.0) -> np.ndarray:
         self.now += cycles * PERIOD
         self.session.hear(self._measured(cycles), self.now)
-        return self.session.answer(self.now, ahead)
+        values = self.session.answer(self.now, ahead)
+        if self.session.state.wanted is CommandMode.TORQUE:
+            self.held_tau = tuple(values)
+        else:
+            self.held = tuple(values)
+        return values
 
     def command(self, end: float, speed: float, way: float, start: float, **torques: object) -> bool:
         """Give the session the command of a tick, at whose end the first joint is ``way`` [rad] away from ``Q``.

@@ -158,7 +158,8 @@ class _Answering:
         newest = self._sessions[arm].state.newest
         if self._record is not None and newest is not None:
             is_torque = self._mode is CommandMode.TORQUE
-            entry = Entry(ARMS.index(arm), begins, is_torque, newest.cycles, time.monotonic(), values)
+            held = np.array(newest.held_tau if is_torque else newest.held)
+            entry = Entry(ARMS.index(arm), begins, is_torque, newest.cycles, time.monotonic(), values, held)
             write_entry(self._record, entry)
 
     def _tell(self, arm: str) -> None:

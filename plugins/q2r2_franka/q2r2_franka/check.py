@@ -1,7 +1,8 @@
 """Check recorded commands against the published limits: ``python -m q2r2_franka.check FILE``.
 
-Velocities, accelerations and jerks are differences of commands that are 1 ms apart, as the robot computes them. In a
-period without a command, the robot goes on with the last acceleration. The check assumes the same motion.
+Velocities, accelerations and jerks are the differences that the robot computes: of a command, and of the positions that
+it commanded itself in the periods before. The robot drops a command that comes late, and then goes on with the last
+acceleration. Each state reports its last position, and the same motion is assumed between two states that were read.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from q2r2_control import Array
 from q2r2_franka import limits
 from q2r2_franka.limits import PERIOD
 from q2r2_franka.record import Entry, entries_of
+from q2r2_franka.stream import robot_positions
 
 ARMS = "left", "right"
 # A share of a limit may exceed 1 by this, because a robot rounds positions to doubles. The third difference of this
@@ -30,7 +32,7 @@ class Checked:
 
     commands: int = 0
     motions: int = 0
-    lost: int = 0  # Number of periods without a command.
+    lost: int = 0  # Number of periods without a command that came in time.
     # By the name of a limit, the greatest ratio of a number to its limit. A ratio above 1 violates the limit.
     shares: dict[str, float] = field(default_factory=dict)
 
@@ -45,32 +47,32 @@ class Checked:
 def check_commands(entries: Iterable[Entry]) -> dict[str, Checked]:
     """Return the result for each arm that has commands, by the arm's name."""
     checked: dict[str, Checked] = {}
+    # For each arm, the robot's last three positions before its last command, and this command.
     histories: dict[str, list[Array]] = {}
+    sent: dict[str, Array] = {}
     for entry in entries:
         arm = ARMS[entry.arm]
         result = checked.setdefault(arm, Checked())
         if entry.begins:
             result.motions += 1
-            histories[arm] = [entry.values] * 4
+            histories[arm], sent[arm] = [entry.values] * 3, entry.values
             continue
         result.commands += 1
         result.lost += entry.cycles - 1
-        history = histories[arm]
         if entry.is_torque:
             result.see("torque", np.abs(entry.values) / limits.TORQUE)
-            result.see("torque rate", np.abs(entry.values - history[-1]) / (limits.TORQUE_RATE * PERIOD))
-            history[:] = [*history[1:], entry.values]
+            result.see("torque rate", np.abs(entry.values - entry.held) / (limits.TORQUE_RATE * PERIOD))
             continue
-        for _ in range(entry.cycles - 1):
-            history[:] = [*history[1:], 3.0 * history[-1] - 3.0 * history[-2] + history[-3]]
-        history[:] = [*history[1:], entry.values]
-        _check_positions(result, history)
+        robot, was_dropped = robot_positions(histories[arm], sent[arm], entry.cycles, entry.held)
+        result.lost += was_dropped
+        histories[arm], sent[arm] = [*robot[:2], entry.held], entry.values
+        _check_positions(result, histories[arm], entry.values)
     return checked
 
 
-def _check_positions(result: Checked, history: list[Array]) -> None:
-    """Check the newest of four positions (7,) [rad], which are 1 ms apart."""
-    oldest, older, before, newest = history
+def _check_positions(result: Checked, history: list[Array], newest: Array) -> None:
+    """Check a position (7,) [rad] after three positions of the robot, all of which are 1 ms apart."""
+    oldest, older, before = history
     centre, half = 0.5 * (limits.UPPER + limits.LOWER), 0.5 * (limits.UPPER - limits.LOWER)
     result.see("position", np.abs(newest - centre) / half)
     velocity = (newest - before) / PERIOD

@@ -84,6 +84,7 @@ class ArmLink:
             tau=tuple(state.tau_J),
             external=tuple(state.tau_ext_hat_filtered),
             held=tuple(state.q_d),
+            held_tau=tuple(state.tau_J_d),
         )
 
     def start(self, mode: CommandMode) -> Measured:

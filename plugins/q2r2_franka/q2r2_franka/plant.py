@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
-
-import numpy as np
 
 from q2r2_control import Array, Command, CommandMode, Config, ConfigError, PlantError, Reason, Robot, RobotState
 from q2r2_control.plants import ArmTiming, check_command
@@ -17,6 +16,10 @@ from q2r2_franka.settings import franka_settings, is_loopback
 from q2r2_franka.state import SessionState
 from q2r2_franka.stream import MEANS
 
+# The mean of n positions that are h = 1 ms apart is at most A (n^2 - 1) h^2 / 24 from the path, where A is the limit of
+# the acceleration. For a jerk limit j, pairs keep the distance for A W^2 / 4 with W = 2 A / j (robot/command_average.py
+# of q2r2_control; W is the longest of all joints). This covers the mean if j is at most this multiple of 2 A / (n h).
+_LARGEST_JERK_LIMIT = MEANS / math.sqrt((MEANS**2 - 1) / 6.0)
 _LOOKS = 0.01  # Time between two checks of the robots during a wait [s].
 
 
@@ -55,10 +58,12 @@ class FrankaPlant:
             raise ConfigError(f"control.max_substep = {self._longest:g}: {allowed}")
         limit = config.control.jerk_limit
         kept = 2.0 * robot.capped_acceleration(config.control.acceleration_limit) / (MEANS * PERIOD)
-        if limit is not None and bool((np.asarray(limit) < kept).any()):
+        if limit is not None and not 1.0 <= float((limit / kept).min()) <= _LARGEST_JERK_LIMIT:
+            # The mean of positions cannot keep a smaller limit. With a larger limit, pairs would be too near.
+            largest = math.floor(_LARGEST_JERK_LIMIT * kept.max())
             raise ConfigError(
-                f"control.jerk_limit = {limit}: allowed with robots: {kept.max():.0f} rad/s^3 or more, which the mean "
-                f"of {MEANS} positions keeps with the acceleration limits of this cell"
+                f"control.jerk_limit = {limit}: allowed with robots: {kept.max():.0f} to {largest} rad/s^3, with the "
+                "acceleration limits of this cell"
             )
         self.begin(CommandMode.POSITION)
         self._answering: RobotAnswers | None = None

@@ -11,7 +11,7 @@ import numpy as np
 
 from q2r2_control import Array
 
-_ENTRY = struct.Struct("<BBBHd7d")
+_ENTRY = struct.Struct("<BBBHd7d7d")
 
 
 class Entry(NamedTuple):
@@ -24,11 +24,14 @@ class Entry(NamedTuple):
     cycles: int
     time: float  # Time by the monotonic clock [s].
     values: Array  # Positions [rad] or torques [Nm] (7,).
+    # Positions [rad] or torques [Nm] (7,) that the robot commanded itself last, as the state reports them that this
+    # command answers.
+    held: Array
 
 
 def write_entry(file: BinaryIO, entry: Entry) -> None:
     head = entry.arm, entry.begins, entry.is_torque, min(entry.cycles, 0xFFFF), entry.time
-    file.write(_ENTRY.pack(*head, *entry.values))
+    file.write(_ENTRY.pack(*head, *entry.values, *entry.held))
 
 
 def entries_of(path: Path) -> Iterator[Entry]:
@@ -37,4 +40,5 @@ def entries_of(path: Path) -> Iterator[Entry]:
     for arm, begins, is_torque, cycles, time, *values in _ENTRY.iter_unpack(
         data[: len(data) // _ENTRY.size * _ENTRY.size]
     ):
-        yield Entry(arm, bool(begins), bool(is_torque), cycles, time, np.array(values))
+        joints = np.array(values).reshape(2, -1)
+        yield Entry(arm, bool(begins), bool(is_torque), cycles, time, joints[0], joints[1])

@@ -140,11 +140,11 @@ class ArmSession:
             state.answered = max(state.answered, now) if rests else state.answered + self._rate * PERIOD
             path.append(self.path.at(state.answered))
         if state.wanted is CommandMode.POSITION:
-            return self._positions.next(path)
+            return self._positions.next(path, np.array(state.newest.held))
         tau = self._tau
         if tau is None or not state.following or now - self._tau_came > _TORQUE_LASTS:
             tau = -self._damping * np.array(state.newest.v)
-        return self._torques.next(tau)
+        return self._torques.next(tau, np.array(state.newest.held_tau))
 
 
 def follow(sessions: Mapping[str, ArmSession], commands: Mapping[str, ArmCommand]) -> bool:

@@ -44,7 +44,10 @@ class Measured:
     v: Joints  # Measured velocities [rad/s].
     tau: Joints  # Measured torques [Nm].
     external: Joints  # Estimated external torques [Nm].
-    held: Joints  # Positions at which the robot's own controller holds the arm [rad].
+    # Positions to which the robot's own controller moves or holds the arm [rad]. They are those of the last command
+    # that the robot took. In a period without a command, the robot computes them itself.
+    held: Joints
+    held_tau: Joints  # Torques of the last command that the robot took, without gravity [Nm].
 
 
 @dataclass(slots=True)

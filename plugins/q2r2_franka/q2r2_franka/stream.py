@@ -4,12 +4,18 @@
 of the acceleration. Where one motion follows the other, the acceleration jumps by up to 2 a. A robot computes the jerk
 from commands that are 1 ms apart, so this jump would be a jerk of 2 a / 1 ms. :class:`PositionStream` therefore sends
 the mean of the last n positions on the path. The third difference of these means is the difference of two second
-differences of the path, divided by n. So the jerk is at most 2 a / (n 1 ms), whatever the path does and wherever its
-ticks are. With a = 10 rad/s^2 and n = 5, it is 4,000 rad/s^3.
+differences of the path, divided by n. So the jerk j is at most 2 a / (n 1 ms), whatever the path does and wherever its
+ticks are. With a = 4.8 rad/s^2 and n = 8, it is 1,200 rad/s^3.
 
-**Lost commands.** If a command does not arrive in time, the robot goes on with the last acceleration, and leaves the
-path. The difference between the robot and the path then goes to zero by a polynomial of fifth degree. The polynomial
+**Lost commands.** If a command does not arrive in time, the robot drops it, goes on with the last acceleration, and
+leaves the path. The sender of a late command does not see this from the number of states that it has read. But each
+state reports the last position that the robot commanded itself (q_d, "after the extrapolation due to packet losses",
+overview of libfranka's documentation). From this position, the stream finds out whether the robot took the last
+command. The difference between the robot and the path then goes to zero by a polynomial of fifth degree. The polynomial
 begins with the position, velocity and acceleration that the difference has at that time.
+
+**A wrong answer to that question** has a small effect. A single lost command leaves the robot at most j (1 ms)^3 from
+the mean. The next difference then has a jerk of at most 4 j, which n = 8 keeps below the limit of 5,000 rad/s^3.
 """
 
 from __future__ import annotations
@@ -22,7 +28,7 @@ import numpy as np
 from q2r2_control import Array
 from q2r2_franka.limits import JOINTS, PERIOD, TORQUE_RATE
 
-MEANS = 5  # Number of positions of which each command is the mean.
+MEANS = 8  # Number of positions of which each command is the mean.
 SMOOTHING_DELAY = 0.5 * (MEANS - 1) * PERIOD  # Time by which a mean is behind the path [s].
 _RETURN = 0.1  # After lost commands, the arm returns to the path within this time [s].
 # This share of the limit of the torque rate is used, because a robot computes the rate from rounded numbers.
@@ -35,31 +41,29 @@ class PositionStream:
     def __init__(self, q: Array) -> None:
         """Make the stream of an arm that rests at ``q`` (7,) [rad]."""
         self._path = deque([q] * MEANS, maxlen=MEANS)
-        self._means = deque([q] * 3, maxlen=3)  # Here the last three means, below the robot's last three positions.
-        self._sent = deque([q] * 3, maxlen=3)
+        self._means = deque([q] * 3, maxlen=3)  # The last three means.
+        self._robot = [q] * 3  # The robot's last three positions before the last command.
+        self._sent = q  # The last command.
         # The coefficients (6, 7) of the polynomial by which the difference between robot and path goes to zero. Its
         # variable is the time since the polynomial began [s].
         self._difference = np.zeros((6, JOINTS))
         self._since = _RETURN
 
-    def next(self, path: Sequence[Array]) -> Array:
+    def next(self, path: Sequence[Array], held: Array) -> Array:
         """Return the position to send now (7,) [rad].
 
         Args:
             path: Positions on the path since the last call, which are 1 ms apart. If there are several, the robot got
                 no command in the periods of all positions before the last one.
+            held: The robot's own last position (7,) [rad], as its newest state reports it.
         """
+        self._robot, was_dropped = robot_positions(self._robot, self._sent, len(path), held)
         for q in path[:-1]:
             self._advance(q)
-            newest, before, oldest = self._sent[-1], self._sent[-2], self._sent[-3]
-            # Without a command, the robot goes on with the last acceleration.
-            self._sent.append(3.0 * newest - 3.0 * before + oldest)
-        if len(path) > 1:
+        if was_dropped or len(path) > 1:
             self._begin_return()
-        mean = self._advance(path[-1])
-        position = mean + self._along(self._since)
-        self._sent.append(position)
-        return position
+        self._sent = self._advance(path[-1]) + self._along(self._since)
+        return self._sent
 
     def _advance(self, q: Array) -> Array:
         self._path.append(q)
@@ -76,7 +80,7 @@ class PositionStream:
 
     def _begin_return(self) -> None:
         """Begin the polynomial by which the difference between the robot's positions and the means goes to zero."""
-        d = [sent - mean for sent, mean in zip(self._sent, self._means, strict=True)]
+        d = [position - mean for position, mean in zip(self._robot, self._means, strict=True)]
         acceleration = (d[2] - 2.0 * d[1] + d[0]) / PERIOD**2
         velocity = (d[2] - d[1]) / PERIOD + 0.5 * PERIOD * acceleration
         T = _RETURN
@@ -86,6 +90,31 @@ class PositionStream:
         self._since = 0.0
 
 
+def robot_positions(before: list[Array], sent: Array, periods: int, held: Array) -> tuple[list[Array], bool]:
+    """Return the last three positions to which a robot commanded itself, and whether it dropped the last command.
+
+    Args:
+        before: Its last three positions before the last command (7,) [rad].
+        sent: The last command (7,) [rad].
+        periods: Number of periods since then. The robot got at most the last command, in the first of them.
+        held: The last position that the robot reports (7,) [rad].
+    """
+    if_taken, if_dropped = _continued([*before[1:], sent], periods - 1), _continued(before, periods)
+    was_dropped = bool(np.abs(if_dropped[-1] - held).max() < np.abs(if_taken[-1] - held).max())
+    return (if_dropped if was_dropped else if_taken), was_dropped
+
+
+def _continued(positions: list[Array], periods: int) -> list[Array]:
+    """Return the robot's last three positions after ``periods`` without a command, in which it goes on by itself.
+
+    It keeps its last acceleration. ``positions`` are its three positions before (7,) [rad].
+    """
+    for _ in range(periods):
+        oldest, before, newest = positions
+        positions = [before, newest, 3.0 * newest - 3.0 * before + oldest]
+    return positions
+
+
 class TorqueStream:
     """Computes the torques that are sent to one arm."""
 
@@ -93,13 +122,19 @@ class TorqueStream:
         """``limit`` is the greatest absolute torque of each joint (7,) [Nm]."""
         self._limit, self._sent = limit, np.zeros(JOINTS)
 
-    def next(self, wanted: Array) -> Array:
+    def next(self, wanted: Array, held: Array) -> Array:
         """Return the torques to send now (7,) [Nm]: as near to ``wanted`` as the limits allow.
 
         The torque may change only by the limit of one period, even after periods without a command, because the robot
-        keeps the last torque in them.
+        keeps the last torque that it took. A late command is dropped, so this torque may be an earlier one than the
+        last command. The result therefore differs by at most one change from both of them.
+
+        Args:
+            wanted: The torques of the impedance (7,) [Nm].
+            held: The torques that the robot took last (7,) [Nm], as its newest state reports them.
         """
         change = _RATE_MARGIN * TORQUE_RATE * PERIOD
-        wanted = np.clip(wanted, -self._limit, self._limit)
-        self._sent = np.clip(wanted, self._sent - change, self._sent + change)
+        held = np.clip(held, self._sent - change, self._sent + change)
+        low, high = np.maximum(self._sent, held) - change, np.minimum(self._sent, held) + change
+        self._sent = np.clip(np.clip(wanted, -self._limit, self._limit), low, high)
         return self._sent
