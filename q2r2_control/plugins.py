@@ -1,4 +1,4 @@
-"""Find inputs, plants, presets, formats of exports and kinds of reasons by name.
+"""Find inputs, plants, presets, formats of exports, kinds of reasons and commands by name.
 
 They are entry points of any installed package:
 
@@ -23,6 +23,7 @@ PLANTS = "q2r2_control.plants"
 PRESETS = "q2r2_control.presets"
 EXPORTS = "q2r2_control.exports"
 REASONS = "q2r2_control.reasons"
+COMMANDS = "q2r2_control.commands"
 # By group and name, the folders in plugins/ of packages that are not installed with this one.
 _OWN_PACKAGES = {(PLANTS, "franka"): "q2r2_franka", (EXPORTS, "zarr"): "q2r2_zarr"}
 

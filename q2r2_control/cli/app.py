@@ -15,7 +15,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from q2r2_control.cli.commands import COMMANDS, CommandOnDemand
+from q2r2_control.cli.commands import COMMANDS, CommandOnDemand, installed_commands
 from q2r2_control.errors import Q2R2Error
 
 # Depending on its version, typer raises click's exceptions or its own copy of them. This is the base class of both.
@@ -36,11 +36,20 @@ class ErrorHandlingGroup(TyperGroup):
         for command in COMMANDS:
             self.add_command(CommandOnDemand(command))
 
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """Return the command of this name, which may be that of another package; None if there is none."""
+        found = super().get_command(ctx, cmd_name)
+        others = () if found is not None else installed_commands()  # Reading the entry points takes some time.
+        return next((CommandOnDemand(other) for other in others if other.name == cmd_name), found)
+
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write the commands into the help, with each group under its heading."""
         for group, commands in groupby(COMMANDS, key=attrgetter("group")):
             with formatter.section(group):
                 formatter.write_dl([(command.name, command.about) for command in commands])
+        if others := installed_commands():
+            with formatter.section("Other packages"):
+                formatter.write_dl([(command.name, command.about) for command in others])
 
     def main(self, *args: Any, **extra: Any) -> Any:
         """Run the command line. It always ends by raising :class:`SystemExit` with the exit code."""

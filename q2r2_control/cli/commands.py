@@ -1,4 +1,7 @@
-"""The commands of ``q2r2``, by group and in the order of its help. Calling a command imports its module."""
+"""The commands of ``q2r2``, by group and in the order of its help. Calling a command imports its module.
+
+Other packages add commands as entry points of the group ``q2r2_control.commands``.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +11,8 @@ from typing import Any, NamedTuple
 from typer import Typer
 from typer.core import TyperCommand
 from typer.main import get_command
+
+from q2r2_control import plugins
 
 
 class ListedCommand(NamedTuple):
@@ -157,10 +162,28 @@ COMMANDS = (
 )
 
 
+class InstalledCommand(NamedTuple):
+    """A command of another package, which declares it as an entry point."""
+
+    name: str
+    about: str
+
+
+def installed_commands() -> tuple[InstalledCommand, ...]:
+    """Return the commands of other packages in alphabetical order. A command of ``q2r2`` itself cannot be replaced."""
+    own = {command.name for command in COMMANDS}
+    points = plugins.points_of(plugins.COMMANDS).values()
+    return tuple(
+        InstalledCommand(point.name, f"A command of the package {point.dist.name if point.dist else point.value}.")
+        for point in points
+        if point.name not in own
+    )
+
+
 class CommandOnDemand(TyperCommand):
     """A command whose module is imported only when it is called. The help of ``q2r2`` does not need the module."""
 
-    def __init__(self, command: ListedCommand) -> None:
+    def __init__(self, command: ListedCommand | InstalledCommand) -> None:
         super().__init__(command.name, help=command.about)
         self._command = command
 
@@ -169,11 +192,19 @@ class CommandOnDemand(TyperCommand):
         return load(self._command).make_context(info_name, args, parent, **extra)
 
 
-def load(command: ListedCommand) -> Any:
-    """Import a command, and return it as a command object of click."""
-    module, _, name = command.at.partition(":")
-    found = getattr(import_module(f"{__package__}.{module}"), name)
+def load(command: ListedCommand | InstalledCommand) -> Any:
+    """Import a command, and return it as a command object of click.
+
+    Raises:
+        ConfigError: If the command of another package cannot be imported.
+    """
+    example: str | None = None
+    if isinstance(command, InstalledCommand):
+        found = plugins.load_class(plugins.COMMANDS, command.name)
+    else:
+        module, _, name = command.at.partition(":")
+        found, example = getattr(import_module(f"{__package__}.{module}"), name), f"Example: {command.example}"
     if not isinstance(found, Typer):
         function, found = found, Typer(add_completion=False, rich_markup_mode=None)
-        found.command(command.name, epilog=f"Example: {command.example}")(function)
+        found.command(command.name, epilog=example)(function)
     return get_command(found)

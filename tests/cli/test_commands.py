@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import inspect
+import os
 import re
 import shlex
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 import typer
@@ -60,3 +62,33 @@ def test_the_help_has_every_command_once_under_the_heading_of_its_group() -> Non
     for command in COMMANDS:
         (section,) = [part for part in printed.split("\n\n") if part.startswith(f"{command.group}:\n")]
         assert len(re.findall(rf"^  {command.name}  ", section, re.MULTILINE)) == 1
+
+
+def test_a_package_adds_a_command_which_is_listed_in_the_help_and_can_fail_with_one_line(tmp_path: Path) -> None:
+    (tmp_path / "my_command.py").write_text(
+        "from q2r2_control import ConfigError\n\n"
+        "def warm(degrees: float = 20.0) -> None:\n"
+        '    """Tell how warm it is."""\n'
+        "    if degrees > 100.0:\n"
+        '        raise ConfigError("--degrees: allowed: 100 or less")\n'
+        '    print(f"{degrees:g} degrees")\n'
+    )
+    about = tmp_path / "my_package-1.0.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: my_package\nVersion: 1.0\n")
+    points = "[q2r2_control.commands]\nwarm = my_command:warm\ngone = my_command:gone\ncheck = my_command:warm\n"
+    (about / "entry_points.txt").write_text(points)
+
+    def called(*arguments: str) -> tuple[int, str, str]:
+        path = os.pathsep.join([str(tmp_path), *filter(None, sys.path)])
+        command = [sys.executable, "-m", "q2r2_control", *arguments]
+        result = subprocess.run(command, capture_output=True, text=True, env=os.environ | {"PYTHONPATH": path})
+        return result.returncode, result.stdout, result.stderr
+
+    assert "\nOther packages:\n  gone  A command of the package my_package." in called("--help")[1]
+    assert called("warm", "--degrees", "30") == (0, "30 degrees\n", "")
+    assert called("warm", "--degrees", "300") == (2, "", "q2r2: --degrees: allowed: 100 or less\n")
+    code, _, said = called("gone")
+    assert (code, said.count("\n")) == (2, 1)
+    assert said.startswith("q2r2: q2r2_control.commands: gone = my_command:gone: module 'my_command' has no attribute")
+    assert "Validate a cell" in called("check", "--help")[1]
