@@ -19,7 +19,7 @@ from q2r2_control.config.external import describe
 from q2r2_control.config.presets import RAW_WARNING
 from q2r2_control.control.controller import CartesianController, check_settings
 from q2r2_control.errors import Q2R2Error
-from q2r2_control.plants.base import make_plant
+from q2r2_control.plants.base import check_plant_settings, make_plant
 from q2r2_control.plugins import INPUTS, PLANTS, load_class
 from q2r2_control.robot.cell_parts import load_model
 from q2r2_control.robot.kept_distances import kept_distances, near_at_home
@@ -92,6 +92,7 @@ def check_cell(config: Config) -> CellCheck:
     if isinstance(controls, DeviceControls):  # The controls of other devices are known only when they are connected.
         config.teleop.bindings.check_device(controls)
     load_class(PLANTS, config.plant)
+    unknown_blocks = check_plant_settings(config)
     robot = Robot.from_config(config)
     # Here the settings still contain the pairs that may touch, so that their names and numbers are checked too. The
     # kept distances below are those of position mode, in which these pairs must not touch.
@@ -102,7 +103,10 @@ def check_cell(config: Config) -> CellCheck:
     distances = sorted(pairs, key=lambda found: found[0].distance)
     arms = [_arm_check(config, robot, name) for name in robot.arms]
     stops = stop_torques(robot, robot.capped_acceleration(settings.acceleration_limit))
-    notes = [f"{arm.name} arm: its tool includes {arm.object} that it holds" for arm in arms if arm.object]
+    notes = [
+        *unknown_blocks,
+        *(f"{arm.name} arm: its tool includes {arm.object} that it holds" for arm in arms if arm.object),
+    ]
     if config.external is not None and not config.external.filtered:
         notes.append(RAW_WARNING)
     notes += _notes_on_models(config, {robot.joint_names[index] for index in joints_in_degrees(robot)})

@@ -11,9 +11,10 @@ import numpy.typing as npt
 
 from q2r2_control.config.cell import Config
 from q2r2_control.config.moving_obstacle import MovingObstacle
+from q2r2_control.config.strict import validated
 from q2r2_control.errors import ConfigError, PlantError, check_kind, shown
 from q2r2_control.events import Reason
-from q2r2_control.plugins import PLANTS, load_class
+from q2r2_control.plugins import PLANTS, load_class, names_of
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import ArmTiming, Array, Command, CommandMode, RobotState, is_number
 
@@ -28,8 +29,12 @@ class Plant(Protocol):
     In each tick ``apply`` takes the posture that the plant should have at the end of the tick. ``advance`` lets the
     time of the tick pass, and ``state`` returns the measurement. The time of real hardware passes by itself, so that
     ``advance`` of such a plant waits for the next measurement. A new plant stands at home with open grippers until a
-    command comes. A plant that is found by its name also has a class method ``from_config(robot, config)``. A plant
-    with a window is a :class:`WindowedPlant`.
+    command comes. A plant with a window is a :class:`WindowedPlant`. A plant that is found by its name also has a class
+    method ``from_config(robot, config)``. Its class may have these further attributes:
+
+    - ``settings``: The :class:`StrictModel` of its block in ``plant_settings``. ``q2r2 check`` checks the block by it.
+    - ``simulated``: True if its time is that of ``advance``. A run with scripted hands is then in simulated time.
+    - ``realtime_only``: True if the plant's time passes by itself. Simulated time and replays are then refused.
     """
 
     modes: tuple[CommandMode, ...]  # The modes of commands that this plant follows.
@@ -152,6 +157,25 @@ def make_plant(plant: Plant | str, robot: Robot, config: Config) -> Plant:
         return plant
     made: Plant = load_class(PLANTS, plant).from_config(robot, config)
     return made
+
+
+def check_plant_settings(config: Config) -> list[str]:
+    """Check each block of ``config.plant_settings`` by the attribute ``settings`` of the plant that it is for.
+
+    Returns:
+        A line for each block that is for no installed plant.
+
+    Raises:
+        ConfigError: If a value is not allowed. The message names the key.
+    """
+    unknown = []
+    for name, block in config.plant_settings.items():
+        if name not in names_of(PLANTS):
+            installed = ", ".join(names_of(PLANTS))
+            unknown.append(f"plant_settings.{name}: no installed plant has this name; installed: {installed}")
+        elif (model := getattr(load_class(PLANTS, name), "settings", None)) is not None:
+            validated(model, f"plant_settings.{name}: ", block)
+    return unknown
 
 
 def check_mode(mode: CommandMode | str, plant: Plant) -> CommandMode:

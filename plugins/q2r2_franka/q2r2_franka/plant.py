@@ -12,7 +12,7 @@ from q2r2_franka.answering import RobotAnswers
 from q2r2_franka.cell import FrankaCell
 from q2r2_franka.hand import Hand
 from q2r2_franka.limits import JOINTS, PERIOD
-from q2r2_franka.settings import franka_settings, is_loopback
+from q2r2_franka.settings import FrankaSettings, franka_settings, is_loopback
 from q2r2_franka.state import SessionState
 from q2r2_franka.stream import MEANS
 
@@ -27,6 +27,7 @@ class FrankaPlant:
     """A plant of real arms. They start where they are, also after a robot has ended a motion."""
 
     modes: tuple[CommandMode, ...] = (CommandMode.TORQUE, CommandMode.POSITION)
+    settings = FrankaSettings
     realtime_only = True
     # Each commanded position is the mean of MEANS positions of the path, so the plant itself keeps control.jerk_limit.
     averages = True
