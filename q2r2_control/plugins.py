@@ -15,7 +15,7 @@ from functools import lru_cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
-from q2r2_control.errors import ConfigError
+from q2r2_control.errors import ConfigError, MissingPackageError
 from q2r2_control.extras import plugin_line
 
 INPUTS = "q2r2_control.inputs"
@@ -65,15 +65,24 @@ def load_class(group: str, name: str) -> Any:
     """Return the class, the preset or the format called ``name``.
 
     Raises:
+        MissingPackageError: If the object needs a package of an extra that is not installed.
         ConfigError: If the group has no such name, or if the object cannot be imported.
     """
     found = points_of(group)
     if name not in found:
-        kind = group.rpartition(".")[2].removesuffix("s")
+        kind = _kind(group)
         if (missing := package_to_install(group, name)) is not None:
             raise ConfigError(f"{kind} {name}: {missing}")
         raise ConfigError(f"{kind} {name!r:.60}: allowed are {', '.join(found)}; installed as entry points {group}")
     try:
         return found[name].load()
+    except MissingPackageError as error:
+        instead = ", or choose --plant kinematic" if (group, name) == (PLANTS, "mujoco") else ""
+        raise MissingPackageError(f"{_kind(group)} {name}: {error}{instead}") from error
     except (ImportError, AttributeError) as error:
         raise ConfigError(f"{group}: {name} = {found[name].value}: {error}") from error
+
+
+def _kind(group: str) -> str:
+    """Return the word for one object of a ``group``, such as "plant"."""
+    return group.rpartition(".")[2].removesuffix("s")

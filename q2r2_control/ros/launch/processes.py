@@ -19,7 +19,7 @@ from dataclasses import dataclass, field, replace
 from q2r2_control.config.cell_file import load_config
 from q2r2_control.config.external import ControllerKind, ExternalConfig
 from q2r2_control.errors import NOT_RECORDED, ConfigError, Q2R2Error
-from q2r2_control.extras import install_line
+from q2r2_control.extras import install_line, require
 from q2r2_control.plugins import INPUTS, load_class
 from q2r2_control.process.scheduling import StopRequest, how_it_ended, stop_on_signals
 from q2r2_control.ros.launch.build import build_missing
@@ -80,9 +80,12 @@ def nodes_of(
     cell = load_config(path)
     source = source or cell.input
     config: dict[str, str | float] = {"config": path}
+    if recording is not None:
+        require("data", "recorder")
     nodes = [] if recording is None else [NodeProcess("recorder", {**config, **recording})]
     controller: dict[str, str | float] = {} if cell.external is None else _relayed(cell.external)
     if robot == "mujoco" or (robot == "auto" and cell.controller is ControllerKind.BUILTIN):
+        require("sim", "mujoco_robot")
         nodes.append(NodeProcess("mujoco_robot", config))
         if cell.external is None:
             controller["external_torque_topic"] = "mujoco_robot/external_torque"
