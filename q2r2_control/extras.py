@@ -12,13 +12,14 @@ from pathlib import Path
 
 from q2r2_control.errors import MissingPackageError
 
-# By extra, its packages. The other extras are checked where they are used.
+# By extra, its packages. Other extras are checked where they are used.
 PACKAGES = {
     "sim": ("mujoco", "pillow"),
     "data": ("mcap", "rosbags", "zstandard", "matplotlib", "pillow"),
     "headset": ("rosbags",),
     "fri": ("protobuf",),
     "gym": ("gymnasium",),
+    "web": ("viser", "msgspec", "cryptography", "segno", "trimesh", "websockets", "rosbags"),
 }
 # Packages whose import has another name.
 _IMPORTS = {"pillow": "PIL", "protobuf": "google.protobuf"}
@@ -56,7 +57,7 @@ def require(extra: str, what: str) -> None:
     ``what`` names the command, setting or file that needs them. The packages are not imported.
     """
     if missing := [package for package in PACKAGES[extra] if not _is_installed(_IMPORTS.get(package, package))]:
-        raise MissingPackageError(f"{what} needs {' and '.join(missing)}: {install_line(extra)}")
+        raise MissingPackageError(f"{what} needs {_listed(missing)}: {install_line(extra)}")
 
 
 @contextmanager
@@ -67,6 +68,11 @@ def importing(extra: str, what: str) -> Iterator[None]:
     except ModuleNotFoundError:
         require(extra, what)
         raise
+
+
+def _listed(names: list[str]) -> str:
+    """Return ``names`` as words, such as "a, b and c"."""
+    return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
 
 
 def _is_installed(module: str) -> bool:

@@ -16,7 +16,7 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 from q2r2_control.errors import ConfigError, MissingPackageError
-from q2r2_control.extras import plugin_line
+from q2r2_control.extras import plugin_line, require
 
 INPUTS = "q2r2_control.inputs"
 PLANTS = "q2r2_control.plants"
@@ -25,6 +25,15 @@ EXPORTS = "q2r2_control.exports"
 REASONS = "q2r2_control.reasons"
 # By group and name, the folders in plugins/ of packages that are not installed with this one.
 _OWN_PACKAGES = {(PLANTS, "franka"): "q2r2_franka", (EXPORTS, "zarr"): "q2r2_zarr"}
+
+# By group and name, the extras of classes that need one.
+_EXTRAS = {
+    (INPUTS, "headset"): "headset",
+    (INPUTS, "web"): "web",
+    (INPUTS, "webxr"): "web",
+    (PLANTS, "fri"): "fri",
+    (PLANTS, "mujoco"): "sim",
+}
 
 
 def points_of(group: str) -> Mapping[str, EntryPoint]:
@@ -74,13 +83,22 @@ def load_class(group: str, name: str) -> Any:
         if (missing := package_to_install(group, name)) is not None:
             raise ConfigError(f"{kind} {name}: {missing}")
         raise ConfigError(f"{kind} {name!r:.60}: allowed are {', '.join(found)}; installed as entry points {group}")
+    if (extra := _EXTRAS.get((group, name))) is not None:
+        _require(extra, group, name)
     try:
         return found[name].load()
-    except MissingPackageError as error:
-        instead = ", or choose --plant kinematic" if (group, name) == (PLANTS, "mujoco") else ""
-        raise MissingPackageError(f"{_kind(group)} {name}: {error}{instead}") from error
     except (ImportError, AttributeError) as error:
         raise ConfigError(f"{group}: {name} = {found[name].value}: {error}") from error
+
+
+def _require(extra: str, group: str, name: str) -> None:
+    """Raise :class:`MissingPackageError` if a package of the ``extra`` of a class is missing."""
+    try:
+        require(extra, f"{_kind(group)} {name}")
+    except MissingPackageError as error:
+        if extra != "sim":
+            raise
+        raise MissingPackageError(f"{error}, or choose --plant kinematic") from None
 
 
 def _kind(group: str) -> str:

@@ -151,6 +151,7 @@ def run_cell(config: Config, options: RunOptions) -> CellRun:
     with _opened_devices(config, options) as streams:
         if options.page is None:
             return _run_recorded(config, options, None, streams)
+        require("web", "--web")
         # The import is here, because a run without a page does not need this module.
         from q2r2_control.viewer.web.view import PageView
 

@@ -25,6 +25,7 @@ from q2r2_control.process.scheduling import StopRequest, how_it_ended, stop_on_s
 from q2r2_control.ros.launch.build import build_missing
 from q2r2_control.types import SIDES
 
+_EXTRAS = {"mujoco_robot": "sim", "recorder": "data"}  # By node, the extra that it needs.
 NO_INPUT = "none"  # Another node sends the hands.
 ROBOTS = ("auto", "mujoco", "none")
 # Time for a process to end, after SIGINT and then after SIGTERM; SIGKILL follows [s].
@@ -80,12 +81,9 @@ def nodes_of(
     cell = load_config(path)
     source = source or cell.input
     config: dict[str, str | float] = {"config": path}
-    if recording is not None:
-        require("data", "recorder")
     nodes = [] if recording is None else [NodeProcess("recorder", {**config, **recording})]
     controller: dict[str, str | float] = {} if cell.external is None else _relayed(cell.external)
     if robot == "mujoco" or (robot == "auto" and cell.controller is ControllerKind.BUILTIN):
-        require("sim", "mujoco_robot")
         nodes.append(NodeProcess("mujoco_robot", config))
         if cell.external is None:
             controller["external_torque_topic"] = "mujoco_robot/external_torque"
@@ -156,9 +154,13 @@ def run_together(nodes: Sequence[NodeProcess], say: Callable[[str], None]) -> in
 
     Raises:
         UpError: If ROS cannot be used.
+        MissingPackageError: If a package of an extra is missing for a node.
         BuildError: If message packages cannot be built.
     """
     check_rclpy()
+    for node in nodes:
+        if (extra := _EXTRAS.get(node.name)) is not None:
+            require(extra, node.name)
     build_missing(say)
     stop, lock = StopRequest(), threading.Lock()
     running: dict[str, subprocess.Popen[str]] = {}
