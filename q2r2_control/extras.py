@@ -56,7 +56,7 @@ def require(extra: str, what: str) -> None:
 
     ``what`` names the command, setting or file that needs them. The packages are not imported.
     """
-    if missing := [package for package in PACKAGES[extra] if not _is_installed(_IMPORTS.get(package, package))]:
+    if missing := [package for package in PACKAGES[extra] if not _is_installed(module_of(package))]:
         raise MissingPackageError(f"{what} needs {_listed(missing)}: {install_line(extra)}")
 
 
@@ -68,6 +68,11 @@ def importing(extra: str, what: str) -> Iterator[None]:
     except ModuleNotFoundError:
         require(extra, what)
         raise
+
+
+def module_of(package: str) -> str:
+    """Return the module by which a ``package`` of :data:`PACKAGES` is imported."""
+    return _IMPORTS.get(package, package)
 
 
 def _listed(names: list[str]) -> str:
