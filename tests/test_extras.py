@@ -62,6 +62,11 @@ def test_an_extra_has_the_packages_that_the_code_requires(extra: str) -> None:
     assert own <= set(PACKAGES[extra]) <= own | others
 
 
+def test_the_base_has_no_package_of_an_extra() -> None:
+    base = {Requirement(entry).name for entry in PROJECT["dependencies"]}
+    assert base.isdisjoint(package for packages in PACKAGES.values() for package in packages)
+
+
 def test_the_quickstart_lists_every_extra_for_users() -> None:
     page = (ROOT / "docs" / "quickstart.md").read_text(encoding="utf-8")
     table = page.partition("| extra |")[2].partition("\n\n")[0]
