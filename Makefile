@@ -12,12 +12,15 @@ PIP    := flock $(VENV) $(BIN)/python -m pip install --quiet --disable-pip-versi
 
 setup: $(VENV)/.installed-dev
 
+# The demo needs the extra `sim`. The commands that the README names next need the others.
+EXTRAS := sim,data,headset,fri
+
 # The package is installed again when its dependencies change. It is editable, so changes of its code need no installation.
 $(VENV)/.installed: pyproject.toml setup.py
 	@$(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(not (3, 11) <= v[:2] < (3, 15) and f"q2r2_control needs Python 3.11 to 3.14, and this is {v[0]}.{v[1]}: make PYTHON=python3.12 ...")'
 	@echo 'installing packages into $(VENV), some 700 MB to download and 1.6 GB on disk: this takes minutes ...'
 	@$(PYTHON) -m venv $(VENV)
-	@$(PIP) --editable .
+	@$(PIP) --editable '.[$(EXTRAS)]'
 	@touch $@
 
 # These are the packages that tests and linters need.
@@ -151,7 +154,7 @@ test-learning: $(LEROBOT)/.installed
 $(LEROBOT)/.installed: pyproject.toml setup.py $(wildcard plugins/*/pyproject.toml)
 	$(LEROBOT_PYTHON) -m venv $(LEROBOT)
 	$(LEROBOT)/bin/python -m pip install --quiet --upgrade pip
-	$(LEROBOT)/bin/python -m pip install --quiet --editable '.[export,lerobot]' 'lerobot$(LEROBOT_VERSION)' \
+	$(LEROBOT)/bin/python -m pip install --quiet --editable '.[sim,fri,export,lerobot]' 'lerobot$(LEROBOT_VERSION)' \
 		'pytest>=8' 'hypothesis>=6.100' $(LEROBOT_PLUGINS)
 	$(LEROBOT)/bin/python -m pip install --quiet --no-deps 'robomimic==0.3.0'  # Its loader only needs torch, which is installed.
 	touch $@
@@ -222,7 +225,8 @@ wheel: $(VENV)/.installed
 	rm -rf dist
 	$(BIN)/python -m build
 
-# This checks the metadata. It then installs the wheel in a fresh environment and uses it from an empty folder.
+# This checks the metadata. It then installs the wheel in a fresh environment and uses it from an empty folder: first
+# without extras, then with the simulation.
 FRESH := .venv-fresh
 
 release-check: wheel
@@ -231,8 +235,10 @@ release-check: wheel
 	$(PYTHON) -m venv $(FRESH)/venv
 	$(FRESH)/venv/bin/python -m pip install --quiet dist/*.whl
 	mkdir $(FRESH)/empty
-	cd $(FRESH)/empty && ../venv/bin/q2r2 doctor
 	cd $(FRESH)/empty && ../venv/bin/q2r2 check config/dual_iiwa7.yaml
+	cd $(FRESH)/empty && ../venv/bin/q2r2 run config/dual_panda.yaml --plant kinematic --fast --headless --duration 3
+	$(FRESH)/venv/bin/python -m pip install --quiet "$$(echo dist/*.whl)[sim]"
+	cd $(FRESH)/empty && ../venv/bin/q2r2 doctor
 	cd $(FRESH)/empty && ../venv/bin/q2r2 run config/dual_panda.yaml --fast --headless --duration 3
 	cd $(FRESH)/empty && ../venv/bin/q2r2 demo --fast --headless
 

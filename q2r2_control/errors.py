@@ -26,6 +26,10 @@ class ConfigError(Q2R2Error):
         return ConfigError(f"{where}{self}", [f"{where}{fault}" for fault in self.faults])
 
 
+class MissingPackageError(ConfigError, ImportError):
+    """A package of an extra is not installed. The message names what needs it, and the command that installs it."""
+
+
 class AllFaults:
     """Collects the errors of several parts, so that a user reads all of them together.
 

@@ -1,11 +1,28 @@
-"""Make the line that installs the packages of an extra. Every message about a missing package ends with this line."""
+"""Find missing packages of extras. Every message about a missing package ends with the line that installs its extra."""
 
 from __future__ import annotations
 
 import os
 import shlex
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
+
+from q2r2_control.errors import MissingPackageError
+
+# By extra, its packages. Other extras are checked where they are used.
+PACKAGES = {
+    "sim": ("mujoco", "pillow"),
+    "data": ("mcap", "rosbags", "zstandard", "matplotlib", "pillow"),
+    "headset": ("rosbags",),
+    "fri": ("protobuf",),
+    "gym": ("gymnasium",),
+    "web": ("viser", "msgspec", "cryptography", "segno", "trimesh", "websockets", "rosbags"),
+}
+# Packages whose import has another name.
+_IMPORTS = {"pillow": "PIL", "protobuf": "google.protobuf"}
 
 _CHECKOUT = Path(__file__).resolve().parents[1]
 
@@ -32,6 +49,42 @@ def plugin_line(package: str) -> str:
     """
     folder = Path("plugins") / package
     return f"{_pip()} install -e {shlex.quote(str(_CHECKOUT / folder if (_CHECKOUT / folder).is_dir() else folder))}"
+
+
+def require(extra: str, what: str) -> None:
+    """Raise :class:`MissingPackageError` unless all packages of an ``extra`` are installed.
+
+    ``what`` names the command, setting or file that needs them. The packages are not imported.
+    """
+    if missing := [package for package in PACKAGES[extra] if not _is_installed(module_of(package))]:
+        raise MissingPackageError(f"{what} needs {_listed(missing)}: {install_line(extra)}")
+
+
+@contextmanager
+def importing(extra: str, what: str) -> Iterator[None]:
+    """If an import in this context fails, do the same as :func:`require`."""
+    try:
+        yield
+    except ModuleNotFoundError:
+        require(extra, what)
+        raise
+
+
+def module_of(package: str) -> str:
+    """Return the module by which a ``package`` of :data:`PACKAGES` is imported."""
+    return _IMPORTS.get(package, package)
+
+
+def _listed(names: list[str]) -> str:
+    """Return ``names`` as words, such as "a, b and c"."""
+    return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
+
+
+def _is_installed(module: str) -> bool:
+    try:
+        return find_spec(module) is not None
+    except ModuleNotFoundError:  # The package of the module is missing, too.
+        return False
 
 
 def _pip() -> str:

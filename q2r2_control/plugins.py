@@ -15,8 +15,8 @@ from functools import lru_cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
-from q2r2_control.errors import ConfigError
-from q2r2_control.extras import plugin_line
+from q2r2_control.errors import ConfigError, MissingPackageError
+from q2r2_control.extras import plugin_line, require
 
 INPUTS = "q2r2_control.inputs"
 PLANTS = "q2r2_control.plants"
@@ -26,6 +26,15 @@ REASONS = "q2r2_control.reasons"
 COMMANDS = "q2r2_control.commands"
 # By group and name, the folders in plugins/ of packages that are not installed with this one.
 _OWN_PACKAGES = {(PLANTS, "franka"): "q2r2_franka", (EXPORTS, "zarr"): "q2r2_zarr"}
+
+# By group and name, the extras of classes that need one.
+_EXTRAS = {
+    (INPUTS, "headset"): "headset",
+    (INPUTS, "web"): "web",
+    (INPUTS, "webxr"): "web",
+    (PLANTS, "fri"): "fri",
+    (PLANTS, "mujoco"): "sim",
+}
 
 
 def points_of(group: str) -> Mapping[str, EntryPoint]:
@@ -66,15 +75,33 @@ def load_class(group: str, name: str) -> Any:
     """Return the class, the preset or the format called ``name``.
 
     Raises:
+        MissingPackageError: If the object needs a package of an extra that is not installed.
         ConfigError: If the group has no such name, or if the object cannot be imported.
     """
     found = points_of(group)
     if name not in found:
-        kind = group.rpartition(".")[2].removesuffix("s")
+        kind = _kind(group)
         if (missing := package_to_install(group, name)) is not None:
             raise ConfigError(f"{kind} {name}: {missing}")
         raise ConfigError(f"{kind} {name!r:.60}: allowed are {', '.join(found)}; installed as entry points {group}")
+    if (extra := _EXTRAS.get((group, name))) is not None:
+        _require(extra, group, name)
     try:
         return found[name].load()
     except (ImportError, AttributeError) as error:
         raise ConfigError(f"{group}: {name} = {found[name].value}: {error}") from error
+
+
+def _require(extra: str, group: str, name: str) -> None:
+    """Raise :class:`MissingPackageError` if a package of the ``extra`` of a class is missing."""
+    try:
+        require(extra, f"{_kind(group)} {name}")
+    except MissingPackageError as error:
+        if extra != "sim":
+            raise
+        raise MissingPackageError(f"{error}, or choose --plant kinematic") from None
+
+
+def _kind(group: str) -> str:
+    """Return the word for one object of a ``group``, such as "plant"."""
+    return group.rpartition(".")[2].removesuffix("s")

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import re
 import sys
 import tomllib
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
 
 from q2r2_control import extras
-from q2r2_control.extras import install_line
+from q2r2_control.extras import PACKAGES, install_line
 
 ROOT = Path(__file__).resolve().parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+EXTRAS: dict[str, list[str]] = PROJECT["optional-dependencies"]
 
 
 @pytest.fixture(autouse=True)
@@ -40,12 +44,31 @@ def test_the_command_starts_with_the_python_of_an_environment_that_is_not_activa
 
 
 def test_every_extra_in_a_message_exists_in_the_package() -> None:
-    known = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
     named = {
         text.split(quote)[1]
         for file in (ROOT / "q2r2_control").rglob("*.py")
-        for text in file.read_text(encoding="utf-8").split("install_line(")[1:]
+        for text in re.split(r"(?:install_line|require|importing)\(", file.read_text(encoding="utf-8"))[1:]
         if (quote := text[0]) in "'\""
     }
-    assert len(named) > 5
-    assert named <= set(known)
+    assert len(named) > 10
+    assert named <= set(EXTRAS)
+
+
+@pytest.mark.parametrize("extra", PACKAGES)
+def test_an_extra_has_the_packages_that_the_code_requires(extra: str) -> None:
+    listed = [Requirement(entry) for entry in EXTRAS[extra]]
+    own = {one.name for one in listed if one.name != "q2r2_control"}
+    others = {name for one in listed for other in one.extras for name in PACKAGES[other]}
+    assert own <= set(PACKAGES[extra]) <= own | others
+
+
+def test_the_base_has_no_package_of_an_extra() -> None:
+    base = {Requirement(entry).name for entry in PROJECT["dependencies"]}
+    assert base.isdisjoint(package for packages in PACKAGES.values() for package in packages)
+
+
+def test_the_quickstart_lists_every_extra_for_users() -> None:
+    page = (ROOT / "docs" / "quickstart.md").read_text(encoding="utf-8")
+    table = page.partition("| extra |")[2].partition("\n\n")[0]
+    named = re.findall(r"`(\w+)`", "".join(re.findall(r"^\|([^|]*)\|", table, re.MULTILINE)))
+    assert set(named) == set(EXTRAS) - {"dev", "docs", "release"}

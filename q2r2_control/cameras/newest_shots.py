@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
-from PIL import Image
 
 from q2r2_control.cameras.camera_watch import longest_silence
 from q2r2_control.cameras.loop_times import LoopTimes, TickTime
@@ -28,6 +27,8 @@ class ReadPicture:
 
     @cached_property
     def pixels(self) -> npt.NDArray[np.uint8]:
+        from PIL import Image  # The import is here, because a policy may use no pixels.
+
         return np.array(Image.open(io.BytesIO(self.jpeg)).convert("RGB"))
 
 

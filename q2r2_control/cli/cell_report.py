@@ -18,7 +18,7 @@ from q2r2_control.config.control import ContactPair
 from q2r2_control.config.external import describe
 from q2r2_control.config.presets import RAW_WARNING
 from q2r2_control.control.controller import CartesianController, check_settings
-from q2r2_control.errors import Q2R2Error
+from q2r2_control.errors import MissingPackageError, Q2R2Error
 from q2r2_control.plants.base import check_plant_settings, make_plant
 from q2r2_control.plugins import INPUTS, PLANTS, load_class
 from q2r2_control.robot.cell_parts import load_model
@@ -88,10 +88,10 @@ class CellCheck:
 
 def check_cell(config: Config) -> CellCheck:
     """Build the cell, and check it with its arms at home. Raises :class:`Q2R2Error` if it cannot be built."""
-    controls = getattr(load_class(INPUTS, config.input), "controls", None)
+    (source, plant), lacking = _installed_classes(config)
+    controls = getattr(source, "controls", None)
     if isinstance(controls, DeviceControls):  # The controls of other devices are known only when they are connected.
         config.teleop.bindings.check_device(controls)
-    load_class(PLANTS, config.plant)
     unknown_blocks = check_plant_settings(config)
     robot = Robot.from_config(config)
     # Here the settings still contain the pairs that may touch, so that their names and numbers are checked too. The
@@ -104,6 +104,7 @@ def check_cell(config: Config) -> CellCheck:
     arms = [_arm_check(config, robot, name) for name in robot.arms]
     stops = stop_torques(robot, robot.capped_acceleration(settings.acceleration_limit))
     notes = [
+        *lacking,
         *unknown_blocks,
         *(f"{arm.name} arm: its tool includes {arm.object} that it holds" for arm in arms if arm.object),
     ]
@@ -120,7 +121,7 @@ def check_cell(config: Config) -> CellCheck:
         notes.append(f"{' and '.join(allowed.pair)} may touch in torque mode: {inside}")
     # No controller is built, because its kernels take minutes to compile. For arms at rest, its certificate would find
     # no other faults.
-    faults = (*preflight_faults(robot, settings, None), *_plant_faults(config, robot))
+    faults = (*preflight_faults(robot, settings, None), *(() if plant is None else _plant_faults(config, robot)))
     return CellCheck(
         name=config.name,
         arms=arms,
@@ -139,6 +140,22 @@ def check_cell(config: Config) -> CellCheck:
         notes=notes + [_stop_note(stop, shared=config.robot is not None) for stop in stops if stop.stop.ratio > 1.0],
         verdict=verdict_on(faults),
     )
+
+
+def _installed_classes(config: Config) -> tuple[list[Any], list[str]]:
+    """Return the classes of the cell's input and plant, and a note for each that needs a package of an extra.
+
+    The class is then None. A missing package is not a fault of the cell, which may run on another computer.
+    """
+    classes: list[Any] = []
+    notes: list[str] = []
+    for group, name in ((INPUTS, config.input), (PLANTS, config.plant)):
+        try:
+            classes.append(load_class(group, name))
+        except MissingPackageError as error:
+            classes.append(None)
+            notes.append(f"not checked: {error}")
+    return classes, notes
 
 
 def verdict_on(faults: Sequence[str]) -> str:

@@ -26,10 +26,10 @@ from q2r2_control.config.cell import Config
 from q2r2_control.config.external import ControllerKind
 from q2r2_control.demo.assembly_tasks import AssemblyTask, TaskResult, TaskWatch, held_to_promises, note_on_parts
 from q2r2_control.errors import ConfigError, PlantError
+from q2r2_control.extras import require
 from q2r2_control.inputs.base import PolicySource, is_simulated, make_input
 from q2r2_control.pipeline.pipeline import Pipeline
-from q2r2_control.plants.base import Plant, WaitingPlant, WindowedPlant, make_plant
-from q2r2_control.plants.mujoco import MujocoPlant
+from q2r2_control.plants.base import Plant, WaitingPlant, WindowedPlant, is_mujoco, make_plant
 from q2r2_control.plugins import INPUTS, PLANTS, load_class
 from q2r2_control.process.scheduling import real_time
 from q2r2_control.robot.robot import Robot
@@ -71,7 +71,7 @@ def show_window(pipeline: Pipeline) -> None:
     if not isinstance(plant, WindowedPlant):
         return
     plant.launch_viewer()
-    if isinstance(plant, MujocoPlant):
+    if is_mujoco(plant):
         plant.viewer_say("")
 
     def show(tick: Tick) -> None:
@@ -151,6 +151,7 @@ def run_cell(config: Config, options: RunOptions) -> CellRun:
     with _opened_devices(config, options) as streams:
         if options.page is None:
             return _run_recorded(config, options, None, streams)
+        require("web", "--web")
         # The import is here, because a run without a page does not need this module.
         from q2r2_control.viewer.web.view import PageView
 
@@ -174,6 +175,7 @@ def _opened_devices(config: Config, options: RunOptions) -> AbstractContextManag
 def _run_recorded(config: Config, options: RunOptions, page: PageView | None, streams: CameraStreams | None) -> CellRun:
     if options.record is None:
         return _run_cell(config, options, None, page, streams)
+    require("data", "--record")
     # The import is here, because a run without --record does not need this module.
     from q2r2_control.cli.run_recording import RunRecording
 
@@ -215,7 +217,7 @@ def _run_cell(
 
 def _open_window(plant: Plant) -> None:
     """Show the arms at home while the controller is built, which takes minutes if its kernels have to be compiled."""
-    if isinstance(plant, MujocoPlant):
+    if is_mujoco(plant):
         plant.launch_viewer()
         plant.viewer_say("preparing the controller")
         plant.viewer_sync()
@@ -242,7 +244,7 @@ def _run_pipeline(
     if (note := note_on_parts(str(options.input_options.get("trajectory", "")), config)) is not None:
         say(note, console, "yellow")
     watch = None
-    if options.tasks and isinstance(pipeline.plant, MujocoPlant):
+    if options.tasks and is_mujoco(pipeline.plant):
         watch = TaskWatch(options.tasks, pipeline.plant, pipeline.robot, config)
         pipeline.listeners.append(watch)
     display: Any = source
@@ -333,11 +335,11 @@ def _run(
             streams.wait_until_ready()
         pipeline.cameras = streams
         devices = {} if streams is None else streams.streams
-        drawn = pipeline.config.simulated_cameras if isinstance(pipeline.plant, MujocoPlant) else {}
+        drawn = pipeline.config.simulated_cameras if is_mujoco(pipeline.plant) else {}
         for name, most, show, watched in _lookers(pipeline, page, [*drawn, *devices]):
             if name in devices:
                 devices[name].hear(ShownPictures(most, show, watched))
-            elif isinstance(pipeline.plant, MujocoPlant):
+            elif is_mujoco(pipeline.plant):
                 pictures = LivePictures(pipeline.plant, name, drawn[name], most, show, watched)
                 pipeline.listeners.append(stack.enter_context(pictures))
         if options.real_time and (refused := stack.enter_context(real_time())):

@@ -28,8 +28,8 @@ from q2r2_control.pipeline.killed_run import measure_kill
 from q2r2_control.pipeline.slow_run import REST, STILL, SlowRun
 from q2r2_control.plants.fri.plant import FriPlant
 from q2r2_control.process.folders import check_file
+from q2r2_control.process.program import program
 from q2r2_control.process.scheduling import real_time
-from q2r2_control.recording.about import program
 from q2r2_control.robot.commissioned import fingerprint, sign_off_file
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import SIDES, Array, CommandMode

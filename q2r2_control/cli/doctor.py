@@ -18,6 +18,7 @@ from q2r2_control.cli.output import DEMO_CONFIG, Json, as_json_text
 from q2r2_control.cli.ros import print_findings
 from q2r2_control.config.cell import Config
 from q2r2_control.config.cell_file import load_config
+from q2r2_control.errors import MissingPackageError
 from q2r2_control.extras import install_line
 from q2r2_control.inputs.listener import access_lines
 from q2r2_control.plugins import INPUTS, PLANTS, load_class
@@ -29,6 +30,10 @@ _PACKAGE = "q2r2_control"
 
 # By the name of an extra, what does not work without its packages. The extra ros has its own function, _ros.
 _NEEDS_EXTRA = {
+    "sim": "no --plant mujoco, no q2r2 demo, no pictures of simulated cameras",
+    "data": "no --record, no q2r2 replay, judge, report and export",
+    "headset": "no --input headset, no q2r2 headset-check",
+    "fri": "no --plant fri",
     "web": "no --web, no --input webxr",
     "export": "no q2r2 export hdf5 and lerobot-v2.1",
     "lerobot": "no q2r2 export lerobot",
@@ -51,8 +56,7 @@ def doctor(
     ros doctor examines the running nodes.
     """
     cell = load_config(config)
-    for group, name in ((INPUTS, cell.input), (PLANTS, cell.plant)):
-        load_class(group, name)
+    lacking = list(_lacking(cell))
     facts = {
         "python": platform.python_version(),
         "version": version(_PACKAGE),
@@ -63,7 +67,7 @@ def doctor(
     if cell.fri:
         facts["cabinets"] = f"q2r2 fri-check {config} says how evenly they send"
     required = requires(_PACKAGE) or ()
-    findings = [*_packages(required), *_extras(required), *_ros(), *_ports(cell), *_display(os.environ)]
+    findings = [*lacking, *_packages(required), *_extras(required), *_ros(), *_ports(cell), *_display(os.environ)]
     notes = machine_notes() + network_notes(cabinet.address for cabinet in cell.fri.values())
     findings += [Finding(False, *_what_and_cure(note)) for note in notes]
     lacks = any(finding.stops_arms for finding in findings)
@@ -75,6 +79,15 @@ def doctor(
             print("nothing is missing for a simulation; the warnings concern real arms, ROS and named extras")
     sys.stdout.flush()
     raise Exit(int(lacks))
+
+
+def _lacking(cell: Config) -> Iterator[Finding]:
+    """Yield a finding if a package of an extra is missing for the input or the plant of the cell."""
+    for group, name in ((INPUTS, cell.input), (PLANTS, cell.plant)):
+        try:
+            load_class(group, name)
+        except MissingPackageError as missing:
+            yield error(*_what_and_cure(str(missing)))
 
 
 def _packages(required: Iterable[str]) -> Iterator[Finding]:

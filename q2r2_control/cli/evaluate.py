@@ -22,6 +22,7 @@ from q2r2_control.cli.output import (
 from q2r2_control.config.cell_file import load_config
 from q2r2_control.demo.assembly_tasks import tasks_named
 from q2r2_control.demo.trials import TrialReport, try_policy, try_tasks
+from q2r2_control.extras import require
 from q2r2_control.inputs.policy import PolicyInput
 from q2r2_control.process.places import Processes, chosen_place
 from q2r2_control.types import CommandMode
@@ -44,6 +45,7 @@ def evaluate(
 
     A trial takes as long as the scripted hands of the task. Lines on stdout say which seeds failed, and why.
     """
+    require("sim", "q2r2 evaluate")
     cell, chosen = load_config(config), tasks_named(tasks)
     # The policy is made once here, so that one line says what is wrong with it.
     PolicyInput.from_config(cell, policy, named="MODULE:NAME")

@@ -9,7 +9,6 @@ from q2r2_control.cli.answers import RememberedAnswers
 from q2r2_control.config.resources import find_resource
 from q2r2_control.errors import ConfigError
 from q2r2_control.robot.description import MJCF_ENDS
-from q2r2_control.robot.mjcf import urdf_of_mjcf
 
 SPEEDS = 0.01, 10.0  # Allowed range of a joint's speed limit [rad/s].
 
@@ -56,6 +55,8 @@ def without_mjcf(
         velocity = answers.ask(question, 1.0)
         if not SPEEDS[0] <= velocity <= SPEEDS[1]:
             raise ConfigError(f"{question} = {velocity:g}: allowed: {SPEEDS[0]:g} .. {SPEEDS[1]:g}")
+    from q2r2_control.robot.mjcf import urdf_of_mjcf  # The import is here, because only MJCF needs MuJoCo.
+
     urdfs = {model: urdf_of_mjcf(find_resource(model), file.parent, velocity) for model, file in files.items()}
     for model, urdf in urdfs.items():
         ET.indent(urdf)

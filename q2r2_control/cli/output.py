@@ -19,13 +19,13 @@ from typer import Argument, Option
 from q2r2_control.config.cell import Config
 from q2r2_control.control.jit import compiling
 from q2r2_control.control.solvers.registry import check_installed
-from q2r2_control.demo.assembly_tasks import TaskResult
 from q2r2_control.errors import ConfigError
 from q2r2_control.summary.run_summary import RunSummary
 from q2r2_control.summary.tick import Tick
 from q2r2_control.viewer.tables import print_table
 
 if TYPE_CHECKING:
+    from q2r2_control.demo.assembly_tasks import TaskResult
     from q2r2_control.judging.judge import Verdict
     from q2r2_control.recording.recorder import RecordingSummary
 

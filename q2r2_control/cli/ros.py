@@ -32,6 +32,7 @@ from q2r2_control.cli.output import (
 )
 from q2r2_control.config.cell import Config
 from q2r2_control.config.cell_file import load_config
+from q2r2_control.extras import require
 from q2r2_control.process.folders import check_folder
 from q2r2_control.process.scheduling import StopRequest, stop_on_signals
 from q2r2_control.ros.launch.build import BuildError, build_interfaces
@@ -39,7 +40,6 @@ from q2r2_control.ros.launch.processes import check_rclpy, in_ros, nodes_of, run
 from q2r2_control.ros.watching.findings import Finding, examine_environment, examine_set
 from q2r2_control.ros.watching.set_view import SILENT, ArmView, NodeView, SetView
 from q2r2_control.viewer.tables import Cell, figure_table
-from q2r2_control.viewer.web.page import check_viser
 
 _COLOURS = {"ok": "green", "warn": "yellow", "error": "red"}
 _ROS_ARGUMENTS = "--ros-args"
@@ -278,7 +278,7 @@ def up(
     recording = None if record is None else {"folder": record, **notes, **leaves_out}
     page = (web_host, web_port) if web else None
     if web:
-        check_viser()  # The check comes before any node starts.
+        require("web", "--web")  # The check comes before any node starts.
     nodes = nodes_of(config, input, robot.value, recording, separate, page)
     nodes = in_ros(nodes, context.meta[_ROS_ARGUMENTS], namespace, sim_time)
     raise Exit(run_together(nodes, lambda line: print(line, flush=True)))

@@ -54,18 +54,15 @@ from q2r2_control.demo.assembly_tasks import (
 )
 from q2r2_control.demo.trials import try_task, try_tasks
 from q2r2_control.errors import NOT_RECORDED, ConfigError, InputError
-from q2r2_control.extras import install_line
+from q2r2_control.extras import install_line, require
 from q2r2_control.inputs.base import adapted, make_input, options_of
-from q2r2_control.inputs.headset_check import watch_headset
 from q2r2_control.inputs.scripted import TRAJECTORIES, hurried, place_of, trajectory_named
-from q2r2_control.plants.mujoco_cameras import window_fault
 from q2r2_control.plugins import PLANTS, load_class
 from q2r2_control.process.places import JobPlace, Processes, chosen_place
 from q2r2_control.process.scheduling import StopRequest, stop_on_signals
 from q2r2_control.robot.commissioned import drives_real_arms, not_commissioned, slowed
 from q2r2_control.teleop.crossed_hands import CrossedHands
 from q2r2_control.types import CommandMode
-from q2r2_control.viewer.headset_table import headset_display, headset_table
 
 LARGEST_SPREAD = 0.03  # Largest displacement of the parts at which the arms still reach the parts in all tasks [m].
 _PORT = 8080  # The port of the page, unless an option names another port.
@@ -256,6 +253,7 @@ def demo(
     """
     if plant not in ("mujoco", "fri"):
         raise ConfigError(f"--plant {plant!r:.40}: allowed: mujoco, fri")
+    require("sim", "q2r2 demo")
     _check_times(fast, rt, plant)
     if hands not in (None, "careful", "shaky"):
         raise ConfigError(f"--hands {hands!r:.40}: allowed: careful, shaky")
@@ -280,6 +278,8 @@ def demo(
     table = _shows_table(headless, viewer)
     usual_port, unseen = _PORT, ""
     if table and plant == "mujoco" and not (viewer or web or fast):
+        from q2r2_control.plants.mujoco_cameras import window_fault  # The import is here, because run needs no MuJoCo.
+
         viewer = window_fault() is None
         # Port 0 is any free port, because another program may use the usual one.
         web, usual_port = not viewer and find_spec("viser") is not None, 0
@@ -375,6 +375,10 @@ def headset_check(
     Move a hand forwards, to the left, and up. If the printed directions differ, change teleop.axes in the config.
     Exit code 1 if poses or inputs of a hand that leads an arm did not come. Without them, the arm cannot be engaged.
     """
+    # The imports are here, because run and demo do not need the packages of these modules.
+    from q2r2_control.inputs.headset_check import watch_headset
+    from q2r2_control.viewer.headset_table import headset_display, headset_table
+
     console, stop = Console(stderr=True), StopRequest()
     positive("--duration", duration)
     if input not in ("headset", "webxr"):

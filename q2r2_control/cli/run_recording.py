@@ -17,7 +17,7 @@ from q2r2_control.errors import PlantError, RecordingError
 from q2r2_control.judging.episode_judge import EpisodeJudge
 from q2r2_control.judging.judge import Judged, judge, keep_verdicts
 from q2r2_control.pipeline.pipeline import Pipeline
-from q2r2_control.plants.mujoco import MujocoPlant
+from q2r2_control.plants.base import PicturedPlant, is_mujoco
 from q2r2_control.plugins import PLANTS, load_class
 from q2r2_control.process.folders import check_folder
 from q2r2_control.recording.about import About, anonymous
@@ -39,7 +39,7 @@ class RunRecording(AbstractContextManager["RunRecording"]):
             ConfigError: If recordings cannot be written into ``folder``.
         """
         check_folder(folder, "--record")
-        pictures = bool(config.simulated_cameras) and issubclass(load_class(PLANTS, options.plant), MujocoPlant)
+        pictures = bool(config.simulated_cameras) and issubclass(load_class(PLANTS, options.plant), PicturedPlant)
         room = ROOM_WITH_PICTURES if devices else ROOM
         self._options, self._devices = options, tuple(devices)
         self.recorder = Recorder(folder, options.name, waits=options.simulated_time, room=room, pictures=pictures)
@@ -63,7 +63,7 @@ class RunRecording(AbstractContextManager["RunRecording"]):
         """
         recorder, options = self.recorder, self._options
         cameras = tuple(pipeline.config.simulated_cameras)
-        if cameras and isinstance(pipeline.plant, MujocoPlant):
+        if cameras and is_mujoco(pipeline.plant):
             recorder.prepare(pipeline.plant, pipeline.robot, pipeline.config.simulated_cameras)
         elif cameras:
             none = f"no pictures are recorded: the {options.plant} plant has none; allowed: --plant mujoco"

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 from q2r2_control.config.bindings import Action
 from q2r2_control.config.cell import Config
 from q2r2_control.demo.contact_judges import PegJudge, WipeJudge
 from q2r2_control.demo.part_judges import CarryJudge, HandoverJudge, Judge, LiftJudge, StackJudge, Toucher, TouchWatch
 from q2r2_control.errors import ConfigError
-from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot
 from q2r2_control.summary.run_summary import RunSummary
 from q2r2_control.summary.tick import Tick
+
+if TYPE_CHECKING:
+    from q2r2_control.plants.mujoco import MujocoPlant
 
 
 @dataclass(frozen=True, slots=True)

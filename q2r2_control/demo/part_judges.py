@@ -5,13 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
+from typing import TYPE_CHECKING
 
-import mujoco
 import numpy as np
 
-from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.robot.robot import Robot
+
+if TYPE_CHECKING:
+    from q2r2_control.plants.mujoco import MujocoPlant
 
 
 class Toucher:
@@ -55,7 +58,10 @@ class TouchWatch:
 
         All are names of ``mujoco.objects``.
         """
+        import mujoco  # The import is here, because tasks can be listed without MuJoCo.
+
         self._model, self._data = plant.model, plant.data
+        self._contact_force = partial(mujoco.mj_contactForce, self._model, self._data)
         loose = {self._model.body(name).id for name in objects}
         self._parts = {name: int(self._model.body(name).id) for name in parts}
         self._pressed = {self._parts[name] for name in pressed}
@@ -81,7 +87,7 @@ class TouchWatch:
                 self.forbidden.setdefault(pair, t)
             pressed = self._pressed.intersection((body[first], body[second]))
             if pressed and one | other == Toucher.PART | Toucher.SURROUNDINGS:
-                mujoco.mj_contactForce(self._model, self._data, contact, self._wrench)
+                self._contact_force(contact, self._wrench)
                 force[pressed.pop()] += self._wrench.item(0)
         places, rotations = self._data.xpos, self._data.xmat
         return {

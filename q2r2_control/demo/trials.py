@@ -21,7 +21,6 @@ from q2r2_control.inputs.base import Input
 from q2r2_control.inputs.policy import PolicyInput
 from q2r2_control.inputs.scripted import ScriptedInput, hurried, place_of, trajectory_named
 from q2r2_control.pipeline.pipeline import Pipeline
-from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.process.places import JobPlace
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import CommandMode
@@ -94,6 +93,8 @@ def try_policy(config: Config, mode: CommandMode, policy: str, spread: float, jo
 
 def _failure_of(config: Config, source: Input, mode: CommandMode, task: str, duration: float | None) -> str:
     """Return why a task fails if ``source`` moves the arms for ``duration`` [s], or "" if it succeeds."""
+    from q2r2_control.plants.mujoco import MujocoPlant  # The import is here, because reports need no MuJoCo.
+
     robot = Robot.from_config(config)
     plant = MujocoPlant(robot, config)
     pipeline = Pipeline(config, robot, source, plant, mode)

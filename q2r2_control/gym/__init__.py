@@ -8,10 +8,12 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-import gymnasium
-from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
-
 from q2r2_control._lazy import lazy_exports
+from q2r2_control.extras import importing
+
+with importing("gym", "an environment"):
+    import gymnasium
+    from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 
 if TYPE_CHECKING:
     from q2r2_control.gym.task_env import TaskEnv as TaskEnv

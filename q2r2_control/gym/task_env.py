@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
-import mujoco
 import numpy as np
 import numpy.typing as npt
 import pinocchio as pin
@@ -21,6 +20,7 @@ from q2r2_control.demo.assembly_tasks import TaskWatch, tasks_named
 from q2r2_control.errors import ConfigError, PlantError, shown
 from q2r2_control.export.lerobot import video_key
 from q2r2_control.export.sampling import continuous
+from q2r2_control.extras import importing
 from q2r2_control.gym.promises import StepPromises
 from q2r2_control.inputs.policy import ActionSpace, PolicyInput, action_names
 from q2r2_control.pipeline.pipeline import Pipeline
@@ -29,6 +29,9 @@ from q2r2_control.plants.mujoco_cameras import CellPictures
 from q2r2_control.robot.robot import Robot
 from q2r2_control.robot.unchecked import check_watched
 from q2r2_control.types import Array, is_number
+
+with importing("sim", "an environment"):
+    import mujoco
 
 CELL = "config/dual_iiwa7.yaml"
 _FRONT = CameraConfig(position=(1.9, 0.0, 1.0), look_at=(0.4, 0.0, 0.3), width=320, height=240)

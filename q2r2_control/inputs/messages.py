@@ -14,12 +14,15 @@ from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
-from rosbags.serde import SerdeError
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from rosbags.typesys.store import Typestore
 
 from q2r2_control.errors import ProtocolError
+from q2r2_control.extras import importing
 from q2r2_control.types import QUEST_CONTROLS, Array, HandInputs, HapticFeedback
+
+with importing("headset", "the format of hand messages"):
+    from rosbags.serde import SerdeError
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+    from rosbags.typesys.store import Typestore
 
 
 class Dialect(StrEnum):

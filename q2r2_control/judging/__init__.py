@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from q2r2_control._lazy import lazy_exports
+from q2r2_control.extras import require
 
 if TYPE_CHECKING:
     from q2r2_control.config.recording import JudgeSettings as JudgeSettings
@@ -13,6 +14,8 @@ if TYPE_CHECKING:
     from q2r2_control.judging.judge import Unreadable as Unreadable
     from q2r2_control.judging.judge import Verdict as Verdict
     from q2r2_control.judging.judge import judge_all as judge_all
+
+require("data", "work with recordings")
 
 _MODULES = {
     "EpisodeFigures": "figures",

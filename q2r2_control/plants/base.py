@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable, Iterable
-from typing import Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
+from typing_extensions import TypeIs
 
 from q2r2_control.config.cell import Config
 from q2r2_control.config.moving_obstacle import MovingObstacle
@@ -17,6 +19,9 @@ from q2r2_control.events import Reason
 from q2r2_control.plugins import PLANTS, load_class, names_of
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import ArmTiming, Array, Command, CommandMode, RobotState, is_number
+
+if TYPE_CHECKING:
+    from q2r2_control.plants.mujoco import MujocoPlant
 
 # Longest time that one call of ``advance`` lets pass [s]. A loop that is farther behind must not catch up in one call.
 MAX_ADVANCE = 1.0
@@ -176,6 +181,15 @@ def check_plant_settings(config: Config) -> list[str]:
         elif (model := getattr(load_class(PLANTS, name), "settings", None)) is not None:
             validated(model, f"plant_settings.{name}: ", block)
     return unknown
+
+
+def is_mujoco(plant: object) -> TypeIs[MujocoPlant]:
+    """Return whether ``plant`` is a :class:`~q2r2_control.plants.mujoco.MujocoPlant`. MuJoCo may be missing.
+
+    Nothing is imported: before the module of the class is imported, no such plant exists.
+    """
+    module = sys.modules.get(f"{__package__}.mujoco")
+    return module is not None and isinstance(plant, module.MujocoPlant)
 
 
 def check_mode(mode: CommandMode | str, plant: Plant) -> CommandMode:

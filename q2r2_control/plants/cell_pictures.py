@@ -9,7 +9,6 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
-from PIL import Image
 
 from q2r2_control.config.recording import CameraConfig
 from q2r2_control.errors import PlantError
@@ -35,6 +34,8 @@ def open_cameras(model: bytes, cameras: Mapping[str, CameraConfig]) -> CellPictu
 
 
 def jpeg_of(picture: Array | np.ndarray, quality: int) -> bytes:
+    from PIL import Image  # The import is here, because runs without pictures import this module, too.
+
     packed = io.BytesIO()
     Image.fromarray(picture).save(packed, "JPEG", quality=quality)
     return packed.getvalue()

@@ -7,18 +7,21 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
 
-import mujoco
 import numpy as np
 import numpy.typing as npt
 
 from q2r2_control.config.cell import Config
 from q2r2_control.config.moving_obstacle import MovingObstacle
 from q2r2_control.errors import PlantError
+from q2r2_control.extras import importing
 from q2r2_control.plants.base import GripperMotion, check_command, check_duration, check_joints
 from q2r2_control.plants.mujoco_cameras import ThreadPictures, close_window, draw_obstacles, open_window
 from q2r2_control.plants.mujoco_model import build_model, settle_mimics
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array, Command, CommandMode, RobotState
+
+with importing("sim", "the simulation in MuJoCo"):
+    import mujoco
 
 # Largest rounding error of the sum of all ticks' durations, in physics steps. A step that is due within this error is
 # taken.

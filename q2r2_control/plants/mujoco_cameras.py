@@ -7,7 +7,6 @@ import threading
 import warnings
 from collections.abc import Iterable, Mapping
 
-import mujoco
 import numpy as np
 import numpy.typing as npt
 import pinocchio as pin
@@ -15,8 +14,12 @@ import pinocchio as pin
 from q2r2_control.config.moving_obstacle import MovingObstacle
 from q2r2_control.config.recording import CameraConfig
 from q2r2_control.errors import PlantError
+from q2r2_control.extras import importing
 from q2r2_control.process.machine_notes import has_display
 from q2r2_control.types import Array
+
+with importing("sim", "the simulation in MuJoCo"):
+    import mujoco
 
 # Rotation from the axes of a MuJoCo camera, which looks along -z with y up in the picture, to those of our cameras,
 # which look along x with z up.

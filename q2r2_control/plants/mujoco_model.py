@@ -11,11 +11,11 @@ import xml.etree.ElementTree as ET
 from itertools import combinations
 
 import coal
-import mujoco
 import numpy as np
 
 from q2r2_control.config.cell import Config, MujocoConfig
 from q2r2_control.errors import PlantError
+from q2r2_control.extras import importing
 from q2r2_control.plants.mujoco_cameras import add_cameras
 from q2r2_control.plants.scene import (
     COLLISION_GROUP,
@@ -33,6 +33,9 @@ from q2r2_control.plants.scene import (
 from q2r2_control.robot.followers import Follower, followers_of
 from q2r2_control.robot.pairs import ENVELOPE, link_of, pair_names
 from q2r2_control.robot.robot import Robot
+
+with importing("sim", "the simulation in MuJoCo"):
+    import mujoco
 
 # Least viscous friction of a joint, which keeps light wrist joints steady [Nm s/rad].
 _MIN_DAMPING = 0.2

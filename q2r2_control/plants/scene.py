@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-import mujoco
-
 from q2r2_control.config.cell import Config
+from q2r2_control.extras import importing
 from q2r2_control.robot.floor import FLOOR
+
+with importing("sim", "the simulation in MuJoCo"):
+    import mujoco
 
 # Geom groups. MuJoCo's viewers draw 0 to 2, and others only on request.
 VISUAL_GROUP, COLLISION_GROUP, ENVELOPE_GROUP = 2, 3, 4

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from q2r2_control._lazy import lazy_exports
+from q2r2_control.extras import require
 
 if TYPE_CHECKING:
     from q2r2_control.recording.about import About as About
@@ -12,6 +13,8 @@ if TYPE_CHECKING:
     from q2r2_control.recording.reader import recordings_in as recordings_in
     from q2r2_control.recording.recorder import Recorder as Recorder
     from q2r2_control.recording.recorder import RecordingSummary as RecordingSummary
+
+require("data", "work with recordings")
 
 _MODULES = {
     "About": "about",

@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import json
-import platform
-import subprocess
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
-from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from q2r2_control.config.yaml_text import read_yaml, yaml_of
+from q2r2_control.process.program import program
 from q2r2_control.recording.messages import Topic, run_topics
 
 if TYPE_CHECKING:  # These modules are not imported at run time, because the process of the writer does not need them.
@@ -27,7 +23,6 @@ ABOUT, CONCLUSION = "q2r2_control", "q2r2_control_end"  # Names of the file's me
 CELL, ROBOT, FIELDS = "cell.yaml", "robot.urdf", "fields.json"  # Names of the file's attachments.
 # Notes that may contain the name of a person or of a computer. The note on the certificate is the path of a file.
 _PERSONAL = ("operator", "host", "certificate")
-_GIT_TIME = 2.0  # The longest time that git may take [s].
 
 
 @dataclass(frozen=True)
@@ -123,22 +118,6 @@ def as_yaml(config: Config) -> str:
     return yaml_of(config.model_dump(mode="json"))
 
 
-def program() -> dict[str, str]:
-    """Return notes on the program's version, the machine and the libraries, by name.
-
-    If the program runs from a git checkout, they include its revision, which ends with -dirty if files were changed.
-    """
-    notes = {"version": _version("q2r2_control"), "machine": f"{platform.node()}, {platform.platform()}"}
-    notes["libraries"] = ", ".join(f"{name} {_version(name)}" for name in ("numpy", "pin", "numba", "daqp", "mujoco"))
-    checkout = Path(__file__).resolve().parents[2]
-    if (checkout / ".git").exists():
-        command = ["git", "-C", str(checkout), "describe", "--always", "--dirty", "--abbrev=40"]
-        with suppress(OSError, subprocess.SubprocessError):
-            done = subprocess.run(command, capture_output=True, text=True, timeout=_GIT_TIME, check=True)
-            notes["revision"] = done.stdout.strip()
-    return notes
-
-
 def anonymous(notes: Mapping[str, str]) -> dict[str, str]:
     """Return only the notes that name no person and no computer."""
     kept = {name: text for name, text in notes.items() if name not in _PERSONAL}
@@ -177,10 +156,3 @@ def _flat(data: Any, key: str = "") -> Iterator[tuple[str, Any]]:
             yield from _flat(value, f"{key}.{name}" if key else str(name))
     else:
         yield key, data
-
-
-def _version(package: str) -> str:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return "unknown"

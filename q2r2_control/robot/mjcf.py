@@ -11,13 +11,16 @@ import re
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
-import mujoco
 import numpy as np
 import pinocchio as pin
 
 from q2r2_control.errors import RobotError
+from q2r2_control.extras import importing
 from q2r2_control.robot.urdf_parts import numbers
 from q2r2_control.types import Array
+
+with importing("sim", "an MJCF file"):
+    import mujoco
 
 _MESHES = (".stl", ".obj")  # Formats of meshes that other programs than MuJoCo read as well.
 _TOOL_SITE = re.compile(r"attachment|tcp|tool|end_?eff|(^|_)eef?(_|$)|grasp|pinch|flange", re.IGNORECASE)

@@ -13,7 +13,7 @@ from q2r2_control.inputs.base import Input
 from q2r2_control.inputs.webxr.exchange import Display
 from q2r2_control.inputs.webxr.page_messages import HeadsetRequest
 from q2r2_control.pipeline.pipeline import Pipeline
-from q2r2_control.plants.mujoco import MujocoPlant
+from q2r2_control.plants.base import is_mujoco
 from q2r2_control.summary.tick import Tick
 from q2r2_control.types import ActiveLimit
 from q2r2_control.viewer.arm_words import Told, told_after
@@ -53,7 +53,7 @@ class HeadsetView:
         self._told: dict[str, Told] = {}
         self._episodes = EpisodeWords(pipeline.config.recording.subtasks) if recorded else None
         self._hand_of = pipeline.teleop.hand_of
-        self._plant = pipeline.plant if isinstance(pipeline.plant, MujocoPlant) else None
+        self._plant = pipeline.plant if is_mujoco(pipeline.plant) else None
         robot, parts = pipeline.robot, places_of_parts(pipeline.plant, pipeline.config)
         display = RunDisplay(ShownRobot.of(robot, pipeline.config), robot.model, robot.collision_model, parts)
         requests = {

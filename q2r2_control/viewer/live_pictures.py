@@ -18,12 +18,12 @@ import numpy as np
 
 from q2r2_control.config.recording import CameraConfig
 from q2r2_control.plants.cell_pictures import ENVIRONMENT, jpeg_of, open_cameras
-from q2r2_control.plants.mujoco import MujocoPlant
 from q2r2_control.process.helper_process import HelperProcess
 from q2r2_control.summary.tick import Tick
 
 if TYPE_CHECKING:
     from q2r2_control.cameras.camera_process import CameraShot
+    from q2r2_control.plants.mujoco import MujocoPlant
 
 _NICENESS = 19  # The process gets the lowest priority, since the loop and the hands come first.
 _QUALITY = 70  # JPEG quality, from 0 to 100.

@@ -1,12 +1,9 @@
-"""The loose parts of a simulated cell.
-
-Processes that only draw must not import this module, because they have to work without the simulator.
-"""
+"""The loose parts of a simulated cell."""
 
 from __future__ import annotations
 
 from q2r2_control.config.cell import Config
-from q2r2_control.plants.mujoco import MujocoPlant
+from q2r2_control.plants.base import is_mujoco
 
 
 def places_of_parts(plant: object, config: Config) -> dict[str, int]:
@@ -14,6 +11,6 @@ def places_of_parts(plant: object, config: Config) -> dict[str, int]:
 
     The result is empty for other plants.
     """
-    if not isinstance(plant, MujocoPlant):
+    if not is_mujoco(plant):
         return {}
     return {name: int(plant.model.joint(f"{name}_free").qposadr[0]) for name in config.mujoco.objects}

@@ -181,7 +181,7 @@ def test_a_demo_at_a_terminal_shows_the_arms_if_this_is_possible(
         raise Exit(7)
 
     monkeypatch.setattr(f"{MODULE}._shows_table", lambda headless, viewer: True)
-    monkeypatch.setattr(f"{MODULE}.window_fault", lambda: None if display else "no display")
+    monkeypatch.setattr("q2r2_control.plants.mujoco_cameras.window_fault", lambda: None if display else "no display")
     monkeypatch.setattr(f"{MODULE}.find_spec", lambda name: viser or None)
     monkeypatch.setattr(f"{MODULE}.run_cell", run_cell)
     result = q2r2("demo", *options)

@@ -18,10 +18,10 @@ import numpy as np
 import pytest
 import yaml
 
-from q2r2_control import Robot
-from q2r2_control.errors import NOT_RECORDED
+from q2r2_control import Robot, extras
+from q2r2_control.errors import NOT_RECORDED, MissingPackageError
 from q2r2_control.ros.launch import executables
-from q2r2_control.ros.launch.processes import NO_INPUT, NodeProcess, nodes_of
+from q2r2_control.ros.launch.processes import NO_INPUT, NodeProcess, nodes_of, run_together
 from q2r2_control.types import SIDES
 from tests.cli.command import q2r2
 from tests.ros.cell import JointRecorder
@@ -84,6 +84,16 @@ def test_a_process_that_does_not_end_is_killed(pair: RosProcess) -> None:
     assert pair.interrupt(30.0) == 0
     assert f"second (process {second}) did not end and is killed" in pair.output
     assert not alive(second)
+
+
+@pytest.mark.parametrize(("node", "extra"), [("mujoco_robot", "sim"), ("recorder", "data")])
+def test_a_set_without_the_extra_of_a_node_names_it_before_any_node_starts(
+    monkeypatch: pytest.MonkeyPatch, node: str, extra: str
+) -> None:
+    monkeypatch.setattr(extras, "_is_installed", lambda module: False)
+    monkeypatch.setattr("q2r2_control.ros.launch.processes.build_missing", lambda say: pytest.fail("nodes would start"))
+    with pytest.raises(MissingPackageError, match=rf"^{node} needs .*\[{extra}\]'$"):
+        run_together([NodeProcess(node, {})], print)
 
 
 def test_a_set_whose_command_is_killed_ends_by_itself(pair: RosProcess) -> None:

@@ -8,7 +8,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+from q2r2_control.extras import importing
+
+with importing("fri", "the Fast Robot Interface"):
+    from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
 _PACKAGE = "q2r2.fri"
 _Field = descriptor_pb2.FieldDescriptorProto

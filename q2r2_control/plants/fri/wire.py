@@ -17,10 +17,13 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from google.protobuf.message import DecodeError, EncodeError
 
 from q2r2_control.errors import ProtocolError
+from q2r2_control.extras import importing
 from q2r2_control.plants.fri.schema import CommandMessage, MonitoringMessage
+
+with importing("fri", "the Fast Robot Interface"):
+    from google.protobuf.message import DecodeError, EncodeError
 
 JOINTS = 7
 LONGEST = 1500  # Longest datagram [bytes].

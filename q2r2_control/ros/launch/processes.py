@@ -19,12 +19,13 @@ from dataclasses import dataclass, field, replace
 from q2r2_control.config.cell_file import load_config
 from q2r2_control.config.external import ControllerKind, ExternalConfig
 from q2r2_control.errors import NOT_RECORDED, ConfigError, Q2R2Error
-from q2r2_control.extras import install_line
+from q2r2_control.extras import install_line, require
 from q2r2_control.plugins import INPUTS, load_class
 from q2r2_control.process.scheduling import StopRequest, how_it_ended, stop_on_signals
 from q2r2_control.ros.launch.build import build_missing
 from q2r2_control.types import SIDES
 
+_EXTRAS = {"mujoco_robot": "sim", "recorder": "data"}  # By node, the extra that it needs.
 NO_INPUT = "none"  # Another node sends the hands.
 ROBOTS = ("auto", "mujoco", "none")
 # Time for a process to end, after SIGINT and then after SIGTERM; SIGKILL follows [s].
@@ -153,9 +154,13 @@ def run_together(nodes: Sequence[NodeProcess], say: Callable[[str], None]) -> in
 
     Raises:
         UpError: If ROS cannot be used.
+        MissingPackageError: If a package of an extra is missing for a node.
         BuildError: If message packages cannot be built.
     """
     check_rclpy()
+    for node in nodes:
+        if (extra := _EXTRAS.get(node.name)) is not None:
+            require(extra, node.name)
     build_missing(say)
     stop, lock = StopRequest(), threading.Lock()
     running: dict[str, subprocess.Popen[str]] = {}

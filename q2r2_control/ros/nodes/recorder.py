@@ -28,7 +28,8 @@ from q2r2_control.config.cell_file import load_config
 from q2r2_control.errors import NOT_RECORDED, ConfigError
 from q2r2_control.events import Event, Reason, ReasonKind
 from q2r2_control.judging.episode_judge import EpisodeJudge
-from q2r2_control.recording.about import ROS, About, anonymous, as_yaml, program
+from q2r2_control.process.program import program
+from q2r2_control.recording.about import ROS, About, anonymous, as_yaml
 from q2r2_control.recording.device_messages import DeviceMessages
 from q2r2_control.recording.messages import (
     RECORDER_EVENTS,

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
-from importlib.util import find_spec
 from pathlib import Path
 from threading import Event as Flag
 from types import MappingProxyType
@@ -14,7 +13,7 @@ from typing import Any, Self
 from q2r2_control.config.cell import Config
 from q2r2_control.device_words import QUEST_WORDS, DeviceWords
 from q2r2_control.errors import ConfigError, InputError
-from q2r2_control.extras import install_line
+from q2r2_control.extras import require
 from q2r2_control.inputs.addresses import reachable_addresses
 from q2r2_control.inputs.listener import is_loopback, listening_socket
 from q2r2_control.inputs.webxr.certificate import installation_folder, own_certificate
@@ -25,12 +24,6 @@ from q2r2_control.viewer.web.exchange import Frame, PageRequest, PageSetting, Pa
 
 _READY = 120.0  # Longest time until the process is ready, before the run, on a busy computer [s].
 _PATIENCE, _LONGEST = 2.0, 10.0  # Longest time until the process ends if it is idle, and if it is busy [s].
-
-
-def check_viser() -> None:
-    """Raise :class:`ConfigError` if viser is not installed."""
-    if find_spec("viser") is None:
-        raise ConfigError(f"--web needs viser: {install_line('web')}")
 
 
 class Page:
@@ -51,7 +44,7 @@ class Page:
         Raises:
             ConfigError: If viser is not installed, or if the port is not free.
         """
-        check_viser()
+        require("web", "--web")
         listening_socket(host, port, "--web").close()  # If the port is in use, this fails before slow work is done.
         self._host, self._port, self._on_request = host, port, on_answer
         self._ready = Flag()

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from q2r2_control.config.bindings import Action
 from q2r2_control.config.teleop import TeleopSettings
@@ -19,7 +19,7 @@ from q2r2_control.errors import ConfigError
 from q2r2_control.events import Event
 from q2r2_control.inputs.web import WebInput
 from q2r2_control.pipeline.pipeline import Pipeline
-from q2r2_control.plants.mujoco import MujocoPlant
+from q2r2_control.plants.base import is_mujoco
 from q2r2_control.summary.tick import Tick
 from q2r2_control.types import ActiveLimit
 from q2r2_control.viewer.loose_parts import places_of_parts
@@ -32,6 +32,9 @@ from q2r2_control.viewer.web.exchange import (
     PageSetting,
 )
 from q2r2_control.viewer.web.page import Page
+
+if TYPE_CHECKING:
+    from q2r2_control.plants.mujoco import MujocoPlant
 
 _PERIOD = 1.0 / 30.0  # Time between frames [s].
 
@@ -111,7 +114,7 @@ class PageView(Page):
             source = operator
         self._input = source if isinstance(source, WebInput) else None
         self._source, self._nobody = source, pipeline.input.controls.words.nobody
-        self._plant = plant if isinstance(plant, MujocoPlant) else None
+        self._plant = plant if is_mujoco(plant) else None
         self._requests = {
             PageRequest.STOP: pipeline.stop,
             PageRequest.ENGAGE: pipeline.engage,
