@@ -45,8 +45,8 @@ class Constraint(Protocol):
         """Return the rows A v+ >= lower that the next joint velocities v+ have to satisfy.
 
         An equality is two rows, one of them the negative of the other. To keep a distance d(q) above 0, return
-        J_d v+ >= -gain d with the gradient J_d and a gain of about 5 /s. The method is called at every substep and by
-        :meth:`CartesianController.problem`, so that its answer may depend on q and v only.
+        J_d v+ >= -gain d with the gradient J_d and a gain of about 5 /s. The method is called at every substep, and
+        also by :meth:`CartesianController.problem`. Its answer must therefore depend on nothing but q and v.
 
         Args:
             q: Joint positions of the reference (nv,) [rad].

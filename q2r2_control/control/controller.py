@@ -43,9 +43,9 @@ class CartesianController(WatchedPairs):
 
     The contract holds for every sequence of targets and every dt in (0, 0.1] s. All numbers are finite, and no
     exception is raised. Joints keep their limits of position, velocity and acceleration. Every monitored pair keeps its
-    distance, also between ticks and during a stop. Its distance is ``min_distance``, or the one in ``distances`` or
-    ``pairs``. If the targets stay constant, the arms come to rest. The reference is the controller's own state. It
-    follows the targets and not the measured joints, so that noise never enters it.
+    distance, also between ticks and during a stop. This distance is ``min_distance``, unless ``distances`` or ``pairs``
+    has another distance for the pair. If the targets stay constant, the arms come to rest. The reference is the
+    controller's own state. It follows the targets and not the measured joints, so that noise never enters it.
 
     One tick is three calls. :func:`assemble` takes the targets, writes the QP and finds the minimum of its cost. If
     this minimum breaks a constraint, a solver solves the QP. :func:`move_reference` moves the reference by the part of
@@ -344,7 +344,7 @@ class CartesianController(WatchedPairs):
         self._observe_again(self._unchanged)
 
     def hold_at(self, q: Array | None) -> None:
-        """Let arms without a target go to the posture ``q`` and hold there. The contract holds as always.
+        """Let arms without a target go to the posture ``q`` and stay there. They keep all limits and distances.
 
         The speed of a joint is 4 /s times its remaining distance. For slower motion, change ``q`` slowly from call to
         call.

@@ -56,7 +56,10 @@ class _TargetPath:
 
 
 class HeldTargets:
-    """The targets of all arms. While a caller holds an arm's target, poses from the earlier one to it are returned."""
+    """The targets of all arms.
+
+    While a caller gives the same target for an arm, poses between the target before and this target are returned.
+    """
 
     def __init__(self) -> None:
         self._paths: dict[str, _TargetPath] = {}
@@ -68,8 +71,8 @@ class HeldTargets:
     def between(self, targets: Mapping[str, pin.SE3 | None], dt: float) -> dict[str, pin.SE3 | None]:
         """Return the targets to follow in a step of ``dt`` [s].
 
-        While the caller gives the same pose for an arm, the arm's targets are interpolated from the pose before to this
-        pose.
+        While the caller gives the same pose for an arm, the arm's targets are interpolated. They lead from the pose
+        that the caller gave before to this pose.
         """
         found: dict[str, pin.SE3 | None] = {}
         for arm, pose in targets.items():

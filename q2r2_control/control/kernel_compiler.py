@@ -92,7 +92,8 @@ class _PartCompiler(_WholeCompiler):
 class Kernel(CPUDispatcher):
     """A function that is compiled for each combination of argument types with which it is called."""
 
-    _being_compiled = 0  # Number of whole kernels that are being compiled. Meanwhile, other kernels become parts.
+    # Number of whole kernels that are being compiled. While it is above 0, other kernels become parts.
+    _being_compiled = 0
 
     def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
         super().__init__(function, targetoptions=options, pipeline_class=_WholeCompiler)

@@ -3,7 +3,8 @@
 **Distances.** The known stop is the stop that was certified last (safety_filter.py). If the required distance of a pair
 became greater at once, the known stop could lose its certificate. The distance that a pair keeps therefore grows only
 as far as the known stop is certified with it. This bound is d - S - buffer,  where d is the distance of the pair at the
-reference, and S bounds by how much the stop brings the pair closer (stop_certificate.py). The kept distance of a pair
+reference, and S is an upper bound on how much the known stop reduces this distance (stop_certificate.py). The kept
+distance of a pair
 
 - falls at once if the requested distance is smaller, since the known stop stays certified;
 - grows at ``GROWTH`` towards the requested distance, up to the bound, before a step is decided on. The step is then
@@ -96,7 +97,7 @@ class ObjectPairs:
         return True
 
     def begin(self) -> None:
-        """Let the pairs that have begun to count keep as much distance as is certified. Measure these pairs before."""
+        """Let the pairs that have begun to count keep as much distance as is certified. Measure them before."""
         kept = np.where(self._new, np.minimum(self._goal, self._within_reach()), self.kept)
         overlap = self._data.distance[self._range] < np.minimum(self._goal, 0.0)
         if (overlap & self._shared & self._new).any():  # Both hands hold one object.
@@ -162,7 +163,7 @@ class LiveSettings:
         return int(np.argmax(self._goal - self.kept)) if self._growing else -1
 
     def change(self, settings: ControllerSettings) -> str | None:
-        """Change to ``settings``, which may differ only in what ``LIVE`` names; return None, or why it was refused."""
+        """Change to ``settings``, which may change only what ``LIVE`` names; return None, or why they are refused."""
         before, goal = self.settings.min_distance, kept_distances(self._robot, settings)
         if settings.min_distance > before:
             if settings.min_distance > CLEARANCE:
@@ -193,7 +194,7 @@ class LiveSettings:
         self._approach_gains(self._ramp)
 
     def begin(self) -> None:
-        """After the reset, let pairs keep as much as the posture allows.
+        """After the reset, let pairs keep as much distance as the posture allows.
 
         Pairs that are within their buffer get a smaller buffer.
         """

@@ -120,7 +120,7 @@ class MovingObstacles:
         self.data.age[:] += time
 
     def _count(self) -> None:
-        """Let a pair count if its obstacle is present, and if its object, should it have one, is held."""
+        """Let a pair count if its obstacle is present, and, for a pair of an object, if the object is held."""
         if not self._number:
             return
         there = np.repeat([name in self.there for name in self._number], len(self._goal) // len(self._number))

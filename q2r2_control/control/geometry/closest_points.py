@@ -98,7 +98,7 @@ def products(a0: Array, a1: Array, b0: Array, b1: Array) -> tuple[float, float, 
 
 @kernel
 def _middle_of_overlap(aa: float, ab: float, ar: float) -> float:
-    """Return the parameter on segment a of the middle of the part that the parallel segment b covers."""
+    """Return the parameter of a point on segment a: the middle of the part of a that the parallel segment b covers."""
     start, end = -ar / aa, (ab - ar) / aa  # Parameters on a of both ends of b.
     return 0.5 * (clamp(start, 0.0, 1.0) + clamp(end, 0.0, 1.0))
 

@@ -92,7 +92,7 @@ def keep_clear(
                 _measure(model, data, obstacles, p)  # A lower bound of the distance does not suffice here.
                 stop_time = _stop_time(data, obstacles, o, p)
                 wanted = min(wanted, stop_time)
-                if age > _LOST:  # The time until the obstacle may have used up the whole free distance.
+                if age > _LOST:  # Until this time, the obstacle cannot have used up the free distance.
                     least_stop = min(least_stop, max((stop_time + age) / _SHARE - age, 0.0))
     known = obstacles.stop_time[0]
     time = min(max(wanted, least_stop, known - h), known + h, longest)

@@ -43,7 +43,7 @@ class ReferenceHistory(NamedTuple):
 
     @classmethod
     def empty(cls, model: CollisionModel, shared: CollisionData) -> ReferenceHistory:
-        """Return a history of arms at rest at zero. The samples use the rotations and the contact of ``shared``."""
+        """Return a history of arms that rest at q = 0. The samples use the rotations and the contact of ``shared``."""
         nv = len(model.chain.parent) - 1
         samples = []
         for _ in range(_POSTURES):

@@ -185,7 +185,7 @@ class SafetyData(NamedTuple):
 
 
 def provable_distances(model: SafetyModel, data: SafetyData) -> Array:
-    """Return d - S of every pair (p,) [m]: the known stop brings no pair closer than that (stop_certificate.py).
+    """Return d - S of every pair (p,) [m]: the known stop brings no pair closer than this (stop_certificate.py).
 
     This also holds for the postures at which delayed arms may still be, see arm_skew.py. ``data`` has to contain the
     distances at the present reference. From now on, a pair may be required to keep the returned distance: the known

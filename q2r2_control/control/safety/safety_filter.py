@@ -26,7 +26,7 @@ FOLLOWED, REDUCED, STOPPED = 0, 1, 2
 SEPARATION = ACCELERATION + 1  # The kind of limit that holds a pair of bodies back.
 TOOL_SPEED = SEPARATION + 1  # The kind of limit that holds a tool back.
 _BISECTIONS = 4
-_ACTIVE = 1e-7  # A velocity that is this near to a bound has met it [rad/s].
+_ACTIVE = 1e-7  # A velocity that is this near to a bound counts as at the bound [rad/s].
 
 
 @kernel
@@ -41,8 +41,8 @@ def apply_safety_filter(
         solution: The solver's next velocities (nv,) [rad/s].
         usable: Whether there is a solution. If not, the known stop is executed.
         h: Duration of the step [s].
-        share: Duration of the step divided by that of the tick: the weight of the step's acceleration in the tick's
-            mean acceleration.
+        share: Duration of the step divided by the duration of the tick. It is the weight of the step's acceleration in
+            the tick's mean acceleration.
 
     Returns:
         FOLLOWED, REDUCED towards the stop, or STOPPED; and the largest violation of a row [rad/s].
@@ -95,8 +95,8 @@ def certify_bodies(model: SafetyModel, data: SafetyData, grown: IntArray) -> int
 
     The bodies have grown since the reference was certified. They are allowed if each of their pairs keeps its distance
     at the reference, and the known stop keeps all pairs apart. The invariant then holds as if the bodies had always had
-    this size. No other stop is tried, because the arms may already be braking along the known stop. A pair that is too
-    close must not be made closer.
+    this size. No other stop is tried, because the arms may already be braking along the known stop. If a pair is too
+    close already, its bodies must not grow.
 
     Args:
         model: The model, with the grown bodies.
@@ -232,7 +232,7 @@ def _note_active(data: SafetyData) -> float:
 
 @kernel
 def _note_too_close(model: SafetyModel, data: SafetyData) -> None:
-    """List the pairs that hold the arms because they are too close and nothing could be certified."""
+    """List the pairs that are too close. Because of them, no solution could be certified."""
     active = data.active
     for p in range(data.distance.shape[0]):
         count = active.used[0]

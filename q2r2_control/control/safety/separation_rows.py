@@ -21,8 +21,8 @@ lever for each joint, the direction of the row would change from tick to tick wi
 
 If a pair is closer than its buffer, the row asks it to open, as fast as a part of the acceleration limits allows. Pairs
 that may touch have a ``min_distance`` below zero. Around contact they have a zone in which they use up B no faster than
-at their contact speed. The rows are for comfort only. They are soft, so that the QP always has a solution, and the
-certificate alone keeps the arms safe.
+at their contact speed. Safety does not depend on the rows, because the certificate alone keeps the arms safe. The rows
+are soft, so that the QP always has a solution.
 
 **The gain may change between any two ticks.** The certificate reads no row and no gain. It reads distances, and a lower
 bound of a distance proves less, never more. The executed part of a solution is therefore certified for every gain.

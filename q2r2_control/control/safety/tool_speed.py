@@ -50,7 +50,7 @@ _SAME_TIME = 1e-9  # If the times until two joints rest differ by less than this
 class ToolLimits(NamedTuple):
     """The origins of all tools, and their largest speed."""
 
-    joint: IntArray  # (n,) Number of the joint that carries the tool.
+    joint: IntArray  # (n,) Number of the last joint that moves the tool.
     translation: Array  # (n, 3) Origin of the tool in the joint's frame [m].
     reach: Array  # (n, nv) Bound on the distance of the tool from each joint's axis [m]; 1 for a sliding joint.
     speed: float  # Speed that no tool exceeds; infinite without a limit [m/s].

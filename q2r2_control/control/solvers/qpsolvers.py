@@ -58,7 +58,8 @@ def slack_problem(problem: QpProblem, sparse: bool = False, scaled: bool = False
 
 # Without these options, the solver cannot be used in a loop.
 _DEFAULTS: dict[str, dict[str, Any]] = {
-    "highs": {"output_flag": False, "qp_iteration_limit": 1000},  # Its active set may cycle for ever.
+    # Without a limit, the active set of HiGHS may cycle for ever.
+    "highs": {"output_flag": False, "qp_iteration_limit": 1000},
     "scs": {"max_iters": 10000},  # With the default, which is ten times as many, a solve takes a second.
 }
 

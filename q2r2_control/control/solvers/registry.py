@@ -70,7 +70,7 @@ def _made(name: str, nv: int, time_limit: float | None, options: dict[str, Any])
 
 @contextmanager
 def printing_to_stderr() -> Iterator[None]:
-    """Send output to stderr, also that of compiled libraries, because a command may print JSON on stdout."""
+    """Send all output, also the output of compiled libraries, to stderr, because a command may print JSON on stdout."""
     try:
         sys.stdout.flush()
         stdout = os.dup(1)

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 class Tools(NamedTuple):
     """The tool frame of each arm."""
 
-    joint: IntArray  # (n,) Number of the joint that carries the tool.
+    joint: IntArray  # (n,) Number of the last joint that moves the tool.
     rotation: Array  # (n, 3, 3) Rotation in the joint's frame.
     translation: Array  # (n, 3) Position in the joint's frame [m].
     member: Array  # (n, nv) 1 if a joint moves the tool.
@@ -61,7 +61,10 @@ _SHARE_OF_LIMIT = 0.9
 
 
 class Motion(NamedTuple):
-    """How a tool approaches its target. Arrays (2,): a linear and an angular value. All may change between ticks."""
+    """How a tool approaches its target.
+
+    Arrays (2,) have a linear and an angular value. All may change between ticks.
+    """
 
     gain: Array  # (2,) [1/s]
     deceleration: Array  # (2,) [m/s^2, rad/s^2]

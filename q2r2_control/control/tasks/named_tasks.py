@@ -199,8 +199,8 @@ class RelativePose:
     """Lets the right tool keep its pose in the left tool's frame.
 
     The cost is  w |J_r v - J_c v - k e|^2  with the pose error e of the right tool (6,) and the Jacobian J_r of that
-    tool. J_c is the Jacobian of a body that the left tool would carry at the wanted pose. A radian counts 0.09 times as
-    much as a metre. A YAML names the task ``relative``.
+    tool. J_c is the Jacobian of a body that is fixed to the left tool, at the wanted pose of the right tool. A radian
+    counts 0.09 times as much as a metre. A YAML names the task ``relative``.
 
     Args:
         robot: A robot with the arms ``left`` and ``right``.
