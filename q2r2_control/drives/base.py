@@ -76,7 +76,7 @@ class Drive(ABC):
         """Set the interval of openings that the controller has accepted, for each arm's gripper."""
 
     def set_holding(self, holding: Mapping[str, bool]) -> None:  # noqa: B027
-        """Set for each arm that has an object whether its gripper holds it."""
+        """Set for each arm whether its gripper holds its object."""
 
     def set_kept_distances(self, kept: Array) -> None:  # noqa: B027
         """Set the distance that every pair keeps from now on (p,) [m]."""
@@ -209,7 +209,7 @@ class VelocityDrive(PositionDrive):
 
 
 class TorqueDrive(Drive):
-    """Commands torques that follow the reference. Targets are not displaced, because the spring is the compliance.
+    """Commands torques that follow the reference. Targets are not displaced, because the spring lets the arms yield.
 
     **Without a trusted state**, the torque of a spring could push the arms anywhere. If the plant has position servos
     of its own (``has_servos``), the command then contains positions, and the servos follow the reference. Otherwise the

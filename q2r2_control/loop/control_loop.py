@@ -94,7 +94,7 @@ class ControlLoop:
         self._kept: Array = controller.kept_distances  # The kept distances that the drive knows [m].
         self._still: Mapping[str, MovingObstacle] = {}  # The obstacles at rest that the drive knows.
         self.holding: dict[str, bool] = {}  # For each arm that has an object, whether its gripper holds it.
-        self.granted_openings: dict[str, tuple[float, float]] = {}  # By arm, the wanted and the granted opening.
+        self.granted_openings: dict[str, tuple[float, float]] = {}  # For each arm, the wanted and the granted opening.
         self._lags = MeasuredLags(robot)
         self._usual_lag = 0.0  # The longest recent lag [s].
         # For each arm whose driver does not report its lag, the time at which the arm was measured [s].
@@ -155,7 +155,7 @@ class ControlLoop:
         self._begin(state, {}, now)
 
     def wait(self, state: RobotState) -> None:
-        """Begin inactive at ``state``, until the states are good and at rest; see :class:`Supervisor`."""
+        """Stay inactive until the states are good and the arms rest, see :class:`Supervisor`. Begin at ``state``."""
         self.controller.reset(state.q)
         self.drive.reset(state)
 

@@ -178,7 +178,7 @@ class LinkTree:
 
     def __init__(self, robot: ET.Element, where: str) -> None:
         links = [link.get("name", "") for link in robot.findall("link")]
-        self.joint_to: dict[str, ET.Element] = {}  # By child link, the joint that carries it.
+        self.joint_to: dict[str, ET.Element] = {}  # For each child link, the joint that connects it to its parent.
         for joint in robot.findall("joint"):
             child = joint_end(joint, "child")
             if child in self.joint_to:

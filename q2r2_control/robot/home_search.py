@@ -110,7 +110,8 @@ class _HomeSearch:
         below = [FLOOR in map(link_of, pair) and bool(last & {*pair}) for pair in pair_names(robot.collision_model)]
         self._rooms = (counts, _ROOM), (np.array(below, bool), _BELOW)
         self._reach = 1.0  # [m]
-        # In most arms, the first joint turns the arm and the second one lifts it, so the shoulder is taken to be there.
+        # The second joint is taken as the shoulder, because in most arms the first joint turns the arm and the second
+        # one lifts it.
         self._shoulder = int(self._joints[min(1, len(self._joints) - 1)]) + 1
 
     def best(self, random: np.random.Generator) -> Array:
@@ -132,7 +133,7 @@ class _HomeSearch:
         return self._q
 
     def _lever(self, x: Array) -> Array:
-        """Return the tool's position relative to the shoulder (3,) [m], and leave the model's data at ``x``."""
+        """Compute the model's data at ``x``, and return the tool's position relative to the shoulder (3,) [m]."""
         model, data = self._robot.model, self._data
         pin.computeJointJacobians(model, data, self._at(x))
         pin.updateFramePlacements(model, data)
@@ -165,5 +166,5 @@ class _HomeSearch:
 
 
 def _beyond(excess: float, most: float) -> float:
-    """Return the cost of an ``excess``: 0 if it is not positive, and a value that jumps at ``most``."""
+    """Return the cost of an ``excess``: 0 if it is not positive. If the excess is above ``most``, the cost jumps."""
     return max(excess, 0.0) / most + (_FAULTY * (1.0 + excess) if excess > most else 0.0)

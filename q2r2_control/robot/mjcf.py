@@ -218,7 +218,8 @@ class _Writer:
         geometry = ET.SubElement(shape, "geometry")
         if form == _Geom.mjGEOM_MESH:
             mesh = int(model.geom_dataid[g])
-            # MuJoCo moves a mesh that it reads to its centre of mass and principal axes. This motion is undone here.
+            # MuJoCo moves each mesh so that its frame is at the centre of mass, along the principal axes. This is
+            # undone here.
             at = at * _pose(model.mesh_pos[mesh], model.mesh_quat[mesh]).inverse()
             scale = numbers(model.mesh_scale[mesh])
             ET.SubElement(geometry, "mesh", filename=self._mesh_file(mesh), scale=scale)

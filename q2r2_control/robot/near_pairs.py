@@ -133,7 +133,7 @@ def warning_at_home(
 ) -> str | None:
     """Return a line about pairs that are nearer at home than usual settings allow; None if there are none.
 
-    Pairs that overlap at home and can part elsewhere are named as well, because they are not watched.
+    Pairs that overlap at home, but not at every posture, are named as well, because they are not watched.
 
     Args:
         robot: The robot.

@@ -55,7 +55,7 @@ class Arm:
     name: str
     tool_frame: str  # Name of the link.
     frame_id: int  # Number of the tool frame in ``Robot.model``.
-    joints: np.ndarray  # Velocity indices from base to tool. A joint that carries several arms belongs to each of them.
+    joints: np.ndarray  # Velocity indices from base to tool. A joint that moves several arms belongs to each of them.
     finger_joints: tuple[str, ...] = ()  # The joints that its gripper drives.
     stroke: float = 0.0  # Travel of each finger joint from closed to open [m or rad]; 0 if it is not known.
     finger_way: float = 0.0  # Distance by which the stroke moves a finger [m]; 0 if it is not known.
@@ -78,11 +78,11 @@ class Robot:
     prismatic joints they are in [m], [m/s] and [N]. ``acceleration_limit`` is infinite for joints without such a limit
     in the model. :meth:`capped_acceleration` returns the limits that a controller uses.
 
-    ``collision_model`` holds exactly the monitored pairs. Each arm has pairs with the other arm and its base, with its
-    own links that it can meet, and with obstacles. Every monitored shape is a capsule, a sphere, or a box fixed in the
-    world. The body of a finger is the volume that it sweeps. ``finger_bodies`` compute the smaller bodies that replace
-    such bodies while a gripper's opening is known. ``objects`` are the objects that grippers hold, in addition to the
-    collision model. ``ignored_pairs`` are pairs of one arm's shapes that overlap by construction.
+    ``collision_model`` contains exactly the monitored pairs. Each arm has pairs with the other arm and that arm's base,
+    with its own links that it can meet, and with obstacles. Every monitored shape is a capsule, a sphere, or a box
+    fixed in the world. The body of a finger is the volume that it sweeps. ``finger_bodies`` compute the smaller bodies
+    that replace such bodies while a gripper's opening is known. ``objects`` are the objects that grippers hold, in
+    addition to the collision model. ``ignored_pairs`` are pairs of one arm's shapes that overlap by construction.
 
     Attributes:
         name: Name of the URDF.
@@ -104,7 +104,7 @@ class Robot:
     """
 
     def __new__(cls, urdf: ET.Element | None = None, *_: object, **__: object) -> Self:
-        """Refuse a first argument that is no parsed URDF, before Python counts the arguments.
+        """Refuse a first argument that is no parsed URDF, before Python complains about missing arguments.
 
         The error then names the right constructors. When Python copies a robot, it calls this method without arguments.
         """
@@ -240,7 +240,7 @@ class Robot:
         return robot
 
     def capped_acceleration(self, cap: float) -> Array:
-        """Return acceleration limits (nv,) [rad/s^2]: the smaller one of ``cap`` and the robot's, for every joint.
+        """Return acceleration limits (nv,) [rad/s^2]: for every joint, its own limit or ``cap``, whichever is smaller.
 
         Raises:
             RobotError: If ``cap`` is not a number above 0.
@@ -294,7 +294,7 @@ class Robot:
         ]
 
     def distance_values(self, q: npt.ArrayLike) -> Array:
-        """Return the numbers of :meth:`distances` alone (pairs,) [m]."""
+        """Return the same distances as :meth:`distances`, as an array (pairs,) [m]."""
         return self._distances.at(self.checked("q", q))
 
     def closest_points(self, q: npt.ArrayLike, pair: tuple[str, str]) -> Array | None:
@@ -338,7 +338,10 @@ class Robot:
             self.roles[held.link] = Role(LinkClass.OBJECT, frozenset({arm}))
 
     def _check_operators_frames(self, config: Config) -> None:
-        """Check that in mode filtered the operator's frame is at the cell's tool. Targets have to begin there."""
+        """If the external mode is ``filtered``, check that the operator's frame is at the cell's tool.
+
+        Targets have to begin there.
+        """
         if config.external is None or not config.external.filtered:
             return
         for arm in self.arms:
@@ -358,7 +361,7 @@ class Robot:
 
 
 def _home_of(urdf: ET.Element, given: Mapping[str, float], where: str) -> dict[str, float]:
-    """Return the home position of every joint, from ``given`` where it has one.
+    """Return the home position of every joint. ``given`` has the positions of some joints.
 
     Raises:
         RobotError: With a text that begins with ``where``, if a value of ``given`` is not allowed.

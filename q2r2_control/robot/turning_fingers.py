@@ -4,10 +4,10 @@ Each shape of the finger gets one capsule.
 
 **Claim.** The capsule of an interval encloses the shape at every opening in that interval, not only at samples.
 
-*Proof.* A shape is the hull of two balls. It is therefore enough to enclose the centres of the balls with the radius of
-the balls. Let a driven joint go from one position to another in m equal steps, together with the joints that mimic it.
-Then a centre x is a function of this one parameter. Let these joints move by w_i in a step. Linear interpolation
-between both ends of the step has an error of at most an eighth of the greatest second derivative,
+*Proof.* A shape is the hull of two balls. It is therefore enough to enclose the centres of the balls, and to add the
+radius of the balls. Let a driven joint go from one position to another in m equal steps, together with the joints that
+mimic it. Then a centre x is a function of this one parameter. Let these joints move by w_i in a step. Linear
+interpolation between both ends of the step has an error of at most an eighth of the greatest second derivative,
 
     1/8 sum_ik w_i w_k r_(the outer one of i and k),
 
@@ -51,7 +51,7 @@ _PULLED_IN = np.array([0.0, 0.58, 1.2])
 
 @dataclass(frozen=True, slots=True)
 class FingerJoint:
-    """A joint that moves a shape, in the frame of the arm's link that carries the hand.
+    """A joint that moves a shape, in the frame of the arm's link to which the hand is fixed.
 
     The shape was drawn at the position ``home``. The positions of all joints with one driver are linear functions of
     the driver's position, also beyond the stroke. All positions are in [m or rad].
@@ -78,7 +78,7 @@ class FingerJoint:
 
 
 class Capsules(NamedTuple):
-    """One capsule for each of b bodies, in the frame of the link that carries the hand."""
+    """One capsule for each of b bodies, in the frame of the link to which the hand is fixed."""
 
     start: Array  # (b, 3) [m]
     end: Array  # (b, 3) [m]
@@ -114,7 +114,7 @@ class TurningBody:
 
     @cached_property
     def extent(self) -> float:
-        """The greatest distance of the segment of any interval's capsule from the origin of the carrying link [m]."""
+        """The greatest distance [m] of any interval's capsule, without its radius, from the frame's origin."""
         return float(TurningSweeps((self,)).extent[0])
 
     @cached_property

@@ -47,7 +47,7 @@ class TurnCounter:
     def of_state(self, state: RobotState) -> RobotState:
         """Return the state with positions as :meth:`counted` returns them.
 
-        The held posture gets as many turns as bring it within half a turn of these positions.
+        Whole turns are added to the posture ``held``, so that it is within half a turn of these positions.
         """
         q, held = self.counted(state.q, state.stamp), state.held
         if held is not None and len(joints := self._joints):

@@ -48,7 +48,8 @@ class SupervisionReason(ReasonKind):
     RUN_ENDED = "run_ended", "the run has ended"
     ACTIVATED = "activated", "active: the reference starts at the measured posture"
     HOMING_OUTCOME = "homing_outcome", "homing ended: {cause}"
-    CONTROLLER_PHASE = "controller_phase", "the controller is {phase}"  # It follows no targets in this phase.
+    # The controller follows no targets in this phase.
+    CONTROLLER_PHASE = "controller_phase", "the controller is {phase}"
     CONTROLLER_PAUSED = "controller_paused", "the controller is paused"
     ARMS_HOMING = "arms_homing", "the arms are on their way home"
     ARMS_BRAKING = "arms_braking", "the arms are braking"

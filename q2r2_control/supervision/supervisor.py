@@ -41,7 +41,7 @@ Displace = Callable[[dict[str, pin.SE3 | None], RobotState, float], dict[str, pi
 
 
 class Phase(StrEnum):
-    INACTIVE = "inactive"  # The supervisor waits for joint states that are good and at rest.
+    INACTIVE = "inactive"  # The supervisor waits until the joint states are good and the arms rest.
     ACTIVE = "active"
     BRAKING = "braking"
     STOPPED = "stopped"  # Only a reset ends this phase.
@@ -159,7 +159,7 @@ class Supervisor:
             pose: The tool's target in the world frame; None if the message was not a pose.
             now: The time of receipt [s].
             number: The sequence number that the publisher gave the message; None if it is unknown.
-            due: The time at which the tool should reach the target [s]; None for at once.
+            due: The time at which the tool should reach the target [s]; None if the tool should reach it at once.
         """
         tools: list[pin.SE3] = []
         if not self.targets.follows_on(arm, now):

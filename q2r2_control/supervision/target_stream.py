@@ -42,7 +42,7 @@ class Origins:
 
     Attributes:
         joint_states: Returns the sender of joint states as " from /node", or "" if it is not known.
-        targets: Returns the sender of an arm's targets, likewise.
+        targets: Returns the sender of an arm's targets in the same form.
         takers: Returns the receiver of an arm's commands as " /node", or "".
     """
 
@@ -131,7 +131,10 @@ _EVEN, _EVEN_TURN = 1.5e-3, 0.01
 
 
 class TargetExtrapolator:
-    """Extrapolates the targets of one stream while they move evenly. All times tell when targets are due [s]."""
+    """Extrapolates the targets of one stream while they move evenly.
+
+    All times are times at which targets are due [s].
+    """
 
     def __init__(self) -> None:
         self.reset()

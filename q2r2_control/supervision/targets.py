@@ -100,7 +100,10 @@ class TargetStreams:
         self._newly_ended: list[Reason] = []
 
     def at(self, now: float) -> dict[str, pin.SE3 | None]:
-        """Return the target that each arm follows at ``now`` [s], see :class:`TargetExtrapolator`; None if it holds."""
+        """Return the target that each arm follows at ``now`` [s]; None if the arm holds.
+
+        Between two messages, targets are extrapolated, see :class:`TargetExtrapolator`.
+        """
         return {arm: self._lines[arm].at(now) if self.follows(arm) else None for arm in self._streams}
 
     def follows(self, arm: str) -> bool:

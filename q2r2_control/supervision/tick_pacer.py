@@ -21,15 +21,15 @@ import pinocchio as pin
 from q2r2_control.config.teleop import GuardSettings
 from q2r2_control.types import LONGEST_DT, Array
 
-_FORGETTING = 0.98  # By each tick, earlier lateness counts less by this factor.
+_FORGETTING = 0.98  # At each tick, the sum of earlier delays is multiplied by this factor.
 _ROUNDING = 1e-9  # The time before a punctual tick may exceed the period by this share of the period.
 
 
 class MissedTicks:
     """Counts the ticks that were due and never came. A tick that only came late is not missed.
 
-    A tick that is late by more than half a period counts as missed at first. If the next one comes so much sooner that
-    the ticks are on their grid again, the count goes back.
+    A tick that is late by more than half a period counts as missed at first. If the next tick comes so early that the
+    ticks are on their grid again, the tick is no longer counted as missed.
     """
 
     def __init__(self) -> None:
@@ -41,7 +41,8 @@ class MissedTicks:
         self._behind += gap - 1.0
         missed = max(round(self._behind), -self.count)
         self.count += missed
-        # Otherwise, two clocks that run differently would let ticks seem missed after some time.
+        # Earlier delays are forgotten slowly. Without this, ticks would seem missed after some time if two clocks run
+        # at different rates.
         self._behind = _FORGETTING * max(self._behind - missed, -0.5)
 
 
