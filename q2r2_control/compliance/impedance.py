@@ -19,8 +19,8 @@ distances that the reference keeps.
 jumps.
 
 **Time.** A reference is due at the end of its tick, and the state is measured at the start of the tick. The spring
-therefore acts about the reference of the previous tick, which is due now. The acceleration a_r is the one that leads
-from this reference to the newest reference.
+therefore pulls the tool towards the reference of the previous tick, which is due now. a_r is the acceleration that
+leads from this reference to the newest reference.
 """
 
 from __future__ import annotations
@@ -88,21 +88,21 @@ class ImpedanceController:
         self.settings = settings = settings or ImpedanceSettings()
         self._limit = settings.torque_scale * robot.torque_limit
         self._payloads = {arm: held for arm, held in robot.objects.by_arm.items() if held.config.mass > 0.0}
-        self._borne = dict.fromkeys(self._payloads, 0.0)  # Share of each payload's mass that is borne now.
+        self._borne = dict.fromkeys(self._payloads, 0.0)  # Share of each payload's mass that its arm bears now.
         self._wanted_borne = dict(self._borne)
         spring = settings.limit_stiffness, settings.limit_damping, settings.limit_distance
         limits = PositionLimits(robot.position_lower, robot.position_upper, *spring)
         largest_error = np.array([settings.max_position_error, settings.max_rotation_error])
         model = ImpedanceModel(chain_of(robot.model), tools_of(robot), limits, self._limit, largest_error)
         values = [float(getattr(settings, name)) for name in LIVE_IMPEDANCE]
-        self._springs = np.tile(values, (len(self._arms), 1))  # The present values.
+        self._springs = np.tile(values, (len(self._arms), 1))  # The present values of ``LIVE_IMPEDANCE``.
         self._kernel_data = ImpedanceData.empty(model, self._springs)
         self._inputs = self._kernel_data.inputs.reshape(-1)  # A view of ``inputs``, which has the same memory.
         self._pointers = pointer_to(model), pointer_to(self._kernel_data)
         self._impedance_torque = bound(impedance_torque, *self._pointers, 0.0)
-        self._model = robot.model.copy()  # Payloads are added to this copy.
+        self._model = robot.model.copy()  # The masses of payloads are added to this copy.
         self._pinocchio_data = self._model.createData()
-        self._wanted_springs = self._springs.copy()  # The values at the end of a ramp.
+        self._wanted_springs = self._springs.copy()  # The values at the end of the present change.
         self._ramp_rate = np.zeros_like(self._springs)
         self._ramping = False
         self._begin(robot.home)

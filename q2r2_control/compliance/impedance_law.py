@@ -47,7 +47,7 @@ def plausible(numbers: Array) -> bool:
 def clip_errors(errors: Array, position: float, rotation: float) -> BoolArray:
     """Shorten ``errors`` (k, 6) to at most ``position`` [m] and ``rotation`` [rad].
 
-    Returns True for each error that was longer (k,).
+    The result (k,) is True for each error that was longer.
     """
     clipped = np.zeros(len(errors), dtype=np.bool_)
     for i in range(len(errors)):
@@ -118,7 +118,7 @@ class ImpedanceData(NamedTuple):
     due: Array  # (2, nv) q and v of the reference that is due now.
     springs: Array  # (k, 5) The values of ``LIVE_IMPEDANCE`` for each arm.
     M: Array  # (nv, nv) Joint-space inertia matrix.
-    torque: Array  # (nv,) Input: torque of gravity and velocity. Output: torque of the law [Nm].
+    torque: Array  # (nv,) Input: torque of gravity and Coriolis forces. Output: torque of the control law [Nm].
     commanded: Array  # (nv,) The last torque, within all bounds [Nm].
     saturated: BoolArray  # (nv,) Joints that would need more than their torque limit.
     late: BoolArray  # (nv,) Joints whose torque would have to change faster than its rate limit allows.

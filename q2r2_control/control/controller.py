@@ -105,7 +105,7 @@ class CartesianController(WatchedPairs):
 
     @property
     def settings(self) -> ControllerSettings:
-        """The settings of the last :meth:`change`, or those of the constructor."""
+        """The settings of the last :meth:`change`; before it, the settings of the constructor."""
         return self._live.settings
 
     def change(self, values: Mapping[str, Any]) -> str | None:
@@ -131,7 +131,8 @@ class CartesianController(WatchedPairs):
         self._move = bound(move_reference, model, data, self._solution, False, self.settings.max_substep, 1.0)
         self.step({arm: self.tool_pose(arm) for arm in self._arms}, self.settings.max_substep)
         problem = self._qp.problem
-        # The minimum is left out, because at home it may be the solution, and the solver would then not be set up.
+        # The minimum of the cost may be the solution at home, and the solver would then not be set up. The minimum is
+        # therefore removed.
         problem.minimum = None
         self._solver.solve(problem)
 
@@ -198,7 +199,7 @@ class CartesianController(WatchedPairs):
         Args:
             targets: As in :meth:`step`.
             dt: Duration of the step, above 0 and up to 0.1 [s]. If it is above ``max_substep``, the step is split, and
-                the QP is that of the first part.
+                the QP of the first part is returned.
             posture: As in :meth:`step`.
 
         Returns:
@@ -226,9 +227,9 @@ class CartesianController(WatchedPairs):
     ) -> Reference:
         """Take a step with a solution of :meth:`problem` that your program has found. It is certified as every step is.
 
-        The result is that of :meth:`step` with a solver that finds the same solution. ``x`` is not trusted: it is
-        clamped to the bounds, and executed as far as it can be certified. None, fewer than nv numbers, another shape,
-        and numbers that are not finite count as a failed solve. Then the certified stop is executed, and
+        The result is the same as that of :meth:`step` with a solver that finds this solution. ``x`` is not trusted: it
+        is clamped to the bounds, and executed as far as it can be certified. None, fewer than nv numbers, another
+        shape, and numbers that are not finite count as a failed solve. Then the certified stop is executed, and
         ``report.unsolved`` says so.
 
         Args:

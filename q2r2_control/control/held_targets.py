@@ -22,7 +22,7 @@ LONGEST_HOLD = 0.11  # If a target was held for longer than this, it belonged to
 _SPARE = 1.25
 _FARTHEST = 1e3  # Largest coordinate of a target that is interpolated. No arm could reach farther [m].
 # Largest difference of R R' from the identity, for the rotation R of a target that is interpolated. The controller
-# itself refuses targets for which it is more than twice as large.
+# itself refuses targets for which this difference is more than twice as large.
 _ORTHONORMAL = 5e-4
 _STEPS = 1.5  # If a target changes after fewer steps than this, targets are new at (nearly) every step.
 

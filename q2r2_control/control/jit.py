@@ -34,7 +34,7 @@ def numpy_kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     return _compiled(function)
 
 
-_kernels: list[Any] = []  # All dispatchers of this process.
+_kernels: list[Any] = []  # Numba's dispatchers of all kernels in this process.
 
 
 def _compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:

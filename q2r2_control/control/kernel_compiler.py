@@ -104,7 +104,7 @@ class Kernel(CPUDispatcher):
         self._part_compiler = numba_compiler(function, self.targetdescr, part_options, {}, _PartCompiler)
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
-        """Return the template with which Numba types a call of this kernel. If a kernel calls it, a part suffices."""
+        """Return the template with which Numba types a call of this kernel. For a call by a kernel, a part suffices."""
         with global_compiler_lock:
             self._wanted_as_part = Kernel._being_compiled > 0
             return super().get_call_template(args, kws)

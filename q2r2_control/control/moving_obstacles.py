@@ -31,7 +31,7 @@ class MovingObstacles:
         pointers: tuple[KernelPointer, ...],
         geometry: pin.GeometryModel,
     ) -> None:
-        """Take the pointers to the kernels' model and data, whose bodies and pairs are those of ``geometry``."""
+        """Take the pointers to the kernels' model and data, which have the bodies and pairs of ``geometry``."""
         model: KernelModel = pointers[0].value
         self._robot, self._bodies, limits = robot, model.safety.collision.bodies, model.safety.limits
         names, last = [item.name for item in geometry.geometryObjects], len(geometry.collisionPairs)

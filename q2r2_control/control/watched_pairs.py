@@ -170,10 +170,10 @@ class WatchedPairs:
     def allow_skew(self, time: float) -> None:
         """Let the arms' delays behind the reference differ by up to ``time`` [s], and let each arm stop on its own.
 
-        From the next step on, the bodies of two arms keep their distance at any point of the one arm's path and at any
-        point of the other arm's path. A path begins where the reference was ``time`` [s] ago, and ends where the
-        certified stop ends. A greater time takes effect gradually as time passes, and a smaller time at once. After
-        :meth:`reset` the whole time counts at once.
+        From the next step on, the bodies of two arms keep their distance wherever each of the two arms is on its own
+        path. A path begins where the reference was ``time`` [s] ago, and ends where the certified stop ends. A greater
+        time takes effect gradually as time passes, and a smaller time at once. After :meth:`reset` the whole time
+        counts at once.
 
         Args:
             time: The difference, from 0 to 0.1 [s].

@@ -26,7 +26,7 @@ from q2r2_control.supervision.tick_pacer import TickPacer
 from q2r2_control.teleop.haptics import ArmCondition
 from q2r2_control.types import ArmTiming, Array, Command, LimitKind, Reference, RobotState, StepReport
 
-_PROVEN = Phase.ACTIVE, Phase.BRAKING  # Openings of grippers are certified in these phases only.
+_PROVEN = Phase.ACTIVE, Phase.BRAKING  # Only in these phases are openings of grippers certified.
 
 
 @dataclass(slots=True)

@@ -24,7 +24,7 @@ _WRIST_JOINT = re.compile(r"gripper_?(roll|rotat|twist|yaw|pitch|swivel)", re.IG
 # is fixed to a sensor may be the tool.
 _SIDE_BRANCH = re.compile(r"finger|jaw|thumb|knuckle|camera|antenna|imu", re.IGNORECASE)
 _SENSOR = re.compile(r"sensor|accelerometer|_range", re.IGNORECASE)
-# Names of tool frames. The first one that exists is taken.
+# Patterns for the names of tool frames, in the order in which they are tried.
 _TOOL_FRAMES = [
     re.compile(pattern, re.IGNORECASE)
     for pattern in (r"tcp", r"tool", r"(^|_)eef?(_|$)|end_?effector|endpoint", r"grasp|gripper_?frame", r"flange")

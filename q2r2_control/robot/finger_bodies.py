@@ -107,8 +107,8 @@ def sweep_fingers(
     this body always covers all positions. A finger that is moved by a joint with more than one axis keeps its shape.
 
     Returns:
-        The bodies that become smaller while the gripper's opening is known: those of fingers that slide along the line
-        of their body, and those of fingers that turn.
+        The bodies that become smaller while the gripper's opening is known. They belong to fingers that slide along the
+        line of their body, and to fingers that turn.
     """
     bodies: list[FingerBody | TurningBody] = []
     for arm, joints in parts.finger_joints.items():

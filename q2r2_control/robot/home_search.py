@@ -23,7 +23,7 @@ from q2r2_control.types import Array
 if TYPE_CHECKING:
     from q2r2_control.robot.robot import Arm, Robot
 
-# Number of random postures, of the best ones that are examined further, and of steps of the local search.
+# Numbers of random postures, of the best postures, which are examined further, and of steps of the local search.
 _SAMPLES, _BEST, _STEPS = 2000, 24, 150
 _INSIDE = 0.85  # Share of its half range that each joint may use on both sides of the middle.
 _HALF = np.pi / 2  # Greatest half range that is assumed for a joint [rad].
@@ -45,7 +45,7 @@ def find_home(
 ) -> Array:
     """Return the best home positions that were found for the joints of ``arm`` (n,) [rad].
 
-    They may still miss a requirement.
+    They may still violate a requirement.
 
     Args:
         robot: The robot.

@@ -151,7 +151,7 @@ def _span(
 
 @dataclass(frozen=True, slots=True)
 class CapsuleFit:
-    """The capsule that encloses a mesh and stands for it, and how well it fits."""
+    """The capsule that encloses a mesh and replaces it, and how well it fits."""
 
     link: str
     radius: float  # [m]

@@ -120,7 +120,7 @@ def hand_links(tree: LinkTree, finger_joints: Iterable[str]) -> set[str]:
 # Links that always stay farther apart than this distance [m] need no watching. The distance is more than twice as large
 # as the distance that pairs usually keep.
 CLEARANCE = 0.05
-# Links and shapes whose names end with this text stand for a whole tool at every opening. Their distances are watched,
+# Links and shapes whose names end with this text represent a whole tool at every opening. Their distances are watched,
 # but they have no contacts in the simulation.
 ENVELOPE = "_envelope"
 

@@ -151,7 +151,8 @@ class Robot:
         self.torque_limit: Array = self.model.effortLimit.copy()
         joints = {joint.get("name", ""): joint for joint in urdf.findall("joint")}
         self.acceleration_limit: Array = np.array([acceleration_limit(joints[name]) for name in self.joint_names])
-        # The links of an arm are those from the root to the tool, and those of branches beside this path, like fingers.
+        # The links of an arm are the links from the root to the tool, and the links of branches beside this path, such
+        # as fingers.
         bodies = [frame for frame in self.model.frames if frame.type == pin.FrameType.BODY]
         own_links = {
             name: {*tree.path(arm.tool_frame), *(body.name for body in bodies if body.parentJoint - 1 in arm.joints)}
@@ -397,6 +398,7 @@ def _text_of(path_or_text: str | os.PathLike[str], name_of_text: str) -> tuple[s
         return path_or_text, name_of_text, None
     try:
         file = Path(path_or_text)
-        return file.read_bytes(), str(file), file.parent  # The first line of XML may name an encoding.
+        # The bytes are not decoded, because the first line of XML may name an encoding.
+        return file.read_bytes(), str(file), file.parent
     except (OSError, ValueError) as error:
         raise RobotError(f"{str(path_or_text)[:200]!r}: neither XML nor a file that can be read: {error}") from error

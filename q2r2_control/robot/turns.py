@@ -2,7 +2,7 @@
 
 If the angle jumps by a whole turn between two reports, the joint has not jumped. This is certain if the joint cannot
 have turned by half a turn between the two reports. Reports that count turns themselves are not changed. The first
-report is not changed either, nor is a report after a longer time.
+report is not changed either, nor is a report after a time in which the joint can have turned by half a turn.
 """
 
 from __future__ import annotations

@@ -70,7 +70,7 @@ class JointWatch:
         source: Callable[[], str] = lambda: "",
     ) -> None:
         self._names, self._velocity_limit, self._settings = names, velocity_limit, settings
-        self._source = source  # Text for messages that names the sender, such as " from /node", or "".
+        self._source = source  # Text that names the sender in messages, such as " from /node", or "".
         self.state: RobotState | None = None  # The newest state that was good; None before the first one.
         self.fault: Reason | None = Reason.of(SupervisionReason.NO_STATES_YET, source="")
         self._lost = False  # True if the fault is a lost session, and all states since then were good.

@@ -230,7 +230,7 @@ class Supervisor:
         return self._controller.step(self._external.targets(targets, self._last), dt, state.q)
 
     def _compare(self, reference: Reference, now: float) -> None:
-        """Stop or start over if the arms are too far from the reference, or if their driver stands still."""
+        """Stop, or brake and activate the arms again, if they deviate too much or if their driver stands still."""
         away, state = self._watch.deviates(reference.q, now), self._watch.state
         standing = None if self._standing is None or state is None else self._standing.look(reference.q, state, now)
         if standing is not None:
@@ -248,7 +248,7 @@ class Supervisor:
                 self.start_over(behind, now)
 
     def _with_gravity(self, away: Reason, reference: Reference) -> Reason:
-        """Return the reason ``away``, or a better one if the joint is too weak to hold the arm against gravity."""
+        """Return the reason ``away``, or a more exact reason if the joint is too weak to bear the arm's weight."""
         torques = joints_that_cannot_hold(self._robot, reference.q).get(away.detail["joint"])
         if torques is None:
             return away

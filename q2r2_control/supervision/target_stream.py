@@ -1,4 +1,4 @@
-"""Decide which targets an arm may follow: only those of a stream that began where the arm was.
+"""Decide which targets an arm may follow: only the targets of a stream that began at the tool's pose.
 
 An arm follows a stream whose first target lies within ``engage_distance`` and ``engage_angle`` of the tool, as it does
 when an operator engages. A stream that begins elsewhere comes from a sender that does not know that the arm was stopped

@@ -54,7 +54,7 @@ class DelayWatch:
 # No publisher sends more often than _MAX_RATE_HZ, and no message takes longer than _MAX_DELIVERY_S. If sequence numbers
 # grow faster, they come from another publisher.
 _MAX_RATE_HZ, _MAX_DELIVERY_S = 2000.0, 0.1
-_ALONE = 1.0  # A break in the sequence counts for this time. After it, one publisher is assumed again [s].
+_ALONE = 1.0  # A break in the sequence counts as recent for this time [s].
 
 
 class SequenceWatch:

@@ -34,7 +34,7 @@ class MissedTicks:
 
     def __init__(self) -> None:
         self.count = 0
-        self._behind = 0.0  # How far the ticks are behind their grid, without the missed ones [periods].
+        self._behind = 0.0  # How far the ticks are behind their grid, if missed ticks do not count [periods].
 
     def add(self, gap: float) -> None:
         """Take the time between two ticks [periods]."""

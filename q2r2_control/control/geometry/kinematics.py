@@ -1,4 +1,4 @@
-"""Forward kinematics of a tree of one-axis joints (compiled). The results equal those of Pinocchio.
+"""Forward kinematics of a tree of one-axis joints (compiled). The results are equal to Pinocchio's results.
 
 The roll-out of a stop needs the placements of the links at many configurations in each tick. Calls of Pinocchio would
 take too long. For that reason this part of Pinocchio is written again here. A test compares it with Pinocchio for every

@@ -189,7 +189,7 @@ def _some_stop_certified(model: SafetyModel, data: SafetyData, h: float, shapes:
 def _mix(data: SafetyData, share: float, h: float) -> None:
     """Write the candidate's velocities, and the positions that follow from them.
 
-    The velocities are (1 - ``share``) times those of the known stop plus ``share`` times the wanted ones.
+    They are (1 - ``share``) times the velocities of the known stop plus ``share`` times the wanted velocities.
     """
     state, candidate = data.state, data.candidate
     for j in range(state.q.shape[0]):

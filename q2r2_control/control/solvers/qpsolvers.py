@@ -69,7 +69,7 @@ class QpSolversSolver:
 
     Args:
         name: One of ``qpsolvers.available_solvers``.
-        options: Keyword arguments of that solver, see qpsolvers' documentation. They replace those in
+        options: Keyword arguments of that solver, see qpsolvers' documentation. They replace options in
             :data:`_DEFAULTS`.
     """
 

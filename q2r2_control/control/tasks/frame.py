@@ -214,7 +214,7 @@ def approach_speed(error: float, gain: float, deceleration: float) -> float:
 
 @kernel
 def wanted_twist(motion: Motion, data: TaskData, targets: TaskTargets, i: int) -> None:
-    """Write the wanted twist of tool ``i`` into ``data.frame``, with the part of it that is due to the pose error."""
+    """Write the wanted twist of tool ``i`` into ``data.frame``, and also the part of it that the pose error causes."""
     twist, feedback, feed_forward = data.frame.twist[i], data.frame.feedback[i], targets.feed_forward[i]
     times_transposed(targets.rotation[i], data.rotation[i], data.frame.turn)
     for k in range(3):
