@@ -63,7 +63,7 @@ class ImpedanceReport:
     saturated: tuple[str, ...]  # Joints that would need more than their torque limit.
     rate_limited: tuple[str, ...]  # Joints whose torque would have to change faster than ``torque_rate_limit`` allows.
     repelled: tuple[str, ...]  # Joints that are pushed away from a position limit.
-    held: bool  # True if the state was not usable. The torque is then gravity at the last usable posture.
+    held: bool  # True if the state was not usable. The command is then the gravity torque at the last usable posture.
 
 
 @dataclass(slots=True)
@@ -140,7 +140,7 @@ class ImpedanceController:
             self._wanted_borne[arm] = float(holding.get(arm, False))
 
     def _bear(self, change: float) -> None:
-        """Change, by at most ``change``, the share of each payload's mass that its arm bears to the wanted share."""
+        """Bring the borne share of each payload's mass nearer to the wanted share, by at most ``change``."""
         inertias = {held.joint: self.robot.model.inertias[held.joint] for held in self._payloads.values()}
         for arm, held in self._payloads.items():
             way = self._wanted_borne[arm] - self._borne[arm]

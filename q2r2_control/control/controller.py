@@ -419,7 +419,8 @@ class CartesianController(WatchedPairs):
 
         The safety filter may mix the solution with the stop. The mixture is then checked against the constraints. If it
         breaks a constraint, the move is undone: posture, velocity and the known stop (safety_filter.py) get their
-        values from before the step. A stop depends on nothing else, so the stop that was certified before is executed.
+        values from before the step. A stop depends only on these values, so the stop that was certified before is
+        executed.
         """
         own, problem, state = self._qp.constraints, self._qp.problem, self._state
         usable = solved and own.permit(np.clip(self._solution, problem.lower, problem.upper))

@@ -3,8 +3,8 @@
 If a target is held until the next target comes, it stands still in most steps, and jumps in one of them. At each jump,
 the controller would move some joint at its acceleration limit. Here, poses between the earlier and the newest target
 are interpolated: on a straight line, with a constant angular velocity. The interpolation takes 1.25 times as long as
-the earlier target was held, so the newest target is reached later by that time. A target that changes at every step, or
-after more than :data:`LONGEST_HOLD`, is passed on at once.
+the earlier target was held, so the newest target is reached only after this time. A target that changes at every step,
+or after more than :data:`LONGEST_HOLD`, is passed on at once.
 """
 
 from __future__ import annotations

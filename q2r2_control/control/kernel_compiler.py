@@ -68,8 +68,8 @@ class _WholeLibrary(JITCodeLibrary):
         super().finalize()
 
     def _optimize_final_module(self) -> None:
-        # Numba itself optimises twice, because only after the first time does it find some superfluous code that counts
-        # references.
+        # Numba itself optimises twice, because it finds some superfluous code that counts references only at the second
+        # time.
         manager, builder = self._codegen._module_pass_manager()
         manager.run(self._final_module, builder)
 

@@ -91,7 +91,7 @@ class MovingObstacles:
         return changed
 
     def hold(self, holding: frozenset[str]) -> None:
-        """Note that the grippers of exactly these arms hold their objects."""
+        """Store that the grippers of exactly these arms hold their objects."""
         self._holding = holding
         self._count()
 

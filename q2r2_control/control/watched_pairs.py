@@ -61,7 +61,7 @@ class WatchedPairs:
 
     @property
     def narrow_pair(self) -> tuple[str, str] | None:
-        """The pair whose kept distance is farthest below the requested one; None if no kept distance is below it."""
+        """The pair whose kept distance is farthest below the requested distance; None if there is no such pair."""
         return None if self._live.narrow < 0 else self._names.pair(self._live.narrow)
 
     def set_opening(self, arm: str, least: float, greatest: float) -> tuple[str, str] | None:

@@ -1,4 +1,4 @@
-"""Compute one tick of control, from measured joints and targets to a command, and the conditions that a hand feels."""
+"""Compute one tick of control, from measured joints and targets to a command. Find the conditions that a hand feels."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ class ControlLoop:
         self._limiter: GripperLimiter | None = None  # None while the reference may differ from the arms' posture.
         self._kept: Array = controller.kept_distances  # The kept distances that the drive knows [m].
         self._still: Mapping[str, MovingObstacle] = {}  # The obstacles at rest that the drive knows.
-        self.holding: dict[str, bool] = {}  # For each arm that has an object, whether its gripper holds it.
+        self.holding: dict[str, bool] = {}  # For each arm that has an object, whether its gripper holds the object.
         self.granted_openings: dict[str, tuple[float, float]] = {}  # For each arm, the wanted and the granted opening.
         self._lags = MeasuredLags(robot)
         self._usual_lag = 0.0  # The longest recent lag [s].

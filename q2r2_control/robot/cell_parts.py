@@ -62,7 +62,7 @@ class Model:
         self.exclusions = [] if description.srdf is None else [*description.srdf]
 
     def name_in_cell(self, name: str) -> str:
-        # The root link of the cell already has the name WORLD, so a link with this name gets another one.
+        # The root link of the cell already has the name WORLD, so a link with this name gets another name.
         return f"robot_{name}" if not self.prefix and name == WORLD else self.prefix + name
 
     def urdf(self, mount: PoseConfig) -> list[ET.Element]:
@@ -236,7 +236,7 @@ class ArmAssembly:
 def load_model(
     config: ArmConfig | RobotConfig | FlangeConfig | ToolConfig, packages: Mapping[str, str], key: str
 ) -> Description:
-    """Return the description that the block ``key`` names; raises :class:`ConfigError` that begins with ``key``."""
+    """Return the description that the block ``key`` names. The text of a :class:`ConfigError` begins with ``key``."""
     model = config.model or ""
     try:
         return load_description(model, config.xacro_args, packages)
@@ -260,7 +260,7 @@ def name_of_stack(parts: Sequence[Description]) -> str:
 
 
 def check_position(joint: ET.Element, position: float, key: str) -> None:
-    """Raise :class:`ConfigError` that begins with ``key`` if ``position`` is outside the joint's limits."""
+    """Raise :class:`ConfigError` if ``position`` is outside the joint's limits. Its text begins with ``key``."""
     lower, upper = joint_limits(joint)
     if lower <= position <= upper:
         return

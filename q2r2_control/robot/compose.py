@@ -44,7 +44,7 @@ class ComposedCell:
     name: str
     urdf: str
     srdf: str
-    tool_frames: dict[str, str]  # By arm, the link that the operator moves.
+    tool_frames: dict[str, str]  # For each arm, the link that the operator moves.
     home: dict[str, float]  # Position of every movable joint, with arms at home and grippers open.
     obstacles: tuple[str, ...]  # Names of the fixed obstacles, which are also the names of their links.
     parts: KnownParts  # The roles of links.

@@ -27,7 +27,7 @@ from q2r2_control.types import ALL_OF_THE_WAY, Array, Interval
 
 @dataclass(frozen=True, slots=True)
 class FingerBody:
-    """A body that covers all positions of some fingers of one arm, which slide along one line."""
+    """A body that covers all positions of some fingers of one arm. These fingers slide along one line."""
 
     arm: str
     name: str  # Name of the geometry object.

@@ -68,7 +68,7 @@ class _Writer:
         self._names = {model.body(body).name for body in range(model.nbody)}
         self._names |= {model.joint(j).name for j in range(model.njnt)}
         self._links: dict[int, str] = {}  # Names of links by the number of their body.
-        self._within: dict[int, pin.SE3] = {}  # By body, the pose of its link's frame in the frame of the body.
+        self._within: dict[int, pin.SE3] = {}  # For each body, the pose of its link's frame in the frame of the body.
 
     def robot(self) -> ET.Element:
         model = self._model

@@ -72,7 +72,7 @@ def _tips(tree: LinkTree, key: str) -> list[str]:
 
 
 def limits_lacking(tree: LinkTree, tip: str) -> list[str]:
-    """Return a line for each joint of the arm that lacks limits."""
+    """Return a line for each of the arm's joints that lacks limits."""
     limits = []
     for joint in tree.chain(tip):
         limit, name = joint.find("limit"), joint.get("name", "")

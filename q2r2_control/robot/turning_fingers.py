@@ -22,8 +22,8 @@ remainder. []
 
 The choice of the segment affects only the size of the capsule. Some candidates lie along the shape and some along the
 path of its middle. The candidate with the least mean width is taken. Capsules of nested intervals are not nested: the
-capsule of the narrower interval may stick out of the capsule of the wider one. A change to a narrower interval has to
-be proven safe as if a body grew (:func:`sticks_out`). The capsule of the wider interval stays valid as long as the
+capsule of the narrower interval may stick out of the capsule of the wider interval. A change to a narrower interval has
+to be proven safe as if a body grew (:func:`sticks_out`). The capsule of the wider interval stays valid as long as the
 opening is in that interval. A narrower interval may therefore always be refused.
 """
 
@@ -44,8 +44,8 @@ _REMAINDER = 5e-5  # The wanted error of the interpolation. The steps are made s
 # the error is greater.
 _MOST_SAMPLES = 512
 _ROUNDING = 1e-9  # Addition to radii for the rounding of numbers [m].
-# Both ends of a segment are pulled in by these multiples of the radius that its capsule needs without the shape's own
-# radius. The capsule becomes thicker and its ends flatter.
+# Each candidate is tried in three lengths. Both of its ends are moved inwards by these multiples of its capsule's
+# radius (without the shape's own radius). A capsule with a shorter segment is thicker.
 _PULLED_IN = np.array([0.0, 0.58, 1.2])
 
 

@@ -2,7 +2,7 @@
 
 A certificate says nothing about such a link. Every part that commands arms calls :func:`check_watched`, which refuses a
 robot if such a link moves with an arm and the cell does not name the link. For a link that stands still, there is only
-a note: in many models it is only for display, and another part of the model often stands in front of it.
+a note: many models have such links only for display, and other parts of the model often stand in front of them.
 """
 
 from __future__ import annotations

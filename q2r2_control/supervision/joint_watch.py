@@ -73,7 +73,7 @@ class JointWatch:
         self._source = source  # Text that names the sender in messages, such as " from /node", or "".
         self.state: RobotState | None = None  # The newest state that was good; None before the first one.
         self.fault: Reason | None = Reason.of(SupervisionReason.NO_STATES_YET, source="")
-        self._lost = False  # True if the fault is a lost session, and all states since then were good.
+        self._lost = False  # True if the fault is that of :meth:`lose`, and all states since then were good.
         self._q: list[float] = []  # Joint positions of ``state`` [rad].
         self._still_since, self._still_at = math.inf, self._q
         self._near_at: float | None = None
@@ -219,7 +219,7 @@ def settings_for_external_arms(config: Config) -> Config:
     distances.
     """
     control = config.control.model_copy(update=_FOLLOW)
-    # The admittance is off, because the other controller is the compliant one.
+    # The admittance is off, because the other controller already yields to forces.
     stiff = config.admittance.model_copy(update={"enabled": False})
     supervision = config.supervision
     lagging = supervision.model_copy(update={"max_deviation": supervision.max_deviation_external})

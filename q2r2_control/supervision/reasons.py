@@ -43,7 +43,7 @@ class SupervisionReason(ReasonKind):
         "left_behind",
         "{arm}: the tool is {distance:.3f} m and {angle:.2f} rad from where it was led; begins anew where it is",
     )
-    # Why arms start over, what happens to them, and why a target is not followed.
+    # Why arms are activated again, what happens to them, and why a target is not followed.
     ARMS_APART = "arms_apart", "{arm}: {skew:.0f} ms behind the other arm; allowed: {allowed:.0f} ms"
     RUN_ENDED = "run_ended", "the run has ended"
     ACTIVATED = "activated", "active: the reference starts at the measured posture"

@@ -30,7 +30,7 @@ from q2r2_control.supervision.target_stream import Origins, StreamSettings
 from q2r2_control.supervision.targets import TargetStreams
 from q2r2_control.types import Array, Reference, RobotState
 
-_REST = 1e-4  # The reference is at rest if no joint is faster [rad/s].
+_REST = 1e-4  # The reference is at rest if no joint is faster than this [rad/s].
 # If a joint is farther from the reference than the first value and slower than the second one, its driver may be gone
 # [rad], [rad/s].
 _OFF_REFERENCE, _STILL = 0.02, 0.05
@@ -305,7 +305,10 @@ class Supervisor:
             self.phase = Phase.STOPPED
 
     def reset(self) -> Reason | None:
-        """Clear faults, stop, pause and all targets. Returns the reason if that is not possible now, else None."""
+        """Clear all faults and targets, and end a stop or a pause.
+
+        Returns the reason if that is not possible now, else None.
+        """
         if self.phase is Phase.BRAKING:
             return Reason(SupervisionReason.ARMS_BRAKING)
         self._stopped, self.paused = None, False

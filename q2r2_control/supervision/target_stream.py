@@ -31,8 +31,8 @@ class StreamSettings:
     """The rules for a stream of targets; they may be changed at run time."""
 
     timeout: float = STREAM_TIMEOUT  # A stream ends if no target comes for longer than this [s].
-    engage_distance: float = 0.03  # A stream must begin at most this far from the tool [m].
-    engage_angle: float = 0.3  # A stream must begin turned from the tool by at most this angle [rad].
+    engage_distance: float = 0.03  # The first target of a stream must be at most this far from the tool [m].
+    engage_angle: float = 0.3  # The first target must be turned from the tool by at most this angle [rad].
     linked: bool = True  # Whether all arms hold when the targets of one arm cease, see TargetStreams.
 
 

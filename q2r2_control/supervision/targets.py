@@ -84,7 +84,9 @@ class SequenceWatch:
 
 
 class TargetStreams:
-    """Holds one :class:`TargetStream` for each arm. Poses are in the world frame; all times are times of receipt [s].
+    """Contains one :class:`TargetStream` for each arm.
+
+    Poses are in the world frame. All times are times of receipt [s].
 
     Linked arms (:attr:`StreamSettings.linked`) stop together. If the targets of one arm cease, or two nodes publish
     them, then every arm needs a new stream that begins at its tool. An operator who pauses one arm ends its stream by

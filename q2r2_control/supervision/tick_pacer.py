@@ -3,9 +3,9 @@
 A plant takes one command per period. From one command to the next a joint may move as far as its velocity limit allows
 in one period, even if the command comes late. A late tick therefore moves the reference by the time t that has passed
 if no joint then moves farther than its velocity limit V allows in a period h:  |v| t + a t^2 / 2 <= V h  for each
-joint, with its acceleration limit a. Otherwise t is reduced until this holds, but not below one period. A slow
-motion therefore makes up for the whole delay in one tick. A fast motion follows the same path, but later. If each joint
-of a command were clipped on its own, the command would leave the path that was certified.
+joint, with its acceleration limit a. Otherwise t is reduced until this is true, but not below one period. A slow motion
+therefore makes up for the whole delay in one tick. A fast motion follows the same path, but later. If each joint of a
+command were clipped on its own, the command would leave the path that was certified.
 
 A plant that takes velocity commands keeps moving at the last velocity while no command comes (``coasts``). Then the
 reference also advances by the time that has passed, up to 0.1 s. The commanded velocity stays within its limit.

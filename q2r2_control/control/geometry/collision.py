@@ -161,7 +161,7 @@ def pairs_of(model: pin.GeometryModel, chain: Chain, bodies: CollisionBodies, tr
         model: The geometries and their pairs.
         chain: The joints.
         bodies: The bodies of ``model``.
-        travel: Greatest distance of each joint from zero (nv,) [rad or m].
+        travel: Greatest absolute position of each joint (nv,) [rad or m].
         extent: For each body, a bound (g,) on the distance of its segment or box from its joint's origin [m]. The bound
             still holds after bodies of fingers change.
 

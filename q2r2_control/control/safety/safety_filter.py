@@ -164,8 +164,8 @@ def _certify_mixture(model: SafetyModel, data: SafetyData, share: float, h: floa
         data: The data.
         share: Share of the wanted velocities in the mixture, from 0 for the known stop to 1.
         h: Duration of the step [s].
-        together: True if a pair is too close. Only a stop of all joints together is then tried: with it, a pair that
-            opens continues to open.
+        together: True if a pair is too close. Only a stop of all joints together is then tried: during this stop, a
+            distance that grows continues to grow.
     """
     _mix(data, share, h)
     return _some_stop_certified(model, data, h, 1 if together else SHAPES)

@@ -136,7 +136,7 @@ def _gap(
 ) -> Gap:
     """Return what a ``corner`` (3,) contributes to the gap along the normal, and how this contribution changes.
 
-    The contribution is that at the start of ``piece``. Its changes are those during ``piece`` and ``then``; see
+    The contribution is computed at the start of ``piece``, and its changes during ``piece`` and ``then``; see
     :class:`Gap`. ``side`` is -1 for a corner of the first body, else 1.
     """
     chain, pairs, placements, normal = model.chain, model.pairs, data.placements, data.contact.normal

@@ -21,13 +21,14 @@ least
 where w_j is the travel of joint j in the step and the stop.
 
 *Proof.* Let D_j(t) be how far joint j has moved. Compare it with v_j sigma(t), where sigma = t in the step and sigma =
-h + s - s^2 / 2T at the time s of the stop, so at most h + T / 2. In the step, |D_j - v_j t| = |v+_j - v_j| t^2 / 2h is
-at most |v+_j - v_j| h / 2, and this difference stays during the stop. In the stop, v+_j replaces v_j, which changes v_j
-(s - s^2 / 2T) by at most |v+_j - v_j| T / 2. The joint itself travels B_j(s) from the step's end. Since d_j >= |v+_j| /
-T, the difference |v+_j| (s - s^2 / 2T) - |B_j(s)| is never negative and never falls. At T it is |v+_j| T / 2 - v+_j^2 /
-2 d_j. Together |D_j - v_j sigma| <= rho_j. A point of a body moves by J D + R, with |R| <= sum reach_j kappa_j over the
-joints that move it (separating_plane.py says why). Two points, one of each body's core, therefore get closer by at most
-|(J_2 - J_1) v| sigma + sum reach_j (rho_j + kappa_j), and |(J_2 - J_1) v| <= V. The radii cancel. []
+h + s - s^2 / 2T at the time s of the stop, so that sigma is at most h + T / 2. In the step, |D_j - v_j t| is equal to
+|v+_j - v_j| t^2 / 2h <= |v+_j - v_j| h / 2, and this difference stays during the stop. In the stop, v+_j replaces v_j,
+which changes v_j (s - s^2 / 2T) by at most |v+_j - v_j| T / 2. The joint itself travels B_j(s) from the step's end.
+Since d_j >= |v+_j| / T, the difference |v+_j| (s - s^2 / 2T) - |B_j(s)| is never negative and never falls. At T it is
+|v+_j| T / 2 - v+_j^2 / 2 d_j. Together |D_j - v_j sigma| <= rho_j. A point of a body moves by J D + R, with
+|R| <= sum reach_j kappa_j over the joints that move it (separating_plane.py says why). Two points, one of each body's
+core, therefore get closer by at most |(J_2 - J_1) v| sigma + sum reach_j (rho_j + kappa_j), and |(J_2 - J_1) v| <= V.
+The radii cancel. []
 
 If a joint moves both bodies, its velocity is part of V, but the joint is not in the sum. V could then be less than the
 speed at which the bodies close in. For that reason the other proofs handle pairs that share a joint.

@@ -191,9 +191,9 @@ def _stop_keeps_apart(model: SafetyModel, data: SafetyData, p: int, duration: fl
 def _comes_no_closer(model: SafetyModel, data: SafetyData, p: int, duration: float, closer: float) -> bool:
     """Return whether a pair that is too close comes no closer during the stop.
 
-    At no sample may its distance be smaller than at the sample before, or be falling. Distances alone would miss a pair
-    that opens and closes again between two samples. At the last sample all joints rest. The joints that came to rest
-    last are then taken with their velocities one sample earlier.
+    At each sample, its distance must not be smaller than at the sample before, and must not be falling. Distances alone
+    would miss a pair that opens and closes again between two samples. At the last sample all joints rest. The joints
+    that came to rest last are then taken with their velocities one sample earlier.
     """
     candidate, row = data.candidate, data.rollout.piece.rate
     before = data.distance[p]

@@ -127,7 +127,7 @@ def write_piece(data: SafetyData, v: Array, start: float, length: float, piece: 
         v: Velocities at the start of the part (nv,) [rad/s].
         start: Start of the part, from the beginning of the stop [s].
         length: Duration of the part [s].
-        piece: Where the motion is written.
+        piece: The motion is written here.
     """
     candidate = data.candidate
     for j in range(v.shape[0]):

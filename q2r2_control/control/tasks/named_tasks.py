@@ -2,7 +2,8 @@
 
 Each task adds the cost  weight |J v - u|^2,  where the velocity u is a gain times the task's error. Tasks with
 different goals reach a compromise according to their weights. A tool's target has the weight 1 for metres and 0.09 for
-radians. The settings ``position_weights`` and ``rotation_weights`` give a tool the freedom that such a task needs.
+radians. With small values in ``position_weights`` and ``rotation_weights``, a tool has the freedom that such a task
+needs.
 """
 
 from __future__ import annotations
