@@ -69,7 +69,7 @@ class MovingObstacles:
         return {name: ObstacleReport(self.there[name], age) for name, age in ages if name in self.there}
 
     def put(self, name: str, obstacle: MovingObstacle | None) -> IntArray:
-        """Take a report of an obstacle; None if it has gone. Returns an array (g,): 1 for the body that has changed.
+        """Take a report of an obstacle, or None if it has gone. Returns an array (g,): 1 for the body that has changed.
 
         Until :meth:`keep_clear` is called, all pairs with obstacles keep the distances that they need while the arms
         stop. Raises the same exceptions as :func:`check_obstacle`.

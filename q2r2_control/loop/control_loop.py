@@ -303,7 +303,7 @@ def without_proof(wanted: float, before: tuple[float, float] | None) -> float:
     return min(wanted, before[1]) if before[0] > before[1] else max(wanted, before[1])
 
 
-_LIMIT_LASTS = 0.5  # A limit that has held a step back counts as reached for this time [s].
+_LIMIT_LASTS = 0.5  # A limit that has limited a step counts as reached for this time [s].
 
 
 class ArmConditions:
@@ -317,7 +317,7 @@ class ArmConditions:
         self._limited: dict[str, float] = {}  # Time at which each joint was last at its position limit [s].
 
     def note(self, report: StepReport, now: float) -> None:
-        """Remember the limits that held a step back. It is called in every tick."""
+        """Remember the limits that have limited a step. It is called in every tick."""
         for kind, names in report.binding:
             if kind is LimitKind.POSITION:
                 self._limited[names[0]] = now

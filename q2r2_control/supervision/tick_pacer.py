@@ -134,7 +134,7 @@ class PoseRateLimiter:
 
     def __init__(self, settings: GuardSettings, period: float) -> None:
         """``period`` is the time between two steps [s]."""
-        self.clipped = 0  # Number of steps since the start in which a limit held the pose back.
+        self.clipped = 0  # Number of steps since the start in which a limit has slowed the pose.
         self._linear, self._angular, self._period = _Limited(), _Limited(), period
         self.change(settings)
         self.reset(None, -math.inf)

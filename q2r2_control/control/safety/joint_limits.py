@@ -37,7 +37,7 @@ _RETURN_GAIN = 4.0  # Inward speed per radian outside of the limit [1/s].
 # A joint beyond its limit is moved to this far inside of the limit, so that it crosses the limit in finite time [rad].
 _RETURN_DEPTH = 1e-3
 
-NO_LIMIT, POSITION, VELOCITY, ACCELERATION = 0, 1, 2, 3  # The kinds of limits that hold a joint back.
+NO_LIMIT, POSITION, VELOCITY, ACCELERATION = 0, 1, 2, 3  # The kinds of limits that may limit the velocity of a joint.
 
 
 class JointLimits(NamedTuple):

@@ -127,7 +127,7 @@ class Rollout(NamedTuple):
 
 
 class ActiveBounds(NamedTuple):
-    """The limits that held the last step back. The first ``used[0]`` entries are valid."""
+    """The limits that limited the last step. The first ``used[0]`` entries are valid."""
 
     kind: IntArray  # (k,) POSITION, VELOCITY or ACCELERATION of a joint, SEPARATION of a pair, TOOL_SPEED of a tool.
     subject: IntArray  # (k,) Index of the joint, the pair or the tool.

@@ -23,8 +23,8 @@ from q2r2_control.control.safety.tool_speed import keeps_tool_speed
 from q2r2_control.types import Array
 
 FOLLOWED, REDUCED, STOPPED = 0, 1, 2
-SEPARATION = ACCELERATION + 1  # The kind of limit that holds a pair of bodies back.
-TOOL_SPEED = SEPARATION + 1  # The kind of limit that holds a tool back.
+SEPARATION = ACCELERATION + 1  # The kind of limit that keeps two bodies apart.
+TOOL_SPEED = SEPARATION + 1  # The kind of limit that bounds the speed of a tool.
 _BISECTIONS = 4
 _ACTIVE = 1e-7  # A velocity that is this near to a bound counts as at the bound [rad/s].
 

@@ -78,7 +78,7 @@ def tool_limits_of(robot: Robot, chain: Chain, speed: float | None) -> ToolLimit
 class ToolSpeeds(NamedTuple):
     """Data that are written when a step is decided on."""
 
-    held: IntArray  # (n,) 1 if the tool's speed limit held the step back.
+    held: IntArray  # (n,) 1 if the tool's speed limit has limited the step.
     origin: Array  # (3,) Buffer for the tool's origin in the world [m].
     columns: Array  # (nv, 3) Buffer for J_j v+_j of each joint [m/s].
     total: Array  # (3,) Buffer for a sum P_k [m/s].

@@ -56,7 +56,7 @@ def slack_problem(problem: QpProblem, sparse: bool = False, scaled: bool = False
     )
 
 
-# Without these options, the solver cannot be used in a loop.
+# These solvers cannot be used in a control loop without these options.
 _DEFAULTS: dict[str, dict[str, Any]] = {
     # Without a limit, the active set of HiGHS may cycle for ever.
     "highs": {"output_flag": False, "qp_iteration_limit": 1000},

@@ -89,7 +89,7 @@ def check_installed(name: str) -> None:
     """Raise :class:`ConfigError` unless a solver called ``name`` is installed. It lists the installed solvers."""
     if name in OURS:
         return
-    import qpsolvers  # See _made.
+    import qpsolvers  # The import is local for the same reason as in _made.
 
     if name not in qpsolvers.available_solvers:
         installed = ", ".join(sorted({*OURS, *qpsolvers.available_solvers}))
