@@ -1,4 +1,4 @@
-"""Compute one tick of control, from measured joints and targets to a command. Find the conditions that a hand feels."""
+"""Compute one tick of control, from measured joints and targets to a command. Find what the operator's hands feel."""
 
 from __future__ import annotations
 
@@ -251,8 +251,8 @@ class ControlLoop:
         """Return the openings to be commanded, and find out whether the grippers hold something.
 
         While the arms do not move, nothing is certified, and a gripper gets the wanted opening, for instance to release
-        an object. If a gripper did not get its wanted opening before the arms stopped, it does not move farther in
-        that direction.
+        an object. There is one exception: a gripper that did not get its wanted opening before the arms stopped does
+        not move farther in that direction.
         """
         if not self._owns_plant and self.supervisor.phase not in _PROVEN:
             self._limiter, self.holding = None, {}
@@ -291,8 +291,8 @@ class ControlLoop:
 def without_proof(wanted: float, before: tuple[float, float] | None) -> float:
     """Return the opening that a gripper gets while the arms do not move, and nothing is certified.
 
-    A gripper gets the wanted opening. If it did not get its wanted opening before, it does not move farther in that
-    direction.
+    A gripper gets the wanted opening, with one exception: a gripper that did not get its wanted opening before does not
+    move farther in that direction.
 
     Args:
         wanted: The wanted opening.
@@ -307,7 +307,10 @@ _LIMIT_LASTS = 0.5  # A limit that has limited a step counts as reached for this
 
 
 class ArmConditions:
-    """Finds the conditions that a hand feels, from the controller and the measured state. Times are the loop's [s]."""
+    """Finds the conditions that an operator's hand feels, from controller and measured state.
+
+    Times are the loop's [s].
+    """
 
     def __init__(self, controller: CartesianController) -> None:
         robot = controller.robot
