@@ -48,7 +48,7 @@ def estimate_wrench(J: Array, tau: Array) -> Array:
 def rest_displacement(force: Array, dead_band: float, stiffness: float, limit: float) -> Array:
     """Return the displacement (3,) [m or rad] at which the spring balances the ``force`` (3,) [N or Nm].
 
-    The result is zero within the dead band, and at most ``limit`` long.
+    The result is zero if the force is within the dead band. It is at most ``limit`` long.
     """
     size = math.hypot(*force)
     if size <= dead_band:
@@ -66,7 +66,7 @@ def stop_at_limit(x: Array, v: Array, limit: float) -> tuple[Array, Array]:
 
 
 def oscillate(x: Array, v: Array, frequency: float, damping_ratio: float, dt: float) -> tuple[Array, Array]:
-    """Return the exact x and v after ``dt`` [s] of x'' + 2 xi w x' + w^2 x = 0, with the ``frequency`` w [rad/s]."""
+    """Return the exact solution of x'' + 2 xi w x' + w^2 x = 0 after ``dt`` [s], with the ``frequency`` w [rad/s]."""
     fall = damping_ratio * frequency
     spread = frequency * math.sqrt(abs(damping_ratio**2 - 1.0))
     # ``cosine`` is e^(-fall t) times cos or cosh, and ``sine`` is e^(-fall t) times sin or sinh, divided by ``spread``.
@@ -97,7 +97,7 @@ class AdmittanceReport:
     """The result of the admittance in one tick."""
 
     arms: dict[str, ArmCompliance]
-    rejected: bool  # Whether the measurement or dt was not finite, so that the last good wrench is used.
+    rejected: bool  # True if the measurement or dt could not be used. The last good wrench is then used.
 
 
 class Admittance:
@@ -121,8 +121,8 @@ class Admittance:
 
         If an arm has no target, its displacement becomes zero at once, because a new target starts at the tool's pose.
         If a torque or the posture is not finite, the last wrench is used. If dt is not positive and finite, no
-        displacement changes. In both cases the report has ``rejected``. A target that is not finite is passed on, and
-        the controller refuses it.
+        displacement changes. In both cases, ``rejected`` of the report is True. A target that is not finite is passed
+        on, and the controller refuses it.
 
         Args:
             targets: Targets of the tools, in the world frame.

@@ -2,24 +2,25 @@
 
     tau = J' (K e + D e') + N (K_n (q_r - q) + D_n (v_r - v)) + M(q) a_r + C(q, v) v + g(q) + joint-limit repulsion
 
-e is the displacement from the measured tool pose to the tool pose of the reference, and e' the difference of the two
-twists. D is the damping of :func:`inertia_and_damping`, D_n the damping of each joint, and N a nullspace projector.
-Hogan 1985, Albu-Schaeffer et al. 2003.
+e is the displacement from the measured tool pose to the tool pose of the reference, and e' is the twist of the tool at
+the reference minus its measured twist. D is the damping of :func:`inertia_and_damping`, D_n the damping of each joint,
+and N a nullspace projector. Hogan 1985, Albu-Schaeffer et al. 2003.
 
-**Feed-forward M a_r.** The inertia of an arm at its tool is mainly that of the rotors times the squared gear ratio: 20
-to 140 kg for a robot of 22 kg. Without the feed-forward, every acceleration would stretch the spring, by 30 mm at
-1 m/s^2. With the feed-forward, the spring bears only the errors of the model, and may be soft. How a resting arm yields
-to a push does not change.
+**Feed-forward M a_r.** The inertia of an arm at its tool comes mainly from the rotors of its motors, because their
+inertia is multiplied by the squared gear ratio. It is 20 to 140 kg for a robot of 22 kg. Without the feed-forward,
+every acceleration would stretch the spring, by 30 mm at 1 m/s^2. With the feed-forward, the spring bears only the
+errors of the model, and may be soft. How a resting arm yields to a push does not change.
 
-**Torque rate.** A full stop at 10 rad/s^2 needs 70 Nm more in a joint that moves the whole arm. While the torque rises
-by this amount, the tool deviates from the reference. The arm may then leave the distances that the reference keeps.
+**Torque rate.** A full stop at 10 rad/s^2 needs 70 Nm more in a joint that moves the whole arm. The torque rises no
+faster than ``torque_rate_limit``, and meanwhile the tool deviates from the reference. The arm may then leave the
+distances that the reference keeps.
 
 **Payload.** A held object is part of M, C and g. Its mass is added and removed linearly over 0.3 s, so that no torque
 jumps.
 
 **Time.** A reference is due at the end of its tick, and the state is measured at the start of the tick. The spring
-therefore acts about the reference of the previous tick, which is due now. The acceleration a_r is the one that leads
-from this reference to the newest reference.
+therefore pulls the tool towards the reference of the previous tick, which is due now. a_r is the acceleration that
+leads from this reference to the newest reference.
 """
 
 from __future__ import annotations
@@ -56,12 +57,13 @@ _PAYLOAD_TIME = 0.3  # Time over which the mass of a payload is added or removed
 class ImpedanceReport:
     """The result of one tick. Joints and arms are given by name."""
 
-    errors: dict[str, Array]  # By arm (6,): clipped displacement from tool to reference, in world axes [m], [rad].
+    # For each arm, the clipped displacement (6,) from the tool to the reference, in world axes [m], [rad].
+    errors: dict[str, Array]
     clipped: tuple[str, ...]  # Arms whose deviation from their reference is clipped.
     saturated: tuple[str, ...]  # Joints that would need more than their torque limit.
     rate_limited: tuple[str, ...]  # Joints whose torque would have to change faster than ``torque_rate_limit`` allows.
     repelled: tuple[str, ...]  # Joints that are pushed away from a position limit.
-    held: bool  # Whether the measured state was not usable, so that the last gravity torque is held.
+    held: bool  # True if the state was not usable. The command is then the gravity torque at the last usable posture.
 
 
 @dataclass(slots=True)
@@ -77,7 +79,8 @@ class ImpedanceController:
 
     For any input the torques are finite, within ``torque_scale`` times the robot's limits, and change between two ticks
     by no more than ``torque_rate_limit`` allows. Torques are computed for each arm alone, with its own blocks of the
-    inertia matrix and of the inverse of this matrix. Joints that carry several arms get the sum of their torques.
+    inertia matrix and of the inverse of this matrix. A joint that moves several arms gets the sum of the torques for
+    these arms.
     """
 
     def __init__(self, robot: Robot, settings: ImpedanceSettings | None = None) -> None:
@@ -85,21 +88,21 @@ class ImpedanceController:
         self.settings = settings = settings or ImpedanceSettings()
         self._limit = settings.torque_scale * robot.torque_limit
         self._payloads = {arm: held for arm, held in robot.objects.by_arm.items() if held.config.mass > 0.0}
-        self._borne = dict.fromkeys(self._payloads, 0.0)  # Share of each payload's mass that is borne now.
+        self._borne = dict.fromkeys(self._payloads, 0.0)  # Share of each payload's mass that its arm bears now.
         self._wanted_borne = dict(self._borne)
         spring = settings.limit_stiffness, settings.limit_damping, settings.limit_distance
         limits = PositionLimits(robot.position_lower, robot.position_upper, *spring)
         largest_error = np.array([settings.max_position_error, settings.max_rotation_error])
         model = ImpedanceModel(chain_of(robot.model), tools_of(robot), limits, self._limit, largest_error)
         values = [float(getattr(settings, name)) for name in LIVE_IMPEDANCE]
-        self._springs = np.tile(values, (len(self._arms), 1))  # The present values.
+        self._springs = np.tile(values, (len(self._arms), 1))  # The present values of ``LIVE_IMPEDANCE``.
         self._kernel_data = ImpedanceData.empty(model, self._springs)
         self._inputs = self._kernel_data.inputs.reshape(-1)  # A view of ``inputs``, which has the same memory.
         self._pointers = pointer_to(model), pointer_to(self._kernel_data)
         self._impedance_torque = bound(impedance_torque, *self._pointers, 0.0)
-        self._model = robot.model.copy()  # Payloads are added to this copy.
+        self._model = robot.model.copy()  # The masses of payloads are added to this copy.
         self._pinocchio_data = self._model.createData()
-        self._wanted_springs = self._springs.copy()  # The values at the end of a ramp.
+        self._wanted_springs = self._springs.copy()  # The values at the end of the present change.
         self._ramp_rate = np.zeros_like(self._springs)
         self._ramping = False
         self._begin(robot.home)
@@ -132,12 +135,12 @@ class ImpedanceController:
         return np.array(pin.computeGeneralizedGravity(self._model, self._pinocchio_data, q))
 
     def set_holding(self, holding: Mapping[str, bool]) -> None:
-        """Set for each arm that has an object whether its gripper holds it. The arm bears the mass of a held object."""
+        """Set for each arm whether its gripper holds its object. The arm bears the mass of a held object."""
         for arm in self._payloads:
             self._wanted_borne[arm] = float(holding.get(arm, False))
 
     def _bear(self, change: float) -> None:
-        """Change the share of each payload's mass that is borne towards the wanted share, by at most ``change``."""
+        """Bring the borne share of each payload's mass nearer to the wanted share, by at most ``change``."""
         inertias = {held.joint: self.robot.model.inertias[held.joint] for held in self._payloads.values()}
         for arm, held in self._payloads.items():
             way = self._wanted_borne[arm] - self._borne[arm]
@@ -168,7 +171,7 @@ class ImpedanceController:
         self._ramping = True
 
     def in_force(self, arm: str) -> dict[str, float]:
-        """Return the present values of ``LIVE_IMPEDANCE`` of an arm."""
+        """Return an arm's present values of the settings in ``LIVE_IMPEDANCE``."""
         return dict(zip(LIVE_IMPEDANCE, self._springs[self._arms.index(arm)].tolist(), strict=True))
 
     def step(self, reference: Reference, state: RobotState, dt: float, extra: Array | None = None) -> TorqueCommand:

@@ -47,7 +47,7 @@ def plausible(numbers: Array) -> bool:
 def clip_errors(errors: Array, position: float, rotation: float) -> BoolArray:
     """Shorten ``errors`` (k, 6) to at most ``position`` [m] and ``rotation`` [rad].
 
-    Returns True for each error that was longer (k,).
+    The result (k,) is True for each error that was longer.
     """
     clipped = np.zeros(len(errors), dtype=np.bool_)
     for i in range(len(errors)):
@@ -67,13 +67,13 @@ def inertia_and_damping(mobility: Array, stiffness: Array) -> tuple[Array, Array
     ``mobility`` is J M^-1 J' (6, 6), whose inverse is Lambda (Khatib 1987, eq. 18). The damping gives every mode of
     Lambda x'' + D x' + K x = 0 the same ratio, by double diagonalisation (Albu-Schaeffer, Ott, Frese, Hirzinger:
     "Cartesian impedance control of redundant robots: recent results with the DLR-light-weight-arms", ICRA 2003):
-    K v = lambda Lambda v, V' Lambda V = I, Q = V^-1, D = 2 Q' diag(xi sqrt(lambda)) Q. K being diagonal,
+    K v = lambda Lambda v, V' Lambda V = I, Q = V^-1, D = 2 Q' diag(xi sqrt(lambda)) Q. Because K is diagonal,
     K^1/2 J M^-1 J' K^1/2 = U diag(lambda) U' gives Q' = K^1/2 U diag(lambda)^-1/2, and with it Lambda = Q' Q.
 
-    Near a singular posture some lambda vanishes, and Lambda and the damping force would grow without bound. A lambda is
-    the square of a mode's frequency. It is therefore raised to at least the value that belongs to a mass of 1000 kg.
-    All other modes stay exact. A damping term on the diagonal would instead make the projector with Lambda inexact in
-    every posture.
+    A lambda is the square of a mode's frequency. Near a singular posture, some lambda vanishes, and Lambda and the
+    damping force would grow without bound. Each lambda is therefore raised to at least the value that belongs to a mass
+    of 1000 kg. Modes with a larger lambda stay exact. A damping term on the diagonal would instead make the projector
+    with Lambda inexact in every posture.
     """
     root = np.sqrt(stiffness)
     scaled = np.zeros((6, 6))
@@ -118,7 +118,7 @@ class ImpedanceData(NamedTuple):
     due: Array  # (2, nv) q and v of the reference that is due now.
     springs: Array  # (k, 5) The values of ``LIVE_IMPEDANCE`` for each arm.
     M: Array  # (nv, nv) Joint-space inertia matrix.
-    torque: Array  # (nv,) Input: torque of gravity and velocity. Output: torque of the law [Nm].
+    torque: Array  # (nv,) Input: torque of gravity and Coriolis forces. Output: torque of the control law [Nm].
     commanded: Array  # (nv,) The last torque, within all bounds [Nm].
     saturated: BoolArray  # (nv,) Joints that would need more than their torque limit.
     late: BoolArray  # (nv,) Joints whose torque would have to change faster than its rate limit allows.
@@ -200,7 +200,7 @@ def impedance_torque(
 
 @numpy_kernel
 def _add_springs(model: ImpedanceModel, data: ImpedanceData, q: Array, v: Array) -> None:
-    """Add the impedance torques of all arms to ``data.torque``, and write ``data.repulsion`` of the limits.
+    """Add the impedance torques of all arms to ``data.torque``. Write the torque of the limits to ``data.repulsion``.
 
     The torque of an arm is J' (K e + D e') + N t_p. The first part is the Cartesian impedance. The second part is the
     null-space impedance: the torque t_p of the posture, projected by N into the nullspace of the tool's motion.

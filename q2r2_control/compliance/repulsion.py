@@ -14,33 +14,33 @@ from the q and v that were measured in this tick. The wall is added before torqu
 d is the distance and d' its rate. c is the damping of ratio xi at the pair's effective mass m = 1 / (g' M^-1 g) with
 g = dd/dq (Khatib, IJRR 1987); over the first two millimetres of x, it rises from 0 to this value. The torque is
 continuous in q and v, and never pulls two bodies together. Its elastic part is the negative gradient of
-U = sum k x^2 / 2:  the wall gives back at most the energy that was put in. Distances are the smooth ones of
-pair_distance.py. If bodies lie along each other, the torque therefore does not switch from end to end.
+U = sum k x^2 / 2:  the wall gives back at most the energy that was put in. The law uses the smooth distances of
+pair_distance.py. If two long bodies are parallel, the torque therefore does not jump between their ends.
 
 **Why many pairs do not add up to an unstable stiffness.** All pairs act through the same joints. With K = sum k g g'
-and D = sum c g g', the largest eigenvalue of M^-1 K is at most its trace, sum k / m, and that of M^-1 D at most sum c /
-m. If the torque is held over a period h, a mode with stiffness w^2 and damping 2 z is stable exactly when h w^2 / 2 <
-2 z < 2 / h  (Colgate and Schenkel, 1997, for the lower bound). T = 2 ms is the longest period. The stiffness of all
-pairs is scaled down together if sum k / m would exceed 0.25 / T^2, and the damping if sum c / m would exceed 0.5 / T.
-These values are a quarter of the stable bounds. That suffices for one period of delay, and for masses that are wrong by
-a factor of two. Then c > h k / 2 for every pair, as long as no more than 16 pairs are scaled down together. The only
-exception is the first hundredths of a millimetre, in which c is still rising. A pair begins to count in the sums two
-millimetres outside its kept distance, with a weight that rises from 0 to 1, so that the scale does not jump. The scale
-only makes the wall softer. If it is below 1 (never for two iiwa 7 with the default stiffness), the elastic torque also
-lacks the part of the gradient of U that comes from the scale.
+and D = sum c g g', the largest eigenvalue of M^-1 K is at most its trace, sum k / m. The largest eigenvalue of M^-1 D
+is at most sum c / m. If the torque is held over a period h, a mode with stiffness w^2 and damping 2 z is stable exactly
+when h w^2 / 2 < 2 z < 2 / h  (Colgate and Schenkel, 1997, for the lower bound). T = 2 ms is the longest period. The
+stiffness of all pairs is scaled down together if sum k / m would exceed 0.25 / T^2, and the damping if sum c / m would
+exceed 0.5 / T. These values are a quarter of the stable bounds. That suffices for one period of delay, and for masses
+that are wrong by a factor of two. Then c > h k / 2 for every pair, as long as no more than 16 pairs are scaled down
+together. The only exception is the first hundredths of a millimetre, in which c is still rising. A pair begins to count
+in the sums two millimetres outside its kept distance, with a weight that rises from 0 to 1, so that the scale does not
+jump. The scale only makes the wall softer. If it is below 1 (never for two iiwa 7 with the default stiffness), the
+elastic torque also lacks the part of the gradient of U that comes from the scale.
 
 **The greatest load.** d_min is the distance that a pair keeps. At rest, the wall withstands a force of k d_min or
 F_max, whichever is less. In motion, it takes up at most the energy F_max d_min for each pair. The impedance of the
-joints takes up further energy. Bodies that meet with more energy are slowed down, but touch. Fingers that may come
-within a millimetre therefore touch at a push of 10 N.
+joints takes up further energy. Bodies that meet with more energy are slowed down, but touch. Two fingers with a kept
+distance of 1 mm therefore touch if a push of more than 10 N acts on them.
 
 **Fingers** have the same bodies as in the controller, for the openings that the controller has accepted. With bodies
-that cover all openings, the wall would push the arms out of postures that the reference may take. If a body has grown,
-it touches no wall at the reference. At other postures, the torque of the wall rises no faster than the impedance's rate
-limit allows.
+that cover all openings, the wall would push the arms out of postures that the reference may take. If a body of a finger
+has grown, no wall acts on it at the posture of the reference. At other postures, a wall may begin to act at once, but
+its torque rises no faster than the impedance's rate limit allows.
 
-**Moving obstacles** count only while they stay where they are. If a moving obstacle counted, each report would let x
-jump, put the energy k x^2 / 2 into the wall, and push an arm that rests.
+**Moving obstacles** count only while they are at rest. If an obstacle counted while it moves, each report of its pose
+would make x jump. This jump would put the energy k x^2 / 2 into the wall, and push an arm that rests.
 """
 
 from __future__ import annotations
@@ -81,9 +81,9 @@ _SMOOTHING = 0.07
 # If two cores are closer than this share of the sum of the radii, their distance is measured exactly, because smoothing
 # would weaken the force.
 _DEEP = 0.25
-# The wall pushes bodies that may touch only at a greater depth than this, relative to the sum of the radii.
+# Two bodies that may touch are pushed apart beyond this depth, which is relative to the sum of their radii.
 _SOFT = 0.5
-# Stands for a moving obstacle that has no effect. It lies far below the cell.
+# A moving obstacle that has to have no effect is replaced by this obstacle, which lies far below the cell.
 _OUT_OF_REACH = MovingObstacle(shape="sphere", size=(0.1,), position=(0.0, 0.0, -20.0), speed=0.0)
 
 
@@ -242,7 +242,8 @@ class MeasuredSeparation:
         pairs = collision.pairs
         self._bodies, self._pairs = collision.bodies, pairs
         self._shell, self._smoothing, self._deep = np.zeros((3, len(pairs.first)))
-        # For each obstacle, its pairs with the arms. The last pairs are those of held objects, and are left out.
+        # For each obstacle, the distances of its pairs. Its last pairs are its pairs with held objects, and are left
+        # out.
         by_obstacle = kept_by_obstacles(robot, settings).values.reshape(max(len(self._obstacles), 1), -1)
         count = by_obstacle.shape[1] - len(robot.objects.by_arm) if self._obstacles else 0
         self._kept_by_obstacles = by_obstacle[:, :count].ravel()
@@ -255,7 +256,7 @@ class MeasuredSeparation:
         self._measured = self._kernel_data.measured.reshape(-1)  # A view of ``measured``, which has the same memory.
         self._model_pointer, self._data_pointer = pointer_to(model), pointer_to(self._kernel_data)
         self._pair_names = [(names[one], names[other]) for one, other in zip(pairs.first, pairs.second, strict=True)]
-        # Every kernel runs once here, so that none is compiled during a motion.
+        # Every kernel runs once here, so that no kernel is compiled during a motion.
         self._find_near = bound(find_near, self._model_pointer, self._data_pointer)
         self._repulsion_torque = bound(repulsion_torque, self._model_pointer, self._data_pointer, 0)
         self._no_torque = np.zeros(robot.model.nv)
@@ -268,7 +269,7 @@ class MeasuredSeparation:
             self.set_kept_distances(self._kept)
 
     def set_obstacles(self, obstacles: Mapping[str, MovingObstacle]) -> None:
-        """Set the moving obstacles that stay where they are, by name. All others have no effect on the arms."""
+        """Set the moving obstacles that are at rest, by name. All other moving obstacles have no effect on the arms."""
         for name, number in self._obstacles.items():
             write_body(self._bodies, number, obstacles.get(name, _OUT_OF_REACH))
         self.set_kept_distances(self._kept)

@@ -13,7 +13,8 @@ from q2r2_control.errors import raised
 from q2r2_control.types import Array
 
 Answer = tuple[Array, Array]
-_MAX_LENGTH = 120  # If a user's function raises an exception, the line has at most this much of its text [characters].
+# If a user's function raises an exception, the line contains at most this many characters of the exception's text.
+_MAX_LENGTH = 120
 
 
 def answer_of(ask: Callable[[Array, Array], object], q: Array, v: Array, shapes: str = "") -> Answer | str:

@@ -18,7 +18,7 @@ def factorise(A: Array) -> bool:
 
     Only the diagonal and the upper triangle of A have to be given. The part above the diagonal is left as it is.
 
-    Returns False if A is not positive definite. The content of A is then of no use.
+    Returns False if A is not positive definite. A must then not be used.
     """
     for j in range(A.shape[0]):
         diagonal = A[j, j]

@@ -19,7 +19,7 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import ActiveLimit, Array, LimitKind
 
 HARD_TOLERANCE = 1e-4  # Permitted violation of a hard row of unit norm, because solvers have a tolerance [rad/s].
-_ACTIVE = 1e-7  # A row of unit norm that is this near to its bound is active [rad/s].
+_ACTIVE = 1e-7  # A row of unit norm that is this near to its bound counts as active [rad/s].
 _TINY = 1e-9  # If the norm of a row is smaller than this, the row counts as depending on no joint.
 
 
@@ -45,8 +45,8 @@ class Constraint(Protocol):
         """Return the rows A v+ >= lower that the next joint velocities v+ have to satisfy.
 
         An equality is two rows, one of them the negative of the other. To keep a distance d(q) above 0, return
-        J_d v+ >= -gain d with the gradient J_d and a gain of about 5 /s. The method is called at every substep and by
-        :meth:`CartesianController.problem`, so that its answer may depend on q and v only.
+        J_d v+ >= -gain d with the gradient J_d and a gain of about 5 /s. The method is called at every substep, and
+        also by :meth:`CartesianController.problem`. Its answer must therefore depend on nothing but q and v.
 
         Args:
             q: Joint positions of the reference (nv,) [rad].
@@ -80,7 +80,7 @@ class OwnConstraints:
         nv = robot.model.nv
         # Left-hand sides of the rows (k, nv), of unit norm, and their lower bounds (k,) [rad/s].
         self.matrix, self.lower = np.zeros((0, nv)), np.zeros(0)
-        self.hard = 0  # Number of hard rows, which are the last ones.
+        self.hard = 0  # Number of hard rows, which come last.
         self._names: list[str] = []  # For each row, the key and the class name of its constraint.
         self._unknown = False  # Whether a hard constraint has no usable answer.
 

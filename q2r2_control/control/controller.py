@@ -43,9 +43,9 @@ class CartesianController(WatchedPairs):
 
     The contract holds for every sequence of targets and every dt in (0, 0.1] s. All numbers are finite, and no
     exception is raised. Joints keep their limits of position, velocity and acceleration. Every monitored pair keeps its
-    distance, also between ticks and during a stop. Its distance is ``min_distance``, or the one in ``distances`` or
-    ``pairs``. If the targets stay constant, the arms come to rest. The reference is the controller's own state. It
-    follows the targets and not the measured joints, so that noise never enters it.
+    distance, also between ticks and during a stop. This distance is ``min_distance``, unless ``distances`` or ``pairs``
+    has another distance for the pair. If the targets stay constant, the arms come to rest. The reference is the
+    controller's own state. It follows the targets and not the measured joints, so that noise never enters it.
 
     One tick is three calls. :func:`assemble` takes the targets, writes the QP and finds the minimum of its cost. If
     this minimum breaks a constraint, a solver solves the QP. :func:`move_reference` moves the reference by the part of
@@ -105,7 +105,7 @@ class CartesianController(WatchedPairs):
 
     @property
     def settings(self) -> ControllerSettings:
-        """The settings of the last :meth:`change`, or those of the constructor."""
+        """The settings of the last :meth:`change`; before it, the settings of the constructor."""
         return self._live.settings
 
     def change(self, values: Mapping[str, Any]) -> str | None:
@@ -131,7 +131,8 @@ class CartesianController(WatchedPairs):
         self._move = bound(move_reference, model, data, self._solution, False, self.settings.max_substep, 1.0)
         self.step({arm: self.tool_pose(arm) for arm in self._arms}, self.settings.max_substep)
         problem = self._qp.problem
-        # The minimum is left out, because at home it may be the solution, and the solver would then not be set up.
+        # The minimum of the cost may be the solution at home, and the solver would then not be set up. The minimum is
+        # therefore removed.
         problem.minimum = None
         self._solver.solve(problem)
 
@@ -198,7 +199,7 @@ class CartesianController(WatchedPairs):
         Args:
             targets: As in :meth:`step`.
             dt: Duration of the step, above 0 and up to 0.1 [s]. If it is above ``max_substep``, the step is split, and
-                the QP is that of the first part.
+                the QP of the first part is returned.
             posture: As in :meth:`step`.
 
         Returns:
@@ -226,9 +227,9 @@ class CartesianController(WatchedPairs):
     ) -> Reference:
         """Take a step with a solution of :meth:`problem` that your program has found. It is certified as every step is.
 
-        The result is that of :meth:`step` with a solver that finds the same solution. ``x`` is not trusted: it is
-        clamped to the bounds, and executed as far as it can be certified. None, fewer than nv numbers, another shape,
-        and numbers that are not finite count as a failed solve. Then the certified stop is executed, and
+        The result is the same as that of :meth:`step` with a solver that finds this solution. ``x`` is not trusted: it
+        is clamped to the bounds, and executed as far as it can be certified. None, fewer than nv numbers, another
+        shape, and numbers that are not finite count as a failed solve. Then the certified stop is executed, and
         ``report.unsolved`` says so.
 
         Args:
@@ -344,7 +345,7 @@ class CartesianController(WatchedPairs):
         self._observe_again(self._unchanged)
 
     def hold_at(self, q: Array | None) -> None:
-        """Let arms without a target go to the posture ``q`` and hold there. The contract holds as always.
+        """Let arms without a target go to the posture ``q`` and stay there. They keep all limits and distances.
 
         The speed of a joint is 4 /s times its remaining distance. For slower motion, change ``q`` slowly from call to
         call.
@@ -418,7 +419,8 @@ class CartesianController(WatchedPairs):
 
         The safety filter may mix the solution with the stop. The mixture is then checked against the constraints. If it
         breaks a constraint, the move is undone: posture, velocity and the known stop (safety_filter.py) get their
-        values from before the step. A stop depends on nothing else, so the stop that was certified before is executed.
+        values from before the step. A stop depends only on these values, so the stop that was certified before is
+        executed.
         """
         own, problem, state = self._qp.constraints, self._qp.problem, self._state
         usable = solved and own.permit(np.clip(self._solution, problem.lower, problem.upper))

@@ -3,8 +3,8 @@
 If a target is held until the next target comes, it stands still in most steps, and jumps in one of them. At each jump,
 the controller would move some joint at its acceleration limit. Here, poses between the earlier and the newest target
 are interpolated: on a straight line, with a constant angular velocity. The interpolation takes 1.25 times as long as
-the earlier target was held, so the newest target is reached later by that time. A target that changes at every step, or
-after more than :data:`LONGEST_HOLD`, is passed on at once.
+the earlier target was held, so the newest target is reached only after this time. A target that changes at every step,
+or after more than :data:`LONGEST_HOLD`, is passed on at once.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ LONGEST_HOLD = 0.11  # If a target was held for longer than this, it belonged to
 _SPARE = 1.25
 _FARTHEST = 1e3  # Largest coordinate of a target that is interpolated. No arm could reach farther [m].
 # Largest difference of R R' from the identity, for the rotation R of a target that is interpolated. The controller
-# itself refuses targets for which it is more than twice as large.
+# itself refuses targets for which this difference is more than twice as large.
 _ORTHONORMAL = 5e-4
 _STEPS = 1.5  # If a target changes after fewer steps than this, targets are new at (nearly) every step.
 
@@ -56,7 +56,10 @@ class _TargetPath:
 
 
 class HeldTargets:
-    """The targets of all arms. While a caller holds an arm's target, poses from the earlier one to it are returned."""
+    """The targets of all arms.
+
+    While a caller gives the same target for an arm, poses between the target before and this target are returned.
+    """
 
     def __init__(self) -> None:
         self._paths: dict[str, _TargetPath] = {}
@@ -68,8 +71,8 @@ class HeldTargets:
     def between(self, targets: Mapping[str, pin.SE3 | None], dt: float) -> dict[str, pin.SE3 | None]:
         """Return the targets to follow in a step of ``dt`` [s].
 
-        While the caller gives the same pose for an arm, the arm's targets are interpolated from the pose before to this
-        pose.
+        While the caller gives the same pose for an arm, the arm's targets are interpolated. They lead from the pose
+        that the caller gave before to this pose.
         """
         found: dict[str, pin.SE3 | None] = {}
         for arm, pose in targets.items():

@@ -14,7 +14,7 @@ from q2r2_control.control.kernel_compiler import Kernel
 
 
 def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile ``function`` at its first call: strict IEEE arithmetic, no Python objects, a division by 0 gives inf.
+    """Compile ``function`` at its first call, with strict IEEE arithmetic (x / 0 is inf) and without Python objects.
 
     The function must not allocate memory. The compiled code therefore does not count references to arrays.
     """
@@ -34,13 +34,13 @@ def numpy_kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     return _compiled(function)
 
 
-_kernels: list[Any] = []  # All dispatchers of this process.
+_kernels: list[Any] = []  # Numba's dispatchers of all kernels in this process.
 
 
 def _compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
     if numba.config.DISABLE_JIT:
         return function
-    # Nothing calls a kernel through a C wrapper. Without this option, it would be compiled besides the Python wrapper.
+    # Nothing calls a kernel through a C wrapper. Without this option, Numba would compile this wrapper too.
     options |= {"nopython": True, "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
     compiled: Any = Kernel(function, options)
     compiled._cache = KernelCache(function)

@@ -1,9 +1,9 @@
 """Keep the machine code of kernels between runs.
 
-Numba's own cache looks only at the path and the time of the compiled function's file. After an edit, a kernel that
-calls another module's kernel would go on running that module's old code. A second checkout would compile everything
-again. The name of the cache folder is therefore a hash of all source files from which machine code is made. In this
-folder, the machine code of a kernel is found by its module's name and its file's content.
+Numba's own cache looks only at the path and the time of the compiled function's file. If a kernel of another module is
+edited, its callers would therefore still run the old code. A second checkout would compile everything again. The name
+of the cache folder is therefore a hash of all source files from which machine code is made. In this folder, the machine
+code of a kernel is found by its module's name and its file's content.
 """
 
 from __future__ import annotations
@@ -60,7 +60,8 @@ def _cache_folder() -> Path:
         _delete_old_versions(root)
         return folder
     except (OSError, RuntimeError) as error:
-        # Numba runs the content as code. A folder that other users could have made is therefore not used instead.
+        # Numba runs the files of the cache as code. The cache is therefore never in a folder that another user could
+        # have made. The kernels of this process go to a new folder.
         warnings.warn(
             f"compiled kernels cannot be kept: {error}. Every start compiles them anew; set XDG_CACHE_HOME to a folder "
             "that can be written",

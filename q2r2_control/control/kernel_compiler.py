@@ -68,8 +68,8 @@ class _WholeLibrary(JITCodeLibrary):
         super().finalize()
 
     def _optimize_final_module(self) -> None:
-        # Numba itself optimises twice, because only after the first time does it find some superfluous code that counts
-        # references.
+        # Numba itself optimises twice, because it finds some superfluous code that counts references only at the second
+        # time.
         manager, builder = self._codegen._module_pass_manager()
         manager.run(self._final_module, builder)
 
@@ -92,7 +92,8 @@ class _PartCompiler(_WholeCompiler):
 class Kernel(CPUDispatcher):
     """A function that is compiled for each combination of argument types with which it is called."""
 
-    _being_compiled = 0  # Number of whole kernels that are being compiled. Meanwhile, other kernels become parts.
+    # Number of whole kernels that are being compiled. While it is above 0, other kernels become parts.
+    _being_compiled = 0
 
     def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
         super().__init__(function, targetoptions=options, pipeline_class=_WholeCompiler)
@@ -103,7 +104,7 @@ class Kernel(CPUDispatcher):
         self._part_compiler = numba_compiler(function, self.targetdescr, part_options, {}, _PartCompiler)
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
-        """Return the template with which Numba types a call of this kernel. If a kernel calls it, a part suffices."""
+        """Return the template with which Numba types a call of this kernel. For a call by a kernel, a part suffices."""
         with global_compiler_lock:
             self._wanted_as_part = Kernel._being_compiled > 0
             return super().get_call_template(args, kws)

@@ -1,8 +1,8 @@
 """Pass a model or its data to kernels by one address, so that there is less code to compile.
 
 A named tuple of arrays is written to memory once, in the layout of Numba's own struct. Kernels pass its address to each
-other, and read each attribute where they use it. Without such an address, they would pass all the numbers with which
-Numba represents a model's arrays, which are hundreds.
+other, and read each attribute where they use it. Without such an address, they would pass the hundreds of numbers with
+which Numba represents a model's arrays.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class _Address(types.Type):
 
     @property
     def key(self) -> Any:
-        """The type of the value. A name is no key, because two named tuples with different fields may have the same."""
+        """The type of the value. The name is not used, because two different named tuples may have the same name."""
         return self.pointee
 
 

@@ -3,7 +3,8 @@
 **Distances.** The known stop is the stop that was certified last (safety_filter.py). If the required distance of a pair
 became greater at once, the known stop could lose its certificate. The distance that a pair keeps therefore grows only
 as far as the known stop is certified with it. This bound is d - S - buffer,  where d is the distance of the pair at the
-reference, and S bounds by how much the stop brings the pair closer (stop_certificate.py). The kept distance of a pair
+reference, and S is an upper bound on how much the known stop reduces this distance (stop_certificate.py). The kept
+distance of a pair
 
 - falls at once if the requested distance is smaller, since the known stop stays certified;
 - grows at ``GROWTH`` towards the requested distance, up to the bound, before a step is decided on. The step is then
@@ -13,8 +14,8 @@ reference, and S bounds by how much the stop brings the pair closer (stop_certif
 After a reset, each pair keeps the distance of the controller's first settings, or the requested distance if that is
 smaller. If the requested distance is greater, the pair keeps at once as much of it as the posture allows. If a pair
 starts closer than its kept distance, the controller recovers until the pair has its whole buffer. If a pair starts
-within the buffer, the QP stops it where it is, with ``LEAST_BUFFER`` at least. The buffer of this pair then grows with
-d - S as above. Arms that rest within the buffer are not pushed apart.
+within the buffer, its buffer is reduced, but not below ``LEAST_BUFFER``, so that the QP stops the pair where it is. The
+buffer of this pair then grows with d - S as above. Arms that rest within the buffer are not pushed apart.
 
 **Held objects.** A pair of an object counts only while the object is held; otherwise its kept distance is minus
 infinity. When an object is gripped, each of its pairs keeps d - S - buffer, or the distance of its class if that is
@@ -22,8 +23,8 @@ less. The known stop is then certified with the object too, so that the object n
 distance grows with later values of d and S, and never falls. If two objects overlap when the second object is gripped,
 it is assumed that both hands hold the same object. Its two bodies are not kept apart until one hand releases it.
 
-**Gains** and weights change linearly to their new values: all arrays of the tasks that differ between the old and the
-new settings, and the gain of the separation rows. The certificate reads none of them.
+**Gains** and weights change linearly to their new values. These are all arrays of the tasks that differ between the old
+and the new settings, and the gain of the separation rows. The certificate does not depend on them.
 """
 
 from __future__ import annotations
@@ -74,7 +75,7 @@ class ObjectPairs:
         self._write(np.full(len(self._holders), -np.inf))
 
     def set_holding(self, arm: str, holds: bool) -> bool:
-        """Note whether an arm's gripper holds its object; return whether this is a change.
+        """Store whether an arm's gripper holds its object; return whether this has changed.
 
         Pairs that begin to count keep the distance of their class at first. The caller then measures these pairs and
         calls :meth:`begin`.
@@ -96,7 +97,7 @@ class ObjectPairs:
         return True
 
     def begin(self) -> None:
-        """Let the pairs that have begun to count keep as much distance as is certified. Measure these pairs before."""
+        """Let the pairs that have begun to count keep as much distance as is certified. Measure them before."""
         kept = np.where(self._new, np.minimum(self._goal, self._within_reach()), self.kept)
         overlap = self._data.distance[self._range] < np.minimum(self._goal, 0.0)
         if (overlap & self._shared & self._new).any():  # Both hands hold one object.
@@ -158,11 +159,11 @@ class LiveSettings:
 
     @property
     def narrow(self) -> int:
-        """The pair whose kept distance is farthest below the requested one; -1 if all pairs keep what is requested."""
+        """The pair whose kept distance is farthest below its requested distance; -1 if no kept distance is below it."""
         return int(np.argmax(self._goal - self.kept)) if self._growing else -1
 
     def change(self, settings: ControllerSettings) -> str | None:
-        """Change to ``settings``, which may differ only in what ``LIVE`` names; return None, or why it was refused."""
+        """Change to ``settings``, which may change only what ``LIVE`` names; return None, or why they are refused."""
         before, goal = self.settings.min_distance, kept_distances(self._robot, settings)
         if settings.min_distance > before:
             if settings.min_distance > CLEARANCE:
@@ -193,7 +194,7 @@ class LiveSettings:
         self._approach_gains(self._ramp)
 
     def begin(self) -> None:
-        """After the reset, let pairs keep as much as the posture allows.
+        """After the reset, let pairs keep as much distance as the posture allows.
 
         Pairs that are within their buffer get a smaller buffer.
         """

@@ -31,7 +31,7 @@ class MovingObstacles:
         pointers: tuple[KernelPointer, ...],
         geometry: pin.GeometryModel,
     ) -> None:
-        """Take the pointers to the kernels' model and data, whose bodies and pairs are those of ``geometry``."""
+        """Take the pointers to the kernels' model and data, which have the bodies and pairs of ``geometry``."""
         model: KernelModel = pointers[0].value
         self._robot, self._bodies, limits = robot, model.safety.collision.bodies, model.safety.limits
         names, last = [item.name for item in geometry.geometryObjects], len(geometry.collisionPairs)
@@ -69,7 +69,7 @@ class MovingObstacles:
         return {name: ObstacleReport(self.there[name], age) for name, age in ages if name in self.there}
 
     def put(self, name: str, obstacle: MovingObstacle | None) -> IntArray:
-        """Take a report of an obstacle; None if it has gone. Returns an array (g,): 1 for the body that has changed.
+        """Take a report of an obstacle, or None if it has gone. Returns an array (g,): 1 for the body that has changed.
 
         Until :meth:`keep_clear` is called, all pairs with obstacles keep the distances that they need while the arms
         stop. Raises the same exceptions as :func:`check_obstacle`.
@@ -91,7 +91,7 @@ class MovingObstacles:
         return changed
 
     def hold(self, holding: frozenset[str]) -> None:
-        """Note that the grippers of exactly these arms hold their objects."""
+        """Store that the grippers of exactly these arms hold their objects."""
         self._holding = holding
         self._count()
 
@@ -120,7 +120,7 @@ class MovingObstacles:
         self.data.age[:] += time
 
     def _count(self) -> None:
-        """Let a pair count if its obstacle is present, and if its object, should it have one, is held."""
+        """Let a pair count if its obstacle is present, and, for a pair of an object, if the object is held."""
         if not self._number:
             return
         there = np.repeat([name in self.there for name in self._number], len(self._goal) // len(self._number))

@@ -6,8 +6,8 @@
 The box is never empty (joint_limits.py) and the rows are soft. A solution therefore always exists. Rows have unit norm,
 so that a slack is a joint speed. If the minimum of the cost violates only row i, the share SOFTNESS of this violation
 remains in the solution as slack. The factor a_i' H^-1 a_i in rho_i, which is the compliance of the cost along row i,
-makes this true however large the weights of the cost are. If the minimum of the cost alone keeps the box and the rows,
-it is the solution, and no solver is called.
+makes this true however large the weights of the cost are. If the minimum of the cost alone is within the box and
+satisfies the rows, it is the solution, and no solver is called.
 """
 
 from __future__ import annotations
@@ -46,11 +46,12 @@ class QpProblem:
         g: Vector of the cost (nv,).
         lower: Least next velocities (nv,) [rad/s], from the limits of position, velocity and acceleration.
         upper: Greatest next velocities (nv,) [rad/s].
-        rows: Left-hand sides (m, nv), of unit norm: separation first, then soft constraints, then hard ones.
+        rows: Left-hand sides (m, nv), of unit norm: first the rows of separation, then the soft constraints, then the
+            hard constraints.
         rows_lower: Right-hand sides (m,) [rad/s].
-        minimum: Minimum of the cost alone (nv,) [rad/s] if it keeps box and rows, so that it is the solution; None if
-            it does not.
-        hard: Number of hard rows, which are the last ones.
+        minimum: Minimum of the cost alone (nv,) [rad/s]; None if it is outside the box or breaks a row. If it is not
+            None, it is the solution.
+        hard: Number of hard rows, which come last.
     """
 
     H: Array

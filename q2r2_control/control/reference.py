@@ -83,7 +83,7 @@ def _observe(model: KernelModel, data: KernelData) -> Observed:
     if safety.distance.shape[0] == 0:
         return 0, np.inf, 0, np.inf
     closest = measure_pairs(model.safety, safety)
-    while True:  # Lower bounds are replaced by exact distances until the least margin is an exact one.
+    while True:  # Lower bounds are replaced by exact distances until the smallest margin is exact.
         tightest, least = 0, np.inf
         for p in range(safety.distance.shape[0]):
             margin = safety.distance[p] - model.safety.min_distance[p]

@@ -28,7 +28,7 @@ class LimitNames:
         both = zip(pairs.first.tolist(), pairs.second.tolist(), strict=True)
         self.pairs = [
             (names[first], names[second]) for first, second in both
-        ]  # The pairs are those of the cell, then of objects, then of obstacles.
+        ]  # First come the pairs of the cell, then the pairs of objects, then the pairs of obstacles.
         # Key and result of the last call of :meth:`of`, because in most ticks the same limits are active as before.
         self._last: tuple[bytes, tuple[ActiveLimit, ...]] = b"", ()
         self._by_kind: dict[int, list[ActiveLimit]] = {

@@ -1,4 +1,4 @@
-"""What each arm has to do: its tool follows a checked target with a velocity, or its joints hold their positions."""
+"""What each arm has to do: its tool follows a checked target and its velocity, or its joints hold their positions."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ class TargetTracker:
             self._targets.latched[:] = 1
 
     def aim_posture(self, posture: npt.ArrayLike | None) -> None:
-        """Let the joints that the tools leave free move to ``posture`` (nv,) [rad], or to home if it is None.
+        """Let joints move to ``posture`` (nv,) [rad] as far as the tools leave them free; None stands for home.
 
         An invalid posture changes nothing.
         """

@@ -61,7 +61,7 @@ class WatchedPairs:
 
     @property
     def narrow_pair(self) -> tuple[str, str] | None:
-        """The pair whose kept distance is farthest below the requested one; None if no kept distance is below it."""
+        """The pair whose kept distance is farthest below the requested distance; None if there is no such pair."""
         return None if self._live.narrow < 0 else self._names.pair(self._live.narrow)
 
     def set_opening(self, arm: str, least: float, greatest: float) -> tuple[str, str] | None:
@@ -103,8 +103,8 @@ class WatchedPairs:
         """Declare that the gripper of an arm holds its object from the next step on, or no longer holds it.
 
         A held object is part of the tool. At first, each of its pairs keeps at most its present distance. The kept
-        distance (:attr:`object_distances`) grows with the distance, up to the one of the pair's class. The object is
-        therefore always accepted, and no arm has to move because of it. After :meth:`reset` no object is held.
+        distance (:attr:`object_distances`) grows with the distance, up to the distance of the pair's class. The object
+        is therefore always accepted, and no arm has to move because of it. After :meth:`reset` no object is held.
 
         Raises:
             RobotError: If the arm has no object.
@@ -164,16 +164,16 @@ class WatchedPairs:
 
     @property
     def skew(self) -> float:
-        """Greatest difference between the delays of two arms behind the reference [s]; 0 if they follow alike."""
+        """Greatest difference between the delays of two arms behind the reference [s]; 0 if the delays are equal."""
         return float(self._data_pointer.value.safety.history.window[0])
 
     def allow_skew(self, time: float) -> None:
-        """Let the delays of the arms behind the reference differ by up to ``time`` [s], and each arm stop on its own.
+        """Let the arms' delays behind the reference differ by up to ``time`` [s], and let each arm stop on its own.
 
-        From the next step on, the bodies of two arms keep their distance at any point of the one arm's path and at any
-        point of the other arm's path. A path begins where the reference was ``time`` [s] ago, and ends where the
-        certified stop ends. A greater time takes effect gradually as time passes, and a smaller time at once. After
-        :meth:`reset` the whole time counts at once.
+        From the next step on, the bodies of two arms keep their distance wherever each of the two arms is on its own
+        path. A path begins where the reference was ``time`` [s] ago, and ends where the certified stop ends. A greater
+        time takes effect gradually as time passes, and a smaller time at once. After :meth:`reset` the whole time
+        counts at once.
 
         Args:
             time: The difference, from 0 to 0.1 [s].

@@ -30,7 +30,7 @@ Openings = dict[str, float]
 class DriveReport:
     """The reports of one tick: of impedance and wall in torque mode, or of the admittance in the other modes.
 
-    A report is None if it belongs to another mode, or if its part is not enabled.
+    A report is None if it belongs to another mode, or if the wall or the admittance is not enabled.
     """
 
     impedance: ImpedanceReport | None = None
@@ -76,13 +76,13 @@ class Drive(ABC):
         """Set the interval of openings that the controller has accepted, for each arm's gripper."""
 
     def set_holding(self, holding: Mapping[str, bool]) -> None:  # noqa: B027
-        """Set for each arm that has an object whether its gripper holds it."""
+        """Set for each arm whether its gripper holds its object."""
 
     def set_kept_distances(self, kept: Array) -> None:  # noqa: B027
         """Set the distance that every pair keeps from now on (p,) [m]."""
 
     def set_obstacles(self, obstacles: Mapping[str, MovingObstacle]) -> None:  # noqa: B027
-        """Set the reported moving obstacles that stay where they are, by name."""
+        """Set the reported moving obstacles that are at rest, by name."""
 
     def displaced(self, targets: ToolTargets, state: RobotState, dt: float) -> ToolTargets:
         """Return the targets for the controller in a tick of ``dt`` [s]. With an admittance, they are displaced."""
@@ -93,7 +93,7 @@ class Drive(ABC):
         return True
 
     def last_command(self, state: RobotState, grippers: Openings) -> Command | None:
-        """Return the command that holds the arms after a run; None if the last command does so."""
+        """Return the command that holds the arms after a run; None if the newest command already holds them."""
         return None
 
 
@@ -118,8 +118,9 @@ def holding_command(q: Array, grippers: Openings) -> Command:
 
 # Gain of the position feedback [1/s]. If the plant has a delay T, gains below about 1 / T are stable; here T is 100 ms.
 FEEDBACK_GAIN = 10.0
-_FRESH_TICKS = 3  # After more ticks than this, a measurement is too old for feedback: the arm has moved since.
-_STILL = 1e-2  # An arm on its spring stands still if its joints are slower than this [rad/s].
+# After more ticks than this, a measurement is too old for feedback, because the arm has moved since then.
+_FRESH_TICKS = 3
+_STILL = 1e-2  # In torque mode, an arm counts as at rest if its joints are slower than this [rad/s].
 
 
 class PositionDrive(Drive):
@@ -209,12 +210,12 @@ class VelocityDrive(PositionDrive):
 
 
 class TorqueDrive(Drive):
-    """Commands torques that follow the reference. Targets are not displaced, because the spring is the compliance.
+    """Commands torques that follow the reference. Targets are not displaced, because the spring lets the arms yield.
 
     **Without a trusted state**, the torque of a spring could push the arms anywhere. If the plant has position servos
     of its own (``has_servos``), the command then contains positions, and the servos follow the reference. Otherwise the
     command is the gravity torque at the newest measured posture, because many drivers repeat the last command for ever.
-    Its flag ``gravity_only`` is then set.
+    The command's flag ``gravity_only`` is then set.
     """
 
     mode = CommandMode.TORQUE

@@ -62,7 +62,7 @@ class CommandAverage:
         return mean_q, mean_v
 
     def _at(self, t: float) -> tuple[Array, Array]:
-        """Return position and velocity of the reference at ``t`` [s], by the cubic through both ends of its tick."""
+        """Return position and velocity of the reference at ``t`` [s], on the cubic through both ends of the tick."""
         after = bisect_right(self._times, t + _ROUNDING)
         if after == 0:
             return self._path[0][0], np.zeros_like(self._path[0][1])

@@ -1,4 +1,4 @@
-"""Compute one tick of control, from measured joints and targets to a command, and the conditions that a hand feels."""
+"""Compute one tick of control, from measured joints and targets to a command. Find what the operator's hands feel."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from q2r2_control.supervision.tick_pacer import TickPacer
 from q2r2_control.teleop.haptics import ArmCondition
 from q2r2_control.types import ArmTiming, Array, Command, LimitKind, Reference, RobotState, StepReport
 
-_PROVEN = Phase.ACTIVE, Phase.BRAKING  # Openings of grippers are certified in these phases only.
+_PROVEN = Phase.ACTIVE, Phase.BRAKING  # Only in these phases are openings of grippers certified.
 
 
 @dataclass(slots=True)
@@ -93,8 +93,8 @@ class ControlLoop:
         self._limiter: GripperLimiter | None = None  # None while the reference may differ from the arms' posture.
         self._kept: Array = controller.kept_distances  # The kept distances that the drive knows [m].
         self._still: Mapping[str, MovingObstacle] = {}  # The obstacles at rest that the drive knows.
-        self.holding: dict[str, bool] = {}  # For each arm that has an object, whether its gripper holds it.
-        self.granted_openings: dict[str, tuple[float, float]] = {}  # By arm, the wanted and the granted opening.
+        self.holding: dict[str, bool] = {}  # For each arm that has an object, whether its gripper holds the object.
+        self.granted_openings: dict[str, tuple[float, float]] = {}  # For each arm, the wanted and the granted opening.
         self._lags = MeasuredLags(robot)
         self._usual_lag = 0.0  # The longest recent lag [s].
         # For each arm whose driver does not report its lag, the time at which the arm was measured [s].
@@ -155,7 +155,7 @@ class ControlLoop:
         self._begin(state, {}, now)
 
     def wait(self, state: RobotState) -> None:
-        """Begin inactive at ``state``, until the states are good and at rest; see :class:`Supervisor`."""
+        """Stay inactive until the states are good and the arms rest, see :class:`Supervisor`. Begin at ``state``."""
         self.controller.reset(state.q)
         self.drive.reset(state)
 
@@ -251,8 +251,8 @@ class ControlLoop:
         """Return the openings to be commanded, and find out whether the grippers hold something.
 
         While the arms do not move, nothing is certified, and a gripper gets the wanted opening, for instance to release
-        an object. If a gripper did not get its wanted opening before the arms stopped, it does not move farther in
-        that direction.
+        an object. There is one exception: a gripper that did not get its wanted opening before the arms stopped does
+        not move farther in that direction.
         """
         if not self._owns_plant and self.supervisor.phase not in _PROVEN:
             self._limiter, self.holding = None, {}
@@ -291,8 +291,8 @@ class ControlLoop:
 def without_proof(wanted: float, before: tuple[float, float] | None) -> float:
     """Return the opening that a gripper gets while the arms do not move, and nothing is certified.
 
-    A gripper gets the wanted opening. If it did not get its wanted opening before, it does not move farther in that
-    direction.
+    A gripper gets the wanted opening, with one exception: a gripper that did not get its wanted opening before does not
+    move farther in that direction.
 
     Args:
         wanted: The wanted opening.
@@ -303,11 +303,14 @@ def without_proof(wanted: float, before: tuple[float, float] | None) -> float:
     return min(wanted, before[1]) if before[0] > before[1] else max(wanted, before[1])
 
 
-_LIMIT_LASTS = 0.5  # A limit that has held a step back counts as reached for this time [s].
+_LIMIT_LASTS = 0.5  # A limit that has limited a step counts as reached for this time [s].
 
 
 class ArmConditions:
-    """Finds the conditions that a hand feels, from the controller and the measured state. Times are the loop's [s]."""
+    """Finds the conditions that an operator's hand feels, from controller and measured state.
+
+    Times are the loop's [s].
+    """
 
     def __init__(self, controller: CartesianController) -> None:
         robot = controller.robot
@@ -317,7 +320,7 @@ class ArmConditions:
         self._limited: dict[str, float] = {}  # Time at which each joint was last at its position limit [s].
 
     def note(self, report: StepReport, now: float) -> None:
-        """Remember the limits that held a step back. It is called in every tick."""
+        """Remember the limits that have limited a step. It is called in every tick."""
         for kind, names in report.binding:
             if kind is LimitKind.POSITION:
                 self._limited[names[0]] = now

@@ -20,10 +20,11 @@ from q2r2_control.robot.pinocchio_models import joint_origin
 _GRIPPER_JOINT = re.compile(r"gripper|finger|jaw|thumb|knuckle", re.IGNORECASE)
 # A wrist joint that turns the gripper, such as gripper_roll_joint, belongs to the arm.
 _WRIST_JOINT = re.compile(r"gripper_?(roll|rotat|twist|yaw|pitch|swivel)", re.IGNORECASE)
-# Names of links that are not the tool. Links beyond a side branch are not the tool either. A sensor may carry the tool.
+# Names of links that are not the tool. Links that are fixed to a side branch are not the tool either, but a link that
+# is fixed to a sensor may be the tool.
 _SIDE_BRANCH = re.compile(r"finger|jaw|thumb|knuckle|camera|antenna|imu", re.IGNORECASE)
 _SENSOR = re.compile(r"sensor|accelerometer|_range", re.IGNORECASE)
-# Names of tool frames. The first one that exists is taken.
+# Patterns for the names of tool frames, in the order in which they are tried.
 _TOOL_FRAMES = [
     re.compile(pattern, re.IGNORECASE)
     for pattern in (r"tcp", r"tool", r"(^|_)eef?(_|$)|end_?effector|endpoint", r"grasp|gripper_?frame", r"flange")
@@ -77,7 +78,7 @@ def end_of(tree: LinkTree, link: str, key: str) -> str:
     """Return the outermost link that is fixed to ``link``. Side branches such as cameras do not count.
 
     Raises:
-        ConfigError: With a text that begins with ``key``, if several links could be meant.
+        ConfigError: With a text that begins with ``key``, if more than one link could be the end.
     """
 
     def is_side_branch(end: str) -> bool:

@@ -62,7 +62,7 @@ class Model:
         self.exclusions = [] if description.srdf is None else [*description.srdf]
 
     def name_in_cell(self, name: str) -> str:
-        # The root link of the cell already has the name WORLD, so a link with this name gets another one.
+        # The root link of the cell already has the name WORLD, so a link with this name gets another name.
         return f"robot_{name}" if not self.prefix and name == WORLD else self.prefix + name
 
     def urdf(self, mount: PoseConfig) -> list[ET.Element]:
@@ -75,8 +75,8 @@ class Mounted(NamedTuple):
     """A flange or a tool on an arm."""
 
     model: Model
-    joint: ET.Element  # The joint between this flange or tool and the part that carries it.
-    is_flat: bool  # True if it sits flat on the end of that part. An SRDF may then exclude pairs between both parts.
+    joint: ET.Element  # The joint between this flange or tool and the part before it.
+    is_flat: bool  # True if it sits flat on the part before it. An SRDF may then exclude pairs between both parts.
 
 
 class ArmAssembly:
@@ -137,16 +137,16 @@ class ArmAssembly:
         return tuple(map(self.name_in_cell, self.config.gripper.joints))
 
     def tool_links(self) -> tuple[str, ...]:
-        """Return the links of the tool, or else of the hand that carries the gripper's joints.
+        """Return the links of the tool, with their names in the cell.
 
-        The links have their names in the cell.
+        Without a tool, these are the links of the hand, to which the gripper's joints are attached.
         """
         has_tool = self.config.tool.model is not None
         links = self.mounted[-1].model.links if has_tool else hand_links(self.tree, self.config.gripper.joints)
         return tuple(sorted(map(self.name_in_cell, links)))
 
     def leave_joints_of(self, others: Sequence[ArmAssembly]) -> None:
-        """Remove joints that also carry another arm, such as those of a torso, unless ``joints`` names them."""
+        """Remove joints that also move another arm, such as the joints of a torso, unless ``joints`` names them."""
         if self.config.joints:
             return
         for other in others:
@@ -161,7 +161,7 @@ class ArmAssembly:
         return [renamed(part, self.name_in_cell) for item in self.mounted for part in [item.joint, *item.model.parts]]
 
     def mounted_exclusions(self) -> list[ET.Element]:
-        """Return the excluded pairs of flange and tool: pairs inside each of them, and pairs with its carrier."""
+        """Return the excluded pairs of flange and tool: pairs within each of them, and pairs with parts before it."""
         parts, carriers = [], [self.model.description]
         for mounted in self.mounted:
             part = mounted.model.description
@@ -236,7 +236,7 @@ class ArmAssembly:
 def load_model(
     config: ArmConfig | RobotConfig | FlangeConfig | ToolConfig, packages: Mapping[str, str], key: str
 ) -> Description:
-    """Return the description that the block ``key`` names; raises :class:`ConfigError` that begins with ``key``."""
+    """Return the description that the block ``key`` names. The text of a :class:`ConfigError` begins with ``key``."""
     model = config.model or ""
     try:
         return load_description(model, config.xacro_args, packages)
@@ -260,7 +260,7 @@ def name_of_stack(parts: Sequence[Description]) -> str:
 
 
 def check_position(joint: ET.Element, position: float, key: str) -> None:
-    """Raise :class:`ConfigError` that begins with ``key`` if ``position`` is outside the joint's limits."""
+    """Raise :class:`ConfigError` if ``position`` is outside the joint's limits. Its text begins with ``key``."""
     lower, upper = joint_limits(joint)
     if lower <= position <= upper:
         return

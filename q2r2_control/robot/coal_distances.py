@@ -15,8 +15,8 @@ class CoalDistances:
         self.model, self.geometry = model, geometry
         self.data: pin.Data = model.createData()
         self.geometry_data: pin.GeometryData = geometry.createData()
-        # This list is made once, because looking up each result again would take longer than measuring. Pinocchio keeps
-        # the results in place.
+        # This list is made once, because looking up each result again would take longer than measuring. Pinocchio
+        # writes later results into the same objects.
         self._results = list(self.geometry_data.distanceResults)
 
     def at(self, q: Array) -> Array:

@@ -8,8 +8,8 @@ the references of a window W [s] until now.
 accelerations of the reference, divided by n. So its jerk is at most 2 A / (n h), and n h >= W = 2 A / j keeps the limit
 j.
 
-**Other limits.** Positions, velocities and accelerations of the mean are means of those of the reference. If the
-reference stays within an interval of a joint, so does the mean.
+**Other limits.** Positions, velocities and accelerations of the mean are means of the reference's positions, velocities
+and accelerations. If the reference stays within an interval of a joint, so does the mean.
 
 **Distances.** A mean of postures is not a posture of the path, but it is near one. Let the reference be at ``q(c + s)``
 at the times of the window around its centre ``c``. The mean of ``q(c + s) - q(c) - s v(c)`` is at most A mean(s^2) / 2,
@@ -80,7 +80,7 @@ def _shift(robot: Robot, item: pin.GeometryObject, off: Array) -> float:
     finger = next((it for it in robot.finger_bodies if isinstance(it, TurningBody) and it.name == item.name), None)
     shape.computeLocalAABB()
     reach = float(np.linalg.norm(item.placement.translation) + np.linalg.norm(shape.aabb_center) + shape.aabb_radius)
-    if finger is not None:  # Its capsule changes with the opening of the gripper.
+    if finger is not None:  # The finger's capsule changes with the opening of the gripper.
         reach = max(reach, finger.extent + finger.radius)
     moved = 0.0
     for joint in reversed(list(model.supports[item.parentJoint])[1:]):

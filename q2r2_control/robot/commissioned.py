@@ -77,7 +77,7 @@ def load_commissioned(path: str | os.PathLike[str], plant: str | None = None, *,
 
     Args:
         path: The cell's YAML, in a form that :func:`load_config` takes.
-        plant: The name of the plant that will move the arms; None for the one that the cell names.
+        plant: The name of the plant that will move the arms; None for the plant that the cell names.
         full_speed: True to let real arms move as fast as the cell says. Otherwise they move at a tenth of this speed.
 
     Raises:

@@ -44,7 +44,7 @@ class ComposedCell:
     name: str
     urdf: str
     srdf: str
-    tool_frames: dict[str, str]  # By arm, the link that the operator moves.
+    tool_frames: dict[str, str]  # For each arm, the link that the operator moves.
     home: dict[str, float]  # Position of every movable joint, with arms at home and grippers open.
     obstacles: tuple[str, ...]  # Names of the fixed obstacles, which are also the names of their links.
     parts: KnownParts  # The roles of links.
@@ -177,7 +177,8 @@ def _check_resting(urdf: ET.Element, resting: Mapping[str, float], home: Mapping
 def _locked_at(urdf: ET.Element, given: Mapping[str, float]) -> dict[str, float]:
     """Return the position of every joint [rad or m].
 
-    It is the ``given`` one, or that of the joint's ``<mimic>``, or else the one nearest to 0 within the limits.
+    It is the position in ``given``, or the position that the joint's ``<mimic>`` demands, or else the position nearest
+    to 0 within the limits.
     """
     joints = urdf.findall("joint")
     followers = followers_of(joints, driven=given)

@@ -69,8 +69,8 @@ def load_description(
 ) -> Description:
     """Find and parse ``model``: a file of robots/ without .urdf, ``example-robot-data:NAME``, or a path to a .urdf.
 
-    A path may be ``package://NAME/...``, where ``packages`` has folders by name. A file that ends in ``.xacro`` is
-    expanded with ``xacro_args``. An SRDF with the same name beside the file belongs to it.
+    A path may be ``package://NAME/...``. ``packages`` contains the folders of packages, by NAME. A file that ends in
+    ``.xacro`` is expanded with ``xacro_args``. An SRDF with the same name beside the file belongs to it.
 
     Raises:
         ConfigError: If there is no such model.
@@ -178,7 +178,7 @@ class LinkTree:
 
     def __init__(self, robot: ET.Element, where: str) -> None:
         links = [link.get("name", "") for link in robot.findall("link")]
-        self.joint_to: dict[str, ET.Element] = {}  # By child link, the joint that carries it.
+        self.joint_to: dict[str, ET.Element] = {}  # For each child link, the joint that connects it to its parent.
         for joint in robot.findall("joint"):
             child = joint_end(joint, "child")
             if child in self.joint_to:
@@ -296,7 +296,7 @@ def _example_robot(name: str) -> tuple[Path, Path | None]:
 
 
 def read_xml(file: Path) -> bytes:
-    """Return the bytes of an XML file. Its first line may name an encoding.
+    """Return the bytes of an XML file. They are not decoded, because the first line may name an encoding.
 
     Raises:
         RobotError: If the file cannot be read.

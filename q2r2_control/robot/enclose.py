@@ -172,7 +172,7 @@ def _slabs(vertices: Array, edges: npt.NDArray[np.int64], axis: Array) -> list[A
 
 def _corners(points: Array) -> Array:
     """Return the corners of the convex hull of ``points`` (n, 3)."""
-    with suppress(QhullError, ValueError):  # The points may lie in a plane, or be too few.
+    with suppress(QhullError, ValueError):  # Qhull fails if the points lie in a plane or are too few.
         points = points[ConvexHull(points).vertices]
     return points
 

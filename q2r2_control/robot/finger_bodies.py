@@ -1,8 +1,8 @@
 """Compute the bodies of fingers. Each body is the volume that a finger sweeps over the travel of its joints.
 
-The kernels compute distances from the arm's joints only, and so the body of a finger covers all positions of the
-finger. While the opening of the gripper is known, a smaller body replaces it: a part of the capsule's segment if the
-finger slides, or a capsule of turning_fingers.py if the finger turns.
+The kernels know the positions of the arm's joints, but not of the finger joints. The body of a finger therefore covers
+all positions of the finger. While the opening of the gripper is known, a smaller body replaces it: a part of the
+capsule's segment if the finger slides, or a capsule of turning_fingers.py if the finger turns.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from q2r2_control.types import ALL_OF_THE_WAY, Array, Interval
 
 @dataclass(frozen=True, slots=True)
 class FingerBody:
-    """A body that covers all positions of some fingers of one arm, which slide along one line."""
+    """A body that covers all positions of some fingers of one arm. These fingers slide along one line."""
 
     arm: str
     name: str  # Name of the geometry object.
@@ -107,8 +107,8 @@ def sweep_fingers(
     this body always covers all positions. A finger that is moved by a joint with more than one axis keeps its shape.
 
     Returns:
-        The bodies that become smaller while the gripper's opening is known: those of fingers that slide along the line
-        of their body, and those of fingers that turn.
+        The bodies that become smaller while the gripper's opening is known. They belong to fingers that slide along the
+        line of their body, and to fingers that turn.
     """
     bodies: list[FingerBody | TurningBody] = []
     for arm, joints in parts.finger_joints.items():
@@ -119,7 +119,7 @@ def sweep_fingers(
         for item in geometry.geometryObjects:
             if (link := link_of(item.name)) not in links:
                 continue
-            # The finger joints that carry the body, from the hand outwards.
+            # The finger joints that move the body, from the hand outwards.
             chain = [joint for joint in tree.chain(link) if joint_end(joint, "child") in links]
             kinds = {joint.get("type", "") for joint in chain}
             if not chain or not kinds <= _KINDS:
@@ -158,7 +158,8 @@ def _finger_joint(
     """Return a joint of a finger that is locked at ``home`` in ``model``.
 
     ``stroke`` [m or rad] moves the gripper's joints from closed to open. Without a stroke, a joint without a <mimic>
-    may be anywhere in its limits. A joint in ``followers`` follows its driver, also to the driver's limits.
+    may be anywhere in its limits. A joint in ``followers`` follows its driver in all positions, also at the driver's
+    limits.
     """
     name = joint.get("name", "")
     followed = followers.get(name, Follower(name, 1.0, 0.0))
@@ -219,7 +220,7 @@ def _merge(geometry: pin.GeometryModel, swept: dict[str, list[_Finger] | None]) 
     """Join bodies whose axes lie on one line and whose radii are equal.
 
     Returns:
-        By body, the fingers that it contains; None if one of them moves across the line.
+        For each body, the fingers that it contains; None if one of them moves across the line.
     """
     kept: dict[str, list[_Finger] | None] = {}
     for name, fingers in swept.items():

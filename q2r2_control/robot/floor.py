@@ -45,11 +45,12 @@ def floor_link(height: float, parent: str, obstacles: Collection[str]) -> list[E
 
 
 def sink_boxes_into_floor(geometry: pin.GeometryModel) -> None:
-    """Extend fixed upright boxes that stand on the floor deep into it, so that nothing is pushed out downwards.
+    """Extend fixed upright boxes that stand on the floor downwards, so that no body is pushed out at the bottom.
 
     A body inside a box is pushed out through the nearest face. It cannot leave through the underside of a box on the
-    floor. If a hand is deep in such a box and its wrist is above, they would be pushed in opposite directions, and stay
-    there for ever. The part of the box above the floor does not change.
+    floor. If a hand were near the underside, and its wrist above the box, they would be pushed in opposite directions,
+    and stay there for ever. The boxes therefore reach deep into the floor. The part of the box above the floor does not
+    change.
     """
     floor = next((item for item in geometry.geometryObjects if _is_floor(item)), None)
     if floor is None:
@@ -70,9 +71,9 @@ def sink_boxes_into_floor(geometry: pin.GeometryModel) -> None:
 def remove_unreachable_floor_pairs(model: pin.Model, geometry: pin.GeometryModel) -> None:
     """Remove each pair of the floor and a body that provably cannot come near to it.
 
-    There are two kinds of such bodies. Some turn about vertical axes only, as the first link of an arm does, and keep
-    their height. Others are carried by a joint that can tip them, but stay more than :data:`CLEARANCE` above the floor
-    even if they point straight down from this joint.
+    There are two kinds of such bodies. Some bodies turn about vertical axes only, as the first link of an arm does, and
+    keep their height. Other bodies can be tipped by a joint, but stay more than :data:`CLEARANCE` above the floor even
+    if they point straight down from this joint.
     """
     data = model.createData()
     pin.computeJointJacobians(model, data, pin.neutral(model))

@@ -67,8 +67,9 @@ def with_followers(positions: Mapping[str, float], followers: Mapping[str, Follo
 def narrow_limits(joints: Collection[ET.Element], where: str = "") -> None:
     """Narrow the limits of drivers in place, so that all followers stay within their own limits.
 
-    A follower has no effect if it has no limits, if it is continuous, or if it does not move. A follower whose
-    limits have the wrong sign, as in models of mirrored fingers, gets the range in which it follows.
+    A follower has no effect if it has no limits, if it is continuous, or if it does not move. In models of mirrored
+    fingers, the limits of a follower may have the wrong sign. They are then replaced by the range in which it follows
+    its driver.
 
     Raises:
         RobotError: In the cases in which :func:`followers_of` raises it, or if a follower leaves its driver no range.

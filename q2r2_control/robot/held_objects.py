@@ -1,8 +1,8 @@
 """Held objects: bodies that are fixed to the tools, and the monitored pairs with them.
 
 The objects are in a copy of ``Robot.collision_model``, after its own bodies and pairs. An object has pairs with the
-same bodies as the link that carries it, and with all obstacles. It has no pairs with the hand that holds it, and none
-with the fingers of other hands, because these must be able to take the object over.
+same bodies as the link to which it is fixed, and with all obstacles. It has no pairs with the hand that holds it, and
+none with the fingers of other hands, because these must be able to take the object over.
 
 **The distance of two boxes** has no short closed form. One of the two closest points of two convex polyhedra can be
 taken on an edge. If both points lie inside of faces, these faces are parallel. Both points can then be moved along
@@ -29,11 +29,11 @@ from q2r2_control.robot.pairs import LinkClass, Role, link_of, pair_names
 
 @dataclass(frozen=True, slots=True)
 class HeldObject:
-    """The object of one gripper, fixed to the joint that carries the tool."""
+    """The object of one gripper. It is fixed to the last joint that moves the tool."""
 
     arm: str
     link: str  # The link after which its bodies are named.
-    joint: int  # Index of the joint in ``Robot.model`` that carries the object.
+    joint: int  # Index of the joint in ``Robot.model`` to which the object is fixed.
     placement: pin.SE3  # Pose of the object's centre in the frame of that joint.
     config: HeldObjectConfig
 

@@ -3,8 +3,8 @@
 A good home has joints near the middle of their ranges. The tool is before and below the shoulder, points forwards and
 down, and can move in all directions. Gravity requires clearly less torque than the joints' limits. The bodies are
 clearly farther apart than the distances that they keep, most of all below the tool, because the tool works below its
-home position. Two conditions are required, and the cost of a posture jumps without them: gravity is within the torque
-limits, and every pair is slightly farther apart than its kept distance.
+home position. Two conditions are required: gravity is within the torque limits, and every pair is slightly farther
+apart than its kept distance. If a posture violates one of them, its cost jumps.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from q2r2_control.types import Array
 if TYPE_CHECKING:
     from q2r2_control.robot.robot import Arm, Robot
 
-# Number of random postures, of the best ones that are examined further, and of steps of the local search.
+# Numbers of random postures, of the best postures, which are examined further, and of steps of the local search.
 _SAMPLES, _BEST, _STEPS = 2000, 24, 150
 _INSIDE = 0.85  # Share of its half range that each joint may use on both sides of the middle.
 _HALF = np.pi / 2  # Greatest half range that is assumed for a joint [rad].
@@ -45,7 +45,7 @@ def find_home(
 ) -> Array:
     """Return the best home positions that were found for the joints of ``arm`` (n,) [rad].
 
-    They may still miss a requirement.
+    They may still violate a requirement.
 
     Args:
         robot: The robot.
@@ -110,7 +110,8 @@ class _HomeSearch:
         below = [FLOOR in map(link_of, pair) and bool(last & {*pair}) for pair in pair_names(robot.collision_model)]
         self._rooms = (counts, _ROOM), (np.array(below, bool), _BELOW)
         self._reach = 1.0  # [m]
-        # In most arms, the first joint turns the arm and the second one lifts it, so the shoulder is taken to be there.
+        # The second joint is taken as the shoulder, because in most arms the first joint turns the arm and the second
+        # one lifts it.
         self._shoulder = int(self._joints[min(1, len(self._joints) - 1)]) + 1
 
     def best(self, random: np.random.Generator) -> Array:
@@ -132,7 +133,7 @@ class _HomeSearch:
         return self._q
 
     def _lever(self, x: Array) -> Array:
-        """Return the tool's position relative to the shoulder (3,) [m], and leave the model's data at ``x``."""
+        """Compute the model's data at ``x``, and return the tool's position relative to the shoulder (3,) [m]."""
         model, data = self._robot.model, self._data
         pin.computeJointJacobians(model, data, self._at(x))
         pin.updateFramePlacements(model, data)
@@ -165,5 +166,5 @@ class _HomeSearch:
 
 
 def _beyond(excess: float, most: float) -> float:
-    """Return the cost of an ``excess``: 0 if it is not positive, and a value that jumps at ``most``."""
+    """Return the cost of an ``excess``: 0 if it is not positive. If the excess is above ``most``, the cost jumps."""
     return max(excess, 0.0) / most + (_FAULTY * (1.0 + excess) if excess > most else 0.0)

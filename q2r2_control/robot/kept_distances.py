@@ -23,7 +23,7 @@ _OUTERMOST_FIRST = list(LinkClass)
 class KeptDistances:
     """The distances that pairs have to keep. The monitored pairs of a robot are in the order of ``Robot.distances``."""
 
-    values: Array  # Kept distances (p,) [m]. For a pair that may touch: minus the depth to which the reference may go.
+    values: Array  # Kept distances (p,) [m]. For a pair that may touch: minus the depth that the reference permits.
     keys: tuple[str, ...]  # Keys in the block ``control``, such as min_distance, distances.arm_arm or pairs[0].
     # Greatest closing speeds near contact of pairs that may touch (p,) [m/s]; infinite for others.
     contact_speed: Array

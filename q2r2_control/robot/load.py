@@ -1,4 +1,4 @@
-"""Identify the mass and the centre of mass that an arm carries, from torques at rest in many postures.
+"""Identify the mass and the centre of mass of an arm's load, from torques at rest in many postures.
 
 Let m be the mass of the last link, and c its centre of mass. At rest the torques of gravity are linear in m and in m c.
 The difference between measured torques and a model therefore tells by how much m and m c differ from the model.

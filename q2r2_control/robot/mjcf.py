@@ -71,7 +71,7 @@ class _Writer:
         self._names = {model.body(body).name for body in range(model.nbody)}
         self._names |= {model.joint(j).name for j in range(model.njnt)}
         self._links: dict[int, str] = {}  # Names of links by the number of their body.
-        self._within: dict[int, pin.SE3] = {}  # By body, the pose of its link's frame in the frame of the body.
+        self._within: dict[int, pin.SE3] = {}  # For each body, the pose of its link's frame in the frame of the body.
 
     def robot(self) -> ET.Element:
         model = self._model
@@ -221,7 +221,8 @@ class _Writer:
         geometry = ET.SubElement(shape, "geometry")
         if form == _Geom.mjGEOM_MESH:
             mesh = int(model.geom_dataid[g])
-            # MuJoCo moves a mesh that it reads to its centre of mass and principal axes. This motion is undone here.
+            # MuJoCo moves each mesh so that its frame is at the centre of mass, along the principal axes. This is
+            # undone here.
             at = at * _pose(model.mesh_pos[mesh], model.mesh_quat[mesh]).inverse()
             scale = numbers(model.mesh_scale[mesh])
             ET.SubElement(geometry, "mesh", filename=self._mesh_file(mesh), scale=scale)

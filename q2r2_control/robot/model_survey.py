@@ -65,14 +65,14 @@ def tips_by_side(tree: LinkTree, key: str) -> dict[str, str]:
 
 
 def _tips(tree: LinkTree, key: str) -> list[str]:
-    """Return the ends of long chains. If the names tell arms from legs, only the ends of arms count."""
+    """Return the ends of long chains. If the names show which chains are arms, only these count."""
     ends = arm_ends(tree)
     named = [end for end in ends if any(map(_ARM_NAME.search, tree.path(end)))]
     return [end_of(tree, end, key) for end in named or ends]
 
 
 def limits_lacking(tree: LinkTree, tip: str) -> list[str]:
-    """Return a line for each joint of the arm that lacks limits."""
+    """Return a line for each of the arm's joints that lacks limits."""
     limits = []
     for joint in tree.chain(tip):
         limit, name = joint.find("limit"), joint.get("name", "")
@@ -151,14 +151,14 @@ def _span(
 
 @dataclass(frozen=True, slots=True)
 class CapsuleFit:
-    """The capsule that encloses a mesh and stands for it, and how well it fits."""
+    """The capsule that encloses a mesh and replaces it, and how well it fits."""
 
     link: str
     radius: float  # [m]
     length: float  # Length of its segment [m].
     beyond: float  # Lower bound on the greatest distance of its surface from the mesh's convex hull [m].
     wasted: float  # Share of its volume that is outside the hull.
-    capsules: int  # Number of capsules that enclose the mesh in clearly less volume; 1 if more capsules do not.
+    capsules: int  # Number of capsules with clearly less volume than one capsule; 1 if there is no such number.
     then_wasted: float  # The wasted share with this number of capsules.
 
 

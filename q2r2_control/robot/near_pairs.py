@@ -133,7 +133,7 @@ def warning_at_home(
 ) -> str | None:
     """Return a line about pairs that are nearer at home than usual settings allow; None if there are none.
 
-    Pairs that overlap at home and can part elsewhere are named as well, because they are not watched.
+    Pairs that overlap at home, but not at every posture, are named as well, because they are not watched.
 
     Args:
         robot: The robot.
@@ -168,8 +168,8 @@ def warning_at_home(
         # pair can never keep its distance, the remedies have to include it too.
         hardly = [links for links, (least, greatest) in spreads.items() if least < 0.0 <= greatest < kept]
         never += [links for links in hardly if links not in never]
-    # With an SRDF, links that overlap at home are no longer left out automatically. The lines for it therefore name
-    # them too.
+    # With an SRDF, links that overlap at home are no longer left out automatically. The lines for the SRDF therefore
+    # name these links too.
     disabled = [_srdf_line(links) for links, (_, greatest) in spreads.items() if greatest < kept]
     remedies = []
     if never:

@@ -30,7 +30,7 @@ def package_file(url: str, near: Path | None, packages: Mapping[str, str]) -> Pa
 
 
 def package_folder(name: str, near: Path | None, packages: Mapping[str, str]) -> Path:
-    """Return the folder of the package ``name``, which is searched as :func:`package_file` does.
+    """Return the folder of the package ``name``, which is searched in the same folders as in :func:`package_file`.
 
     Raises:
         ConfigError: If there is no such folder.
@@ -81,7 +81,7 @@ def expand_xacro(file: Path, arguments: Mapping[str, object], packages: Mapping[
         # ``find``.
         substitution_args._eval_find = substitution_args._eval_dict["find"] = find
         text: str = xacro.process_file(str(file), mappings=given).toxml()
-    # A file may hold Python expressions, which can raise any exception.
+    # A file may contain Python expressions, which can raise any exception.
     except (Exception, SystemExit) as error:
         inside = next((f" (in {name})" for name in reversed(xacro.filestack or []) if name != str(file)), "")
         reason = " ".join(str(error).split())[:300] or type(error).__name__

@@ -45,7 +45,7 @@ class KnownParts:
 
     @classmethod
     def carried_by(cls, tree: LinkTree, chains: Mapping[str, Sequence[str]]) -> KnownParts:
-        """Return the roles that the tree shows. Joints beyond an arm's own joints are taken for joints of its fingers.
+        """Return the roles that the tree shows. Joints beyond an arm's own joints count as joints of its fingers.
 
         ``chains`` are the joints of each arm, from base to tool.
         """
@@ -65,14 +65,17 @@ class KnownParts:
 
 @dataclass(frozen=True, slots=True)
 class Role:
-    """The class of one link, and the arms to which it belongs. A link of the torso may carry several arms or none."""
+    """The class of one link, and the arms to which it belongs.
+
+    A link of a torso may belong to several arms, or to none.
+    """
 
     part: LinkClass
     arms: frozenset[str]
 
 
 def roles_of(tree: LinkTree, own_links: Mapping[str, set[str]], parts: KnownParts) -> dict[str, Role]:
-    """Return the role of every link. ``own_links`` are the links of each arm, from the root to all that it carries."""
+    """Return the role of every link. ``own_links`` are the links of each arm, from the root to the fingers."""
     classes = dict.fromkeys([tree.root, *tree.joint_to], LinkClass.ARM)
     classes |= dict.fromkeys(parts.obstacles, LinkClass.OBSTACLE)
     for links in parts.tool_links.values():
@@ -86,7 +89,7 @@ def roles_of(tree: LinkTree, own_links: Mapping[str, set[str]], parts: KnownPart
 
 
 def links_moved_by(tree: LinkTree, joints: Iterable[str]) -> set[str]:
-    """Return the links that are carried by ``joints`` or by joints that follow one of them."""
+    """Return the links that are moved by ``joints``, or by joints that follow one of them."""
     named = set(joints)
     followers = followers_of(tree.joint_to.values(), driven=named)
     named |= {name for name, one in followers.items() if one.driver in named}
@@ -107,7 +110,7 @@ def links_that_follow(tree: LinkTree, joints: Collection[str]) -> dict[str, str]
 def hand_links(tree: LinkTree, finger_joints: Iterable[str]) -> set[str]:
     """Return the links of the hand of an arm without a tool model.
 
-    These are the links that carry ``finger_joints``, and all links beyond them.
+    These are the links to which ``finger_joints`` are attached, and all links beyond them.
     """
     named = set(finger_joints)
     palms = {joint_end(joint, "parent") for joint in tree.joint_to.values() if joint.get("name") in named}
@@ -117,7 +120,7 @@ def hand_links(tree: LinkTree, finger_joints: Iterable[str]) -> set[str]:
 # Links that always stay farther apart than this distance [m] need no watching. The distance is more than twice as large
 # as the distance that pairs usually keep.
 CLEARANCE = 0.05
-# Links and shapes whose names end with this text stand for a whole tool at every opening. Their distances are watched,
+# Links and shapes whose names end with this text represent a whole tool at every opening. Their distances are watched,
 # but they have no contacts in the simulation.
 ENVELOPE = "_envelope"
 
@@ -128,7 +131,10 @@ def link_of(geometry_name: str) -> str:
 
 
 def pairs_with_others(pairs: Iterable[tuple[str, str]], roles: Mapping[str, Role], arm: str) -> np.ndarray:
-    """Return the indices (p,) of those ``pairs`` of geometry names of which exactly one body belongs to ``arm``."""
+    """Return the indices (p,) of those ``pairs`` of geometries in which exactly one body belongs to ``arm``.
+
+    ``pairs`` are pairs of names of geometries.
+    """
     own = [[arm in roles[link_of(name)].arms for name in names].count(True) for names in pairs]
     return np.flatnonzero(np.array(own, dtype=np.int64) == 1)
 
@@ -136,9 +142,10 @@ def pairs_with_others(pairs: Iterable[tuple[str, str]], roles: Mapping[str, Role
 def add_movable_pairs(model: pin.Model, geometry: pin.GeometryModel, tree: LinkTree) -> None:
     """Add every pair whose bodies can move relative to each other and are not neighbours in the chain.
 
-    Neighbours are bodies with one joint between them. Fixed parts such as a tool belong to the body that carries them.
-    For Pinocchio everything that is fixed in the world is one body, although a table is no neighbour of an arm's first
-    link. Of the links that are fixed in the world, only the link that carries the joint counts as a neighbour.
+    Neighbours are bodies with one joint between them. A fixed part such as a tool belongs to the body to which it is
+    fixed. For Pinocchio everything that is fixed in the world is one body, although a table is no neighbour of an arm's
+    first link. Of the links that are fixed in the world, only the link to which the joint is attached counts as a
+    neighbour.
     """
     carrier = {joint.get("name", ""): joint_end(joint, "parent") for joint in tree.joint_to.values()}
     geometry.removeAllCollisionPairs()
@@ -237,7 +244,7 @@ def distance_gradient(
 ) -> Array:
     """Return the gradient of a pair's distance with respect to the joints (nv,) [m/rad].
 
-    It is the normal times the difference of the Jacobians of both nearest points. ``data`` has to hold the joint
+    It is the normal times the difference of the Jacobians of both nearest points. ``data`` has to contain the joint
     Jacobians, and ``geometry_data`` the placements of the geometry and the distance of the pair.
     """
     result, bodies = geometry_data.distanceResults[pair], geometries.collisionPairs[pair]

@@ -30,7 +30,7 @@ Progress = Callable[[str, int, int], None]
 # of them, it descends along the gradient of the distance.
 _STARTS = 8
 _STEPS = 30  # Greatest number of steps of a descent.
-_FLAT = 1e-6  # If the relative progress of a step is smaller, the descent ends.
+_FLAT = 1e-6  # If the relative progress of a step is smaller than this, the descent ends.
 _BATCH, _FEW = 250, 4  # Number of postures in a batch, and number of batches before the first descent for each pair.
 
 

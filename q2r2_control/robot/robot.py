@@ -55,7 +55,7 @@ class Arm:
     name: str
     tool_frame: str  # Name of the link.
     frame_id: int  # Number of the tool frame in ``Robot.model``.
-    joints: np.ndarray  # Velocity indices from base to tool. A joint that carries several arms belongs to each of them.
+    joints: np.ndarray  # Velocity indices from base to tool. A joint that moves several arms belongs to each of them.
     finger_joints: tuple[str, ...] = ()  # The joints that its gripper drives.
     stroke: float = 0.0  # Travel of each finger joint from closed to open [m or rad]; 0 if it is not known.
     finger_way: float = 0.0  # Distance by which the stroke moves a finger [m]; 0 if it is not known.
@@ -78,11 +78,11 @@ class Robot:
     prismatic joints they are in [m], [m/s] and [N]. ``acceleration_limit`` is infinite for joints without such a limit
     in the model. :meth:`capped_acceleration` returns the limits that a controller uses.
 
-    ``collision_model`` holds exactly the monitored pairs. Each arm has pairs with the other arm and its base, with its
-    own links that it can meet, and with obstacles. Every monitored shape is a capsule, a sphere, or a box fixed in the
-    world. The body of a finger is the volume that it sweeps. ``finger_bodies`` compute the smaller bodies that replace
-    such bodies while a gripper's opening is known. ``objects`` are the objects that grippers hold, in addition to the
-    collision model. ``ignored_pairs`` are pairs of one arm's shapes that overlap by construction.
+    ``collision_model`` contains exactly the monitored pairs. Each arm has pairs with the other arm and that arm's base,
+    with its own links that it can meet, and with obstacles. Every monitored shape is a capsule, a sphere, or a box
+    fixed in the world. The body of a finger is the volume that it sweeps. ``finger_bodies`` compute the smaller bodies
+    that replace such bodies while a gripper's opening is known. ``objects`` are the objects that grippers hold, in
+    addition to the collision model. ``ignored_pairs`` are pairs of one arm's shapes that overlap by construction.
 
     Attributes:
         name: Name of the URDF.
@@ -104,7 +104,7 @@ class Robot:
     """
 
     def __new__(cls, urdf: ET.Element | None = None, *_: object, **__: object) -> Self:
-        """Refuse a first argument that is no parsed URDF, before Python counts the arguments.
+        """Refuse a first argument that is no parsed URDF, before Python complains about missing arguments.
 
         The error then names the right constructors. When Python copies a robot, it calls this method without arguments.
         """
@@ -151,7 +151,8 @@ class Robot:
         self.torque_limit: Array = self.model.effortLimit.copy()
         joints = {joint.get("name", ""): joint for joint in urdf.findall("joint")}
         self.acceleration_limit: Array = np.array([acceleration_limit(joints[name]) for name in self.joint_names])
-        # The links of an arm are those from the root to the tool, and those of branches beside this path, like fingers.
+        # The links of an arm are the links from the root to the tool, and the links of branches beside this path, such
+        # as fingers.
         bodies = [frame for frame in self.model.frames if frame.type == pin.FrameType.BODY]
         own_links = {
             name: {*tree.path(arm.tool_frame), *(body.name for body in bodies if body.parentJoint - 1 in arm.joints)}
@@ -240,7 +241,7 @@ class Robot:
         return robot
 
     def capped_acceleration(self, cap: float) -> Array:
-        """Return acceleration limits (nv,) [rad/s^2]: the smaller one of ``cap`` and the robot's, for every joint.
+        """Return acceleration limits (nv,) [rad/s^2]: for every joint, its own limit or ``cap``, whichever is smaller.
 
         Raises:
             RobotError: If ``cap`` is not a number above 0.
@@ -294,7 +295,7 @@ class Robot:
         ]
 
     def distance_values(self, q: npt.ArrayLike) -> Array:
-        """Return the numbers of :meth:`distances` alone (pairs,) [m]."""
+        """Return the same distances as :meth:`distances`, as an array (pairs,) [m]."""
         return self._distances.at(self.checked("q", q))
 
     def closest_points(self, q: npt.ArrayLike, pair: tuple[str, str]) -> Array | None:
@@ -338,7 +339,10 @@ class Robot:
             self.roles[held.link] = Role(LinkClass.OBJECT, frozenset({arm}))
 
     def _check_operators_frames(self, config: Config) -> None:
-        """Check that in mode filtered the operator's frame is at the cell's tool. Targets have to begin there."""
+        """If the external mode is ``filtered``, check that the operator's frame is at the cell's tool.
+
+        Targets have to begin there.
+        """
         if config.external is None or not config.external.filtered:
             return
         for arm in self.arms:
@@ -358,7 +362,7 @@ class Robot:
 
 
 def _home_of(urdf: ET.Element, given: Mapping[str, float], where: str) -> dict[str, float]:
-    """Return the home position of every joint, from ``given`` where it has one.
+    """Return the home position of every joint. ``given`` has the positions of some joints.
 
     Raises:
         RobotError: With a text that begins with ``where``, if a value of ``given`` is not allowed.
@@ -394,6 +398,7 @@ def _text_of(path_or_text: str | os.PathLike[str], name_of_text: str) -> tuple[s
         return path_or_text, name_of_text, None
     try:
         file = Path(path_or_text)
-        return file.read_bytes(), str(file), file.parent  # The first line of XML may name an encoding.
+        # The bytes are not decoded, because the first line of XML may name an encoding.
+        return file.read_bytes(), str(file), file.parent
     except (OSError, ValueError) as error:
         raise RobotError(f"{str(path_or_text)[:200]!r}: neither XML nor a file that can be read: {error}") from error

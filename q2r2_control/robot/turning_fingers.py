@@ -4,26 +4,26 @@ Each shape of the finger gets one capsule.
 
 **Claim.** The capsule of an interval encloses the shape at every opening in that interval, not only at samples.
 
-*Proof.* A shape is the hull of two balls. It is therefore enough to enclose the centres of the balls with the radius of
-the balls. Let a driven joint go from one position to another in m equal steps, together with the joints that mimic it.
-Then a centre x is a function of this one parameter. Let these joints move by w_i in a step. Linear interpolation
-between both ends of the step has an error of at most an eighth of the greatest second derivative,
+*Proof.* A shape is the hull of two balls. It is therefore enough to enclose the centres of the balls, and to add the
+radius of the balls. Let a driven joint go from one position to another in m equal steps, together with the joints that
+mimic it. Then a centre x is a function of this one parameter. Let these joints move by w_i in a step. Linear
+interpolation between both ends of the step has an error of at most an eighth of the greatest second derivative,
 
     1/8 sum_ik w_i w_k r_(the outer one of i and k),
 
 because the second derivative by two turning joints is a product of rotations about both axes with the lever of the
 outer joint. Here r bounds the distance of x from the axis of a joint. For a joint that slides, r = 1 if it is the outer
 one of two joints, and r = 0 if it is the inner one or both. Several driven joints in one chain are interpolated one
-after the other. Each interpolation takes means of the values of the one before. The errors therefore add up, and
-derivatives by two different driven joints do not count. Interpolated points lie in the hull of the samples. A capsule
-is convex. If it encloses each sample with the shape's radius and that remainder, it encloses all points. For any
-segment, this radius is the distance of the farthest sample from the segment, plus the shape's radius and the remainder.
-[]
+after the other. Each interpolation takes means of the values of the interpolation before it. The errors therefore add
+up, and derivatives by two different driven joints do not count. Interpolated points lie in the hull of the samples. A
+capsule is convex. If it encloses each sample with the shape's radius and that remainder, it encloses all points. For
+any segment, this radius is the distance of the farthest sample from the segment, plus the shape's radius and the
+remainder. []
 
 The choice of the segment affects only the size of the capsule. Some candidates lie along the shape and some along the
 path of its middle. The candidate with the least mean width is taken. Capsules of nested intervals are not nested: the
-capsule of the narrower interval may stick out of the capsule of the wider one. A change to a narrower interval has to
-be proven safe as if a body grew (:func:`sticks_out`). The capsule of the wider interval stays valid as long as the
+capsule of the narrower interval may stick out of the capsule of the wider interval. A change to a narrower interval has
+to be proven safe as if a body grew (:func:`sticks_out`). The capsule of the wider interval stays valid as long as the
 opening is in that interval. A narrower interval may therefore always be refused.
 """
 
@@ -44,14 +44,14 @@ _REMAINDER = 5e-5  # The wanted error of the interpolation. The steps are made s
 # the error is greater.
 _MOST_SAMPLES = 512
 _ROUNDING = 1e-9  # Addition to radii for the rounding of numbers [m].
-# Both ends of a segment are pulled in by these multiples of the radius that its capsule needs without the shape's own
-# radius. The capsule becomes thicker and its ends flatter.
+# Each candidate is tried in three lengths. Both of its ends are moved inwards by these multiples of its capsule's
+# radius (without the shape's own radius). A capsule with a shorter segment is thicker.
 _PULLED_IN = np.array([0.0, 0.58, 1.2])
 
 
 @dataclass(frozen=True, slots=True)
 class FingerJoint:
-    """A joint that moves a shape, in the frame of the arm's link that carries the hand.
+    """A joint that moves a shape, in the frame of the arm's link to which the hand is fixed.
 
     The shape was drawn at the position ``home``. The positions of all joints with one driver are linear functions of
     the driver's position, also beyond the stroke. All positions are in [m or rad].
@@ -78,7 +78,7 @@ class FingerJoint:
 
 
 class Capsules(NamedTuple):
-    """One capsule for each of b bodies, in the frame of the link that carries the hand."""
+    """One capsule for each of b bodies, in the frame of the link to which the hand is fixed."""
 
     start: Array  # (b, 3) [m]
     end: Array  # (b, 3) [m]
@@ -114,7 +114,7 @@ class TurningBody:
 
     @cached_property
     def extent(self) -> float:
-        """The greatest distance of the segment of any interval's capsule from the origin of the carrying link [m]."""
+        """The greatest distance [m] of any interval's capsule, without its radius, from the frame's origin."""
         return float(TurningSweeps((self,)).extent[0])
 
     @cached_property

@@ -2,7 +2,7 @@
 
 If the angle jumps by a whole turn between two reports, the joint has not jumped. This is certain if the joint cannot
 have turned by half a turn between the two reports. Reports that count turns themselves are not changed. The first
-report is not changed either, nor is a report after a longer time.
+report is not changed either, nor is a report after a time in which the joint can have turned by half a turn.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class TurnCounter:
     def of_state(self, state: RobotState) -> RobotState:
         """Return the state with positions as :meth:`counted` returns them.
 
-        The held posture gets as many turns as bring it within half a turn of these positions.
+        Whole turns are added to the posture ``held``, so that it is within half a turn of these positions.
         """
         q, held = self.counted(state.q, state.stamp), state.held
         if held is not None and len(joints := self._joints):

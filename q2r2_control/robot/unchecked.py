@@ -1,8 +1,8 @@
 """Find links that have no collision shape, so that nothing keeps them apart from other bodies.
 
-A certificate says nothing about such a link. Every part that commands arms calls :func:`check_watched`, which refuses
-a robot with such a link that moves with an arm, unless its cell names the link. A link that stands still gets a note,
-because it is drawn for looks in many models, and another part of the model often stands in front of it.
+A certificate says nothing about such a link. Every part that commands arms calls :func:`check_watched`, which refuses a
+robot if such a link moves with an arm and the cell does not name the link. For a link that stands still, there is only
+a note: many models have such links only for display, and other parts of the model often stand in front of them.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ WORLD = "world"  # The root link of every cell.
 # Range of a joint without limits: two turns in each direction [rad].
 CONTINUOUS_RANGE = 4 * math.pi
 
-# Elements that name links or joints, and the attribute that holds the name.
+# Elements that name links or joints, and the attribute that contains the name.
 _NAMING = {"parent": "link", "child": "link", "mimic": "joint"}
 
 
@@ -112,7 +112,7 @@ def mimic_of(joint: ET.Element) -> tuple[str, float, float] | None:
 def acceleration_limit(joint: ET.Element) -> float:
     """Return the least acceleration limit of a joint [rad/s^2, or m/s^2 of a sliding joint]; infinity without limits.
 
-    The number holds for both directions, and for speeding up and braking.
+    The number is valid for both directions, and for speeding up and braking.
     """
     limit = joint.find("limit")
     written = [] if limit is None else [limit.get(attribute) for attribute in ATTRIBUTES]

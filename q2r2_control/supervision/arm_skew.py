@@ -62,7 +62,7 @@ class SkewWatch:
     def _one_is_silent(self, timings: Mapping[str, ArmTiming]) -> bool:
         """Return whether one arm has been silent for longer than another arm, by more than two of its periods.
 
-        If all arms are silent for the same time, this loop was late, and no arm is to blame.
+        If all arms are silent for the same time, this loop was late, and no arm is at fault.
         """
         silent = [timing.silent for timing in timings.values()]
         return any(timing.silent - min(silent) > 2.0 * timing.period + _TIMING_NOISE_S for timing in timings.values())

@@ -30,7 +30,7 @@ _BELIEVABLE = (-0.2, 1.2)  # Plausible measured openings. A finger may go a litt
 
 
 class GripperLimiter:
-    """Turns wanted openings into permitted ones, for every arm whose opening is measured.
+    """Turns wanted openings into permitted openings, for every arm whose opening is measured.
 
     The openings of other arms are passed through, because the certificate assumes that their fingers may be anywhere
     between closed and open. After a reset the controller assumes this for all arms, and needs a new limiter.

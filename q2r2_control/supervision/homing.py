@@ -166,7 +166,7 @@ def _samples(points: list[Array]) -> Iterator[Array]:
 
 _LINEAR_SPEED, _ANGULAR_SPEED = 0.1, 0.3  # Greatest speeds of the tools' targets [m/s], [rad/s].
 _ARRIVED, _TURNED = 0.003, 0.01  # A tool has arrived if its pose is this near to the home pose [m], [rad].
-_PATIENCE = 5.0  # The tools may arrive by this time later than their targets [s].
+_PATIENCE = 5.0  # The tools may arrive later than their targets by up to this time [s].
 
 
 class ToolHoming:
@@ -245,8 +245,8 @@ class Homing:
         """End the motion home if the arms have arrived or cannot go on. Return the outcome; None if it goes on.
 
         Args:
-            reference: The newest reference. If the arms cannot move on, the outcome names the tightest pair of the
-                reference.
+            reference: The newest reference. If the arms cannot move on, the outcome names the pair with the least
+                margin.
         """
         kind = None if self._motion is None else self._motion.outcome
         if kind is None:

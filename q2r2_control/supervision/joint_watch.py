@@ -35,7 +35,7 @@ class WatchSettings:
     timeout: float  # Greatest age of the newest state before the arms stop [s].
     # Time for which states with NaN or infinite numbers are ignored before they are a fault [s].
     unusable_time: float
-    settle_time: float  # Time for which the states must be good and at rest before the arms are activated [s].
+    settle_time: float  # The arms are activated after the states were good, and the arms rested, for this time [s].
     deviation: float  # Greatest distance of a measured joint from the reference [rad].
     deviation_time: float  # Time for which a joint may be farther away than ``deviation`` [s].
 
@@ -70,10 +70,10 @@ class JointWatch:
         source: Callable[[], str] = lambda: "",
     ) -> None:
         self._names, self._velocity_limit, self._settings = names, velocity_limit, settings
-        self._source = source  # Text for messages that names the sender, such as " from /node", or "".
+        self._source = source  # Text that names the sender in messages, such as " from /node", or "".
         self.state: RobotState | None = None  # The newest state that was good; None before the first one.
         self.fault: Reason | None = Reason.of(SupervisionReason.NO_STATES_YET, source="")
-        self._lost = False  # True if the fault is a lost session, and all states since then were good.
+        self._lost = False  # True if the fault is that of :meth:`lose`, and all states since then were good.
         self._q: list[float] = []  # Joint positions of ``state`` [rad].
         self._still_since, self._still_at = math.inf, self._q
         self._near_at: float | None = None
@@ -119,7 +119,7 @@ class JointWatch:
         return self.fault is None or self._lost
 
     def settled(self, now: float) -> bool:
-        """Return whether the states have been good and at rest for the settle time."""
+        """Return whether the states have been good, and the arms have rested, for the settle time."""
         fresh = now - self._stamp <= self._settings.timeout
         return fresh and now - self._still_since >= self._settings.settle_time
 
@@ -155,7 +155,7 @@ class JointWatch:
         )
 
     def accept(self) -> None:
-        """Clear the fault, after :meth:`settled` has found the states good and at rest."""
+        """Clear the fault, after :meth:`settled` has found that the states are good and the arms rest."""
         self.fault, self._near_at, self._lost = None, None, False
 
     def accept_at_once(self, state: RobotState, now: float) -> None:
@@ -219,7 +219,7 @@ def settings_for_external_arms(config: Config) -> Config:
     distances.
     """
     control = config.control.model_copy(update=_FOLLOW)
-    # The admittance is off, because the other controller is the compliant one.
+    # The admittance is off, because the other controller already yields to forces.
     stiff = config.admittance.model_copy(update={"enabled": False})
     supervision = config.supervision
     lagging = supervision.model_copy(update={"max_deviation": supervision.max_deviation_external})

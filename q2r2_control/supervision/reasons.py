@@ -43,12 +43,13 @@ class SupervisionReason(ReasonKind):
         "left_behind",
         "{arm}: the tool is {distance:.3f} m and {angle:.2f} rad from where it was led; begins anew where it is",
     )
-    # Why arms start over, what happens to them, and why a target is not followed.
+    # Why arms are activated again, what happens to them, and why a target is not followed.
     ARMS_APART = "arms_apart", "{arm}: {skew:.0f} ms behind the other arm; allowed: {allowed:.0f} ms"
     RUN_ENDED = "run_ended", "the run has ended"
     ACTIVATED = "activated", "active: the reference starts at the measured posture"
     HOMING_OUTCOME = "homing_outcome", "homing ended: {cause}"
-    CONTROLLER_PHASE = "controller_phase", "the controller is {phase}"  # It follows no targets in this phase.
+    # The controller follows no targets in this phase.
+    CONTROLLER_PHASE = "controller_phase", "the controller is {phase}"
     CONTROLLER_PAUSED = "controller_paused", "the controller is paused"
     ARMS_HOMING = "arms_homing", "the arms are on their way home"
     ARMS_BRAKING = "arms_braking", "the arms are braking"

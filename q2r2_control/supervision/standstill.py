@@ -70,7 +70,7 @@ class StandstillWatch:
     def look(self, asked: Array, measured: Array, stamp: float, now: float) -> float | None:
         """Return how far the command moved while the arm stood still; None if the arm does not stand still.
 
-        The unit is that of the arrays, [rad] for joints and [m] for a tool.
+        The result has the unit of the arrays: [rad] for joints and [m] for a tool.
 
         Args:
             asked: The newest command that was sent before this tick (n,).

@@ -30,7 +30,7 @@ from q2r2_control.supervision.target_stream import Origins, StreamSettings
 from q2r2_control.supervision.targets import TargetStreams
 from q2r2_control.types import Array, Reference, RobotState
 
-_REST = 1e-4  # The reference is at rest if no joint is faster [rad/s].
+_REST = 1e-4  # The reference is at rest if no joint is faster than this [rad/s].
 # If a joint is farther from the reference than the first value and slower than the second one, its driver may be gone
 # [rad], [rad/s].
 _OFF_REFERENCE, _STILL = 0.02, 0.05
@@ -41,7 +41,7 @@ Displace = Callable[[dict[str, pin.SE3 | None], RobotState, float], dict[str, pi
 
 
 class Phase(StrEnum):
-    INACTIVE = "inactive"  # The supervisor waits for joint states that are good and at rest.
+    INACTIVE = "inactive"  # The supervisor waits until the joint states are good and the arms rest.
     ACTIVE = "active"
     BRAKING = "braking"
     STOPPED = "stopped"  # Only a reset ends this phase.
@@ -159,7 +159,7 @@ class Supervisor:
             pose: The tool's target in the world frame; None if the message was not a pose.
             now: The time of receipt [s].
             number: The sequence number that the publisher gave the message; None if it is unknown.
-            due: The time at which the tool should reach the target [s]; None for at once.
+            due: The time at which the tool should reach the target [s]; None if the tool should reach it at once.
         """
         tools: list[pin.SE3] = []
         if not self.targets.follows_on(arm, now):
@@ -230,7 +230,7 @@ class Supervisor:
         return self._controller.step(self._external.targets(targets, self._last), dt, state.q)
 
     def _compare(self, reference: Reference, now: float) -> None:
-        """Stop or start over if the arms are too far from the reference, or if their driver stands still."""
+        """Stop, or brake and activate the arms again, if they deviate too much or if their driver stands still."""
         away, state = self._watch.deviates(reference.q, now), self._watch.state
         standing = None if self._standing is None or state is None else self._standing.look(reference.q, state, now)
         if standing is not None:
@@ -248,7 +248,7 @@ class Supervisor:
                 self.start_over(behind, now)
 
     def _with_gravity(self, away: Reason, reference: Reference) -> Reason:
-        """Return the reason ``away``, or a better one if the joint is too weak to hold the arm against gravity."""
+        """Return the reason ``away``, or a more exact reason if the joint is too weak to bear the arm's weight."""
         torques = joints_that_cannot_hold(self._robot, reference.q).get(away.detail["joint"])
         if torques is None:
             return away
@@ -305,7 +305,10 @@ class Supervisor:
             self.phase = Phase.STOPPED
 
     def reset(self) -> Reason | None:
-        """Clear faults, stop, pause and all targets. Returns the reason if that is not possible now, else None."""
+        """Clear all faults and targets, and end a stop or a pause.
+
+        Returns the reason if that is not possible now, else None.
+        """
         if self.phase is Phase.BRAKING:
             return Reason(SupervisionReason.ARMS_BRAKING)
         self._stopped, self.paused = None, False

@@ -1,4 +1,4 @@
-"""Decide which targets an arm may follow: only those of a stream that began where the arm was.
+"""Decide which targets an arm may follow: only the targets of a stream that began at the tool's pose.
 
 An arm follows a stream whose first target lies within ``engage_distance`` and ``engage_angle`` of the tool, as it does
 when an operator engages. A stream that begins elsewhere comes from a sender that does not know that the arm was stopped
@@ -31,8 +31,8 @@ class StreamSettings:
     """The rules for a stream of targets; they may be changed at run time."""
 
     timeout: float = STREAM_TIMEOUT  # A stream ends if no target comes for longer than this [s].
-    engage_distance: float = 0.03  # A stream must begin at most this far from the tool [m].
-    engage_angle: float = 0.3  # A stream must begin turned from the tool by at most this angle [rad].
+    engage_distance: float = 0.03  # The first target of a stream must be at most this far from the tool [m].
+    engage_angle: float = 0.3  # The first target must be turned from the tool by at most this angle [rad].
     linked: bool = True  # Whether all arms hold when the targets of one arm cease, see TargetStreams.
 
 
@@ -42,7 +42,7 @@ class Origins:
 
     Attributes:
         joint_states: Returns the sender of joint states as " from /node", or "" if it is not known.
-        targets: Returns the sender of an arm's targets, likewise.
+        targets: Returns the sender of an arm's targets in the same form.
         takers: Returns the receiver of an arm's commands as " /node", or "".
     """
 
@@ -131,7 +131,10 @@ _EVEN, _EVEN_TURN = 1.5e-3, 0.01
 
 
 class TargetExtrapolator:
-    """Extrapolates the targets of one stream while they move evenly. All times tell when targets are due [s]."""
+    """Extrapolates the targets of one stream while they move evenly.
+
+    All times are times at which targets are due [s].
+    """
 
     def __init__(self) -> None:
         self.reset()

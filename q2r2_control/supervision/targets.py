@@ -54,7 +54,7 @@ class DelayWatch:
 # No publisher sends more often than _MAX_RATE_HZ, and no message takes longer than _MAX_DELIVERY_S. If sequence numbers
 # grow faster, they come from another publisher.
 _MAX_RATE_HZ, _MAX_DELIVERY_S = 2000.0, 0.1
-_ALONE = 1.0  # A break in the sequence counts for this time. After it, one publisher is assumed again [s].
+_ALONE = 1.0  # A break in the sequence counts as recent for this time [s].
 
 
 class SequenceWatch:
@@ -84,7 +84,9 @@ class SequenceWatch:
 
 
 class TargetStreams:
-    """Holds one :class:`TargetStream` for each arm. Poses are in the world frame; all times are times of receipt [s].
+    """Contains one :class:`TargetStream` for each arm.
+
+    Poses are in the world frame. All times are times of receipt [s].
 
     Linked arms (:attr:`StreamSettings.linked`) stop together. If the targets of one arm cease, or two nodes publish
     them, then every arm needs a new stream that begins at its tool. An operator who pauses one arm ends its stream by
@@ -100,7 +102,10 @@ class TargetStreams:
         self._newly_ended: list[Reason] = []
 
     def at(self, now: float) -> dict[str, pin.SE3 | None]:
-        """Return the target that each arm follows at ``now`` [s], see :class:`TargetExtrapolator`; None if it holds."""
+        """Return the target that each arm follows at ``now`` [s]; None if the arm holds.
+
+        Between two messages, targets are extrapolated, see :class:`TargetExtrapolator`.
+        """
         return {arm: self._lines[arm].at(now) if self.follows(arm) else None for arm in self._streams}
 
     def follows(self, arm: str) -> bool:

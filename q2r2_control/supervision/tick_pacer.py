@@ -3,9 +3,9 @@
 A plant takes one command per period. From one command to the next a joint may move as far as its velocity limit allows
 in one period, even if the command comes late. A late tick therefore moves the reference by the time t that has passed
 if no joint then moves farther than its velocity limit V allows in a period h:  |v| t + a t^2 / 2 <= V h  for each
-joint, with its acceleration limit a. Otherwise t is reduced until this holds, but not below one period. A slow
-motion therefore makes up for the whole delay in one tick. A fast motion follows the same path, but later. If each joint
-of a command were clipped on its own, the command would leave the path that was certified.
+joint, with its acceleration limit a. Otherwise t is reduced until this is true, but not below one period. A slow motion
+therefore makes up for the whole delay in one tick. A fast motion follows the same path, but later. If each joint of a
+command were clipped on its own, the command would leave the path that was certified.
 
 A plant that takes velocity commands keeps moving at the last velocity while no command comes (``coasts``). Then the
 reference also advances by the time that has passed, up to 0.1 s. The commanded velocity stays within its limit.
@@ -21,27 +21,28 @@ import pinocchio as pin
 from q2r2_control.config.teleop import GuardSettings
 from q2r2_control.types import LONGEST_DT, Array
 
-_FORGETTING = 0.98  # By each tick, earlier lateness counts less by this factor.
+_FORGETTING = 0.98  # At each tick, the sum of earlier delays is multiplied by this factor.
 _ROUNDING = 1e-9  # The time before a punctual tick may exceed the period by this share of the period.
 
 
 class MissedTicks:
     """Counts the ticks that were due and never came. A tick that only came late is not missed.
 
-    A tick that is late by more than half a period counts as missed at first. If the next one comes so much sooner that
-    the ticks are on their grid again, the count goes back.
+    A tick that is late by more than half a period counts as missed at first. If the next tick comes so early that the
+    ticks are on their grid again, the tick is no longer counted as missed.
     """
 
     def __init__(self) -> None:
         self.count = 0
-        self._behind = 0.0  # How far the ticks are behind their grid, without the missed ones [periods].
+        self._behind = 0.0  # How far the ticks are behind their grid, if missed ticks do not count [periods].
 
     def add(self, gap: float) -> None:
         """Take the time between two ticks [periods]."""
         self._behind += gap - 1.0
         missed = max(round(self._behind), -self.count)
         self.count += missed
-        # Otherwise, two clocks that run differently would let ticks seem missed after some time.
+        # Earlier delays are forgotten slowly. Without this, ticks would seem missed after some time if two clocks run
+        # at different rates.
         self._behind = _FORGETTING * max(self._behind - missed, -0.5)
 
 
@@ -133,7 +134,7 @@ class PoseRateLimiter:
 
     def __init__(self, settings: GuardSettings, period: float) -> None:
         """``period`` is the time between two steps [s]."""
-        self.clipped = 0  # Number of steps since the start in which a limit held the pose back.
+        self.clipped = 0  # Number of steps since the start in which a limit has slowed the pose.
         self._linear, self._angular, self._period = _Limited(), _Limited(), period
         self.change(settings)
         self.reset(None, -math.inf)

@@ -98,8 +98,8 @@ def products(a0: Array, a1: Array, b0: Array, b1: Array) -> tuple[float, float, 
 
 @kernel
 def _middle_of_overlap(aa: float, ab: float, ar: float) -> float:
-    """Return the parameter on segment a of the middle of the part that the parallel segment b covers."""
-    start, end = -ar / aa, (ab - ar) / aa  # Parameters on a of both ends of b.
+    """Return the parameter of a point on segment a: the middle of the part of a that the parallel segment b covers."""
+    start, end = -ar / aa, (ab - ar) / aa  # Parameters on a of the ends of b, projected onto a.
     return 0.5 * (clamp(start, 0.0, 1.0) + clamp(end, 0.0, 1.0))
 
 
@@ -110,7 +110,7 @@ def segment_box(a0: Array, a1: Array, half: Array, on_a: Array, on_box: Array, n
     The closest points and the unit normal from the segment to the box are written. The squared distance along the
     segment is convex and piecewise quadratic. Its pieces meet at the parameters, six at most, at which the segment
     crosses the plane of a face. Between two such parameters, the zero of the slope is found exactly. If the segment
-    enters the box, the distance is minus the length of the shortest translation that takes it out.
+    enters the box, the distance is minus the length of the shortest translation that moves it out of the box.
     """
     s = _minimum_along(a0, a1, half)
     for k in range(3):

@@ -27,14 +27,14 @@ class CollisionBodies(NamedTuple):
     change too, see :mod:`finger_openings`.
     """
 
-    joint: IntArray  # (g,) Number of the joint that carries the geometry; 0 is the world.
+    joint: IntArray  # (g,) Number of the joint to which the geometry is attached; 0 is the world.
     box: IntArray  # (g,) 1 for a box, 0 for a segment.
     start: Array  # (g, 3) Start of the segment, or centre of the box [m].
     end: Array  # (g, 3) End of the segment [m].
     radius: Array  # (g,) Radius [m]; for a box 0, or the radius of its rounded edges.
     half: Array  # (g, 3) Half sides of a box [m].
     rotation: Array  # (g, 3, 3) Rotation of a box.
-    size: Array  # (g,) Radius of the ball around its middle that contains the geometry [m].
+    size: Array  # (g,) Radius of a ball that contains the geometry, with the geometry's middle as its centre [m].
 
 
 class Pairs(NamedTuple):
@@ -73,7 +73,7 @@ class Contact(NamedTuple):
     second: Array  # (3,) The closest point of the second body [m].
     normal: Array  # (3,) Unit vector from the first to the second body.
     local: Array  # (3, 3) Buffer for vectors in the frame of a box.
-    kept: Array  # (2, 3) Buffer for closest points that are needed after another part has been measured.
+    kept: Array  # (2, 3) Buffer that keeps closest points while parts of a segment are measured.
 
     @classmethod
     def empty(cls) -> Contact:
@@ -161,7 +161,7 @@ def pairs_of(model: pin.GeometryModel, chain: Chain, bodies: CollisionBodies, tr
         model: The geometries and their pairs.
         chain: The joints.
         bodies: The bodies of ``model``.
-        travel: Greatest distance of each joint from zero (nv,) [rad or m].
+        travel: Greatest absolute position of each joint (nv,) [rad or m].
         extent: For each body, a bound (g,) on the distance of its segment or box from its joint's origin [m]. The bound
             still holds after bodies of fingers change.
 

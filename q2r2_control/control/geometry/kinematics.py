@@ -1,4 +1,4 @@
-"""Forward kinematics of a tree of one-axis joints (compiled). The results equal those of Pinocchio.
+"""Forward kinematics of a tree of one-axis joints (compiled). The results are equal to Pinocchio's results.
 
 The roll-out of a stop needs the placements of the links at many configurations in each tick. Calls of Pinocchio would
 take too long. For that reason this part of Pinocchio is written again here. A test compares it with Pinocchio for every
@@ -26,8 +26,8 @@ class Chain(NamedTuple):
     """The tree of joints as arrays. Index 0 is the world, and joint i has the velocity index i - 1."""
 
     parent: IntArray  # (n,) Number of the parent joint.
-    rotation: Array  # (n, 3, 3) Rotation of the joint's frame in the frame of the parent joint, at zero.
-    translation: Array  # (n, 3) Position of the joint's frame in the frame of the parent joint, at zero [m].
+    rotation: Array  # (n, 3, 3) Rotation of the joint's frame in the frame of the parent joint, if q is 0.
+    translation: Array  # (n, 3) Position of the joint's frame in the frame of the parent joint, if q is 0 [m].
     axis: Array  # (n, 3) Unit axis in the joint's frame.
     prismatic: IntArray  # (n,) 1 if the joint slides.
 

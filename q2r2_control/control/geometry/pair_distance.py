@@ -10,8 +10,8 @@ pulls the parameters s, t in [0, 1] of the closest points to the middles of the 
     D^2 = min |a(s) - b(t)|^2 + e ((s - 1/2)^2 + (t - 1/2)^2).
 
 This makes the closest points unique, and continuous in the posture. By the envelope theorem dD = (b - a)' d(b - a) / D
-at these points. The row of the pair with the vector (b - a) / D as its normal is therefore exactly the gradient of D.
-This vector is slightly shorter than one. D is larger than the distance d of the cores, by e / (4 d) at most.
+at these points. If a pair's row is computed with (b - a) / D as the normal, the row is therefore exactly the gradient
+of D. This vector is slightly shorter than 1. D is larger than the distance d of the cores, by e / (4 d) at most.
 """
 
 from __future__ import annotations
@@ -192,9 +192,10 @@ def with_rounded_boxes(model: CollisionModel, depth: Array) -> CollisionModel:
 
 
 def deeper_at_corners(model: CollisionModel, kept: Array) -> Array:
-    """Return by how much deeper than -``kept`` (p,) [m] a body can enter a box at a real, sharp corner (p,) [m].
+    """Return how much deeper than the permitted depth -``kept`` (p,) [m] a body can enter a box at a sharp corner.
 
-    Only pairs that may touch (``kept`` below 0) can do so. The result is 0 for all other pairs.
+    The model's boxes have rounded corners, and the real boxes have sharp ones. The result (p,) [m] is 0 for pairs that
+    must not touch (``kept`` at least 0), and for pairs without a box.
     """
     boxed = (kept < 0.0) & (model.bodies.box[model.pairs.second] == 1)
     return np.where(boxed, (1.0 - 1.0 / np.sqrt(3.0)) * model.bodies.radius[model.pairs.first], 0.0)

@@ -107,7 +107,7 @@ def keeps_apart_at_any_time(model: SafetyModel, data: SafetyData, p: int, durati
     if gap - needed >= way(model, p, data.history.bend[1]):
         return True
     if gap - needed < way(model, p, data.history.bend[2]):
-        return False  # With more instants the gap only gets smaller, so the finer proof would fail too.
+        return False  # More instants can only make the gap smaller, so the finer proof would fail too.
     gap = _lowest_on_way(model, data, second, 1.0, duration, True)
     gap += _lowest_on_way(model, data, first, -1.0, duration, True)
     return gap - needed >= way(model, p, data.history.bend[2])

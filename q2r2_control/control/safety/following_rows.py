@@ -39,7 +39,7 @@ def append_following_row(
     pairs, history, v, row = model.collision.pairs, data.history, data.state.v, data.rows.matrix[count]
     distance = measure(model.collision, data.collision, p)
     if distance < model.min_distance[p] or history.counted[0] == 0:
-        # Such a row does not apply to a pair that is too close: it has to open, whichever arm is in front.
+        # A pair that is too close gets no such row, because its distance has to grow, whichever arm is in front.
         return count
     distance_row(model.collision, data.collision, p, row)
     first, second = 0.0, 0.0

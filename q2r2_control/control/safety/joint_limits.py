@@ -10,7 +10,7 @@ The reference moves with constant acceleration during a step h <= H (H is the lo
 
 then full braking keeps P for any h in (0, H], and the interval below contains full braking, hence is not empty.
 
-*Proof.* Let v > 0. If v >= a h, braking gives w = v - a h and r' = r - v h + a h^2 / 2. Then
+*Proof.* Let v > 0. If v >= a h, braking gives the velocity w = v - a h and the distance r' = r - v h + a h^2 / 2. Then
 w^2/(2a) + H w = v^2/(2a) + H v - v h + a h^2/2 - a h H <= r - v h + a h^2/2 - a h H <= r'. If v < a h, braking gives
 w = 0 and r' = r - v h / 2 >= v^2/(2a) + H v - v h / 2 >= 0 because h <= H. If v <= 0, r' >= r. The bound is the largest
 v+ for which P holds after the step. Every v+ at or below it that the acceleration limit allows therefore keeps P. The
@@ -37,7 +37,7 @@ _RETURN_GAIN = 4.0  # Inward speed per radian outside of the limit [1/s].
 # A joint beyond its limit is moved to this far inside of the limit, so that it crosses the limit in finite time [rad].
 _RETURN_DEPTH = 1e-3
 
-NO_LIMIT, POSITION, VELOCITY, ACCELERATION = 0, 1, 2, 3  # The kinds of limits that hold a joint back.
+NO_LIMIT, POSITION, VELOCITY, ACCELERATION = 0, 1, 2, 3  # The kinds of limits that may limit the velocity of a joint.
 
 
 class JointLimits(NamedTuple):

@@ -51,7 +51,7 @@ _OPENING = 1e-4
 
 
 class ObstacleData(NamedTuple):
-    """Data of the o moving obstacles, and of their n pairs, which are the last ones of all pairs."""
+    """Data of the o moving obstacles, and of their n pairs, which come last among all pairs."""
 
     first: IntArray  # (o + 1,) Index of each obstacle's first pair among the n pairs; the last entry is n.
     speed: Array  # (o,) Greatest speed of any point [m/s].
@@ -92,7 +92,7 @@ def keep_clear(
                 _measure(model, data, obstacles, p)  # A lower bound of the distance does not suffice here.
                 stop_time = _stop_time(data, obstacles, o, p)
                 wanted = min(wanted, stop_time)
-                if age > _LOST:  # The time until the obstacle may have used up the whole free distance.
+                if age > _LOST:  # Until this time, the obstacle cannot have used up the free distance.
                     least_stop = min(least_stop, max((stop_time + age) / _SHARE - age, 0.0))
     known = obstacles.stop_time[0]
     time = min(max(wanted, least_stop, known - h), known + h, longest)
@@ -143,7 +143,7 @@ def _measure(model: SafetyModel, data: SafetyData, obstacles: ObstacleData, p: i
 def _stop_time(data: SafetyData, obstacles: ObstacleData, o: int, p: int) -> float:
     """Return the largest T_0 with which the reach of obstacle ``o`` takes only its share of the free distance [s].
 
-    The free distance is that of the obstacles' pair ``p``. T_0 is infinite if this pair does not count now, or if the
+    The free distance of the obstacles' pair ``p`` is used. T_0 is infinite if this pair does not count now, or if the
     obstacle does not move.
     """
     if obstacles.kept[p] == -np.inf or obstacles.speed[o] == 0.0:

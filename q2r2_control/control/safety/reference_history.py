@@ -43,7 +43,7 @@ class ReferenceHistory(NamedTuple):
 
     @classmethod
     def empty(cls, model: CollisionModel, shared: CollisionData) -> ReferenceHistory:
-        """Return a history of arms at rest at zero. The samples use the rotations and the contact of ``shared``."""
+        """Return a history of arms that rest at q = 0. The samples use the rotations and the contact of ``shared``."""
         nv = len(model.chain.parent) - 1
         samples = []
         for _ in range(_POSTURES):
@@ -125,7 +125,7 @@ def look_back(model: CollisionModel, history: ReferenceHistory, q: Array, v: Arr
         for j in range(q.shape[0]):
             later = v[j] if i == 0 else history.v[i - 1, j]
             moved |= history.v[i, j] != 0.0 or history.a[i, j] != 0.0 or later != 0.0
-        # If the arms have not moved since a posture, its age counts only up to the window.
+        # If the arms have not moved since a posture, the age of this posture is limited to the window.
         age = history.age[i] if moved else min(history.age[i], max(newer, window))
         if moved:
             longest = max(longest, age - newer)

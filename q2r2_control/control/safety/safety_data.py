@@ -127,7 +127,7 @@ class Rollout(NamedTuple):
 
 
 class ActiveBounds(NamedTuple):
-    """The limits that held the last step back. The first ``used[0]`` entries are valid."""
+    """The limits that limited the last step. The first ``used[0]`` entries are valid."""
 
     kind: IntArray  # (k,) POSITION, VELOCITY or ACCELERATION of a joint, SEPARATION of a pair, TOOL_SPEED of a tool.
     subject: IntArray  # (k,) Index of the joint, the pair or the tool.
@@ -185,7 +185,7 @@ class SafetyData(NamedTuple):
 
 
 def provable_distances(model: SafetyModel, data: SafetyData) -> Array:
-    """Return d - S of every pair (p,) [m]: the known stop brings no pair closer than that (stop_certificate.py).
+    """Return d - S of every pair (p,) [m]: the known stop brings no pair closer than this (stop_certificate.py).
 
     This also holds for the postures at which delayed arms may still be, see arm_skew.py. ``data`` has to contain the
     distances at the present reference. From now on, a pair may be required to keep the returned distance: the known

@@ -23,10 +23,10 @@ from q2r2_control.control.safety.tool_speed import keeps_tool_speed
 from q2r2_control.types import Array
 
 FOLLOWED, REDUCED, STOPPED = 0, 1, 2
-SEPARATION = ACCELERATION + 1  # The kind of limit that holds a pair of bodies back.
-TOOL_SPEED = SEPARATION + 1  # The kind of limit that holds a tool back.
+SEPARATION = ACCELERATION + 1  # The kind of limit that keeps two bodies apart.
+TOOL_SPEED = SEPARATION + 1  # The kind of limit that bounds the speed of a tool.
 _BISECTIONS = 4
-_ACTIVE = 1e-7  # A velocity that is this near to a bound has met it [rad/s].
+_ACTIVE = 1e-7  # A velocity that is this near to a bound counts as at the bound [rad/s].
 
 
 @kernel
@@ -41,8 +41,8 @@ def apply_safety_filter(
         solution: The solver's next velocities (nv,) [rad/s].
         usable: Whether there is a solution. If not, the known stop is executed.
         h: Duration of the step [s].
-        share: Duration of the step divided by that of the tick: the weight of the step's acceleration in the tick's
-            mean acceleration.
+        share: Duration of the step divided by the duration of the tick. It is the weight of the step's acceleration in
+            the tick's mean acceleration.
 
     Returns:
         FOLLOWED, REDUCED towards the stop, or STOPPED; and the largest violation of a row [rad/s].
@@ -95,8 +95,8 @@ def certify_bodies(model: SafetyModel, data: SafetyData, grown: IntArray) -> int
 
     The bodies have grown since the reference was certified. They are allowed if each of their pairs keeps its distance
     at the reference, and the known stop keeps all pairs apart. The invariant then holds as if the bodies had always had
-    this size. No other stop is tried, because the arms may already be braking along the known stop. A pair that is too
-    close must not be made closer.
+    this size. No other stop is tried, because the arms may already be braking along the known stop. If a pair is too
+    close already, its bodies must not grow.
 
     Args:
         model: The model, with the grown bodies.
@@ -164,8 +164,8 @@ def _certify_mixture(model: SafetyModel, data: SafetyData, share: float, h: floa
         data: The data.
         share: Share of the wanted velocities in the mixture, from 0 for the known stop to 1.
         h: Duration of the step [s].
-        together: True if a pair is too close. Only a stop of all joints together is then tried: with it, a pair that
-            opens continues to open.
+        together: True if a pair is too close. Only a stop of all joints together is then tried: during this stop, a
+            distance that grows continues to grow.
     """
     _mix(data, share, h)
     return _some_stop_certified(model, data, h, 1 if together else SHAPES)
@@ -189,7 +189,7 @@ def _some_stop_certified(model: SafetyModel, data: SafetyData, h: float, shapes:
 def _mix(data: SafetyData, share: float, h: float) -> None:
     """Write the candidate's velocities, and the positions that follow from them.
 
-    The velocities are (1 - ``share``) times those of the known stop plus ``share`` times the wanted ones.
+    They are (1 - ``share``) times the velocities of the known stop plus ``share`` times the wanted velocities.
     """
     state, candidate = data.state, data.candidate
     for j in range(state.q.shape[0]):
@@ -232,7 +232,7 @@ def _note_active(data: SafetyData) -> float:
 
 @kernel
 def _note_too_close(model: SafetyModel, data: SafetyData) -> None:
-    """List the pairs that hold the arms because they are too close and nothing could be certified."""
+    """List the pairs that are too close. Because of them, no solution could be certified."""
     active = data.active
     for p in range(data.distance.shape[0]):
         count = active.used[0]

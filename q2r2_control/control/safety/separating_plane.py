@@ -13,14 +13,14 @@ move by D(t) with |D_j(t)| <= w_j, then at every t the distance is at least
     K = 1/2 sum_k r_k w_k (w_k + 2 sum_(i before k) w_i)   over the joints that move one body relative to the other.
 
 *Proof.* The distance of convex sets is the largest gap between them over all directions, hence at least the gap along
-n. That gap is the least over their corners. Joints that carry both bodies change no distance and count as fixed. Each
-of the other joints moves one of the two bodies. A corner moves by J_e D and a remainder. The second derivative of its
-position with respect to joint i and a later joint k of the same chain is a product of rotations about both axes with
-the lever about joint k, which is at most r_k. Taylor's remainder is then at most 1/2 sum_ik r_max(i,k) w_i w_k = K. (A
-sliding joint has reach 1 and turns nothing: its second derivative with an earlier joint is at most 1, and with a later
-joint it is 0.) []
+n. That gap is the least over their corners. Joints that move both bodies alike change no distance and count as fixed.
+Each of the other joints moves one of the two bodies. A corner moves by J_e D and a remainder. The second derivative of
+its position with respect to joint i and a later joint k of the same chain is a product of rotations about both axes
+with the lever about joint k, which is at most r_k. Taylor's remainder is then at most
+1/2 sum_ik r_max(i,k) w_i w_k = K. (A sliding joint has reach 1 and turns nothing: its second derivative with an earlier
+joint is at most 1, and with a later joint it is 0.) []
 
-In a step, and between two instants of a stop, D_j(t) is a parabola. A joint that comes to rest in between counts as
+In a step, and between two instants of a stop, D_j(t) is a parabola. A joint that comes to rest in between may be
 anywhere between its start and its end. For each pair of corners, the bound is therefore the minimum of a parabola.
 """
 
@@ -136,7 +136,7 @@ def _gap(
 ) -> Gap:
     """Return what a ``corner`` (3,) contributes to the gap along the normal, and how this contribution changes.
 
-    The contribution is that at the start of ``piece``. Its changes are those during ``piece`` and ``then``; see
+    The contribution is computed at the start of ``piece``, and its changes during ``piece`` and ``then``; see
     :class:`Gap`. ``side`` is -1 for a corner of the first body, else 1.
     """
     chain, pairs, placements, normal = model.chain, model.pairs, data.placements, data.contact.normal

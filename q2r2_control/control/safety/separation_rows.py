@@ -8,7 +8,7 @@ A step may use up only a share of B: B(q+, v+) >= (1 - gain h) B(q, v). This is 
 from a backup manoeuvre (Gurriet, Mote, Ames, Feron, CDC 2018). A motion during which the pair's distance stays the same
 uses up nothing and is not slowed. A motion that brings the pair closer is slowed in time for the stop. The rows are
 linearised at those instants of the stop at which the free distance is least, or may soon be least, so that rows do not
-come and go from tick to tick. An instant with more free distance than B may use up the difference at 50 /s.
+appear and disappear from tick to tick. An instant with more free distance than B may use up the difference at 50 /s.
 
 A stop takes the time T. At its time t, joints that stop together have travelled v s, with s = t - t^2 / 2T. If the stop
 after the step takes T too, the step changes the posture at the time t by D q, and the row is
@@ -21,8 +21,8 @@ lever for each joint, the direction of the row would change from tick to tick wi
 
 If a pair is closer than its buffer, the row asks it to open, as fast as a part of the acceleration limits allows. Pairs
 that may touch have a ``min_distance`` below zero. Around contact they have a zone in which they use up B no faster than
-at their contact speed. The rows are for comfort only. They are soft, so that the QP always has a solution, and the
-certificate alone keeps the arms safe.
+at their contact speed. Safety does not depend on the rows, because the certificate alone keeps the arms safe. The rows
+are soft, so that the QP always has a solution.
 
 **The gain may change between any two ticks.** The certificate reads no row and no gain. It reads distances, and a lower
 bound of a distance proves less, never more. The executed part of a solution is therefore certified for every gain.
@@ -108,7 +108,7 @@ def write_separation_rows(model: SafetyModel, data: SafetyData, h: float) -> Non
 
 @kernel
 def _distances_ahead(model: SafetyModel, data: SafetyData, p: int, duration: float, straight: bool) -> float:
-    """Write the distance of pair ``p`` at each instant, infinite if the instant is skipped; return the least one [m].
+    """Write the distance [m] of pair ``p`` at each instant, infinite if it is skipped; return the least distance.
 
     If the paths are ``straight``, the pair is nearest at the start or at the end of the stop. If the pair is too close,
     only the start counts, because the pair has to open from its present position.
@@ -145,9 +145,9 @@ def _append_row(
 ) -> int:
     """Add a row if some velocity that the acceleration limit allows (v +- a h) breaks it; other rows cannot bind.
 
-    Pair ``p`` was measured in ``at``, which is the posture at the ``moment``. If ``moment.along``, it is the posture at
-    the start of the stop, from which the row computes the end of the stop along the tangent. The row gets unit norm, so
-    that its violation is a joint speed.
+    Pair ``p`` was measured in ``at``, which is the posture at the ``moment``. If ``moment.along`` is True, it is the
+    posture at the start of the stop, from which the row computes the end of the stop along the tangent. The row gets
+    unit norm, so that its violation is a joint speed.
     """
     h = moment.h
     a, v, row, lever = model.limits.acceleration, data.state.v, data.rows.matrix[count], moment.lever
@@ -167,8 +167,8 @@ def _append_row(
     if slow < np.inf:
         allowed = max(allowed, -h * max(slow, gain * (free - model.approach.contact_zone[p])))
     if free < 0.0:
-        # If rows asked for more than the joints can do, the QP would weigh them against each other. A pair that is much
-        # too close would then open at the cost of closing another pair.
+        # If rows asked for more than the joints can do, the QP would weigh them against each other. The distance of a
+        # pair that is much too close would then grow, and the distance of another pair would fall.
         allowed = min(allowed, model.approach.recovery_speed * h, max(h * rate, 0.0) + _SHARE * change)
     if h * rate - change >= allowed or change <= 0.0:
         return count

@@ -4,9 +4,9 @@ The bound S with the reach of joints (stop_certificate.py) treats every joint as
 the other body. For most pairs of two moving arms, a bound from the speeds of the bodies suffices. Joints that stop
 together keep the direction of their motion, and arms that move in the same way come no closer at all.
 
-**Speed.** A geometry lies in the ball of radius s around its middle. With the middle moving at u and the link turning
-at w, no point of it is faster than |u| + |w| s. The distance of two geometries therefore falls no faster than |u_2 -
-u_1| + |w_1| s_1 + |w_2| s_2.
+**Speed.** A geometry lies in the ball of radius s around its middle. If the middle moves at u and the link turns at w,
+no point of the geometry is faster than |u| + |w| s. The distance of two geometries therefore falls no faster than
+|u_2 - u_1| + |w_1| s_1 + |w_2| s_2.
 
 **Claim.** Let two bodies share no joint, and let d be their distance at the reference. Let V = |u_2 - u_1| + |w_1| s_1
 + |w_2| s_2 be the bound on their approach speed there, where the joints have the velocities v. Let a step of h lead to
@@ -21,16 +21,17 @@ least
 where w_j is the travel of joint j in the step and the stop.
 
 *Proof.* Let D_j(t) be how far joint j has moved. Compare it with v_j sigma(t), where sigma = t in the step and sigma =
-h + s - s^2 / 2T at the time s of the stop, so at most h + T / 2. In the step, |D_j - v_j t| = |v+_j - v_j| t^2 / 2h is
-at most |v+_j - v_j| h / 2, and this difference stays during the stop. In the stop, v+_j replaces v_j, which changes v_j
-(s - s^2 / 2T) by at most |v+_j - v_j| T / 2. The joint itself travels B_j(s) from the step's end. Since d_j >= |v+_j| /
-T, the difference |v+_j| (s - s^2 / 2T) - |B_j(s)| is never negative and never falls. At T it is |v+_j| T / 2 - v+_j^2 /
-2 d_j. Together |D_j - v_j sigma| <= rho_j. A point of a body moves by J D + R, with |R| <= sum reach_j kappa_j over the
-joints that move it (separating_plane.py says why). Two points, one of each body's core, therefore get closer by at most
-|(J_2 - J_1) v| sigma + sum reach_j (rho_j + kappa_j), and |(J_2 - J_1) v| <= V. The radii cancel. []
+h + s - s^2 / 2T at the time s of the stop, so that sigma is at most h + T / 2. In the step, |D_j - v_j t| is equal to
+|v+_j - v_j| t^2 / 2h <= |v+_j - v_j| h / 2, and this difference stays during the stop. In the stop, v+_j replaces v_j,
+which changes v_j (s - s^2 / 2T) by at most |v+_j - v_j| T / 2. The joint itself travels B_j(s) from the step's end.
+Since d_j >= |v+_j| / T, the difference |v+_j| (s - s^2 / 2T) - |B_j(s)| is never negative and never falls. At T it is
+|v+_j| T / 2 - v+_j^2 / 2 d_j. Together |D_j - v_j sigma| <= rho_j. A point of a body moves by J D + R, with
+|R| <= sum reach_j kappa_j over the joints that move it (separating_plane.py says why). Two points, one of each body's
+core, therefore get closer by at most |(J_2 - J_1) v| sigma + sum reach_j (rho_j + kappa_j), and |(J_2 - J_1) v| <= V.
+The radii cancel. []
 
-The velocity of a joint that carries both bodies is part of V, but this joint is not in the sum. V could then be less
-than the speed at which the bodies close in. For that reason the other proofs handle pairs that share a joint.
+If a joint moves both bodies, its velocity is part of V, but the joint is not in the sum. V could then be less than the
+speed at which the bodies close in. For that reason the other proofs handle pairs that share a joint.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ class BodyVelocities(NamedTuple):
     linear: Array  # (n, 3) Velocities of the origins of joint frames [m/s].
     angular: Array  # (n, 3) [rad/s]
     middle: Array  # (g, 3) Velocities of the middles of geometries [m/s].
-    swing: Array  # (g,) Greatest speed of a point of a geometry about its middle [m/s].
+    swing: Array  # (g,) Greatest speed of a geometry's point relative to the geometry's middle [m/s].
 
     @classmethod
     def empty(cls, model: CollisionModel) -> BodyVelocities:
@@ -121,9 +122,8 @@ def fastest_approach(velocities: BodyVelocities, first: int, second: int) -> flo
 def write_deviations(model: SafetyModel, data: SafetyData, h: float, duration: float) -> float:
     """Write the bound rho + kappa on every joint's deviation from motion at constant velocity [rad or m].
 
-    It is for a step of ``h`` [s] and a stop of ``duration`` [s].
-
-    The travel of the joints in the step and the stop has to be written before. Returns h + T / 2 [s].
+    The bound holds in a step of ``h`` [s] and a stop of ``duration`` [s]. The travel of the joints in both has to be
+    written before. Returns h + T / 2 [s].
     """
     parent, v, v_next, rollout = model.collision.chain.parent, data.state.v, data.candidate.v, data.rollout
     step, stop = rollout.step.travel, rollout.stop.travel

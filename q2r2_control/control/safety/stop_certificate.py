@@ -42,7 +42,7 @@ _LAST_DIGITS = 1e-11  # [m]
 
 @kernel
 def step_travel(v: float, v_next: float, h: float) -> float:
-    """Return how far a joint travels in a step with constant acceleration [rad or m]. Both directions add up."""
+    """Return the length of a joint's path in a step with constant acceleration [rad or m]."""
     if v * v_next >= 0.0:
         return 0.5 * abs(v + v_next) * h
     return 0.5 * (v * v + v_next * v_next) / (abs(v) + abs(v_next)) * h
@@ -68,7 +68,7 @@ def certify(model: SafetyModel, data: SafetyData, h: float) -> bool:
         farthest = max(farthest, data.rollout.step.travel[j] + data.rollout.stop.travel[j], history.travel[j])
     for p in range(data.distance.shape[0]):
         if data.distance[p] - model.collision.pairs.leverage[p] * farthest >= model.min_distance[p]:
-            continue  # No joint travels farther than this, so the bodies cannot come closer by more.
+            continue  # No joint travels farther than ``farthest``, so the pair keeps its distance.
         alone = apart and model.of_two_arms[p] == 1  # Each of the two arms may be anywhere on its path.
         if is_far(model, data, p, time) if alone else _has_room(model, data, p, time):
             continue
@@ -85,7 +85,8 @@ def certify(model: SafetyModel, data: SafetyData, h: float) -> bool:
 def is_too_close(model: SafetyModel, data: SafetyData, p: int) -> bool:
     """Return whether pair ``p`` is closer at the reference than its required distance.
 
-    ``data.distance`` is exact for near pairs, so a mere lower bound is never below the required distance.
+    ``data.distance`` is exact for near pairs. For other pairs it is a lower bound, which is not below the required
+    distance.
     """
     return data.distance[p] < model.min_distance[p] - ROUNDING
 
@@ -100,7 +101,7 @@ def _keeps_apart(model: SafetyModel, data: SafetyData, p: int, h: float, duratio
     if data.distance[p] < model.min_distance[p] - 0.5 * ROUNDING and not _comes_no_closer(
         model, data, p, duration, _NOISE
     ):
-        return False  # Otherwise the tolerance in ``threshold`` would add up from tick to tick to more than rounding.
+        return False  # Without this test, the tolerance in ``threshold`` could add up from tick to tick.
     threshold = min(model.min_distance[p], data.distance[p] - _LAST_DIGITS)
     if alone:  # This proof includes the case in which both arms move at the same time.
         return keeps_apart_at_any_time(model, data, p, duration, threshold)
@@ -190,9 +191,9 @@ def _stop_keeps_apart(model: SafetyModel, data: SafetyData, p: int, duration: fl
 def _comes_no_closer(model: SafetyModel, data: SafetyData, p: int, duration: float, closer: float) -> bool:
     """Return whether a pair that is too close comes no closer during the stop.
 
-    At no sample may its distance be smaller than at the sample before, or be falling. Distances alone would miss a pair
-    that opens and closes again between two samples. At the last sample all joints rest. The joints that came to rest
-    last are then taken with their velocities one sample earlier.
+    At each sample, its distance must not be smaller than at the sample before, and must not be falling. Distances alone
+    would miss a pair that opens and closes again between two samples. At the last sample all joints rest. The joints
+    that came to rest last are then taken with their velocities one sample earlier.
     """
     candidate, row = data.candidate, data.rollout.piece.rate
     before = data.distance[p]

@@ -4,10 +4,10 @@ evenly spaced in time (compiled). All pairs share the samples. A sample is compu
 **Claim.** If a state satisfies P (joint_limits.py), a stop of each shape keeps P until the joint rests, and no joint
 brakes harder than its acceleration limit a.
 
-*Proof.* In the shape OWN, each joint brakes fully, and the claim is that of joint_limits.py. In the other shapes, the
-joint with the greatest |v| / a brakes fully. Let another joint have v > 0, and let r be the distance to its upper
-limit. By P, r - H v >= v^2 / (2 a) > 0. The joint brakes with a deceleration d for which v^2 / (2 (r - H v)) <= d <= a.
-When its velocity has fallen to w, its distance to the limit is
+*Proof.* In the shape OWN, each joint brakes fully, and joint_limits.py proves the claim. In the other shapes, the joint
+with the greatest |v| / a brakes fully. Let another joint have v > 0, and let r be the distance to its upper limit. By
+P, r - H v >= v^2 / (2 a) > 0. The joint brakes with a deceleration d for which v^2 / (2 (r - H v)) <= d <= a. When its
+velocity has fallen to w, its distance to the limit is
 
     r' = r - (v^2 - w^2) / (2 d) >= H v + w^2 / (2 d) >= H w + w^2 / (2 a),
 
@@ -127,7 +127,7 @@ def write_piece(data: SafetyData, v: Array, start: float, length: float, piece: 
         v: Velocities at the start of the part (nv,) [rad/s].
         start: Start of the part, from the beginning of the stop [s].
         length: Duration of the part [s].
-        piece: Where the motion is written.
+        piece: The motion is written here.
     """
     candidate = data.candidate
     for j in range(v.shape[0]):

@@ -50,7 +50,7 @@ _SAME_TIME = 1e-9  # If the times until two joints rest differ by less than this
 class ToolLimits(NamedTuple):
     """The origins of all tools, and their largest speed."""
 
-    joint: IntArray  # (n,) Number of the joint that carries the tool.
+    joint: IntArray  # (n,) Number of the last joint that moves the tool.
     translation: Array  # (n, 3) Origin of the tool in the joint's frame [m].
     reach: Array  # (n, nv) Bound on the distance of the tool from each joint's axis [m]; 1 for a sliding joint.
     speed: float  # Speed that no tool exceeds; infinite without a limit [m/s].
@@ -78,7 +78,7 @@ def tool_limits_of(robot: Robot, chain: Chain, speed: float | None) -> ToolLimit
 class ToolSpeeds(NamedTuple):
     """Data that are written when a step is decided on."""
 
-    held: IntArray  # (n,) 1 if the tool's speed limit held the step back.
+    held: IntArray  # (n,) 1 if the tool's speed limit has limited the step.
     origin: Array  # (3,) Buffer for the tool's origin in the world [m].
     columns: Array  # (nv, 3) Buffer for J_j v+_j of each joint [m/s].
     total: Array  # (3,) Buffer for a sum P_k [m/s].

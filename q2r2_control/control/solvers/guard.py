@@ -3,8 +3,9 @@
 The safety filter clamps the answer to the same box that a solver gets. If a solver wrote into this box, it would change
 the limits, and the certificate would use the changed limits. A solver therefore gets copies.
 
-The user's own costs and rows may be of any size, and the sum of costs need not be convex. With such a problem, some
-libraries print a line, and some loop for ever. No solver gets such a problem.
+The user's own costs and rows may be of any size, and the sum of costs need not be convex. If numbers are very large, or
+if the sum is not convex, some libraries print a line, and some loop for ever. The guard therefore gives no such problem
+to a solver.
 """
 
 from __future__ import annotations

@@ -56,9 +56,10 @@ def slack_problem(problem: QpProblem, sparse: bool = False, scaled: bool = False
     )
 
 
-# Without these options, the solver cannot be used in a loop.
+# These solvers cannot be used in a control loop without these options.
 _DEFAULTS: dict[str, dict[str, Any]] = {
-    "highs": {"output_flag": False, "qp_iteration_limit": 1000},  # Its active set may cycle for ever.
+    # Without a limit, the active set of HiGHS may cycle for ever.
+    "highs": {"output_flag": False, "qp_iteration_limit": 1000},
     "scs": {"max_iters": 10000},  # With the default, which is ten times as many, a solve takes a second.
 }
 
@@ -68,7 +69,7 @@ class QpSolversSolver:
 
     Args:
         name: One of ``qpsolvers.available_solvers``.
-        options: Keyword arguments of that solver, see qpsolvers' documentation. They replace those in
+        options: Keyword arguments of that solver, see qpsolvers' documentation. They replace options in
             :data:`_DEFAULTS`.
     """
 

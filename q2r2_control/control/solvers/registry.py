@@ -25,8 +25,8 @@ def make_solver(
     """Return the solver called ``name``.
 
     Args:
-        name: The name. ``daqp`` and ``osqp`` are called directly, and any other one of
-            ``qpsolvers.available_solvers`` through qpsolvers.
+        name: The name. The solvers ``daqp`` and ``osqp`` are called directly. The solvers in
+            ``qpsolvers.available_solvers`` are called through qpsolvers.
         nv: Number of joints.
         time_limit: DAQP and OSQP give up after this time [s]; None if they never give up.
         options: Keyword arguments of the solver.
@@ -70,7 +70,7 @@ def _made(name: str, nv: int, time_limit: float | None, options: dict[str, Any])
 
 @contextmanager
 def printing_to_stderr() -> Iterator[None]:
-    """Send output to stderr, also that of compiled libraries, because a command may print JSON on stdout."""
+    """Send all output, also the output of compiled libraries, to stderr, because a command may print JSON on stdout."""
     try:
         sys.stdout.flush()
         stdout = os.dup(1)
@@ -86,10 +86,10 @@ def printing_to_stderr() -> Iterator[None]:
 
 
 def check_installed(name: str) -> None:
-    """Raise :class:`ConfigError` unless a solver called ``name`` is installed. The error lists the installed ones."""
+    """Raise :class:`ConfigError` unless a solver called ``name`` is installed. It lists the installed solvers."""
     if name in OURS:
         return
-    import qpsolvers  # See _made.
+    import qpsolvers  # The import is local for the same reason as in _made.
 
     if name not in qpsolvers.available_solvers:
         installed = ", ".join(sorted({*OURS, *qpsolvers.available_solvers}))

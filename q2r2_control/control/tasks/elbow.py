@@ -1,8 +1,8 @@
 """Control the swivel of an arm's elbow about the line from shoulder to wrist: the task that YAML names ``swivel``.
 
 Let S, E and W be the positions of shoulder, elbow and wrist, w = (W - S) / |W - S|, e = E - S, and V the unit vector
-that points up. The part of e that is perpendicular to the line is p = e - (w'e) w, and that of V is l = V - (w'V) w.
-The swivel angle is the angle from l to p about w,
+that points up. The part of e that is perpendicular to the line is p = e - (w'e) w, and the same part of V is
+l = V - (w'V) w. The swivel angle is the angle from l to p about w,
 
     psi = atan2(w'(V x p), V'p)
 

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 class Tools(NamedTuple):
     """The tool frame of each arm."""
 
-    joint: IntArray  # (n,) Number of the joint that carries the tool.
+    joint: IntArray  # (n,) Number of the last joint that moves the tool.
     rotation: Array  # (n, 3, 3) Rotation in the joint's frame.
     translation: Array  # (n, 3) Position in the joint's frame [m].
     member: Array  # (n, nv) 1 if a joint moves the tool.
@@ -61,7 +61,10 @@ _SHARE_OF_LIMIT = 0.9
 
 
 class Motion(NamedTuple):
-    """How a tool approaches its target. Arrays (2,): a linear and an angular value. All may change between ticks."""
+    """How a tool approaches its target.
+
+    Arrays (2,) have a linear and an angular value. All may change between ticks.
+    """
 
     gain: Array  # (2,) [1/s]
     deceleration: Array  # (2,) [m/s^2, rad/s^2]
@@ -211,7 +214,7 @@ def approach_speed(error: float, gain: float, deceleration: float) -> float:
 
 @kernel
 def wanted_twist(motion: Motion, data: TaskData, targets: TaskTargets, i: int) -> None:
-    """Write the wanted twist of tool ``i`` into ``data.frame``, with the part of it that is due to the pose error."""
+    """Write the wanted twist of tool ``i`` into ``data.frame``, and also the part of it that the pose error causes."""
     twist, feedback, feed_forward = data.frame.twist[i], data.frame.feedback[i], targets.feed_forward[i]
     times_transposed(targets.rotation[i], data.rotation[i], data.frame.turn)
     for k in range(3):

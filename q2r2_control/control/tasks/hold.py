@@ -11,7 +11,8 @@ if TYPE_CHECKING:
     from q2r2_control.control.targets import TaskTargets
     from q2r2_control.control.tasks.built_in import TaskData
 
-# With this weight, the task of the other arm does not move an arm that holds. It moves only if a pair is too close.
+# With this weight, the task of the other arm does not move an arm that holds. The arm moves only if a pair is too
+# close.
 _WEIGHT = 300.0
 _GAIN = 4.0  # [1/s]
 

@@ -2,7 +2,8 @@
 
 Each task adds the cost  weight |J v - u|^2,  where the velocity u is a gain times the task's error. Tasks with
 different goals reach a compromise according to their weights. A tool's target has the weight 1 for metres and 0.09 for
-radians. The settings ``position_weights`` and ``rotation_weights`` give a tool the freedom that such a task needs.
+radians. With small values in ``position_weights`` and ``rotation_weights``, a tool has the freedom that such a task
+needs.
 """
 
 from __future__ import annotations
@@ -199,8 +200,8 @@ class RelativePose:
     """Lets the right tool keep its pose in the left tool's frame.
 
     The cost is  w |J_r v - J_c v - k e|^2  with the pose error e of the right tool (6,) and the Jacobian J_r of that
-    tool. J_c is the Jacobian of a body that the left tool would carry at the wanted pose. A radian counts 0.09 times as
-    much as a metre. A YAML names the task ``relative``.
+    tool. J_c is the Jacobian of a body that is fixed to the left tool, at the wanted pose of the right tool. A radian
+    counts 0.09 times as much as a metre. A YAML names the task ``relative``.
 
     Args:
         robot: A robot with the arms ``left`` and ``right``.

@@ -15,9 +15,9 @@ class Priority(NamedTuple):
     """Weights that decide which arm gives way if one arm blocks the other. The weights may change between ticks.
 
     In the QP the arms influence each other only through separation rows, which couple their joints. All costs of an arm
-    that gives way, also posture and damping, are multiplied by a small weight. If a row couples both arms, the QP then
-    changes the motion of this arm and not that of the other arm. If no row is active, the weights change nothing. An
-    arm without a target holds its joints, and does not give way.
+    that gives way, including the costs of posture and damping, are multiplied by a small weight. If a row couples both
+    arms, the QP then changes the motion of the arm that gives way, and not the motion of the other arm. If no row is
+    active, the weights change nothing. An arm without a target holds its joints, and does not give way.
     """
 
     arm: Array  # (n,) Weight of an arm's costs while it follows a target: 1, or less if it gives way.
