@@ -17,7 +17,7 @@ from q2r2_control.extras import install_line
 Pixels = npt.NDArray[np.uint8]  # (height, width, 3) b g r, as OpenCV has them.
 _PASSWORD = re.compile(r"(?<=://)[^/@]*@")
 _RIGHT_ANGLE = 90  # [deg]
-_OLDEST_STAMP = 1.0  # A driver's stamp that is older than this comes from another clock [s].
+_OLDEST_STAMP = 1.0  # A driver's stamp that is older than this counts as a stamp of another clock [s].
 _Number = TypeVar("_Number", np.uint8, np.uint16)
 
 
@@ -60,7 +60,7 @@ def shown_device(camera: CameraConfig) -> str:
 
 
 def address_of(camera: CameraConfig) -> str:
-    """Return the path or address to open. ``$NAME`` is replaced by the environment variable NAME, say a password."""
+    """Return the path or address to open. ``$NAME`` is replaced by the environment variable NAME, e.g. a password."""
     return os.path.expandvars(str(camera.device))
 
 

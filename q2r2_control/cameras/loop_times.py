@@ -17,8 +17,8 @@ class TickTime(NamedTuple):
 class LoopTimes:
     """Converts times of the computer's monotonic clock into times of the loop's clock.
 
-    In real time both are the same. In simulated time, a loop that is paced may be slower than the computer's clock, and
-    takes its ticks in bursts.
+    In real time, both clocks are the same. In simulated time, the loop's clock may be slower than the computer's clock,
+    even if the loop is paced. Its ticks then come in bursts.
     """
 
     def __init__(self) -> None:

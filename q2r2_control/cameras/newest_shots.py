@@ -47,7 +47,7 @@ class NewestShots:
     def at(self, now: float) -> tuple[dict[str, ObservedPicture], dict[str, str]]:
         """Return the newest pictures at a tick that is at ``now`` [s], by camera. It never waits.
 
-        The second mapping says of each camera without a usable picture why it has none.
+        The second mapping has each camera without a usable picture, and the reason why it has none.
         """
         found: dict[str, ObservedPicture] = {}
         reasons: dict[str, str] = {}

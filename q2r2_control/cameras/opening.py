@@ -7,7 +7,7 @@ from q2r2_control.config.recording import CameraConfig
 
 
 def open_device(camera: CameraConfig) -> CameraDevice:
-    """Open a camera, whose pictures have the size that the cell says once they are turned by ``camera.rotation``.
+    """Open a camera. After its pictures are turned by ``camera.rotation``, they have the size that the cell says.
 
     Raises:
         CameraError: If it cannot be opened as the cell asks. The message says why, without the camera's name.

@@ -30,7 +30,7 @@ class VideoFile:
             raise CameraError(f"{shown_device(camera)}: no video that OpenCV can read; allowed: .mp4, .avi, .mkv")
         check_size(camera, *size_of(self._opened))
         self._began = time.monotonic()  # Time at which the file shows its first picture [s].
-        self._shown = 0  # Number of pictures since then.
+        self._shown = 0  # Number of pictures that were read since ``_began``.
 
     def read(self) -> Capture:
         if not self._opened.grab():

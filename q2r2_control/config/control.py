@@ -26,10 +26,10 @@ ObstacleName = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$", max_leng
 class DistanceSettings(StrictModel):
     """Distances that pairs keep, by the kind of their bodies. A kind that is left out has ``min_distance``.
 
-    A finger is moved by a gripper's joints, and carried by a tool (the hand). An obstacle stands in the cell, and the
-    floor counts as an obstacle. An object is the body that ``gripper.object`` describes, while it is held. ``arm_self``
-    is for all bodies of one arm among themselves and with the rest of its robot. The bodies of an arm include the
-    object that it holds. The other classes without obstacles are for pairs of different arms.
+    The joints of a gripper move its fingers, and the tool (also called the hand) is the part to which the fingers are
+    attached. Obstacles include the floor. An object is the body that ``gripper.object`` describes, while it is held.
+    ``arm_self`` is for pairs of two bodies of one arm, and for pairs of an arm and the rest of its robot. The bodies of
+    an arm include the object that it holds. All other keys without obstacles are for bodies of two different arms.
     """
 
     arm_arm: Distance | None = Field(None, description="links of two arms, bases included [m]")

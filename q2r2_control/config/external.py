@@ -80,7 +80,7 @@ class ExternalGripper(GripperSettings):
 
 
 class GuardLimits(StrictModel):
-    """Limits of the target's motion; null: the limit of the preset."""
+    """Limits of the target's motion. If a limit is null, the limit of the preset is used."""
 
     max_velocity: float | None = Field(None, gt=0, le=5, description="largest speed of the target's position [m/s]")
     max_acceleration: float | None = Field(

@@ -22,7 +22,7 @@ class Hold(StrEnum):
     """The messages to a controller while its arm is paused and its target stands still."""
 
     REPEAT = "repeat"  # The last target with a new stamp.
-    SILENCE = "silence"  # No messages. The controller then holds the arm by itself, and stops for an old target.
+    SILENCE = "silence"  # No messages. The controller then holds the arm by itself, and stops if its target is old.
 
 
 # Limits of targets for controllers that have no limits of their own.
@@ -49,7 +49,7 @@ class Preset:
     output: str = "none"
     # Topic for a message with a zero wrench, without which the controller may push; None if it needs no such message.
     zero_wrench: str | None = None
-    command_type: str | None = None  # Service that sets the type of targets, called at each start; None if none.
+    command_type: str | None = None  # Service that is called at each start to set the type of targets; None if none.
 
     @property
     def takes_targets(self) -> bool:
@@ -66,7 +66,7 @@ BUILTIN = Preset("builtin", "always on", rate=100.0, lowest_rate=20.0, hold=Hold
 _ALL = (
     BUILTIN,
     # The velocity limit of this controller uses the time since the target last changed. After a long pause without
-    # messages, the next target would therefore not be limited.
+    # messages, the next target would therefore not be limited. The preset therefore repeats targets during a pause.
     Preset("kuka_lbr_clik", _LATCHES),
     Preset("kuka_lbr_impedance", _LATCHES, rate=200.0, lowest_rate=100.0, zero_wrench="{ctrl}/target_wrench"),
     Preset("fzi", "targets count when they come after its activation"),

@@ -17,7 +17,7 @@ SubtaskSeconds = Annotated[float, Field(ge=0, le=3600)]
 
 
 class JudgeSettings(StrictModel):
-    """Thresholds of ``q2r2 judge``: an episode beyond any of them is discarded. With null, the number is not judged.
+    """Thresholds of ``q2r2 judge``: an episode beyond any of them is discarded. A threshold of null is not checked.
 
     Shares are fractions of the time for which an arm is engaged, unless a description says otherwise. No threshold thus
     depends on the length of an episode. The package ``q2r2_control.judging`` computes the numbers.
@@ -242,7 +242,7 @@ class CameraConfig(StrictModel):
 
     @property
     def device_kind(self) -> Literal["v4l2", "realsense", "address", "file"] | None:
-        """The kind of the device; None if the camera is no device."""
+        """The kind of the device; None if the camera is simulated or on a ROS topic."""
         if self.device is None:
             return None
         if isinstance(self.device, int) or self.device.isdigit() or self.device.startswith("/dev/"):

@@ -109,7 +109,7 @@ def config_error(
 
 
 def _key(fault: ErrorDetails) -> str:
-    # Parts in brackets are not keys: pydantic adds "[key]", and the tags of alternative models for a key's value.
+    # Parts in brackets are not keys. They are pydantic's "[key]", or the tag of one of several models for a value.
     key = ".".join(str(part) for part in fault["loc"] if not str(part).startswith("["))
     return " ".join(key.split())[:300] or "(top level)"
 
@@ -127,7 +127,7 @@ def _line(fault: ErrorDetails, model: type[BaseModel]) -> str:
         keys = _keys_at(fault["loc"][:-1], model)
         meant = get_close_matches(str(fault["loc"][-1]), keys, n=1)
         allowed = f"unknown key; {f'did you mean {meant[0]}? ' if meant else ''}allowed here: {', '.join(keys)}"
-    # If the value is a block, it is not shown. For a known block, the text names the keys that do not fit together.
+    # A block is not shown as a value, because the text already names its unknown key, or the keys that do not fit.
     is_block = fault["type"] in ("value_error", "extra_forbidden") and isinstance(fault["input"], dict)
     value = "" if is_block else f" = {shown(fault['input'])}"
     return f"{key}{value}: {allowed}"

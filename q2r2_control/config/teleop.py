@@ -107,7 +107,7 @@ class LeashSettings(StrictModel):
     carried_angle: float = Field(0.1, ge=0.03, le=2, description="the same for the rotation of that frame [rad]")
 
     def carried(self) -> LeashSettings:
-        """Return the leash of the frame between two tools that carry one object. It is at most as long as a tool's."""
+        """Return the leash of the frame between two tools that carry one object. A tool's leash is at least as long."""
         distance, angle = (math.inf if length is None else length for length in (self.distance, self.angle))
         shorter = {"distance": min(distance, self.carried_distance), "angle": min(angle, self.carried_angle)}
         return self.model_copy(update=shorter)
