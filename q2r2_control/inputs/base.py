@@ -114,7 +114,7 @@ def is_simulated(source: str) -> bool:
 
 
 def adapted(source: str, config: Config) -> Config:
-    """Return the cell with the settings that an input needs, such as its bindings. ``q2r2 run`` changes them likewise.
+    """Return the cell with the settings that an input needs, such as its bindings. ``q2r2 run`` also calls this.
 
     Args:
         source: The name of an installed input.
@@ -133,8 +133,8 @@ def make_input(source: Input | str, config: Config, **options: object) -> Input:
     Args:
         source: The name of an installed input, such as ``headset``, or an object with all methods of :class:`Input`.
         config: The cell that the input moves.
-        options: Keyword arguments of the input's ``from_config``, such as ``trajectory="circle"``. The ones that the
-            input does not have are ignored.
+        options: Keyword arguments of the input's ``from_config``, such as ``trajectory="circle"``. Options
+            that the input does not have are ignored.
 
     Raises:
         ConfigError: If the name is unknown, if ``source`` is neither a name nor an input, or if the input refuses an

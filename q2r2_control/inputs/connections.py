@@ -27,13 +27,13 @@ from q2r2_control.inputs.messages import KEEPALIVE, FrameDecoder, HandPose, Wire
 from q2r2_control.inputs.session import HeadsetSession, Reception, log_frame
 from q2r2_control.types import HapticFeedback
 
-KEEPALIVE_AFTER = 1.0  # The server sends a keepalive if it has sent nothing for longer [s].
+KEEPALIVE_AFTER = 1.0  # The server sends a keepalive if it has sent nothing for longer than this [s].
 # A driver that sends no whole frame for longer than this is dropped [s]. The app sends a keepalive after 1 s.
 SILENCE_ALLOWED = 2.0
 TURN = 0.05  # Longest wait for the network. Timeouts are checked this often [s].
 # Greatest number of bytes in one read, about 40 messages. The control loop can run between two reads.
 _RECEIVE_BYTES = 1 << 12
-MAX_FRAMES_PER_SECOND = 2000  # The app sends about 450. More would take processor time from the control loop.
+MAX_FRAMES_PER_SECOND = 2000  # The app sends about 450. Much more would delay the control loop.
 
 _LOG = logging.getLogger("q2r2_control.inputs.headset")
 
@@ -107,7 +107,7 @@ class Connections:
         # thread or the whole process has stalled, a client could count as silent although it has sent data.
         asked = self._clock()
         self._watch_door(asked)
-        # During this loop, only the event of a connection itself can end it. No event of an ended connection follows.
+        # In this loop, a connection ends only while its own event is handled. No event of an ended connection follows.
         for key, _ in self._selector.select(TURN):
             key.data()
         self._settle(asked)
@@ -248,7 +248,7 @@ class Connections:
             self._waiting.remove(client)
         self._selector.unregister(client.socket)
         with client.socket, suppress(OSError):
-            # The unsent bytes go first, since they may be the end of a frame.
+            # Unsent bytes are sent before the last line, since they may be the end of a frame.
             client.socket.send(bytes(client.session.outgoing) + log_frame("error", last_words or reason))
 
     def _write(self, client: Client, level: int, what: str) -> None:

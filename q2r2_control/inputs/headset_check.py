@@ -111,7 +111,7 @@ def watch_headset(
     stopping: Callable[[], bool],
     watch: HandWatch,
 ) -> HeadsetCheck:
-    """Watch a started server for ``duration`` [s] or until ``stopping()`` is True; None for no bound on the time.
+    """Watch a started server for ``duration`` [s] (None: without end), or until ``stopping()`` is True.
 
     Each state of the check is passed to ``show``, and the last one is returned.
     """
@@ -160,9 +160,9 @@ def needed_topics(config: Config) -> tuple[str, ...]:
 
 
 def advice_on_some(silent: tuple[str, ...], warning: str | None = None) -> tuple[str, ...]:
-    """Return advice if some topics come and others are ``silent``, with one line for each hand.
+    """Return advice if some topics come and others are ``silent``: one line for each hand with silent topics.
 
-    The ``warning`` about the poses of both hands comes first; None if there is none.
+    If there is a ``warning`` about the poses of both hands, it is the first line.
     """
     lines = [] if warning is None else [warning]
     for hand in SIDES:

@@ -79,7 +79,8 @@ def moved_as_one(before: HandPair, after: HandPair, tolerance: Move) -> bool:
 
 
 # A motion from one sample to the next is a step if two conditions hold. It is larger than _STEP, and it is larger than
-# _STANDS_OUT times each of the last _BEFORE motions. From rest, this is 0.7 m/s within one sample: over 30 m/s^2.
+# _STANDS_OUT times each of the last _BEFORE motions. A hand that starts from rest makes such a motion only if it
+# accelerates at over 30 m/s^2, to a mean speed of 0.7 m/s between two samples.
 _STEP = Move(0.010, math.radians(2.0))
 _STANDS_OUT, _BEFORE = 3.0, 4
 _PERIOD = 1.0 / 72.0  # Period of samples [s]. The time between two samples is shorter if the first one was delayed.

@@ -79,7 +79,7 @@ class HeadsetSampling(SampleTiming):
         self._lost = lost
         self._random = np.random.default_rng([seed, SIDES.index(hand)])
         self._position_noise, self._dropout_probability = position_noise, dropout_probability
-        # In each degree of freedom, the amplitude of a sum of two sines rises and falls, like that of a real tremor.
+        # In each degree of freedom, the tremor is a sum of two sines. Its amplitude rises and falls, like real tremor.
         self._frequencies = self._random.uniform(*((5.5, 6.5) if shaky else (8.0, 12.0)), (6, 2))
         self._phases = self._random.uniform(0.0, 2.0 * math.pi, (6, 2))
         self._amplitudes = (1.0 if shaky else 0.5) * tremor * np.array([1e-3] * 3 + [math.radians(0.3)] * 3)

@@ -45,7 +45,7 @@ class ActionSpace(StrEnum):
 
     JOINTS = "action"  # Joint positions of all arms [rad].
     TOOL = "action.tool"  # Tool poses x y z [m] qx qy qz qw in the world frame.
-    # Motions from each target pose to the next: displacement [m] and rotation vector [rad], in the axes of the first.
+    # Motions from each target pose to the next: displacement [m] and rotation vector [rad], in the first pose's axes.
     TOOL_DELTA = "action.tool_delta"
 
 

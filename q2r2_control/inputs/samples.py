@@ -45,7 +45,7 @@ class SampleQueue:
 
     After :meth:`cut` the next two calls of :meth:`take` return nothing, and :attr:`is_cut` is True until the second
     call. A loop that checks :attr:`is_cut` once per tick, before or after :meth:`take`, therefore notices even a
-    connection that was lost and made again at once. Such a loop never takes the poses of two clients for one motion.
+    connection that was lost and made again at once. Such a loop never sees the poses of two clients as one motion.
     """
 
     def __init__(self) -> None:

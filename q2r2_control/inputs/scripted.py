@@ -90,14 +90,14 @@ def _phase(t: float, frequency: float) -> float:
 def _circle(t: float, frequency: float) -> tuple[Array, Array]:
     """Return the hand's displacement at ``t`` on a circle of radius 0.1 m, as in Quest2ROS2's SimulationInput.
 
-    The circle leads sidewards and up.
+    The circle lies in the plane of y and z, and the start is its lowest point.
     """
     phase = _phase(t, frequency)
     return np.array([0.0, 0.1 * math.sin(phase), 0.1 * (1.0 - math.cos(phase))]), np.zeros(3)
 
 
 def _line(t: float, frequency: float) -> tuple[Array, Array]:
-    """Return the hand's displacement at ``t`` on a line of 0.15 m, which leads forwards and up, and back."""
+    """Return the hand's displacement at ``t`` on a straight line of 0.15 m forwards and up, and back again."""
     distance = 0.15 * (1.0 - math.cos(_phase(t, frequency))) / 2.0
     return distance * np.array([0.6, 0.0, 0.8]), np.zeros(3)
 
@@ -105,7 +105,7 @@ def _line(t: float, frequency: float) -> tuple[Array, Array]:
 def _rotate(t: float, frequency: float) -> tuple[Array, Array]:
     """Return the hand's displacement at ``t`` in a motion that turns the hand by 30 degrees and back.
 
-    The hand turns about x, y and z one after the other. Meanwhile it is 0.05 m above its start.
+    The hand turns about x, y and z one after the other. During this motion, it is 0.05 m above its start.
     """
     phase = _phase(t, frequency)
     turn = np.zeros(3)

@@ -22,7 +22,7 @@ from q2r2_control.inputs.messages import (
 from q2r2_control.types import SIDES, HandFault, HapticFeedback
 
 MAX_OUTGOING_BYTES = 1 << 16  # Greatest size of the answers that a client may leave unread.
-MAX_COMMAND_BYTES = 1 << 14  # Greatest length of the JSON of a system command. Commands of the app have under 200.
+MAX_COMMAND_BYTES = 1 << 14  # Greatest length of a system command's JSON. The app's commands have under 200 bytes.
 MAX_TOPICS = 64  # Greatest number of topics that a client may name. The app names about ten.
 MAX_INCOMPLETE = 64  # Greatest number of registrations without topic or type in one session.
 
@@ -80,7 +80,7 @@ class HeadsetSession:
 
     The server sends the first frame, in the dialect ROS2, before it knows the client's dialect. An app that is set to
     ROS1 logs an error and goes on. The client's first frame shows its dialect: only ROS2 clients put a NUL behind every
-    destination. Each payload then has to fit this dialect, so that no message is read by guessing.
+    destination. Each payload then has to fit this dialect, so that the dialect is never guessed.
 
     Data on topics outside ``HAND_TOPICS`` is counted and ignored. A registration whose topic or type the app's user
     left empty gets an error for the app's console, as from Unity's own endpoint. An unknown command, a name that no

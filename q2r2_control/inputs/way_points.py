@@ -1,6 +1,6 @@
 """Tasks of two hands, as way points of their tools in the world frame.
 
-The hands make the same motions as the tools are to make, wherever the hands are at the start.
+The motion of each hand is the motion that its tool has to make. The hands may start at any poses.
 """
 
 from __future__ import annotations
