@@ -14,10 +14,10 @@ from q2r2_control.robot.load import LEAST_POSTURES, MODEL, PENDANT, LoadReport, 
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
-_STEP = np.radians(1.17)  # Commanded step of a joint [rad]. If 0.17 degrees of it are missing, a degree remains.
+_STEP = np.radians(1.17)  # Commanded step of a joint [rad]. Even with an error of 0.17 degrees, it moves by a degree.
 # Largest difference between a measured joint and the commanded joint, at rest and during the motion [deg].
 _REACHED, _BEHIND = 0.2, 0.8
-# Largest displacements of A1 .. A7 from the first posture [rad]. A1 stays, because turning it changes no torque.
+# Largest displacements of A1 .. A7 from the first posture [rad]. A1 does not move, because its angle changes no torque.
 _SPREAD = np.array([0.0, 0.1, 0.2, 0.25, 0.4, 0.5, 0.5])
 _TRIES = 40
 LED = 2.0  # Time of the upward motion before the hand releases its button [s].

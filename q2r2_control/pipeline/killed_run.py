@@ -45,8 +45,8 @@ def measure_kill(config: Config, posture: Callable[[], Array], led: float = LED)
     process = HelperProcess("leads the arms", __name__, moments.append)
     process.send(config)
     try:
-        # The kill waits until the arms move up. After a late loop, an arm may move up too slowly for a measurement of
-        # its stop.
+        # The process is killed only while the tools move up fast enough. After a late tick, a tool may be too slow for
+        # a measurement of its stop.
         while _led(moments) < led or not _goes_up(robot, moments[-1]):
             if not process.alive:
                 raise PlantError(process.fault or "the arms did not follow the hands")

@@ -12,7 +12,8 @@ _SHORTEST_DT = 1e-6  # Least duration of a tick that :meth:`LoopClock.wait` retu
 # Shorter sleeps are left out [s]. Nobody sees the difference, because a window shows each picture of the arms for eight
 # times as long.
 _SHORTEST_SLEEP = 0.004
-# If simulated time is farther behind than this, it does not catch up, and the motion goes on in slow motion [s].
+# If simulated time is farther behind the computer's clock than this, it does not catch up [s]. The run goes on in slow
+# motion.
 _LONGEST_LAG = 0.1
 _WINDOW = 1.0  # Time over which late ticks are counted [s].
 _MANY_LATE = 0.1  # The loop falls behind if a larger share of the ticks in a window is late.
@@ -25,7 +26,7 @@ class WallPace:
         self._wall_at_zero: float | None = None  # Computer's time at simulated time zero [s].
 
     def wait_for(self, elapsed: float) -> None:
-        """Sleep until ``elapsed`` [s] of simulated time may be over by the computer's clock."""
+        """Sleep until ``elapsed`` [s] have passed on the computer's clock since simulated time zero."""
         now = time.monotonic()
         if self._wall_at_zero is None:
             self._wall_at_zero = now - elapsed

@@ -99,7 +99,7 @@ class OperatorSide:
         for event in events:
             stopped = (
                 is_fault(event) and event.kind is not TeleopReason.RECORDING_ENDED
-            )  # The recorder has logged that.
+            )  # The recorder has already logged the end of the recording.
             if stopped or event.kind is TeleopReason.HANDS_CROSSED:
                 _logger.warning("%s arm: %s", event.arm, sentence(event.reason))
             elif _logger.isEnabledFor(logging.DEBUG):

@@ -51,10 +51,12 @@ if TYPE_CHECKING:
     from q2r2_control.cameras.camera_streams import CameraStreams
 
 STOPPING = "stopping"  # The state of every arm while the run ends.
-_STOP_ALLOWANCE_S = 1.0  # Time after full braking for an arm that still returns into its limits.
+_STOP_ALLOWANCE_S = 1.0  # Further time, after full braking, for an arm that still has to return into its limits.
 _REST = 1e-6  # The reference is at rest if no joint is faster [rad/s].
 _ROUNDING_S = 1e-9
-_MAX_TORQUE_HOLD_S = 0.005  # A torque that a late tick held for 0.1 s would drive the arms into each other.
+# Longest time for which a simulated plant executes one torque, unless a period is longer. If a late tick let it execute
+# a torque for 0.1 s, the torque would drive the arms into each other.
+_MAX_TORQUE_HOLD_S = 0.005
 _LATE_LOOP = "the loop falls behind: of its %.0f ticks a second more than a tenth come late; %s"
 _CURES = "close other programs, give it priority with --rt, or set a lower loop_rate_hz in the cell"
 _CURES_OF_FITTED_RATE = (
@@ -108,8 +110,8 @@ class Pipeline(RequestedRun):
         check_kind("plant", plant, Plant, "an object with all methods of Plant")
         config.teleop.bindings.check_device(input.controls)
         self.config, self.robot, self.input, self.plant = config, robot, input, plant
-        # Arms of a session do not count. If torques are not safe, they cannot change to position commands, because a
-        # session has one mode.
+        # Whether position commands can replace torques that are not safe. In a session they cannot, because a session
+        # has only one mode.
         has_servos = CommandMode.POSITION in plant.modes and not isinstance(plant, SessionPlant)
         self.drive = make_drive(check_mode(mode, plant), robot, config, has_servos)
         if config.control.jerk_limit is not None and not keeps_jerk_limit(plant, self.drive.mode):
@@ -416,7 +418,7 @@ class Pipeline(RequestedRun):
         self.loop.observe(seen, now, passed, lost)
         self._watch_skew(now)
         openings, tools = self.plant.gripper_openings(), self._measured_tools(state)
-        self.loop.age_obstacles(now)  # Before new reports come, because their ages count from now.
+        self.loop.age_obstacles(now)  # This is done before new reports come, because their ages count from now.
         if self._following:
             self._targets = self._operator.targets(samples, tools, now)
         step = self._control(state, openings, now, gap, dt, braked)

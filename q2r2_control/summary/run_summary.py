@@ -126,13 +126,13 @@ class ArmSummary:
 
     @property
     def followed(self) -> bool:
-        """Whether the tool was where it should be at the end, or as near as a compliant arm can be."""
+        """Whether the tool was near its reference at the end. A compliant arm may be ``_FOLLOWED`` [mm] away."""
         return self.end_error_mm is None or self.end_error_mm <= _FOLLOWED
 
 
 @dataclass(frozen=True, slots=True)
 class RunSummary:
-    """Figures of a whole run. Ratios and margins are the worst of all ticks. A ratio of 1 means the limit."""
+    """Figures of a whole run. Ratios and margins are the worst of all ticks. At a ratio of 1, the limit was reached."""
 
     ticks: int
     duration_s: float
