@@ -133,7 +133,7 @@ class ArmTeleop:
         if usable and fault is None and self._gate.pose is not None:
             self.motion.add(self._gate.pose, self._gate.stamp, now, self.state is ArmState.ENGAGED)
         if usable and self.state is ArmState.ALIGNING:
-            # A jump is no fault here, because aligning makes the pose jump, and the arm does not follow it.
+            # A jump is no fault here, because the alignment makes the pose jump, and the arm does not follow the jump.
             return None
         return fault
 
@@ -260,7 +260,7 @@ class ArmTeleop:
         return 0.0 if Action.TRANSLATION_LOCK in held else share, 0.0 if Action.ROTATION_LOCK in held else share
 
     def go(self, cause: Cause, now: float, reason: Reason) -> None:
-        """Change the state by ``cause``. Presses that are not finished go on."""
+        """Change the state by ``cause``. Presses that are not finished are kept."""
         state = next_state(self.state, cause)
         if state is not self.state:
             self.events.append(Event(now, self.arm, self.state, state, reason))

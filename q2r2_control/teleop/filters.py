@@ -22,7 +22,7 @@ _MIN_SPACING = 0.005
 _USUAL_PERIOD = 1.0 / 75.0  # Period of a headset's samples that is assumed until it is measured [s].
 # Gains of the delay-locked loop: the shares of a sample's jitter that correct the sample's time and the period.
 _PHASE_SHARE, _PERIOD_SHARE = 0.2, 0.02
-_CATCH_UP = 0.5  # After a gap in the stream, the output catches up with the hand within this share of the gap.
+_CATCH_UP = 0.5  # After a gap in the stream, the output catches up with the hand in this share of the gap.
 
 
 class Interpolator:
@@ -31,7 +31,8 @@ class Interpolator:
     A headset measures at constant intervals, but its samples arrive at irregular ones. This jitter would look like
     speed. A delay-locked loop (Adriaensen 2005) removes it. The loop starts again when a sample is half a period early
     or late. If no sample comes for longer than ``delay``, the output rests at the newest sample, because nothing is
-    extrapolated. When samples come again, the output does not jump: it catches up within ``_CATCH_UP`` of the gap.
+    extrapolated. When samples come again, the output does not jump: it catches up with the hand in the share
+    ``_CATCH_UP`` of the gap.
     """
 
     def __init__(self, delay: float, period: float = _USUAL_PERIOD) -> None:
@@ -67,8 +68,8 @@ class Interpolator:
         self._even = stamp
         while len(knots) > 1 and stamp - knots[-1][0] < _MIN_SPACING:
             knots.pop()
-        # The output reaches a late sample no earlier than half the delay from now. Otherwise it would have to be
-        # faster.
+        # If a sample comes late, the output takes at least half the delay to reach it. With less time, the output would
+        # have to move too fast.
         earliest = max(self._caught_up, knots[0][0] + max(self.delay / 2.0, _MIN_SPACING))
         knots.append((max(stamp, earliest), position, rotation))
 

@@ -24,7 +24,7 @@ Shares = tuple[float, float]  # Factors of the scales of position and rotation: 
 class HandMotion:
     """Maps the motion of one hand to a tool, or to the frame between two tools that carry one object.
 
-    After :meth:`anchor` the tool never follows earlier motion of the hand, because nothing keeps that motion.
+    After :meth:`anchor` the tool never follows earlier motion of the hand, because this motion is not stored.
     """
 
     def __init__(self, arm: str, settings: TeleopSettings) -> None:

@@ -8,13 +8,14 @@ the rotation.
 **Slack.** Suppose that a leash is taut, that the tool is blocked in the direction of the leash, and that the hand comes
 back by more than its tremor. Then the target is put at the tool pose, and the tool follows the hand from there. The
 unfiltered hand poses decide whether the hand comes back, because filtered poses swing back by millimetres when a hand
-stops. The target's position and rotation are put at the tool pose together. A blocked tool rests where the pulls of the
-two balance. If only one of them were put there, the tool would follow the other one, by up to 50 mm.
+stops. The target's position and rotation are put at the tool pose together. While a tool is blocked, the pull towards
+the target's position and the pull towards its rotation are in balance. If only one of the two were put at the tool
+pose, the tool would follow the other one, by up to 50 mm.
 
 **Why the arm does not jump.** The only state of the controller is its reference, which is at rest while the tool is
 blocked. A target at the tool pose therefore asks for no motion. The controller also follows the velocity of its target,
-but ignores a step that is faster than three times the tool's speed limit. This is 9 m/s or 30 rad/s at most. The target
-is put at the tool pose only in a tick so short that this step is faster than that.
+but ignores a step that is faster than three times the tool's speed limit, which is 9 m/s or 30 rad/s at most. To put
+the target at the tool pose is such a step. It is only done in a tick that is short enough to make the step so fast.
 """
 
 from __future__ import annotations
@@ -156,7 +157,7 @@ class Leash:
     def _ends(self, tool: Pose, target: Pose) -> bool:
         """Return whether the target has reached the maximum distance or angle from the tool.
 
-        This is rare, so the check is kept cheap.
+        Targets rarely reach it, but all of them are checked. The check is therefore cheap.
         """
         (start, (a, b, c, d)), (end, (x, y, z, w)) = tool, target
         # The scalar product of two unit quaternions is the cosine of half the angle between them, up to its sign.

@@ -1,4 +1,4 @@
-"""Decide which arms follow a policy. These are arms that no operator drives, until the actions end or have a fault."""
+"""Decide which arms follow a policy: arms that no operator drives, until the policy's actions end or have a fault."""
 
 from __future__ import annotations
 

@@ -91,7 +91,7 @@ class RelativeMotion:
         """Let the pose ``hand`` (input's frame) correspond to the pose ``tool`` (world frame) from now on.
 
         Raises:
-            Q2R2Error: If one of the poses is not finite or no rotation. :meth:`target` and :meth:`hand` check likewise.
+            Q2R2Error: If a pose is not finite, or has no rotation matrix. :meth:`target` and :meth:`hand` raise it too.
         """
         self.anchor_floats(_checked_floats("anchor: hand", hand), _checked_floats("anchor: tool", tool))
 

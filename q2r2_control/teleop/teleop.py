@@ -255,8 +255,8 @@ class Teleop:
     def give_back(self, now: float) -> None:
         """Let a policy move the arms that hands have driven.
 
-        An arm that a fault stops afterwards waits for no press before the policy may move it again. This ends when a
-        reading of its hand comes.
+        If a fault stops an arm afterwards, the policy may move it again without a press. After the next reading of the
+        arm's hand, a press is needed again.
         """
         now, _ = self._clock(now)
         reason = Reason(TeleopReason.POLICY_REQUESTED)

@@ -30,7 +30,7 @@ class Told(NamedTuple):
 
     change: Event | None = None  # The last change of state.
     refusal: Event | None = None  # The newest refusal since this change.
-    pause: Event | None = None  # The newest request to pause the arm, which held already; None since the last change.
+    pause: Event | None = None  # The newest request to pause the arm, if it came after the change and while it held.
 
     def after(self, event: Event) -> Told:
         """Return the events that say why the arm is in its state after one more ``event``.
@@ -50,7 +50,7 @@ class Told(NamedTuple):
 
 
 def told_after(told: Mapping[str, Told], events: Iterable[Event]) -> dict[str, Told]:
-    """Return, by arm, the events that say why it is in its state after ``events``. ``told`` are the ones before."""
+    """Return, by arm, the events that say why it is in its state after ``events``. ``told`` are the events before."""
     newest = dict(told)
     for event in events:
         newest[event.arm] = newest.get(event.arm, Told()).after(event)

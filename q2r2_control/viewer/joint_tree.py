@@ -20,7 +20,7 @@ _SHARP = 0.6  # Edges with a larger angle than this look sharp, and other edges 
 
 
 class JointTree:
-    """All movable joints of arms and fingers, and the shapes that each joint carries."""
+    """All movable joints of arms and fingers, and the shapes that each joint moves."""
 
     def __init__(self, shown: ShownRobot) -> None:
         self.model = pin.buildModelFromXML(shown.urdf)

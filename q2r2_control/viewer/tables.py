@@ -17,7 +17,7 @@ from rich.text import Text
 Cell = Text | str | float | None
 _NARROWEST_NAME = 12  # A column of names is folded, but not to fewer characters than this.
 _UNIT = re.compile(r" (\[[^][]*\]|/\S*)$")
-_WIDEST = 1000  # Width with which the width of a whole table is measured [characters].
+_WIDEST = 1000  # The width of a whole table is measured as on a console of this width [characters].
 
 
 def figure_table(

@@ -72,12 +72,12 @@ class Door(PageDoor):
             def checked(connection: ServerConnection, request: Request) -> Response | None:
                 if (reason := self.refusal(request)) is not None:
                     return text_response(http.HTTPStatus.FORBIDDEN, f"{reason}\n")
-                request.path = "/"  # Every path means the page, because viser serves nothing else.
+                request.path = "/"  # Every path leads to the page, because viser serves nothing else.
                 response: Response | None = answer(connection, request)
                 if response is not None:
                     page.change(response)
                     protect(response, _POLICY)
-                    # No page may contain this one, because a foreign page could then steal a click.
+                    # No other page may embed this page. It could make the user click this page's buttons unknowingly.
                     response.headers["X-Frame-Options"] = "DENY"
                 return response
 

@@ -107,7 +107,7 @@ class PageView(Page):
             self._on_request = on_request
         config, plant = pipeline.config, pipeline.plant
         source: object = pipeline.input
-        while (operator := getattr(source, "operator", None)) is not None:  # A policy's input has an operator's input.
+        while (operator := getattr(source, "operator", None)) is not None:  # A policy's input may have an operator.
             source = operator
         self._input = source if isinstance(source, WebInput) else None
         self._source, self._nobody = source, pipeline.input.controls.words.nobody
