@@ -75,8 +75,8 @@ def capture_time(received: float, stamp_ms: float, delay: float) -> float:
 
     Args:
         received: Time of its receipt [s].
-        stamp_ms: Stamp of the driver by the same clock [ms]. V4L2 drivers stamp pictures by the monotonic clock;
-            others give 0, or the time since their stream began.
+        stamp_ms: Stamp of the driver [ms]. V4L2 drivers use the monotonic clock. Other drivers give 0, or the time
+            since their stream began.
         delay: Time from the capture to the receipt [s]. It is used if the stamp is not by the monotonic clock.
     """
     stamp = stamp_ms / 1e3

@@ -45,7 +45,7 @@ class NewestShots:
         return tuple(self._streams)
 
     def at(self, now: float) -> tuple[dict[str, ObservedPicture], dict[str, str]]:
-        """Return the newest pictures at a tick that is at ``now`` [s], by camera. It never waits.
+        """Return the newest picture of each camera at the tick of time ``now`` [s]. This method never waits.
 
         The second mapping has each camera without a usable picture, and the reason why it has none.
         """

@@ -122,7 +122,7 @@ def _line_number(text: str, location: Sequence[int | str]) -> int | None:
     node, line = yaml.compose(text, Loader=_Loader), None
     for part in location:
         if isinstance(node, yaml.MappingNode):
-            # Some parts are not in the file: pydantic's tags of alternative models, and keys that are missing.
+            # Two kinds of parts are not in the file: pydantic's tags of alternative models, and missing keys.
             found = [(key, value) for key, value in node.value if key.value == str(part)]
         elif isinstance(node, yaml.SequenceNode) and isinstance(part, int) and part < len(node.value):
             found = [(node.value[part], node.value[part])]

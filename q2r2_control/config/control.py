@@ -233,7 +233,7 @@ class ControllerSettings(StrictModel):
 
     @property
     def largest_distance(self) -> tuple[str, float]:
-        """Key and value of the largest distance in these settings that a pair may have to keep [m]."""
+        """Return the key and the value [m] of the largest distance that these settings may ask a pair to keep."""
         by_class = {f"distances.{name}": value for name, value in self.distances if value is not None}
         by_name = {f"pairs[{i}].distance": named.distance for i, named in enumerate(self.pairs)}
         return max((("min_distance", self.min_distance), *by_class.items(), *by_name.items()), key=lambda item: item[1])

@@ -38,11 +38,11 @@ class Preset:
     """The properties of one controller."""
 
     name: str
-    activation: str  # The conditions under which it follows a target, in words.
+    activation: str  # The conditions under which the controller follows a target, in words.
     topic: str = "{ctrl}/target_frame"  # Topic of its target.
     message: str = POSE  # Message type of its target.
     rate: float = 100.0  # Rate at which targets are sent [Hz].
-    lowest_rate: float = 50.0  # Below this rate, it stops or moves unevenly [Hz].
+    lowest_rate: float = 50.0  # Below this rate of targets, the arm stops or moves unevenly [Hz].
     hold: Hold = Hold.REPEAT
     guard: GuardSettings = _CAREFUL
     # The kind of joint commands that the node cartesian_controller sends in mode filtered; "none" if it sends none.

@@ -15,8 +15,8 @@ from q2r2_control.errors import ConfigError, shown
 Model = TypeVar("Model", bound=BaseModel)
 
 
-# What is allowed instead of a value, by pydantic's type of the fault. Braces enclose values that pydantic adds to the
-# fault.
+# For each type of fault of pydantic, a text that says what is allowed. A name in braces is replaced by the value that
+# pydantic gives for it.
 _ALLOWED = {
     "list_type": "a list such as [a, b]",
     "tuple_type": "a list such as [a, b]",

@@ -36,8 +36,8 @@ class Input(Protocol):
     The order of use is ``start``, then ``poll`` and ``send_haptic`` in any order, then ``close``. An input that is
     found by its name also has a class method ``from_config(config)``. Its class may have these further attributes:
 
-    - ``options``: The names of keyword arguments of ``from_config``. Each is an option of ``q2r2 run``, or ``say``, a
-      function that prints a line.
+    - ``options``: The names of keyword arguments of ``from_config``. Each is an option of ``q2r2 run``, except
+      ``say``, which is a function that prints a line.
     - ``cell``: A function that changes a cell's settings to the ones that this input needs, such as its own axes.
     - ``executable``: The ROS executable that is started for this input instead of ``hand_input``.
     - ``feels``: False if there is no device that could vibrate. No vibrations are then computed.
@@ -82,7 +82,7 @@ class PolicySource(Input, Protocol):
         """Return the chunks that came since the last call, oldest first. The method never waits and never raises."""
 
     def observe(self, observation: Observation) -> None:
-        """Give the policy a tick's observation, whose numbers never change. In real time the method never waits."""
+        """Give the policy the observation of a tick, which does not change later. In real time, this never waits."""
 
 
 def check_samples(samples: list[HandSample]) -> list[HandSample]:

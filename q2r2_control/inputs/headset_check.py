@@ -19,7 +19,7 @@ from q2r2_control.types import SIDES, Array, HandSample
 
 SILENCE = 2.0  # Time without data before advice is given [s].
 _PERIOD = 0.05  # Time between two polls of the server [s].
-_WINDOW = 0.5  # The movement in the newest time span of this length is put in words [s].
+_WINDOW = 0.5  # Duration of the newest movement, which is put in words [s].
 _STILL = 0.02  # A hand that has moved by less than this in the window counts as still [m].
 _DIRECTIONS = (("back -x", "forward +x"), ("right -y", "left +y"), ("down -z", "up +z"))
 

@@ -158,7 +158,7 @@ class PlayedInput:
             self._origin = now
         backlog = now - self._origin - self._due
         if backlog < 0.0:
-            return []  # Most polls end here.
+            return []  # Most polls come before the next sample is due.
         self._origin += max(backlog - _LONGEST_BACKLOG, 0.0)
         samples = []
         for index, stream in enumerate(self._streams):

@@ -202,7 +202,7 @@ _HESITATIONS, _HESITATES = 3, 0.4  # Number of hesitations, and the duration of 
 # Four delays after the headset loses the hands [s]: until the headset sees the hands again, until the hands engage the
 # arms, until the hands begin to carry again, and until the hands continue the work.
 _LOST, _ENGAGES, _CARRIES, _GOES_ON = 1.0, 1.3, 1.6, 2.1
-# Range of the fraction of the work after which the headset loses the hands. No tool presses on a part so early.
+# The headset loses the hands after a fraction of the work in this range. So early, no tool presses on a part yet.
 _EARLY = (0.1, 0.45)
 _NO_PRESS = (0.3, 0.6)  # Hands do not stop within these times before and after a press [s].
 
@@ -347,7 +347,7 @@ class ScriptedInput(PlayedInput):
 
     def hand_twist(self, hand: str, t: float) -> pin.Motion:
         """Return the ideal velocity of ``hand`` at ``t`` [s], in the axes of its poses [m/s, rad/s]."""
-        t -= self._origin or 0.0  # Otherwise, the differences below would be inexact if times count from 1970.
+        t -= self._origin or 0.0  # Times from 1970 on would make the differences below inexact.
         before, after = (self._ideal(hand, t + step) for step in (-_DIFFERENCE, _DIFFERENCE))
         linear = (after.translation - before.translation) / (2.0 * _DIFFERENCE)
         return pin.Motion(linear, pin.log3(after.rotation @ before.rotation.T) / (2.0 * _DIFFERENCE))

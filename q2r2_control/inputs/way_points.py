@@ -63,7 +63,7 @@ class HandWork:
     """The motion of both hands, from home and back to home."""
 
     duration: float  # [s]
-    # By hand, the way points after home, at rising times. A hand that is not a key rests.
+    # For each hand, the way points after home, at rising times. A hand that is not a key rests.
     tools: Mapping[str, tuple[WayPoint, ...]]
     steps: tuple[tuple[float, str], ...]  # Start of each step [s], and the step in words.
     presses: Mapping[str, tuple[float, ...]] = field(default_factory=dict)  # Presses of the upper button, by hand [s].

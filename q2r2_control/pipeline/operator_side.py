@@ -134,7 +134,7 @@ class OperatorSide:
             pulses.grasps(self._grips[arm].look(commanded, opening, tick.now))
 
     def _fulfil(self, now: float) -> None:
-        # Only the requests that are there now count. Requests that come meanwhile wait for the next tick.
+        # Only requests that have come before this tick are carried out. Later requests wait for the next tick.
         for _ in range(len(self._requests)):
             request = self._requests.popleft()
             if isinstance(request, TeleopSettings):

@@ -126,7 +126,7 @@ class Pipeline(RequestedRun):
         self.cameras: CameraStreams | None = None  # The open real cameras, whose pictures a policy gets.
         # This is a plain flag, because a signal handler cannot take the lock of a threading.Event safely.
         self._stopping = False
-        self._ticked = time.monotonic()  # The end of the last tick, or the time before the first one [s].
+        self._ticked = time.monotonic()  # End of the last tick, or a time before the first tick [s].
         self._rate_was_fitted = False  # Whether :meth:`fit_rate` chose the rate of the loop.
         self._pace: WallPace | None = None  # Keeps simulated time from being faster than the clock; None if it may be.
         self._set_up()
@@ -336,7 +336,8 @@ class Pipeline(RequestedRun):
         self._turns = TurnCounter(self.robot)
         self._turns.counted(self._state.q, self._clock.now)
         self.controller.pass_time(self._clock.since(self._ticked))
-        # The reports are aged up to the time at which the first tick is due. If that tick is late, they age more.
+        # The reports of obstacles are aged up to the time at which the first tick is due. If that tick is late, it ages
+        # them further.
         self.loop.age_obstacles(self._clock.now + self._clock.period)
         self._start = RunStart(self._clock.now, self._state)
         self._plant_clock = PlantClock(self._state)
@@ -422,7 +423,7 @@ class Pipeline(RequestedRun):
         if self._following:
             self._targets = self._operator.targets(samples, tools, now)
         step = self._control(state, openings, now, gap, dt, braked)
-        assert step.reference is not None  # The loop owns its plant, and always commands it.
+        assert step.reference is not None  # A pipeline commands its plant in every tick.
         assert step.command is not None
         self.plant.apply(step.command)
         withdrawn = self._sessions is not None and self._sessions.withdraws()

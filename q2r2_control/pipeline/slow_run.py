@@ -67,7 +67,7 @@ class Moment(NamedTuple):
     reference: Array  # Positions of the reference.
     v: Array  # Velocities of the reference [rad/s].
     deceleration: Array | None  # Deceleration of the certified stop from the reference [rad/s^2].
-    engaged: dict[str, bool]  # By arm, whether it follows a hand.
+    engaged: dict[str, bool]  # For each arm, whether it follows a hand.
 
 
 class SlowRun:

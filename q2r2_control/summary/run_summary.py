@@ -70,7 +70,7 @@ class Histogram:
 class TorqueSummary:
     """Figures of a run in torque mode."""
 
-    # By arm, the time for which its distance from the reference was larger than the impedance's error clip.
+    # For each arm, the time for which its distance from the reference was larger than the impedance's error clip.
     off_reference_s: dict[str, float]
     min_measured_distance_mm: float | None = None  # By the measured joints; None if there is no monitored pair.
     measured_closest_pair: tuple[str, str] | None = None

@@ -39,7 +39,7 @@ class CrossedHands:
     def __init__(self, axes: Sequence[str]) -> None:
         """``axes`` are the signed axes of the setting ``teleop.axes``, from the input's frame to the world frame."""
         self._forward, self._left = axes_matrix(axes)[:2].tolist()  # The world's x and y axes, in the input's frame.
-        # By hand: time [s], and the horizontal parts of its position [m] and of its pointing direction.
+        # For each hand: time [s], and the horizontal parts of its position [m] and of its pointing direction.
         self._hands: dict[str, tuple[float, _Level, _Level]] = {}
         self._since = math.inf  # Time since which the hands have been crossed [s]; infinite if they are not crossed.
         self._at = -math.inf  # Time of the newest sample at which both hands were judged [s].
@@ -54,7 +54,7 @@ class CrossedHands:
         position, rotation = pose
         *points, _ = product(product(rotation, (*self._forward, 0.0)), inverse(rotation))
         self._hands[sample.hand] = stamp, self._level(position), self._level(points)
-        if stamp - self._at > _NEWEST:  # Both hands have not been judged for too long.
+        if stamp - self._at > _NEWEST:  # The last judgement of both hands is too old.
             self._since = math.inf
         if self._hands.keys() == {*SIDES}:
             self._judge(stamp)

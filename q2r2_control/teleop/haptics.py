@@ -22,7 +22,7 @@ class Pulse(NamedTuple):
     strongest: float | None = None  # Greatest amplitude, if the amplitude grows with a quantity; otherwise None.
 
     def grown(self, share: float) -> Pulse:
-        """Return the vibration with an amplitude between its own (``share`` 0) and :attr:`strongest` (1 or more)."""
+        """Return the vibration with an amplitude that grows to :attr:`strongest` while ``share`` grows from 0 to 1."""
         most = self.amplitude if self.strongest is None else self.strongest
         return self._replace(amplitude=self.amplitude + (most - self.amplitude) * min(share, 1.0))
 

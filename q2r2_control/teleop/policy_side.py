@@ -106,7 +106,7 @@ class PolicySide:
         return not any(self._arms[other].heard_of for other in lost)
 
     def _begin(self, around: ArmMeasurements, now: float) -> None:
-        """Let the arms begin that may follow the policy and have a plan. Linked arms begin together or not at all."""
+        """Let each arm that has a plan and may follow it begin to do so. Linked arms begin together or not at all."""
         ready = [name for name in self._arms if self._may_begin(name, around) and self._motions[name].counts(now)]
         if not ready or (self._linked and not self._wanted().issubset(ready)):
             return

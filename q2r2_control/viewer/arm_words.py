@@ -71,14 +71,14 @@ class ArmWords:
             device: The words of the device that drives.
         """
         self._joints, self._bindings, self._device = joints, bindings, device
-        self.told: Mapping[str, Told] = {}  # By arm, the events that say why it is in its state.
+        self.told: Mapping[str, Told] = {}  # For each arm, the events that say why it is in its state.
 
     def follow(self, events: Iterable[Event]) -> None:
         """Keep those of the newest ``events`` that say why an arm is in its state."""
         self.told = told_after(self.told, events)
 
     def controls(self) -> dict[str, str]:
-        """Return the action of each control of a hand that is bound to an action. Both are in words."""
+        """Return the controls of a hand that are bound to an action, and these actions. Both are in words."""
         bound = {self._device.noun(binding.words): MEANINGS[binding.action] for binding in self._bindings.bound()}
         both = [self._device.noun(control) for control in ("lower", "upper") if control in self._device.nouns]
         chord = {} if len(both) < 2 else {" and ".join(both): "the headset's alignment: stops both arms until let go"}

@@ -56,7 +56,7 @@ class JointTree:
 
         Args:
             q: Positions of the arms' joints (nv,) [rad].
-            openings: By arm, the opening of its gripper, from 0 for closed to 1 for open.
+            openings: For each arm, the opening of its gripper, from 0 for closed to 1 for open.
         """
         full: Array = pin.neutral(self.model)
         full[self._arms] = q

@@ -25,10 +25,10 @@ def figure_table(
 ) -> Table:
     """Return a table of figures and names under headings; ``notes`` are lines below it.
 
-    The unit at the end of a heading is put into a second line. A column with a unit or with numbers has figures.
-    Such a column is aligned to the right and is never cut. In other columns, text that is too long continues in the
-    next line. A row of one cell is the heading of the rows below. If the console is too narrow, the table is wider than
-    the console. It therefore has to be printed by :func:`print_table`.
+    The unit at the end of a heading is put into a second line. A column with a unit or with numbers is aligned to the
+    right, and is never cut. In other columns, text that is too long continues in the next line. A row of one cell is
+    the heading of the rows below. If the console is too narrow, the table is wider than the console. The table
+    therefore has to be printed by :func:`print_table`.
     """
     given = list(given)
     rows = [tuple(map(_shown, row)) for row in given]

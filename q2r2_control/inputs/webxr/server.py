@@ -173,7 +173,8 @@ class PageServer:
         if client is not self._driver:
             self._settle(now)
             return
-        # If several messages come together, only the newest is passed on. A change of the buttons is never left out.
+        # If several messages come together, only the newest one and the last one before each change of the buttons are
+        # passed on.
         if client.newest is None:
             asyncio.get_running_loop().call_soon(self._pass_on, client)
         elif client.newest.controls != message.controls:

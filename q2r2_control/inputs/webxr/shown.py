@@ -35,7 +35,7 @@ class ShownScene(TypedDict):
 
     name: str
     meshes: list[ShownMesh]
-    hands: dict[str, list[int]]  # By arm, the joints whose meshes move with the tool.
+    hands: dict[str, list[int]]  # For each arm, the joints whose meshes move with the tool.
     parts: dict[str, ShownPart]
     floor: float  # Height of the floor [m].
     timeout: float  # An arm stops if no hand comes for this time [s].
