@@ -69,7 +69,7 @@ Answer = CameraShot | DepthShot | CameraLost
 
 
 def main(requests: Iterator[Any], answer: Callable[[Answer], None]) -> None:
-    """Answer with each picture of a camera until the requests end. The first request is the camera's configuration.
+    """Send each picture of a camera as an answer until the requests end. The first request is the camera's settings.
 
     If the camera is lost later, this process tries again and again to open it.
 

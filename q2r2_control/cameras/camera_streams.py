@@ -16,7 +16,7 @@ from q2r2_control.errors import CameraError
 from q2r2_control.process.helper_process import HelperProcess, reason_of
 
 _WAITING = 256  # Greatest number of a camera's pictures that wait for ``take``. If more come, the oldest are lost.
-_READY = 120.0  # Longest time until a camera gives its first picture, on a computer that is busy [s].
+_READY = 120.0  # Longest wait for a camera's first picture [s]. It is so long for a busy computer.
 _Item = TypeVar("_Item")
 _LOOKS = 0.02  # Time between two checks whether a picture has come [s].
 
@@ -116,7 +116,7 @@ class CameraStreams(AbstractContextManager["CameraStreams"]):
             stream.first_picture()
 
     def newest_shots(self, realtime: bool) -> NewestShots:
-        """Return the newest pictures at each tick of a run. ``realtime``: whether the loop keeps real time."""
+        """Return the newest pictures at each tick of a run. ``realtime`` says whether the loop keeps real time."""
         return NewestShots(self.streams, realtime)
 
     def close(self) -> None:

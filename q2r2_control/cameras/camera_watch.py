@@ -1,6 +1,6 @@
 """Notices when a camera stops, slows down, changes the size of its pictures, or comes back.
 
-It reads no clock: its methods get all times.
+This module reads no clock. The callers pass all times.
 """
 
 from __future__ import annotations

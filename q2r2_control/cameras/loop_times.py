@@ -30,8 +30,8 @@ class LoopTimes:
     def at(self, computer: float) -> TickTime:
         """Return the loop's time at a time of the computer's clock, with the number of the last tick up to then.
 
-        Before the first tick, the loop's clock is assumed to run like the computer's. The number is then that of the
-        first tick.
+        Before the first tick, the loop's clock is assumed to run like the computer's. The number is then the
+        number of the first tick.
         """
         ahead = None
         for tick in reversed(self._ticks):

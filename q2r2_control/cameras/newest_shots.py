@@ -35,7 +35,7 @@ class NewestShots:
     """The newest pictures of the open cameras at each tick of one run."""
 
     def __init__(self, streams: Mapping[str, CameraStream], realtime: bool) -> None:
-        """``streams`` are the open cameras. The loop's clock is that of the computer if ``realtime`` is True."""
+        """``streams`` are the open cameras. If ``realtime`` is True, the loop's clock is the computer's."""
         self._streams, self._realtime, self._times = streams, realtime, LoopTimes()
         self._pictures: dict[str, ReadPicture] = {}  # The newest picture of each camera.
 

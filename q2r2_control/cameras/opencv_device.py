@@ -71,7 +71,7 @@ class OpenCvDevice:
         return opened
 
     def _choose_format(self, opened: cv2.VideoCapture) -> None:
-        """Set size and rate. If the device's own format does not reach them, use MJPG, which loads the bus less."""
+        """Set size and rate. If the device's own format does not reach them, use MJPG, which needs less bandwidth."""
         width, height = size_before_rotation(self._camera)
         for fourcc in (None, _MJPG):
             if fourcc is not None:

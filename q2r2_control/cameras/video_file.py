@@ -16,7 +16,7 @@ class VideoFile:
     """Plays a file, in a loop or once. Implements :class:`CameraDevice`.
 
     A picture is captured at the time at which the file shows it. These times do not depend on how busy the computer is:
-    a picture that is read too late still has its own time, and none is left out.
+    a picture that is read too late still has its own time, and no picture is left out.
     """
 
     def __init__(self, camera: CameraConfig) -> None:

@@ -1,7 +1,7 @@
 """Properties of community controllers: topic, message type, rate, activation, limits.
 
-``{ctrl}`` stands for the controller's own name with its namespace, the parameter ``ctrl_prefix`` of an arm controller.
-``{robot}`` stands for that namespace alone. An installed package can add a controller by an entry point of
+``{ctrl}`` stands for the parameter ``ctrl_prefix`` of an arm controller: the controller's own name with its namespace.
+``{robot}`` stands for this namespace alone. An installed package can add a controller by an entry point of
 ``q2r2_control.presets`` that is a :class:`Preset` of the same name.
 """
 
@@ -168,7 +168,7 @@ class Mode(StrEnum):
     FILTERED = "filtered"  # The target after the built-in controller: within limits and free of collisions.
 
 
-# The warning about mode raw, at the start and in q2r2 check.
+# The warning about mode raw. It is shown at the start and by q2r2 check.
 RAW_WARNING = "raw: no limits, no distances, no self-collision"
 
 

@@ -25,7 +25,7 @@ def axes_matrix(axes: Sequence[str]) -> Array:
 
     A position p of the input becomes M p in the world, and a rotation R becomes M R M'. ``axes[i]`` is the input's axis
     that becomes the world's i-th axis. The determinant is -1 if the frame of the input is left-handed, as in raw Unity.
-    M R M' is a proper rotation then too.
+    Even then, M R M' is a proper rotation.
 
     Raises:
         ValueError: If the axes are not allowed. The message names the value and what is allowed.
@@ -43,7 +43,7 @@ class Stance(StrEnum):
     SIDE_BY_SIDE = "side_by_side"
     # The operator faces the robot. The left hand moves the right arm, and motions keep their direction in the world.
     MIRROR = "mirror"
-    MIRROR_REFLECTED = "mirror_reflected"  # The hands are swapped too, but motions are reflected left to right.
+    MIRROR_REFLECTED = "mirror_reflected"  # Like ``MIRROR``, but motions are reflected left to right.
 
     def hand_of(self, arm: str) -> str:
         """Return the hand that moves an arm."""

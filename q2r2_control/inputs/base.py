@@ -86,7 +86,7 @@ class PolicySource(Input, Protocol):
 
 
 def check_samples(samples: list[HandSample]) -> list[HandSample]:
-    """Return the ``samples`` of a poll. Their numbers may have any value.
+    """Check the types in the ``samples`` of a poll, and return the samples. Their numbers may have any value.
 
     Raises:
         InputError: If ``samples`` is not a list of HandSample, or if a field of a sample has a wrong type.
@@ -128,7 +128,9 @@ def adapted(source: str, config: Config) -> Config:
 
 
 def make_input(source: Input | str, config: Config, **options: object) -> Input:
-    """Return the input called ``source``, or ``source`` itself if it is an input. It receives nothing before ``start``.
+    """Return the input called ``source``, or ``source`` itself if it is an input.
+
+    The input receives nothing before ``start``.
 
     Args:
         source: The name of an installed input, such as ``headset``, or an object with all methods of :class:`Input`.

@@ -48,7 +48,7 @@ class Client(Peer):
         self.socket = connection
         self.decoder = FrameDecoder()
         self.refused_hosts: set[str] = set()  # Hosts that the log has named as refused while this client drives.
-        self.announced = False  # Whether the log has a line that this client is connected.
+        self.announced = False  # Whether the log already says that this client is connected.
         self.last_sent = now
         self._frames = RateLimit(MAX_FRAMES_PER_SECOND)
 

@@ -23,7 +23,7 @@ from q2r2_control.types import QUEST_CONTROLS, Array, HandInputs, HapticFeedback
 
 
 class Dialect(StrEnum):
-    """The app's form of serialisation. The app's settings choose it, and only the bytes of the messages show it."""
+    """The app's form of serialisation. The app's user sets it, and the server sees it only from the messages' bytes."""
 
     ROS1 = "ROS1"
     ROS2 = "ROS2"

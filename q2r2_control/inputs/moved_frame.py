@@ -18,7 +18,7 @@ import pinocchio as pin
 from q2r2_control.inputs.messages import HandPose
 from q2r2_control.types import SIDES, Array, HandInputs
 
-_FARTHEST = 1e3  # Greatest allowed coordinate of a hand. No tracking system measures so far [m].
+_FARTHEST = 1e3  # Greatest allowed coordinate of a hand. No tracking system measures larger ones [m].
 
 
 class Move(NamedTuple):
@@ -126,8 +126,8 @@ class MovedFrame:
         """Forget everything that was received, except which hand holds the buttons of an alignment."""
         self._motions = {hand: _HandMotion() for hand in SIDES}
         self._pairs: deque[HandPair] = deque()
-        # Since this pair, the left hand has stayed within _NEAR of its position in the pair. It is set if ``_pairs`` is
-        # not empty.
+        # Since this pair, the left hand has stayed within _NEAR of its position in the pair. The pair is set if
+        # ``_pairs`` is not empty.
         self._near: HandPair
         # The time at which a step of the hands' frame was detected that may be the operator's alignment [s]; None if
         # there is no such step.

@@ -1,6 +1,6 @@
 """Scripted hands: ideal or human-like motions with button presses, which are the same in every run.
 
-A motion is a displacement from the pose that the hand has at the start. Motions that are no assembly work are written
+A motion is a displacement from the pose that the hand has at the start. All motions except assembly works are written
 for the left hand, and the right hand moves as its mirror image. The axes are x forwards, y to the left, and z up.
 """
 
@@ -168,7 +168,7 @@ TRAJECTORIES: Mapping[str, HandTrajectory] = {
 
 
 def place_of(seed: int, spread: float) -> tuple[float, float]:
-    """Return a random shift of all tasks' parts along x and y [m]. Each is between -``spread`` and ``spread`` [m]."""
+    """Return a random shift of all tasks' parts along x and y [m]. Both are between -``spread`` and ``spread``."""
     x, y = np.random.default_rng([seed, _PLACES]).uniform(-spread, spread, 2).tolist()
     return x, y
 
@@ -204,7 +204,7 @@ _HESITATIONS, _HESITATES = 3, 0.4  # Number of hesitations, and the duration of 
 _LOST, _ENGAGES, _CARRIES, _GOES_ON = 1.0, 1.3, 1.6, 2.1
 # The headset loses the hands after a fraction of the work in this range. So early, no tool presses on a part yet.
 _EARLY = (0.1, 0.45)
-_NO_PRESS = (0.3, 0.6)  # Hands do not stop within these times before and after a press [s].
+_NO_PRESS = (0.3, 0.6)  # Hands do not hesitate within these times before and after a press [s].
 
 
 def hurried(work: HandTrajectory, seed: int) -> HandTrajectory:

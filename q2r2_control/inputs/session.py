@@ -188,7 +188,7 @@ class HeadsetSession:
 
 
 def _parameters(command: str, payload: bytes) -> dict[str, Any]:
-    """Return the JSON object of a system command. Too deep nesting and too long numbers are refused too."""
+    """Return the JSON object of a system command. JSON with too deep nesting or too long numbers is refused."""
     if len(payload) > MAX_COMMAND_BYTES:
         raise ProtocolError(f"{command!r:.60}: {len(payload)} bytes, at most {MAX_COMMAND_BYTES} are allowed")
     try:

@@ -76,7 +76,7 @@ class LoopClock:
         return max(self.now - before, _SHORTEST_DT)
 
     def keep_pace(self) -> None:
-        """Wait if simulated time is ahead of the computer's clock and has to keep its pace."""
+        """Wait if simulated time is ahead of the computer's clock, and must not pass faster than this clock."""
         if self._pace is not None:
             self._pace.wait_for(self.now - self.start)
 
@@ -88,7 +88,7 @@ class LoopClock:
         return late * self.period > _MANY_LATE * _WINDOW
 
     def after(self, duration: float) -> bool:
-        """Return whether ``duration`` [s] is over. Half a period may be missing, so that rounding adds no tick."""
+        """Return whether at most half a period of ``duration`` [s] is left. Rounding errors then add no tick."""
         return self.now - self.start >= duration - 0.5 * self.period
 
     def read(self) -> float:
@@ -111,7 +111,7 @@ class LoopClock:
 class PlantClock:
     """Stamps the states of a plant by the loop's clock.
 
-    If the plant repeats a state, the state gets older by the time for which the plant was advanced meanwhile.
+    If the plant gives the same state again, its age grows by the time for which the plant was advanced since then.
     """
 
     def __init__(self, state: RobotState) -> None:
@@ -124,7 +124,7 @@ class PlantClock:
         self._unanswered += dt
 
     def stamped(self, state: RobotState, now: float) -> tuple[RobotState, float]:
-        """Return the ``state`` with a stamp of the loop's clock, and the plant's time since the last state [s].
+        """Return the ``state`` with a stamp of the loop's clock, and the plant's own time since the state before [s].
 
         Args:
             state: The state that was read at ``now``, with the stamp of the plant's clock.

@@ -63,7 +63,7 @@ class OperatorSide:
         self._feels = getattr(source, "feels", True)  # False if no device can vibrate.
         self._controller, self._requests, self._impedance = controller, requests, impedance
         self._homing = False  # True while supervision moves the arms home.
-        self._in_the_way: frozenset[str] = frozenset()  # Moving obstacles too close to an arm in their last report.
+        self._in_the_way: frozenset[str] = frozenset()  # Moving obstacles that were reported too close to an arm.
         self.connected = False
         arms = controller.robot.arms
         self._conditions = ArmConditions(controller)

@@ -1,4 +1,4 @@
-"""Run a cell in one process: input -> teleop -> control -> plant at every tick, and arms at rest at the end."""
+"""Run a cell in one process: input -> teleop -> control -> plant at every tick. At the end, the arms come to rest."""
 
 from __future__ import annotations
 
@@ -178,7 +178,7 @@ class Pipeline(RequestedRun):
         return preflight_faults(self.robot, self.config.control.without_contact(), self.controller)
 
     def stop(self) -> None:
-        """Bring the arms to rest and end the run, or end the next run if none goes on.
+        """Bring the arms to rest and end the run. If no run goes on, end the next run when it begins.
 
         Any thread and any signal handler may call this method.
         """
@@ -195,7 +195,7 @@ class Pipeline(RequestedRun):
                 The result is the same, bit for bit.
 
         Raises:
-            ConfigError: If the duration is not positive, or if the plant cannot keep the kind of time asked for.
+            ConfigError: If the duration is not positive, or if the plant does not support this kind of time.
         """
         if duration is not None and not (is_number(duration) and duration > 0.0):
             raise ConfigError(f"duration = {shown(duration)}: allowed: a positive number of seconds")
@@ -484,7 +484,7 @@ class Pipeline(RequestedRun):
     def _posture(self) -> Array | None:
         """Return the joint positions that a policy asks for (nv,) [rad], or None.
 
-        Arms for which it asks for none get their home posture.
+        An arm for which the policy asks for no positions gets its home posture.
         """
         asked = {arm: posture for arm, target in self._targets.items() if (posture := target.posture) is not None}
         if not asked:

@@ -25,13 +25,13 @@ _NEWEST = 0.2  # A pose that is older than this does not count [s].
 class CrossedHands:
     """Watches whether the left hand is to the left of the right hand, as the operator sees them.
 
-    The samples do not say where the operator faces, so the controllers have to show it. Both point forward along the
-    x axis of their own frames. Their mean horizontal direction is taken as the operator's forward direction. The
-    displacement from the right hand to the left hand, measured towards the operator's left, is negative if the hands
-    are crossed.
+    The samples do not say where the operator faces, so the controllers have to show it. Each controller points forward
+    along the x axis of its own frame. The mean horizontal direction of both controllers counts as the operator's
+    forward direction. The displacement from the right hand to the left hand, measured towards the operator's left, is
+    negative if the hands are crossed.
 
     In ordinary work, hands cross only for moments, or by less than 10 cm, or with controllers that point in different
-    directions. Such a moment starts the 3 s anew, and so does a moment in which one hand is not tracked. Swapped
+    directions. After such a moment, the 3 s begin again. They also begin again if one hand is not tracked. Swapped
     controllers stay on the wrong side from the beginning. The result is only a warning, since an operator may also
     cross the arms on purpose.
     """

@@ -178,7 +178,7 @@ class _Control:
 
     def cancel(self) -> None:
         self._muted = False
-        self.began: float | None = None  # Time at which the undecided press began [s]; None without one.
+        self.began: float | None = None  # Time at which the undecided press began [s]; None if there is none.
 
     def begin(self, stamp: float) -> None:
         self.began, self._muted = stamp, False

@@ -83,7 +83,7 @@ class ComponentLeash:
         return 0.0, 0.0, 0.0
 
     def hold(self, shift: Vector) -> Vector | None:
-        """Return ``shift`` (from tool to target), cut to the leash's length; None if it is not longer."""
+        """Return ``shift`` (from tool to target), cut to the leash's length; None if ``shift`` is not too long."""
         distance = math.hypot(*shift)
         if distance <= self._length:
             return None

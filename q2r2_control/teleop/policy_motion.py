@@ -175,7 +175,7 @@ class PolicyMotion:
         return None
 
     def _at(self, now: float) -> Pose:
-        """Return the plan's pose at ``now``, plus the part of the jump from the plan before that has not faded yet."""
+        """Return the plan's pose at ``now``, plus the part of the jump at the plan's start that has not faded yet."""
         assert self._plan is not None
         (x, y, z), rotation = _interpolated(self._plan, now)
         left = 1.0 - min((now - self._began) / self._fades, 1.0)

@@ -31,7 +31,7 @@ _CLOSE_TIMEOUT = 1.0  # Longest time until a browser confirms that a connection 
 
 
 class Door(PageDoor):
-    """Checks the requests to viser's page. The token is the path of its URL, since the page connects to this path."""
+    """Checks the requests to viser's page. The page connects to the path of its URL, so the token is this path."""
 
     def __init__(self, host: str, port: int, certificate: str | None = None, addresses: Sequence[str] = ()) -> None:
         """Open the socket. The arguments are those of :class:`PageDoor`."""

@@ -19,7 +19,7 @@ from q2r2_control.viewer.web.pace import BrowserPace
 
 _SIZE = 0.22  # Size of a gizmo [m].
 _PERIOD = 0.02  # Shortest time between two samples of a dragged hand [s].
-_ANSWER = 60.0  # A page without an answer for this time loses control. The gate stops the arms long before [s].
+_ANSWER = 60.0  # A page that gives no answer for this time stops driving [s]. Long before, the gate stops the arms.
 _Gizmos = dict[str, viser.TransformControlsHandle]  # The gizmo of each arm.
 
 
@@ -56,7 +56,7 @@ class Driving:
         return "let go, then drag again to engage" if not moves and arm in {*self._dragged, *self._spent} else ""
 
     def slowness(self, silent: bool) -> str:
-        """Return why the hands of the page that drives come too late; see :meth:`BrowserPace.advice`."""
+        """Return why the hand poses of the page that drives come too late; see :meth:`BrowserPace.advice`."""
         return self._pace.advice(silent)
 
     def add_buttons(self, gui: viser.GuiApi) -> None:
@@ -105,7 +105,7 @@ class Driving:
         gizmo = client.scene.add_transform_controls(name, scale=_SIZE, depth_test=False, visible=False)
 
         async def drag(event: viser.TransformControlsEvent) -> None:
-            # The function contains no await. Otherwise, the pose could be that of a later event.
+            # This function must not await anything. Otherwise, a later event could already have changed the pose.
             self._drag(client.client_id, arm, event)
 
         gizmo.on_update(drag)

@@ -159,7 +159,7 @@ class Panel:
         self._time_line = gui.add_slider("time [s]", 0.0, 1.0, 0.01, 0.0)
 
         def seek(event: viser.GuiEvent[viser.GuiSliderHandle[float]]) -> None:
-            if event.client_id is not None:  # Without a client, the panel itself moved the slider.
+            if event.client_id is not None:  # If there is no client, the panel itself moved the slider.
                 self._answer(PageSeek(float(event.target.value)))
 
         self._time_line.on_update(seek)

@@ -22,8 +22,8 @@ _BREAK = 1.0  # If the time between two points would be longer than this, a new 
 _AWAY = 0.01  # The ghost is shown if a joint is farther from its reference than this [rad].
 _SHORT = 0.01  # Lines up to this length are not drawn [m].
 _PER_NEWTON = 0.005  # Drawn length per force [m/N].
-# Forces are computed only in directions in which the ratio of the Jacobian's singular value to the largest one is above
-# this.
+# Forces are computed only in directions in which the Jacobian's singular value, divided by its largest one, is above
+# this number.
 _SINGULAR = 0.05
 _NEAR = 0.1  # A pair with this margin or more is green [m].
 _CAMERA = np.array([-1.8, 0.35, 1.5])  # Vector from the middle of the arms to the first position of the camera [m].

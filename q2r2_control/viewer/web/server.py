@@ -50,14 +50,14 @@ class _Newest:
 
 
 class LimitedAnswers:
-    """Passes answers of browsers on at a limited rate, because too many would take the interpreter from the loop.
+    """Passes answers of browsers on at a limited rate, because too many answers would delay the loop.
 
     A stop is always passed on, and so is the loss of a page that drove.
     """
 
     def __init__(self, answer: Callable[[Any], None], clock: Callable[[], float] = time.monotonic) -> None:
         self._answer, self._clock, self._lock = answer, clock, Lock()
-        self._allowed, self._then = _BURST, clock()  # Number of answers that are allowed, at this time [s].
+        self._allowed, self._then = _BURST, clock()  # Number of answers that were allowed at a time, and this time [s].
 
     def __call__(self, answer: Any) -> None:
         with self._lock:
