@@ -17,8 +17,8 @@ from q2r2_control.cameras.opening import open_device
 from q2r2_control.config.recording import CameraConfig
 from q2r2_control.errors import CameraError
 
-# Niceness of a camera's process. With it, the loop has priority even over ten of these processes together. On a
-# computer that is too busy, this process may therefore receive a picture late. If the picture has no stamp of the
+# Niceness of a camera's process. At this niceness, the loop has priority even over ten of these processes together.
+# On a computer that is too busy, this process may therefore receive a picture late. If the picture has no stamp of the
 # driver, its time is the time of its receipt, and is then late too.
 _NICENESS = 15
 _QUALITY = 90  # The quality of JPEG pictures, from 0 to 100.

@@ -145,7 +145,7 @@ PRESETS = {preset.name: preset for preset in _ALL}
 
 
 def preset_names() -> tuple[str, ...]:
-    """Return the names of the presets of this package, and then those of other installed packages."""
+    """Return the names of this package's presets, and then the names of other installed presets."""
     return (*PRESETS, *(name for name in names_of(ENTRY_POINTS) if name not in PRESETS))
 
 

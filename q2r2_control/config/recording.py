@@ -131,14 +131,14 @@ class RecordingSettings(StrictModel):
 
 
 def subtask_name(names: Sequence[str], number: int) -> str:
-    """Return the name of subtask ``number``, from 1 on; ``names`` are those of ``recording.subtasks``."""
+    """Return the name of subtask ``number``, from 1 on; ``names`` is ``recording.subtasks``."""
     return names[number - 1] if number <= len(names) else f"subtask {number}"
 
 
 def subtask_names(names: Sequence[str], presses: int) -> tuple[str, ...]:
     """Return the names of the subtasks that have begun in an episode; empty if the episode has no subtasks.
 
-    ``names`` are those of ``recording.subtasks``, and ``presses`` is how often the operator began another subtask.
+    ``names`` is ``recording.subtasks``, and ``presses`` is how often the operator began another subtask.
     """
     return tuple(subtask_name(names, number) for number in range(1, presses + 2)) if names or presses else ()
 

@@ -78,7 +78,7 @@ class StrictModel(BaseModel):
 
 
 def validated(model: type[Model], where: str, values: object, *, as_json: bool = False, **options: Any) -> Model:
-    """Return settings made of ``values``, or of a JSON text. ``options`` are those of pydantic's ``model_validate``.
+    """Return settings made of ``values``, or of a JSON text. ``options`` are for pydantic's ``model_validate``.
 
     Raises:
         ConfigError: If a value is not allowed. The message begins with ``where``.
@@ -134,7 +134,7 @@ def _line(fault: ErrorDetails, model: type[BaseModel]) -> str:
 
 
 def allowed_instead(fault: ErrorDetails) -> str:
-    """Return what is allowed instead of a value, in the words of ``_ALLOWED``, or otherwise in those of pydantic."""
+    """Return what is allowed instead of a value: the text of ``_ALLOWED``, or pydantic's text if there is none."""
     words = _ALLOWED.get(fault["type"])
     text = fault["msg"].removeprefix("Value error, ")
     return text if words is None else f"allowed: {words.format(**fault.get('ctx', {}))}"

@@ -21,7 +21,7 @@ _ALLOWED = "three of +x -x +y -y +z -z that use x, y and z once each, e.g. [+z, 
 
 
 def axes_matrix(axes: Sequence[str]) -> Array:
-    """Return the signed permutation M (3, 3) from the input's axes to those of the world.
+    """Return the signed permutation M (3, 3) from the input's axes to the world's axes.
 
     A position p of the input becomes M p in the world, and a rotation R becomes M R M'. ``axes[i]`` is the input's axis
     that becomes the world's i-th axis. The determinant is -1 if the frame of the input is left-handed, as in raw Unity.

@@ -38,7 +38,7 @@ class Input(Protocol):
 
     - ``options``: The names of keyword arguments of ``from_config``. Each is an option of ``q2r2 run``, except
       ``say``, which is a function that prints a line.
-    - ``cell``: A function that changes a cell's settings to the ones that this input needs, such as its own axes.
+    - ``cell``: A function that gives a cell the settings that this input needs, such as the input's own axes.
     - ``executable``: The ROS executable that is started for this input instead of ``hand_input``.
     - ``feels``: False if there is no device that could vibrate. No vibrations are then computed.
     - ``simulated``: True if the samples depend only on the times of the polls, so that a run may be in simulated time.

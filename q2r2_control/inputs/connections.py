@@ -157,7 +157,7 @@ class Connections:
         """Decide which client drives. All data that were sent before ``now`` [s] have been read."""
         driver = self._driver
         if driver is not None and now - driver.last_frame > SILENCE_ALLOWED:
-            self._drop(driver, f"no frame for {SILENCE_ALLOWED:g} s")  # Otherwise this client would keep others out.
+            self._drop(driver, f"no frame for {SILENCE_ALLOWED:g} s")  # A silent driver would keep others out.
         for client in tuple(self._waiting):
             if not is_allowed(client.host, self._allow):
                 self._refuse(client, f"{client.host} is not in headset.allow", self._unwelcome)

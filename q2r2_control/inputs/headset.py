@@ -62,7 +62,7 @@ class HeadsetServer:
         watch: HandsWatch | None = None,
         say: Callable[[str], None] = _LOG.debug,
     ) -> None:
-        self.address = host, port  # After ``start``, the port is the one that was bound.
+        self.address = host, port  # After ``start``, the port is the bound port.
         self._allow, self._clock, self._say = allow, clock, say
         self._stream = HandStream(watch or HandsWatch(), listener)
         self._thread: threading.Thread | None = None

@@ -53,7 +53,7 @@ class EvenSampling(SampleTiming):
 
 
 class HeadsetSampling(SampleTiming):
-    """Samples like those of a headset: at an uneven rate of 72-76 Hz, received late, and with sensor noise.
+    """Samples like a headset's samples: at an uneven rate of 72-76 Hz, received late, and with sensor noise.
 
     Args:
         hand: The hand. Each hand has other random numbers.

@@ -232,7 +232,7 @@ class TopicStatistics:
 
 @dataclass(frozen=True, slots=True)
 class HeadsetStatistics:
-    """A snapshot of the server. If no headset is connected, dialect and topics are those of the last connection."""
+    """A snapshot of the server. If no headset is connected, dialect and topics belong to the last connection."""
 
     address: tuple[str, int]  # Bound host and port.
     peer: str | None  # Host and port of the connected headset, as host:port; None if there is none.

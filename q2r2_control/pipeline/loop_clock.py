@@ -116,7 +116,7 @@ class PlantClock:
 
     def __init__(self, state: RobotState) -> None:
         """``state`` is the first state of the plant."""
-        # The plant's stamp of the newest state, and the time for which it was advanced without a newer one [s].
+        # The plant's stamp of the newest state, and the time for which it was advanced without a newer state [s].
         self._stamp, self._unanswered = state.stamp, 0.0
 
     def give(self, dt: float) -> None:

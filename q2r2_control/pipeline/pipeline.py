@@ -83,8 +83,8 @@ class Pipeline(RequestedRun):
         mode: Kind of the plant's commands: joint positions, velocities, or the torques of a Cartesian impedance.
         solver: See :class:`CartesianController`, also for ``tasks`` and ``constraints``. A recording does not contain
             these objects, so a replay of the run does not use them.
-        tasks: Costs in addition to those of ``config.control.tasks``.
-        constraints: Rows in addition to those of the controller.
+        tasks: Further costs, in addition to ``config.control.tasks``.
+        constraints: Further rows, in addition to the controller's own rows.
 
     Raises:
         ConfigError: If an argument has another type, if the plant lacks the mode, if the input lacks a control that is
@@ -145,8 +145,8 @@ class Pipeline(RequestedRun):
     ) -> Pipeline:
         """Build a pipeline for a cell.
 
-        The other arguments are those of the class. A task or constraint may have been made with another Robot of the
-        same ``config``.
+        The other arguments are the same as for the class. A task or constraint may have been made with another Robot of
+        the same ``config``.
 
         Args:
             config: The cell.
@@ -367,7 +367,7 @@ class Pipeline(RequestedRun):
         self.teleop.marks.subtasks = self.config.recording.subtasks
 
     def _run_until(self, duration: float) -> RunSummary:
-        """Tick until ``duration`` [s] is over or a stop is asked for, and then until the arms are at rest."""
+        """Tick until ``duration`` [s] is over or a stop is requested, and then until the arms are at rest."""
         try:
             while not (self._clock.after(duration) or self._stopping):
                 self.tick()
@@ -505,7 +505,7 @@ class Pipeline(RequestedRun):
         step = self.loop.step(state, poses, now, dt, grippers, openings, braked, self._posture())
         self._grippers = step.grippers
         for refusal in step.refusals.values():
-            self.teleop.pause(now, refusal)  # Otherwise the operator would think that the arm follows.
+            self.teleop.pause(now, refusal)  # Without this pause, the operator would think that the arm follows.
         for reason in self.supervisor.events:
             _logger.log(logging.INFO if reason.root.kind in ROUTINE else logging.WARNING, sentence(reason))
         self.supervisor.events.clear()

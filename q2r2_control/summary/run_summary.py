@@ -77,7 +77,7 @@ class TorqueSummary:
     pressed_pairs: list[tuple[str, str]] = field(default_factory=list)  # Pairs that the wall has pushed apart.
     max_wall_force_n: float = 0.0  # The greatest force of the wall on one pair.
     saturated_ticks: int = 0  # Ticks in which a joint would have needed more torque than its limit.
-    rate_limited_ticks: int = 0  # Ticks in which a joint's torque could not change as fast as it should.
+    rate_limited_ticks: int = 0  # Ticks in which the rate limit slowed the change of a joint's torque.
     held_ticks: int = 0  # Ticks without a usable measurement, in which the last gravity torque was held.
 
     @property
@@ -159,7 +159,7 @@ class RunSummary:
 
     @property
     def broken(self) -> tuple[str, ...]:
-        """Broken promises in words. A run with any of them ends with exit code 1."""
+        """Broken promises in words. A run with any broken promise ends with exit code 1."""
         refusals = {event.arm: event.reason for event in self.events if event.kind is TeleopReason.NOT_ENGAGED}
         broken = []
         for name, arm in self.arms.items():
@@ -223,7 +223,7 @@ class _ArmStatistics:
         if target.pose is not None and tick.engaged[self._name]:
             summary.engaged_s += tick.dt
             errors = tick.tracking_error(self._name)
-            if math.isfinite(sum(errors)):  # Otherwise nothing was measured.
+            if math.isfinite(sum(errors)):  # If a value is not finite, nothing was measured.
                 self._ticks += 1
                 self._squares += np.square(errors)
 

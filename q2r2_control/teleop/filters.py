@@ -76,7 +76,7 @@ class Interpolator:
     def at(self, now: float) -> tuple[Vector, Quaternion, Vector]:
         """Return the position [m] and the rotation at ``now`` [s].
 
-        The third value is the rotation vector from the last call's rotation to this one [rad].
+        The third value is the rotation vector from the last call's rotation to this call's rotation [rad].
 
         ``now`` must not go back.
         """

@@ -71,7 +71,7 @@ _SLIP_STEP = 0.02  # Slip of the target's position from one pulse to the next [m
 _SLIP_ANGLE_STEP = 0.1  # Slip of the target's rotation from one pulse to the next [rad].
 _NEAR_STEP, _NEAR_FROM = 0.005, 0.05  # Approach from one pulse to the next, and the distance at which pulses begin [m].
 _FORCE_STEP, _FORCE_TO = 5.0, 50.0  # Force from one pulse to the next, and the force of the strongest pulse [N].
-_PAUSE = 0.05  # Pause between two vibrations, so that they are felt as two [s].
+_PAUSE = 0.05  # Pause between two vibrations, so that the hand does not feel them as one [s].
 
 
 class ArmCondition(NamedTuple):

@@ -206,7 +206,7 @@ def _dot(one: Vector, other: Vector) -> float:
 class Workspace:
     """Keeps the targets of one arm in a box.
 
-    If the tool was outside of the box at the anchor, the targets may be as far outside.
+    If the tool was outside of the box at the anchor, the targets may be equally far outside of it.
     """
 
     def __init__(self, settings: WorkspaceSettings | None) -> None:

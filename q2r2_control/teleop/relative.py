@@ -34,7 +34,7 @@ _CONTINUOUS = 1.0
 
 
 class RelativeMotion:
-    """Maps hand poses to tool poses, relative to an anchor: one pose of the hand and one of the tool.
+    """Maps hand poses to tool poses, relative to an anchor: a pose of the hand and a pose of the tool.
 
     With M the signed permutation ``axes``, preceded by S = diag(1, -1, 1) in the stance ``mirror_reflected``, a hand
     pose (p, R) counts in the world as (M p, M R M'). With anchors hand0 and tool0, ``target`` is

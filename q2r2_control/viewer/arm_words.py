@@ -74,7 +74,7 @@ class ArmWords:
         self.told: Mapping[str, Told] = {}  # For each arm, the events that say why it is in its state.
 
     def follow(self, events: Iterable[Event]) -> None:
-        """Keep those of the newest ``events`` that say why an arm is in its state."""
+        """Keep each of the newest ``events`` that says why an arm is in its state."""
         self.told = told_after(self.told, events)
 
     def controls(self) -> dict[str, str]:

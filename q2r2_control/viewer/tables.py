@@ -54,7 +54,7 @@ def figure_table(
 
 
 def print_table(table: Table, console: Console) -> None:
-    """Print a table without cutting figures off. Its lines may be longer than those of the console.
+    """Print a table without cutting figures off. Its lines may be longer than the console is wide.
 
     On a terminal, the notes below the table are folded to the table's width. A file or another program gets each note
     in one line.
@@ -98,7 +98,7 @@ def times_real_time(factor: float) -> str:
 
 
 def short_figure(value: float | None) -> str:
-    """Return a number with about three digits: two decimals below 10, one below 100, and none above; "-" for None."""
+    """Return a number with about three digits: 2 decimals below 10, 1 decimal below 100, otherwise 0; "-" for None."""
     if value is None:
         return "-"
     digits = 2 if abs(value) < 9.995 else 1 if abs(value) < 99.95 else 0

@@ -34,7 +34,7 @@ class Door(PageDoor):
     """Checks the requests to viser's page. The page connects to the path of its URL, so the token is this path."""
 
     def __init__(self, host: str, port: int, certificate: str | None = None, addresses: Sequence[str] = ()) -> None:
-        """Open the socket. The arguments are those of :class:`PageDoor`."""
+        """Open the socket. The arguments are the same as for :class:`PageDoor`."""
         super().__init__(host, port, "--web", secrets.token_urlsafe(16), certificate, addresses)
         self.messages = BrowserMessages()  # Decides which messages viser gets.
         self._clients = 0
@@ -77,7 +77,7 @@ class Door(PageDoor):
                 if response is not None:
                     page.change(response)
                     protect(response, _POLICY)
-                    # No other page may embed this page. It could make the user click this page's buttons unknowingly.
+                    # No other page may embed this page. It could deceive the user into clicking this page's buttons.
                     response.headers["X-Frame-Options"] = "DENY"
                 return response
 
