@@ -15,8 +15,8 @@ from q2r2_control.errors import CameraError
 class VideoFile:
     """Plays a file, in a loop or once. Implements :class:`CameraDevice`.
 
-    A picture is captured at the time at which the file shows it. These times do not depend on how busy the computer is:
-    a picture that is read too late still has its own time, and no picture is left out.
+    A picture is captured at the time at which the file shows it. A busy computer does not change these times, even if
+    it reads a picture too late. No picture is left out.
     """
 
     def __init__(self, camera: CameraConfig) -> None:

@@ -65,9 +65,9 @@ def moved_as_one(before: HandPair, after: HandPair, tolerance: Move) -> bool:
     If they have, their distance, their relative rotation and the vector between them are the same ``before`` and
     ``after``, up to the ``tolerance``.
 
-    If the left hand's measured rotation has an error of the tolerance's angle, the right hand seems to move in the left
-    hand's axes, by this angle times the distance between the hands. The bound on ``seen`` includes this motion.
-    Otherwise less noise of the rotation would be allowed than the tolerance says.
+    Suppose that the left hand's measured rotation has an error of the tolerance's angle. In the left hand's axes, the
+    right hand then seems to move, by this angle times the distance between the hands. The bound on ``seen`` includes
+    this motion. Otherwise less noise of the rotation would be allowed than the tolerance says.
     """
     shift = math.dist(after.seen, before.seen)
     if (
@@ -80,7 +80,7 @@ def moved_as_one(before: HandPair, after: HandPair, tolerance: Move) -> bool:
 
 # A motion from one sample to the next is a step if two conditions hold. It is larger than _STEP, and it is larger than
 # _STANDS_OUT times each of the last _BEFORE motions. A hand that starts from rest makes such a motion only if it
-# accelerates at over 30 m/s^2, to a mean speed of 0.7 m/s between two samples.
+# accelerates at over 30 m/s^2. Its mean speed between two samples is then 0.7 m/s.
 _STEP = Move(0.010, math.radians(2.0))
 _STANDS_OUT, _BEFORE = 3.0, 4
 _PERIOD = 1.0 / 72.0  # Period of samples [s]. The time between two samples is shorter if the first one was delayed.

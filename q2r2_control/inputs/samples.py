@@ -94,7 +94,7 @@ class HandsWatch:
     """Finds poses of real hands that must not be followed: frozen poses, and poses after their frame has moved.
 
     Sensor noise changes each pose of a hand at rest, so a pose that stays the same is a copy of an old one. After the
-    frame has moved, poses are faulty for twice ``timeout``. For a receiver that leaves faulty poses out, this is long
+    frame has moved, poses count as faulty for twice ``timeout``. If the receiver leaves faulty poses out, this is long
     enough to stop its arm. Poses are passed on without delay. Only a pose after an unusually large step may wait for
     the other hand's pose.
     """

@@ -199,8 +199,8 @@ def trajectory_named(name: str, place: tuple[float, float] | None = None) -> Han
 _PLACES = 7  # Second seed. It makes the shifts independent of other random numbers with the same first seed.
 _PACE = 1.25  # Speed of hasty hands, as a multiple of the speed in the trajectory.
 _HESITATIONS, _HESITATES = 3, 0.4  # Number of hesitations, and the duration of each [s].
-# Four delays after the headset loses the hands [s]: until the headset sees the hands again, until the hands engage the
-# arms, until the hands begin to carry again, and until the hands continue the work.
+# The headset loses the hands once. These are the times from this loss [s] until the headset sees the hands again, until
+# the hands engage the arms, until they begin to carry again, and until they continue the work.
 _LOST, _ENGAGES, _CARRIES, _GOES_ON = 1.0, 1.3, 1.6, 2.1
 # The headset loses the hands after a fraction of the work in this range. So early, no tool presses on a part yet.
 _EARLY = (0.1, 0.45)

@@ -84,8 +84,8 @@ class HeadsetSession:
 
     Data on topics outside ``HAND_TOPICS`` is counted and ignored. A registration whose topic or type the app's user
     left empty gets an error for the app's console, as from Unity's own endpoint. An unknown command, a name that no
-    topic can have, and a payload that does not fit its topic raise a :class:`ProtocolError`, because the two sides then
-    do not speak the same protocol.
+    topic can have, and a payload that does not fit its topic raise a :class:`ProtocolError`. They show that the two
+    sides do not use the same protocol.
     """
 
     def __init__(self) -> None:

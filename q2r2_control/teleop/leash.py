@@ -14,8 +14,8 @@ pose, the tool would follow the other one, by up to 50 mm.
 
 **Why the arm does not jump.** The only state of the controller is its reference, which is at rest while the tool is
 blocked. A target at the tool pose therefore asks for no motion. The controller also follows the velocity of its target,
-but ignores a step that is faster than three times the tool's speed limit, which is 9 m/s or 30 rad/s at most. To put
-the target at the tool pose is such a step. It is only done in a tick that is short enough to make the step so fast.
+but ignores a step that is faster than three times the tool's speed limit. Three times this limit is 9 m/s or 30 rad/s
+at most. To put the target at the tool pose is a step. It is only done in a tick so short that this step is ignored.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from q2r2_control.types import Interval, Pose
 
 # If the hand comes back by more than this, the target is put at the tool pose [m], [rad]. It is more than tremor, which
 # is 0.2 mm and 0.2 degrees to either side, and more than the noise of a headset. This noise has a standard deviation of
-# 0.2 mm and 0.03 degrees, and two samples of a hand at rest are at most about seven standard deviations apart.
+# 0.2 mm and 0.03 degrees. Two samples of a hand at rest are at most about seven standard deviations apart.
 _COMES_BACK = 1.5e-3, 12e-3
 # A tool that is slower counts as blocked [m/s], [rad/s]. A tool of this speed stops within a fraction of a millimetre.
 _HELD_UP = 0.05, 0.2

@@ -3,7 +3,7 @@
 A chunk is followed from the time of its first action, or at once if this time has passed. It then replaces all older
 chunks. Positions between two actions are cubic in time, and rotations turn at constant speed. If two chunks differ at
 the moment of the change, the difference fades out, so that the target does not jump. Chunks of motions have no such
-difference, because they begin at the present target. The last action counts for :data:`SILENT`. After that the arm
+difference, because they begin at the present target. The last action stays valid for :data:`SILENT`. Then the arm
 rests, because a policy that sends nothing has failed.
 """
 
@@ -24,7 +24,7 @@ from q2r2_control.teleop.leash import Leash, Workspace
 from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.types import ActionChunk, Array, Pose
 
-SILENT = 0.5  # The last action of a plan counts for this time. After that the arm rests [s].
+SILENT = 0.5  # The last action of a plan stays valid for this time [s]. Then the arm rests.
 _FADING = 0.5, 2.0  # Greatest speed at which the difference between two chunks fades [m/s], [rad/s].
 # If a time of a chunk is farther in the past or in the future, another clock has stamped the chunk [s].
 _AHEAD = 10.0

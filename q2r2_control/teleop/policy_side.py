@@ -21,8 +21,9 @@ class PolicySide:
     """Lets a policy drive the arms.
 
     After a fault, an arm whose hand has sent readings waits for a press. An arm without an operator goes on with the
-    next chunk that begins at its tool pose. Linked arms begin together or not at all, since they may hold one object.
-    The arms that have to begin together are those in the newest chunk, and those that a fault has stopped together.
+    next chunk that begins at the arm's tool pose. Linked arms begin together or not at all, since they may hold one
+    object. The arms that have to begin together are the arms in the newest chunk, and the arms that a fault has stopped
+    together.
     """
 
     def __init__(self, arms: Mapping[str, ArmTeleop], settings: TeleopSettings) -> None:
