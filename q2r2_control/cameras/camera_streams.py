@@ -16,7 +16,7 @@ from q2r2_control.errors import CameraError
 from q2r2_control.process.helper_process import HelperProcess, reason_of
 
 _WAITING = 256  # Greatest number of a camera's pictures that wait for ``take``. If more come, the oldest are lost.
-_READY = 120.0  # Longest wait for a camera's first picture [s]. It is so long for a busy computer.
+_READY = 120.0  # Longest wait for a camera's first picture [s]. A busy computer may need so long.
 _Item = TypeVar("_Item")
 _LOOKS = 0.02  # Time between two checks whether a picture has come [s].
 
@@ -89,7 +89,7 @@ class CameraStream:
 
 
 def _taken(waiting: deque[_Item]) -> list[_Item]:
-    """Take all items out of a queue to which another thread adds."""
+    """Take all items out of a queue to which another thread adds items."""
     found = []
     with suppress(IndexError):
         while True:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from typing import NamedTuple
 
-_KEPT = 8192  # Number of ticks whose times are known: 8 s of a loop at 1 kHz.
+_KEPT = 8192  # Number of ticks whose times are kept: 8 s of a loop at 1 kHz.
 
 
 class TickTime(NamedTuple):

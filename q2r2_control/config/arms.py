@@ -114,7 +114,7 @@ class HeldObjectConfig(StrictModel):
 
     @property
     def radius(self) -> float:
-        """The radius of the ball by which the object is replaced if it is not a box [m]."""
+        """The radius of the object if it is a ball, and not a box [m]."""
         return _USUAL_RADIUS if self.sphere is None else self.sphere
 
 

@@ -21,8 +21,8 @@ POSE, TWIST = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/TwistStamped"
 class Hold(StrEnum):
     """The messages to a controller while its arm is paused and its target stands still."""
 
-    REPEAT = "repeat"  # The last target with a new stamp.
-    SILENCE = "silence"  # No messages. The controller then holds the arm by itself, and stops if its target is old.
+    REPEAT = "repeat"  # The last target is sent again, with a new stamp.
+    SILENCE = "silence"  # Nothing is sent. The controller then holds the arm by itself, and stops if its target is old.
 
 
 # Limits of targets for controllers that have no limits of their own.

@@ -20,7 +20,7 @@ from q2r2_control.types import SIDES, Array, HandSample
 SILENCE = 2.0  # Time without data before advice is given [s].
 _PERIOD = 0.05  # Time between two polls of the server [s].
 _WINDOW = 0.5  # Duration of the newest movement, which is put in words [s].
-_STILL = 0.02  # A hand that has moved by less than this in the window counts as still [m].
+_STILL = 0.02  # A hand that has moved by less than this in ``_WINDOW`` counts as still [m].
 _DIRECTIONS = (("back -x", "forward +x"), ("right -y", "left +y"), ("down -z", "up +z"))
 
 
@@ -80,8 +80,8 @@ class HeadsetCheck:
     """What is known about a headset's data at one time."""
 
     statistics: HeadsetStatistics
-    directions: dict[str, str]  # Direction of movement by hand, in words.
-    positions: dict[str, Array | None]  # Position in the world frame (3,) [m], by hand; None without data.
+    directions: dict[str, str]  # The direction in which each hand moves, in words.
+    positions: dict[str, Array | None]  # For each hand, its position in the world frame (3,) [m]; None without data.
     heard: bool  # Whether a sample of a hand has ever come.
     missing: tuple[str, ...]  # Topics that a run needs and of which no message has ever come.
     crossed: bool  # Whether the controllers seem to be swapped.

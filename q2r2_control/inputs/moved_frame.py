@@ -116,7 +116,7 @@ class MovedFrame:
     """Judges the poses of both hands when they are received. Times are receipt times [s]."""
 
     def __init__(self, fault_time: float) -> None:
-        """Make a detector. After the frame has moved, each pose has a fault for ``fault_time`` [s]."""
+        """Make a detector. After the frame has moved, poses count as faulty for ``fault_time`` [s]."""
         self._fault_time = fault_time
         # For each hand that holds both buttons to align the frame, the time since which it holds them [s].
         self._chords: dict[str, float] = {}
@@ -132,7 +132,7 @@ class MovedFrame:
         # The time at which a step of the hands' frame was detected that may be the operator's alignment [s]; None if
         # there is no such step.
         self._suspected: float | None = None
-        self._bad_until = -math.inf  # Until this time, poses have a fault [s].
+        self._bad_until = -math.inf  # Until this time, poses count as faulty [s].
 
     def take_inputs(self, hand: str, inputs: HandInputs, now: float) -> None:
         """Take the buttons of a hand. With both buttons the operator aligns the frame, which may then move."""
@@ -197,7 +197,7 @@ class _HandMotion:
         self._moves: deque[Move] = deque(maxlen=_BEFORE)
 
     def add(self, place: Place, now: float) -> bool:
-        """Add a pose that came at ``now`` [s]. Return whether it follows the pose before without a long gap in time."""
+        """Add a pose that came at ``now`` [s]. Return whether it follows the last pose without a long gap in time."""
         gap = now - self.stamp
         goes_on = gap <= _LONGEST_GAP
         if goes_on:

@@ -113,7 +113,7 @@ class HandsWatch:
         self.reset()
 
     def reset(self) -> None:
-        """Start again for a new connection, whose poses do not continue the motion of the poses before."""
+        """Start again for a new connection, whose poses do not continue the motion of the last poses."""
         self._numbers: dict[str, bytes] = {}  # The numbers of each hand's newest pose.
         self._since: dict[str, float] = {}  # For each hand, the time at which its numbers last changed [s].
         self._frame = MovedFrame(self._fault_time) if self._watches_frame else None

@@ -44,7 +44,7 @@ class HandTrajectory:
 
     left: Path
     right: Path | None = None  # None if the right hand moves as the mirror image of the left hand.
-    upper_presses: Mapping[str, tuple[float, ...]] = field(default_factory=dict)  # Times of presses, by hand [s].
+    upper_presses: Mapping[str, tuple[float, ...]] = field(default_factory=dict)  # Each hand's times of presses [s].
     lower_presses: tuple[float, ...] = (FIRST_PRESS,)  # Times of presses by both hands [s].
     duration: float | None = None  # [s]; None if the motion has no end.
     steps: tuple[tuple[float, str], ...] = ()  # Start of each step [s], and the step in words.

@@ -157,10 +157,10 @@ class HeadsetSession:
                 self._register(command, parameters)
             case "__topic_list":
                 types = _TOPIC_TYPES | self.published
-                names = [f"/{name}" for name in types]  # The names are written as in the ROS graph.
+                names = [f"/{name}" for name in types]  # Names in the ROS graph begin with a slash.
                 self._answer("__topic_list", {"topics": names, "types": list(types.values())})
             case "__ros_service" | "__unity_service" | "__remove_ros_service" | "__remove_unity_service":
-                pass  # The package q2r2 has no services.
+                pass  # These commands have no effect, because q2r2 has no services.
             case "__request" | "__response":
                 self._skip_body = True
                 if command == "__request":
@@ -260,6 +260,6 @@ class TopicRecorder:
         self._last = message
 
     def snapshot(self, now: float) -> TopicStatistics:
-        """Return the statistics at ``now`` [s]. At least one message has to be recorded before."""
+        """Return the statistics at ``now`` [s]. At least one message has to be recorded before this call."""
         rate = float(sum(stamp > now - 1.0 for stamp in self._stamps))
         return TopicStatistics(self._count, rate, now - self._stamps[-1], self._last)

@@ -32,7 +32,7 @@ from q2r2_control.teleop.teleop import Teleop
 from q2r2_control.types import ActionChunk, ArmTarget, HandSample, Observation
 from q2r2_control.wording import event_line, sentence
 
-# Each arm's conditions, slip and gripper are examined once in this time, and its events at each tick [s].
+# Each arm's conditions, slip and gripper are examined once in this time [s]. Its events are examined at each tick.
 _PERIOD = 0.02
 _logger = logging.getLogger(__name__)
 

@@ -128,7 +128,7 @@ class Pipeline(RequestedRun):
         self._stopping = False
         self._ticked = time.monotonic()  # End of the last tick, or a time before the first tick [s].
         self._rate_was_fitted = False  # Whether :meth:`fit_rate` chose the rate of the loop.
-        self._pace: WallPace | None = None  # Keeps simulated time from being faster than the clock; None if it may be.
+        self._pace: WallPace | None = None  # Keeps simulated time no faster than the clock; None if not needed.
         self._set_up()
 
     @classmethod
@@ -300,7 +300,7 @@ class Pipeline(RequestedRun):
             yield time.perf_counter() - self._clock.woke
 
     def _prepare(self, realtime: bool) -> None:
-        """Forget the last run, so that nothing of it moves an arm. Every run starts paused, with open grippers."""
+        """Forget the last run, so that none of its data moves an arm. Every run starts paused, with open grippers."""
         settings = permitted(self.config.control.timed(realtime), self.drive)
         if settings != self.controller.settings:
             reports = self.controller.obstacle_reports

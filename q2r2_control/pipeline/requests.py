@@ -25,7 +25,7 @@ class ObstacleRequest(NamedTuple):
 
     name: str
     obstacle: MovingObstacle | None
-    reported: float  # The time of the report, of time.monotonic() [s].
+    reported: float  # The time of the report, by time.monotonic() [s].
 
     def reason(self, waited: float) -> Reason:
         """Return the request as it is recorded, ``waited`` [s] after the report."""

@@ -12,7 +12,7 @@ from q2r2_control.types import Array
 
 _SMOOTHING = 0.01  # Time constant of the filter that smooths the velocity of a target [s].
 _FASTEST = 3.0, 20.0  # If a target seems to move faster than this, it has jumped [m/s], [rad/s].
-_REST = 1e-6  # A target that moves more slowly stands still [m/s], [rad/s].
+_REST = 1e-6  # A target that moves more slowly counts as a target at rest [m/s], [rad/s].
 
 
 class TargetLead:

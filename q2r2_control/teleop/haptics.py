@@ -132,7 +132,7 @@ class HapticPulses:
             self._want(CONTACT.grown(condition.force / _FORCE_TO))
 
     def grasps(self, holds: bool) -> None:
-        """Take whether the gripper holds something. If it has begun to hold, ask for a vibration."""
+        """Remember whether the gripper holds something. If it has begun to hold something, ask for a vibration."""
         if holds and not self._grasps:
             self._want(GRASP)
         self._grasps = holds

@@ -192,7 +192,7 @@ def _displacements(start: Pose, end: Pose) -> tuple[Vector, Vector]:
 
 
 def _put(target: Pose, tool: Pose, shift: Vector | None, turn: Vector | None) -> Pose:
-    """Return the target at the displacements ``shift`` and ``turn`` from the tool. None keeps position or rotation."""
+    """Return ``target``, put at ``shift`` and ``turn`` from the tool. None keeps the target's position or rotation."""
     (position, rotation), ((x, y, z), tool_rotation) = target, tool
     if shift is not None:
         position = x + shift[0], y + shift[1], z + shift[2]

@@ -26,7 +26,7 @@ from q2r2_control.types import ActionChunk, Array, Pose
 
 SILENT = 0.5  # The last action of a plan stays valid for this time [s]. Then the arm rests.
 _FADING = 0.5, 2.0  # Greatest speed at which the difference between two chunks fades [m/s], [rad/s].
-# If a time of a chunk is farther in the past or in the future, another clock has stamped the chunk [s].
+# If a time of a chunk is farther than this from now, another clock has stamped the chunk [s].
 _AHEAD = 10.0
 
 
@@ -36,7 +36,7 @@ class _Plan(NamedTuple):
     start: float  # Time from which the plan is followed [s].
     chunk: ActionChunk
     times: list[float]  # Times of the poses [s].
-    # Poses in the world frame. For a chunk of motions, relative to the tool pose at which the first motion begins.
+    # Poses in the world frame. A chunk of motions has poses relative to the tool pose where the first motion begins.
     poses: list[Pose]
     grippers: list[float]  # Openings of the gripper; empty if the policy does not command it.
 
@@ -273,7 +273,7 @@ def _interpolated(plan: _Plan, t: float) -> Pose:
 
 
 def _velocity(times: list[float], poses: list[Pose], index: int) -> Vector:
-    """Return the velocity at an action: the mean velocity from the action before to the action after [m/s]."""
+    """Return the velocity at an action: the mean velocity from the previous action to the next one [m/s]."""
     first, last = max(index - 1, 0), min(index + 1, len(times) - 1)
     h, start, end = times[last] - times[first], poses[first][0], poses[last][0]
     return (end[0] - start[0]) / h, (end[1] - start[1]) / h, (end[2] - start[2]) / h

@@ -75,7 +75,7 @@ class RunDisplay:
         }
 
     def _joints_of_tool(self, joints: Array) -> list[int]:
-        """Return the index of an arm's last joint, and the indices of all joints behind it, such as the fingers'."""
+        """Return the index of an arm's last joint, and the indices of all joints behind it, such as finger joints."""
         model = self._tree.model
         return [int(joint) for joint in model.subtrees[model.getJointId(self._run.joint_names[joints[-1]])]]
 

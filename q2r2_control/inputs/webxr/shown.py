@@ -38,7 +38,7 @@ class ShownScene(TypedDict):
     hands: dict[str, list[int]]  # For each arm, the joints whose meshes move with the tool.
     parts: dict[str, ShownPart]
     floor: float  # Height of the floor [m].
-    timeout: float  # An arm stops if no hand comes for this time [s].
+    timeout: float  # An arm stops if no data of its hand come for this time [s].
 
 
 class ShownArm(TypedDict):
