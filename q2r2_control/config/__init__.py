@@ -1,1 +1,1 @@
-"""Turn the YAML of a cell into checked settings that never change. This package imports no package that uses it."""
+"""Turn the YAML of a cell into checked, immutable settings. This package imports no package that uses it."""

@@ -20,7 +20,7 @@ _GRIP, _OVER = 0.243, 0.33
 def _meeting(middle: float) -> dict[str, tuple[WayPoint, ...]]:
     """Return way points with which both hands bring their blocks to the middle of the cell, and back.
 
-    In the middle, each tool is ``middle`` [m] to its own side of the cell's centre.
+    Where the blocks meet, the tools are ``middle`` [m] to the left and to the right of the cell's centre.
     """
     left: tuple[WayPoint, ...] = (
         (1.4, 0.55, 0.25, 0.35, 0.0, 0.0),  # Over the block.

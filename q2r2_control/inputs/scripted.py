@@ -347,7 +347,7 @@ class ScriptedInput(PlayedInput):
 
     def hand_twist(self, hand: str, t: float) -> pin.Motion:
         """Return the ideal velocity of ``hand`` at ``t`` [s], in the axes of its poses [m/s, rad/s]."""
-        t -= self._origin or 0.0  # Times from 1970 on would make the differences below inexact.
+        t -= self._origin or 0.0  # Times that count from 1970 would make the differences below inexact.
         before, after = (self._ideal(hand, t + step) for step in (-_DIFFERENCE, _DIFFERENCE))
         linear = (after.translation - before.translation) / (2.0 * _DIFFERENCE)
         return pin.Motion(linear, pin.log3(after.rotation @ before.rotation.T) / (2.0 * _DIFFERENCE))

@@ -76,7 +76,7 @@ class _IncompleteRegistrationError(Exception):
 
 
 class HeadsetSession:
-    """The protocol state of one client. :meth:`receive` takes its frames, :attr:`outgoing` has the answers.
+    """The protocol state of one client. :meth:`receive` takes its frames. :attr:`outgoing` has the bytes to send.
 
     The server sends the first frame, in the dialect ROS2, before it knows the client's dialect. An app that is set to
     ROS1 logs an error and goes on. The client's first frame shows its dialect: only ROS2 clients put a NUL behind every

@@ -128,7 +128,7 @@ class Pipeline(RequestedRun):
         self._stopping = False
         self._ticked = time.monotonic()  # End of the last tick, or a time before the first tick [s].
         self._rate_was_fitted = False  # Whether :meth:`fit_rate` chose the rate of the loop.
-        self._pace: WallPace | None = None  # Keeps simulated time no faster than the clock; None if not needed.
+        self._pace: WallPace | None = None  # Slows simulated time to the clock's speed; None if it may be faster.
         self._set_up()
 
     @classmethod

@@ -43,8 +43,8 @@ from q2r2_control.inputs.webxr.page_client import MAX_MESSAGES_PER_SECOND, PageC
 from q2r2_control.inputs.webxr.page_messages import LONGEST, HeadsetRequest, read
 from q2r2_control.types import HapticFeedback
 
-# Codes that tell a page why its socket is closed. FREE tells a page that watches that no page drives any more, so that
-# it may now drive.
+# Codes that tell a page why its socket is closed. FREE goes to pages that only watch. It says that no page drives any
+# more, so that one of them may now drive.
 REFUSED, DROPPED, OVER, FREE = 4001, 4002, 4003, 4004
 _MOST_WATCHERS = 8  # Greatest number of pages that only watch.
 _WATCHED = 0.1  # Least time between two states that are sent to pages that watch [s].
