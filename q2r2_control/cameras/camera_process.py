@@ -17,12 +17,13 @@ from q2r2_control.cameras.opening import open_device
 from q2r2_control.config.recording import CameraConfig
 from q2r2_control.errors import CameraError
 
-# Niceness of a camera's process. The loop has priority, also over ten of these processes together. On a computer that
-# is too busy, a picture without a stamp of its own is therefore received late, and gets a late time.
+# Niceness of a camera's process. At this niceness, the loop has priority even over ten of these processes together.
+# On a computer that is too busy, this process may therefore receive a picture late. If the picture has no stamp of the
+# driver, its time is the time of its receipt, and is then late too.
 _NICENESS = 15
-_QUALITY = 90  # The quality of JPEG.
+_QUALITY = 90  # The quality of JPEG pictures, from 0 to 100.
 _RETRY = 0.5  # Time between two attempts to open a camera that was lost [s].
-_EARLY = 0.4  # Share of a period by which a picture may come too early for its camera's rate.
+_EARLY = 0.4  # A picture is kept if it comes before it is due, but by at most this share of a period.
 
 
 class CameraShot(NamedTuple):
@@ -43,7 +44,7 @@ class DepthShot(NamedTuple):
 
 
 class CameraLost(NamedTuple):
-    """The camera gives no more pictures. Pictures that follow are from the camera after it was opened again."""
+    """The camera gives no more pictures. If pictures follow, the camera has been opened again."""
 
     why: str
 
@@ -68,7 +69,7 @@ Answer = CameraShot | DepthShot | CameraLost
 
 
 def main(requests: Iterator[Any], answer: Callable[[Answer], None]) -> None:
-    """Answer with each picture of a camera until the requests end. The first request is the camera's configuration.
+    """Send each picture of a camera as an answer until the requests end. The first request is the camera's settings.
 
     If the camera is lost later, this process tries again and again to open it.
 

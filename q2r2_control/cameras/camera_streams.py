@@ -1,4 +1,4 @@
-"""The open cameras of a cell. Each gives its newest picture, and all pictures since they were last taken."""
+"""The open cameras of a cell. Each gives its newest picture, and all pictures since the last call of ``take``."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from q2r2_control.config.recording import CameraConfig
 from q2r2_control.errors import CameraError
 from q2r2_control.process.helper_process import HelperProcess, reason_of
 
-_WAITING = 256  # Greatest number of pictures of a camera that wait until they are taken. The oldest are lost first.
-_READY = 120.0  # Longest time until a camera gives its first picture, on a computer that is busy [s].
+_WAITING = 256  # Greatest number of a camera's pictures that wait for ``take``. If more come, the oldest are lost.
+_READY = 120.0  # Longest wait for a camera's first picture [s]. A busy computer may need so long.
 _Item = TypeVar("_Item")
 _LOOKS = 0.02  # Time between two checks whether a picture has come [s].
 
 
 class CameraStream:
-    """One camera, whose process starts at once."""
+    """One camera. Its process starts when the instance is created."""
 
     def __init__(self, name: str, camera: CameraConfig) -> None:
         """Raises :class:`CameraError` if the camera's package is missing, or its process cannot be started."""
@@ -42,7 +42,7 @@ class CameraStream:
 
     @property
     def why_lost(self) -> str | None:
-        """The reported reason why the camera gives no pictures; None while it gives pictures, or without a report."""
+        """The reported reason why the camera gives no pictures; None if it gives pictures, or if no reason is known."""
         return self.process.fault if self._lost is None or self.process.fault else self._lost.why
 
     def hear(self, hearer: Callable[[CameraShot], None]) -> None:
@@ -89,7 +89,7 @@ class CameraStream:
 
 
 def _taken(waiting: deque[_Item]) -> list[_Item]:
-    """Take all items out of a queue to which another thread adds."""
+    """Take all items out of a queue to which another thread adds items."""
     found = []
     with suppress(IndexError):
         while True:
@@ -116,7 +116,7 @@ class CameraStreams(AbstractContextManager["CameraStreams"]):
             stream.first_picture()
 
     def newest_shots(self, realtime: bool) -> NewestShots:
-        """Return the newest pictures at each tick of a run. ``realtime``: whether the loop keeps real time."""
+        """Return the newest pictures at each tick of a run. ``realtime`` says whether the loop keeps real time."""
         return NewestShots(self.streams, realtime)
 
     def close(self) -> None:

@@ -1,6 +1,6 @@
 """Notices when a camera stops, slows down, changes the size of its pictures, or comes back.
 
-It reads no clock: its methods get all times.
+This module reads no clock. The callers pass all times.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _WINDOW = 2.0  # Time over which the rate of a camera is measured [s].
 # The delays of successive pictures are added up. If the sum is at least 1 - _NEARLY periods, a picture counts as
 # missing. Only the share _REMEMBERS of the sum still counts at the next picture.
 _NEARLY, _REMEMBERS = 0.3, 0.9
-# Shares of the rate. A camera becomes slow below the first share, and is no longer slow from the second share on.
+# Shares of the rate. Below the first share, a camera counts as slow. From the second share on, it no longer does.
 _SLOW, _FAST_ENOUGH = 0.8, 0.9
 
 
@@ -62,9 +62,9 @@ class CameraWatch:
     def __init__(self, name: str, camera: CameraConfig, begin: float) -> None:
         """``begin`` is the time of the run's first tick, by the clock of the pictures [s]."""
         self._name, self._camera = name, camera
-        self._received = begin  # Receipt of the newest picture, or the first tick [s].
+        self._received = begin  # Time of the newest picture's receipt; at first, of the first tick [s].
         self._missing = MissingPictures(begin, camera.rate)
-        self._times: deque[float] = deque()  # Times of the pictures in the window [s].
+        self._times: deque[float] = deque()  # Times of the pictures of the last ``_WINDOW`` [s].
         self._told: set[ReasonKind] = set()
 
     @property
@@ -113,12 +113,12 @@ class CameraWatch:
         rate = (len(self._times) - 1) / span
         self._times.popleft()
         share = rate / self._camera.rate
-        if _SLOW <= share < _FAST_ENOUGH:  # The camera stays slow if it was slow, and otherwise is not slow.
+        if _SLOW <= share < _FAST_ENOUGH:  # Between the shares, the last report stays valid.
             return []
         return self._tell(CameraReason.CAMERA_SLOW, share < _SLOW, rate=rate, due=self._camera.rate)
 
     def _tell(self, kind: ReasonKind, is_so: bool, **detail: Any) -> list[Reason]:
-        """Return the reason if it holds (``is_so``) and did not hold at the last call with this ``kind``."""
+        """Return a reason of this ``kind`` if the fault is present (``is_so``) and was absent at the last call."""
         was_told = kind in self._told
         (self._told.add if is_so else self._told.discard)(kind)
         return [self._reason(kind, **detail)] if is_so and not was_told else []

@@ -17,7 +17,7 @@ from q2r2_control.extras import install_line
 Pixels = npt.NDArray[np.uint8]  # (height, width, 3) b g r, as OpenCV has them.
 _PASSWORD = re.compile(r"(?<=://)[^/@]*@")
 _RIGHT_ANGLE = 90  # [deg]
-_OLDEST_STAMP = 1.0  # A driver's stamp that is older than this comes from another clock [s].
+_OLDEST_STAMP = 1.0  # A driver's stamp that is older than this counts as a stamp of another clock [s].
 _Number = TypeVar("_Number", np.uint8, np.uint16)
 
 
@@ -60,7 +60,7 @@ def shown_device(camera: CameraConfig) -> str:
 
 
 def address_of(camera: CameraConfig) -> str:
-    """Return the path or address to open. ``$NAME`` is replaced by the environment variable NAME, say a password."""
+    """Return the path or address to open. ``$NAME`` is replaced by the environment variable NAME, e.g. a password."""
     return os.path.expandvars(str(camera.device))
 
 
@@ -75,8 +75,8 @@ def capture_time(received: float, stamp_ms: float, delay: float) -> float:
 
     Args:
         received: Time of its receipt [s].
-        stamp_ms: Stamp of the driver by the same clock [ms]. V4L2 drivers stamp pictures by the monotonic clock;
-            others give 0, or the time since their stream began.
+        stamp_ms: Stamp of the driver [ms]. V4L2 drivers use the monotonic clock. Other drivers give 0, or the time
+            since their stream began.
         delay: Time from the capture to the receipt [s]. It is used if the stamp is not by the monotonic clock.
     """
     stamp = stamp_ms / 1e3

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from typing import NamedTuple
 
-_KEPT = 8192  # Number of ticks whose times are known: 8 s of a loop at 1 kHz.
+_KEPT = 8192  # Number of ticks whose times are kept: 8 s of a loop at 1 kHz.
 
 
 class TickTime(NamedTuple):
@@ -17,8 +17,8 @@ class TickTime(NamedTuple):
 class LoopTimes:
     """Converts times of the computer's monotonic clock into times of the loop's clock.
 
-    In real time both are the same. In simulated time, a loop that is paced may be slower than the computer's clock, and
-    takes its ticks in bursts.
+    In real time, both clocks are the same. In simulated time, the loop's clock may be slower than the computer's clock,
+    even if the loop is paced. Its ticks then come in bursts.
     """
 
     def __init__(self) -> None:
@@ -30,8 +30,8 @@ class LoopTimes:
     def at(self, computer: float) -> TickTime:
         """Return the loop's time at a time of the computer's clock, with the number of the last tick up to then.
 
-        Before the first tick, the loop's clock is assumed to run like the computer's. The number is then that of the
-        first tick.
+        Before the first tick, the loop's clock is assumed to run like the computer's. The number is then the
+        number of the first tick.
         """
         ahead = None
         for tick in reversed(self._ticks):

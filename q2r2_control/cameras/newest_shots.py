@@ -36,7 +36,7 @@ class NewestShots:
     """The newest pictures of the open cameras at each tick of one run."""
 
     def __init__(self, streams: Mapping[str, CameraStream], realtime: bool) -> None:
-        """``streams`` are the open cameras. The loop's clock is that of the computer if ``realtime`` is True."""
+        """``streams`` are the open cameras. If ``realtime`` is True, the loop's clock is the computer's."""
         self._streams, self._realtime, self._times = streams, realtime, LoopTimes()
         self._pictures: dict[str, ReadPicture] = {}  # The newest picture of each camera.
 
@@ -46,9 +46,9 @@ class NewestShots:
         return tuple(self._streams)
 
     def at(self, now: float) -> tuple[dict[str, ObservedPicture], dict[str, str]]:
-        """Return the newest pictures at a tick that is at ``now`` [s], by camera. It never waits.
+        """Return the newest picture of each camera at the tick of time ``now`` [s]. This method never waits.
 
-        The second mapping says of each camera without a usable picture why it has none.
+        The second mapping has each camera without a usable picture, and the reason why it has none.
         """
         found: dict[str, ObservedPicture] = {}
         reasons: dict[str, str] = {}

@@ -22,7 +22,7 @@ from q2r2_control.errors import CameraError
 
 _PATIENCE_MS = 5000  # Longest wait for a network camera [ms].
 _ENOUGH = 0.9  # If a device offers less than this share of the cell's rate, MJPG is requested.
-_EXPOSURE_UNIT = 1e-4  # V4L2_CID_EXPOSURE_ABSOLUTE counts in 100 us [s].
+_EXPOSURE_UNIT = 1e-4  # The unit of V4L2_CID_EXPOSURE_ABSOLUTE: 100 us [s].
 _MANUAL_EXPOSURE = 1  # V4L2_EXPOSURE_MANUAL
 _MJPG = cv2.VideoWriter.fourcc(*"MJPG")
 
@@ -71,7 +71,7 @@ class OpenCvDevice:
         return opened
 
     def _choose_format(self, opened: cv2.VideoCapture) -> None:
-        """Set size and rate. If the device's own format does not reach them, use MJPG, which loads the bus less."""
+        """Set size and rate. If the device's own format does not reach them, use MJPG, which needs less bandwidth."""
         width, height = size_before_rotation(self._camera)
         for fourcc in (None, _MJPG):
             if fourcc is not None:

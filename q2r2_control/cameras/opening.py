@@ -7,10 +7,11 @@ from q2r2_control.config.recording import CameraConfig
 
 
 def open_device(camera: CameraConfig) -> CameraDevice:
-    """Open a camera, whose pictures have the size that the cell says once they are turned by ``camera.rotation``.
+    """Open a camera. After its pictures are turned by ``camera.rotation``, they have the size that the cell says.
 
     Raises:
-        CameraError: If it cannot be opened as the cell asks. The message says why, without the camera's name.
+        CameraError: If the camera cannot be opened with the cell's settings. The message says why. It does not name the
+            camera.
     """
     check_installed(camera)
     if camera.device_kind == "file":

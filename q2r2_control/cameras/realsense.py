@@ -83,7 +83,7 @@ class RealSense:
         """Start the streams of a ``pyrealsense2.device``.
 
         Raises:
-            CameraError: If it has no stream of the size of the cell.
+            CameraError: If it has no stream of the size that the cell says.
             RuntimeError: If the library cannot start them.
         """
         import pyrealsense2 as rs
@@ -110,11 +110,11 @@ class RealSense:
         silent = [stream.name for stream, came in self._came.items() if received - came >= _PATIENCE_MS / 1e3]
         if silent or not has_come:
             raise CameraError(f"no {' and no '.join(silent) or 'frame'} within {_PATIENCE_MS / 1e3:g} s")
-        stamp_ms = 0.0  # It stays 0 if the stamp is by the camera's own clock, whose offset is not known.
+        stamp_ms = 0.0  # The stamp stays 0 if it is by the camera's own clock, whose offset is not known.
         if frame.get_frame_timestamp_domain() != self._rs.timestamp_domain.hardware_clock:
             stamp_ms = frame.get_timestamp() + 1e3 * _monotonic_minus_unix_time()
         captured = capture_time(received, stamp_ms, self._camera.delay)
-        pixels = turned(np.array(frame.get_data()), self._camera)  # A copy, because the library uses the memory again.
+        pixels = turned(np.array(frame.get_data()), self._camera)  # A copy, because the library reuses its memory.
         if frame.is_depth_frame():
             return DepthCapture(captured, pixels, frame.as_depth_frame().get_units())
         return Capture(captured, pixels)
@@ -125,7 +125,7 @@ class RealSense:
             sensor.close()
 
     def _choose(self, device: Any, stream: Any) -> tuple[Any, Any]:
-        """Return the sensor and the profile of a stream that fit the cell best."""
+        """Return the sensor and the profile of a stream whose size and rate fit the cell best."""
         found = [(sensor, profile) for sensor, profile in _profiles(device) if profile.stream_type() == stream]
         if not found:
             raise CameraError(f"{shown_device(self._camera)}: gives no {stream.name}; allowed: another camera")

@@ -1,4 +1,4 @@
-"""The kinds of reasons that the cameras of a recording give."""
+"""The kinds of faults of cameras that are reported during a recording."""
 
 from __future__ import annotations
 

@@ -18,9 +18,9 @@ _QUERYCAP, _CAPABILITY = 0x80685600, struct.Struct("=16s32s32s3I12x")
 _ENUM_FMT, _FORMAT = 0xC0405602, struct.Struct("=3I32sI16x")
 _ENUM_FRAMESIZES, _SIZE = 0xC02C564A, struct.Struct("=3I2I24x")
 _ENUM_FRAMEINTERVALS, _INTERVAL = 0xC034564B, struct.Struct("=5I2I24x")
-_CAPTURES, _HAS_DEVICE_CAPS = 0x1, 0x80000000  # Bits of capabilities.
-_VIDEO_CAPTURE, _DISCRETE = 1, 1  # A kind of buffer; a kind of size or interval.
-_MOST = 200  # Greatest number of entries that are asked for.
+_CAPTURES, _HAS_DEVICE_CAPS = 0x1, 0x80000000  # Bits of a device's capabilities.
+_VIDEO_CAPTURE, _DISCRETE = 1, 1  # A type of buffers, and a type of frame sizes and frame intervals.
+_MOST = 200  # Greatest number of entries that are read from a list of the driver.
 _NO_PICTURES = "no camera: it gives no pictures"
 
 
@@ -59,7 +59,7 @@ def capture_devices() -> dict[str, str]:
 def fault_of(path: str) -> str | None:
     """Return why a device cannot be opened as a camera; None if it can be.
 
-    A device that another program reads can be opened, and gives no pictures.
+    While another program reads the device, this function may return None although the device gives no pictures.
     """
     try:
         file = os.open(path, os.O_RDWR | os.O_NONBLOCK)

@@ -15,8 +15,8 @@ from q2r2_control.errors import CameraError
 class VideoFile:
     """Plays a file, in a loop or once. Implements :class:`CameraDevice`.
 
-    A picture is captured at the time at which the file shows it. These times do not depend on how busy the computer is:
-    a picture that is read too late still has its own time, and none is left out.
+    A picture is captured at the time at which the file shows it. A busy computer does not change these times, even if
+    it reads a picture too late. No picture is left out.
     """
 
     def __init__(self, camera: CameraConfig) -> None:
@@ -30,7 +30,7 @@ class VideoFile:
             raise CameraError(f"{shown_device(camera)}: no video that OpenCV can read; allowed: .mp4, .avi, .mkv")
         check_size(camera, *size_of(self._opened))
         self._began = time.monotonic()  # Time at which the file shows its first picture [s].
-        self._shown = 0  # Number of pictures since then.
+        self._shown = 0  # Number of pictures that were read since ``_began``.
 
     def read(self) -> Capture:
         if not self._opened.grab():

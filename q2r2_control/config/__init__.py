@@ -1,1 +1,1 @@
-"""Configuration: a cell's YAML as checked, immutable settings. This package imports nothing from the layers above."""
+"""Turn the YAML of a cell into checked, immutable settings. This package imports no package that uses it."""

@@ -12,7 +12,7 @@ from q2r2_control.config.strict import StrictModel
 from q2r2_control.errors import ConfigError
 
 Side = Literal["left", "right"]
-# The ranges detect values in millimetres or degrees.
+# The ranges detect values that were written in millimetres or degrees by mistake.
 Coordinate = Annotated[float, Field(ge=-20, le=20)]  # [m]
 Extent = Annotated[float, Field(gt=0, le=20)]  # [m]
 Angle = Annotated[float, Field(ge=-6.2832, le=6.2832)]  # [rad]
@@ -26,9 +26,9 @@ _USUAL_RADIUS = 0.03  # Default radius of a held object: more than half the open
 
 
 def _beside_the_file(value: str, info: ValidationInfo) -> str:
-    """Return a relative path with the folder of the YAML before it, if that folder has such a file or folder."""
+    """Return the path of this name in the folder of the YAML, if it exists there; otherwise the name itself."""
     folder: Path | None = (info.context or {}).get("folder")
-    # A model without a file ending is the NAME in robots/NAME.urdf.
+    # If a model has no file ending, it is the name of a file robots/NAME.urdf.
     path = f"robots/{value}.urdf" if info.field_name == "model" and not Path(value).suffix else value
     try:
         return str(folder / path) if folder is not None and value and (folder / path).exists() else value
@@ -37,7 +37,7 @@ def _beside_the_file(value: str, info: ValidationInfo) -> str:
 
 
 def _by_joint(value: object) -> object:
-    """Refuse a list or a number. The message of pydantic would name a type that does not exist in YAML."""
+    """Refuse a list or a number here, because pydantic's own message would name a type that does not exist in YAML."""
     if not isinstance(value, Mapping):
         raise ValueError("allowed: limits by joint, such as {A2: 5.4}")
     return value
@@ -56,7 +56,7 @@ class PoseConfig(StrictModel):
 
 
 class FlangeConfig(StrictModel):
-    """The flange between an arm's last link and its tool: a model, or a cylinder of these sizes; by default nothing."""
+    """The flange between an arm's last link and its tool: a model, or a cylinder. By default, there is no flange."""
 
     model: LocalPath | None = Field(None, description="a file of robots/ without .urdf, or a path")
     xacro_args: XacroArgs = Field({})
@@ -114,7 +114,7 @@ class HeldObjectConfig(StrictModel):
 
     @property
     def radius(self) -> float:
-        """The radius of the ball that stands for the object if it is not a box [m]."""
+        """The radius of the object if it is a ball, and not a box [m]."""
         return _USUAL_RADIUS if self.sphere is None else self.sphere
 
 
@@ -154,7 +154,7 @@ class RobotConfig(StrictModel):
 
 
 class ArmConfig(StrictModel):
-    """One arm: model and mount, unless it is part of the cell's ``robot``; tip, tool, home posture."""
+    """One arm: its tip, tool and home posture. An arm that is not part of ``robot`` also has a model and a mount."""
 
     model: LocalPath | None = Field(
         None, description="a file of robots/ without .urdf, example-robot-data:NAME, or a path"

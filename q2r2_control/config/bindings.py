@@ -73,12 +73,12 @@ MEANINGS: dict[str, str] = {
     Action.TRANSLATION_LOCK: "held: the tool keeps its position",
     Action.GRIPPER_ANALOG: "closes the gripper, where the arm has one, as far as it is pressed",
 }
-# Fields of the settings, which name the controls as an operator does.
+# Fields of the settings. Their names are the operator's words for the controls.
 BUTTONS = ("lower", "upper")
 TRIGGERS = ("trigger", "grip")
 HELD = (*TRIGGERS, "stick_up", "stick_down", "stick_left", "stick_right")
 CONTROLS = (*BUTTONS, *HELD)
-# The button or axis of a device for each control, and the axis's direction.
+# For each control, the button or axis of a device, and the sign of the axis in the direction of the control.
 DEVICE_NAMES: dict[str, tuple[str, float]] = {
     "lower": ("button_lower", 1.0),
     "upper": ("button_upper", 1.0),
@@ -203,7 +203,7 @@ class BindingSettings(StrictModel):
 
     @property
     def of_device(self) -> tuple[str, ...]:
-        """The controls that only the device has, each once."""
+        """The names of the controls in the block ``device``. A control with two gestures is named once."""
         return tuple(dict.fromkeys(key.removesuffix(_SUFFIXES[Gesture.HOLD]) for key in self.device))
 
     def meanings(self) -> dict[str, str]:

@@ -53,7 +53,10 @@ _LoopRate = Annotated[
 
 
 class ObstacleConfig(StrictModel):
-    """A fixed body of the cell. Cylinders and capsules stand along z; a capsule's length is that of its segment."""
+    """A fixed body of the cell. The axis of a cylinder or capsule is z.
+
+    The length of a capsule is the length of its axis between the centres of its two half balls.
+    """
 
     shape: Literal["box", "cylinder", "sphere", "capsule"]
     size: tuple[Extent, ...] = Field(

@@ -58,7 +58,7 @@ def parse_config(
         data = yaml.load(text, Loader=_Loader)
     # Values such as dates and huge integers, and too deep nesting, raise Python's own exceptions.
     except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
-        said = str(error).replace(' "<unicode string>",', "")  # This is PyYAML's name for the text.
+        said = str(error).replace(' "<unicode string>",', "")  # PyYAML calls the text "<unicode string>".
         raise ConfigError(f"{path}: not YAML: {_line(said)}") from error
     if data is None:
         raise ConfigError(f"{path}: the file is empty; allowed: a cell's YAML; q2r2 new-cell makes one")
@@ -83,18 +83,20 @@ def parse_config(
         raise ConfigError(f"{path}: expected plain keys and values: {_line(error)}") from error
 
 
-# A KUKA driver's joint limits are one degree inside the model's, and its soft limits 5 degrees inside these [rad].
-# Beyond the limits, lbr_fri_ros2_stack closes the connection, and a cabinet ends its session. The driver's safe_stop
-# closes the connection already if one more step at a joint's greatest speed would leave the limits. This step is 1.8
-# degrees at most if commands are due every 10 ms, and is smaller than the 5 degrees.
+# Distance of the soft limits of a KUKA driver from the model's joint limits [rad]. The driver's joint limits are one
+# degree inside the model's, and its soft limits are another 5 degrees inside. Beyond the driver's joint limits,
+# lbr_fri_ros2_stack closes the connection, and a cabinet ends its session. The driver's safe_stop closes the connection
+# even earlier, if one more step at a joint's greatest speed would leave its joint limits. If commands are due every
+# 10 ms, this step is 1.8 degrees at most. This is less than the 5 degrees between soft limits and joint limits.
 _DRIVER_MARGIN = 0.105
-# Commands come unevenly. If one command more than usual comes within a period of the driver, the output of the driver's
-# filter is faster by the share h / T. T is the filter's time constant, and h is the time between commands. For h = 5 ms
-# and T = 40 ms, the share is an eighth. A command that was late by d adds (d / T)^2 / 2. The driver also closes the
-# connection if a joint is beyond its velocity limit.
+# Greatest share of a joint's velocity limit that the commands for a driver may reach. The driver also closes the
+# connection if a joint is faster than its velocity limit. Commands come unevenly. If one command more than usual comes
+# within a period of the driver, the output of the driver's filter is faster by the share h / T. T is the filter's time
+# constant, and h is the time between commands. For h = 5 ms and T = 40 ms, the share h / T is an eighth. If a command
+# is late by d, the share grows by (d / T)^2 / 2.
 _DRIVER_SPEED = 0.85
-# While the times of answers catch up with a cabinet's clock, the cabinet sees up to 1.05 times the reference's speeds
-# (plants.fri.answers).
+# The same share for a cabinet. While the times of answers catch up with a cabinet's clock, the cabinet sees up to 1.05
+# times the reference's speeds (plants.fri.answers).
 _CABINET_SPEED = 0.95
 
 
@@ -115,12 +117,12 @@ def _within_driver_limits(config: Config) -> Config:
 def _line_number(text: str, location: Sequence[int | str]) -> int | None:
     """Return the number of the line of a key in a YAML, from 1 on.
 
-    If the key is missing, it is the line of the deepest block around the key; None if that is missing too.
+    If the key is missing, return the line of the innermost block that should contain it; None if no such block exists.
     """
     node, line = yaml.compose(text, Loader=_Loader), None
     for part in location:
         if isinstance(node, yaml.MappingNode):
-            # Some parts are not in the file: pydantic's tags of alternative models, and keys that are missing.
+            # Two kinds of parts are not in the file: pydantic's tags of alternative models, and missing keys.
             found = [(key, value) for key, value in node.value if key.value == str(part)]
         elif isinstance(node, yaml.SequenceNode) and isinstance(part, int) and part < len(node.value):
             found = [(node.value[part], node.value[part])]
@@ -132,7 +134,10 @@ def _line_number(text: str, location: Sequence[int | str]) -> int | None:
 
 
 class _Loader(SafeLoader):
-    """A stricter loader than that of YAML 1.1, where a later key silently replaces an equal one, and 1e-3 is a text."""
+    """A loader that is stricter than YAML 1.1: it refuses a key that is given twice, and reads 1e-3 as a number.
+
+    In YAML 1.1, the second of two equal keys would silently replace the first one, and 1e-3 would be a text.
+    """
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         seen: set[Any] = set()

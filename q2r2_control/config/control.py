@@ -26,10 +26,10 @@ ObstacleName = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$", max_leng
 class DistanceSettings(StrictModel):
     """Distances that pairs keep, by the kind of their bodies. A kind that is left out has ``min_distance``.
 
-    A finger is moved by a gripper's joints, and carried by a tool (the hand). An obstacle stands in the cell, and the
-    floor counts as an obstacle. An object is the body that ``gripper.object`` describes, while it is held. ``arm_self``
-    is for all bodies of one arm among themselves and with the rest of its robot. The bodies of an arm include the
-    object that it holds. The other classes without obstacles are for pairs of different arms.
+    The joints of a gripper move its fingers, and the tool (also called the hand) is the part to which the fingers are
+    attached. Obstacles include the floor. An object is the body that ``gripper.object`` describes, while it is held.
+    ``arm_self`` is for pairs of two bodies of one arm, and for pairs of an arm and the rest of its robot. The bodies of
+    an arm include the object that it holds. All other keys without obstacles are for bodies of two different arms.
     """
 
     arm_arm: Distance | None = Field(None, description="links of two arms, bases included [m]")
@@ -49,7 +49,7 @@ class DistanceSettings(StrictModel):
 
 
 class NamedPairDistance(StrictModel):
-    """The distance that pairs keep, by the names of their bodies."""
+    """A distance for the pairs of bodies whose names match ``pair``."""
 
     pair: tuple[LinkPattern, LinkPattern] = Field(
         description="two links in any order; * stands for any characters and ? for one"
@@ -58,7 +58,7 @@ class NamedPairDistance(StrictModel):
 
 
 class ContactPair(StrictModel):
-    """Bodies that may touch in torque mode, by their names. In the other modes they keep their distance.
+    """Pairs of bodies, by their names, that may touch in torque mode. In the other modes they keep their distance.
 
     The reference may penetrate a body by ``depth``. The impedance then presses with at most its stiffness times this
     depth.
@@ -219,7 +219,7 @@ class ControllerSettings(StrictModel):
         return self.model_copy(update={"solve_time_limit": limit})
 
     def changed(self, values: Mapping[str, Any]) -> ControllerSettings:
-        """Return the settings with other ``values`` of settings in ``LIVE``, by name.
+        """Return the settings with new ``values`` for some of the settings in ``LIVE``, by name.
 
         Raises:
             ConfigError: If a name is not in ``LIVE``, or if a value is not allowed.
@@ -233,7 +233,7 @@ class ControllerSettings(StrictModel):
 
     @property
     def largest_distance(self) -> tuple[str, float]:
-        """Key and value of the largest distance in these settings that a pair may have to keep [m]."""
+        """Return the key and the value [m] of the largest distance that these settings may ask a pair to keep."""
         by_class = {f"distances.{name}": value for name, value in self.distances if value is not None}
         by_name = {f"pairs[{i}].distance": named.distance for i, named in enumerate(self.pairs)}
         return max((("min_distance", self.min_distance), *by_class.items(), *by_name.items()), key=lambda item: item[1])
@@ -297,7 +297,7 @@ class AdmittanceSettings(StrictModel):
     mass: float = Field(10.0, ge=0.5, le=200, description="virtual mass of the tool [kg]")
     inertia: float = Field(0.3, ge=0.01, le=20, description="virtual inertia of the tool [kg m^2]")
     # The mass in the tool's model may be wrong by 0.2 kg. The default force is the weight of this mass. The default
-    # torque is that of this weight at a distance of 0.15 m from the tool frame.
+    # torque is the torque of this weight at a distance of 0.15 m from the tool frame.
     force_dead_band: float = Field(2.0, ge=0, le=50, description="a smaller force moves nothing [N]")
     torque_dead_band: float = Field(0.3, ge=0, le=10, description="a smaller torque moves nothing [Nm]")
     filter_time: float = Field(0.01, ge=0, le=0.5, description="time constant of the wrench's low-pass [s]")

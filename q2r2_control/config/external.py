@@ -80,7 +80,7 @@ class ExternalGripper(GripperSettings):
 
 
 class GuardLimits(StrictModel):
-    """Limits of the target's motion; null: the limit of the preset."""
+    """Limits of the target's motion. If a limit is null, the limit of the preset is used."""
 
     max_velocity: float | None = Field(None, gt=0, le=5, description="largest speed of the target's position [m/s]")
     max_acceleration: float | None = Field(
@@ -94,7 +94,7 @@ class GuardLimits(StrictModel):
     )
 
     def over(self, guard: GuardSettings) -> GuardSettings:
-        """Return ``guard`` with the limits that are given here."""
+        """Return ``guard`` with its limits replaced by those limits that are not None here."""
         return guard.model_copy(update=self.model_dump(exclude_none=True))
 
 
@@ -163,7 +163,7 @@ class ExternalConfig(StrictModel):
 
     @property
     def filtered(self) -> bool:
-        """Whether the built-in controller computes the external controller's targets from those of the hands."""
+        """Whether the built-in controller computes the external controller's targets from the hands' targets."""
         return self.mode is Mode.FILTERED
 
     def topic(self, arm: str) -> str:
@@ -197,7 +197,7 @@ def check_external(kind: ControllerKind, external: ExternalConfig | None, arms: 
 
 
 def describe(external: ExternalConfig) -> dict[str, str]:
-    """Return one line about the controller of each arm, by arm."""
+    """Return, for each arm, one line about its controller."""
     preset = external.terms
     source = "what the built-in controller makes of the hand's target" if external.filtered else "the hand's target"
     lines: dict[str, str] = {}

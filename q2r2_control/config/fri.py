@@ -12,7 +12,7 @@ from q2r2_control.config.strict import StrictModel
 
 
 class GripperIoConfig(StrictModel):
-    """A gripper on named inputs and outputs of the cabinet, as they are called in the Sunrise project."""
+    """A gripper on inputs and outputs of the cabinet, with the names that they have in the Sunrise project."""
 
     output: str = Field(
         min_length=1, description="name of the output for the opening: 0 closed .. 1 open, or on for open"

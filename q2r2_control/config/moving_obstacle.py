@@ -12,7 +12,7 @@ from q2r2_control.errors import ConfigError, check_kind, shown
 
 
 class MovingObstacle(ObstacleConfig):
-    """The shape and pose of an obstacle in the world, and how fast any of its points may move after this pose."""
+    """The shape of an obstacle, its pose in the world, and how fast any of its points may move from this pose on."""
 
     shape: Literal["box", "sphere", "capsule"]
     speed: float = Field(ge=0, le=10, description="largest speed of any of its points; 0: the obstacle stays [m/s]")

@@ -1,7 +1,7 @@
 """Properties of community controllers: topic, message type, rate, activation, limits.
 
-``{ctrl}`` stands for the controller's own name with its namespace, the parameter ``ctrl_prefix`` of an arm controller.
-``{robot}`` stands for that namespace alone. An installed package can add a controller by an entry point of
+``{ctrl}`` stands for the parameter ``ctrl_prefix`` of an arm controller: the controller's own name with its namespace.
+``{robot}`` stands for this namespace alone. An installed package can add a controller by an entry point of
 ``q2r2_control.presets`` that is a :class:`Preset` of the same name.
 """
 
@@ -21,8 +21,8 @@ POSE, TWIST = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/TwistStamped"
 class Hold(StrEnum):
     """The messages to a controller while its arm is paused and its target stands still."""
 
-    REPEAT = "repeat"  # The last target with a new stamp.
-    SILENCE = "silence"  # No messages. The controller then holds the arm by itself, and stops for an old target.
+    REPEAT = "repeat"  # The last target is sent again, with a new stamp.
+    SILENCE = "silence"  # Nothing is sent. The controller then holds the arm by itself, and stops if its target is old.
 
 
 # Limits of targets for controllers that have no limits of their own.
@@ -38,18 +38,18 @@ class Preset:
     """The properties of one controller."""
 
     name: str
-    activation: str  # The conditions under which it follows a target, in words.
+    activation: str  # The conditions under which the controller follows a target, in words.
     topic: str = "{ctrl}/target_frame"  # Topic of its target.
     message: str = POSE  # Message type of its target.
     rate: float = 100.0  # Rate at which targets are sent [Hz].
-    lowest_rate: float = 50.0  # Below this rate, it stops or moves unevenly [Hz].
+    lowest_rate: float = 50.0  # Below this rate of targets, the arm stops or moves unevenly [Hz].
     hold: Hold = Hold.REPEAT
     guard: GuardSettings = _CAREFUL
     # The kind of joint commands that the node cartesian_controller sends in mode filtered; "none" if it sends none.
     output: str = "none"
     # Topic for a message with a zero wrench, without which the controller may push; None if it needs no such message.
     zero_wrench: str | None = None
-    command_type: str | None = None  # Service that sets the type of targets, called at each start; None if none.
+    command_type: str | None = None  # Service that is called at each start to set the type of targets; None if none.
 
     @property
     def takes_targets(self) -> bool:
@@ -66,7 +66,7 @@ BUILTIN = Preset("builtin", "always on", rate=100.0, lowest_rate=20.0, hold=Hold
 _ALL = (
     BUILTIN,
     # The velocity limit of this controller uses the time since the target last changed. After a long pause without
-    # messages, the next target would therefore not be limited.
+    # messages, the next target would therefore not be limited. The preset therefore repeats targets during a pause.
     Preset("kuka_lbr_clik", _LATCHES),
     Preset("kuka_lbr_impedance", _LATCHES, rate=200.0, lowest_rate=100.0, zero_wrench="{ctrl}/target_wrench"),
     Preset("fzi", "targets count when they come after its activation"),
@@ -145,7 +145,7 @@ PRESETS = {preset.name: preset for preset in _ALL}
 
 
 def preset_names() -> tuple[str, ...]:
-    """Return the names of the presets of this package, and then those of other installed packages."""
+    """Return the names of this package's presets, and then the names of other installed presets."""
     return (*PRESETS, *(name for name in names_of(ENTRY_POINTS) if name not in PRESETS))
 
 
@@ -168,7 +168,7 @@ class Mode(StrEnum):
     FILTERED = "filtered"  # The target after the built-in controller: within limits and free of collisions.
 
 
-# The warning about mode raw, at the start and in q2r2 check.
+# The warning about mode raw. It is shown at the start and by q2r2 check.
 RAW_WARNING = "raw: no limits, no distances, no self-collision"
 
 

@@ -17,7 +17,7 @@ SubtaskSeconds = Annotated[float, Field(ge=0, le=3600)]
 
 
 class JudgeSettings(StrictModel):
-    """Thresholds of ``q2r2 judge``: an episode beyond any of them is discarded. With null, the number is not judged.
+    """Thresholds of ``q2r2 judge``: an episode beyond any of them is discarded. A threshold of null is not checked.
 
     Shares are fractions of the time for which an arm is engaged, unless a description says otherwise. No threshold thus
     depends on the length of an episode. The package ``q2r2_control.judging`` computes the numbers.
@@ -131,14 +131,14 @@ class RecordingSettings(StrictModel):
 
 
 def subtask_name(names: Sequence[str], number: int) -> str:
-    """Return the name of subtask ``number``, from 1 on; ``names`` are those of ``recording.subtasks``."""
+    """Return the name of subtask ``number``, from 1 on; ``names`` is ``recording.subtasks``."""
     return names[number - 1] if number <= len(names) else f"subtask {number}"
 
 
 def subtask_names(names: Sequence[str], presses: int) -> tuple[str, ...]:
     """Return the names of the subtasks that have begun in an episode; empty if the episode has no subtasks.
 
-    ``names`` are those of ``recording.subtasks``, and ``presses`` is how often the operator began another subtask.
+    ``names`` is ``recording.subtasks``, and ``presses`` is how often the operator began another subtask.
     """
     return tuple(subtask_name(names, number) for number in range(1, presses + 2)) if names or presses else ()
 
@@ -150,7 +150,7 @@ DeviceText = Annotated[LocalPath, Field(min_length=1, max_length=500)]
 _LEAST_DISTANCE = 1e-6  # Least distance between a camera and the point that it looks at [m].
 _POSE_KEYS = ("position", "look_at", "rpy")  # Keys that only a simulated camera has.
 _DEVICE_KEYS = ("exposure", "rotation", "delay", "repeat", "depth")  # Keys that only a device has.
-REALSENSE = "realsense:"  # The beginning of the device of a RealSense camera, before its serial number.
+REALSENSE = "realsense:"  # How ``device`` of a RealSense camera begins. A serial number follows.
 
 
 class CameraConfig(StrictModel):
@@ -242,7 +242,7 @@ class CameraConfig(StrictModel):
 
     @property
     def device_kind(self) -> Literal["v4l2", "realsense", "address", "file"] | None:
-        """The kind of the device; None if the camera is no device."""
+        """The kind of the device; None if the camera is simulated or on a ROS topic."""
         if self.device is None:
             return None
         if isinstance(self.device, int) or self.device.isdigit() or self.device.startswith("/dev/"):

@@ -15,8 +15,8 @@ from q2r2_control.errors import ConfigError, shown
 Model = TypeVar("Model", bound=BaseModel)
 
 
-# What is allowed instead of a value, by pydantic's type of the fault. Braces enclose values that pydantic adds to the
-# fault.
+# For each type of fault of pydantic, a text that says what is allowed. A name in braces is replaced by the value that
+# pydantic gives for it.
 _ALLOWED = {
     "list_type": "a list such as [a, b]",
     "tuple_type": "a list such as [a, b]",
@@ -78,7 +78,7 @@ class StrictModel(BaseModel):
 
 
 def validated(model: type[Model], where: str, values: object, *, as_json: bool = False, **options: Any) -> Model:
-    """Return settings made of ``values``, or of a JSON text. ``options`` are those of pydantic's ``model_validate``.
+    """Return settings made of ``values``, or of a JSON text. ``options`` are for pydantic's ``model_validate``.
 
     Raises:
         ConfigError: If a value is not allowed. The message begins with ``where``.
@@ -109,7 +109,7 @@ def config_error(
 
 
 def _key(fault: ErrorDetails) -> str:
-    # Parts in brackets are not keys: pydantic adds "[key]", and the tags of alternative models for a key's value.
+    # Parts in brackets are not keys. They are pydantic's "[key]", or the tag of one of several models for a value.
     key = ".".join(str(part) for part in fault["loc"] if not str(part).startswith("["))
     return " ".join(key.split())[:300] or "(top level)"
 
@@ -127,14 +127,14 @@ def _line(fault: ErrorDetails, model: type[BaseModel]) -> str:
         keys = _keys_at(fault["loc"][:-1], model)
         meant = get_close_matches(str(fault["loc"][-1]), keys, n=1)
         allowed = f"unknown key; {f'did you mean {meant[0]}? ' if meant else ''}allowed here: {', '.join(keys)}"
-    # If the value is a block, it is not shown. For a known block, the text names the keys that do not fit together.
+    # A block is not shown as a value, because the text already names its unknown key, or the keys that do not fit.
     is_block = fault["type"] in ("value_error", "extra_forbidden") and isinstance(fault["input"], dict)
     value = "" if is_block else f" = {shown(fault['input'])}"
     return f"{key}{value}: {allowed}"
 
 
 def allowed_instead(fault: ErrorDetails) -> str:
-    """Return what is allowed instead of a value, in the words of ``_ALLOWED``, or otherwise in those of pydantic."""
+    """Return what is allowed instead of a value: the text of ``_ALLOWED``, or pydantic's text if there is none."""
     words = _ALLOWED.get(fault["type"])
     text = fault["msg"].removeprefix("Value error, ")
     return text if words is None else f"allowed: {words.format(**fault.get('ctx', {}))}"

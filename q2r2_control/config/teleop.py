@@ -21,11 +21,11 @@ _ALLOWED = "three of +x -x +y -y +z -z that use x, y and z once each, e.g. [+z, 
 
 
 def axes_matrix(axes: Sequence[str]) -> Array:
-    """Return the signed permutation M (3, 3) from the input's axes to those of the world.
+    """Return the signed permutation M (3, 3) from the input's axes to the world's axes.
 
     A position p of the input becomes M p in the world, and a rotation R becomes M R M'. ``axes[i]`` is the input's axis
     that becomes the world's i-th axis. The determinant is -1 if the frame of the input is left-handed, as in raw Unity.
-    M R M' is a proper rotation then too.
+    Even then, M R M' is a proper rotation.
 
     Raises:
         ValueError: If the axes are not allowed. The message names the value and what is allowed.
@@ -43,7 +43,7 @@ class Stance(StrEnum):
     SIDE_BY_SIDE = "side_by_side"
     # The operator faces the robot. The left hand moves the right arm, and motions keep their direction in the world.
     MIRROR = "mirror"
-    MIRROR_REFLECTED = "mirror_reflected"  # The hands are swapped too, but motions are reflected left to right.
+    MIRROR_REFLECTED = "mirror_reflected"  # Like ``MIRROR``, but motions are reflected left to right.
 
     def hand_of(self, arm: str) -> str:
         """Return the hand that moves an arm."""
@@ -107,7 +107,7 @@ class LeashSettings(StrictModel):
     carried_angle: float = Field(0.1, ge=0.03, le=2, description="the same for the rotation of that frame [rad]")
 
     def carried(self) -> LeashSettings:
-        """Return the leash of the frame between two tools that carry one object. It is at most as long as a tool's."""
+        """Return the leash of the frame between two tools that carry one object. A tool's leash is at least as long."""
         distance, angle = (math.inf if length is None else length for length in (self.distance, self.angle))
         shorter = {"distance": min(distance, self.carried_distance), "angle": min(angle, self.carried_angle)}
         return self.model_copy(update=shorter)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 EVERY_NETWORK = ("", "0.0.0.0", "::")  # A server with one of these hosts listens on all networks.
 NO_NETWORK = "of this machine (it has no network now)"
-# Numbers of Linux: ioctl requests about the network interface with a given name, and flags of an interface's state.
+# Constants of Linux: ioctl requests about the network interface with a given name, and flags of an interface's state.
 _GET_FLAGS, _GET_ADDRESS = 0x8913, 0x8915
 _UP, _LOOPBACK, _RUNNING = 0x1, 0x8, 0x40
 _IPV6_TABLE = Path("/proc/net/if_inet6")

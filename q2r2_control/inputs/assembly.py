@@ -20,7 +20,7 @@ _GRIP, _OVER = 0.243, 0.33
 def _meeting(middle: float) -> dict[str, tuple[WayPoint, ...]]:
     """Return way points with which both hands bring their blocks to the middle of the cell, and back.
 
-    There the tools are ``middle`` [m] to the left and to the right of the cell's centre.
+    Where the blocks meet, the tools are ``middle`` [m] to the left and to the right of the cell's centre.
     """
     left: tuple[WayPoint, ...] = (
         (1.4, 0.55, 0.25, 0.35, 0.0, 0.0),  # Over the block.
@@ -50,8 +50,8 @@ MEET = HandWork(
     ),
     presses={"left": (3.5, 14.9), "right": (3.7, 15.1)},
 )
-# Both hands move to the same position. Each target gets 65 mm away from its tool, which the leash allows. The hands
-# then bring the blocks back.
+# Both hands move to the same position. Since the tools cannot meet there, each target gets 65 mm away from its tool,
+# which the leash allows. The hands then bring the blocks back.
 CLASH = replace(MEET, tools=_meeting(0.0))
 
 _LOW = 0.216  # Height of the tool at which the finger tips are 3 mm above the table [m].
@@ -176,7 +176,7 @@ HANDOVER = HandWork(
 )
 
 
-# All works, in the order in which they can follow each other.
+# All works (tasks of both hands), in the order in which they can follow each other.
 WORKS: Mapping[str, HandWork] = {
     "meet": MEET,
     "clash": CLASH,

@@ -36,9 +36,9 @@ class Input(Protocol):
     The order of use is ``start``, then ``poll`` and ``send_haptic`` in any order, then ``close``. An input that is
     found by its name also has a class method ``from_config(config)``. Its class may have these further attributes:
 
-    - ``options``: The names of keyword arguments of ``from_config``. Each is an option of ``q2r2 run``, or ``say``, a
-      function that prints a line.
-    - ``cell``: A function that changes a cell's settings to the ones that this input needs, such as its own axes.
+    - ``options``: The names of keyword arguments of ``from_config``. Each is an option of ``q2r2 run``, except
+      ``say``, which is a function that prints a line.
+    - ``cell``: A function that gives a cell the settings that this input needs, such as the input's own axes.
     - ``executable``: The ROS executable that is started for this input instead of ``hand_input``.
     - ``feels``: False if there is no device that could vibrate. No vibrations are then computed.
     - ``simulated``: True if the samples depend only on the times of the polls, so that a run may be in simulated time.
@@ -82,11 +82,11 @@ class PolicySource(Input, Protocol):
         """Return the chunks that came since the last call, oldest first. The method never waits and never raises."""
 
     def observe(self, observation: Observation) -> None:
-        """Give the policy a tick's observation, whose numbers never change. In real time the method never waits."""
+        """Give the policy the observation of a tick, which does not change later. In real time, this never waits."""
 
 
 def check_samples(samples: list[HandSample]) -> list[HandSample]:
-    """Return the ``samples`` of a poll. Their numbers may have any value.
+    """Check the types in the ``samples`` of a poll, and return the samples. Their numbers may have any value.
 
     Raises:
         InputError: If ``samples`` is not a list of HandSample, or if a field of a sample has a wrong type.
@@ -114,7 +114,7 @@ def is_simulated(source: str) -> bool:
 
 
 def adapted(source: str, config: Config) -> Config:
-    """Return the cell with the settings that an input needs, such as its bindings. ``q2r2 run`` changes them likewise.
+    """Return the cell with the settings that an input needs, such as its bindings. ``q2r2 run`` also calls this.
 
     Args:
         source: The name of an installed input.
@@ -128,13 +128,15 @@ def adapted(source: str, config: Config) -> Config:
 
 
 def make_input(source: Input | str, config: Config, **options: object) -> Input:
-    """Return the input called ``source``, or ``source`` itself if it is an input. It receives nothing before ``start``.
+    """Return the input called ``source``, or ``source`` itself if it is an input.
+
+    The input receives nothing before ``start``.
 
     Args:
         source: The name of an installed input, such as ``headset``, or an object with all methods of :class:`Input`.
         config: The cell that the input moves.
-        options: Keyword arguments of the input's ``from_config``, such as ``trajectory="circle"``. The ones that the
-            input does not have are ignored.
+        options: Keyword arguments of the input's ``from_config``, such as ``trajectory="circle"``. Options
+            that the input does not have are ignored.
 
     Raises:
         ConfigError: If the name is unknown, if ``source`` is neither a name nor an input, or if the input refuses an

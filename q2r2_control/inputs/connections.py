@@ -27,13 +27,13 @@ from q2r2_control.inputs.messages import KEEPALIVE, FrameDecoder, HandPose, Wire
 from q2r2_control.inputs.session import HeadsetSession, Reception, log_frame
 from q2r2_control.types import HapticFeedback
 
-KEEPALIVE_AFTER = 1.0  # The server sends a keepalive if it has sent nothing for longer [s].
+KEEPALIVE_AFTER = 1.0  # The server sends a keepalive if it has sent nothing for longer than this [s].
 # A driver that sends no whole frame for longer than this is dropped [s]. The app sends a keepalive after 1 s.
 SILENCE_ALLOWED = 2.0
 TURN = 0.05  # Longest wait for the network. Timeouts are checked this often [s].
 # Greatest number of bytes in one read, about 40 messages. The control loop can run between two reads.
 _RECEIVE_BYTES = 1 << 12
-MAX_FRAMES_PER_SECOND = 2000  # The app sends about 450. More would take processor time from the control loop.
+MAX_FRAMES_PER_SECOND = 2000  # The app sends about 450. Much more would delay the control loop.
 
 _LOG = logging.getLogger("q2r2_control.inputs.headset")
 
@@ -48,7 +48,7 @@ class Client(Peer):
         self.socket = connection
         self.decoder = FrameDecoder()
         self.refused_hosts: set[str] = set()  # Hosts that the log has named as refused while this client drives.
-        self.announced = False  # Whether the log has a line that this client is connected.
+        self.announced = False  # Whether the log already says that this client is connected.
         self.last_sent = now
         self._frames = RateLimit(MAX_FRAMES_PER_SECOND)
 
@@ -107,7 +107,7 @@ class Connections:
         # thread or the whole process has stalled, a client could count as silent although it has sent data.
         asked = self._clock()
         self._watch_door(asked)
-        # During this loop, only the event of a connection itself can end it. No event of an ended connection follows.
+        # In this loop, a connection ends only while its own event is handled. No event of an ended connection follows.
         for key, _ in self._selector.select(TURN):
             key.data()
         self._settle(asked)
@@ -157,7 +157,7 @@ class Connections:
         """Decide which client drives. All data that were sent before ``now`` [s] have been read."""
         driver = self._driver
         if driver is not None and now - driver.last_frame > SILENCE_ALLOWED:
-            self._drop(driver, f"no frame for {SILENCE_ALLOWED:g} s")  # Otherwise this client would keep others out.
+            self._drop(driver, f"no frame for {SILENCE_ALLOWED:g} s")  # A silent driver would keep others out.
         for client in tuple(self._waiting):
             if not is_allowed(client.host, self._allow):
                 self._refuse(client, f"{client.host} is not in headset.allow", self._unwelcome)
@@ -248,7 +248,7 @@ class Connections:
             self._waiting.remove(client)
         self._selector.unregister(client.socket)
         with client.socket, suppress(OSError):
-            # The unsent bytes go first, since they may be the end of a frame.
+            # Unsent bytes are sent before the last line, since they may be the end of a frame.
             client.socket.send(bytes(client.session.outgoing) + log_frame("error", last_words or reason))
 
     def _write(self, client: Client, level: int, what: str) -> None:

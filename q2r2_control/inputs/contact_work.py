@@ -58,7 +58,7 @@ CARRY = HandWork(
 )
 
 _SPONGE_X, _SPONGE_Y, _SPONGE_HELD = 0.60, 0.42, 0.248  # Position x, y and z of the tool at the sponge [m].
-_WIPING = _SPONGE_HELD - 0.012  # Height of the tool while it wipes [m]. It is lower, so that the sponge is pressed.
+_WIPING = _SPONGE_HELD - 0.012  # Height of the tool while it wipes, and presses the sponge by 12 mm [m].
 # Ends of the strokes: positions x and y of the tool [m].
 _STROKES = ((0.72, 0.42), (0.72, 0.39), (0.60, 0.39), (0.60, 0.36), (0.72, 0.36))
 WIPE = HandWork(

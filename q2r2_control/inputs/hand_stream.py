@@ -51,7 +51,7 @@ class HandStream:
 
     def lose(self, reason: str) -> None:
         """Note that the connection of the headset that drove is lost."""
-        # The cut comes before the peer changes. Otherwise `connected` could be True for the next headset too early.
+        # The queue is cut before the peer changes. Otherwise `connected` could be True for the next headset too early.
         self._samples.cut()
         with self._lock:
             self.peer, self._last_disconnect = None, reason

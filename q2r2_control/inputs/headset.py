@@ -25,7 +25,7 @@ _LOG = logging.getLogger(__name__)
 
 
 def watch_of(config: Config) -> HandsWatch:
-    """Return an object that detects faults of a headset's poses, with the settings of the cell."""
+    """Return an object that uses the settings of the cell to detect faults of a headset's poses."""
     headset = config.headset
     return HandsWatch(headset.frozen_time, headset.watch_frame, config.teleop.gate.timeout)
 
@@ -62,7 +62,7 @@ class HeadsetServer:
         watch: HandsWatch | None = None,
         say: Callable[[str], None] = _LOG.debug,
     ) -> None:
-        self.address = host, port  # After ``start``, the port is the one that was bound.
+        self.address = host, port  # After ``start``, the port is the bound port.
         self._allow, self._clock, self._say = allow, clock, say
         self._stream = HandStream(watch or HandsWatch(), listener)
         self._thread: threading.Thread | None = None
@@ -70,7 +70,7 @@ class HeadsetServer:
         self._owed: dict[str, HapticFeedback] = {}  # The newest vibration of each hand that has not been sent yet.
         self._owed_lock = threading.Lock()
         self._session_lock = threading.Lock()  # Neither poll nor send_haptic waits for this lock.
-        self._client: Client | None = None  # The client that was admitted last; it may be gone.
+        self._client: Client | None = None  # The client that was admitted last. It may have disconnected.
 
     @classmethod
     def from_config(

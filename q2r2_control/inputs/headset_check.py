@@ -19,8 +19,8 @@ from q2r2_control.types import SIDES, Array, HandSample
 
 SILENCE = 2.0  # Time without data before advice is given [s].
 _PERIOD = 0.05  # Time between two polls of the server [s].
-_WINDOW = 0.5  # The movement in the newest time span of this length is put in words [s].
-_STILL = 0.02  # A hand that has moved by less than this in the window counts as still [m].
+_WINDOW = 0.5  # Duration of the newest movement, which is put in words [s].
+_STILL = 0.02  # A hand that has moved by less than this in ``_WINDOW`` counts as still [m].
 _DIRECTIONS = (("back -x", "forward +x"), ("right -y", "left +y"), ("down -z", "up +z"))
 
 
@@ -80,8 +80,8 @@ class HeadsetCheck:
     """What is known about a headset's data at one time."""
 
     statistics: HeadsetStatistics
-    directions: dict[str, str]  # Direction of movement by hand, in words.
-    positions: dict[str, Array | None]  # Position in the world frame (3,) [m], by hand; None without data.
+    directions: dict[str, str]  # The direction in which each hand moves, in words.
+    positions: dict[str, Array | None]  # For each hand, its position in the world frame (3,) [m]; None without data.
     heard: bool  # Whether a sample of a hand has ever come.
     missing: tuple[str, ...]  # Topics that a run needs and of which no message has ever come.
     crossed: bool  # Whether the controllers seem to be swapped.
@@ -111,7 +111,7 @@ def watch_headset(
     stopping: Callable[[], bool],
     watch: HandWatch,
 ) -> HeadsetCheck:
-    """Watch a started server for ``duration`` [s] or until ``stopping()`` is True; None for no bound on the time.
+    """Watch a started server for ``duration`` [s] (None: without end), or until ``stopping()`` is True.
 
     Each state of the check is passed to ``show``, and the last one is returned.
     """
@@ -160,9 +160,9 @@ def needed_topics(config: Config) -> tuple[str, ...]:
 
 
 def advice_on_some(silent: tuple[str, ...], warning: str | None = None) -> tuple[str, ...]:
-    """Return advice if some topics come and others are ``silent``, with one line for each hand.
+    """Return advice if some topics come and others are ``silent``: one line for each hand with silent topics.
 
-    The ``warning`` about the poses of both hands comes first; None if there is none.
+    If there is a ``warning`` about the poses of both hands, it is the first line.
     """
     lines = [] if warning is None else [warning]
     for hand in SIDES:

@@ -61,8 +61,8 @@ class _Host:
 class HostLog:
     """Writes at most one line a second about each host.
 
-    A line that comes too early is held back. When the second is over, the newest of the held lines with the highest
-    level is written, with the number of the lines that are left out.
+    A line that comes too early is held back. When the second is over, one of these lines is written: the newest line of
+    the highest level. It ends with the number of the lines that are left out.
     """
 
     def __init__(self, logger: logging.Logger) -> None:

@@ -26,7 +26,7 @@ with importing("headset", "the format of hand messages"):
 
 
 class Dialect(StrEnum):
-    """The app's form of serialisation. The app's settings choose it, and only the bytes of the messages show it."""
+    """The app's form of serialisation. The app's user sets it, and the server sees it only from the messages' bytes."""
 
     ROS1 = "ROS1"
     ROS2 = "ROS2"
@@ -99,7 +99,7 @@ def decode(kind: MessageType, payload: bytes, dialect: Dialect) -> HandMessage:
     """Read a message: a pose, a twist, or the inputs of a hand. Its numbers may have any value, also NaN.
 
     Raises:
-        ProtocolError: If a length, an encapsulation, a boolean or a string cannot be that of a message of ``kind`` in
+        ProtocolError: If a length, an encapsulation, a boolean or a string is impossible in a message of ``kind`` in
             ``dialect``.
     """
     _check_bytes(kind, payload, dialect)
@@ -146,7 +146,7 @@ def warm_up() -> None:
 
 @cache
 def message_types(dialect: Dialect) -> Typestore:
-    """Return the message types of ROS 1 Noetic or ROS 2 Jazzy, and those of quest2ros."""
+    """Return the message types of ROS 1 Noetic or ROS 2 Jazzy, together with the message types of quest2ros."""
     store = get_typestore(Stores.ROS1_NOETIC if dialect is Dialect.ROS1 else Stores.ROS2_JAZZY)
     for kind, text in ((MessageType.INPUTS, _INPUTS_FIELDS), (MessageType.HAPTIC, _HAPTIC_FIELDS)):
         store.register(get_types_from_msg(text, kind.full_name))

@@ -18,7 +18,7 @@ import pinocchio as pin
 from q2r2_control.inputs.messages import HandPose
 from q2r2_control.types import SIDES, Array, HandInputs
 
-_FARTHEST = 1e3  # Greatest allowed coordinate of a hand. No tracking system measures so far [m].
+_FARTHEST = 1e3  # Greatest allowed coordinate of a hand. No tracking system measures larger ones [m].
 
 
 class Move(NamedTuple):
@@ -65,9 +65,9 @@ def moved_as_one(before: HandPair, after: HandPair, tolerance: Move) -> bool:
     If they have, their distance, their relative rotation and the vector between them are the same ``before`` and
     ``after``, up to the ``tolerance``.
 
-    If the left hand's measured rotation has an error of the tolerance's angle, the right hand seems to move in the left
-    hand's axes, by this angle times the distance between the hands. The bound on ``seen`` includes this motion.
-    Otherwise less noise of the rotation would be allowed than the tolerance says.
+    Suppose that the left hand's measured rotation has an error of the tolerance's angle. In the left hand's axes, the
+    right hand then seems to move, by this angle times the distance between the hands. The bound on ``seen`` includes
+    this motion. Otherwise less noise of the rotation would be allowed than the tolerance says.
     """
     shift = math.dist(after.seen, before.seen)
     if (
@@ -79,7 +79,8 @@ def moved_as_one(before: HandPair, after: HandPair, tolerance: Move) -> bool:
 
 
 # A motion from one sample to the next is a step if two conditions hold. It is larger than _STEP, and it is larger than
-# _STANDS_OUT times each of the last _BEFORE motions. From rest, this is 0.7 m/s within one sample: over 30 m/s^2.
+# _STANDS_OUT times each of the last _BEFORE motions. A hand that starts from rest makes such a motion only if it
+# accelerates at over 30 m/s^2. Its mean speed between two samples is then 0.7 m/s.
 _STEP = Move(0.010, math.radians(2.0))
 _STANDS_OUT, _BEFORE = 3.0, 4
 _PERIOD = 1.0 / 72.0  # Period of samples [s]. The time between two samples is shorter if the first one was delayed.
@@ -115,7 +116,7 @@ class MovedFrame:
     """Judges the poses of both hands when they are received. Times are receipt times [s]."""
 
     def __init__(self, fault_time: float) -> None:
-        """Make a detector. After the frame has moved, each pose has a fault for ``fault_time`` [s]."""
+        """Make a detector. After the frame has moved, poses count as faulty for ``fault_time`` [s]."""
         self._fault_time = fault_time
         # For each hand that holds both buttons to align the frame, the time since which it holds them [s].
         self._chords: dict[str, float] = {}
@@ -125,13 +126,13 @@ class MovedFrame:
         """Forget everything that was received, except which hand holds the buttons of an alignment."""
         self._motions = {hand: _HandMotion() for hand in SIDES}
         self._pairs: deque[HandPair] = deque()
-        # Since this pair, the left hand has stayed within _NEAR of its position in the pair. It is set if ``_pairs`` is
-        # not empty.
+        # Since this pair, the left hand has stayed within _NEAR of its position in the pair. The pair is set if
+        # ``_pairs`` is not empty.
         self._near: HandPair
         # The time at which a step of the hands' frame was detected that may be the operator's alignment [s]; None if
         # there is no such step.
         self._suspected: float | None = None
-        self._bad_until = -math.inf  # Until this time, poses have a fault [s].
+        self._bad_until = -math.inf  # Until this time, poses count as faulty [s].
 
     def take_inputs(self, hand: str, inputs: HandInputs, now: float) -> None:
         """Take the buttons of a hand. With both buttons the operator aligns the frame, which may then move."""
@@ -196,7 +197,7 @@ class _HandMotion:
         self._moves: deque[Move] = deque(maxlen=_BEFORE)
 
     def add(self, place: Place, now: float) -> bool:
-        """Add a pose that came at ``now`` [s]. Return whether it follows the pose before without a long gap in time."""
+        """Add a pose that came at ``now`` [s]. Return whether it follows the last pose without a long gap in time."""
         gap = now - self.stamp
         goes_on = gap <= _LONGEST_GAP
         if goes_on:

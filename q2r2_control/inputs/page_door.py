@@ -23,7 +23,7 @@ _PORT = re.compile(r":\d{1,5}$")
 def text_response(status: http.HTTPStatus, text: str, kind: str = "text/plain") -> Response:
     body = text.encode()
     headers = Headers({"Content-Type": f"{kind}; charset=utf-8", "Content-Length": str(len(body))})
-    # No page may contain this one, because a foreign page could then steal a click.
+    # No other page may embed this page. It could deceive the user into clicking this page's buttons.
     headers["X-Frame-Options"] = "DENY"
     return Response(status.value, status.phrase, headers, body)
 
@@ -57,10 +57,10 @@ def tls_context(certificate: str | None) -> ssl.SSLContext | None:
 class PageDoor:
     """A listening socket for a page, and the check of every request to the socket.
 
-    A page of another site may not connect, since its ``Origin`` differs. An attacker may also let a DNS name of his own
-    lead to this machine. On a loopback address such a name is refused as ``Host``, since only known names are allowed.
-    The port in ``Host`` is not checked, because ssh may forward another port, and the name is enough to refuse an
-    attacker's page. On any other address, a request needs the token of the URL.
+    A page of another site may not connect, since its ``Origin`` differs. An attacker may also let his own DNS name
+    point to this machine. If the socket listens on a loopback address, such a name in ``Host`` is refused, since only
+    known names are allowed. The port in ``Host`` is not checked, because ssh may forward another port, and the name is
+    enough to refuse an attacker's page. If the socket listens on any other address, a request needs the URL's token.
     """
 
     def __init__(

@@ -53,7 +53,7 @@ class EvenSampling(SampleTiming):
 
 
 class HeadsetSampling(SampleTiming):
-    """Samples like those of a headset: at an uneven rate of 72-76 Hz, received late, and with sensor noise.
+    """Samples like a headset's samples: at an uneven rate of 72-76 Hz, received late, and with sensor noise.
 
     Args:
         hand: The hand. Each hand has other random numbers.
@@ -79,7 +79,7 @@ class HeadsetSampling(SampleTiming):
         self._lost = lost
         self._random = np.random.default_rng([seed, SIDES.index(hand)])
         self._position_noise, self._dropout_probability = position_noise, dropout_probability
-        # In each degree of freedom, the amplitude of a sum of two sines rises and falls, like that of a real tremor.
+        # In each degree of freedom, the tremor is a sum of two sines. Its amplitude rises and falls, like real tremor.
         self._frequencies = self._random.uniform(*((5.5, 6.5) if shaky else (8.0, 12.0)), (6, 2))
         self._phases = self._random.uniform(0.0, 2.0 * math.pi, (6, 2))
         self._amplitudes = (1.0 if shaky else 0.5) * tremor * np.array([1e-3] * 3 + [math.radians(0.3)] * 3)
@@ -158,7 +158,7 @@ class PlayedInput:
             self._origin = now
         backlog = now - self._origin - self._due
         if backlog < 0.0:
-            return []  # Most polls end here.
+            return []  # Most polls come before the next sample is due.
         self._origin += max(backlog - _LONGEST_BACKLOG, 0.0)
         samples = []
         for index, stream in enumerate(self._streams):

@@ -45,7 +45,7 @@ class ActionSpace(StrEnum):
 
     JOINTS = "action"  # Joint positions of all arms [rad].
     TOOL = "action.tool"  # Tool poses x y z [m] qx qy qz qw in the world frame.
-    # Motions from each target pose to the next: displacement [m] and rotation vector [rad], in the axes of the first.
+    # Motions from each target pose to the next: displacement [m] and rotation vector [rad], in the first pose's axes.
     TOOL_DELTA = "action.tool_delta"
 
 
@@ -202,10 +202,10 @@ class PolicyInput:
 
         Args:
             actions: The numbers of the actions.
-            times: The time of each action (n,), on the loop's clock [s]. Without them, the first action has the time of
-                the newest observation, and the others follow at the rate.
-            names: The names of an action's numbers, to be checked. Without them, only the length of an action is
-                checked.
+            times: The time of each action (n,), on the loop's clock [s]. Without ``times``, the first action has the
+                time of the newest observation, and the others follow at the rate.
+            names: The names of an action's numbers, to be checked. Without ``names``, only the length of an action
+                is checked.
         """
         try:
             chunk = self._checked(actions, times, names)

@@ -45,7 +45,7 @@ class SampleQueue:
 
     After :meth:`cut` the next two calls of :meth:`take` return nothing, and :attr:`is_cut` is True until the second
     call. A loop that checks :attr:`is_cut` once per tick, before or after :meth:`take`, therefore notices even a
-    connection that was lost and made again at once. Such a loop never takes the poses of two clients for one motion.
+    connection that was lost and made again at once. Such a loop never sees the poses of two clients as one motion.
     """
 
     def __init__(self) -> None:
@@ -94,7 +94,7 @@ class HandsWatch:
     """Finds poses of real hands that must not be followed: frozen poses, and poses after their frame has moved.
 
     Sensor noise changes each pose of a hand at rest, so a pose that stays the same is a copy of an old one. After the
-    frame has moved, poses are faulty for twice ``timeout``. For a receiver that leaves faulty poses out, this is long
+    frame has moved, poses count as faulty for twice ``timeout``. If the receiver leaves faulty poses out, this is long
     enough to stop its arm. Poses are passed on without delay. Only a pose after an unusually large step may wait for
     the other hand's pose.
     """
@@ -113,9 +113,9 @@ class HandsWatch:
         self.reset()
 
     def reset(self) -> None:
-        """Start again for a new connection, whose poses do not continue the motion of the poses before."""
+        """Start again for a new connection, whose poses do not continue the motion of the last poses."""
         self._numbers: dict[str, bytes] = {}  # The numbers of each hand's newest pose.
-        self._since: dict[str, float] = {}  # By hand, the time at which these numbers last changed [s].
+        self._since: dict[str, float] = {}  # For each hand, the time at which its numbers last changed [s].
         self._frame = MovedFrame(self._fault_time) if self._watches_frame else None
         self._waiting: list[Watched] = []
 

@@ -1,6 +1,6 @@
 """Scripted hands: ideal or human-like motions with button presses, which are the same in every run.
 
-A motion is a displacement from the pose that the hand has at the start. Motions that are no assembly work are written
+A motion is a displacement from the pose that the hand has at the start. All motions except assembly works are written
 for the left hand, and the right hand moves as its mirror image. The axes are x forwards, y to the left, and z up.
 """
 
@@ -44,7 +44,7 @@ class HandTrajectory:
 
     left: Path
     right: Path | None = None  # None if the right hand moves as the mirror image of the left hand.
-    upper_presses: Mapping[str, tuple[float, ...]] = field(default_factory=dict)  # Times of presses, by hand [s].
+    upper_presses: Mapping[str, tuple[float, ...]] = field(default_factory=dict)  # Each hand's times of presses [s].
     lower_presses: tuple[float, ...] = (FIRST_PRESS,)  # Times of presses by both hands [s].
     duration: float | None = None  # [s]; None if the motion has no end.
     steps: tuple[tuple[float, str], ...] = ()  # Start of each step [s], and the step in words.
@@ -90,14 +90,14 @@ def _phase(t: float, frequency: float) -> float:
 def _circle(t: float, frequency: float) -> tuple[Array, Array]:
     """Return the hand's displacement at ``t`` on a circle of radius 0.1 m, as in Quest2ROS2's SimulationInput.
 
-    The circle leads sidewards and up.
+    The circle lies in the plane of y and z, and the start is its lowest point.
     """
     phase = _phase(t, frequency)
     return np.array([0.0, 0.1 * math.sin(phase), 0.1 * (1.0 - math.cos(phase))]), np.zeros(3)
 
 
 def _line(t: float, frequency: float) -> tuple[Array, Array]:
-    """Return the hand's displacement at ``t`` on a line of 0.15 m, which leads forwards and up, and back."""
+    """Return the hand's displacement at ``t`` on a straight line of 0.15 m forwards and up, and back again."""
     distance = 0.15 * (1.0 - math.cos(_phase(t, frequency))) / 2.0
     return distance * np.array([0.6, 0.0, 0.8]), np.zeros(3)
 
@@ -105,7 +105,7 @@ def _line(t: float, frequency: float) -> tuple[Array, Array]:
 def _rotate(t: float, frequency: float) -> tuple[Array, Array]:
     """Return the hand's displacement at ``t`` in a motion that turns the hand by 30 degrees and back.
 
-    The hand turns about x, y and z one after the other. Meanwhile it is 0.05 m above its start.
+    The hand turns about x, y and z one after the other. During this motion, it is 0.05 m above its start.
     """
     phase = _phase(t, frequency)
     turn = np.zeros(3)
@@ -168,7 +168,7 @@ TRAJECTORIES: Mapping[str, HandTrajectory] = {
 
 
 def place_of(seed: int, spread: float) -> tuple[float, float]:
-    """Return a random shift of all tasks' parts along x and y [m]. Each is between -``spread`` and ``spread`` [m]."""
+    """Return a random shift of all tasks' parts along x and y [m]. Both are between -``spread`` and ``spread``."""
     x, y = np.random.default_rng([seed, _PLACES]).uniform(-spread, spread, 2).tolist()
     return x, y
 
@@ -199,12 +199,12 @@ def trajectory_named(name: str, place: tuple[float, float] | None = None) -> Han
 _PLACES = 7  # Second seed. It makes the shifts independent of other random numbers with the same first seed.
 _PACE = 1.25  # Speed of hasty hands, as a multiple of the speed in the trajectory.
 _HESITATIONS, _HESITATES = 3, 0.4  # Number of hesitations, and the duration of each [s].
-# Four delays after the headset loses the hands [s]: until the headset sees the hands again, until the hands engage the
-# arms, until the hands begin to carry again, and until the hands continue the work.
+# The headset loses the hands once. These are the times from this loss [s] until the headset sees the hands again, until
+# the hands engage the arms, until they begin to carry again, and until they continue the work.
 _LOST, _ENGAGES, _CARRIES, _GOES_ON = 1.0, 1.3, 1.6, 2.1
-# Range of the fraction of the work after which the headset loses the hands. No tool presses on a part so early.
+# The headset loses the hands after a fraction of the work in this range. So early, no tool presses on a part yet.
 _EARLY = (0.1, 0.45)
-_NO_PRESS = (0.3, 0.6)  # Hands do not stop within these times before and after a press [s].
+_NO_PRESS = (0.3, 0.6)  # Hands do not hesitate within these times before and after a press [s].
 
 
 def hurried(work: HandTrajectory, seed: int) -> HandTrajectory:
@@ -347,7 +347,7 @@ class ScriptedInput(PlayedInput):
 
     def hand_twist(self, hand: str, t: float) -> pin.Motion:
         """Return the ideal velocity of ``hand`` at ``t`` [s], in the axes of its poses [m/s, rad/s]."""
-        t -= self._origin or 0.0  # Otherwise, the differences below would be inexact if times count from 1970.
+        t -= self._origin or 0.0  # Times that count from 1970 would make the differences below inexact.
         before, after = (self._ideal(hand, t + step) for step in (-_DIFFERENCE, _DIFFERENCE))
         linear = (after.translation - before.translation) / (2.0 * _DIFFERENCE)
         return pin.Motion(linear, pin.log3(after.rotation @ before.rotation.T) / (2.0 * _DIFFERENCE))

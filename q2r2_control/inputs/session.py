@@ -22,7 +22,7 @@ from q2r2_control.inputs.messages import (
 from q2r2_control.types import SIDES, HandFault, HapticFeedback
 
 MAX_OUTGOING_BYTES = 1 << 16  # Greatest size of the answers that a client may leave unread.
-MAX_COMMAND_BYTES = 1 << 14  # Greatest length of the JSON of a system command. Commands of the app have under 200.
+MAX_COMMAND_BYTES = 1 << 14  # Greatest length of a system command's JSON. The app's commands have under 200 bytes.
 MAX_TOPICS = 64  # Greatest number of topics that a client may name. The app names about ten.
 MAX_INCOMPLETE = 64  # Greatest number of registrations without topic or type in one session.
 
@@ -76,16 +76,16 @@ class _IncompleteRegistrationError(Exception):
 
 
 class HeadsetSession:
-    """The protocol state of one client. :meth:`receive` takes the client's frames. :attr:`outgoing` has bytes for it.
+    """The protocol state of one client. :meth:`receive` takes its frames. :attr:`outgoing` has the bytes to send.
 
     The server sends the first frame, in the dialect ROS2, before it knows the client's dialect. An app that is set to
     ROS1 logs an error and goes on. The client's first frame shows its dialect: only ROS2 clients put a NUL behind every
-    destination. Each payload then has to fit this dialect, so that no message is read by guessing.
+    destination. Each payload then has to fit this dialect, so that the dialect is never guessed.
 
     Data on topics outside ``HAND_TOPICS`` is counted and ignored. A registration whose topic or type the app's user
     left empty gets an error for the app's console, as from Unity's own endpoint. An unknown command, a name that no
-    topic can have, and a payload that does not fit its topic raise a :class:`ProtocolError`, because the two sides then
-    do not speak the same protocol.
+    topic can have, and a payload that does not fit its topic raise a :class:`ProtocolError`. They show that the two
+    sides do not use the same protocol.
     """
 
     def __init__(self) -> None:
@@ -157,10 +157,10 @@ class HeadsetSession:
                 self._register(command, parameters)
             case "__topic_list":
                 types = _TOPIC_TYPES | self.published
-                names = [f"/{name}" for name in types]  # The names are written as in the ROS graph.
+                names = [f"/{name}" for name in types]  # Names in the ROS graph begin with a slash.
                 self._answer("__topic_list", {"topics": names, "types": list(types.values())})
             case "__ros_service" | "__unity_service" | "__remove_ros_service" | "__remove_unity_service":
-                pass  # The package q2r2 has no services.
+                pass  # These commands have no effect, because q2r2 has no services.
             case "__request" | "__response":
                 self._skip_body = True
                 if command == "__request":
@@ -188,7 +188,7 @@ class HeadsetSession:
 
 
 def _parameters(command: str, payload: bytes) -> dict[str, Any]:
-    """Return the JSON object of a system command. Too deep nesting and too long numbers are refused too."""
+    """Return the JSON object of a system command. JSON with too deep nesting or too long numbers is refused."""
     if len(payload) > MAX_COMMAND_BYTES:
         raise ProtocolError(f"{command!r:.60}: {len(payload)} bytes, at most {MAX_COMMAND_BYTES} are allowed")
     try:
@@ -232,7 +232,7 @@ class TopicStatistics:
 
 @dataclass(frozen=True, slots=True)
 class HeadsetStatistics:
-    """A snapshot of the server. If no headset is connected, dialect and topics are those of the last connection."""
+    """A snapshot of the server. If no headset is connected, dialect and topics belong to the last connection."""
 
     address: tuple[str, int]  # Bound host and port.
     peer: str | None  # Host and port of the connected headset, as host:port; None if there is none.
@@ -260,6 +260,6 @@ class TopicRecorder:
         self._last = message
 
     def snapshot(self, now: float) -> TopicStatistics:
-        """Return the statistics at ``now`` [s]. At least one message has to be recorded before."""
+        """Return the statistics at ``now`` [s]. At least one message has to be recorded before this call."""
         rate = float(sum(stamp > now - 1.0 for stamp in self._stamps))
         return TopicStatistics(self._count, rate, now - self._stamps[-1], self._last)

@@ -1,6 +1,6 @@
 """Tasks of two hands, as way points of their tools in the world frame.
 
-The hands make the same motions as the tools are to make, wherever the hands are at the start.
+The motion of each hand is the motion that its tool has to make. The hands may start at any poses.
 """
 
 from __future__ import annotations
@@ -63,10 +63,10 @@ class HandWork:
     """The motion of both hands, from home and back to home."""
 
     duration: float  # [s]
-    # By hand, the way points after home, at rising times. A hand that is not a key rests.
+    # For each hand, the way points after home, at rising times. A hand without way points rests.
     tools: Mapping[str, tuple[WayPoint, ...]]
     steps: tuple[tuple[float, str], ...]  # Start of each step [s], and the step in words.
-    presses: Mapping[str, tuple[float, ...]] = field(default_factory=dict)  # Presses of the upper button, by hand [s].
+    presses: Mapping[str, tuple[float, ...]] = field(default_factory=dict)  # Upper button's presses, for each hand [s].
     grips: tuple[float, ...] = ()  # Taps of the left grip, which begin or end a carry [s].
     engages: tuple[float, ...] = ()  # Presses of both lower buttons [s].
     # Start and end of each time span in which both sticks are pushed up, for precision [s].

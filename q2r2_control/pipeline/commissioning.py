@@ -14,16 +14,16 @@ from q2r2_control.robot.load import LEAST_POSTURES, MODEL, PENDANT, LoadReport, 
 from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 
-_STEP = np.radians(1.17)  # Commanded step of a joint [rad]. If 0.17 degrees of it are missing, a degree remains.
+_STEP = np.radians(1.17)  # Commanded step of a joint [rad]. With an error of 0.17 degrees, a degree of motion is left.
 # Largest difference between a measured joint and the commanded joint, at rest and during the motion [deg].
 _REACHED, _BEHIND = 0.2, 0.8
-# Largest displacements of A1 .. A7 from the first posture [rad]. A1 stays, because turning it changes no torque.
+# Largest displacements of A1 .. A7 from the first posture [rad]. A1 does not move, because its angle changes no torque.
 _SPREAD = np.array([0.0, 0.1, 0.2, 0.25, 0.4, 0.5, 0.5])
 _TRIES = 40
 LED = 2.0  # Time of the upward motion before the hand releases its button [s].
 # Longest time from the release of the hand's button until the arm brakes: the timeout of a silent hand [s].
 _LATENCY = 0.15
-LEAST_SPEED = 0.01  # Least speed of the tool from which a stop is measured [m/s].
+LEAST_SPEED = 0.01  # The stop of a slower tool is not measured [m/s].
 _STANDS = 1e-3  # Joints nearer than this to their final positions count as resting [rad].
 
 
@@ -38,7 +38,7 @@ class JointMotion:
     others_deg: float  # Largest motion of another joint.
 
     def check(self) -> JointMotion:
-        """Return this report. Raises :class:`PlantError` if the joint did not follow, or did not move alone."""
+        """Return this report. Raises :class:`PlantError` if the joint did not follow, or if another joint moved."""
         off = abs(self.measured_deg - self.commanded_deg)
         if off > _REACHED or self.behind_deg > _BEHIND or self.others_deg > _REACHED:
             raise PlantError(

@@ -1,7 +1,7 @@
 """A run that is killed while hands move its arms. Another process, which goes on, has to stop the arms.
 
-If a loop dies, the process that answers the cabinets brings the arms to rest on the certified stop, and then ends and
-releases its ports. A commissioning checks this with a loop that runs in a process of its own.
+If a loop dies, the process that answers the cabinets brings the arms to rest on the certified stop. Then this process
+ends and releases its ports. A commissioning checks this with a loop that runs in a process of its own.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ def measure_kill(config: Config, posture: Callable[[], Array], led: float = LED)
     process = HelperProcess("leads the arms", __name__, moments.append)
     process.send(config)
     try:
-        # The kill waits until the arms move up. After a late loop, an arm may move up too slowly for a measurement of
-        # its stop.
+        # The process is killed only while the tools move up fast enough. After a late tick, a tool may be too slow for
+        # a measurement of its stop.
         while _led(moments) < led or not _goes_up(robot, moments[-1]):
             if not process.alive:
                 raise PlantError(process.fault or "the arms did not follow the hands")

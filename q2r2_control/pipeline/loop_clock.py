@@ -12,7 +12,8 @@ _SHORTEST_DT = 1e-6  # Least duration of a tick that :meth:`LoopClock.wait` retu
 # Shorter sleeps are left out [s]. Nobody sees the difference, because a window shows each picture of the arms for eight
 # times as long.
 _SHORTEST_SLEEP = 0.004
-# If simulated time is farther behind than this, it does not catch up, and the motion goes on in slow motion [s].
+# If simulated time is farther behind the computer's clock than this, it does not catch up [s]. The run goes on in slow
+# motion.
 _LONGEST_LAG = 0.1
 _WINDOW = 1.0  # Time over which late ticks are counted [s].
 _MANY_LATE = 0.1  # The loop falls behind if a larger share of the ticks in a window is late.
@@ -25,7 +26,7 @@ class WallPace:
         self._wall_at_zero: float | None = None  # Computer's time at simulated time zero [s].
 
     def wait_for(self, elapsed: float) -> None:
-        """Sleep until ``elapsed`` [s] of simulated time may be over by the computer's clock."""
+        """Sleep until ``elapsed`` [s] have passed on the computer's clock since simulated time zero."""
         now = time.monotonic()
         if self._wall_at_zero is None:
             self._wall_at_zero = now - elapsed
@@ -75,7 +76,7 @@ class LoopClock:
         return max(self.now - before, _SHORTEST_DT)
 
     def keep_pace(self) -> None:
-        """Wait if simulated time is ahead of the computer's clock and has to keep its pace."""
+        """Wait if simulated time is ahead of the computer's clock, and must not pass faster than this clock."""
         if self._pace is not None:
             self._pace.wait_for(self.now - self.start)
 
@@ -87,7 +88,7 @@ class LoopClock:
         return late * self.period > _MANY_LATE * _WINDOW
 
     def after(self, duration: float) -> bool:
-        """Return whether ``duration`` [s] is over. Half a period may be missing, so that rounding adds no tick."""
+        """Return whether at most half a period of ``duration`` [s] is left. Rounding errors then add no tick."""
         return self.now - self.start >= duration - 0.5 * self.period
 
     def read(self) -> float:
@@ -110,12 +111,12 @@ class LoopClock:
 class PlantClock:
     """Stamps the states of a plant by the loop's clock.
 
-    If the plant repeats a state, the state gets older by the time for which the plant was advanced meanwhile.
+    If the plant gives the same state again, its age grows by the time for which the plant was advanced since then.
     """
 
     def __init__(self, state: RobotState) -> None:
         """``state`` is the first state of the plant."""
-        # The plant's stamp of the newest state, and the time for which it was advanced without a newer one [s].
+        # The plant's stamp of the newest state, and the time for which it was advanced without a newer state [s].
         self._stamp, self._unanswered = state.stamp, 0.0
 
     def give(self, dt: float) -> None:
@@ -123,7 +124,7 @@ class PlantClock:
         self._unanswered += dt
 
     def stamped(self, state: RobotState, now: float) -> tuple[RobotState, float]:
-        """Return the ``state`` with a stamp of the loop's clock, and the plant's time since the last state [s].
+        """Return the ``state`` with a stamp of the loop's clock, and the plant's own time since the state before [s].
 
         Args:
             state: The state that was read at ``now``, with the stamp of the plant's clock.

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from q2r2_control.cameras.newest_shots import NewestShots
 
 Pixels = npt.NDArray[np.uint8]  # (height, width, 3) r g b.
-_ROUNDING = 1e-6  # A picture counts as due if only this share of its period is missing, because times are rounded.
+_ROUNDING = 1e-6  # Times are rounded, so a picture is due even if this share of its period is missing.
 
 
 class DrawnPicture:

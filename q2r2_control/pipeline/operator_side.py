@@ -32,7 +32,7 @@ from q2r2_control.teleop.teleop import Teleop
 from q2r2_control.types import ActionChunk, ArmTarget, HandSample, Observation
 from q2r2_control.wording import event_line, sentence
 
-# Each arm's conditions, slip and gripper are examined once in this time, and its events at each tick [s].
+# Each arm's conditions, slip and gripper are examined once in this time [s]. Its events are examined at each tick.
 _PERIOD = 0.02
 _logger = logging.getLogger(__name__)
 
@@ -63,7 +63,7 @@ class OperatorSide:
         self._feels = getattr(source, "feels", True)  # False if no device can vibrate.
         self._controller, self._requests, self._impedance = controller, requests, impedance
         self._homing = False  # True while supervision moves the arms home.
-        self._in_the_way: frozenset[str] = frozenset()  # Moving obstacles too close to an arm in their last report.
+        self._in_the_way: frozenset[str] = frozenset()  # Moving obstacles that were reported too close to an arm.
         self.connected = False
         arms = controller.robot.arms
         self._conditions = ArmConditions(controller)
@@ -99,7 +99,7 @@ class OperatorSide:
         for event in events:
             stopped = (
                 is_fault(event) and event.kind is not TeleopReason.RECORDING_ENDED
-            )  # The recorder has logged that.
+            )  # The recorder has already logged the end of the recording.
             if stopped or event.kind is TeleopReason.HANDS_CROSSED:
                 _logger.warning("%s arm: %s", event.arm, sentence(event.reason))
             elif _logger.isEnabledFor(logging.DEBUG):
@@ -134,7 +134,7 @@ class OperatorSide:
             pulses.grasps(self._grips[arm].look(commanded, opening, tick.now))
 
     def _fulfil(self, now: float) -> None:
-        # Only the requests that are there now count. Requests that come meanwhile wait for the next tick.
+        # Only requests that have come before this tick are carried out. Later requests wait for the next tick.
         for _ in range(len(self._requests)):
             request = self._requests.popleft()
             if isinstance(request, TeleopSettings):

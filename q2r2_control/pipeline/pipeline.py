@@ -1,4 +1,4 @@
-"""Run a cell in one process: input -> teleop -> control -> plant at every tick, and arms at rest at the end."""
+"""Run a cell in one process: input -> teleop -> control -> plant at every tick. At the end, the arms come to rest."""
 
 from __future__ import annotations
 
@@ -51,10 +51,12 @@ if TYPE_CHECKING:
     from q2r2_control.cameras.camera_streams import CameraStreams
 
 STOPPING = "stopping"  # The state of every arm while the run ends.
-_STOP_ALLOWANCE_S = 1.0  # Time after full braking for an arm that still returns into its limits.
+_STOP_ALLOWANCE_S = 1.0  # Further time, after full braking, for an arm that still has to return into its limits.
 _REST = 1e-6  # The reference is at rest if no joint is faster [rad/s].
 _ROUNDING_S = 1e-9
-_MAX_TORQUE_HOLD_S = 0.005  # A torque that a late tick held for 0.1 s would drive the arms into each other.
+# Longest time for which a simulated plant executes one torque, unless a period is longer. If a late tick let it execute
+# a torque for 0.1 s, the torque would drive the arms into each other.
+_MAX_TORQUE_HOLD_S = 0.005
 _LATE_LOOP = "the loop falls behind: of its %.0f ticks a second more than a tenth come late; %s"
 _CURES = "close other programs, give it priority with --rt, or set a lower loop_rate_hz in the cell"
 _CURES_OF_FITTED_RATE = (
@@ -81,8 +83,8 @@ class Pipeline(RequestedRun):
         mode: Kind of the plant's commands: joint positions, velocities, or the torques of a Cartesian impedance.
         solver: See :class:`CartesianController`, also for ``tasks`` and ``constraints``. A recording does not contain
             these objects, so a replay of the run does not use them.
-        tasks: Costs in addition to those of ``config.control.tasks``.
-        constraints: Rows in addition to those of the controller.
+        tasks: Further costs, in addition to ``config.control.tasks``.
+        constraints: Further rows, in addition to the controller's own rows.
 
     Raises:
         ConfigError: If an argument has another type, if the plant lacks the mode, if the input lacks a control that is
@@ -108,8 +110,8 @@ class Pipeline(RequestedRun):
         check_kind("plant", plant, Plant, "an object with all methods of Plant")
         config.teleop.bindings.check_device(input.controls)
         self.config, self.robot, self.input, self.plant = config, robot, input, plant
-        # Arms of a session do not count. If torques are not safe, they cannot change to position commands, because a
-        # session has one mode.
+        # Whether position commands can replace torques that are not safe. In a session they cannot, because a session
+        # has only one mode.
         has_servos = CommandMode.POSITION in plant.modes and not isinstance(plant, SessionPlant)
         self.drive = make_drive(check_mode(mode, plant), robot, config, has_servos)
         if config.control.jerk_limit is not None and not keeps_jerk_limit(plant, self.drive.mode):
@@ -124,9 +126,9 @@ class Pipeline(RequestedRun):
         self.cameras: CameraStreams | None = None  # The open real cameras, whose pictures a policy gets.
         # This is a plain flag, because a signal handler cannot take the lock of a threading.Event safely.
         self._stopping = False
-        self._ticked = time.monotonic()  # The end of the last tick, or the time before the first one [s].
+        self._ticked = time.monotonic()  # End of the last tick, or a time before the first tick [s].
         self._rate_was_fitted = False  # Whether :meth:`fit_rate` chose the rate of the loop.
-        self._pace: WallPace | None = None  # Keeps simulated time from being faster than the clock; None if it may be.
+        self._pace: WallPace | None = None  # Slows simulated time to the clock's speed; None if it may be faster.
         self._set_up()
 
     @classmethod
@@ -143,8 +145,8 @@ class Pipeline(RequestedRun):
     ) -> Pipeline:
         """Build a pipeline for a cell.
 
-        The other arguments are those of the class. A task or constraint may have been made with another Robot of the
-        same ``config``.
+        The other arguments are the same as for the class. A task or constraint may have been made with another Robot of
+        the same ``config``.
 
         Args:
             config: The cell.
@@ -176,7 +178,7 @@ class Pipeline(RequestedRun):
         return preflight_faults(self.robot, self.config.control.without_contact(), self.controller)
 
     def stop(self) -> None:
-        """Bring the arms to rest and end the run, or end the next run if none goes on.
+        """Bring the arms to rest and end the run. If no run goes on, end the next run when it begins.
 
         Any thread and any signal handler may call this method.
         """
@@ -193,7 +195,7 @@ class Pipeline(RequestedRun):
                 The result is the same, bit for bit.
 
         Raises:
-            ConfigError: If the duration is not positive, or if the plant cannot keep the kind of time asked for.
+            ConfigError: If the duration is not positive, or if the plant does not support this kind of time.
         """
         if duration is not None and not (is_number(duration) and duration > 0.0):
             raise ConfigError(f"duration = {shown(duration)}: allowed: a positive number of seconds")
@@ -298,7 +300,7 @@ class Pipeline(RequestedRun):
             yield time.perf_counter() - self._clock.woke
 
     def _prepare(self, realtime: bool) -> None:
-        """Forget the last run, so that nothing of it moves an arm. Every run starts paused, with open grippers."""
+        """Forget the last run, so that none of its data moves an arm. Every run starts paused, with open grippers."""
         settings = permitted(self.config.control.timed(realtime), self.drive)
         if settings != self.controller.settings:
             reports = self.controller.obstacle_reports
@@ -334,7 +336,8 @@ class Pipeline(RequestedRun):
         self._turns = TurnCounter(self.robot)
         self._turns.counted(self._state.q, self._clock.now)
         self.controller.pass_time(self._clock.since(self._ticked))
-        # The reports are aged up to the time at which the first tick is due. If that tick is late, they age more.
+        # The reports of obstacles are aged up to the time at which the first tick is due. If that tick is late, it ages
+        # them further.
         self.loop.age_obstacles(self._clock.now + self._clock.period)
         self._start = RunStart(self._clock.now, self._state)
         self._plant_clock = PlantClock(self._state)
@@ -364,7 +367,7 @@ class Pipeline(RequestedRun):
         self.teleop.marks.subtasks = self.config.recording.subtasks
 
     def _run_until(self, duration: float) -> RunSummary:
-        """Tick until ``duration`` [s] is over or a stop is asked for, and then until the arms are at rest."""
+        """Tick until ``duration`` [s] is over or a stop is requested, and then until the arms are at rest."""
         try:
             while not (self._clock.after(duration) or self._stopping):
                 self.tick()
@@ -416,11 +419,11 @@ class Pipeline(RequestedRun):
         self.loop.observe(seen, now, passed, lost)
         self._watch_skew(now)
         openings, tools = self.plant.gripper_openings(), self._measured_tools(state)
-        self.loop.age_obstacles(now)  # Before new reports come, because their ages count from now.
+        self.loop.age_obstacles(now)  # This is done before new reports come, because their ages count from now.
         if self._following:
             self._targets = self._operator.targets(samples, tools, now)
         step = self._control(state, openings, now, gap, dt, braked)
-        assert step.reference is not None  # The loop owns its plant, and always commands it.
+        assert step.reference is not None  # A pipeline commands its plant in every tick.
         assert step.command is not None
         self.plant.apply(step.command)
         withdrawn = self._sessions is not None and self._sessions.withdraws()
@@ -481,7 +484,7 @@ class Pipeline(RequestedRun):
     def _posture(self) -> Array | None:
         """Return the joint positions that a policy asks for (nv,) [rad], or None.
 
-        Arms for which it asks for none get their home posture.
+        An arm for which the policy asks for no positions gets its home posture.
         """
         asked = {arm: posture for arm, target in self._targets.items() if (posture := target.posture) is not None}
         if not asked:
@@ -502,7 +505,7 @@ class Pipeline(RequestedRun):
         step = self.loop.step(state, poses, now, dt, grippers, openings, braked, self._posture())
         self._grippers = step.grippers
         for refusal in step.refusals.values():
-            # Without a pause, the operator would think that the arm follows. Operator and recording get the fault that
+            # Without this pause, the operator would think that the arm follows. Operator and recording get the fault that
             # stopped the arms, and not only the phase of the controller to which the fault has led.
             ceased = self.supervisor.ceased if refusal.kind is SupervisionReason.CONTROLLER_PHASE else None
             self.teleop.pause(now, refusal if ceased is None else ceased.root)

@@ -25,7 +25,7 @@ class ObstacleRequest(NamedTuple):
 
     name: str
     obstacle: MovingObstacle | None
-    reported: float  # The time of the report, of time.monotonic() [s].
+    reported: float  # The time of the report, by time.monotonic() [s].
 
     def reason(self, waited: float) -> Reason:
         """Return the request as it is recorded, ``waited`` [s] after the report."""
@@ -57,14 +57,14 @@ class RequestedRun:
         return self.drive.impedance if isinstance(self.drive, TorqueDrive) else None
 
     def go_home(self) -> None:
-        """Bring both arms home, as an operator may. Any thread may call it.
+        """Bring both arms home, as an operator may ask for it. Any thread may call this method.
 
         Any press ends the motion home. Events report the result.
         """
         self.requests.append(Reason(TeleopReason.HOME_REQUESTED))
 
     def pause(self) -> None:
-        """Let both arms hold until a new press. Any thread may call it."""
+        """Let both arms hold until a new press. Any thread may call this method."""
         self.requests.append(Reason(TeleopReason.PAUSE_REQUESTED))
 
     def engage(self) -> None:
@@ -76,7 +76,7 @@ class RequestedRun:
         self.requests.append(Reason(TeleopReason.POLICY_REQUESTED))
 
     def mark(self, action: Action) -> None:
-        """Begin, end or mark an episode of the recording, as an operator may. Any thread may call it.
+        """Begin, end or mark an episode of the recording, as an operator may. Any thread may call this method.
 
         Raises :class:`ConfigError` for an unknown action.
         """
@@ -124,7 +124,7 @@ class RequestedRun:
 
 
 def change_of(old: TeleopSettings, new: TeleopSettings) -> Reason:
-    """Return the request that changes ``old`` settings into ``new`` ones. It contains the values that differ."""
+    """Return the request that changes the settings ``old`` into the settings ``new``: the values that differ."""
     changes = _difference(old.model_dump(mode="json"), new.model_dump(mode="json"))
     return Reason.of(TeleopReason.SETTINGS_REQUESTED, changes=changes)
 

@@ -42,7 +42,7 @@ _RATE = 75.0  # Rate of the hands' samples [Hz].
 
 
 class _Hands(PlayedInput):
-    """Both simulated hands. A hand rests until its button is held. Then its arm is engaged, and both move up."""
+    """Both simulated hands. A hand rests until its button is held. Then its arm is engaged, and the hand moves up."""
 
     def __init__(self) -> None:
         self.held: tuple[str, ...] = ()  # The hands whose buttons are held.
@@ -67,7 +67,7 @@ class Moment(NamedTuple):
     reference: Array  # Positions of the reference.
     v: Array  # Velocities of the reference [rad/s].
     deceleration: Array | None  # Deceleration of the certified stop from the reference [rad/s^2].
-    engaged: dict[str, bool]  # By arm, whether it follows a hand.
+    engaged: dict[str, bool]  # For each arm, whether it follows a hand.
 
 
 class SlowRun:
@@ -221,7 +221,7 @@ class SlowRun:
 
     @property
     def _now(self) -> float:
-        """Return the time of the loop's clock, which moves the arms [s]."""
+        """Return the time of the newest tick by the loop's clock [s]; 0 before the first tick."""
         return 0.0 if self._newest is None else self._newest.now
 
     def _wait(self, until: Callable[[], bool]) -> None:

@@ -12,19 +12,19 @@ from q2r2_control.types import Array
 
 _SMOOTHING = 0.01  # Time constant of the filter that smooths the velocity of a target [s].
 _FASTEST = 3.0, 20.0  # If a target seems to move faster than this, it has jumped [m/s], [rad/s].
-_REST = 1e-6  # A target that moves more slowly stands still [m/s], [rad/s].
+_REST = 1e-6  # A target that moves more slowly counts as a target at rest [m/s], [rad/s].
 
 
 class TargetLead:
     """Extrapolates each target with its own smoothed velocity.
 
-    A target at constant velocity is extrapolated by exactly the delay. If the target stops abruptly, the result
-    overshoots it by at most its velocity times the delay, for about ``_SMOOTHING``. A target at rest is not changed.
+    A target at constant velocity is extrapolated by exactly the delay. If a target stops abruptly, the result goes too
+    far by at most the target's velocity times the delay, for about ``_SMOOTHING`` [s]. A target at rest is not changed.
     """
 
     def __init__(self) -> None:
         self._last: dict[str, pin.SE3] = {}
-        # By arm, linear velocity, and angular velocity in the target's frame (6,) [m/s], [rad/s].
+        # For each arm, the target's linear velocity, and its angular velocity in its own frame (6,) [m/s], [rad/s].
         self._velocities: dict[str, Array] = {}
 
     def ahead(self, targets: Mapping[str, pin.SE3 | None], dt: float, delay: float) -> dict[str, pin.SE3 | None]:

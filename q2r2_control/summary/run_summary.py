@@ -70,14 +70,14 @@ class Histogram:
 class TorqueSummary:
     """Figures of a run in torque mode."""
 
-    # By arm, the time for which its distance from the reference was larger than the impedance's error clip.
+    # For each arm, the time for which its distance from the reference was larger than the impedance's error clip.
     off_reference_s: dict[str, float]
-    min_measured_distance_mm: float | None = None  # By the measured joints; None if there is no monitored pair.
+    min_measured_distance_mm: float | None = None  # At the measured joint positions; None without a monitored pair.
     measured_closest_pair: tuple[str, str] | None = None
     pressed_pairs: list[tuple[str, str]] = field(default_factory=list)  # Pairs that the wall has pushed apart.
     max_wall_force_n: float = 0.0  # The greatest force of the wall on one pair.
     saturated_ticks: int = 0  # Ticks in which a joint would have needed more torque than its limit.
-    rate_limited_ticks: int = 0  # Ticks in which a joint's torque could not change as fast as it should.
+    rate_limited_ticks: int = 0  # Ticks in which the rate limit slowed the change of a joint's torque.
     held_ticks: int = 0  # Ticks without a usable measurement, in which the last gravity torque was held.
 
     @property
@@ -126,13 +126,13 @@ class ArmSummary:
 
     @property
     def followed(self) -> bool:
-        """Whether the tool was where it should be at the end, or as near as a compliant arm can be."""
+        """Whether the tool was near its reference at the end. A compliant arm may be ``_FOLLOWED`` [mm] away."""
         return self.end_error_mm is None or self.end_error_mm <= _FOLLOWED
 
 
 @dataclass(frozen=True, slots=True)
 class RunSummary:
-    """Figures of a whole run. Ratios and margins are the worst of all ticks. A ratio of 1 means the limit."""
+    """Figures of a whole run. Ratios and margins are the worst of all ticks. At a ratio of 1, the limit was reached."""
 
     ticks: int
     duration_s: float
@@ -159,7 +159,7 @@ class RunSummary:
 
     @property
     def broken(self) -> tuple[str, ...]:
-        """Broken promises in words. A run with any of them ends with exit code 1."""
+        """Broken promises in words. A run with any broken promise ends with exit code 1."""
         refusals = {event.arm: event.reason for event in self.events if event.kind is TeleopReason.NOT_ENGAGED}
         broken = []
         for name, arm in self.arms.items():
@@ -223,7 +223,7 @@ class _ArmStatistics:
         if target.pose is not None and tick.engaged[self._name]:
             summary.engaged_s += tick.dt
             errors = tick.tracking_error(self._name)
-            if math.isfinite(sum(errors)):  # Otherwise nothing was measured.
+            if math.isfinite(sum(errors)):  # If a value is not finite, nothing was measured.
                 self._ticks += 1
                 self._squares += np.square(errors)
 

@@ -37,8 +37,8 @@ class Tick:
     connected: bool  # Whether the input was connected.
     samples: list[HandSample]  # The new samples of the hands.
     targets: dict[str, ArmTarget]  # The operator's targets, without the displacement of an admittance.
-    engaged: dict[str, bool]  # By arm, whether it follows a hand or a policy.
-    states: dict[str, str]  # By arm, the state of the teleop layer, or STOPPING while the run ends.
+    engaged: dict[str, bool]  # For each arm, whether it follows a hand or a policy.
+    states: dict[str, str]  # The teleop layer's state of each arm, or STOPPING while the run ends.
     reference: Reference
     state: RobotState  # Measured before the command of this tick.
     openings: dict[str, float]  # Openings of the grippers, measured before the command of this tick.
@@ -54,7 +54,7 @@ class Tick:
     holding: dict[str, bool] = field(default_factory=dict)  # For each arm with an object, whether its gripper holds it.
     obstacles: dict[str, ObstacleReport] = field(default_factory=dict)  # The last reports of moving obstacles.
     chunks: list[ActionChunk] = field(default_factory=list)  # New action chunks of a policy.
-    interventions: dict[str, bool] = field(default_factory=dict)  # By arm, whether a hand replaces a policy.
+    interventions: dict[str, bool] = field(default_factory=dict)  # For each arm, whether a hand replaces a policy.
     sessions: dict[str, str] = field(default_factory=dict)  # The state of each arm's session in words, if it has any.
 
     def by_policy(self, arm: str) -> bool:

@@ -69,7 +69,7 @@ class AnalogGripper:
 
 
 class ArmTeleop:
-    """Moves one arm as its hand asks. Engaging anchors hand and tool at their poses; see :class:`HandMotion`."""
+    """Moves one arm as its hand asks. When the arm is engaged, hand and tool are anchored; see :class:`HandMotion`."""
 
     def __init__(self, arm: str, settings: TeleopSettings) -> None:
         self.arm = arm
@@ -133,7 +133,7 @@ class ArmTeleop:
         if usable and fault is None and self._gate.pose is not None:
             self.motion.add(self._gate.pose, self._gate.stamp, now, self.state is ArmState.ENGAGED)
         if usable and self.state is ArmState.ALIGNING:
-            # A jump is no fault here, because aligning makes the pose jump, and the arm does not follow it.
+            # A jump is no fault here, because the alignment makes the pose jump, and the arm does not follow the jump.
             return None
         return fault
 
@@ -187,7 +187,7 @@ class ArmTeleop:
 
         Args:
             presses: The gestures of this hand.
-            around: The measured and the commanded tool poses, and the obstacles to engaging.
+            around: The measured and the commanded tool poses, and the reasons why arms may not be engaged.
             now: The time [s].
             chord: Whether either hand holds the alignment chord.
         """
@@ -195,7 +195,7 @@ class ArmTeleop:
             self.go(Cause.LET_GO, now, Reason(TeleopReason.DEAD_MAN_RELEASED))
         if chord:
             self._aligned_at = now
-            # While the gesture of this hand is not decided yet, only its own chord counts, not the other hand's chord.
+            # While the gesture of this hand is not decided yet, the other hand's chord does not count.
             if self.state is not ArmState.PAUSING or self.chord:
                 self.go(Cause.CHORD, now, Reason(TeleopReason.ALIGNMENT_CHORD))
         elif self.state is ArmState.ALIGNING and self._gate.pose is not None and self._gate.stamp >= self._aligned_at:
@@ -260,7 +260,7 @@ class ArmTeleop:
         return 0.0 if Action.TRANSLATION_LOCK in held else share, 0.0 if Action.ROTATION_LOCK in held else share
 
     def go(self, cause: Cause, now: float, reason: Reason) -> None:
-        """Change the state by ``cause``. Presses that are not finished go on."""
+        """Change the state by ``cause``. Presses that are not finished are kept."""
         state = next_state(self.state, cause)
         if state is not self.state:
             self.events.append(Event(now, self.arm, self.state, state, reason))

@@ -24,7 +24,7 @@ _OUTCOMES = {Action.RECORD_FAILURE: TeleopReason.EPISODE_FAILED, Action.RECORD_S
 
 
 class EpisodeMarks:
-    """Turns the presses that mark episodes into events. The recording contains them, as it contains all events.
+    """Turns the presses that mark episodes into events. Like all events, these events are recorded.
 
     An episode begins with its first subtask. If no episode begins in a run, the whole run is one episode.
     """

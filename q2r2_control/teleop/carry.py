@@ -1,7 +1,7 @@
 """Let one hand move two tools as one rigid body, for two arms that carry one box.
 
 The hand is anchored to a frame in the middle between both tools. At the beginning, the axes of this frame are parallel
-to those of the world. Both tools keep their poses in this frame. No target jumps at the beginning, and both targets
+to the world's axes. Both tools keep their poses in this frame. No target jumps at the beginning, and both targets
 move exactly as one rigid body, except for the small correction of :class:`RelationKeeper`. If an arm cannot follow, a
 leash keeps the frame near this arm. This leash is shorter than the leash of one arm, so that the load is neither torn
 nor crushed.

@@ -25,13 +25,13 @@ _NEWEST = 0.2  # A pose that is older than this does not count [s].
 class CrossedHands:
     """Watches whether the left hand is to the left of the right hand, as the operator sees them.
 
-    The samples do not say where the operator faces, so the controllers have to show it. Both point forward along the
-    x axis of their own frames. Their mean horizontal direction is taken as the operator's forward direction. The
-    displacement from the right hand to the left hand, measured towards the operator's left, is negative if the hands
-    are crossed.
+    The samples do not say where the operator faces, so the controllers have to show it. Each controller points forward
+    along the x axis of its own frame. The mean horizontal direction of both controllers counts as the operator's
+    forward direction. The displacement from the right hand to the left hand, measured towards the operator's left, is
+    negative if the hands are crossed.
 
     In ordinary work, hands cross only for moments, or by less than 10 cm, or with controllers that point in different
-    directions. Such a moment starts the 3 s anew, and so does a moment in which one hand is not tracked. Swapped
+    directions. After such a moment, the 3 s begin again. They also begin again if one hand is not tracked. Swapped
     controllers stay on the wrong side from the beginning. The result is only a warning, since an operator may also
     cross the arms on purpose.
     """
@@ -39,7 +39,7 @@ class CrossedHands:
     def __init__(self, axes: Sequence[str]) -> None:
         """``axes`` are the signed axes of the setting ``teleop.axes``, from the input's frame to the world frame."""
         self._forward, self._left = axes_matrix(axes)[:2].tolist()  # The world's x and y axes, in the input's frame.
-        # By hand: time [s], and the horizontal parts of its position [m] and of its pointing direction.
+        # For each hand: time [s], and the horizontal parts of its position [m] and of its pointing direction.
         self._hands: dict[str, tuple[float, _Level, _Level]] = {}
         self._since = math.inf  # Time since which the hands have been crossed [s]; infinite if they are not crossed.
         self._at = -math.inf  # Time of the newest sample at which both hands were judged [s].
@@ -54,7 +54,7 @@ class CrossedHands:
         position, rotation = pose
         *points, _ = product(product(rotation, (*self._forward, 0.0)), inverse(rotation))
         self._hands[sample.hand] = stamp, self._level(position), self._level(points)
-        if stamp - self._at > _NEWEST:  # Both hands have not been judged for too long.
+        if stamp - self._at > _NEWEST:  # The last judgement of both hands is too old.
             self._since = math.inf
         if self._hands.keys() == {*SIDES}:
             self._judge(stamp)

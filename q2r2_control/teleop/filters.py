@@ -22,16 +22,17 @@ _MIN_SPACING = 0.005
 _USUAL_PERIOD = 1.0 / 75.0  # Period of a headset's samples that is assumed until it is measured [s].
 # Gains of the delay-locked loop: the shares of a sample's jitter that correct the sample's time and the period.
 _PHASE_SHARE, _PERIOD_SHARE = 0.2, 0.02
-_CATCH_UP = 0.5  # After a gap in the stream, the output catches up with the hand within this share of the gap.
+_CATCH_UP = 0.5  # After a gap in the stream, the output catches up with the hand in this share of the gap.
 
 
 class Interpolator:
     """Plays samples back ``delay`` seconds after their receipt, on straight lines from sample to sample.
 
-    A headset measures at constant intervals, but its samples arrive at irregular ones. This jitter would look like
+    A headset measures at constant intervals, but its samples arrive at irregular times. This jitter would look like
     speed. A delay-locked loop (Adriaensen 2005) removes it. The loop starts again when a sample is half a period early
     or late. If no sample comes for longer than ``delay``, the output rests at the newest sample, because nothing is
-    extrapolated. When samples come again, the output does not jump: it catches up within ``_CATCH_UP`` of the gap.
+    extrapolated. When samples come again, the output does not jump: it catches up with the hand in the share
+    ``_CATCH_UP`` of the gap.
     """
 
     def __init__(self, delay: float, period: float = _USUAL_PERIOD) -> None:
@@ -67,15 +68,15 @@ class Interpolator:
         self._even = stamp
         while len(knots) > 1 and stamp - knots[-1][0] < _MIN_SPACING:
             knots.pop()
-        # The output reaches a late sample no earlier than half the delay from now. Otherwise it would have to be
-        # faster.
+        # If a sample comes late, the output takes at least half the delay to reach it. With less time, the output would
+        # have to move too fast.
         earliest = max(self._caught_up, knots[0][0] + max(self.delay / 2.0, _MIN_SPACING))
         knots.append((max(stamp, earliest), position, rotation))
 
     def at(self, now: float) -> tuple[Vector, Quaternion, Vector]:
         """Return the position [m] and the rotation at ``now`` [s].
 
-        The third value is the rotation vector from the last call's rotation to this one [rad].
+        The third value is the rotation vector from the last call's rotation to this call's rotation [rad].
 
         ``now`` must not go back.
         """
@@ -95,7 +96,7 @@ class Interpolator:
             x, y, z = x + dt * linear[0], y + dt * linear[1], z + dt * linear[2]
             turn = dt * angular[0], dt * angular[1], dt * angular[2]
             rotation = turned_by(rotation, turn)
-        # The present line now starts at the output, so that the output does not step if a new sample replaces the
+        # The present line now starts at the output, so that the output does not jump if a new sample replaces the
         # line's end.
         knots[0] = playhead, (x, y, z), rotation
         return (x, y, z), rotation, turn_between(last, rotation) if passed else turn
@@ -107,8 +108,8 @@ class OneEuro:
     The cutoff rises with speed: f = min_cutoff + beta |v|. The original filter lags by tau = 1 / (2 pi f). This delay
     changes with the speed, and so the output leaves the hand's path. Here the input is moved ahead by (tau - delay) v,
     where v is the filter's own estimate of the velocity. At constant velocity the output then lags by exactly
-    ``delay``. Since tau |v| <= 1 / (2 pi beta), this displacement is bounded. So is the overshoot when the hand stops
-    suddenly.
+    ``delay``. Since tau |v| <= 1 / (2 pi beta), this displacement is bounded. If the hand stops suddenly, the
+    overshoot is bounded too.
     """
 
     def __init__(self, min_cutoff: float, beta: float, derivative_cutoff: float, delay: float) -> None:
@@ -189,7 +190,7 @@ class PoseFilter:
 
 
 # A hand is at rest if two conditions hold. First, the mean of its ``_NEWEST`` newest samples is within ``_DRIFTED`` of
-# the mean of all samples since it came to rest [m], [rad]. Second, each sample is within ``_FAR`` of that mean of all
+# the mean of all samples since it came to rest [m], [rad]. Second, each sample is within ``_FAR`` of the latter mean
 # [m], [rad]. The noise of a headset puts one sample in thousands farther away. Both bounds grow with measured noise.
 _NEWEST, _DRIFTED, _FAR = 8, (0.35e-3, 2e-3), (1.0e-3, 5e-3)
 _NOISE = 0.2e-3, 1.0e-3  # The noise of one axis that is assumed until it is measured [m], [rad].

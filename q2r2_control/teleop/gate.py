@@ -14,7 +14,7 @@ from q2r2_control.quaternions import Quaternion
 from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.types import HandSample, Pose
 
-_MAX_COORDINATE = 1e6  # No tracking system measures positions as far away [m].
+_MAX_COORDINATE = 1e6  # No tracking system measures such a large coordinate [m].
 _QUATERNION_LENGTHS = (1e-6, 1e6)  # A quaternion with a length outside this range counts as no rotation.
 # Least time over which a speed is measured [s]. Messages that a network has delayed arrive less than 1 ms apart. A
 # speed between two of them would mean nothing.
@@ -37,7 +37,7 @@ class PoseGate:
         self.pose: Pose | None = None
         self.stamp = -math.inf  # Time of the newest pose, usable or not [s].
         self._problem: Reason | None = None
-        self._recent: deque[tuple[float, Pose]] = deque()  # Times and poses. The first is about _SPEED_WINDOW old.
+        self._recent: deque[tuple[float, Pose]] = deque()  # Times [s] and poses, the first one about _SPEED_WINDOW old.
 
     @property
     def problem(self) -> Reason | None:

@@ -70,10 +70,10 @@ class GestureRecognizer:
     """Turns the levels of buttons, triggers and stick into gestures. Each gesture is reported once.
 
     The two buttons of a chord hardly ever go down in the same sample. A tap of a button is therefore reported after
-    ``chord_window`` [s], or at its release if the release is earlier. If the other button goes down before, the press
-    is a chord, and no tap is reported. If a control is bound to a hold as well, a tap is reported at its release, and a
-    hold after ``hold_time`` [s]. A stop must not wait, so ``DOWN`` reports every press at once. ``DOWN`` may only be
-    used to stop motion, because the press may still become a chord, which stops motion as well.
+    ``chord_window`` [s], or at its release if the release is earlier. If the other button goes down before this, the
+    press is a chord, and no tap is reported. If a control is bound to a hold as well, a tap is reported at its release,
+    and a hold after ``hold_time`` [s]. A stop must not wait, so ``DOWN`` reports every press at once. ``DOWN`` may only
+    be used to stop motion, because the press may still become a chord, which stops motion as well.
 
     A button that goes down while the other one is held makes a chord at any time. After a chord both buttons have to be
     released before either of them counts again. Likewise, a control that is held at the first reading counts only after
@@ -178,7 +178,7 @@ class _Control:
 
     def cancel(self) -> None:
         self._muted = False
-        self.began: float | None = None  # Time at which the undecided press began [s]; None without one.
+        self.began: float | None = None  # Time at which the undecided press began [s]; None if there is none.
 
     def begin(self, stamp: float) -> None:
         self.began, self._muted = stamp, False

@@ -24,7 +24,7 @@ Shares = tuple[float, float]  # Factors of the scales of position and rotation: 
 class HandMotion:
     """Maps the motion of one hand to a tool, or to the frame between two tools that carry one object.
 
-    After :meth:`anchor` the tool never follows earlier motion of the hand, because nothing keeps that motion.
+    After :meth:`anchor` the tool never follows earlier motion of the hand, because this motion is not stored.
     """
 
     def __init__(self, arm: str, settings: TeleopSettings) -> None:
@@ -156,8 +156,8 @@ class ArmMeasurements:
     def anchor(self, arm: str) -> Anchor | None:
         """Return the pose at which ``arm`` may be engaged; None if its tool pose is not measured.
 
-        The orientation is the commanded one. If no commands are known, it is the last target's orientation, and without
-        a last target the measured one.
+        The orientation is the commanded orientation. If no commands are known, it is the orientation of the last
+        target. If there is no last target either, it is the measured orientation.
         """
         measured = self.tools.get(arm)
         if measured is None:
@@ -174,7 +174,7 @@ class ArmMeasurements:
     def expected(self, arm: str, offset: Array | None) -> Pose | None:
         """Return the tool pose that should be measured after the command (world frame); None if not known.
 
-        ``offset`` is the measured position minus the commanded one (3,) [m]; None if it is not known.
+        ``offset`` is the measured position minus the commanded position (3,) [m]; None if it is not known.
         """
         if self.commanded is None or (commanded := self.commanded.get(arm)) is None:
             return None

@@ -22,7 +22,7 @@ class Pulse(NamedTuple):
     strongest: float | None = None  # Greatest amplitude, if the amplitude grows with a quantity; otherwise None.
 
     def grown(self, share: float) -> Pulse:
-        """Return the vibration with an amplitude between its own (``share`` 0) and :attr:`strongest` (1 or more)."""
+        """Return the vibration with an amplitude that grows to :attr:`strongest` while ``share`` grows from 0 to 1."""
         most = self.amplitude if self.strongest is None else self.strongest
         return self._replace(amplitude=self.amplitude + (most - self.amplitude) * min(share, 1.0))
 
@@ -69,9 +69,9 @@ _WHILE_STATE_STAYS: dict[ReasonKind, Pulse] = {
 # Slip is the distance or the angle by which leash and workspace have held the target back.
 _SLIP_STEP = 0.02  # Slip of the target's position from one pulse to the next [m].
 _SLIP_ANGLE_STEP = 0.1  # Slip of the target's rotation from one pulse to the next [rad].
-_NEAR_STEP, _NEAR_FROM = 0.005, 0.05  # Approach from one pulse to the next, and the distance at which they begin [m].
+_NEAR_STEP, _NEAR_FROM = 0.005, 0.05  # Approach from one pulse to the next, and the distance at which pulses begin [m].
 _FORCE_STEP, _FORCE_TO = 5.0, 50.0  # Force from one pulse to the next, and the force of the strongest pulse [N].
-_PAUSE = 0.05  # Pause between two vibrations, so that they are felt as two [s].
+_PAUSE = 0.05  # Pause between two vibrations, so that the hand does not feel them as one [s].
 
 
 class ArmCondition(NamedTuple):
@@ -132,7 +132,7 @@ class HapticPulses:
             self._want(CONTACT.grown(condition.force / _FORCE_TO))
 
     def grasps(self, holds: bool) -> None:
-        """Take whether the gripper holds something. If it has begun to hold, ask for a vibration."""
+        """Remember whether the gripper holds something. If it has begun to hold something, ask for a vibration."""
         if holds and not self._grasps:
             self._want(GRASP)
         self._grasps = holds
@@ -144,7 +144,7 @@ class HapticPulses:
         """
         if self._ends is not None and now >= self._ends:
             self._ends, self._next = None, now + _PAUSE
-            # The vibration ends in the hand that felt it, which may not drive the arm any more.
+            # The vibration ends in the hand that felt it. Another hand may drive the arm now.
             return HapticFeedback(self._felt_by, 0.0, 0.0)
         pulse = self._waiting
         if pulse is None or (self._ends is None and now < self._next and pulse is not FAULT):

@@ -8,13 +8,14 @@ the rotation.
 **Slack.** Suppose that a leash is taut, that the tool is blocked in the direction of the leash, and that the hand comes
 back by more than its tremor. Then the target is put at the tool pose, and the tool follows the hand from there. The
 unfiltered hand poses decide whether the hand comes back, because filtered poses swing back by millimetres when a hand
-stops. The target's position and rotation are put at the tool pose together. A blocked tool rests where the pulls of the
-two balance. If only one of them were put there, the tool would follow the other one, by up to 50 mm.
+stops. The target's position and rotation are put at the tool pose together. While a tool is blocked, the pull towards
+the target's position and the pull towards its rotation are in balance. If only one of the two were put at the tool
+pose, the tool would follow the other one, by up to 50 mm.
 
 **Why the arm does not jump.** The only state of the controller is its reference, which is at rest while the tool is
 blocked. A target at the tool pose therefore asks for no motion. The controller also follows the velocity of its target,
-but ignores a step that is faster than three times the tool's speed limit. This is 9 m/s or 30 rad/s at most. The target
-is put at the tool pose only in a tick so short that this step is faster than that.
+but ignores a step that is faster than three times the tool's speed limit. Three times this limit is 9 m/s or 30 rad/s
+at most. To put the target at the tool pose is a step. It is only done in a tick so short that this step is ignored.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from q2r2_control.types import Interval, Pose
 
 # If the hand comes back by more than this, the target is put at the tool pose [m], [rad]. It is more than tremor, which
 # is 0.2 mm and 0.2 degrees to either side, and more than the noise of a headset. This noise has a standard deviation of
-# 0.2 mm and 0.03 degrees, and two samples of a hand at rest are at most about seven standard deviations apart.
+# 0.2 mm and 0.03 degrees. Two samples of a hand at rest are at most about seven standard deviations apart.
 _COMES_BACK = 1.5e-3, 12e-3
 # A tool that is slower counts as blocked [m/s], [rad/s]. A tool of this speed stops within a fraction of a millimetre.
 _HELD_UP = 0.05, 0.2
@@ -82,7 +83,7 @@ class ComponentLeash:
         return 0.0, 0.0, 0.0
 
     def hold(self, shift: Vector) -> Vector | None:
-        """Return ``shift`` (from tool to target), cut to the leash's length; None if it is not longer."""
+        """Return ``shift`` (from tool to target), cut to the leash's length; None if ``shift`` is not too long."""
         distance = math.hypot(*shift)
         if distance <= self._length:
             return None
@@ -156,7 +157,7 @@ class Leash:
     def _ends(self, tool: Pose, target: Pose) -> bool:
         """Return whether the target has reached the maximum distance or angle from the tool.
 
-        This is rare, so the check is kept cheap.
+        Targets rarely reach it, but all of them are checked. The check is therefore cheap.
         """
         (start, (a, b, c, d)), (end, (x, y, z, w)) = tool, target
         # The scalar product of two unit quaternions is the cosine of half the angle between them, up to its sign.
@@ -191,7 +192,7 @@ def _displacements(start: Pose, end: Pose) -> tuple[Vector, Vector]:
 
 
 def _put(target: Pose, tool: Pose, shift: Vector | None, turn: Vector | None) -> Pose:
-    """Return the target at the displacements ``shift`` and ``turn`` from the tool. None keeps position or rotation."""
+    """Return ``target``, put at ``shift`` and ``turn`` from the tool. None keeps the target's position or rotation."""
     (position, rotation), ((x, y, z), tool_rotation) = target, tool
     if shift is not None:
         position = x + shift[0], y + shift[1], z + shift[2]
@@ -205,7 +206,7 @@ def _dot(one: Vector, other: Vector) -> float:
 class Workspace:
     """Keeps the targets of one arm in a box.
 
-    If the tool was outside of the box at the anchor, the targets may be as far outside.
+    If the tool was outside of the box at the anchor, the targets may be equally far outside of it.
     """
 
     def __init__(self, settings: WorkspaceSettings | None) -> None:

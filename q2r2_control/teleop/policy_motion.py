@@ -3,7 +3,7 @@
 A chunk is followed from the time of its first action, or at once if this time has passed. It then replaces all older
 chunks. Positions between two actions are cubic in time, and rotations turn at constant speed. If two chunks differ at
 the moment of the change, the difference fades out, so that the target does not jump. Chunks of motions have no such
-difference, because they begin at the present target. The last action counts for :data:`SILENT`. After that the arm
+difference, because they begin at the present target. The last action stays valid for :data:`SILENT`. Then the arm
 rests, because a policy that sends nothing has failed.
 """
 
@@ -24,9 +24,9 @@ from q2r2_control.teleop.leash import Leash, Workspace
 from q2r2_control.teleop.reasons import TeleopReason
 from q2r2_control.types import ActionChunk, Array, Pose
 
-SILENT = 0.5  # The last action of a plan counts for this time. After that the arm rests [s].
+SILENT = 0.5  # The last action of a plan stays valid for this time [s]. Then the arm rests.
 _FADING = 0.5, 2.0  # Greatest speed at which the difference between two chunks fades [m/s], [rad/s].
-# If a time of a chunk is farther in the past or in the future, another clock has stamped the chunk [s].
+# If a time of a chunk is farther than this from now, another clock has stamped the chunk [s].
 _AHEAD = 10.0
 
 
@@ -36,7 +36,7 @@ class _Plan(NamedTuple):
     start: float  # Time from which the plan is followed [s].
     chunk: ActionChunk
     times: list[float]  # Times of the poses [s].
-    # Poses in the world frame. For a chunk of motions, relative to the tool pose at which the first motion begins.
+    # Poses in the world frame. A chunk of motions has poses relative to the tool pose where the first motion begins.
     poses: list[Pose]
     grippers: list[float]  # Openings of the gripper; empty if the policy does not command it.
 
@@ -175,7 +175,7 @@ class PolicyMotion:
         return None
 
     def _at(self, now: float) -> Pose:
-        """Return the plan's pose at ``now``, plus the part of the jump from the plan before that has not faded yet."""
+        """Return the plan's pose at ``now``, plus the part of the jump at the plan's start that has not faded yet."""
         assert self._plan is not None
         (x, y, z), rotation = _interpolated(self._plan, now)
         left = 1.0 - min((now - self._began) / self._fades, 1.0)
@@ -273,7 +273,7 @@ def _interpolated(plan: _Plan, t: float) -> Pose:
 
 
 def _velocity(times: list[float], poses: list[Pose], index: int) -> Vector:
-    """Return the velocity at an action: the mean velocity from the action before to the action after [m/s]."""
+    """Return the velocity at an action: the mean velocity from the previous action to the next one [m/s]."""
     first, last = max(index - 1, 0), min(index + 1, len(times) - 1)
     h, start, end = times[last] - times[first], poses[first][0], poses[last][0]
     return (end[0] - start[0]) / h, (end[1] - start[1]) / h, (end[2] - start[2]) / h

@@ -1,4 +1,4 @@
-"""Decide which arms follow a policy. These are arms that no operator drives, until the actions end or have a fault."""
+"""Decide which arms follow a policy: arms that no operator drives, until the policy's actions end or have a fault."""
 
 from __future__ import annotations
 
@@ -21,8 +21,9 @@ class PolicySide:
     """Lets a policy drive the arms.
 
     After a fault, an arm whose hand has sent readings waits for a press. An arm without an operator goes on with the
-    next chunk that begins at its tool pose. Linked arms begin together or not at all, since they may hold one object.
-    The arms that have to begin together are those in the newest chunk, and those that a fault has stopped together.
+    next chunk that begins at the arm's tool pose. Linked arms begin together or not at all, since they may hold one
+    object. The arms that have to begin together are the arms in the newest chunk, and the arms that a fault has stopped
+    together.
     """
 
     def __init__(self, arms: Mapping[str, ArmTeleop], settings: TeleopSettings) -> None:
@@ -106,7 +107,7 @@ class PolicySide:
         return not any(self._arms[other].heard_of for other in lost)
 
     def _begin(self, around: ArmMeasurements, now: float) -> None:
-        """Let the arms begin that may follow the policy and have a plan. Linked arms begin together or not at all."""
+        """Let each arm that has a plan and may follow it begin to do so. Linked arms begin together or not at all."""
         ready = [name for name in self._arms if self._may_begin(name, around) and self._motions[name].counts(now)]
         if not ready or (self._linked and not self._wanted().issubset(ready)):
             return

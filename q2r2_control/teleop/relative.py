@@ -34,16 +34,18 @@ _CONTINUOUS = 1.0
 
 
 class RelativeMotion:
-    """Maps hand poses to tool poses, relative to an anchor: one pose of the hand and one of the tool.
+    """Maps hand poses to tool poses, relative to an anchor: a pose of the hand and a pose of the tool.
 
-    With M the signed permutation ``axes``, preceded by S = diag(1, -1, 1) in the stance ``mirror_reflected``, a hand
-    pose (p, R) counts in the world as (M p, M R M'). With anchors hand0 and tool0, ``target`` is
+    M is the signed permutation of ``axes``. In the stance ``mirror_reflected``, M is S times this permutation, with
+    S = diag(1, -1, 1). In the world, a hand pose (p, R) of the input is (M p, M R M'). With the anchors hand0 and
+    tool0, ``target`` is
 
         position  tool0 + scale diag(axis_scales) (hand - hand0)
         rotation  base frame:  exp(rotation_scale log(R R0')) Rtool0
                   tool frame:  Rtool0 exp(rotation_scale log(R0' R))
 
-    as in Quest2ROS2 (HRI 2026) for scales of 1 in the base frame. The caller decides which hand drives which arm.
+    With scales of 1 and the base frame, Quest2ROS2 (HRI 2026) does the same. The caller decides which hand drives which
+    arm.
 
     Every rotation has two rotation vectors: a short one and a longer one in the opposite direction. The vector that
     continues the previous call's vector is used. With a scale other than 1 the tool then does not flip when the hand
@@ -91,7 +93,7 @@ class RelativeMotion:
         """Let the pose ``hand`` (input's frame) correspond to the pose ``tool`` (world frame) from now on.
 
         Raises:
-            Q2R2Error: If one of the poses is not finite or no rotation. :meth:`target` and :meth:`hand` check likewise.
+            Q2R2Error: If a pose is not finite, or has no rotation matrix. :meth:`target` and :meth:`hand` raise it too.
         """
         self.anchor_floats(_checked_floats("anchor: hand", hand), _checked_floats("anchor: tool", tool))
 

@@ -28,11 +28,12 @@ _HAND_FAULT_STOPS = FOLLOWING - {ArmState.CARRIED, ArmState.POLICY}
 class Teleop:
     """Lets hands drive arms relative to anchors, and stops the arms at faults. :mod:`arm_states` has the transitions.
 
-    An engaged arm stops if no pose or no reading of the buttons has been received for ``gate.timeout``, if a pose is
-    not finite or its quaternion is no rotation, and if the hand jumps or is faster than the gate allows. It also stops
-    if the input reports a fault, if the connection is lost, if the loop stalls, and if the clock goes back by more than
-    ``gate.timeout``. With ``linked`` the other arm stops as well. Only a new press engages an arm again. The alignment
-    chord of either hand stops both arms, because it moves the frame in which the poses of both hands are measured.
+    An engaged arm stops if, for ``gate.timeout``, no pose or no reading of the buttons has been received. It stops if a
+    pose is not finite or its quaternion is no rotation, and if the hand jumps or is faster than the gate allows. It
+    also stops if the input reports a fault, if the connection is lost, if the loop stalls, or if the clock goes back by
+    more than ``gate.timeout``. With ``linked`` the other arm stops as well. Only a new press engages an arm again. The
+    alignment chord of either hand stops both arms, because it moves the frame in which the poses of both hands are
+    measured.
 
     If several presses come in the same tick, a stop is carried out first, then the alignment chord, then a pause, then
     the others. Either hand may ask for the actions that concern both arms. While :attr:`homing` is True, the caller
@@ -255,8 +256,8 @@ class Teleop:
     def give_back(self, now: float) -> None:
         """Let a policy move the arms that hands have driven.
 
-        An arm that a fault stops afterwards waits for no press before the policy may move it again. This ends when a
-        reading of its hand comes.
+        If a fault stops an arm afterwards, the policy may move it again without a press. After the next reading of the
+        arm's hand, a press is needed again.
         """
         now, _ = self._clock(now)
         reason = Reason(TeleopReason.POLICY_REQUESTED)

@@ -30,7 +30,7 @@ class Told(NamedTuple):
 
     change: Event | None = None  # The last change of state.
     refusal: Event | None = None  # The newest refusal since this change.
-    pause: Event | None = None  # The newest request to pause the arm, which held already; None since the last change.
+    pause: Event | None = None  # The newest request to pause the arm, if it came after the change and while it held.
 
     def after(self, event: Event) -> Told:
         """Return the events that say why the arm is in its state after one more ``event``.
@@ -50,7 +50,7 @@ class Told(NamedTuple):
 
 
 def told_after(told: Mapping[str, Told], events: Iterable[Event]) -> dict[str, Told]:
-    """Return, by arm, the events that say why it is in its state after ``events``. ``told`` are the ones before."""
+    """Return, by arm, the events that say why it is in its state after ``events``. ``told`` are the events before."""
     newest = dict(told)
     for event in events:
         newest[event.arm] = newest.get(event.arm, Told()).after(event)
@@ -71,14 +71,14 @@ class ArmWords:
             device: The words of the device that drives.
         """
         self._joints, self._bindings, self._device = joints, bindings, device
-        self.told: Mapping[str, Told] = {}  # By arm, the events that say why it is in its state.
+        self.told: Mapping[str, Told] = {}  # For each arm, the events that say why it is in its state.
 
     def follow(self, events: Iterable[Event]) -> None:
-        """Keep those of the newest ``events`` that say why an arm is in its state."""
+        """Keep each of the newest ``events`` that says why an arm is in its state."""
         self.told = told_after(self.told, events)
 
     def controls(self) -> dict[str, str]:
-        """Return the action of each control of a hand that is bound to an action. Both are in words."""
+        """Return the controls of a hand that are bound to an action, and these actions. Both are in words."""
         bound = {self._device.noun(binding.words): MEANINGS[binding.action] for binding in self._bindings.bound()}
         both = [self._device.noun(control) for control in ("lower", "upper") if control in self._device.nouns]
         chord = {} if len(both) < 2 else {" and ".join(both): "the headset's alignment: stops both arms until let go"}

@@ -25,8 +25,8 @@ class ShownTick(NamedTuple):
 
     tick: Tick
     binding: tuple[ActiveLimit, ...]  # Limits that held a step back since the last shown tick.
-    told: Mapping[str, Told]  # By arm, the events that say why it is in its state.
-    hands: Mapping[str, str]  # By arm, the hand that drives it.
+    told: Mapping[str, Told]  # For each arm, the events that say why it is in its state.
+    hands: Mapping[str, str]  # For each arm, the hand that drives it.
     moved: Array | None  # MuJoCo's positions (qpos) of everything that moves.
     recording: str
 
@@ -75,7 +75,7 @@ class RunDisplay:
         }
 
     def _joints_of_tool(self, joints: Array) -> list[int]:
-        """Return the index of an arm's last joint, and the indices of all joints behind it, such as the fingers'."""
+        """Return the index of an arm's last joint, and the indices of all joints behind it, such as finger joints."""
         model = self._tree.model
         return [int(joint) for joint in model.subtrees[model.getJointId(self._run.joint_names[joints[-1]])]]
 

@@ -40,7 +40,7 @@ class DisplayInput(Input, Protocol):
         """Show the newest state. Return False if the last state is not sent yet. The method never waits."""
 
     def show_picture(self, jpeg: bytes) -> bool:
-        """Show the newest picture of a camera; otherwise like :meth:`show`. Any thread may call this."""
+        """Show the newest picture of a camera, in the manner of :meth:`show`. Any thread may call this method."""
 
 
 class HeadsetView:

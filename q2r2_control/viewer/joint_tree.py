@@ -20,7 +20,7 @@ _SHARP = 0.6  # Edges with a larger angle than this look sharp, and other edges 
 
 
 class JointTree:
-    """All movable joints of arms and fingers, and the shapes that each joint carries."""
+    """All movable joints of arms and fingers, and the shapes that each joint moves."""
 
     def __init__(self, shown: ShownRobot) -> None:
         self.model = pin.buildModelFromXML(shown.urdf)
@@ -56,7 +56,7 @@ class JointTree:
 
         Args:
             q: Positions of the arms' joints (nv,) [rad].
-            openings: By arm, the opening of its gripper, from 0 for closed to 1 for open.
+            openings: For each arm, the opening of its gripper, from 0 for closed to 1 for open.
         """
         full: Array = pin.neutral(self.model)
         full[self._arms] = q

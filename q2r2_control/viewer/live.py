@@ -1,4 +1,4 @@
-"""The live table of a run. A thread draws it, so that each tick only stores a reference."""
+"""The live table of a run. A thread draws the table, so that the loop only has to keep the newest tick."""
 
 from __future__ import annotations
 

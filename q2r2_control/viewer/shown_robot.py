@@ -20,8 +20,8 @@ class ShownRobot:
     config: Config
     urdf: str
     joint_names: tuple[str, ...]
-    joints: Mapping[str, Array]  # By arm, the indices of its joints in ``joint_names``.
-    fingers: Mapping[str, tuple[str, ...]]  # By arm, the joints of its gripper.
+    joints: Mapping[str, Array]  # For each arm, the indices of its joints in ``joint_names``.
+    fingers: Mapping[str, tuple[str, ...]]  # For each arm, the joints of its gripper.
 
     @classmethod
     def of(cls, robot: Robot, config: Config) -> Self:

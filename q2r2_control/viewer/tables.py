@@ -17,7 +17,7 @@ from rich.text import Text
 Cell = Text | str | float | None
 _NARROWEST_NAME = 12  # A column of names is folded, but not to fewer characters than this.
 _UNIT = re.compile(r" (\[[^][]*\]|/\S*)$")
-_WIDEST = 1000  # Width with which the width of a whole table is measured [characters].
+_WIDEST = 1000  # The width of a whole table is measured as on a console of this width [characters].
 
 
 def figure_table(
@@ -25,10 +25,10 @@ def figure_table(
 ) -> Table:
     """Return a table of figures and names under headings; ``notes`` are lines below it.
 
-    The unit at the end of a heading is put into a second line. A column with a unit or with numbers has figures.
-    Such a column is aligned to the right and is never cut. In other columns, text that is too long continues in the
-    next line. A row of one cell is the heading of the rows below. If the console is too narrow, the table is wider than
-    the console. It therefore has to be printed by :func:`print_table`.
+    The unit at the end of a heading is put into a second line. A column with a unit or with numbers is aligned to the
+    right, and is never cut. In other columns, text that is too long continues in the next line. A row of one cell is
+    the heading of the rows below. If the console is too narrow, the table is wider than the console. The table
+    therefore has to be printed by :func:`print_table`.
     """
     given = list(given)
     rows = [tuple(map(_shown, row)) for row in given]
@@ -54,7 +54,7 @@ def figure_table(
 
 
 def print_table(table: Table, console: Console) -> None:
-    """Print a table without cutting figures off. Its lines may be longer than those of the console.
+    """Print a table without cutting figures off. Its lines may be longer than the console is wide.
 
     On a terminal, the notes below the table are folded to the table's width. A file or another program gets each note
     in one line.
@@ -98,7 +98,7 @@ def times_real_time(factor: float) -> str:
 
 
 def short_figure(value: float | None) -> str:
-    """Return a number with about three digits: two decimals below 10, one below 100, and none above; "-" for None."""
+    """Return a number with about three digits: 2 decimals below 10, 1 decimal below 100, otherwise 0; "-" for None."""
     if value is None:
         return "-"
     digits = 2 if abs(value) < 9.995 else 1 if abs(value) < 99.95 else 0

@@ -27,7 +27,7 @@ def installation_folder() -> Path:
 def installation_token(folder: Path) -> str:
     """Return the token of the page's URL. It is the same in each run, so that a headset does not need a new URL.
 
-    A file whose text is shorter than a token is replaced. It may be empty after a full disk, and opens no page.
+    A file that is too short, for example because the disk was full, could open no page. It is replaced.
 
     Raises:
         InputError: If the token's file cannot be read or written.
@@ -121,7 +121,7 @@ def _general_name(name: str) -> object:
 
 
 def _write(file: Path, content: bytes) -> None:
-    """Write a file that only this user can read, and that is never half written."""
+    """Write a file that only this user can read. If the writing fails, the old file stays as it was."""
     file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     temporary = file.with_suffix(f".{os.getpid()}")
     with open(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "wb") as stream:

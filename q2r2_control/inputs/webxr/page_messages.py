@@ -20,7 +20,7 @@ from q2r2_control.inputs.session import HAND_TOPICS, Reception
 from q2r2_control.inputs.webxr.shown import Seven
 from q2r2_control.types import QUEST_CONTROLS, DeviceControls, HandFault, HandInputs
 
-LONGEST = 4096  # Greatest length of a message [bytes]. Messages of the page have under 600.
+LONGEST = 4096  # Greatest length of a message [bytes]. Messages of the page have under 600 bytes.
 # The button "pinch" is a pinch of bare fingers, or a touch of a phone's screen. These devices have no other button.
 _NOUNS = {**QUEST_WORDS.nouns, "lower": "A, X or Space", "upper": "B, Y or G", "pinch": "the pinch"}
 _ABSENT = "nothing: no browser drives, open the page"

@@ -43,8 +43,8 @@ from q2r2_control.inputs.webxr.page_client import MAX_MESSAGES_PER_SECOND, PageC
 from q2r2_control.inputs.webxr.page_messages import LONGEST, HeadsetRequest, read
 from q2r2_control.types import HapticFeedback
 
-# Codes with which a socket is closed, which the page reads. FREE says that no page drives, so that a page that watched
-# may drive.
+# Codes that tell a page why its socket is closed. FREE goes to pages that only watch. It says that no page drives any
+# more, so that one of them may now drive.
 REFUSED, DROPPED, OVER, FREE = 4001, 4002, 4003, 4004
 _MOST_WATCHERS = 8  # Greatest number of pages that only watch.
 _WATCHED = 0.1  # Least time between two states that are sent to pages that watch [s].
@@ -157,7 +157,7 @@ class PageServer:
             sending.cancel()
             self._forget(client, client.reason or reason)
             if client.closing is not None:
-                await client.closing  # Otherwise the server would close the socket without the reason.
+                await client.closing  # Otherwise the page would not get the reason.
 
     def _receive(self, client: PageClient, text: str | bytes) -> None:
         now = self._clock()
@@ -173,7 +173,8 @@ class PageServer:
         if client is not self._driver:
             self._settle(now)
             return
-        # If several messages come together, only the newest is passed on. A change of the buttons is never left out.
+        # If several messages come together, only the newest one and the last one before each change of the buttons are
+        # passed on.
         if client.newest is None:
             asyncio.get_running_loop().call_soon(self._pass_on, client)
         elif client.newest.controls != message.controls:

@@ -35,17 +35,17 @@ class ShownScene(TypedDict):
 
     name: str
     meshes: list[ShownMesh]
-    hands: dict[str, list[int]]  # By arm, the joints whose meshes move with the tool.
+    hands: dict[str, list[int]]  # For each arm, the joints whose meshes move with the tool.
     parts: dict[str, ShownPart]
     floor: float  # Height of the floor [m].
-    timeout: float  # An arm stops if no hand comes for this time [s].
+    timeout: float  # An arm stops if no data of its hand come for this time [s].
 
 
 class ShownArm(TypedDict):
     """An arm. ``why`` is the reason for its state, and ``next`` is what its operator can do.
 
     In both texts, the name of a control is in braces, since only the page knows the words of its device. ``hand`` is
-    the hand that drives the arm, ``colour`` is the colour of the state, and ``silent`` says that the arm has stopped
+    the hand that drives the arm, and ``colour`` is the colour of the state. ``silent`` is True if the arm has stopped
     because the data of its hand did not come in time.
     """
 

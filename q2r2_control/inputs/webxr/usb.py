@@ -1,4 +1,4 @@
-"""Connect a headset by a USB cable: adb forwards the headset's localhost to this machine, without HTTPS and Wi-Fi."""
+"""Connect a headset by USB: adb forwards a port of the headset to this machine. HTTPS and Wi-Fi are not needed."""
 
 from __future__ import annotations
 

@@ -84,9 +84,9 @@ class WebXrInput:
     ) -> None:
         """Make an input, which listens on ``host`` and ``port`` after :meth:`start`.
 
-        A page that sends nothing for ``silence`` [s] is dropped. The teleop layer stops the arms long before.
+        A page that sends nothing for ``silence`` [s] is dropped. Long before, the teleop layer stops the arms.
         """
-        self.address = host, port  # After ``start``, the port is the one that was bound.
+        self.address = host, port  # After ``start``, the port is the bound port.
         self.urls: tuple[str, ...] = ()  # After ``start``, one URL for each address of this computer.
         self._clock, self._allow, self._usb, self._certificate, self._say = clock, allow, by_usb, certificate, say
         self._silence = silence
@@ -141,7 +141,7 @@ class WebXrInput:
         return self._process is not None and self._process.send(Shown(content), 1)
 
     def show_picture(self, jpeg: bytes) -> bool:
-        """Show the newest picture of a camera; otherwise like :meth:`show`. Any thread may call this."""
+        """Show the newest picture of a camera, in the manner of :meth:`show`. Any thread may call this method."""
         return self._process is not None and self._process.send(CameraPicture(jpeg), 1)
 
     def start(self) -> None:

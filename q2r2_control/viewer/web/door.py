@@ -31,10 +31,10 @@ _CLOSE_TIMEOUT = 1.0  # Longest time until a browser confirms that a connection 
 
 
 class Door(PageDoor):
-    """Checks the requests to viser's page. The token is the path of its URL, since the page connects to this path."""
+    """Checks the requests to viser's page. The page connects to the path of its URL, so the token is this path."""
 
     def __init__(self, host: str, port: int, certificate: str | None = None, addresses: Sequence[str] = ()) -> None:
-        """Open the socket. The arguments are those of :class:`PageDoor`."""
+        """Open the socket. The arguments are the same as for :class:`PageDoor`."""
         super().__init__(host, port, "--web", secrets.token_urlsafe(16), certificate, addresses)
         self.messages = BrowserMessages()  # Decides which messages viser gets.
         self._clients = 0
@@ -72,12 +72,12 @@ class Door(PageDoor):
             def checked(connection: ServerConnection, request: Request) -> Response | None:
                 if (reason := self.refusal(request)) is not None:
                     return text_response(http.HTTPStatus.FORBIDDEN, f"{reason}\n")
-                request.path = "/"  # Every path means the page, because viser serves nothing else.
+                request.path = "/"  # Every path leads to the page, because viser serves nothing else.
                 response: Response | None = answer(connection, request)
                 if response is not None:
                     page.change(response)
                     protect(response, _POLICY)
-                    # No page may contain this one, because a foreign page could then steal a click.
+                    # No other page may embed this page. It could deceive the user into clicking this page's buttons.
                     response.headers["X-Frame-Options"] = "DENY"
                 return response
 

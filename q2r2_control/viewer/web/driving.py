@@ -19,8 +19,8 @@ from q2r2_control.viewer.web.pace import BrowserPace
 
 _SIZE = 0.22  # Size of a gizmo [m].
 _PERIOD = 0.02  # Shortest time between two samples of a dragged hand [s].
-_ANSWER = 60.0  # A page without an answer for this time loses control. The gate stops the arms long before [s].
-_Gizmos = dict[str, viser.TransformControlsHandle]  # By arm.
+_ANSWER = 60.0  # A page that gives no answer for this time stops driving [s]. Long before, the gate stops the arms.
+_Gizmos = dict[str, viser.TransformControlsHandle]  # The gizmo of each arm.
 
 
 class Driving:
@@ -35,13 +35,13 @@ class Driving:
         self._server, self._arms, self._answer = server, tuple(setup.joints), answer
         self._pace = BrowserPace(setup.config.teleop.gate.timeout)
         self._lock = RLock()
-        self._gizmos: dict[int, tuple[viser.ClientHandle, _Gizmos]] = {}  # By page: its connection and its gizmos.
+        self._gizmos: dict[int, tuple[viser.ClientHandle, _Gizmos]] = {}  # For each page: connection and gizmos.
         self._driver: int | None = None  # The page that drives; None if no page drives.
-        # By dragged arm, the pose of the gizmo in the world frame: position [m] and quaternion x y z w.
+        # For each dragged arm, the pose of the gizmo in the world frame: position [m] and quaternion x y z w.
         self._dragged: dict[str, tuple[tuple[float, ...], tuple[float, ...]]] = {}
         self._spent: set[str] = set()  # Arms whose last drag cannot engage them any more.
         self._gizmo_count = 0
-        self._tools: dict[str, tuple[float, ...]] = {}  # By arm, the tool pose x y z [m] qx qy qz qw (world frame).
+        self._tools: dict[str, tuple[float, ...]] = {}  # Tool poses x y z [m] qx qy qz qw (world frame).
         server.on_client_connect(self._connect)
         server.on_client_disconnect(self._disconnect)
 
@@ -56,7 +56,7 @@ class Driving:
         return "let go, then drag again to engage" if not moves and arm in {*self._dragged, *self._spent} else ""
 
     def slowness(self, silent: bool) -> str:
-        """Return why the hands of the page that drives come too late; see :meth:`BrowserPace.advice`."""
+        """Return why the hand poses of the page that drives come too late; see :meth:`BrowserPace.advice`."""
         return self._pace.advice(silent)
 
     def add_buttons(self, gui: viser.GuiApi) -> None:
@@ -105,7 +105,7 @@ class Driving:
         gizmo = client.scene.add_transform_controls(name, scale=_SIZE, depth_test=False, visible=False)
 
         async def drag(event: viser.TransformControlsEvent) -> None:
-            # The function contains no await. Otherwise, the pose could be that of a later event.
+            # This function must not await anything. Otherwise, a later event could already have changed the pose.
             self._drag(client.client_id, arm, event)
 
         gizmo.on_update(drag)

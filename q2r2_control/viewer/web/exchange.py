@@ -25,13 +25,13 @@ class PageSetup(ShownRobot):
     addresses: tuple[str, ...]  # Addresses at which other computers reach the server.
     certificate: str | None  # A PEM file with a certificate and its key; None for plain HTTP.
     title: str
-    tools: Mapping[str, int]  # By arm, the index of its tool frame in ``model``.
+    tools: Mapping[str, int]  # For each arm, the index of its tool frame in ``model``.
     home: Array  # Joint positions at home (nv,) [rad].
     lower: Array  # Lower position limits (nv,) [rad].
     upper: Array  # Upper position limits (nv,) [rad].
     model: pin.Model
     collision_model: pin.GeometryModel  # The bodies, and the pairs that are kept apart.
-    parts: Mapping[str, int]  # By name of a loose part, the index in ``Frame.moved`` at which its pose begins.
+    parts: Mapping[str, int]  # For each loose part, the index in ``Frame.moved`` at which its pose begins.
     requests: tuple[PageRequest, ...]  # Requests that have a button.
     changes: tuple[PageSetting, ...]  # Settings that have a slider.
     device: DeviceWords  # Words for the device that drives the arms.
@@ -50,8 +50,8 @@ class Frame:
     slowest: float  # Computing time of the slowest of these ticks [s].
     moved: Array | None  # MuJoCo's positions (qpos) of everything that moves.
     end: float = 0.0  # In a replay, the time up to which frames exist [s].
-    ages: Mapping[str, float] = field(default_factory=dict)  # By arm, the age of the newest pose of its hand [s].
-    why: Mapping[str, str] = field(default_factory=dict)  # By arm, the reason for its state that another program gives.
+    ages: Mapping[str, float] = field(default_factory=dict)  # For each arm, the age of its hand's newest pose [s].
+    why: Mapping[str, str] = field(default_factory=dict)  # Reasons of other programs for the states of arms.
     driver: str = ""  # The person or page that drives, in words; empty if not known.
     notice: str = ""  # The result of a request of a button, in words; empty if there is none.
     pictures: Mapping[str, bytes] = field(default_factory=dict)  # The newest pictures by camera, JPEG or PNG.

@@ -72,7 +72,7 @@ class ObstacleFigure:
 
     def __init__(self, scene: viser.SceneApi, name: str) -> None:
         self._scene, self._name = scene, name
-        # By obstacle: a tuple of its shape, size and colour; and its node in the scene.
+        # For each obstacle: a tuple of its shape, size and colour; and its node in the scene.
         self._drawn: dict[str, tuple[object, viser.SceneNodeHandle]] = {}
 
     def show(self, reports: Mapping[str, ObstacleReport]) -> None:

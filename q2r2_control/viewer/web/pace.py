@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable
 
-_TOLD = 10.0  # After a time without positions that was too long, the advice is shown for this time [s].
+_TOLD = 10.0  # If no position came for too long, the advice is then shown for this time [s].
 _CURE = (
     "Let go, then drag again. If it happens often, make the window smaller, close other programs, or open the page on "
     "another computer."
@@ -14,7 +14,7 @@ _CURE = (
 
 
 class BrowserPace:
-    """Measures how often a browser sends positions, and gives advice if it is too seldom.
+    """Measures how often a browser sends positions, and gives advice if it sends them too seldom.
 
     Arms stop if no position comes for ``allowed`` [s]. ``clock`` returns the time [s].
     """

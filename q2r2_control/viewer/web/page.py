@@ -52,7 +52,7 @@ class Page:
         self.lines: tuple[str, ...] = ()  # Lines for the user, with the URLs.
         self._certificate = certificate
         self.watched = False  # Whether any browser shows the page.
-        self._pictures: dict[str, bytes] = {}  # By camera, the picture that waits for the next frame.
+        self._pictures: dict[str, bytes] = {}  # For each camera, the picture that waits for the next frame.
         try:
             # Only one frame may wait, because a newer frame is better than a queue of old ones.
             self._process = HelperProcess("serves the page", "q2r2_control.viewer.web.server", self._on_answer, room=1)

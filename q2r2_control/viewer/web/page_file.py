@@ -32,7 +32,7 @@ class PageFile:
 
     def __init__(self, name: str) -> None:
         self._head = f"<title>{escape(name)}</title>{_PHONE}{_NOTICES}".encode()
-        self._made: dict[bytes, bytes] = {}  # The changed page, by viser's page. Both are plain or both are compressed.
+        self._made: dict[bytes, bytes] = {}  # For each page of viser, the page that replaces it.
 
     def change(self, response: Response) -> None:
         """Replace viser's page in ``response`` by the changed page. Responses that report an error stay as they are."""

@@ -107,7 +107,8 @@ class Panel:
         else:
             self._add_buttons(gui)
         self._banner = gui.add_html("", visible=False, order=-1.0)
-        # A small window shows only the top of the panel. Buttons are above lines that come and go, so that none moves.
+        # A small window shows only the top of the panel, so the buttons are there. Lines that come and go are below the
+        # buttons, so that no button moves.
         if driving is not None:
             with gui.add_folder("Grippers"):
                 driving.add_buttons(gui)
@@ -158,7 +159,7 @@ class Panel:
         self._time_line = gui.add_slider("time [s]", 0.0, 1.0, 0.01, 0.0)
 
         def seek(event: viser.GuiEvent[viser.GuiSliderHandle[float]]) -> None:
-            if event.client_id is not None:  # Without a client, the panel itself moved the slider.
+            if event.client_id is not None:  # If there is no client, the panel itself moved the slider.
                 self._answer(PageSeek(float(event.target.value)))
 
         self._time_line.on_update(seek)
@@ -230,7 +231,8 @@ class Panel:
             binding, self._binding = list(self._binding), {}
             self._table.content = self._drawn(frame, binding)
             self._advise(frame)
-            if self._told and not self._setup.replayed:  # In a replay, each frame has only the last events.
+            # In a replay, the frames do not have all events, so the lines about episodes are not shown.
+            if self._told and not self._setup.replayed:
                 self._episodes.content, self._episodes.visible = table(self._told[-_EPISODES:]), True
             if (pictures := self._pictures) is not self._pictured:
                 self._pictured, self._cameras.visible = pictures, True

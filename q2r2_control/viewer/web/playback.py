@@ -28,7 +28,7 @@ class Playback:
         self._view = view
         self._frames: list[Frame] = []
         self._times: list[float] = []  # Times of the frames [s].
-        self._told: dict[str, Told] = {}  # By arm, the events that say why it is in its state.
+        self._told: dict[str, Told] = {}  # For each arm, the events that say why it is in its state.
         self._ticks, self._slowest = 0, 0.0
         self._position, self._playing, self._complete = 0.0, True, False
         self._ended = Flag()

@@ -22,8 +22,8 @@ _BREAK = 1.0  # If the time between two points would be longer than this, a new 
 _AWAY = 0.01  # The ghost is shown if a joint is farther from its reference than this [rad].
 _SHORT = 0.01  # Lines up to this length are not drawn [m].
 _PER_NEWTON = 0.005  # Drawn length per force [m/N].
-# Forces are computed only in directions in which the ratio of the Jacobian's singular value to the largest one is above
-# this.
+# Forces are computed only in directions in which the Jacobian's singular value, divided by its largest one, is above
+# this number.
 _SINGULAR = 0.05
 _NEAR = 0.1  # A pair with this margin or more is green [m].
 _CAMERA = np.array([-1.8, 0.35, 1.5])  # Vector from the middle of the arms to the first position of the camera [m].
@@ -53,7 +53,7 @@ class CellScene:
         self._tightest = TightestPair(setup.model, setup.collision_model)
         self._tree = JointTree(setup)
         scene.set_up_direction("+z")
-        scene.configure_default_lights(cast_shadow=False)  # A browser without a GPU is then ten times as fast.
+        scene.configure_default_lights(cast_shadow=False)  # Without a GPU, shadows slow a browser down tenfold.
         scene.set_background_image(np.full((2, 2, 3), _BACKGROUND, dtype=np.uint8))
         scene.add_grid(
             "/floor",
@@ -115,7 +115,7 @@ class CellScene:
     def _add_choices(self, server: viser.ViserServer) -> viser.GuiInputHandle[bool]:
         """Add checkboxes for things that are drawn on request.
 
-        Return the checkbox with which the ghost, which shows the reference, is always drawn.
+        Return the checkbox for the ghost, which is the robot at its reference. If checked, the ghost is always drawn.
         """
         with server.gui.add_folder("View", order=1e9, expand_by_default=False):
             shadows = server.gui.add_checkbox("shadows", False, hint="slow without a graphics card")
@@ -159,7 +159,7 @@ class CellScene:
                 box.visible = True
 
     def _show_line(self, line: viser.LineSegmentsHandle, tool: pin.SE3, vector: Array | None) -> None:
-        """Draw a line from a ``tool`` along the ``vector`` (3,) [m]. If this is None or very short, hide the line."""
+        """Draw a line from a ``tool`` along ``vector`` (3,) [m]. Hide the line if the vector is None or very short."""
         line.visible = vector is not None and float(np.linalg.norm(vector)) > _SHORT
         if line.visible:
             line.points = np.array([[tool.translation, tool.translation + vector]])

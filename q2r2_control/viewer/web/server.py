@@ -34,7 +34,7 @@ class _Newest:
         self._ended = False
 
     def put(self, frame: Frame | None) -> None:
-        """Pass a frame on; None if no more frames follow."""
+        """Pass a frame on. A ``frame`` of None says that no more frames follow."""
         with self._condition:
             self._frame, self._ended = frame, frame is None
             self._condition.notify()
@@ -50,14 +50,14 @@ class _Newest:
 
 
 class LimitedAnswers:
-    """Passes answers of browsers on at a limited rate, because too many would take the interpreter from the loop.
+    """Passes answers of browsers on at a limited rate, because too many answers would delay the loop.
 
-    A stop is always passed on, and so is the loss of a page that drove.
+    A stop and the loss of a page that drove are always passed on.
     """
 
     def __init__(self, answer: Callable[[Any], None], clock: Callable[[], float] = time.monotonic) -> None:
         self._answer, self._clock, self._lock = answer, clock, Lock()
-        self._allowed, self._then = _BURST, clock()  # Number of answers that are allowed, at this time [s].
+        self._allowed, self._then = _BURST, clock()  # Number of answers that were allowed at a time, and this time [s].
 
     def __call__(self, answer: Any) -> None:
         with self._lock:

@@ -65,7 +65,7 @@ class PageView(Page):
         self._events: list[Event] = []
         self._binding: dict[ActiveLimit, None] = {}
         self._ticks, self._slowest = 0, 0.0
-        self._heard: dict[str, float] = {}  # By hand, the time of its newest pose, by the loop's clock [s].
+        self._heard: dict[str, float] = {}  # For each hand, the time of its newest pose on the loop's clock [s].
         self._plant: MujocoPlant | None = None  # The simulator whose loose objects are shown.
         self._input: WebInput | None = None  # The input that the page drives.
         self._requests: dict[PageRequest, Callable[[], None]] = {}
@@ -110,7 +110,7 @@ class PageView(Page):
             self._on_request = on_request
         config, plant = pipeline.config, pipeline.plant
         source: object = pipeline.input
-        while (operator := getattr(source, "operator", None)) is not None:  # A policy's input has an operator's input.
+        while (operator := getattr(source, "operator", None)) is not None:  # A policy's input may have an operator.
             source = operator
         self._input = source if isinstance(source, WebInput) else None
         self._source, self._nobody = source, pipeline.input.controls.words.nobody
