@@ -138,10 +138,10 @@ class MujocoPlant:
         self._grippers.command(command.grippers)
 
     def advance(self, dt: float) -> None:
-        """See :meth:`Plant.advance`. All whole physics steps that are due are taken, and the rest is carried over.
+        """See :meth:`Plant.advance`. All whole physics steps that are due are taken. The next call adds the rest.
 
         Raises:
-            PlantError: If ``dt`` is not allowed, or if the simulation has diverged. After ``reset`` it is usable again.
+            PlantError: If ``dt`` is not allowed, or if the simulation has diverged. ``reset`` makes it usable again.
         """
         check_duration(dt)
         if dt == 0:
@@ -160,7 +160,7 @@ class MujocoPlant:
         self._acceleration[self._v_index] = (self._end[1] - self._start[1]) / max(dt, self._timestep)
         due = math.floor(self._clock / self._timestep + _STEP_ROUNDING)
         while self._steps < due:
-            # A step may begin before the tick in which it ends. It then counts from the start of the tick.
+            # A step may begin before the tick in which it ends. The servos then use the start of the tick for it.
             self._step(max(self._steps * self._timestep - start, 0.0) / dt)
         if not math.isfinite(self._qvel.dot(self._qvel)):
             raise PlantError(f"the simulation diverged at {self._clock:.3f} s; reset it")

@@ -18,14 +18,15 @@ from q2r2_control.errors import PlantError
 from q2r2_control.process.machine_notes import has_display
 from q2r2_control.types import Array
 
-# Rotation from the axes of a MuJoCo camera, which looks along -z with y up in the picture, to those of our cameras,
+# Rotation from the axes of a MuJoCo camera, which looks along -z with y up in the picture, to the axes of our cameras,
 # which look along x with z up.
 _FROM_OURS = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 _STRAIGHT = 1e-9  # With a smaller sine of the angle to the vertical, the camera looks straight up or down.
-_LONGEST_CLOSE = 5.0  # Time to wait until a window is closed [s].
+_LONGEST_CLOSE = 5.0  # Longest time to wait until a window is closed [s].
 _OPACITY = 0.6  # Opacity of moving obstacles.
-# Size of the shadow map, number of samples per pixel, and numbers of slices and stacks of round shapes. On a computer
-# without a graphics card, MuJoCo's defaults (8192 and 8) take five times as long, and (28, 16) twice as long.
+# Size of the shadow map [pixels], number of samples per pixel, and numbers of slices and stacks of round shapes. On a
+# computer without a graphics card, a picture with the first two settings of the window (8192 and 8) takes five times as
+# long, and a picture with MuJoCo's default numbers of slices and stacks (28 and 16) twice as long.
 _SHADOW_MAP, _SAMPLES, _ROUND = 1024, 0, (16, 8)
 
 
@@ -53,14 +54,14 @@ def _orientation(camera: CameraConfig) -> Array:
     sight = np.subtract(camera.look_at, camera.position)
     sight /= np.linalg.norm(sight)
     left = np.cross((0.0, 0.0, 1.0), sight)
-    if np.linalg.norm(left) < _STRAIGHT:  # The camera looks straight up or down. The x axis of the link is up then.
+    if np.linalg.norm(left) < _STRAIGHT:  # The camera looks straight up or down. The link's x is up in the picture.
         left = np.cross((1.0, 0.0, 0.0), sight)
     left /= np.linalg.norm(left)
     return np.stack((sight, left, np.cross(sight, left)), axis=1)
 
 
 class CellPictures:
-    """Takes pictures with the cameras of a model, in one thread only, because OpenGL belongs to a thread."""
+    """Takes pictures with the cameras of a model, always in one thread, because a context of OpenGL belongs to it."""
 
     def __init__(self, model: mujoco.MjModel, cameras: Mapping[str, CameraConfig]) -> None:
         """Prepare pictures of a simulated cell.
@@ -121,7 +122,7 @@ class ThreadPictures:
 
 
 def window_fault() -> str | None:
-    """Return why no window can be opened; None if one can. MuJoCo would wait for ever for a window that cannot open."""
+    """Return why no window can be opened, or None. MuJoCo itself would wait for ever for a window that cannot open."""
     if not has_display():
         lacks = "neither DISPLAY nor WAYLAND_DISPLAY is set"
         return f"MuJoCo's window needs a display: {lacks}; --web shows the arms in a browser"

@@ -16,7 +16,7 @@ from q2r2_control.types import Array, Command, CommandMode, RobotState
 # A busy computer delivers commands unevenly. If the next command is late, a joint therefore goes on at its velocity for
 # this number of intervals between commands. The other two numbers are the bounds of this time [s].
 _COAST_INTERVALS, _SHORTEST_COAST, _LONGEST_COAST = 3.0, 0.01, 0.1
-# Share of the newest interval between commands in the running mean of these intervals.
+# Weight of the newest interval between commands in the running mean of these intervals.
 _INTERVAL_SHARE = 0.1
 
 
@@ -71,7 +71,8 @@ class JointFollower:
         )
         bounded = np.minimum(np.maximum(change, -largest), largest)
         self.q = self.q + bounded
-        # A joint far from its wanted position catches up at its limit. Its velocity is then that of this motion.
+        # A joint that is far from its wanted position catches up at its limit. ``v`` is then the velocity with which it
+        # catches up.
         on_time = np.abs(change) <= largest
         self.v = np.where(fresh, np.where(on_time, self._command_v, bounded / dt), slower)
 
@@ -86,8 +87,8 @@ _LONGEST_TORQUE = 0.012
 class SimulatedCell:
     """The simulated arms and their commands. If commands cease, position servos stop and hold the arms.
 
-    The method of a command returns None. If the command is refused, it changes nothing, and the method returns a line
-    of text with the reason.
+    A method that takes a command returns None if it follows the command. If it refuses the command, nothing changes,
+    and the method returns a line of text with the reason.
     """
 
     def __init__(self, robot: Robot, config: Config, hold_after: float, max_jump: float) -> None:
