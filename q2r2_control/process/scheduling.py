@@ -1,6 +1,7 @@
 """Prepare the process that runs a loop: real-time scheduling and signals.
 
-Real-time scheduling needs permissions. Without them a run goes on without it, and one line says so.
+Real-time scheduling needs permissions. Without these, a run goes on with the ordinary scheduler, and reports this in
+one line.
 """
 
 from __future__ import annotations

@@ -61,9 +61,9 @@ class CommandWatch:
     """Watches for other publishers of the topics on which a node commands arms.
 
     While the node commands, :meth:`intruder` finds a new publisher, and an earlier publisher that begins to send. While
-    the node does not command, it may listen, and :meth:`commander` tells whether another node commands. It listens by
-    best effort, so that nobody waits for its acknowledgements. The node also receives its own commands. It recognises
-    them by their bytes, because rclpy does not say who sent a message.
+    the node does not command, it may listen, and :meth:`commander` tells whether another node commands. The node
+    listens by best effort, so that no publisher waits for its acknowledgements. It also receives its own commands. It
+    recognises them by their bytes, because rclpy does not say who sent a message.
     """
 
     def __init__(self, node: BaseNode, kind: type, publishers: Iterable[WatchedPublisher]) -> None:

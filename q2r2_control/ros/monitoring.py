@@ -79,8 +79,9 @@ def publish_in_time(publisher: Any, message: Any, decided: float) -> bool:
     """Publish a message, unless its lifespan is over; returns whether it was published.
 
     The middleware counts the lifespan from the moment of publishing. If the process was frozen before that moment, it
-    would send an old command, and the arm would jump. Serialisation takes most of the time until the message is sent.
-    :class:`DelayWatch` covers the rest.
+    would send an old command, and the arm would jump. The time is therefore checked after serialisation, which takes
+    most of the time until the message is sent. If the process freezes after this check, the receiver's
+    :class:`DelayWatch` notices it.
 
     Args:
         publisher: The publisher.
@@ -203,7 +204,8 @@ class HandListeners:
     def __init__(self, node: Node, hands: Sequence[str]) -> None:
         self._states, self._hands = NodeStates(node, namespace=node.get_namespace()), hands
         self._began = self._asked_at = 0.0  # Times of the first and of the last query of the graph [s].
-        self._requests: dict[str, int] = {}  # By controller, how often its services to hold were called at the start.
+        # By controller, how often its services to hold, stop or go home had been called at the last :meth:`begin`.
+        self._requests: dict[str, int] = {}
 
     def look(self) -> None:
         now = time.monotonic()
@@ -235,8 +237,8 @@ class HandListeners:
     def asked_to_hold(self) -> bool:
         """Return whether a request to pause, reset, stop or go home was made.
 
-        It shows as an arm's last event, or as a call of a controller's service since :meth:`begin`. A controller that
-        was restarted counts its calls anew, and counts as such a request.
+        Such a request is an arm's last event, or a call of a controller's service since :meth:`begin`. A controller
+        that was restarted counts its calls from 0 again. Its new number then also counts as a request.
         """
         return self._new_requests() or any(
             state.get("last_event_kind") in HOLD_REQUESTS for _, state, _ in self._arms()

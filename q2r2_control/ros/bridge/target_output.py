@@ -58,7 +58,7 @@ class TargetOutput:
         self.guard = PoseRateLimiter(guard, 1.0 / values.rate)
         self._node, self._controller, self._frame = node, controller, frame
         self._template = pose_template(frame)
-        # The controller takes the velocity of the guarded pose instead of the pose.
+        # True if the controller gets the velocity of the guarded pose instead of the pose.
         self._is_twist = preset.message == TWIST
         kind = TwistStamped if self._is_twist else PoseStamped
         self._publisher = WatchedPublisher(node, kind, topic, values.listener_timeout)
@@ -136,7 +136,7 @@ class TargetOutput:
             base: The frame of the controller's targets, in the world frame; None if it is not known.
             now: The time [s].
             decided: See :func:`publish_in_time`.
-            start: The pose at which a new stream begins, in the world frame; None for the first target itself.
+            start: The pose at which a new stream begins, in the world frame; None if it begins at the first target.
             state: The state of the arm. In PAUSING the stream continues, because the press may become another gesture.
                 In PAUSED a message ends the stream. Without this message, the built-in controller also holds linked
                 arms.

@@ -26,6 +26,7 @@ def set_up_middleware(environment: MutableMapping[str, str]) -> None:
     if environment.get(_RANGE) != "LOCALHOST":
         environment.update({_TRANSPORTS: "UDPv4", _PROFILES_FILE: str(_PROFILES / "subnet.xml")})
     elif not environment.get(_PEERS):
-        # For LOCALHOST, ROS 2 adds shared memory against any profile. For SYSTEM_DEFAULT, it adds neither shared memory
-        # nor static peers. Therefore, with static peers, the range and its shared memory do not change.
+        # For LOCALHOST, ROS 2 adds shared memory even if a profile disables it. For SYSTEM_DEFAULT, it adds neither
+        # shared memory nor static peers. If the user has set static peers, the range therefore stays LOCALHOST, with
+        # shared memory.
         environment.update({_RANGE: "SYSTEM_DEFAULT", _PROFILES_FILE: str(_PROFILES / "localhost.xml")})

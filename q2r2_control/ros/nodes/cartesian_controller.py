@@ -128,7 +128,10 @@ class CartesianControllerNode(ManagedNode):
         self.get_logger().info(f"{config.name}: {', '.join(robot.arms)}; waits for joint states")
 
     def _standstill(self, output: str) -> StandstillLimits | None:
-        """Return the limits for a driver that stands still; None for compliant arms, which a person may hold."""
+        """Return the limits above which a driver counts as standing still; None for compliant arms.
+
+        A person may prevent the motion of a compliant arm.
+        """
         if output == NONE:
             return LAGGING_JOINTS
         return None if self._output.drive.yields else JOINTS
@@ -150,7 +153,7 @@ class CartesianControllerNode(ManagedNode):
         if self._output.waits():
             return  # This tick is missed, and the next one is late.
         now = self._clock_of_ticks.at(self.now)
-        # A late tick makes no jump, and a clock that was set back moves nothing.
+        # ``dt`` is bounded, so that a late tick causes no jump, and a clock that was set back causes no motion.
         gap = now - self._last_tick
         dt = self._loop.pace(gap)
         if gap > max(LONGEST_DT, self._watch.timeout):  # No tick came for longer than states may be missing.

@@ -280,7 +280,7 @@ class MujocoRobot(BaseNode):
         tau = state.tau.tolist() + [0.0] * len(cell.fingers)
         self._joint_states.publish(self._measured.fill(q + v + tau, stamp))
         if state.tau_external is not None and now >= self._external_due:
-            # The due times are on a grid, half a tick early, so that a tick that comes early by jitter counts.
+            # Each due time is half a tick before the regular time, so that a tick that comes slightly early publishes.
             self._external_due = max(self._external_due + self._external_period, now - 0.5 * self._period)
             if self._external.get_subscription_count():
                 self._external.publish(self._felt.fill(state.tau_external.tolist(), stamp))

@@ -24,7 +24,7 @@ _BEFORE_PRESS, _BEFORE_MOTION = FIRST_PRESS - 0.1, START - 0.05
 # Time after the first motion of the hands in which an arm that stops is engaged again, while other nodes start [s].
 _SETTLES = 6.0
 # After that time, an arm is engaged again only if it can be engaged within this time after it followed last [s]. A node
-# that stood still goes on sooner. A node that was killed counts as a second publisher for this time.
+# that stood still works again within this time. A node that was killed counts as a second publisher for this time.
 _RECOVERS = 3.0
 _MODES = {
     "all": (MessageType.POSE, MessageType.INPUTS, MessageType.TWIST),

@@ -14,7 +14,7 @@ from q2r2_control.teleop.arm_states import AT_REST, ArmState
 from q2r2_control.wording import sentence
 
 SILENT = 2.0  # A node without a report for this time is silent. Nodes report twice a second [s].
-_SLIPPED = 0.005  # A target that has slipped farther than this is held back [m].
+_SLIPPED = 0.005  # If leash and workspace hold the target back by more than this, the arm counts as held up [m].
 # Texts for states in which the arm moves already, or in which nothing is wrong.
 _MOVES = {
     ArmState.CARRIED: "goes with the other arm",
