@@ -114,7 +114,8 @@ class MujocoPlant:
         self._next: tuple[Array, Array] | None = None  # Commanded posture and velocity at the end of the next tick.
         self._torque: Array | None = None  # Commanded torque in torque mode.
         self._velocity: Array | None = None  # Commanded velocity in velocity mode, for the next advance.
-        self._pushes: dict[str, tuple[Array, int]] = {}  # Wrench and the step before which it ends, by arm.
+        # By arm, the wrench of a push, and the number of the physics step before which the push ends.
+        self._pushes: dict[str, tuple[Array, int]] = {}
         self._steps = 0
         self._clock = 0.0
         mujoco.mj_forward(self.model, self.data)
@@ -170,8 +171,8 @@ class MujocoPlant:
         index, data = self._v_index, self.data
         self.observed_qpos = self._qpos.copy()
         tau = data.qfrc_actuator.take(index)
-        # MuJoCo's sum of forces before contacts, minus the terms that are not external, leaves the pushes of
-        # :meth:`push` and of MuJoCo's window.
+        # ``qfrc_smooth`` is the sum of all forces except contacts and other constraints. Without the forces that are
+        # not external, it contains only the pushes of :meth:`push` and of MuJoCo's window.
         external = (data.qfrc_constraint + data.qfrc_smooth - data.qfrc_passive + self._bias).take(index) - tau
         q, v = self._qpos.take(self._q_index), self._qvel.take(index)
         return RobotState(q, v, tau, external, self._steps * self._timestep)

@@ -61,7 +61,7 @@ def _orientation(camera: CameraConfig) -> Array:
 
 
 class CellPictures:
-    """Takes pictures with the cameras of a model, always in one thread, because a context of OpenGL belongs to it."""
+    """Takes pictures with the cameras of a model. One thread must do this, because an OpenGL context belongs to it."""
 
     def __init__(self, model: mujoco.MjModel, cameras: Mapping[str, CameraConfig]) -> None:
         """Prepare pictures of a simulated cell.
@@ -71,7 +71,7 @@ class CellPictures:
             cameras: At least one of the cell's ``simulated_cameras``, by name.
 
         Raises:
-            PlantError: If OpenGL without a window is missing.
+            PlantError: If OpenGL cannot draw without a window.
         """
         model.vis.quality.shadowsize, model.vis.quality.offsamples = _SHADOW_MAP, _SAMPLES
         model.vis.quality.numslices, model.vis.quality.numstacks = _ROUND

@@ -163,13 +163,13 @@ def _correct_inertias(spec: mujoco.MjSpec) -> None:
 
 
 def _set_shapes(spec: mujoco.MjSpec, robot: Robot) -> None:
-    """Sort shapes into groups, keep envelopes out of contact, and restore capsules, which the URDF has as cylinders."""
+    """Sort shapes into groups, and exclude envelopes from contacts. Cylinders that stand for capsules become capsules."""
     declared = ET.fromstring(robot.urdf).iterfind("link/collision_checking/capsule")
     capsules = {capsule.get("name", "") for capsule in declared}
     for body in spec.bodies:
         drawn = any(not geom.contype for geom in body.geoms)
         for geom in body.geoms:
-            # Shapes of a URDF have no mass. Without this line, links without a mass would get one from their shapes.
+            # Shapes of a URDF have no mass. Without this line, links without a mass would get a mass from their shapes.
             geom.mass = 0.0
             if geom.name in capsules:
                 geom.type = mujoco.mjtGeom.mjGEOM_CAPSULE

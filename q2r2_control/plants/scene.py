@@ -100,7 +100,8 @@ _STIFFNESS = (0.02, 1.0)
 # Time constant of friction [s], and a damping ratio, which has no effect on friction.
 _SLIDING = (0.1, 1.0)
 
-# Stiffness of friction relative to the normal direction. It holds grasped objects, and a finger on an obstacle.
+# Stiffness of friction relative to the stiffness in the normal direction. With this value, grasped objects do not creep
+# out of the fingers, and a finger that rests on an obstacle does not creep over it.
 FRICTION_IMPEDANCE = 100.0
 
 

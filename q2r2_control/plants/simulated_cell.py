@@ -21,7 +21,7 @@ _INTERVAL_SHARE = 0.1
 
 
 class JointFollower:
-    """Computes the wanted position of each joint at any time, from the newest command that names it.
+    """Computes the wanted position of each joint at any time, from the newest command for this joint.
 
     A command has a posture and a velocity for one time. Until the next command, the joint moves on at that velocity. If
     no command comes for too long, the joint brakes at its ``acceleration_limit`` (nv,) [rad/s^2]. It therefore does not
@@ -115,7 +115,7 @@ class SimulatedCell:
         self.reset()
 
     def reset(self) -> None:
-        """Return home, at rest, with open grippers and without a command."""
+        """Put the arms at home, at rest, with open grippers and without a command."""
         self.plant.reset()
         self._follower.stop(self.robot.home, np.zeros_like(self.robot.home))
         self._tau: Array | None = None
@@ -159,7 +159,7 @@ class SimulatedCell:
         if len(v) != len(self._columns):
             return f"{len(v)} velocities for {len(self._columns)} joints"
         q = self._follower.q if self._tau is None else self.plant.state().q
-        if self._time is not None:  # The wanted position moves on to ``now``, because the follower is at the last step.
+        if self._time is not None:  # The follower has the position of the last physics step. It is moved on to ``now``.
             q = q + v * min(max(now - self._time, 0.0), _LONGEST_CATCH_UP)
         return self.command_positions(self.robot.joint_names, q, v, now)
 

@@ -205,7 +205,7 @@ def run_helper(module: str) -> None:
     After a failure, the last answer is a RuntimeError with the reason.
     """
     leave_signals_to_the_run()
-    stream, sys.stdout = sys.stdout.buffer, sys.stderr  # What a library prints must not be taken for an answer.
+    stream, sys.stdout = sys.stdout.buffer, sys.stderr  # The run must not read a library's output as an answer.
     lock = Lock()  # Answers are sent one after the other, although several threads may send them.
 
     def answer(content: Any) -> None:

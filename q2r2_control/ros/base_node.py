@@ -56,7 +56,7 @@ COMMAND_QOS = QoSProfile(depth=1)
 # clock of the receiver may differ.
 SENT_COMMAND_QOS = QoSProfile(depth=1, lifespan=Duration(seconds=0.1))
 # The profile of streams of a headset, of joint states or of nodes' reports, in which a late message is worth less than
-# the next one. A reliable subscription delivers in order: after a lost message, the next ones would wait up to 3 s.
+# the next one. A reliable subscription delivers in order: after a lost message, later messages would wait up to 3 s.
 STREAM_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 # The profile of messages that are only recorded. All of them are needed, but they may arrive late.
 RECORDED_QOS = QoSProfile(depth=200)
@@ -216,7 +216,7 @@ class BaseNode(Node):
 
 
 class ManagedNode(LifecycleNodeMixin, BaseNode):
-    """A node with a lifecycle, which starts active: ``ros2 lifecycle set /cartesian_controller deactivate``.
+    """A node with a lifecycle, which starts active. ``ros2 lifecycle set NODE deactivate`` makes it inactive.
 
     Subclasses override :meth:`begin` and :meth:`end`, which make the node active or inactive, or return why this is not
     possible. A transition is answered when it is complete. Parameters are read at the start only. For this reason

@@ -17,7 +17,7 @@ from q2r2_control.ros.base_node import STREAM_QOS, BaseNode
 from q2r2_control.ros.monitoring import WatchedPublisher, node_of
 from q2r2_control.ros.reasons import RosReason
 
-_DISCOVERY = 1.0  # Publishers that are discovered within this time count as older than the node [s].
+_DISCOVERY = 1.0  # Publishers that a new node discovers within this time count as older than the node [s].
 _GRAPH_PERIOD = 0.04  # Time between two queries of the graph [s].
 _UNKNOWN = "a node not known yet"  # The graph lists an endpoint before the name of the endpoint's node.
 HEARD = 0.3  # A node that sent a command within this time is a commander [s].

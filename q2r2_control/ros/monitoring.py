@@ -113,7 +113,7 @@ class WatchedPublisher:
         self._lately: deque[bytes] = deque(maxlen=_LATELY)
         self.own_listeners = 0  # Number of subscriptions of the same node, which acknowledge nothing.
         self._streaming = False
-        # Time when all messages were last acknowledged; None if they were not yet in this stream [s].
+        # Time when all messages were last acknowledged [s]; None if this has not happened yet in this stream.
         self._acknowledged: float | None = None
         self._gap_began = -math.inf  # Time since which messages are left out [s].
 
@@ -255,9 +255,9 @@ class HandListeners:
         )
 
     def lost(self) -> dict[str, str]:
-        """Return the reports of those arms' nodes whose arm is lost, because a fault or a request has stopped it.
+        """Return the reports of the nodes whose arms are lost, by name of the node.
 
-        The keys are the names of the nodes.
+        An arm is lost if a fault or a request has stopped it.
         """
         return {name: state["message"] for name, state, _ in self._arms() if state.get("state") == ArmState.LOST}
 

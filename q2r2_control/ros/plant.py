@@ -127,7 +127,7 @@ class RosPlant:
             return self._bad or Reason.of(SupervisionReason.NO_STATES_YET, source=_CURE)
         if not self._publisher.listeners:
             return Reason.of(RosReason.NO_SUBSCRIBER, topic=self._publisher.topic_name)
-        if self._seen <= self._received_since:  # The newest state came before the present receiver.
+        if self._seen <= self._received_since:  # The newest state came before the present receiver appeared.
             return Reason.of(SupervisionReason.NO_STATES_YET, source=_CURE)
         return self._bad
 

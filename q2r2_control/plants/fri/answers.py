@@ -1,4 +1,4 @@
-"""Compute where an arm has to be when its cabinet asks: the reference between ticks, and the time of an answer.
+"""Compute the posture in an answer to a cabinet: the reference between two ticks, at the time of the answer.
 
 **Two clocks.** A cabinet sends its questions by its own clock, which drifts against ours, through a network that delays
 and loses messages. To the cabinet, the difference between the positions of two answers, divided by its period, is a
@@ -30,7 +30,7 @@ from q2r2_control.types import Array
 
 CATCH_UP = 0.05  # The rate at which the times of answers pass differs from 1 by at most this number.
 CATCH_UP_RAMP = 0.4  # Greatest change of this rate per second [1/s].
-# Number of messages within which ``MessageClock`` follows a cabinet's clock that is slower than it was assumed.
+# If a cabinet's clock is slower than it was assumed, ``MessageClock`` adapts to it within this number of messages.
 _SETTLED = 500
 _PIECES = 1024  # Number of pieces of the path that are kept. A piece is the motion of one tick, or a stop.
 # Number of answers whose time is remembered. At the shortest period of 1 ms, these answers span four times the lag
@@ -188,7 +188,7 @@ class AnswerTimes:
         return self._answers.get(counter) or self._answers[min(self._answers)]
 
     def at(self, question: int, expected: float, counter: int, heard: int) -> float:
-        """Return the time on the path that an answer is for [s]. A repeated question gets the newest time again.
+        """Return the time on the path for an answer [s]. A repeated question gets the newest time again.
 
         Args:
             question: The counter of the question.

@@ -34,7 +34,7 @@ _MARGIN, _LONGEST_MARGIN = 0.002, 0.016
 _SHORTEST = 0.5
 _FORGETTING = 0.01  # Share by which the longest recent tick and the margin become shorter in each tick.
 _PASSING = 0.0015  # Approximate time that a measurement takes through cabinet, network and processes [s].
-_NO_COMMANDS = 0.1  # If all commands of a time longer than this come too late, this is reported as a fault [s].
+_NO_COMMANDS = 0.1  # If no command has come in time for longer than this, this is reported as a fault [s].
 # Time constant with which an arm loses its speed if no torque overlay comes: several periods of a cabinet [s].
 _BRAKING_TIME = 0.03
 _MISSING = 10  # If a cabinet's lost and unreadable messages reach this number in a run, they are reported.
@@ -97,7 +97,8 @@ class FriCell:
     def due(self, now: float) -> tuple[float, float]:
         """Return two durations for the tick at ``now`` [s]: the reference brakes first, and then moves [s].
 
-        In the first duration, the reference follows the certified stop. It is 0 if no answer passes the path's end.
+        In the first duration, the reference follows the certified stop. This duration is 0 if no answer is for a time
+        after the end of the path.
         """
         following = [state for state in self.states.values() if state.following]
         sent = now + self._margin

@@ -43,8 +43,8 @@ class FriPlant:
 
         Raises:
             ConfigError: If an arm lacks a cabinet or does not have seven joints, if the package of a gripper is
-                missing, or if ``control.max_substep`` is shorter than two loop periods. Then a late tick would be split
-                into steps, but a cabinet can follow only one parabola per tick.
+                missing, or if ``control.max_substep`` is shorter than two loop periods. With so short a value, a late
+                tick would be split into steps, but a cabinet can follow only one parabola per tick.
         """
         for arm, its in robot.arms.items():
             if arm not in set(config.fri):

@@ -29,7 +29,7 @@ DELAY = 0.004
 _AT_REST = 1e-9  # Greatest distance from the end of the path at which the arm counts as resting [rad].
 _RESTARTED = 1000  # A counter that goes back by more shows that the session has begun again.
 _COUNTERS = 1 << 32
-# A message's counter may have grown by twice the number of periods that have passed, plus this number.
+# A message's counter may have grown by at most twice the number of periods that have passed, plus this number.
 _MOST_AHEAD = 20
 # A torque without updates would push for ever. If it is older than the first of these times [s], it is replaced by a
 # torque that brakes. If it is older than the second time [s], the cabinet gets no answer, so that it ends the session.

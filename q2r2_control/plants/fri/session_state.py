@@ -37,10 +37,10 @@ class SessionState:
     ended: int = 0  # Number of times that the arm ceased to follow because its cabinet ended the session.
     answered: float = -math.inf  # The latest time on the path for which an answer was sent.
     expected: float = -math.inf  # The time at which the question of the newest answer would have come without delay.
-    # The time of an answer should be ``DELAY`` before the arrival of its question. By so much is the newest one
-    # earlier.
+    # The time of an answer should be ``DELAY`` before the arrival of its question. The lag is the time by which the
+    # newest answer is for an earlier time than this.
     lag: float = 0.0
-    # The same, but with ``expected`` instead of the arrival, so that delays of the network do not count.
+    # The lag with ``expected`` in place of the arrival, so that delays of the network do not count.
     behind: float = 0.0
     took: float | None = None  # Time from the newest message until its answer was sent; None if it got no answer.
     lost: int = 0  # Number of lost messages of the cabinet.

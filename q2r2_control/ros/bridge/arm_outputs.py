@@ -113,9 +113,9 @@ class ArmOutputs:
 
     @property
     def gripper_held(self) -> str | None:
-        """Return the pair of bodies that stops the gripper short of its requested opening, or None.
+        """Return which pair of bodies keeps the gripper from its requested opening, or None.
 
-        The built-in controller reports it.
+        The built-in controller reports this pair.
         """
         why = "" if self._follows is None else self._follows.gripper_held
         return f"the gripper goes no farther: {why}" if why else None
@@ -215,7 +215,7 @@ class FollowWatch:
         self._is_there, self._looked = False, -math.inf
         self.homing = False  # Whether the controller reports that it goes home.
         self.homing_outcome: Reason | None = None  # How the last motion home ended; None if nothing is reported.
-        self.gripper_held = ""  # The pair of bodies that stops the gripper; empty if none does.
+        self.gripper_held = ""  # The pair of bodies that stops the gripper; empty if no pair does.
         node.create_subscription(Bool, self._topic, self._on_following, LATCHED_QOS)
         node.create_subscription(String, self._state_topic, self._on_state, STREAM_QOS)
 

@@ -133,7 +133,7 @@ class TargetIntake:
             self._refused.pop(arm, None)
 
     def _due(self, arm: str, made: int, received: float) -> float | None:
-        """Return when a target is due [s], by its stamp [ns]; None if the stamp does not tell."""
+        """Return when a target is due [s], from its stamp ``made`` [ns]; None if the stamp does not show this."""
         stamp, stamps = 1e-9 * made, self._stamps[arm]
         known = stamp > 0.0 and stamps.take(received - stamp, received) == 0.0
         return stamp + stamps.usual if known else None
@@ -171,7 +171,7 @@ def _frame_of(node: BaseNode, robot: Robot, arm: str) -> TargetFrame:
 
 
 class JointIntake:
-    """Merges joint states of one topic or several into one state of all arms. It is as old as its oldest part."""
+    """Merges joint states from one or more topics into one state of all arms, with the time of its oldest part."""
 
     def __init__(
         self, node: BaseNode, robot: Robot, needs_external_torque: bool = False, told_by_drivers: bool = False
@@ -293,7 +293,10 @@ class JointIntake:
         return text if len(self._topics) == 1 else f"{topic}: {text}"
 
     def _part(self, topic: str, given: tuple[str, ...]) -> tuple[list[str], npt.NDArray[np.intp]]:
-        """Return the names and indices of a topic's joints that a message has. Each arm may have its own publisher."""
+        """Return names and indices of those joints of a topic that are in a message with the names ``given``.
+
+        A message may contain only some of them, because each arm may have its own publisher.
+        """
         if (part := self._parts.get((topic, given))) is None:
             if len(self._parts) >= _PARTS:  # The cache fills only if a publisher sends other names each time.
                 self._parts.clear()

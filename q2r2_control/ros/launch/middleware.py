@@ -17,7 +17,7 @@ _RANGE, _PEERS = "ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_STATIC_PEERS"
 
 
 def set_up_middleware(environment: MutableMapping[str, str]) -> None:
-    """Add the variables for Fast DDS before ``rclpy.init``. The user's own settings and another middleware stay."""
+    """Add the variables for Fast DDS before ``rclpy.init``, unless the user has set these or another middleware."""
     if not environment.get("RMW_IMPLEMENTATION", _FAST_DDS).startswith(_FAST_DDS):
         return
     # ROS_LOCALHOST_ONLY overrides the discovery range. With it, shared memory is used even if a profile disables it.

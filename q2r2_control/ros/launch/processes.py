@@ -201,7 +201,7 @@ def _start(node: NodeProcess) -> subprocess.Popen[str]:
         stderr=subprocess.STDOUT,
         text=True,
         errors="replace",
-        env=_LOG_FORMAT | os.environ | {"PYTHONUNBUFFERED": "1"},  # The user's own format stays.
+        env=_LOG_FORMAT | os.environ | {"PYTHONUNBUFFERED": "1"},  # A format that the user has set is kept.
         start_new_session=True,
         preexec_fn=None if _prctl is None else lambda: _end_with(parent),
     )

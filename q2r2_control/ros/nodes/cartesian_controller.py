@@ -47,7 +47,7 @@ from q2r2_control.supervision.tick_pacer import TickClock
 from q2r2_control.types import LONGEST_DT, Reference
 from q2r2_control.wording import sentence
 
-_LONGEST_STOP = 3.0  # Longest time until the arms rest at the end [s].
+_LONGEST_STOP = 3.0  # When the node ends or is deactivated, longest time until the arms rest [s].
 _QUIET = 0.3  # The node commands only after other commanders have been silent for this time [s].
 _LONGEST_ACTIVATION = 2.0  # Longest time of an activation in addition to the settle time [s].
 _SAFE_TARGET_PERIOD = 0.02  # Time between two safe targets if no other controller follows them [s].

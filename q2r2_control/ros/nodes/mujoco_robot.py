@@ -3,7 +3,7 @@
 Joint positions come in on any one of ``joint_trajectory`` (one point), ``joint_commands`` (JointState) and
 ``position_commands`` (Float64MultiArray in the order of the joints in ``joint_states``, all arms). Velocities come in
 on ``velocity_commands`` and torques on ``torque_commands``, in the same order. The newest command counts. Without
-commands the arms brake, and after ``hold_after`` their position servos hold them, whatever commanded them before.
+commands the arms brake, and after ``hold_after`` their position servos hold them, after any kind of commands.
 """
 
 from __future__ import annotations
