@@ -163,7 +163,10 @@ def _correct_inertias(spec: mujoco.MjSpec) -> None:
 
 
 def _set_shapes(spec: mujoco.MjSpec, robot: Robot) -> None:
-    """Sort shapes into groups, and exclude envelopes from contacts. Cylinders that stand for capsules become capsules."""
+    """Sort shapes into groups, and exclude envelopes from contacts.
+
+    The URDF has a cylinder for each capsule. This function turns these cylinders into capsules.
+    """
     declared = ET.fromstring(robot.urdf).iterfind("link/collision_checking/capsule")
     capsules = {capsule.get("name", "") for capsule in declared}
     for body in spec.bodies:

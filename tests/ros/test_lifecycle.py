@@ -1,4 +1,7 @@
-"""The controller as a managed node: it rests before it answers, sends no commands while inactive, and never jumps."""
+"""The controller as a managed node. It lets the arms rest before it answers, and sends no commands while inactive.
+
+No arm ever jumps.
+"""
 
 from __future__ import annotations
 

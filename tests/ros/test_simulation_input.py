@@ -40,7 +40,7 @@ def subscribe(node: Any, hand: str) -> dict[str, Queue[Any]]:
 
 
 def assert_a_part_of(received: Array, script: Array) -> None:
-    """Assert that ``received`` is a run of rows of ``script``. The first rows may be lost before discovery."""
+    """Assert that ``received`` contains successive rows of ``script``. The first rows may be lost before discovery."""
     starts = range(len(script) - len(received) + 1)
     assert min(float(np.abs(script[start : start + len(received)] - received).max()) for start in starts) <= 1e-6
 
