@@ -126,7 +126,7 @@ def test_the_bench_runs_our_controller_in_free_air_and_in_the_cell(monkeypatch: 
     assert report.notes[0] == f"missing: not installed; {INSTALL}"
     assert report.notes[1].startswith("broken: cannot be built for this cell: ModuleNotFoundError")
     assert ours.min_distance_mm is not None
-    assert ours.min_distance_mm >= 1.0  # The nearest pair is a finger and an obstacle, which keep 1 mm.
+    assert ours.min_distance_mm >= 1.0  # The nearest pair, a finger and an obstacle, keeps 1 mm.
     assert row.free_air.rms_error_mm is not None
     assert ours.rms_error_mm is not None
     # The target is 10 mm lower than the table allows.

@@ -288,7 +288,7 @@ def test_if_gravity_alone_needs_too_much_torque_the_note_does_not_advise_slower_
     )
 
 
-def test_check_notes_a_control_for_grippers_that_do_not_exist() -> None:
+def test_check_prints_a_note_about_a_control_for_grippers_that_do_not_exist() -> None:
     def notes_with(gripper: dict[str, object]) -> list[str]:
         cell = one_arm(tool={"model": "hand_e", "frame": "tool_frame"}, gripper=gripper)
         bindings = BindingSettings(upper=Action.NONE, trigger=Action.GRIPPER_ANALOG)

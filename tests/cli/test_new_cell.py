@@ -134,7 +134,7 @@ def test_the_answers_of_the_user_are_written_into_the_cell(tmp_path: Path) -> No
 @pytest.mark.slow
 def test_the_answers_of_an_interrupted_try_are_offered_in_the_next_try() -> None:
     command = ("new-cell", "cell", "--left", "iiwa7", "--right", "iiwa7", "--samples", "100")
-    interrupted = q2r2(*command, typed="0.9\n0.1\n")  # the terminal ends at the third question
+    interrupted = q2r2(*command, typed="0.9\n0.1\n")  # The input ends at the third question.
     assert interrupted.exit_code != 0
     assert not Path("cell.yaml").exists()
     result = q2r2(*command, typed="\n\n\n\n")

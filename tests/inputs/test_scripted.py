@@ -219,7 +219,7 @@ def test_a_motion_reaches_each_way_point_at_its_time_and_rests_there() -> None:
 
 @pytest.mark.slow
 def test_the_headset_loses_shaky_hands_for_a_second_and_they_engage_again_and_complete_the_work() -> None:
-    for seed in (3, 6, 12):  # The loss is early, late, and moved behind a press.
+    for seed in (3, 6, 12):  # With these seeds, the loss comes early, comes late, and is moved behind a press.
         calm, hasty = trajectory_named("carry"), hurried(trajectory_named("carry"), seed)
         assert hasty.duration is not None
         samples = [s for s in play(ScriptedInput("carry", shaky=True, seed=seed), hasty.duration) if s.hand == "left"]

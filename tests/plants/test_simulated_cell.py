@@ -1,4 +1,4 @@
-"""The simulated cell behind a topic: what acts on it between two commands, with a simulated clock."""
+"""How the simulated cell of ``mujoco_robot`` moves between two commands. The tests set its clock."""
 
 from __future__ import annotations
 

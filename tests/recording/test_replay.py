@@ -1,4 +1,4 @@
-"""A replay repeats a run to the bit, and names each difference."""
+"""A replay repeats a run with the same bits, and names each difference."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Settings of arms and of the controller come from the YAML or from parameters. A change of a setting causes no jump."""
+"""Settings of arms and of the controller come from the YAML or from parameters. Changes of settings cause no jump."""
 
 from __future__ import annotations
 
