@@ -77,7 +77,7 @@ class JointFollower:
         self.v = np.where(fresh, np.where(on_time, self._command_v, bounded / dt), slower)
 
 
-# Longest time that a late loop catches up [s]. The rest is dropped, because it would be a jump.
+# Longest time that a late loop catches up [s]. The rest is dropped, because it would cause a jump.
 _LONGEST_CATCH_UP = 0.05
 # Time for which one torque acts [s]. A real robot stops if its sender misses a few periods. The simulation instead lets
 # no time pass until the next torque.
@@ -199,7 +199,8 @@ class SimulatedCell:
         """Take all physics steps that are due at ``now`` [s], and return the measured state."""
         before = now if self._time is None else self._time
         time = max(before, now - _LONGEST_CATCH_UP)
-        # If the last torque is too old to act, but the arms are not held yet, the simulation waits for the sender.
+        # If the last torque is too old to act, but servos do not hold the arms yet, the simulation waits for the
+        # sender.
         age = now - self._last_command
         if self._tau is not None and _LONGEST_TORQUE < age <= self._hold_after:
             time = min(time + age - _LONGEST_TORQUE, now)

@@ -124,7 +124,8 @@ class Cluster:
             for due in range(len(calls)):
                 while due not in outcomes:
                     number = self._next(client, finished)
-                    # The future is dropped together with its result. Otherwise the scheduler might repeat the job.
+                    # The future is dropped as soon as its result is read. Otherwise, the scheduler might repeat the job
+                    # if the worker with the result ends.
                     outcomes[number] = self._outcome(waiting.pop(number))
                 result, error = outcomes.pop(due)
                 if error is not None:

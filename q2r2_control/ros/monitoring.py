@@ -33,7 +33,7 @@ _LATELY = 32  # Number of sent messages that are remembered. The queue of the no
 _STATE = "/state"
 _LOOK_PERIOD = 0.3  # Time between two queries of the graph for nodes that report [s].
 _DISCOVERY = 2.0  # Time in which the node of every running arm has reported. Nodes report twice a second [s].
-_SILENT, _GONE = 2.0, 5.0  # Times without a report, after which a node is silent, and has gone [s].
+_SILENT, _GONE = 2.0, 5.0  # Times without a report after which a node counts as silent, and as ended [s].
 _ARM = {"engaged", "ready", "hand"}  # The keys by which the report of an arm's node is recognised.
 # Names of nodes by the unique number of an endpoint. The graph loses a node that was frozen or unreachable for longer
 # than its lease. The node comes back with the same endpoints, but Fast DDS does not learn its name again.

@@ -40,7 +40,8 @@ from q2r2_control.types import ArmTiming, Array, Command, CommandMode, RobotStat
 from q2r2_control.wording import sentence
 
 _WAIT = 5.0  # Longest time to wait for joint states and for a receiver of the commands [s].
-_QUIET = 1.0  # Time for which the plant first listens for other commanders, which must be discovered [s].
+# Time for which the plant listens for other commanders before it commands, so that they can be discovered [s].
+_QUIET = 1.0
 _CURE = "; start the robot, and see q2r2 ros doctor"
 _AWAY = 0.02  # If a command is farther than this from the measured joints, a new receiver lets the arms jump [rad].
 
@@ -192,7 +193,7 @@ class RosPlant:
 
     def state(self) -> RobotState:
         state = self._joints.state
-        assert state is not None  # It exists since the reset.
+        assert state is not None  # A state has existed since the reset.
         return state
 
     def gripper_openings(self) -> dict[str, float]:

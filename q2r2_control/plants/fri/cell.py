@@ -130,7 +130,7 @@ class FriCell:
             damping = pin.crba(model, data, measured).diagonal() / _BRAKING_TIME
         for arm, joints in self._joints.items():
             deceleration = command.deceleration
-            # A reference at rest has no deceleration. Any positive number may stand in its place.
+            # The command of a reference at rest has no deceleration. Any positive number is then allowed here.
             stop = (1.0,) * JOINTS if deceleration is None else joints_of(deceleration[joints])
             q, v = joints_of(command.q[joints]), joints_of(command.v[joints])
             its = sent[arm] = ArmCommand(self._now, self._start, self._end, q, v, stop)

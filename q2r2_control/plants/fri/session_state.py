@@ -37,8 +37,8 @@ class SessionState:
     ended: int = 0  # Number of times that the arm ceased to follow because its cabinet ended the session.
     answered: float = -math.inf  # The latest time on the path for which an answer was sent.
     expected: float = -math.inf  # The time at which the question of the newest answer would have come without delay.
-    # The time of an answer should be ``DELAY`` before the arrival of its question. The lag is the time by which the
-    # newest answer is for an earlier time than this.
+    # An answer should be for the time ``DELAY`` before the arrival of its question. The newest answer is for a time
+    # that is earlier than this by the lag.
     lag: float = 0.0
     # The lag with ``expected`` in place of the arrival, so that delays of the network do not count.
     behind: float = 0.0

@@ -96,7 +96,7 @@ class FrameTree:
                 place = self._found[frame, within] = Placement(pose, received)
                 self._used.update(up, passed)  # ``up`` contains all ancestors of this common ancestor.
                 self._all = False
-                return place  # The placement is remembered until the next transform, which clears all of them.
+                return place  # The placement is remembered until the next transform, which clears all placements.
         self._all = True
         return None
 

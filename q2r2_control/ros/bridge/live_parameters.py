@@ -82,7 +82,7 @@ def make_control_live(node: BaseNode, controller: CartesianController) -> None:
         field = ControllerSettings.model_fields[name]
         value, within = getattr(controller.settings, name), range_of(field)
         if name == "min_distance":
-            # The range is written here, because the field does not contain the bounds of this type.
+            # The range is given here, because the metadata of this field do not contain the bounds of its type.
             within = 0.0, max(CLEARANCE, value)
         node.parameter(f"control.{name}", value, field.description or name, read_only=False, within=within)
 

@@ -125,7 +125,7 @@ class RecorderLink:
         node.create_subscription(String, self._topic, self._on_state, STREAM_QOS)
 
     def update(self, marks: EpisodeMarks) -> list[Reason]:
-        """Update the marks before the teleoperation of a tick. Return the reasons of newly reported events."""
+        """Update the marks of episodes before the teleoperation of a tick. Return the reasons of new events."""
         if self._state is not None:
             marks.restore(self._state)
             self._state = None

@@ -57,7 +57,7 @@ class CartesianControllerNode(ManagedNode):
     """Passes the messages of its topics to a :class:`ControlLoop`, and publishes the commands of this loop."""
 
     ticks = True
-    priority = 40  # No other program may delay a joint command. ros2_control runs drivers at 50.
+    priority = 40  # No other program may delay a joint command. ros2_control runs drivers at the priority 50.
 
     def __init__(self) -> None:
         super().__init__("cartesian_controller")
@@ -156,7 +156,7 @@ class CartesianControllerNode(ManagedNode):
         # ``dt`` is bounded, so that a late tick causes no jump, and a clock that was set back causes no motion.
         gap = now - self._last_tick
         dt = self._loop.pace(gap)
-        if gap > max(LONGEST_DT, self._watch.timeout):  # No tick came for longer than states may be missing.
+        if gap > max(LONGEST_DT, self._watch.timeout):  # The gap is longer than the time that states may be missing.
             self._supervisor.stalled(gap, now)
         self._last_tick = now
         self.ticked += 1

@@ -173,7 +173,7 @@ class MujocoRobot(BaseNode):
         self._robot = Robot.from_config(config)
         self._cell = SimulatedCell(self._robot, config, hold_after, max_jump)
         self._period = 1.0 / rate
-        self._received = 0.0  # Receipt time of the command in progress [s].
+        self._received = 0.0  # Receipt time of the command that is being processed [s].
         self._refused: dict[str, str] = {}
         self._refusals = 0
         self._delays: dict[tuple[str, ...], DelayWatch] = {}  # The delays of commands, by topic and first joint.
@@ -237,8 +237,8 @@ class MujocoRobot(BaseNode):
         take(message, info)
 
     def _take(self, topic: str, command: Callable[[Any], str | None], message: Any, info: Mapping[str, Any]) -> None:
-        # Delays are watched by topic and first joint. Two controllers, each of one arm, may send on one topic from
-        # hosts with different clocks.
+        # Delays are watched separately for each topic and each first joint, because two controllers, each for one arm,
+        # may send on the same topic from hosts with different clocks.
         names = message.joint_names if topic == _TRAJECTORY else getattr(message, "name", ())
         delays = self._delays.setdefault((topic, *names[:1]), DelayWatch(STREAM_TIMEOUT))
         if late := delays.take(delay(info), time.monotonic()):

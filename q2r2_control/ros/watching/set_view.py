@@ -156,7 +156,7 @@ def _why(node: NodeView, controller: NodeView | None, cell: Config) -> str:
         bindings = cell.teleop.bindings
         control = bindings.words_of(Action.PAUSE_TOGGLE) or bindings.words_of(Action.DEAD_MAN)
         press = "a press" if control is None else QUEST_WORDS.noun(control)
-        # The state is cut off, because it is shown beside this text.
+        # The name of the state at the beginning of the text is left out, because it is shown beside this text.
         last = str(values.get("last_event", "")).removeprefix(f"{state}: ")
         return f"waits for its operator: {press} of the {values.get('hand')} hand engages (last: {last})"
     return node.message.removeprefix(f"{state}: ")
