@@ -222,7 +222,7 @@ def test_two_links_are_ignored_only_if_all_pairs_of_their_shapes_overlap(tmp_pat
 
 
 @pytest.mark.slow
-def test_meshes_that_one_capsule_fits_badly_get_several_capsules_and_the_tools_follow(tmp_path: Path) -> None:
+def test_meshes_that_one_capsule_fits_badly_get_several_capsules_with_which_a_run_succeeds(tmp_path: Path) -> None:
     model = "example-robot-data:ur5"
     made = one_object(
         q2r2("new-cell", "cell", "--left", model, "--right", model, "--yes", "--samples", "100", "--json").stdout

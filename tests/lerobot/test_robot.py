@@ -130,7 +130,7 @@ def test_arms_behind_cabinets_follow_actions_like_simulated_arms(tmp_path: Path)
     assert_follows_behind(robot, "q2r2_control", "fri-cabinet", str(file))
 
 
-def test_arms_behind_ros_follow_actions_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_arms_behind_ros_also_follow_actions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("rclpy", reason="make test-lerobot-ros installs it")
     coordinator = pytest.importorskip("domain_coordinator")
     cell = write_cell(tmp_path, {"loop_rate_hz: auto": f"loop_rate_hz: {ROS_RATE}"})

@@ -342,7 +342,7 @@ def test_the_executor_raises_the_error_of_a_callback(make: Any, ticking: Ticking
         spin_until(executor, lambda: False)
 
 
-def test_an_executor_of_rclpy_runs_ticks_and_callbacks_of_messages_too(ticking: Ticking, context: Any) -> None:
+def test_an_executor_of_rclpy_also_runs_ticks_and_callbacks_of_messages(ticking: Ticking, context: Any) -> None:
     plain, publisher = SingleThreadedExecutor(context=context), ticking.listen()
     plain.add_node(ticking)
     ticking.create_tick(PERIOD, lambda: ticking.log.append("tick"))
