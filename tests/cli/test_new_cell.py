@@ -72,7 +72,7 @@ def test_a_folder_that_cannot_be_written_is_refused_before_the_models_are_read(m
 
 
 @pytest.mark.slow
-def test_a_fault_of_the_written_cell_names_links_without_masses_as_left_to_do() -> None:
+def test_a_fault_names_the_links_without_masses_and_a_line_says_that_these_masses_are_left_to_do() -> None:
     Path("arm.urdf").write_text(re.sub(r"<inertial>.*?</inertial>", "", IIWA, flags=re.DOTALL))
     result = q2r2("new-cell", "cell", "--left", "arm.urdf", "--yes", "--samples", "100")
     assert result.exit_code == 1
@@ -159,7 +159,7 @@ def test_arguments_of_xacro_go_into_the_cell(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_an_mjcf_becomes_a_urdf_beside_the_cell_which_runs(tmp_path: Path) -> None:
+def test_an_mjcf_becomes_a_urdf_beside_the_new_cell_and_the_new_cell_runs(tmp_path: Path) -> None:
     bodies = "".join(
         f"""<body name="link_{i}" pos="0 0 {0.1 if i == 1 else 0.25}"><joint name="j{i}" axis="{axis}"
         range="-110 110" actuatorfrcrange="-200 200"/><geom type="capsule" fromto="0 0 0.06 0 0 0.19" size="0.05"/>"""

@@ -159,7 +159,7 @@ def test_an_arm_needs_the_pose_of_its_tool_and_a_gripper_needs_its_server(rig: A
     assert rig.state["gripper"] == "open"
 
 
-def test_each_of_the_services_pause_and_reset_pauses_the_arm_and_so_does_a_second_publisher_of_targets(
+def test_the_services_pause_and_reset_pause_the_arm_and_a_second_publisher_of_targets_pauses_it_too(
     rig: ArmRig, node: Any, processes: Processes
 ) -> None:
     rig.start(processes)

@@ -133,7 +133,7 @@ def test_a_new_receiver_gets_no_commands_while_the_arms_are_elsewhere(
 
 
 @pytest.mark.parametrize("begins", ["a publisher that appears", "one that was silent"])
-def test_if_another_node_commands_the_arms_they_are_released_and_this_node_is_named(
+def test_if_another_node_commands_the_arms_they_are_released_and_the_other_node_is_named(
     begins: str, cell: Cell, config: Config, caplog: pytest.LogCaptureFixture
 ) -> None:
     goal, other = cell.q.copy(), None

@@ -149,7 +149,7 @@ def test_torques_are_refused_for_a_cabinet_whose_period_is_too_long() -> None:
     assert sentence(fault) == "left: the cabinet asks every 10 ms; allowed for torques: 5 at most"
 
 
-def test_the_end_of_a_session_is_a_fault_and_the_arm_follows_no_more() -> None:
+def test_the_end_of_a_session_is_a_fault_and_the_arm_no_longer_follows() -> None:
     cabinet = Cabinet()
     cabinet.ask(WAITING)
     cabinet.ask(ACTIVE)
