@@ -1,4 +1,4 @@
-"""Events are data that recordings and ROS messages carry completely. Sentences are only for display."""
+"""Recordings and ROS messages contain events as data, without loss. Sentences about events are only for display."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ from tests.support.modules import ROOT, load_script
 PACKAGE = "q2r2_control"
 HEAVY = (f"{PACKAGE}.control.controller", "mujoco", "numba", "matplotlib")
 ROS = ROOT / PACKAGE / "ros"
-# Some distributions have another name than their import.
+# Some distributions have another name than the module that they install.
 IMPORTS = {
     **{"pin": "pinocchio", "example-robot-data-loaders": "example_robot_data", "PyYAML": "yaml", "pin-pink": "pink"},
     "pillow": "PIL",

@@ -50,7 +50,8 @@ class Plant(Protocol):
     def apply(self, command: Command) -> None:
         """Take a command. Posture and velocity are due at the end of the next ``advance``; a torque acts at once.
 
-        If no newer command comes, later calls of ``advance`` hold this command's posture at rest, or its torque.
+        If no newer command comes, later calls of ``advance`` keep the robot at rest in this command's posture, or keep
+        applying its torque.
 
         Raises:
             PlantError: If the plant lacks the mode, or a number is not finite. The previous command then stays.
@@ -80,7 +81,11 @@ class WindowedPlant(Protocol):
         """Open the window; raises :class:`PlantError` if there is no display."""
 
     def viewer_sync(self, obstacles: Iterable[tuple[MovingObstacle, tuple[int, int, int]]] = ()) -> bool:
-        """Show the plant and ``obstacles``, each with its colour r g b (0 to 255); returns False after it is closed."""
+        """Show the plant and ``obstacles``, each with its colour r g b (0 to 255).
+
+        Returns:
+            False after the window was closed.
+        """
 
 
 @runtime_checkable
@@ -97,22 +102,26 @@ class PicturedPlant(Protocol):
 
 @runtime_checkable
 class SessionPlant(Protocol):
-    """The additional methods of a plant whose arms follow only during sessions, each arm with its own timing.
+    """The additional methods of a plant whose arms follow commands only during sessions, each arm with its own timing.
 
-    The arms start where they stand. If the session of one arm ends, the run goes on. All arms brake. They are activated
-    again where they rest, as soon as all of them are in a session again.
+    The arms start where they stand. If the session of one arm ends, all arms brake, but the run goes on. The arms are
+    activated again in the postures in which they rest, as soon as all of them are in a session again.
     """
 
     realtime_only: bool
 
     def begin(self, mode: CommandMode, stopped: Callable[[], bool]) -> None:
-        """Prepare for commands of ``mode`` after the next ``reset``, which ends its wait if ``stopped()`` is True."""
+        """Prepare for commands of ``mode``, which come after the next ``reset``.
+
+        The reset waits for sessions. It ends this wait as soon as ``stopped()`` returns True.
+        """
 
     def due(self, now: float) -> tuple[float, float]:
-        """Return two durations for the tick at ``now`` [s]: of the certified stop, and of the motion after it [s].
+        """Return the durations of two motions in the tick at ``now`` [s]: a certified stop, and a new motion [s].
 
-        If a command was late, the plant already follows the certified stop, and the first duration says for how long;
-        otherwise it is 0. The tick's command is for the end of both durations.
+        If a command was late, the arms have already begun the certified stop. The reference then follows this stop for
+        the first duration; otherwise the first duration is 0. The new motion follows. The tick's command is the state
+        of the reference at the end of the new motion.
         """
 
     def withdraws(self) -> bool:
@@ -131,7 +140,10 @@ class SessionPlant(Protocol):
         """
 
     def fault(self) -> Reason | None:
-        """Return why the arms cannot be commanded, or could not at some time since the last call; otherwise None."""
+        """Return why the arms cannot be commanded now, or why they could not at some time since the last call.
+
+        The result is None if the arms could always be commanded.
+        """
 
     def sessions(self) -> dict[str, str]:
         """Return the state of each arm's session in words."""
@@ -139,7 +151,7 @@ class SessionPlant(Protocol):
 
 @runtime_checkable
 class RealPlant(Protocol):
-    """The additional method of a plant that can drive real arms. Its joints move slowly until the user allows more."""
+    """The additional method of a plant that can drive real arms. They move slowly until the user allows more speed."""
 
     @classmethod
     def drives_real_arms(cls, config: Config) -> bool:
@@ -204,8 +216,8 @@ def keeps_jerk_limit(plant: Plant, mode: CommandMode) -> bool:
     """Return whether commands reach the arms within ``control.jerk_limit``; True in torque mode, which has no limit.
 
     For most plants, the loop's drive averages the commands, and the averages keep the limit. A :class:`SessionPlant`
-    executes the certified stop by itself. It therefore has to average what it sends to the arms, and then has the
-    attribute ``averages``, which is True.
+    executes the certified stop by itself, so that the drive cannot average this motion. Such a plant keeps the limit
+    only if it averages what it sends to the arms. It then has an attribute ``averages``, which is True.
     """
     return mode is CommandMode.TORQUE or not isinstance(plant, SessionPlant) or getattr(plant, "averages", False)
 
@@ -247,7 +259,7 @@ def _check_shape(what: str, values: Array, robot: Robot) -> None:
 
 
 def check_state(state: RobotState, robot: Robot) -> RobotState:
-    """Return the first ``state`` of a plant. Its numbers need not be finite.
+    """Return ``state``, the first state of a plant, if its types and shapes are right. NaN and infinity are allowed.
 
     Raises:
         PlantError: If ``state`` is not a RobotState with arrays of the robot's shape.
@@ -283,7 +295,10 @@ class GripperMotion:
         self._wanted = dict(self.openings)
 
     def command(self, openings: dict[str, float]) -> None:
-        """Set the commanded openings. Arms without a gripper are ignored, and grippers without an entry keep theirs."""
+        """Set the commanded openings. Entries of arms without a gripper are ignored.
+
+        A gripper without an entry keeps the opening that was commanded before.
+        """
         for arm in self._rate:
             if arm in openings:
                 self._wanted[arm] = float(openings[arm])

@@ -18,8 +18,9 @@ from q2r2_control.types import Array
 if TYPE_CHECKING:
     from q2r2_control.plants.mujoco_cameras import CellPictures
 
-# Environment variables of the process that takes pictures. MuJoCo's default way to use OpenGL needs a display. On a
-# computer without a graphics card, the limit of threads leaves a processor to the loop.
+# Environment variables of the process that takes pictures. MuJoCo's default way to use OpenGL needs a display; EGL does
+# not. Without a graphics card, the CPU draws the pictures. It uses only one thread, so that the loop is not slowed
+# down.
 ENVIRONMENT = {"MUJOCO_GL": "egl", "LP_NUM_THREADS": "1"}
 
 

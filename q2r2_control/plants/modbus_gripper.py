@@ -3,10 +3,10 @@
 Hand-E, 2F-85 and 2F-140 have the same registers (chapter 4 of their instruction manuals).
 
 **Safety.** Until an opening is measured, the bodies of the fingers cover all positions of the fingers. After that, they
-cover the openings that were measured and commanded a moment ago. An activation opens and closes the fingers fully. The
-gripper is therefore activated only before an opening is measured in a run. If the measured opening, or the command that
-was in force then, is older than ``MODBUS_DELAY``, the opening is no longer known. Supervision then grants no other
-opening.
+cover all openings that were measured or commanded recently. An activation opens and closes the fingers fully. The
+gripper is therefore activated only before an opening is measured in a run. If the newest measurement of the opening, or
+the command that applied at that measurement, is older than ``MODBUS_DELAY``, the opening is no longer known.
+Supervision then does not allow another opening.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from q2r2_control.config.fri import MODBUS_DELAY, ModbusGripperConfig
 from q2r2_control.errors import ConfigError
 from q2r2_control.extras import install_line
 
-_OUTPUTS, _INPUTS = 0x03E8, 0x07D0  # The first of three registers to write and to read, of two bytes each.
+_OUTPUTS, _INPUTS = 0x03E8, 0x07D0  # First register to write, and first to read. Three registers, of two bytes each.
 _PERIOD = 0.025  # Time between two readings. A new opening is written at the same time [s].
 _AGAIN = 1.0  # Time after which a lost connection is tried again [s].
 _TIMEOUT, _REPEATS = 0.3, 1  # Time to wait for an answer [s], and the number of repeated requests.
@@ -80,8 +80,8 @@ class ModbusGripper:
         self._where = f"{config.modbus}, unit {config.unit}"
         self.status: GripperStatus | None = None  # None if the gripper does not answer.
         self._wanted: float | None = None
-        # The measured opening, and the time at which the command in force at the measurement was chosen [s]; None if
-        # the opening is not known.
+        # The measured opening, and the time at which its exchange with the gripper began [s]. The command that applied
+        # at the measurement was chosen at this time. None if the opening is not known.
         self._measured: tuple[float, float] | None = None
         self._used = False  # Whether the gripper was ready in this run.
         self._sent, self._told = b"", ""

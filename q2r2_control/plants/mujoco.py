@@ -117,7 +117,8 @@ class MujocoPlant:
         self._next: tuple[Array, Array] | None = None  # Commanded posture and velocity at the end of the next tick.
         self._torque: Array | None = None  # Commanded torque in torque mode.
         self._velocity: Array | None = None  # Commanded velocity in velocity mode, for the next advance.
-        self._pushes: dict[str, tuple[Array, int]] = {}  # Wrench and the step before which it ends, by arm.
+        # By arm, the wrench of a push, and the number of the physics step before which the push ends.
+        self._pushes: dict[str, tuple[Array, int]] = {}
         self._steps = 0
         self._clock = 0.0
         mujoco.mj_forward(self.model, self.data)
@@ -141,10 +142,10 @@ class MujocoPlant:
         self._grippers.command(command.grippers)
 
     def advance(self, dt: float) -> None:
-        """See :meth:`Plant.advance`. All whole physics steps that are due are taken, and the rest is carried over.
+        """See :meth:`Plant.advance`. All whole physics steps that are due are taken. The next call adds the rest.
 
         Raises:
-            PlantError: If ``dt`` is not allowed, or if the simulation has diverged. After ``reset`` it is usable again.
+            PlantError: If ``dt`` is not allowed, or if the simulation has diverged. ``reset`` makes it usable again.
         """
         check_duration(dt)
         if dt == 0:
@@ -163,7 +164,7 @@ class MujocoPlant:
         self._acceleration[self._v_index] = (self._end[1] - self._start[1]) / max(dt, self._timestep)
         due = math.floor(self._clock / self._timestep + _STEP_ROUNDING)
         while self._steps < due:
-            # A step may begin before the tick in which it ends. It then counts from the start of the tick.
+            # A step may begin before the tick in which it ends. The servos then use the start of the tick for it.
             self._step(max(self._steps * self._timestep - start, 0.0) / dt)
         if not math.isfinite(self._qvel.dot(self._qvel)):
             raise PlantError(f"the simulation diverged at {self._clock:.3f} s; reset it")
@@ -173,8 +174,8 @@ class MujocoPlant:
         index, data = self._v_index, self.data
         self.observed_qpos = self._qpos.copy()
         tau = data.qfrc_actuator.take(index)
-        # MuJoCo's sum of forces before contacts, minus the terms that are not external, leaves the pushes of
-        # :meth:`push` and of MuJoCo's window.
+        # ``qfrc_smooth`` is the sum of all forces except contacts and other constraints. Without the forces that are
+        # not external, it contains only the pushes of :meth:`push` and of MuJoCo's window.
         external = (data.qfrc_constraint + data.qfrc_smooth - data.qfrc_passive + self._bias).take(index) - tau
         q, v = self._qpos.take(self._q_index), self._qvel.take(index)
         return RobotState(q, v, tau, external, self._steps * self._timestep)

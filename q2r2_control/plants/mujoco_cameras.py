@@ -25,10 +25,11 @@ with importing("sim", "the simulation in MuJoCo"):
 # which look along x with z up.
 _FROM_OURS = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 _STRAIGHT = 1e-9  # With a smaller sine of the angle to the vertical, the camera looks straight up or down.
-_LONGEST_CLOSE = 5.0  # Time to wait until a window is closed [s].
+_LONGEST_CLOSE = 5.0  # Longest time to wait until a window is closed [s].
 _OPACITY = 0.6  # Opacity of moving obstacles.
-# Size of the shadow map, number of samples per pixel, and numbers of slices and stacks of round shapes. On a computer
-# without a graphics card, MuJoCo's defaults (8192 and 8) take five times as long, and (28, 16) twice as long.
+# Size of the shadow map [pixels], number of samples per pixel, and numbers of slices and stacks of round shapes. On a
+# computer without a graphics card, a picture with the first two settings of the window (8192 and 8) takes five times as
+# long, and a picture with MuJoCo's default numbers of slices and stacks (28 and 16) twice as long.
 _SHADOW_MAP, _SAMPLES, _ROUND = 1024, 0, (16, 8)
 
 
@@ -56,14 +57,14 @@ def _orientation(camera: CameraConfig) -> Array:
     sight = np.subtract(camera.look_at, camera.position)
     sight /= np.linalg.norm(sight)
     left = np.cross((0.0, 0.0, 1.0), sight)
-    if np.linalg.norm(left) < _STRAIGHT:  # The camera looks straight up or down. The x axis of the link is up then.
+    if np.linalg.norm(left) < _STRAIGHT:  # The camera looks straight up or down. The link's x is up in the picture.
         left = np.cross((1.0, 0.0, 0.0), sight)
     left /= np.linalg.norm(left)
     return np.stack((sight, left, np.cross(sight, left)), axis=1)
 
 
 class CellPictures:
-    """Takes pictures with the cameras of a model, in one thread only, because OpenGL belongs to a thread."""
+    """Takes pictures with the cameras of a model. One thread must do this, because an OpenGL context belongs to it."""
 
     def __init__(self, model: mujoco.MjModel, cameras: Mapping[str, CameraConfig]) -> None:
         """Prepare pictures of a simulated cell.
@@ -73,7 +74,7 @@ class CellPictures:
             cameras: At least one of the cell's ``simulated_cameras``, by name.
 
         Raises:
-            PlantError: If OpenGL without a window is missing.
+            PlantError: If OpenGL cannot draw without a window.
         """
         model.vis.quality.shadowsize, model.vis.quality.offsamples = _SHADOW_MAP, _SAMPLES
         model.vis.quality.numslices, model.vis.quality.numstacks = _ROUND
@@ -124,7 +125,7 @@ class ThreadPictures:
 
 
 def window_fault() -> str | None:
-    """Return why no window can be opened; None if one can. MuJoCo would wait for ever for a window that cannot open."""
+    """Return why no window can be opened, or None. MuJoCo itself would wait for ever for a window that cannot open."""
     if not has_display():
         lacks = "neither DISPLAY nor WAYLAND_DISPLAY is set"
         return f"MuJoCo's window needs a display: {lacks}; --web shows the arms in a browser"

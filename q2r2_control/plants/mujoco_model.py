@@ -93,7 +93,7 @@ def build_model(robot: Robot, config: Config) -> mujoco.MjModel:
 def _moving_without_mass(spec: mujoco.MjSpec) -> list[str]:
     """Return the names of all moving bodies without a mass, if no body that is fixed to them has a mass either.
 
-    MuJoCo's own error names one only.
+    MuJoCo's own error names only one of them.
     """
 
     def mass(body: mujoco.MjsBody) -> float:
@@ -166,13 +166,16 @@ def _correct_inertias(spec: mujoco.MjSpec) -> None:
 
 
 def _set_shapes(spec: mujoco.MjSpec, robot: Robot) -> None:
-    """Sort shapes into groups, keep envelopes out of contact, and restore capsules, which the URDF has as cylinders."""
+    """Sort shapes into groups, and exclude envelopes from contacts.
+
+    The URDF has a cylinder for each capsule. This function turns these cylinders into capsules.
+    """
     declared = ET.fromstring(robot.urdf).iterfind("link/collision_checking/capsule")
     capsules = {capsule.get("name", "") for capsule in declared}
     for body in spec.bodies:
         drawn = any(not geom.contype for geom in body.geoms)
         for geom in body.geoms:
-            # Shapes of a URDF have no mass. Without this line, links without a mass would get one from their shapes.
+            # Shapes of a URDF have no mass. Without this line, links without a mass would get a mass from their shapes.
             geom.mass = 0.0
             if geom.name in capsules:
                 geom.type = mujoco.mjtGeom.mjGEOM_CAPSULE
@@ -238,14 +241,14 @@ def settle_mimics(model: mujoco.MjModel, data: mujoco.MjData) -> None:
 
 
 def _exclude_contacts(spec: mujoco.MjSpec, robot: Robot) -> None:
-    """Let pairs that are not monitored pass through each other: neighbours, and pairs that always or never meet."""
+    """Exclude contacts of two links that are not a monitored pair: neighbours, and links that always or never touch."""
     watched = {frozenset((link_of(a), link_of(b))) for a, b in pair_names(robot.collision_model)}
     for first, second in combinations(sorted(frozenset().union(*watched)), 2):
         if frozenset((first, second)) not in watched:
             _exclude(spec, first, second)
     for name in robot.joint_names:
-        # MuJoCo itself leaves out contacts of a body with its parent only if that parent can move. The others are left
-        # out here, unless they are watched.
+        # MuJoCo itself excludes contacts of a body with its parent only if that parent can move. Contacts with a fixed
+        # parent are excluded here, unless the controller monitors the pair.
         link = spec.joint(name).parent
         if frozenset((link.parent.name, link.name)) not in watched:
             _exclude(spec, link.parent.name, link.name)

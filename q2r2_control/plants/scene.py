@@ -14,9 +14,10 @@ VISUAL_GROUP, COLLISION_GROUP, ENVELOPE_GROUP = 2, 3, 4
 
 
 def furnish(spec: mujoco.MjSpec, floor: bool) -> None:
-    """Add sky and lights, make a plane of the cell's ``floor`` if it has one, and set the view of a window.
+    """Add sky, lights and a plane for the floor, and set the view of a window.
 
-    A cell without a floor gets a drawing of a floor at z = 0. It causes no contacts, since the arms may move below it.
+    ``floor`` is True if the cell has a floor, whose boxes the plane replaces. Otherwise, the plane is only drawn, at
+    z = 0. It then causes no contacts, because the arms may move below it.
     """
     spec.add_texture(
         name="sky",
@@ -34,7 +35,7 @@ def furnish(spec: mujoco.MjSpec, floor: bool) -> None:
     spec.visual.headlight.specular = (0.0, 0.0, 0.0)
     spec.visual.quality.shadowsize = 8192
     spec.visual.quality.offsamples = 8
-    # The size is sufficient for any picture.
+    # The largest width and height of a picture [pixels], which is sufficient for any camera.
     spec.visual.global_.offwidth, spec.visual.global_.offheight = 3840, 2160
     spec.visual.global_.azimuth, spec.visual.global_.elevation = 145, -20
     spec.stat.center, spec.stat.extent = (0.4, 0.0, 0.4), 1.6
@@ -65,7 +66,7 @@ def _add_floor(spec: mujoco.MjSpec, body: mujoco.MjsBody | None) -> None:
 
 
 def _add_lights(spec: mujoco.MjSpec) -> None:
-    """Add a lamp overhead that casts shadows, and a weak light from the other side that casts none."""
+    """Add a lamp overhead that casts shadows, and a weak light from the other side that casts no shadows."""
     spec.worldbody.add_light(
         name="lamp",
         type=mujoco.mjtLightType.mjLIGHT_SPOT,
@@ -101,7 +102,8 @@ _STIFFNESS = (0.02, 1.0)
 # Time constant of friction [s], and a damping ratio, which has no effect on friction.
 _SLIDING = (0.1, 1.0)
 
-# Stiffness of friction relative to the normal direction. It holds grasped objects, and a finger on an obstacle.
+# Stiffness of friction relative to the stiffness in the normal direction. With this value, grasped objects do not creep
+# out of the fingers, and a finger that rests on an obstacle does not creep over it.
 FRICTION_IMPEDANCE = 100.0
 
 

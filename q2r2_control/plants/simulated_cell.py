@@ -16,12 +16,12 @@ from q2r2_control.types import Array, Command, CommandMode, RobotState
 # A busy computer delivers commands unevenly. If the next command is late, a joint therefore goes on at its velocity for
 # this number of intervals between commands. The other two numbers are the bounds of this time [s].
 _COAST_INTERVALS, _SHORTEST_COAST, _LONGEST_COAST = 3.0, 0.01, 0.1
-# Share of the newest interval between commands in the running mean of these intervals.
+# Weight of the newest interval between commands in the running mean of these intervals.
 _INTERVAL_SHARE = 0.1
 
 
 class JointFollower:
-    """Computes the wanted position of each joint at any time, from the newest command that names it.
+    """Computes the wanted position of each joint at any time, from the newest command for this joint.
 
     A command has a posture and a velocity for one time. Until the next command, the joint moves on at that velocity. If
     no command comes for too long, the joint brakes at its ``acceleration_limit`` (nv,) [rad/s^2]. It therefore does not
@@ -71,12 +71,13 @@ class JointFollower:
         )
         bounded = np.minimum(np.maximum(change, -largest), largest)
         self.q = self.q + bounded
-        # A joint far from its wanted position catches up at its limit. Its velocity is then that of this motion.
+        # A joint that is far from its wanted position catches up at its limit. ``v`` is then the velocity with which it
+        # catches up.
         on_time = np.abs(change) <= largest
         self.v = np.where(fresh, np.where(on_time, self._command_v, bounded / dt), slower)
 
 
-# Longest time that a late loop catches up [s]. The rest is dropped, because it would be a jump.
+# Longest time that a late loop catches up [s]. The rest is dropped, because it would cause a jump.
 _LONGEST_CATCH_UP = 0.05
 # Time for which one torque acts [s]. A real robot stops if its sender misses a few periods. The simulation instead lets
 # no time pass until the next torque.
@@ -86,8 +87,8 @@ _LONGEST_TORQUE = 0.012
 class SimulatedCell:
     """The simulated arms and their commands. If commands cease, position servos stop and hold the arms.
 
-    The method of a command returns None. If the command is refused, it changes nothing, and the method returns a line
-    of text with the reason.
+    A method that takes a command returns None if it follows the command. If it refuses the command, nothing changes,
+    and the method returns a line of text with the reason.
     """
 
     def __init__(self, robot: Robot, config: Config, hold_after: float, max_jump: float) -> None:
@@ -114,7 +115,7 @@ class SimulatedCell:
         self.reset()
 
     def reset(self) -> None:
-        """Return home, at rest, with open grippers and without a command."""
+        """Put the arms at home, at rest, with open grippers and without a command."""
         self.plant.reset()
         self._follower.stop(self.robot.home, np.zeros_like(self.robot.home))
         self._tau: Array | None = None
@@ -158,7 +159,7 @@ class SimulatedCell:
         if len(v) != len(self._columns):
             return f"{len(v)} velocities for {len(self._columns)} joints"
         q = self._follower.q if self._tau is None else self.plant.state().q
-        if self._time is not None:  # The wanted position moves on to ``now``, because the follower is at the last step.
+        if self._time is not None:  # The follower has the position of the last physics step. It is moved on to ``now``.
             q = q + v * min(max(now - self._time, 0.0), _LONGEST_CATCH_UP)
         return self.command_positions(self.robot.joint_names, q, v, now)
 
@@ -198,7 +199,8 @@ class SimulatedCell:
         """Take all physics steps that are due at ``now`` [s], and return the measured state."""
         before = now if self._time is None else self._time
         time = max(before, now - _LONGEST_CATCH_UP)
-        # If the last torque is too old to act, but the arms are not held yet, the simulation waits for the sender.
+        # If the last torque is too old to act, but servos do not hold the arms yet, the simulation waits for the
+        # sender.
         age = now - self._last_command
         if self._tau is not None and _LONGEST_TORQUE < age <= self._hold_after:
             time = min(time + age - _LONGEST_TORQUE, now)

@@ -81,7 +81,7 @@ class AnsweringProcess:
         return word == self.TAKEN
 
     def said(self) -> Iterator[bytes]:
-        """Yield what the process has sent about states since the last call.
+        """Yield the states, as bytes, that the process has sent since the last call.
 
         Raises:
             PlantError: If the process has ended.
@@ -101,7 +101,7 @@ class AnsweringProcess:
         return PlantError(how_it_ended(f"the process that answers {self._robots}", self._process.wait(_PATIENCE)))
 
     def close(self) -> None:
-        """Let the process end as soon as the arms stand still."""
+        """Let the process end as soon as the arms stand still, and wait for its end. Kill it if this takes over 5 s."""
         self._commands.close()
         try:
             self._process.wait(_PATIENCE)

@@ -21,7 +21,7 @@ from q2r2_control.process.cluster_worker import Call, Needs, hash_of_sources, lo
 
 _CONNECT_S = 20.0  # Longest time to connect to the scheduler [s].
 _LOOK_S = 2.0  # While no job finishes, time between two checks whether any worker is left [s].
-# Packages whose version may change a number of a result.
+# Packages whose versions may change the numbers in results.
 _COMPARED = (
     *("q2r2_control", "dask", "distributed", "numpy", "scipy", "pin", "numba", "daqp", "osqp", "qpsolvers"),
     *("mujoco", "pillow", "mcap", "zstandard", "h5py", "pyarrow", "av", "lerobot"),
@@ -124,7 +124,8 @@ class Cluster:
             for due in range(len(calls)):
                 while due not in outcomes:
                     number = self._next(client, finished)
-                    # The future is dropped together with its result. Otherwise the scheduler might repeat the job.
+                    # The future is dropped as soon as its result is read. Otherwise, the scheduler might repeat the job
+                    # if the worker with the result ends.
                     outcomes[number] = self._outcome(waiting.pop(number))
                 result, error = outcomes.pop(due)
                 if error is not None:

@@ -92,5 +92,5 @@ def _write_fault(probe: Path) -> str | None:
 
 
 def _highest_missing(path: Path) -> Path:
-    """Return the first part of ``path`` that does not exist here, or ``path`` if it may not be read."""
+    """Return the highest folder of ``path``, or ``path`` itself, that does not exist here; ``path`` if all exist."""
     return next((part for part in (*reversed(path.parents), path) if not part.exists()), path)

@@ -59,7 +59,7 @@ def check_file(file: Path, what: str) -> None:
 
 
 def _try_to_write(folder: Path) -> None:
-    """Write a file in ``folder`` that is gone when this function returns; raises OSError if this is impossible."""
+    """Write a file in ``folder``, and remove it; raises OSError if this is impossible."""
     with TemporaryFile(dir=folder) as file:
         file.write(bytes(_LEAST_ROOM))
         file.flush()

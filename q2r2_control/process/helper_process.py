@@ -1,9 +1,10 @@
 """Run a process beside the loop. It gets requests on its standard input, and answers on its standard output.
 
-A thread would take Python's interpreter from the loop for milliseconds. ``multiprocessing`` was tried as well, and has
-three problems. If the run was killed while it sent 1 MB, 8 of 8 processes with a ``Queue`` waited for the rest for
-ever, and closed no file. A ``Pipe`` makes the loop wait while it is full, so it needs the same threads as this module.
-And ``multiprocessing`` runs a user's script again if the script has no main guard.
+A thread instead of a process would stop the loop for milliseconds, because only one thread at a time runs Python code.
+``multiprocessing`` was tried as well, and has three problems. If the run was killed while it sent 1 MB, 8 of 8
+processes with a ``Queue`` waited for the remaining bytes for ever, and closed no file. While a ``Pipe`` is full, its
+sender waits, so a ``Pipe`` would need the same threads as this module. And ``multiprocessing`` runs a user's script
+again if the script has no main guard.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from typing import Any
 from q2r2_control.process.scheduling import how_it_ended
 
 _LOOKS = 0.1  # While a process is ending, time between two checks of its progress [s].
-_AFTER_KILL = 1.0  # Time for the code that handles the last answer [s].
+_AFTER_KILL = 1.0  # After a kill, longest time to wait until the last answer has been handled [s].
 _NO_ROOM = 1e-3  # While there is no room for a request, time between two attempts to queue it [s].
 
 
@@ -96,7 +97,8 @@ class HelperProcess:
         """Wait until the process has done all requests and has ended.
 
         If it neither takes nor answers anything for ``patience`` [s] although processors are free, it is killed. It is
-        also killed if it is busy for ``longest`` [s]. Nobody waits for a process that was killed.
+        also killed if it has not ended after ``longest`` [s]. This method does not wait until a killed process has
+        ended.
         """
         self._ending = True
         self._queue.put(None)
@@ -176,8 +178,8 @@ def start_python(
 ) -> subprocess.Popen[bytes]:
     """Start a process that runs the Python ``code`` and reads its input from a pipe.
 
-    The process finds the same modules as this process, and inherits the open ``files``. ``environment`` has variables
-    for it. Variables of this process override them.
+    The process finds the same modules as this process, and inherits the open ``files``. ``environment`` has additional
+    environment variables for the process. Variables of this process override them.
     """
     paths = {"PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path))}
     return subprocess.Popen(
@@ -203,7 +205,7 @@ def run_helper(module: str) -> None:
     After a failure, the last answer is a RuntimeError with the reason.
     """
     leave_signals_to_the_run()
-    stream, sys.stdout = sys.stdout.buffer, sys.stderr  # What a library prints must not be taken for an answer.
+    stream, sys.stdout = sys.stdout.buffer, sys.stderr  # The run must not read a library's output as an answer.
     lock = Lock()  # Answers are sent one after the other, although several threads may send them.
 
     def answer(content: Any) -> None:

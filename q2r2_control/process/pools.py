@@ -12,7 +12,7 @@ from threading import Thread
 def pool_of(workers: int) -> ProcessPoolExecutor:
     """Return a pool of ``workers`` processes. They are spawned, not forked, because this process may have threads.
 
-    Workers ignore Ctrl-C, which reaches all processes, because this process ends its workers.
+    Ctrl-C in a terminal reaches all processes. The workers ignore it, because this process ends them.
     """
     return ProcessPoolExecutor(workers, get_context("spawn"), initializer=_begin)
 

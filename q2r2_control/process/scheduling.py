@@ -1,6 +1,7 @@
 """Prepare the process that runs a loop: real-time scheduling and signals.
 
-Real-time scheduling needs permissions. Without them a run goes on without it, and one line says so.
+Real-time scheduling needs permissions. Without these, a run goes on with the ordinary scheduler, and reports this in
+one line.
 """
 
 from __future__ import annotations
@@ -124,8 +125,8 @@ def _schedule_as_others(threads: Iterable[int]) -> None:
 class StopRequest:
     """A flag that a signal handler sets and a loop reads.
 
-    The flag is a plain attribute. A ``threading.Event`` has a lock. If a second signal interrupted a handler that holds
-    this lock, its own handler would wait for ever.
+    The flag is a plain attribute, because a ``threading.Event`` has a lock. If a second signal interrupted a handler
+    that holds this lock, the handler of the second signal would wait for ever.
     """
 
     asked = False

@@ -41,24 +41,24 @@ from q2r2_control.ros.launch.middleware import set_up_middleware
 from q2r2_control.ros.reasons import RosReason
 from q2r2_control.wording import sentence
 
-# If a real-time process computes for this time without a sleep, Linux sends it a signal [s]. Other processes could
-# not run meanwhile.
+# If a real-time process computes for this time without a sleep, Linux sends it a signal [s], because other processes
+# cannot run meanwhile.
 _NEVER_IDLE = 0.5
 # After its nodes are closed, a process has at least this time to end [s]. To close a node takes up to 3 s, because its
 # arms brake.
 _LEAST_END = 2.0
 _deadline = math.inf  # Time of the steady clock at which this process must have ended [s].
-# All QoS profiles keep the last messages. They are reliable and volatile unless they say otherwise.
+# The QoS profiles. Each keeps the last messages, and is reliable and volatile unless its arguments say otherwise.
 # The profile of a receiver of commands. Only the newest command counts, and it must arrive.
 COMMAND_QOS = QoSProfile(depth=1)
 # The profile of a sender of commands. A reliable sender repeats messages that have not arrived, also after the network
-# was down for a while. An old target would be a jump. The lifespan is measured by the sender's clock, and the clock of
-# the receiver may differ.
+# was down for a while. An old target would let the arm jump. The lifespan is measured by the sender's clock, and the
+# clock of the receiver may differ.
 SENT_COMMAND_QOS = QoSProfile(depth=1, lifespan=Duration(seconds=0.1))
 # The profile of streams of a headset, of joint states or of nodes' reports, in which a late message is worth less than
-# the next one. A reliable subscription delivers in order: after a lost message, the next ones would wait up to 3 s.
+# the next one. A reliable subscription delivers in order: after a lost message, later messages would wait up to 3 s.
 STREAM_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
-# The profile of messages that are only recorded. All of them count, and nobody waits for them.
+# The profile of messages that are only recorded. All of them are needed, but they may arrive late.
 RECORDED_QOS = QoSProfile(depth=200)
 # The profile of latched messages (transient local), such as robot_description. A node that subscribes later still gets
 # the last message.
@@ -93,8 +93,8 @@ class BaseNode(Node):
         self.create_timer(_DIAGNOSTICS_PERIOD, self.report_health, clock=STEADY)
 
     # rclpy checks the events of every endpoint each time that it waits, which costs processor time. These events warn
-    # of settings or types that do not match. Publishers do without them, because their subscribers warn as well.
-    # Best-effort subscriptions do without them, because they match every publisher's settings.
+    # of settings or types that do not match. Publishers get no events here, because their subscribers warn as well.
+    # Best-effort subscriptions get no events either, because they match every publisher's settings.
     def create_publisher(self, *args: Any, **kwargs: Any) -> Any:
         kwargs.setdefault("event_callbacks", PublisherEventCallbacks(use_default_callbacks=False))
         return super().create_publisher(*args, **kwargs)
@@ -143,9 +143,10 @@ class BaseNode(Node):
         return value
 
     def full_name(self, name: str) -> str:
-        """Return the name of a topic, a service or a node in this node's namespace. A name with a leading / stays.
+        """Return the full name of a topic, a service or a node in this node's namespace.
 
-        The name is not remapped here, because rclpy does so when it is used.
+        A name with a leading / is returned unchanged. The name is not remapped here, because rclpy remaps it when it
+        is used.
         """
         return str(self.resolve_topic_name(name, only_expand=True)) if name else name
 
@@ -169,7 +170,7 @@ class BaseNode(Node):
         return round(rate, 1)
 
     def health(self) -> tuple[bytes, str, Mapping[str, Any]]:
-        """Return the level (OK, WARN, ERROR), one line, and figures, for the diagnostics."""
+        """Return the level (OK, WARN, ERROR), one line of text, and values by name, for the diagnostics."""
         return OK, "running", {}
 
     def drop(self, topic: str, text: str) -> None:
@@ -215,7 +216,7 @@ class BaseNode(Node):
 
 
 class ManagedNode(LifecycleNodeMixin, BaseNode):
-    """A node with a lifecycle, which starts active: ``ros2 lifecycle set /cartesian_controller deactivate``.
+    """A node with a lifecycle, which starts active. ``ros2 lifecycle set NODE deactivate`` makes it inactive.
 
     Subclasses override :meth:`begin` and :meth:`end`, which make the node active or inactive, or return why this is not
     possible. A transition is answered when it is complete. Parameters are read at the start only. For this reason

@@ -17,7 +17,7 @@ from q2r2_control.ros.base_node import STREAM_QOS, BaseNode
 from q2r2_control.ros.monitoring import WatchedPublisher, node_of
 from q2r2_control.ros.reasons import RosReason
 
-_DISCOVERY = 1.0  # Publishers that are discovered within this time count as older than the node [s].
+_DISCOVERY = 1.0  # Publishers that a new node discovers within this time count as older than the node [s].
 _GRAPH_PERIOD = 0.04  # Time between two queries of the graph [s].
 _UNKNOWN = "a node not known yet"  # The graph lists an endpoint before the name of the endpoint's node.
 HEARD = 0.3  # A node that sent a command within this time is a commander [s].
@@ -61,9 +61,9 @@ class CommandWatch:
     """Watches for other publishers of the topics on which a node commands arms.
 
     While the node commands, :meth:`intruder` finds a new publisher, and an earlier publisher that begins to send. While
-    the node does not command, it may listen, and :meth:`commander` tells whether another node commands. It listens by
-    best effort, so that nobody waits for its acknowledgements. The node also receives its own commands. It recognises
-    them by their bytes, because rclpy does not say who sent a message.
+    the node does not command, it may listen, and :meth:`commander` tells whether another node commands. The node
+    listens by best effort, so that no publisher waits for its acknowledgements. It also receives its own commands. It
+    recognises them by their bytes, because rclpy does not say who sent a message.
     """
 
     def __init__(self, node: BaseNode, kind: type, publishers: Iterable[WatchedPublisher]) -> None:

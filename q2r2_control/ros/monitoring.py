@@ -33,7 +33,7 @@ _LATELY = 32  # Number of sent messages that are remembered. The queue of the no
 _STATE = "/state"
 _LOOK_PERIOD = 0.3  # Time between two queries of the graph for nodes that report [s].
 _DISCOVERY = 2.0  # Time in which the node of every running arm has reported. Nodes report twice a second [s].
-_SILENT, _GONE = 2.0, 5.0  # Times without a report, after which a node is silent, and has gone [s].
+_SILENT, _GONE = 2.0, 5.0  # Times without a report after which a node counts as silent, and as ended [s].
 _ARM = {"engaged", "ready", "hand"}  # The keys by which the report of an arm's node is recognised.
 # Names of nodes by the unique number of an endpoint. The graph loses a node that was frozen or unreachable for longer
 # than its lease. The node comes back with the same endpoints, but Fast DDS does not learn its name again.
@@ -79,8 +79,9 @@ def publish_in_time(publisher: Any, message: Any, decided: float) -> bool:
     """Publish a message, unless its lifespan is over; returns whether it was published.
 
     The middleware counts the lifespan from the moment of publishing. If the process was frozen before that moment, it
-    would send an old command, and the arm would jump. Serialisation takes most of the time until the message is sent.
-    :class:`DelayWatch` covers the rest.
+    would send an old command, and the arm would jump. The time is therefore checked after serialisation, which takes
+    most of the time until the message is sent. If the process freezes after this check, the receiver's
+    :class:`DelayWatch` notices it.
 
     Args:
         publisher: The publisher.
@@ -112,7 +113,7 @@ class WatchedPublisher:
         self._lately: deque[bytes] = deque(maxlen=_LATELY)
         self.own_listeners = 0  # Number of subscriptions of the same node, which acknowledge nothing.
         self._streaming = False
-        # Time when all messages were last acknowledged; None if they were not yet in this stream [s].
+        # Time when all messages were last acknowledged [s]; None if this has not happened yet in this stream.
         self._acknowledged: float | None = None
         self._gap_began = -math.inf  # Time since which messages are left out [s].
 
@@ -203,7 +204,8 @@ class HandListeners:
     def __init__(self, node: Node, hands: Sequence[str]) -> None:
         self._states, self._hands = NodeStates(node, namespace=node.get_namespace()), hands
         self._began = self._asked_at = 0.0  # Times of the first and of the last query of the graph [s].
-        self._requests: dict[str, int] = {}  # By controller, how often its services to hold were called at the start.
+        # By controller, how often its services to hold, stop or go home had been called at the last :meth:`begin`.
+        self._requests: dict[str, int] = {}
 
     def look(self) -> None:
         now = time.monotonic()
@@ -235,8 +237,8 @@ class HandListeners:
     def asked_to_hold(self) -> bool:
         """Return whether a request to pause, reset, stop or go home was made.
 
-        It shows as an arm's last event, or as a call of a controller's service since :meth:`begin`. A controller that
-        was restarted counts its calls anew, and counts as such a request.
+        Such a request is an arm's last event, or a call of a controller's service since :meth:`begin`. A controller
+        that was restarted counts its calls from 0 again. Its new number then also counts as a request.
         """
         return self._new_requests() or any(
             state.get("last_event_kind") in HOLD_REQUESTS for _, state, _ in self._arms()
@@ -253,9 +255,9 @@ class HandListeners:
         )
 
     def lost(self) -> dict[str, str]:
-        """Return the reports of those arms' nodes whose arm is lost, because a fault or a request has stopped it.
+        """Return the reports of the nodes whose arms are lost, by name of the node.
 
-        The keys are the names of the nodes.
+        An arm is lost if a fault or a request has stopped it.
         """
         return {name: state["message"] for name, state, _ in self._arms() if state.get("state") == ArmState.LOST}
 

@@ -39,10 +39,11 @@ from q2r2_control.supervision.standstill import JOINTS
 from q2r2_control.types import ArmTiming, Array, Command, CommandMode, RobotState
 from q2r2_control.wording import sentence
 
-_WAIT = 5.0  # Time to wait for joint states and for a receiver of the commands [s].
-_QUIET = 1.0  # Time for which the plant first listens for other commanders, which must be discovered [s].
+_WAIT = 5.0  # Longest time to wait for joint states and for a receiver of the commands [s].
+# Time for which the plant listens for other commanders before it commands, so that they can be discovered [s].
+_QUIET = 1.0
 _CURE = "; start the robot, and see q2r2 ros doctor"
-_AWAY = 0.02  # If a command is farther from the measured joints, a new receiver would let the arms jump [rad].
+_AWAY = 0.02  # If a command is farther than this from the measured joints, a new receiver lets the arms jump [rad].
 
 
 class _PlantNode(BaseNode):
@@ -59,7 +60,7 @@ class RosPlant:
 
     modes: tuple[CommandMode, ...] = (CommandMode.POSITION,)
     realtime_only = True
-    # The arms' controller is another process, which can freeze. The plant notices that the arms then do not follow.
+    # The arms' controller is another process, which can freeze. Supervision uses these limits to notice this.
     standstill = JOINTS
 
     def __init__(self, robot: Robot, config: Config) -> None:
@@ -82,7 +83,8 @@ class RosPlant:
         """Begin to listen to the robot, and wait for its joint states and for a receiver of the commands.
 
         Raises:
-            PlantError: If the robot is not there, if another node commands it, or if ``q`` is given.
+            PlantError: If no joint states come or no node receives commands, if another node commands the robot, or if
+                ``q`` is given.
         """
         if q is not None:
             raise PlantError("reset q: a real arm starts where it stands")
@@ -126,7 +128,7 @@ class RosPlant:
             return self._bad or Reason.of(SupervisionReason.NO_STATES_YET, source=_CURE)
         if not self._publisher.listeners:
             return Reason.of(RosReason.NO_SUBSCRIBER, topic=self._publisher.topic_name)
-        if self._seen <= self._received_since:  # The newest state came before the present receiver.
+        if self._seen <= self._received_since:  # The newest state came before the present receiver appeared.
             return Reason.of(SupervisionReason.NO_STATES_YET, source=_CURE)
         return self._bad
 
@@ -191,7 +193,7 @@ class RosPlant:
 
     def state(self) -> RobotState:
         state = self._joints.state
-        assert state is not None  # It exists since the reset.
+        assert state is not None  # A state has existed since the reset.
         return state
 
     def gripper_openings(self) -> dict[str, float]:

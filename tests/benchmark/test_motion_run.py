@@ -59,7 +59,9 @@ class Standing:
         return self._q.copy(), np.zeros(len(self._q))
 
 
-def test_for_a_controller_without_motion_the_figures_equal_those_computed_from_its_targets(robot: Robot) -> None:
+def test_for_a_controller_without_motion_the_figures_equal_figures_that_are_computed_from_its_targets(
+    robot: Robot,
+) -> None:
     ends = round(SHORT.ends / DT)
     figures = run_motion(Standing(jerked=ends - 100, failing=ends - 50), robot, SHORT)
     # The target moves by 10 mm at a constant speed, so the root mean square of the error is 10 / sqrt(3).
@@ -126,7 +128,7 @@ def test_the_bench_runs_our_controller_in_free_air_and_in_the_cell(monkeypatch: 
     assert report.notes[0] == f"missing: not installed; {INSTALL}"
     assert report.notes[1].startswith("broken: cannot be built for this cell: ModuleNotFoundError")
     assert ours.min_distance_mm is not None
-    assert ours.min_distance_mm >= 1.0  # The nearest pair is a finger and an obstacle, which keep 1 mm.
+    assert ours.min_distance_mm >= 1.0  # The nearest pair, a finger and an obstacle, keeps 1 mm.
     assert row.free_air.rms_error_mm is not None
     assert ours.rms_error_mm is not None
     # The target is 10 mm lower than the table allows.

@@ -38,7 +38,7 @@ def test_a_camera_with_small_jitter_is_not_reported_and_misses_no_picture() -> N
     assert watched.missing == 0
 
 
-def test_a_camera_that_stops_is_reported_once_with_the_reason_and_its_return_is_reported_too() -> None:
+def test_a_camera_that_stops_is_reported_once_with_the_reason_and_its_return_is_also_reported() -> None:
     watched = watch()
     told(watched, every(0.05, 0.0, 1.0))
     assert watched.look(100.95 + LATENCY + 0.99) == []

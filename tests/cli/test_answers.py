@@ -1,4 +1,4 @@
-"""Answers outlast a command that was interrupted or failed. They are offered again only for the same subject."""
+"""After a command was interrupted or failed, a person's answers are offered again, but only for the same subject."""
 
 from __future__ import annotations
 

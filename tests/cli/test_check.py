@@ -123,7 +123,7 @@ def test_check_and_run_list_all_faults_of_a_file(tmp_path: Path) -> None:
     assert found["verdict"] == "this cell cannot run: 4 faults"
 
 
-def test_check_prints_a_verdict_for_a_model_that_cannot_be_read_too(tmp_path: Path) -> None:
+def test_check_also_prints_a_verdict_for_a_model_that_cannot_be_read(tmp_path: Path) -> None:
     result = q2r2("check", changed_cell(tmp_path, "model: iiwa7", "model: iiwa8"))
     assert (result.exit_code, result.stdout) == (2, "this cell cannot run: 1 fault\n")
     assert "iiwa8" in result.stderr
@@ -211,7 +211,7 @@ def test_check_lists_what_is_wrong_at_home_and_exits_with_1(tmp_path: Path, old:
         pytest.param("srdf: mine.srdf\ncontrol:\n  min_distance: 0.02\n", "/mine.srdf:", id="an SRDF"),
     ],
 )
-def test_the_lines_that_check_prints_for_too_near_links_make_the_cell_valid(
+def test_a_cell_becomes_valid_with_the_lines_that_check_prints_for_links_that_are_too_near(
     tmp_path: Path, written: str, says: str
 ) -> None:
     bare = load_description("example-robot-data:ur5").file  # A model that is loaded by its path has no SRDF.
@@ -236,7 +236,7 @@ def test_the_lines_that_check_prints_for_too_near_links_make_the_cell_valid(
     assert q2r2("check", str(cell)).exit_code == 0
 
 
-def test_check_says_how_to_remove_a_floor_that_is_in_the_way(tmp_path: Path) -> None:
+def test_check_says_how_to_remove_a_floor_that_overlaps_the_robot(tmp_path: Path) -> None:
     low = changed_cell(tmp_path, "[0.0, 0.4, 0.0]", "[0.0, 0.4, -0.6]")
     lines = [line for line in q2r2("check", low).stdout.splitlines() if line.startswith("FAULT") and "floor_0" in line]
     assert lines
@@ -247,7 +247,7 @@ def test_check_says_how_to_remove_a_floor_that_is_in_the_way(tmp_path: Path) -> 
     assert (result.exit_code, "floor" in result.stdout) == (0, False)
 
 
-def test_a_stop_that_needs_too_much_torque_is_a_note_and_no_fault(tmp_path: Path) -> None:
+def test_a_stop_that_needs_too_much_torque_causes_a_note_and_no_fault(tmp_path: Path) -> None:
     fast = changed_cell(tmp_path, "acceleration_limit: {}", "acceleration_limit: {A1: 10.0, A2: 10.0, A3: 10.0}")
     result = q2r2("check", fast)
     (note,) = (line for line in result.stdout.splitlines() if line.startswith("NOTE "))
@@ -288,7 +288,7 @@ def test_if_gravity_alone_needs_too_much_torque_the_note_does_not_advise_slower_
     )
 
 
-def test_check_notes_a_control_for_grippers_that_do_not_exist() -> None:
+def test_check_prints_a_note_about_a_control_for_grippers_that_do_not_exist() -> None:
     def notes_with(gripper: dict[str, object]) -> list[str]:
         cell = one_arm(tool={"model": "hand_e", "frame": "tool_frame"}, gripper=gripper)
         bindings = BindingSettings(upper=Action.NONE, trigger=Action.GRIPPER_ANALOG)

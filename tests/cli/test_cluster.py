@@ -58,7 +58,7 @@ def write_or_die(episode: EpisodeVectors, path: Path) -> None:
     write_table(episode, path)
 
 
-def test_judge_on_a_cluster_prints_the_same_as_in_one_process(
+def test_judge_prints_the_same_lines_on_a_cluster_and_in_one_process(
     recordings: Path, cluster: DaskCluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     alone = q2r2("judge", str(recordings), "--json")
@@ -69,7 +69,7 @@ def test_judge_on_a_cluster_prints_the_same_as_in_one_process(
     assert len(json.loads(alone.stdout)["episodes"]) == 7
 
 
-def test_export_on_a_cluster_writes_the_same_files_as_in_one_process(
+def test_export_writes_the_same_files_on_a_cluster_and_in_one_process(
     recordings: Path, cluster: DaskCluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(

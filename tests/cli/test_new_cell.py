@@ -72,7 +72,7 @@ def test_a_folder_that_cannot_be_written_is_refused_before_the_models_are_read(m
 
 
 @pytest.mark.slow
-def test_a_fault_of_the_written_cell_names_links_without_masses_as_left_to_do() -> None:
+def test_a_fault_names_the_links_without_masses_and_a_line_says_that_these_masses_are_left_to_do() -> None:
     Path("arm.urdf").write_text(re.sub(r"<inertial>.*?</inertial>", "", IIWA, flags=re.DOTALL))
     result = q2r2("new-cell", "cell", "--left", "arm.urdf", "--yes", "--samples", "100")
     assert result.exit_code == 1
@@ -134,7 +134,7 @@ def test_the_answers_of_the_user_are_written_into_the_cell(tmp_path: Path) -> No
 @pytest.mark.slow
 def test_the_answers_of_an_interrupted_try_are_offered_in_the_next_try() -> None:
     command = ("new-cell", "cell", "--left", "iiwa7", "--right", "iiwa7", "--samples", "100")
-    interrupted = q2r2(*command, typed="0.9\n0.1\n")  # the terminal ends at the third question
+    interrupted = q2r2(*command, typed="0.9\n0.1\n")  # The input ends at the third question.
     assert interrupted.exit_code != 0
     assert not Path("cell.yaml").exists()
     result = q2r2(*command, typed="\n\n\n\n")
@@ -159,7 +159,7 @@ def test_arguments_of_xacro_go_into_the_cell(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_an_mjcf_becomes_a_urdf_beside_the_cell_which_runs(tmp_path: Path) -> None:
+def test_an_mjcf_becomes_a_urdf_beside_the_new_cell_and_the_new_cell_runs(tmp_path: Path) -> None:
     bodies = "".join(
         f"""<body name="link_{i}" pos="0 0 {0.1 if i == 1 else 0.25}"><joint name="j{i}" axis="{axis}"
         range="-110 110" actuatorfrcrange="-200 200"/><geom type="capsule" fromto="0 0 0.06 0 0 0.19" size="0.05"/>"""
@@ -222,7 +222,7 @@ def test_two_links_are_ignored_only_if_all_pairs_of_their_shapes_overlap(tmp_pat
 
 
 @pytest.mark.slow
-def test_meshes_that_one_capsule_fits_badly_get_several_capsules_and_the_tools_follow(tmp_path: Path) -> None:
+def test_meshes_that_one_capsule_fits_badly_get_several_capsules_with_which_a_run_succeeds(tmp_path: Path) -> None:
     model = "example-robot-data:ur5"
     made = one_object(
         q2r2("new-cell", "cell", "--left", model, "--right", model, "--yes", "--samples", "100", "--json").stdout

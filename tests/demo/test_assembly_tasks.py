@@ -76,7 +76,7 @@ def test_the_arms_follow_the_hands_within_1_5_millimetres_and_need_no_fallback(p
     assert played.summary.at_rest
     for arm in played.summary.arms.values():
         assert arm.position_error_mm_rms is not None
-        # While two arms carry, the led tool also corrects the lag of the leading tool.
+        # While two arms carry a part, one tool follows the other tool, and also corrects the lag of the other tool.
         assert arm.position_error_mm_rms < (1.5 if "carry" in played.results else 1.0)
     if played.mode is CommandMode.TORQUE:
         assert_torque_bounds(played.pipeline, played.ticks)

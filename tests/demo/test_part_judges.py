@@ -75,7 +75,7 @@ GIVER, BOTH, TAKER = (1.0, 0.0, 0.4, LEFT), (0.5, 0.0, 0.4, FINGERS), (0.5, 0.0,
 AWAY = (1.2, -0.12, 0.4, RIGHT)
 
 
-def test_a_part_in_both_hands_must_not_tilt_by_5_degrees() -> None:
+def test_a_part_in_both_hands_must_not_tilt_by_5_degrees_or_more() -> None:
     level, inclined = (math.radians(angle) for angle in (4.9, 5.1))
     for tilt, faults in ((level, []), (inclined, ["part: inclined by 5.1 deg"])):
         judge = play(CarryJudge("part"), [LIES, (1.5, 0.12, 0.3, FINGERS)])

@@ -162,7 +162,7 @@ def test_a_listener_gets_every_message_in_order_and_poll_returns_nothing_for_a_s
         assert server.poll(0.0) == []
 
 
-def test_a_frozen_pose_has_a_fault_and_after_a_new_connection_the_same_pose_has_none(
+def test_a_frozen_pose_has_a_fault_and_after_a_new_connection_the_same_pose_has_no_fault(
     server: HeadsetServer, clock: HandClock
 ) -> None:
     for expected in ([None, None, HandFault.FROZEN], [None, None]):

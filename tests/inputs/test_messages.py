@@ -145,7 +145,7 @@ def test_numbers_that_are_not_finite_are_read_so_that_the_teleop_layer_rejects_t
     np.testing.assert_equal(pose.quaternion, [value] * 4)
 
 
-def test_random_and_mutated_bytes_raise_nothing_but_protocol_errors() -> None:
+def test_random_and_mutated_bytes_raise_only_protocol_errors() -> None:
     random_source = random.Random(7)
     refused = 0
     for _ in range(3000):

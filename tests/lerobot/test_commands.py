@@ -258,7 +258,7 @@ def test_the_commands_in_the_docs_train_a_policy_and_let_it_act(tmp_path: Path) 
 
 
 @pytest.mark.skipif(not ROLLS_OUT, reason="lerobot has DAgger since 0.6")
-def test_takeovers_in_dagger_make_no_target_jump_and_every_frame_says_who_moved_the_arms(
+def test_takeovers_in_dagger_cause_no_jump_of_a_target_and_every_frame_says_who_moved_the_arms(
     seen: Path, trained: Path
 ) -> None:
     dagger = ("--strategy.type=dagger", "--strategy.record_autonomous=true", "--strategy.smooth_handover=false")

@@ -37,8 +37,8 @@ from tests.recording.runs import ROOT
 from tests.ros.processes import EXECUTABLES, as_arguments, environment_of
 
 register_third_party_plugins()
-# Required motion of a joint [rad]. Tolerance of a joint [rad] and of an opening [of 1]. Number of tries, each of which
-# takes at least 1/30 s.
+# Required motion of a joint [rad]; tolerance of a joint [rad] and of an opening, which is 0 to 1; and number of tries,
+# each of which takes at least 1/30 s.
 MOVED, NEAR, TRIES = 0.02, 0.004, 1800
 ROS_RATE = 200.0  # [Hz]
 
@@ -130,7 +130,7 @@ def test_arms_behind_cabinets_follow_actions_like_simulated_arms(tmp_path: Path)
     assert_follows_behind(robot, "q2r2_control", "fri-cabinet", str(file))
 
 
-def test_arms_behind_ros_follow_actions_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_arms_behind_ros_also_follow_actions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("rclpy", reason="make test-lerobot-ros installs it")
     coordinator = pytest.importorskip("domain_coordinator")
     cell = write_cell(tmp_path, {"loop_rate_hz: auto": f"loop_rate_hz: {ROS_RATE}"})

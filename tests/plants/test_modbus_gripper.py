@@ -197,7 +197,7 @@ def test_a_gripper_that_was_switched_off_during_a_run_is_activated_only_in_the_n
     gripper.command(0.5)
     measures(gripper, 0.5)
     simulated.power_off()
-    # On a busy machine the opening may be unknown before the loss of power is read, because it is too old.
+    # On a busy machine the opening may be unknown before the loss of power is read, because its measurement is too old.
     eventually(lambda: gripper.status is not None and not gripper.status.activated)
     gripper.command(0.0)
     read_on(simulated)

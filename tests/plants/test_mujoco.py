@@ -46,7 +46,9 @@ def _same(first: RobotState, second: RobotState) -> bool:
 
 
 class TestPositionMode:
-    def test_the_arms_hold_home_against_gravity_before_any_command(self, plant: MujocoPlant, robot: Robot) -> None:
+    def test_the_arms_stay_at_home_against_gravity_until_the_first_command(
+        self, plant: MujocoPlant, robot: Robot
+    ) -> None:
         for _ in range(1000):
             np.testing.assert_allclose(plant.state().tau, _gravity(robot, robot.home), atol=0.01)
             plant.advance(DT)

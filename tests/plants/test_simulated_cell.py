@@ -1,4 +1,4 @@
-"""The simulated cell behind a topic: what acts on it between two commands, with a simulated clock."""
+"""How the simulated cell of ``mujoco_robot`` moves between two commands. The tests set its clock."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def test_without_commands_the_cell_coasts_briefly_and_brakes() -> None:
     assert not follower.v.any()
 
 
-def test_a_command_may_name_only_some_joints_and_the_other_joints_stay() -> None:
+def test_a_command_may_name_only_some_joints_and_the_other_joints_do_not_move() -> None:
     follower = JointFollower(np.array([0.1, 0.2]), ACCELERATION, LIMIT)
     for tick in range(100):
         follower.command(np.array([1]), np.array([0.25]), np.zeros(1), tick * DT)

@@ -90,7 +90,7 @@ def test_a_file_that_a_worker_cannot_see_is_named_before_any_job_begins(cluster:
         pytest.skip("looks into /proc")
     (file := tmp_path / "seen").write_text("seen")
     with file.open() as stream:
-        own = os.dup2(stream.fileno(), 900)  # No worker has this file open.
+        own = os.dup2(stream.fileno(), 900)  # No worker has a file with this descriptor open.
         line = fault_of(Cluster(cluster.address), reads=lambda job: file if job else Path(f"/proc/self/fd/{own}"))
         os.close(own)
     assert f"cannot see /proc/self/fd/{own}; allowed: a folder that all machines share" in line
@@ -142,7 +142,7 @@ def test_a_scheduler_that_cannot_do_the_work_raises_an_error_of_one_line(
 
 
 class _Answers(logging.Handler):
-    """Starts another worker as soon as a logged line says that none is left."""
+    """Starts another worker as soon as a logged line says that no worker is left."""
 
     def __init__(self, cluster: DaskCluster) -> None:
         super().__init__()

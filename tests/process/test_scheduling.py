@@ -163,7 +163,7 @@ print(stop.asked, len(sent) > 0)
 """
 
 
-def test_if_a_signal_interrupts_the_handler_of_another_signal_its_own_handler_does_not_wait_for_ever() -> None:
+def test_a_handler_that_interrupts_the_handler_of_another_signal_does_not_wait_for_ever() -> None:
     done = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, timeout=60)
     assert done.stdout.split() == ["True", "True"], done.stderr
 

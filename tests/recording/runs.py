@@ -107,7 +107,7 @@ def writer_of(recorder: Recorder) -> HelperProcess:
 
 
 def file_of(summary: RecordingSummary) -> Path:
-    """Return the file of a recording without a fault."""
+    """Return the file of a recording, and assert that it has no fault and lost no tick."""
     assert summary.fault is None
     assert summary.lost_ticks == 0
     assert summary.file is not None

@@ -112,7 +112,7 @@ def test_pictures_that_are_not_taken_in_time_are_lost_and_counted(tmp_path: Path
     def stopped_for_a_while(recorder: Recorder) -> Iterator[None]:
         pid = cameras_of(recorder).process.pid
         os.kill(pid, signal.SIGSTOP)
-        while cameras_of(recorder).due < 600:  # So many pictures do not fit into the queue.
+        while cameras_of(recorder).due < 600:  # 600 pictures do not fit into the queue.
             yield
         os.kill(pid, signal.SIGCONT)
         taken.append(cameras_of(recorder).due)

@@ -1,4 +1,4 @@
-"""The steps of a clock that is set while a recording is made are found."""
+"""If the computer's clock is set while a recording is made, the steps of its time are found."""
 
 from __future__ import annotations
 

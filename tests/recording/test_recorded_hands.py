@@ -1,4 +1,4 @@
-"""The hands of a recording lead the arms of a new run, which may have other arms and another rate."""
+"""The hands of a recording move the arms of a new run, which may have other arms and another rate."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
 
 
 def played(recorded: Recorded, duration: float) -> tuple[Watch, list[str]]:
-    """Let the recorded hands lead the recorded cell's arms. Returns the ticks, and the lines that were said."""
+    """Let the recorded hands move the recorded cell's arms. Return the ticks, and the lines that the input printed."""
     said: list[str] = []
     loop = pipeline(source=RecordedHands(recorded.file, cell(), said.append))
     watch = Watch(loop)
@@ -74,7 +74,7 @@ def test_the_arms_pause_when_the_recording_is_over(recorded: Recorded) -> None:
     assert over == pytest.approx(len(recorded.commands) / RATE, abs=2.0 / RATE)
 
 
-def test_hands_of_a_recording_lead_other_arms_at_another_rate_along_the_same_path(recorded: Recorded) -> None:
+def test_hands_of_a_recording_move_other_arms_at_another_rate_along_the_same_path(recorded: Recorded) -> None:
     config = load_config("config/dual_panda.yaml").model_copy(update={"loop_rate_hz": 250.0, "cameras": {}})
     hands: Input = RecordedHands(recorded.file, config)
     loop = Pipeline.from_config(config, input=hands, plant="kinematic")

@@ -1,4 +1,4 @@
-"""A replay repeats a run to the bit, and names each difference."""
+"""A replay repeats a run with the same bits, and names each difference."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def test_a_replay_of_a_run_in_real_time_is_identical(tmp_path: Path) -> None:
     assert 0 <= first - recording.about.epoch < 1_000_000_000, "Unix times, whatever the loop's clock is"
 
 
-def test_a_gripper_that_held_an_object_holds_the_object_in_the_replay_too(tmp_path: Path) -> None:
+def test_a_gripper_that_held_an_object_also_holds_the_object_in_the_replay(tmp_path: Path) -> None:
     flat = {"box": (0.06, 0.04, 0.015), "at": (0.0, 0.0, 0.0085), "mass": 0.1}
     config = object_cell(None, flat)
     loop = pipeline("grasp", "mujoco", source=ScriptedInput("grasp"), arms=config.arms, mujoco=config.mujoco)

@@ -117,7 +117,7 @@ def test_subtasks_are_judged_by_their_own_durations(file: Path) -> None:
     assert second.figures.missing_subtasks == ["place"]
 
 
-def test_an_episode_without_all_named_subtasks_is_discarded_unless_that_is_allowed(file: Path) -> None:
+def test_an_episode_in_which_a_named_subtask_is_missing_is_discarded_unless_the_settings_allow_it(file: Path) -> None:
     for needed, expected in ((True, [[], ["it has no place"]]), (False, [[], []])):
         judged = judge(Recording(file), JudgeSettings(needs_subtasks=needed))
         found = [[one.text for one in each.verdict.reasons if one.name == "needs_subtasks"] for each in judged]

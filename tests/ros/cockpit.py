@@ -19,7 +19,8 @@ ROBOT, CONTROLLER, ARMS = "mujoco_robot", "cartesian_controller", "arm_controlle
 class Cockpit:
     def __init__(self, node: Any, robot: Robot, processes: Processes, parameters: Mapping[str, Any]) -> None:
         self._starts: dict[str, Callable[[], RosProcess]] = {
-            ROBOT: lambda: start_robot(processes, "max_jump:=1.0"),  # The robot follows a jump, so that tests see it.
+            # The robot does not refuse a jump of its commands, so that tests see the jump.
+            ROBOT: lambda: start_robot(processes, "max_jump:=1.0"),
             CONTROLLER: lambda: start_controller(processes, *PATIENT),
             ARMS: lambda: processes.start_node(ARMS, *patient(parameters)),
         }

@@ -68,7 +68,7 @@ def precedence() -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def kernels(robot: Robot) -> None:
-    """Compile the kernels before any process is waited for, because the first time takes a minute or two."""
+    """Compile the kernels before tests wait for processes, because the first compilation takes one or two minutes."""
     config = load_config(CONFIG)
     CartesianController(robot, config.control).step({}, 0.001)
     ImpedanceController(robot, config.impedance)

@@ -14,7 +14,7 @@ from q2r2_control.plants.fri.wire import CommandKind, Drives, Operation, Quality
 from q2r2_control.types import Array
 
 PERIOD = 0.005  # Period of the driver [s].
-TAU = 0.04  # Default time constant of its filter of positions [s].
+TAU = 0.04  # Default time constant of the driver's filter of positions [s].
 NARROWER = math.radians(1.0)  # The driver's limits are narrower than the model's by this angle [rad].
 SAME = 3e-4  # Largest permitted difference between a first command and the cabinet's own position [rad].
 SAG = 2e-3  # The measured joints hang this far below their commands [rad].
@@ -33,7 +33,8 @@ class FakeLbr:
     def __init__(self, robot: Robot, arm: str, tau: float = TAU) -> None:
         """The time constant of the filter of positions is ``tau`` [s]."""
         joints = robot.arms[arm].joints
-        self._share = 1.0 if tau == 0.0 else 1.0 - math.exp(-PERIOD / tau)  # Share of the error that a period removes.
+        # Share of the distance to the command that the filter covers in a period.
+        self._share = 1.0 if tau == 0.0 else 1.0 - math.exp(-PERIOD / tau)
         # Positions and velocities as commanded to the cabinet [rad], [rad/s].
         self.q, self.v = robot.home[joints].copy(), np.zeros(len(joints))
         self.session, self.quality, self.safety = Session.MONITORING_READY, Quality.EXCELLENT, Safety.NORMAL
@@ -47,7 +48,7 @@ class FakeLbr:
         self._lower, self._upper = robot.position_lower[joints] + away, robot.position_upper[joints] - away
 
     def begin(self) -> None:
-        """Enter commanding active, as after a press on the pendant. The driver was restarted."""
+        """Enter commanding active, as after a restart of the driver and a press on the pendant."""
         self.quality, self.safety, self.drives = Quality.EXCELLENT, Safety.NORMAL, Drives.ACTIVE
         self.target, self.v, self.ipo = None, np.zeros_like(self.q), self.q
         self.session, self.silent = Session.COMMANDING_ACTIVE, False

@@ -23,7 +23,7 @@ _RESTARTED = 1.0  # Shortest time until a driver's process is restarted [s].
 _ALLOWANCE = 0.2  # Braking may last longer than the certified stop by this time [s].
 _LONGEST_STOP = 1.0  # Longest time from the end of a session to rest [s].
 _CREEPS = 1e-3  # A slower joint counts as resting [rad/s].
-_STUCK = 20.0  # A session in which nothing moves for this time will never move [s].
+_STUCK = 20.0  # If nothing moves in a session for this time, the soak has failed [s].
 
 
 @dataclass

@@ -159,7 +159,7 @@ def test_an_arm_needs_the_pose_of_its_tool_and_a_gripper_needs_its_server(rig: A
     assert rig.state["gripper"] == "open"
 
 
-def test_each_of_the_services_pause_and_reset_pauses_the_arm_and_so_does_a_second_publisher_of_targets(
+def test_the_services_pause_and_reset_pause_the_arm_and_a_second_publisher_of_targets_pauses_it_too(
     rig: ArmRig, node: Any, processes: Processes
 ) -> None:
     rig.start(processes)
@@ -275,7 +275,7 @@ def test_without_a_running_clock_an_arm_is_neither_engaged_nor_ready(
     send_time = lambda: publisher.publish(Clock(clock=time_message(1.0 + time.monotonic() - began)))  # noqa: E731
     timer = node.create_timer(0.01, send_time)
     rig.wait(lambda: rig.state["ready"], "it is ready when time comes")
-    assert (rig.state["engaged"], rig.targets) == (False, [])  # The press before has not engaged it.
+    assert (rig.state["engaged"], rig.targets) == (False, [])  # The earlier press has not engaged the arm.
     rig.engage()
     node.destroy_timer(timer)
     # On a machine with other load, another fault may have paused it before. Therefore its present reason is asked for.

@@ -131,7 +131,7 @@ def test_a_second_publisher_of_targets_during_motion_stops_the_arm_and_is_named(
     # The arm may only follow the motion of 1 cm of its first stream.
     assert max(np.linalg.norm(tool - begin.translation) for tool in tools) < 0.03
     stream.poses["left"] = shifted(begin, 0.0, 0.0, 0.2)
-    time.sleep(1.5)  # After this time, one publisher is assumed again.
+    time.sleep(1.5)  # After this time, the controller again counts only one publisher.
     stream.poses["left"] = cell.tool("left")
     wait_until(lambda: cell.state("left_state") == "following", "the stream that is left begins anew")
 

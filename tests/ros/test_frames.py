@@ -1,4 +1,4 @@
-"""Poses of frames in other frames, from transforms as they come."""
+"""Poses of frames in other frames are computed from the newest transforms."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A gripper's client asks before it commands. It moves only as far as it is permitted, whatever fails."""
+"""A gripper's client asks before it commands. The gripper moves only as far as is permitted, whatever fails."""
 
 from __future__ import annotations
 

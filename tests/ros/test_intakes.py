@@ -1,4 +1,4 @@
-"""Messages that nodes get from the middleware: late ones, joint states in parts, torques, refusals."""
+"""Messages that nodes get from the middleware: late messages, joint states of single arms, torques, and refusals."""
 
 from __future__ import annotations
 

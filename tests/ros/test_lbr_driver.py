@@ -67,7 +67,7 @@ def test_if_a_session_begins_while_the_arms_still_brake_it_gets_no_command_of_th
 
 
 @pytest.mark.parametrize(("tau", "delay", "speed"), [tuple(map(float, row)) for row in FILTERS])
-def test_the_delay_of_the_drivers_filter_and_its_speed_after_a_double_step_are_those_in_docs_kuka(
+def test_the_delay_of_the_drivers_filter_and_its_speed_after_a_double_step_agree_with_docs_kuka(
     tau: float, delay: float, speed: float, robot: Robot
 ) -> None:
     driver, ramp = FakeLbr(robot, "left", tau), 0.2  # ``ramp`` is the speed of the commanded joints [rad/s].

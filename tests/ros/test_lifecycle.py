@@ -1,4 +1,7 @@
-"""The controller as a managed node: it rests before it answers, sends no commands while inactive, and never jumps."""
+"""The controller as a managed node. It lets the arms rest before it answers, and sends no commands while inactive.
+
+No arm ever jumps.
+"""
 
 from __future__ import annotations
 
@@ -99,7 +102,7 @@ def test_the_controller_starts_active_and_brings_the_arms_to_rest_before_it_answ
     wait_until(lambda: cell.state("left_state") == "deactivated", "its state says so")
 
 
-def test_the_controller_activates_where_another_node_left_the_arms_once_this_node_is_silent(
+def test_the_controller_activates_where_another_node_left_the_arms_as_soon_as_the_other_node_is_silent(
     cell: Managed, robot: Robot
 ) -> None:
     if cell.lifecycle() == "active":

@@ -1,4 +1,4 @@
-"""Settings of arms and of the controller, from the YAML, at the start and while an arm moves. Nothing jumps."""
+"""Settings of arms and of the controller come from the YAML or from parameters. Changes of settings cause no jump."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A set in a namespace contains all topics and services of its nodes, so that two sets in one domain do not meet."""
+"""All topics and services of a set are in the set's namespace, so that two sets in one domain are independent."""
 
 from __future__ import annotations
 

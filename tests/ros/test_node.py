@@ -44,7 +44,7 @@ def test_only_the_thread_that_ticks_has_real_time_priority_where_permitted(node:
     assert set(found[1:]) == {(0, 0)}
 
 
-# The program runs an entry point and presses Ctrl-C when a module is about to be imported.
+# The program runs an entry point, and interrupts itself as Ctrl-C does, just before a module is imported.
 RUN = """
 import os, signal, sys
 from importlib import import_module
@@ -178,7 +178,8 @@ def test_middleware_settings_of_the_user_are_kept(environment: dict[str, str]) -
 def test_without_settings_of_the_user_the_shipped_profile_is_set_and_kept(ours: dict[str, str]) -> None:
     set_up_middleware(ours)
     assert Path(ours["FASTRTPS_DEFAULT_PROFILES_FILE"]).is_file()
-    # Both settings allow only UDP: one by a variable, the other by its profile, which the range has to keep.
+    # Both results allow only UDP. The first one does so by a variable. The second one does so by its profile, and needs
+    # this range, with which ROS 2 adds no shared memory.
     assert (
         ours.get("FASTDDS_BUILTIN_TRANSPORTS") == "UDPv4" or ours["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "SYSTEM_DEFAULT"
     )
@@ -341,7 +342,7 @@ def test_the_executor_raises_the_error_of_a_callback(make: Any, ticking: Ticking
         spin_until(executor, lambda: False)
 
 
-def test_an_executor_of_rclpy_runs_ticks_and_callbacks_of_messages_too(ticking: Ticking, context: Any) -> None:
+def test_an_executor_of_rclpy_also_runs_ticks_and_callbacks_of_messages(ticking: Ticking, context: Any) -> None:
     plain, publisher = SingleThreadedExecutor(context=context), ticking.listen()
     plain.add_node(ticking)
     ticking.create_tick(PERIOD, lambda: ticking.log.append("tick"))

@@ -124,7 +124,7 @@ def test_a_new_receiver_gets_no_commands_while_the_arms_are_elsewhere(
         with driven(config, robot, goal) as (ticks, _):
             wait_until(lambda: ticks and np.abs(ticks[-1].reference.q - robot.home).max() > 0.04, "a command is away")
             heard = subscribed(node, JointTrajectory, "joint_trajectory", COMMAND_QOS)
-            # Commands may be on their way between the middleware's notice of the receiver and the loop's.
+            # The middleware notices the receiver before the loop does. The commands between are still delivered.
             commands = (heard.get(timeout=PATIENCE).points[0].positions for _ in range(UNDER_WAY))
             assert any(np.abs(np.array(command) - robot.home).max() < 0.03 for command in commands)
             assert "a new receiver takes the commands" in caplog.text
@@ -133,7 +133,7 @@ def test_a_new_receiver_gets_no_commands_while_the_arms_are_elsewhere(
 
 
 @pytest.mark.parametrize("begins", ["a publisher that appears", "one that was silent"])
-def test_if_another_node_commands_the_arms_they_are_released_and_this_node_is_named(
+def test_if_another_node_commands_the_arms_they_are_released_and_the_other_node_is_named(
     begins: str, cell: Cell, config: Config, caplog: pytest.LogCaptureFixture
 ) -> None:
     goal, other = cell.q.copy(), None

@@ -110,7 +110,7 @@ def test_the_file_contains_messages_byte_for_byte_and_can_be_read_without_ros(
 
     # Bytes between a message's fields are arbitrary memory of the sender. Compare with the bytes of another listener.
     heard: list[bytes] = []
-    qos = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)  # The depth is that of the recorder.
+    qos = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)  # The recorder has the same depth.
     node.create_subscription(PoseStamped, HAND, heard.append, qos, raw=True)
     before = time.time_ns()
     strange = node.create_publisher(String, arm_events("left"), RECORDED_QOS)
@@ -210,7 +210,7 @@ def test_a_killed_recorder_leaves_a_file_that_its_writer_closes(recorder: Runnin
                 publisher.publish(PoseStamped())
             return int(recorder.state()["messages"]) - taken
 
-        # The count is that of all topics, and the newest messages may still be on the way to the pipe.
+        # The count contains the messages of all topics. The newest of them may still be on the way to the pipe.
         wait_until(lambda: sent() >= 2 * HANDED_OVER, "the node hands over what is not written", patience=600.0)
         recorder.state()  # When this state has come, those messages are in the pipe.
         os.kill(recorder.process.pid, signal.SIGKILL)

@@ -40,12 +40,14 @@ def subscribe(node: Any, hand: str) -> dict[str, Queue[Any]]:
 
 
 def assert_a_part_of(received: Array, script: Array) -> None:
-    """Assert that ``received`` is a run of rows of ``script``. The first rows may be lost before discovery."""
+    """Assert that ``received`` contains successive rows of ``script``. The first rows may be lost before discovery."""
     starts = range(len(script) - len(received) + 1)
     assert min(float(np.abs(script[start : start + len(received)] - received).max()) for start in starts) <= 1e-6
 
 
-def test_poses_inputs_and_twists_equal_those_of_the_script(node: Any, processes: Processes) -> None:
+def test_received_poses_inputs_and_twists_equal_the_poses_inputs_and_twists_of_the_script(
+    node: Any, processes: Processes
+) -> None:
     queues = subscribe(node, "right")
     start(processes, side="right", trajectory="rotate", rate=RATE)
     wait_until(lambda: all(queue.qsize() >= 300 for queue in queues.values()), "six seconds of each topic")

@@ -51,7 +51,8 @@ CHANGES = {
     "cartesian_controller": {"rate": RATE, "joint_state_timeout": 1.0, "target_timeout": 2.0, "listener_timeout": 3.0},
     "arm_controllers": {"rate": RATE, **PATIENT},
 }
-LENIENT = {"supervision": {"max_deviation": 0.5}}  # The arms of a starved robot are far behind their reference.
+# If the robot's process gets little processor time, its arms are far behind their reference.
+LENIENT = {"supervision": {"max_deviation": 0.5}}
 CHANGES["mujoco_robot"]["max_jump"] = 1.0  # On a busy machine, commands may come late and several at a time.
 
 

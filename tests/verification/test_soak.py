@@ -339,7 +339,7 @@ def test_while_bodies_leave_a_penetration_their_distance_never_decreases() -> No
     [((100.0, 103.0, 106.0, 109.0), 9.0), ((142.0, 145.0, 147.5, 147.1), -1.2), ((100.0, None, 100.0, 100.0), None)],
     ids=["a leak", "a heap that settles", "unknown"],
 )
-def test_a_steady_growth_of_memory_is_reported_and_a_heap_that_settles_is_not(
+def test_a_steady_growth_of_memory_is_reported_and_a_heap_that_settles_is_not_reported(
     memory: tuple[float | None, ...], growth: float | None
 ) -> None:
     found = steady_growth(memory)

@@ -31,7 +31,7 @@ def violation(promise: str, seed: int) -> Violation:
     return Violation(promise, seed, 3, "walk", 1, np.zeros(2), np.zeros(2), {}, "0.001", "")
 
 
-def test_the_report_on_two_soaks_has_the_sums_of_their_counts_and_the_worst_of_their_margins() -> None:
+def test_the_report_on_two_soaks_has_the_sums_of_their_counts_and_their_worst_margins() -> None:
     lines: list[str] = []
     both = run_soaks(cell(), TICKS, range(3, 5), HERE, progress=lines.append)
     first, second = (run_soak(cell(), TICKS, seed) for seed in (3, 4))

@@ -51,7 +51,7 @@ def test_for_an_arm_away_from_its_target_the_sentence_names_the_limit_that_holds
     assert words(tick_at(robot, 1.0), *binding) == expected
 
 
-def test_whatever_limits_are_active_the_sentence_says_of_an_arm_at_its_target_that_it_follows(
+def test_for_an_arm_at_its_target_the_sentence_says_that_the_arm_follows_whatever_limits_are_active(
     robot: Robot,
 ) -> None:
     tick = tick_at(robot, 1.0)

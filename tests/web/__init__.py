@@ -1,1 +1,1 @@
-"""The page of a run, in a real browser: make test-web."""
+"""Tests of the page of a run in a real browser. ``make test-web`` runs them."""

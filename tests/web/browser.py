@@ -51,7 +51,7 @@ class WebRun:
                 stdout=subprocess.PIPE,
                 stderr=file,
                 text=True,
-                # The background jobs of a shell ignore this signal, and the run would inherit this.
+                # If these tests are a background job of a shell, they ignore Ctrl-C, and the run would inherit this.
                 preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
             )
         wait_until(lambda: re.search(_URL, self.errors) or self._process.poll() is not None)
@@ -82,9 +82,9 @@ class WebRun:
 
 @contextmanager
 def one_processor() -> Iterator[None]:
-    """Let browsers that start meanwhile use one processor only, because they draw by software and would use all.
+    """Let browsers that start in the ``with`` block use only one processor.
 
-    Processes that start afterwards may use all processors again.
+    They draw by software, and would otherwise use all processors. Processes that start afterwards may use all of them.
     """
     processors = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {max(processors)})

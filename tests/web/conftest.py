@@ -24,7 +24,7 @@ Start = Callable[..., WebRun]
 
 @pytest.fixture(scope="session")
 def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[BrowserContext]:
-    """Start one browser for all tests. It looks for no updates of its own."""
+    """Start one browser for all tests. The browser does not look for updates of itself."""
     folder = tmp_path_factory.mktemp("profile")
     with ExitStack() as stack:
         with one_processor():
@@ -46,7 +46,7 @@ def open_page(browser: BrowserContext) -> Iterator[Open]:
     pages: list[Page] = []
 
     def open_one(url: str, script: str | None = None) -> Page:
-        """Open a page. With a ``script``, this is the headset's page, which runs ``script`` before its own scripts."""
+        """Open a page. A ``script`` is given for the headset's page, and runs before the page's own scripts."""
         pages.append(browser.new_page())
         if script is not None:
             pages[-1].add_init_script(script)

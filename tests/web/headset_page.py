@@ -28,7 +28,7 @@ def hand(x: float, *buttons: bool, **more: Any) -> dict[str, Any]:
 
 
 class Page:
-    """The connection of a page to the server. It numbers the messages. The page itself has the number ``number``."""
+    """The connection of a page to the server. It numbers its messages; ``number`` is the number of the page itself."""
 
     def __init__(self, source: WebXrInput, number: str = "1") -> None:
         assert source.url is not None

@@ -233,7 +233,7 @@ PICTURES = """async ([took, times]) => {
 }"""
 
 
-def test_after_a_slow_picture_keys_get_the_same_time_and_the_next_picture_has_fewer_pixels(
+def test_after_a_slow_picture_the_page_draws_nothing_for_the_same_time_and_then_draws_fewer_pixels(
     open_page: Open, listen: Listen
 ) -> None:
     page = open_page(str(listen().url), COUNTING)

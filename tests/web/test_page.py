@@ -44,7 +44,7 @@ def test_the_page_shows_both_arms_and_its_buttons_end_the_run_with_the_arms_at_r
     page.get_by_text("Pause both arms").click()
     wait_for_row(page, "why", 1, "a program asks for a pause")
     assert table(page)["next"] == ["nothing: a script moves the hands"] * 2
-    # Events without a change of state, such as that of a slider, do not hide the reason.
+    # Events without a change of state, such as the event of a slider, do not hide the reason.
     page.get_by_text("Settings", exact=True).click()
     page.locator("input:visible").first.fill("50")
     page.locator("input:visible").first.press("Enter")
@@ -147,7 +147,7 @@ def test_on_a_phone_the_panel_is_below_the_scene(open_page: Open, start: Start) 
 def test_the_page_of_a_replay_has_a_time_line_and_can_be_reloaded_with_its_token(
     open_page: Open, start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))  # The certificate is made here.
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))  # The certificate is made in this folder.
     loop = pipeline()
     with Recorder(tmp_path, "circle", waits=True) as recorder:
         recorder.begin(About.of(loop, False, {}), loop.robot)

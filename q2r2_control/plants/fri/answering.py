@@ -28,7 +28,7 @@ from q2r2_control.process.scheduling import few_garbage_collections, real_time, 
 # 0.2 ms.
 _RESERVED = 0.0015, 0.002
 _POLL = 0.05  # Time between two checks whether the arms stand still, after the loop has ended [s].
-_LONGEST_REPLY_WAIT = 1.0  # Longest time that the loop waits for the reply to its commands [s]. Arms brake meanwhile.
+_LONGEST_REPLY_WAIT = 1.0  # Longest time that the loop waits for the reply to its commands [s].
 # The socket option SO_TIMESTAMPNS, by which Linux stamps each arriving datagram with its real-time clock; the layout of
 # such a stamp; the size of the buffer for the stamp [bytes]; and the longest time that a datagram can have waited [s].
 # If the stamp shows a longer wait, the real-time clock has jumped.
@@ -42,7 +42,9 @@ class Line:
     session: ArmSession
     address: str  # Address of the cabinet. Datagrams from other addresses are ignored.
     file: int  # File descriptor of the socket.
-    newest: bytes | None = None  # The newest message of the cabinet, which the process passes on without decoding it.
+    newest: bytes | None = (
+        None  # The cabinet's newest message, which the process sends to the loop without decoding it.
+    )
 
 
 class CabinetAnswers(AnsweringProcess):
@@ -71,7 +73,7 @@ class CabinetAnswers(AnsweringProcess):
         newest, answers = {}, []
         for said in self.said():
             values, datagram = pickle.loads(said)
-            newest[values["arm"]] = values, datagram  # After a late tick only the newest message is decoded.
+            newest[values["arm"]] = values, datagram  # If several messages have come, only the newest one is decoded.
             if values["took"] is not None:
                 answers.append((values["arrival"], values["took"]))
         return [SessionState(**its | {"newest": raw and read_monitoring(raw)}) for its, raw in newest.values()], answers
@@ -150,7 +152,7 @@ class _Answering:
             if reply is not None:
                 opened.sendto(reply, source)
                 state.took = time.monotonic() - came
-        except OSError:  # The cabinet has gone. Its silence will be noticed.
+        except OSError:  # The cabinet cannot be reached. The loop notices that it is silent.
             return
         with suppress(OSError):  # If the loop stalls, the socket has no space for this state. A later state follows.
             self._states.send(pickle.dumps((vars(state) | {"newest": None}, line.newest)))

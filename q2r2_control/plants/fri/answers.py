@@ -1,4 +1,4 @@
-"""Compute where an arm has to be when its cabinet asks: the reference between ticks, and the time of an answer.
+"""Compute the posture in an answer to a cabinet: the reference between two ticks, at the time of the answer.
 
 **Two clocks.** A cabinet sends its questions by its own clock, which drifts against ours, through a network that delays
 and loses messages. To the cabinet, the difference between the positions of two answers, divided by its period, is a
@@ -6,10 +6,10 @@ velocity. If an answer were for the time at which its question arrived, the jitt
 The times of answers are therefore evenly spaced: each one is one period after the time of the newest answer that the
 cabinet has heard.
 
-**Catching up.** Lost messages and drift let the times of answers fall behind. They catch up at a rate of 1 +
-``CATCH_UP`` at most, and the rate changes by at most ``CATCH_UP_RAMP`` per second. If the reference has the velocity v
-and the acceleration a, the cabinet sees at most the velocity (1 + CATCH_UP) v and the acceleration
-(1 + CATCH_UP)^2 a + CATCH_UP_RAMP v.
+**Catching up.** Lost messages and drift let the times of answers fall behind the questions. They catch up at a rate of
+1 + ``CATCH_UP`` at most, and the rate changes by at most ``CATCH_UP_RAMP`` per second. If the reference has the
+velocity v and the acceleration a, the cabinet sees at most the velocity (1 + CATCH_UP) v and the acceleration (1 +
+CATCH_UP)^2 a + CATCH_UP_RAMP v.
 
 **Never beyond the certificate.** If the newest reference ends before the time of an answer, because our loop is late,
 the answer lies on the reference's certified stop. The loop then lets its own reference follow the same stop for the
@@ -30,7 +30,7 @@ from q2r2_control.types import Array
 
 CATCH_UP = 0.05  # The rate at which the times of answers pass differs from 1 by at most this number.
 CATCH_UP_RAMP = 0.4  # Greatest change of this rate per second [1/s].
-# Number of messages within which ``MessageClock`` follows a cabinet's clock that is slower than it was assumed.
+# If a cabinet's clock is slower than it was assumed, ``MessageClock`` adapts to it within this number of messages.
 _SETTLED = 500
 _PIECES = 1024  # Number of pieces of the path that are kept. A piece is the motion of one tick, or a stop.
 # Number of answers whose time is remembered. At the shortest period of 1 ms, these answers span four times the lag
@@ -45,12 +45,12 @@ class _Move(NamedTuple):
     end: float  # Time of the end [s].
     q: tuple[Array, Array]  # Postures at the start and at the end [rad].
     v: tuple[Array, Array]  # Velocities at the start and at the end [rad/s].
-    deceleration: Array  # Deceleration of the certified stop from the end [rad/s^2].
+    deceleration: Array  # Deceleration of the certified stop that begins at the end [rad/s^2].
 
     def at(self, t: float) -> tuple[Array, Array]:
         """Return posture and velocity at ``t`` [s], on the cubic through both ends.
 
-        It is a parabola if the acceleration is constant.
+        The cubic is a parabola if the acceleration is constant.
         """
         h = self.end - self.start
         return cubic(min(max((t - self.start) / h, 0.0), 1.0), h, self.q, self.v)
@@ -135,8 +135,8 @@ class ReferencePath:
 
 
 class _Answer(NamedTuple):
-    time: float  # The answer has the posture of the path at this time [s].
-    rate: float  # The time since the answer before, divided by the period [s/s].
+    time: float  # The answer contains the posture of the path at this time [s].
+    rate: float  # By how much this time is later than the time of the answer before, divided by the period [s/s].
 
 
 class MessageClock:
@@ -169,7 +169,7 @@ class AnswerTimes:
 
         Args:
             period: Time between two answers [s].
-            delay: An answer is for a time that is earlier than the expected time of its question by this much [s].
+            delay: The time of an answer is this much earlier than the expected time of its question [s].
         """
         self._period, self._delay = period, delay
         self._question = -1  # The counter of the newest question.
@@ -188,7 +188,7 @@ class AnswerTimes:
         return self._answers.get(counter) or self._answers[min(self._answers)]
 
     def at(self, question: int, expected: float, counter: int, heard: int) -> float:
-        """Return the time on the path that an answer is for [s]. A repeated question gets the newest time again.
+        """Return the time on the path for an answer [s]. A repeated question gets the newest time again.
 
         Args:
             question: The counter of the question.
@@ -209,8 +209,8 @@ class AnswerTimes:
         before = standing if heard < first or newest is None else self._heard(heard)
         lag = (wanted - before.time) / self._period - 1.0  # The lag as a number of answers.
         ramp = CATCH_UP_RAMP * self._period
-        # The additional rate falls by CATCH_UP_RAMP per second. This is the greatest rate with which it reaches 0
-        # together with the lag.
+        # The rate minus 1 falls by at most CATCH_UP_RAMP per second. ``excess`` is the greatest value from which it
+        # reaches 0 not later than the lag does.
         excess = math.copysign(math.sqrt(2.0 * ramp * abs(lag) + 0.25 * ramp * ramp) - 0.5 * ramp, lag)
         excess = min(max(excess, -CATCH_UP), CATCH_UP)
         rate = min(max(1.0 + excess, before.rate - ramp), before.rate + ramp)

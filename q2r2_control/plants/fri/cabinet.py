@@ -1,4 +1,4 @@
-"""A simulated Sunrise cabinet: its session, its guards and its arm. The caller passes the time.
+"""A simulated Sunrise cabinet: its session, its guards and its arm. It has no clock; callers pass the time to it.
 
 It serves to test clients, and is not a model of KUKA's controller. The states and their conditions follow the public
 client kits. Where the kits say nothing, such as how many answers a client may miss, the simulation is too strict
@@ -30,8 +30,9 @@ from q2r2_control.plants.fri.wire import (
 )
 
 _WINDOW = 50  # Number of the newest answers by which the quality of the connection is judged.
-# Least share of answers in time for each quality. KUKA publishes no such numbers. If GOOD needed 0.9, a loss of 1 % in
-# each direction would end a session within minutes, because by chance 6 of 50 successive answers would be missed.
+# Smallest share of answers in time for each quality. KUKA publishes no such numbers. If GOOD needed 0.9, a loss of 1 %
+# of the datagrams in each direction would end a session within minutes, because at some time 6 of 50 successive answers
+# would be missed by chance.
 _FAIR, _GOOD, _EXCELLENT = 0.5, 0.8, 0.98
 _MISSES = 10  # Number of successive answers that may be late while the client commands.
 _NEAR = 1e-3  # Largest distance of the first command from the cabinet's own position [rad].
@@ -75,7 +76,7 @@ class CabinetArm(Protocol):
         """Torques that contacts cause [Nm]."""
 
     def advance(self, dt: float, q: Joints, tau: Joints | None) -> None:
-        """Let ``dt`` [s] pass. The drives move to ``q`` [rad], and ``tau`` [Nm] is added to their impedance."""
+        """Let ``dt`` [s] pass. The drives move to ``q`` [rad], and add ``tau`` [Nm] to their impedance torques."""
 
     def tool_way(self, start: Joints, end: Joints) -> float:
         """Return the distance between the tool's positions in two postures [m]."""
@@ -147,7 +148,7 @@ class Cabinet:
         self._answer: FriCommand | None = None  # Answer to the newest message that asked for one.
         self._in_time: deque[bool] = deque(maxlen=_WINDOW)  # Whether each of the newest answers came in time.
         self._misses = 0  # Number of answers that were missed one after the other until now.
-        # Number of missed answers while a client commanded. Those after the client's last answer do not count.
+        # Number of answers that were missed while a client commanded. Misses after its last answer do not count.
         self.missed = 0
         self._overlay = False  # True if the application asks for the client's command.
         self._held: Joints = arm.q  # Position that the cabinet's own motion holds.
@@ -290,7 +291,8 @@ class Cabinet:
     def _guard(self, answer: FriCommand) -> Trip | None:
         """Return the reason why an answer cannot be followed; None if it can be followed.
 
-        A position may change only by what is allowed in one period, even if the answers before were missed.
+        Since the last answer, a position may have changed by at most the change that is allowed in one answer period,
+        even if answers in between were missed.
         """
         limits, period = self.settings, self.settings.answer_period
         if answer.q is None:

@@ -36,7 +36,7 @@ from q2r2_control.types import Array, Command, CommandMode
 # After a stall of this process, a client that commands still gets the messages that are late by up to this time [s].
 # Earlier messages are left out, as if the cabinets had been silent.
 _LONGEST_STALL = 1.0
-_LONGEST_CATCH_UP = 0.05  # Longest time that the simulation catches up in one step [s]. More is dropped.
+_LONGEST_CATCH_UP = 0.05  # Longest time that the simulation catches up in one step [s]. Any further time is dropped.
 _LOOK_AGAIN = 2e-4  # Time between two checks for an answer, while the next message waits for it [s].
 _ROUNDING = 1e-6  # Relative tolerance of durations.
 _SAG = 1e-3  # A cabinet allows positions this far beyond the robot's limits, because the simulated arm sags [rad].
@@ -52,7 +52,7 @@ class Network:
 
     loss: float = 0.0  # Share of lost datagrams in each direction.
     duplicate: float = 0.0  # Share of messages that come twice.
-    jitter: float = 0.0  # Largest delay of a datagram, which another one may overtake [s].
+    jitter: float = 0.0  # Largest random delay of a datagram [s]. Later datagrams may overtake it.
     cut: float = 0.0  # Share of datagrams that lose their end, in each direction.
 
 
@@ -97,7 +97,7 @@ class SimulatedArm:
     def wanted(self, t: float) -> tuple[Array, Array]:
         """Return the wanted position (n,) [rad] and velocity (n,) [rad/s] of the drives at ``t`` [s]."""
         share, change = (t - self._began) / self._lasts, np.subtract(self._to, self._from)
-        if share > 1.0 + _ROUNDING:  # If the next message is in time, its share is 1, and the drives still move.
+        if share > 1.0 + _ROUNDING:  # When the next message is in time, ``share`` is 1, and the drives still move.
             return np.array(self._to), np.zeros(JOINTS)
         return np.add(self._from, max(share, 0.0) * change), change / self._lasts
 

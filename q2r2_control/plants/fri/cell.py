@@ -1,11 +1,11 @@
 """Turn the ticks of the loop into commands for the sessions of all cabinets.
 
 **The loop's time and the cabinets' time.** Each tick of the loop moves the reference to one period after the tick. If
-ticks took longer lately, or commands came too late, the reference goes farther ahead by as much. The cabinets get each
-posture of the reference ``DELAY`` after the posture's time. If the loop is so late that the time of an answer would be
-after the end of the reference, the cabinets get the certified stop. :meth:`FriCell.due` then lets the reference follow
-the same stop first. If an answer passes the end while a tick is computed, the sessions refuse the command of this tick,
-and it is withdrawn.
+recent ticks took longer, or commands came too late, the reference goes farther ahead by this delay. The cabinets get
+each posture of the reference ``DELAY`` after the posture's time. If the loop is so late that the time of an answer
+would be after the end of the reference, the cabinets get the certified stop. :meth:`FriCell.due` then lets the
+reference follow the same stop first. If the time of an answer passes the end of the reference while a tick is computed,
+the sessions refuse the command of this tick, and it is withdrawn.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ _MARGIN, _LONGEST_MARGIN = 0.002, 0.016
 _SHORTEST = 0.5
 _FORGETTING = 0.01  # Share by which the longest recent tick and the margin become shorter in each tick.
 _PASSING = 0.0015  # Approximate time that a measurement takes through cabinet, network and processes [s].
-_NO_COMMANDS = 0.1  # If all commands come too late for longer than this, it is reported as a fault [s].
-# Time constant with which an arm loses its speed if no overlay comes: several periods of a cabinet [s].
+_NO_COMMANDS = 0.1  # If no command has come in time for longer than this, this is reported as a fault [s].
+# Time constant with which an arm loses its speed if no torque overlay comes: several periods of a cabinet [s].
 _BRAKING_TIME = 0.03
 _MISSING = 10  # If a cabinet's lost and unreadable messages reach this number in a run, they are reported.
 _logger = logging.getLogger(__name__)
@@ -58,7 +58,7 @@ class FriCell:
             robot: The robot.
             states: The state of each arm's session.
             period: Period of the loop [s].
-            longest: The longest step of the reference, whose acceleration is constant [s].
+            longest: The longest step of the reference [s]. The acceleration is constant during a step.
             grippers: The grippers of those arms that have one.
         """
         self.states = {state.arm: state for state in states}
@@ -97,7 +97,8 @@ class FriCell:
     def due(self, now: float) -> tuple[float, float]:
         """Return two durations for the tick at ``now`` [s]: the reference brakes first, and then moves [s].
 
-        In the first duration, the reference follows the certified stop. It is 0 if no answer passes the path's end.
+        In the first duration, the reference follows the certified stop. This duration is 0 if no answer is for a time
+        after the end of the path.
         """
         following = [state for state in self.states.values() if state.following]
         sent = now + self._margin
@@ -105,14 +106,15 @@ class FriCell:
         late, self._now, before = now - self._now if following else 0.0, now, self._end
         longest = max(late, (1.0 - _FORGETTING) * self._longest_tick)
         self._longest_tick = max(self._period, min(longest, self._longest))
-        # While no arm follows, a session may have begun of which the loop does not know yet. Each tick therefore moves
+        # While no arm follows, a session may have begun, and the loop may not know it yet. Each tick therefore moves
         # the reference by one period.
         ahead = self._ahead if following else self._period
         if not following or latest <= before:
             braked, self._start = 0.0, before if following else now
         else:
             braked, self._start = latest - before, latest
-        # A step with one acceleration is a parabola, as the path expects. The next tick adds the rest of a late tick.
+        # The acceleration is constant during a step, because the path expects a parabola. If a tick is so late that the
+        # step would be too long, the next tick adds the rest.
         step = min(max(now + ahead - self._start, _SHORTEST * self._period), self._longest)
         self._end = self._start + step
         return braked, step
@@ -128,7 +130,7 @@ class FriCell:
             damping = pin.crba(model, data, measured).diagonal() / _BRAKING_TIME
         for arm, joints in self._joints.items():
             deceleration = command.deceleration
-            # A reference at rest has no deceleration, so any positive number will do.
+            # The command of a reference at rest has no deceleration. Any positive number is then allowed here.
             stop = (1.0,) * JOINTS if deceleration is None else joints_of(deceleration[joints])
             q, v = joints_of(command.q[joints]), joints_of(command.v[joints])
             its = sent[arm] = ArmCommand(self._now, self._start, self._end, q, v, stop)
@@ -191,7 +193,7 @@ class FriCell:
     def timings(self) -> dict[str, ArmTiming]:
         """Return the timing of all arms whose cabinets were heard.
 
-        Answers with torques have no lag, so that only silence counts for them.
+        Answers with torques have no lag. For them, only the time since the cabinet's last message is of interest.
         """
         return {arm: state.timing(self._now) for arm, state in self.states.items() if state.newest is not None}
 

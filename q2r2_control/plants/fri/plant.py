@@ -1,4 +1,4 @@
-"""Two arms, or one, behind KUKA's cabinets. A process answers the cabinets, and gets the arms' motion from the loop."""
+"""One or two arms that KUKA's cabinets control. A process answers the cabinets; the loop sends it the arms' motion."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ class FriPlant:
 
         Raises:
             ConfigError: If an arm lacks a cabinet or does not have seven joints, if the package of a gripper is
-                missing, or if ``control.max_substep`` is shorter than two loop periods. Then a late tick would be split
-                into steps, but a cabinet can follow only one parabola per tick.
+                missing, or if ``control.max_substep`` is shorter than two loop periods. With so short a value, a late
+                tick would be split into steps, but a cabinet can follow only one parabola per tick.
         """
         for arm, its in robot.arms.items():
             if arm not in set(config.fri):
@@ -85,7 +85,7 @@ class FriPlant:
         """Start the process that answers the cabinets, and wait for their sessions.
 
         Raises:
-            PlantError: If a cabinet says nothing, or if ``q`` is given, because real arms cannot be placed.
+            PlantError: If a cabinet sends no message, or if ``q`` is given, because real arms start where they stand.
         """
         if q is not None:
             raise PlantError("reset q: a real arm starts where it stands")
@@ -108,7 +108,7 @@ class FriPlant:
             raise
 
     def _wait(self) -> None:
-        """Wait for the cabinets; raises :class:`PlantError` if one says nothing."""
+        """Wait for the cabinets; raises :class:`PlantError` if a cabinet sends no message."""
         waiting = CabinetWait(self._stopped)
 
         def looked(ready: Callable[[], bool]) -> bool:

@@ -29,12 +29,13 @@ DELAY = 0.004
 _AT_REST = 1e-9  # Greatest distance from the end of the path at which the arm counts as resting [rad].
 _RESTARTED = 1000  # A counter that goes back by more shows that the session has begun again.
 _COUNTERS = 1 << 32
-# A message's counter may have grown by twice the number of periods that have passed, plus this number.
+# A message's counter may have grown by at most twice the number of periods that have passed, plus this number.
 _MOST_AHEAD = 20
-# A torque that nobody updates would push for ever. After the first time, it is replaced by a torque that brakes [s].
-# After the second time, the cabinet gets no answer, so that it ends the session [s].
+# A torque without updates would push for ever. If it is older than the first of these times [s], it is replaced by a
+# torque that brakes. If it is older than the second time [s], the cabinet gets no answer, so that it ends the session.
 _TORQUE_LASTS, _TORQUE_GONE = 0.02, 0.1
-# A lower limit of the torques' rate is raised to this value [Nm/s]. With the lower limit, damping would come too late.
+# If the limit of the torques' rate is below this value, it is raised to it [Nm/s]. With the original limit, the damping
+# would come too late.
 _BRAKING_RATE = 5000.0
 # Greatest distance at which a reference may begin [rad]: with positions, from the position in which the arm is held;
 # with torques, from the arm's measured position.
@@ -45,7 +46,7 @@ _FROM_REST = 20.0  # Upper bound on the acceleration of a joint in the first tic
 class ArmSession:
     """The session of one arm.
 
-    While the arm follows the reference, the positions in its answers lie on ``path``. Otherwise they hold the arm.
+    While the arm follows the reference, the positions in its answers lie on ``path``. Otherwise they keep it at rest.
     """
 
     def __init__(
@@ -87,7 +88,8 @@ class ArmSession:
         self._answers = 0
         self._times: AnswerTimes | None = None
         self._clock = MessageClock(-math.inf)
-        self.waits = 0.0  # By this much the times of answers are earlier, to wait for other arms that are behind [s].
+        # The times of answers are this much earlier, so that the arm waits for other arms that are behind [s].
+        self.waits = 0.0
         self._begun = False  # Whether the path begins at the cabinet's own position, which is then known.
 
     def is_still(self, now: float) -> bool:
@@ -239,7 +241,8 @@ class ArmSession:
             self._times = AnswerTimes(message.period * message.multiplier, DELAY)
         if message.session is Session.COMMANDING_WAIT or not self._begun:
             # The first command has to equal the cabinet's own position, at which the reference begins. If another
-            # client has begun the session, the arm has left that position, and its commanded position counts.
+            # client has begun the session, the arm has left that position. The reference then begins at the position
+            # that the cabinet reports as commanded.
             own = message.ipo_q if message.session is Session.COMMANDING_WAIT else message.commanded_q
             self._cease()
             self._begun = True

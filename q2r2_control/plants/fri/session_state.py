@@ -37,8 +37,10 @@ class SessionState:
     ended: int = 0  # Number of times that the arm ceased to follow because its cabinet ended the session.
     answered: float = -math.inf  # The latest time on the path for which an answer was sent.
     expected: float = -math.inf  # The time at which the question of the newest answer would have come without delay.
-    lag: float = 0.0  # By how much the time of the newest answer is too early, judged by the arrival of its question.
-    # By how much that time is too early, judged by ``expected``, so that delays of the network do not count.
+    # An answer should be for the time ``DELAY`` before the arrival of its question. The newest answer is for a time
+    # that is earlier than this by the lag.
+    lag: float = 0.0
+    # The lag with ``expected`` in place of the arrival, so that delays of the network do not count.
     behind: float = 0.0
     took: float | None = None  # Time from the newest message until its answer was sent; None if it got no answer.
     lost: int = 0  # Number of lost messages of the cabinet.
@@ -90,8 +92,8 @@ class SessionState:
         if self.is_too_slow:
             period, allowed = 1e3 * self.period, 1e3 * TORQUE_PERIOD
             return Reason.of(FriReason.FRI_TOO_SELDOM, arm=self.arm, period=period, allowed=allowed)
-        # Both are checked, because the session goes on for a while after some stops of the safety controller, and our
-        # own stop has to begin at once.
+        # Session and safety are both checked. After some stops of the safety controller, the session goes on for a
+        # while, but our own stop has to begin at once.
         if newest.session is not Session.COMMANDING_ACTIVE or newest.safety is not Safety.NORMAL:
             states = newest.session, newest.quality, newest.safety, newest.drives
             doing, quality, safety, drives = map(in_words, states)
@@ -116,6 +118,6 @@ class ArmCommand:
     q: Joints  # Posture of the reference at the end of the tick [rad].
     v: Joints  # Velocity of the reference at the end of the tick [rad/s].
     deceleration: Joints  # Deceleration of the stop [rad/s^2].
-    outputs: dict[str, IoValue] = field(default_factory=dict)  # Outputs of the cabinet that are set, by name.
+    outputs: dict[str, IoValue] = field(default_factory=dict)  # New values of the cabinet's outputs, by name.
     tau: Joints | None = None  # Torque overlay [Nm]; None with positions, or if the damping brakes.
     damping: Joints | None = None  # Damping that brakes if no overlay comes [Nm s/rad]; None with positions.

@@ -76,7 +76,7 @@ class Operation(IntEnum):
 
 
 class Drives(IntEnum):
-    """The state of the drives, which is the state of the worst joint."""
+    """The state of an arm's drives. If the joints' drives differ, it is their lowest state."""
 
     OFF = 0
     TRANSITIONING = 1

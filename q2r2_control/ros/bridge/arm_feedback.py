@@ -95,7 +95,7 @@ class ArmFeedback:
         self.haptics = HapticPulses(values.teleop.haptics)
         # The text of the last event, and the kind of this event's reason.
         self.last_line, self.last_kind = "not engaged yet", ""
-        # The text of the last event that left the arm holding, and the kind of this event's reason.
+        # The text of the last event after which the arm rested, and the kind of this event's reason.
         self.paused, self.paused_kind = "not engaged yet", ""
         self._drawn = TargetMarkers(arm, values.tool_frame, values.world_frame)
         self._markers = node.create_publisher(Marker, "visualization_marker", 10)

@@ -63,8 +63,8 @@ class ArmOutputs:
                 self.first = theirs
         self._all = [self.first] if self._relay is None else [self.first, self._relay]
         self._follows: FollowWatch | None = None
-        # The name of the built-in controller, or None: in ``builtin`` if it gets the hand's targets, and in
-        # ``home_controller`` if it also moves the arm home.
+        # ``builtin`` is the name of the built-in controller if this controller gets the hand's targets; otherwise None.
+        # ``home_controller`` is this name if the built-in controller also moves the arm home; otherwise None.
         self.builtin = values.builtin_node if self.first.preset is BUILTIN else None
         self.home_controller = None if self._filtered else self.builtin
         if self.first.preset is BUILTIN:
@@ -77,7 +77,8 @@ class ArmOutputs:
         self._safe_problem: Reason | None = self._safe_target.problem  # Why the relay cannot begin now, or None.
         self._relaying = False
         raw = not self._filtered and preset is not BUILTIN
-        # The built-in controller needs no such watch: its reference is known here, and may stand still for a reason.
+        # The built-in controller needs no such watch. Its reference may rest on purpose, such as near an obstacle, and
+        # is known here from its safe targets.
         self._stands = StandstillWatch(LAGGING_TOOL) if raw else None
         self._node, self._arm = node, arm
 
@@ -112,9 +113,9 @@ class ArmOutputs:
 
     @property
     def gripper_held(self) -> str | None:
-        """Return the pair of bodies that stops the gripper short of its requested opening, or None.
+        """Return which pair of bodies keeps the gripper from its requested opening, or None.
 
-        The built-in controller reports it.
+        The built-in controller reports this pair.
         """
         why = "" if self._follows is None else self._follows.gripper_held
         return f"the gripper goes no farther: {why}" if why else None
@@ -214,7 +215,7 @@ class FollowWatch:
         self._is_there, self._looked = False, -math.inf
         self.homing = False  # Whether the controller reports that it goes home.
         self.homing_outcome: Reason | None = None  # How the last motion home ended; None if nothing is reported.
-        self.gripper_held = ""  # The pair of bodies that stops the gripper; empty if none does.
+        self.gripper_held = ""  # The pair of bodies that stops the gripper; empty if no pair does.
         node.create_subscription(Bool, self._topic, self._on_following, LATCHED_QOS)
         node.create_subscription(String, self._state_topic, self._on_state, STREAM_QOS)
 

@@ -196,8 +196,8 @@ class GripperLimits:
             return
         wanted, commanded = told
         if arm not in self.wanted and commanded == commanded:
-            # This opening was requested before the node began, maybe long ago. Therefore the gripper stays at its last
-            # command.
+            # This opening was requested before the node began, maybe long ago. Therefore the gripper stays at the last
+            # commanded opening.
             now = self._node.now
             self._loop.resume_gripper(arm, wanted, commanded, self.openings(now), now)
             self.answer()

@@ -94,9 +94,9 @@ class FrameTree:
             if name in up:
                 pose, received = up[name].pose.inverse() * placement.pose, min(up[name].received, placement.received)
                 place = self._found[frame, within] = Placement(pose, received)
-                self._used.update(up, passed)  # All ancestors of this common one are in ``up``.
+                self._used.update(up, passed)  # ``up`` contains all ancestors of this common ancestor.
                 self._all = False
-                return place  # The placement is remembered until the next transform, which clears all of them.
+                return place  # The placement is remembered until the next transform, which clears all placements.
         self._all = True
         return None
 

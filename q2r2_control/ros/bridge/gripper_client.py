@@ -16,7 +16,9 @@ from q2r2_control.ros.base_node import COMMAND_QOS, LATCHED_QOS, BaseNode
 
 _RESULT_TIMEOUT = 10.0  # Longest time to wait for the result of a goal [s].
 _ANSWER_TIMEOUT = 1.0  # Longest time to wait for the controller that grants openings [s].
-_MOVE_PERIOD, _MOVE_STEP = 0.1, 0.01  # For a gripper that follows a trigger: time between goals [s], share of stroke.
+# For a gripper that follows a trigger: shortest time between two goals [s], and smallest change of the opening, as a
+# share of the stroke, for which a new goal is sent.
+_MOVE_PERIOD, _MOVE_STEP = 0.1, 0.01
 
 
 def wanted_topic(target_topic: str) -> str:
@@ -49,7 +51,7 @@ class OpeningGrants:
         return None if self._answer is None or self._answer[0] != self._wanted else self._answer[1]
 
     def ask(self, opening: float) -> None:
-        """Request an opening. The request holds until the next request."""
+        """Request an opening. The request is valid until the next request."""
         self._wanted = opening
         self._tell()
 

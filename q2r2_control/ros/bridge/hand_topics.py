@@ -141,7 +141,7 @@ class HandIntake:
         self._haptics: dict[str, Any] = {}
         self._one: dict[str, OnePublisher] = {}  # The check for several publishers of each hand.
         self._samples = SampleQueue()
-        self._received = -math.inf  # Receipt time of the message in progress [s].
+        self._received = -math.inf  # Receipt time of the message that is being processed [s].
         self.follow(hand)
 
     def follow(self, hand: str) -> None:

@@ -44,8 +44,8 @@ from q2r2_control.wording import sentence
 _SHARED = "joint_states"  # The default topic of joint states.
 # If a target's delay exceeds the usual delay by more than this, the stamp does not say when the target is due [s].
 _LATEST = 0.02
-# If a target is older at its receipt than the target before was, by more than this, its sender stood still after making
-# it [s].
+# The age of a target is the time from its stamp to its receipt. If a target is older than the target before was, by
+# more than this, its sender stood still between making and sending it [s].
 _OLD = 0.5
 # Longest period of joint states from which the lags of two arms can be compared [s], and the weight of a new period in
 # the mean period.
@@ -87,7 +87,7 @@ class TargetIntake:
         # The delay of each target from its stamp to its receipt.
         self._stamps = {arm: DelayWatch(_LATEST) for arm in robot.arms}
         self._newest = dict.fromkeys(robot.arms, (0, 0.0))  # Stamp of the last target [ns], and its age at receipt [s].
-        # By arm, why its last target was not used, and the time of that [s].
+        # By arm, why its last target was refused, and the time of the refusal [s].
         self._refused: dict[str, tuple[Reason, float]] = {}
         self.rejected = dict.fromkeys(robot.arms, 0)
 
@@ -133,7 +133,7 @@ class TargetIntake:
             self._refused.pop(arm, None)
 
     def _due(self, arm: str, made: int, received: float) -> float | None:
-        """Return when a target is due [s], by its stamp [ns]; None if the stamp does not tell."""
+        """Return when a target is due [s], from its stamp ``made`` [ns]; None if the stamp does not show this."""
         stamp, stamps = 1e-9 * made, self._stamps[arm]
         known = stamp > 0.0 and stamps.take(received - stamp, received) == 0.0
         return stamp + stamps.usual if known else None
@@ -171,18 +171,18 @@ def _frame_of(node: BaseNode, robot: Robot, arm: str) -> TargetFrame:
 
 
 class JointIntake:
-    """Merges joint states of one topic or several into one state of all arms. It is as old as its oldest part."""
+    """Merges joint states from one or more topics into one state of all arms, with the time of its oldest part."""
 
     def __init__(
         self, node: BaseNode, robot: Robot, needs_external_torque: bool = False, told_by_drivers: bool = False
     ) -> None:
         """Declare the parameters; raises :class:`ConfigError`.
 
-        With ``needs_external_torque``, no state is good without external torques. Their topic must then be set, unless
-        drivers report the torques (``told_by_drivers``).
+        With ``needs_external_torque``, a state without external torques counts as a fault. The topic of these torques
+        must then be set, unless drivers report the torques (``told_by_drivers``).
         """
         self._node, self._needs_external_torque = node, needs_external_torque
-        self._topics: dict[str, list[str]] = {}  # By topic, the arms whose joints it carries.
+        self._topics: dict[str, list[str]] = {}  # By topic, the arms whose joint states come on it.
         for arm in robot.arms:
             topic = node.parameter(f"{arm}.joint_states_topic", _SHARED, "carries all joints of this arm")
             self._topics.setdefault(topic, []).append(arm)
@@ -204,7 +204,7 @@ class JointIntake:
         self._values = np.zeros((3, len(robot.joint_names)))
         self._turns = TurnCounter(robot)
         self.state: RobotState | None = None  # The newest state of all arms.
-        self._own_names: set[str] = set()  # Topics on which the arms' own names have come.
+        self._own_names: set[str] = set()  # Topics on which messages with our own names of joints have come.
         # By our name of a joint, the name that the driver uses for it. Joints with equal names are left out.
         self.theirs: dict[str, str] = {}
         # Two functions that return what drivers report. The first one returns why arms do not follow, or None. The
@@ -293,7 +293,10 @@ class JointIntake:
         return text if len(self._topics) == 1 else f"{topic}: {text}"
 
     def _part(self, topic: str, given: tuple[str, ...]) -> tuple[list[str], npt.NDArray[np.intp]]:
-        """Return the names and indices of a topic's joints that a message has. Each arm may have its own publisher."""
+        """Return names and indices of those joints of a topic that are in a message with the names ``given``.
+
+        A message may contain only some of them, because each arm may have its own publisher.
+        """
         if (part := self._parts.get((topic, given))) is None:
             if len(self._parts) >= _PARTS:  # The cache fills only if a publisher sends other names each time.
                 self._parts.clear()
@@ -305,7 +308,8 @@ class JointIntake:
     def _named_otherwise(self, topic: str, given: Sequence[str]) -> list[str]:
         """Return the sender's own names of an arm's joints; [] if they cannot be found. They are logged once."""
         names = self._names[topic]
-        # Any robot may publish on the default topic. If a topic has carried our names, no other names are needed.
+        # Any robot may publish on the default topic. If messages with our names came on a topic, other names on it are
+        # not needed.
         if topic == _SHARED or len(self._topics[topic]) > 1 or topic in self._own_names:
             return []
         theirs = called_otherwise(tuple(names), tuple(given), self._others[topic])

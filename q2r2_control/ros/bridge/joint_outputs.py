@@ -41,8 +41,9 @@ class Kind(ABC):
     """One kind of command message. It is made for the control loop's period [s] and a robot."""
 
     topic: ClassVar[str]  # The default topic.
-    older: str | None = None  # The topic's last part in older releases of the receiver. Commands are sent there too.
-    mode = CommandMode.POSITION  # The mode of the drive whose commands this kind carries.
+    # The last part of the topic's name in older releases of the receiver. Commands are also sent on that topic.
+    older: str | None = None
+    mode = CommandMode.POSITION  # The mode of the drive whose commands a message of this kind contains.
     joints_each: int | None = None  # The number of joints that a message must have; None for any number.
     message: Any  # The type of the messages.
 
@@ -129,7 +130,7 @@ class LbrPosition(Kind):
 class LbrTorque(LbrPosition):
     """An LBRTorqueCommand of lbr_fri_idl, with torques without gravity, which KUKA's cabinet compensates itself.
 
-    Each message carries the measured position, because the driver ignores torques with a position of NaN.
+    Each message contains the measured position, because the driver ignores torques with a position of NaN.
     """
 
     topic, mode, older = "/{arm}/command/lbr_torque_command", CommandMode.TORQUE, "torque"
@@ -244,9 +245,9 @@ class JointOutput:
     def listener_fault(self, off_reference: bool) -> Reason | None:
         """Return a reason if the receiver of the commands has gone, or if there is a new one; else None.
 
-        It is called before each command. Receivers are checked only while the arms are ``off_reference``, because a
-        check sometimes costs a message. Receivers of torques are not checked: compliant arms are off their reference by
-        design, and a torque for the measured posture causes no jump.
+        It is called before each command. Receivers are checked only while the arms are ``off_reference``, because for
+        these checks a message sometimes has to be left out. Receivers of torques are not checked: compliant arms are
+        off their reference by design, and a torque for the measured posture causes no jump.
         """
         publishers = [channel.publisher for channel in self._channels]
         before, self._listeners = self._listeners, sum(publisher.listeners for publisher in publishers)
@@ -294,7 +295,7 @@ def make_output(name: str, node: BaseNode, robot: Robot, config: Config, period:
 
 
 def _topics(name: str, node: BaseNode, robot: Robot) -> dict[str, str]:
-    """Return the topic that carries each arm's joints. Arms with the same topic share its messages."""
+    """Return the topic for the joint commands of each arm. Arms with the same topic share its messages."""
     what = "joint commands of all arms, {arm} stands for an arm's name; \"\": the output's usual one"
     shared = node.parameter("output_topic", "", what) or ("" if name == NONE else KINDS[name].topic)
     topics: dict[str, str] = {}

@@ -25,7 +25,7 @@ _WANTED = {CommandMode.POSITION: CommandKind.POSITION, CommandMode.TORQUE: Comma
 
 
 class LbrDrivers:
-    """Listens to the drivers of the arms. Commands count only in COMMANDING_ACTIVE, as with :class:`FriPlant`.
+    """Listens to the drivers of the arms. Arms follow commands only in COMMANDING_ACTIVE, as with :class:`FriPlant`.
 
     Commands overlay a motion of the cabinet, whose position (``ipo_joint_position``) stays where the session began. The
     first command of a session equals this position. After it, the arm is held at the last command. An arm is not ready
@@ -73,8 +73,8 @@ class LbrDrivers:
     def held(self, q: Array) -> Array | None:
         """Return the posture (nv,) at which the arms are held, which the next command has to equal [rad].
 
-        If an arm's posture is not known or not near the measured ``q`` (nv,) [rad], its joints are those of ``q``.
-        Return None if the commands are torques.
+        If the posture of an arm is not known, or not near the measured ``q`` (nv,) [rad], the result contains the
+        measured positions of this arm. The result is None if the commands are torques.
         """
         if self._mode is not CommandMode.POSITION:
             return None

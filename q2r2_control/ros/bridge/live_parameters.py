@@ -1,4 +1,7 @@
-"""Settings that change while a node runs. If one of several cannot change, none does, and the answer says why."""
+"""Settings that users change while a node runs.
+
+If a user changes several settings at once and one of them cannot change, none changes, and the answer says why.
+"""
 
 from __future__ import annotations
 
@@ -16,8 +19,8 @@ from q2r2_control.robot.pairs import CLEARANCE
 from q2r2_control.ros.base_node import BaseNode
 from q2r2_control.ros.bridge.parameters import may_be_none, range_of, stance_of
 
-# These modules are not imported at run time, because the nodes of arms have no controller, and must not wait for its
-# kernels.
+# These modules are not imported at run time, because the nodes of arms have no controller, and must not spend time on
+# loading its kernels.
 if TYPE_CHECKING:
     from q2r2_control.compliance.impedance import ImpedanceController
     from q2r2_control.control.controller import CartesianController
@@ -79,7 +82,7 @@ def make_control_live(node: BaseNode, controller: CartesianController) -> None:
         field = ControllerSettings.model_fields[name]
         value, within = getattr(controller.settings, name), range_of(field)
         if name == "min_distance":
-            # The range is written here, because the field does not contain the bounds of this type.
+            # The range is given here, because the metadata of this field do not contain the bounds of its type.
             within = 0.0, max(CLEARANCE, value)
         node.parameter(f"control.{name}", value, field.description or name, read_only=False, within=within)
 

@@ -22,7 +22,7 @@ from q2r2_control.ros.bridge.wire import JointNumbers, Template, read_pose
 from q2r2_control.types import QUEST_CONTROLS, Array, HandInputs, RobotState
 
 _UNIT = 1e-3  # Allowed error of a quaternion's norm.
-_OLDEST = 0.1  # A message waits only until the next tick. A greater age means that the clock was set [s].
+_OLDEST = 0.1  # A message waits only until the next tick. If it seems to be older than this, the clock was set [s].
 
 
 def ended_topic(target_topic: str) -> str:
@@ -92,7 +92,7 @@ def is_pose(numbers: Sequence[float]) -> bool:
 
 
 def pose_of_numbers(numbers: Sequence[float]) -> pin.SE3 | None:
-    """Return the pose of a position and a quaternion x y z w; None as in :func:`pose_of`."""
+    """Return the pose of a position and a quaternion x y z w; None if the numbers are no finite pose."""
     if not is_pose(numbers):
         return None
     x, y, z, a, b, c, w = numbers
@@ -182,7 +182,7 @@ def robot_state(message: JointState | JointNumbers, names: Sequence[str], t: flo
         if len(numbers) != len(message.name):
             return f"{len(numbers)} {field} values for {len(message.name)} joints"
         numbers = numbers[order]
-        if not math.isfinite(sum(numbers.tolist())):  # Most often this is enough to know that all are finite.
+        if not math.isfinite(sum(numbers.tolist())):  # If the sum is finite, all numbers are finite.
             numbers = measured(field, numbers)
             if not np.isfinite(numbers).all():
                 return f"{field} of {names[int(np.argmin(np.isfinite(numbers)))]} is not finite"
@@ -195,8 +195,9 @@ def called_otherwise(names: tuple[str, ...], given: tuple[str, ...], others: tup
     """Return the sender's name for each of an arm's joints, among the ``given`` names; {} unless all are found.
 
     A joint left_A1 may be lbr_A1 or A1 for the sender. It is found by its last part if only one given name has this
-    part. It may also be left_joint_1, if names that differ only in their number have all the numbers of the joints. If
-    a given name begins with one of ``others``, which are the other arms, no name is used.
+    part. It may also be left_joint_1. It is then found by its number: in exactly one group of given names that differ
+    only in the numbers at their ends, these numbers must be those of the arm's joints. If a given name begins with one
+    of ``others``, which are the other arms, no name is used.
     """
     if any(name.startswith(f"{other}_") for name in given for other in others):
         return {}

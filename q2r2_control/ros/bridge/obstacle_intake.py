@@ -21,8 +21,8 @@ TOPIC = "~/obstacles"
 class ObstacleIntake:
     """Passes each :class:`Marker` to the controller. ``ns`` is the obstacle's name, ``text`` has its bounds as YAML.
 
-    The bounds are ``speed``, ``acceleration`` and ``speed_now``, see :class:`MovingObstacle`. A cylinder becomes the
-    capsule around it. The action DELETE removes an obstacle.
+    The bounds are ``speed``, ``acceleration`` and ``speed_now``, see :class:`MovingObstacle`. A cylinder becomes a
+    capsule that contains it. The action DELETE removes an obstacle.
     """
 
     def __init__(self, node: BaseNode, controller: CartesianController) -> None:

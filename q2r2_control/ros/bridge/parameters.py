@@ -128,7 +128,7 @@ def _of_cell(given: ArmDefaults, path: str) -> ArmDefaults:
     if cell.external is None:
         return given
     external, theirs = cell.external, cell.external.arm(side)
-    takes_targets = external.terms.takes_targets  # If not, rate and topic belong to joint commands.
+    takes_targets = external.terms.takes_targets  # Otherwise, ``rate`` and ``target_topic`` are for joint commands.
     return replace(
         given,
         preset=external.preset,
@@ -211,7 +211,7 @@ def may_be_none(field: FieldInfo) -> bool:
 
 
 def range_of(field: FieldInfo) -> tuple[float, float] | None:
-    """Return the closed range of a field, or None. The model checks whether the ends are allowed."""
+    """Return the closed range of a field, or None. The settings model checks whether the ends are allowed."""
     least = [getattr(entry, name) for entry in field.metadata for name in ("ge", "gt") if hasattr(entry, name)]
     greatest = [getattr(entry, name) for entry in field.metadata for name in ("le", "lt") if hasattr(entry, name)]
     return (float(least[0]), float(greatest[0])) if least and greatest else None

@@ -27,12 +27,12 @@ from q2r2_control.teleop.arm_states import ArmState
 _GRAPH_PERIOD = 0.1  # Time between two queries of the graph for subscribers [s].
 # After a subscriber appeared, the graph is asked at every tick, because it lists an endpoint before the name of the
 # endpoint's node. Until the name is known nothing is sent: the node may be the restarted controller, whose first target
-# must not be a jump. If the name is not known after this time, an engaged arm is paused [s].
+# must not cause a jump. If the name is not known after this time, an engaged arm is paused [s].
 _NAME_TIMEOUT = 3.0
 # Time from a stream's last target to the message that ends the stream [s]. That message is on another topic, and must
 # not arrive before the target.
 _END_DELAY = 0.03
-# If the tool is farther from a held target than this, something else moved it. The target is then not repeated.
+# If a tool is farther from its held target than this, something else has moved the tool. The target is not repeated.
 _HELD = 0.15, 0.6  # [m], [rad]
 
 
@@ -58,7 +58,7 @@ class TargetOutput:
         self.guard = PoseRateLimiter(guard, 1.0 / values.rate)
         self._node, self._controller, self._frame = node, controller, frame
         self._template = pose_template(frame)
-        # The controller takes the velocity of the guarded pose instead of the pose.
+        # True if the controller gets the velocity of the guarded pose instead of the pose.
         self._is_twist = preset.message == TWIST
         kind = TwistStamped if self._is_twist else PoseStamped
         self._publisher = WatchedPublisher(node, kind, topic, values.listener_timeout)
@@ -136,7 +136,7 @@ class TargetOutput:
             base: The frame of the controller's targets, in the world frame; None if it is not known.
             now: The time [s].
             decided: See :func:`publish_in_time`.
-            start: The pose at which a new stream begins, in the world frame; None for the first target itself.
+            start: The pose at which a new stream begins, in the world frame; None if it begins at the first target.
             state: The state of the arm. In PAUSING the stream continues, because the press may become another gesture.
                 In PAUSED a message ends the stream. Without this message, the built-in controller also holds linked
                 arms.

@@ -28,7 +28,8 @@ if TYPE_CHECKING:
 
 
 _TIME_PERIOD = 0.05  # Time between two checks whether simulated time stands still [s].
-_PATIENCE = 2.0  # Time to wait for an answer, for a controller to go home, and for a report of the recorder [s].
+# Longest time to wait for an answer, for a controller to begin a motion home, and for a report of the recorder [s].
+_PATIENCE = 2.0
 
 
 class HomeClient:
@@ -124,7 +125,7 @@ class RecorderLink:
         node.create_subscription(String, self._topic, self._on_state, STREAM_QOS)
 
     def update(self, marks: EpisodeMarks) -> list[Reason]:
-        """Update the marks before the teleoperation of a tick. Return the reasons of newly reported events."""
+        """Update the marks of episodes before the teleoperation of a tick. Return the reasons of new events."""
         if self._state is not None:
             marks.restore(self._state)
             self._state = None
@@ -229,7 +230,7 @@ class TeleopLoop:
             self.teleop.pause(now, reason)
 
     def _watch_time(self) -> None:
-        """Pause the arms if simulated time stands still. The hands move on, which must not be followed later."""
+        """Pause the arms if simulated time stands still. The hands still move, and arms must not follow this later."""
         timeout = self.teleop.settings.gate.timeout
         if (problem := self.nodes[0].clock_problem(timeout)) is None:
             return

@@ -100,7 +100,7 @@ class _Walk:
     """Reads a serialized message from its start. Raises SerdeError if it ends too early or has an invalid text."""
 
     def __init__(self, data: bytes) -> None:
-        self.data, self.offset = data, 4  # Alignment counts from the end of the encapsulation.
+        self.data, self.offset = data, 4  # Alignment is relative to the end of the encapsulation, which has 4 bytes.
         # Offsets and bytes of texts and lengths. The gaps between aligned parts may have any bytes.
         self.same = [(1, _LITTLE_ENDIAN)]
         if data[1:2] != _LITTLE_ENDIAN:
@@ -152,7 +152,8 @@ def _joints(data: bytes, arrays: int, before: Callable[[_Walk], bool] = lambda w
 
 def _remembered(make: Callable[[bytes], Any]) -> Callable[[bytes], Any]:
     """Return a function that returns the layout of a message. ``make`` computes each layout once."""
-    # By the length of a message, the function that takes its constant parts, these parts, and the layout.
+    # For each length of messages: a function that extracts the constant parts of a message, these parts, and the
+    # layout.
     layouts: dict[int, tuple[Callable[[bytes], Any], Any, Any]] = {}
 
     def find(data: bytes) -> Any:

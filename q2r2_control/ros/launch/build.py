@@ -60,7 +60,8 @@ def interface_packages() -> list[Interfaces]:
 def build_interfaces(report: Callable[[str], None], force: bool = False) -> None:
     """Build packages that cannot be imported, and ``report`` one line for each; raises :class:`BuildError`.
 
-    ``force`` builds the packages of this environment again. Packages of another install, such as a sourced ROS, stay.
+    ``force`` builds the packages of this environment again. Packages of another install, such as a sourced ROS, are not
+    changed.
     """
     prefix = Path(sys.prefix)
     held = []  # Packages of this environment.

@@ -17,7 +17,7 @@ _RANGE, _PEERS = "ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_STATIC_PEERS"
 
 
 def set_up_middleware(environment: MutableMapping[str, str]) -> None:
-    """Add the variables for Fast DDS before ``rclpy.init``. The user's own settings and another middleware stay."""
+    """Add the variables for Fast DDS before ``rclpy.init``, unless the user has set these or another middleware."""
     if not environment.get("RMW_IMPLEMENTATION", _FAST_DDS).startswith(_FAST_DDS):
         return
     # ROS_LOCALHOST_ONLY overrides the discovery range. With it, shared memory is used even if a profile disables it.
@@ -26,6 +26,7 @@ def set_up_middleware(environment: MutableMapping[str, str]) -> None:
     if environment.get(_RANGE) != "LOCALHOST":
         environment.update({_TRANSPORTS: "UDPv4", _PROFILES_FILE: str(_PROFILES / "subnet.xml")})
     elif not environment.get(_PEERS):
-        # For LOCALHOST, ROS 2 adds shared memory against any profile. For SYSTEM_DEFAULT, it adds neither shared memory
-        # nor static peers. Therefore, with static peers, the range and its shared memory do not change.
+        # For LOCALHOST, ROS 2 adds shared memory even if a profile disables it. For SYSTEM_DEFAULT, it adds neither
+        # shared memory nor static peers. If the user has set static peers, the range therefore stays LOCALHOST, with
+        # shared memory.
         environment.update({_RANGE: "SYSTEM_DEFAULT", _PROFILES_FILE: str(_PROFILES / "localhost.xml")})

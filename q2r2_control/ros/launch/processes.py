@@ -143,7 +143,7 @@ class UpError(Q2R2Error):
 def run_together(nodes: Sequence[NodeProcess], say: Callable[[str], None]) -> int:
     """Start ``nodes`` and pass each line that they print to ``say``, after a name; returns the exit code.
 
-    The name is that of the node whose log contains the line, or else that of the process.
+    This is the name of the node whose log contains the line, or else the name of the process.
 
     Ctrl-C or SIGTERM ends all of them. The exit code is then 0, or 3 if a node reports by this code that its recording
     failed. If a node ends by itself, this is reported at once, the others are ended, and the exit code is 1. No node is
@@ -174,7 +174,7 @@ def run_together(nodes: Sequence[NodeProcess], say: Callable[[str], None]) -> in
         try:
             for node in nodes:
                 running[node.name] = _start(node)
-            for name, process in running.items():  # Threads start last: forking is safer from a single thread.
+            for name, process in running.items():  # Threads start last, because it is safer to fork without threads.
                 readers.append(threading.Thread(target=_read, args=(name, process, say_alone), daemon=True))
                 readers[-1].start()
             dead = _watch(running, stop, say_alone)
@@ -206,7 +206,7 @@ def _start(node: NodeProcess) -> subprocess.Popen[str]:
         stderr=subprocess.STDOUT,
         text=True,
         errors="replace",
-        env=_LOG_FORMAT | os.environ | {"PYTHONUNBUFFERED": "1"},  # The user's own format stays.
+        env=_LOG_FORMAT | os.environ | {"PYTHONUNBUFFERED": "1"},  # A format that the user has set is kept.
         start_new_session=True,
         preexec_fn=None if _prctl is None else lambda: _end_with(parent),
     )

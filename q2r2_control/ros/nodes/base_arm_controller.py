@@ -104,7 +104,7 @@ class BaseArmController(BaseNode):
         self.loop.join(self)
         self._has_analog_gripper = self.parameters.teleop.bindings.words_of(Action.GRIPPER_ANALOG) is not None
         self._target = ArmTarget(None, OPEN)
-        # These values count until the first tick, which never comes if time stands still.
+        # These values are used until the first tick, which never comes if time stands still.
         not_begun = Reason(RosReason.NO_TOOL_POSE, cause=Reason(RosReason.NODE_BEGINS))
         self._refusal: tuple[bytes, Reason] | None = WARN, not_begun
         self.inputs = TickInputs(None, None, None, None)
@@ -260,8 +260,8 @@ class BaseArmController(BaseNode):
         if base is None:
             return WARN, Reason.of(RosReason.NO_TRANSFORM, frame=values.base_frame, world=values.world_frame)
         unready = self.outputs.unready
-        # Only an arm that holds is unready for this reason, because it would be engaged and stopped again at every
-        # press. An arm that follows may lag behind the safe target.
+        # If the safe target is away from an arm that holds, each press would engage the arm, and it would stop at once.
+        # It is therefore unready. An arm that follows may lag behind the safe target.
         if self.outputs.builtin and self.state in HOLDING and (away := self.outputs.away(controlled, tool)):
             unready = unready or Reason(RosReason.CONTROLLER_REFUSES, cause=away)
             if self.state is ArmState.IDLE:

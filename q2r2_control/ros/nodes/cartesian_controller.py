@@ -47,7 +47,7 @@ from q2r2_control.supervision.tick_pacer import TickClock
 from q2r2_control.types import LONGEST_DT, Reference
 from q2r2_control.wording import sentence
 
-_LONGEST_STOP = 3.0  # Longest time until the arms rest at the end [s].
+_LONGEST_STOP = 3.0  # When the node ends or is deactivated, longest time until the arms rest [s].
 _QUIET = 0.3  # The node commands only after other commanders have been silent for this time [s].
 _LONGEST_ACTIVATION = 2.0  # Longest time of an activation in addition to the settle time [s].
 _SAFE_TARGET_PERIOD = 0.02  # Time between two safe targets if no other controller follows them [s].
@@ -57,7 +57,7 @@ class CartesianControllerNode(ManagedNode):
     """Passes the messages of its topics to a :class:`ControlLoop`, and publishes the commands of this loop."""
 
     ticks = True
-    priority = 40  # No other program may delay a joint command. ros2_control runs drivers at 50.
+    priority = 40  # No other program may delay a joint command. ros2_control runs drivers at the priority 50.
 
     def __init__(self) -> None:
         super().__init__("cartesian_controller")
@@ -128,7 +128,10 @@ class CartesianControllerNode(ManagedNode):
         self.get_logger().info(f"{config.name}: {', '.join(robot.arms)}; waits for joint states")
 
     def _standstill(self, output: str) -> StandstillLimits | None:
-        """Return the limits for a driver that stands still; None for compliant arms, which a person may hold."""
+        """Return the limits above which a driver counts as standing still; None for compliant arms.
+
+        A person may prevent the motion of a compliant arm.
+        """
         if output == NONE:
             return LAGGING_JOINTS
         return None if self._output.drive.yields else JOINTS
@@ -150,10 +153,10 @@ class CartesianControllerNode(ManagedNode):
         if self._output.waits():
             return  # This tick is missed, and the next one is late.
         now = self._clock_of_ticks.at(self.now)
-        # A late tick makes no jump, and a clock that was set back moves nothing.
+        # ``dt`` is bounded, so that a late tick causes no jump, and a clock that was set back causes no motion.
         gap = now - self._last_tick
         dt = self._loop.pace(gap)
-        if gap > max(LONGEST_DT, self._watch.timeout):  # No tick came for longer than states may be missing.
+        if gap > max(LONGEST_DT, self._watch.timeout):  # The gap is longer than the time that states may be missing.
             self._supervisor.stalled(gap, now)
         self._last_tick = now
         self.ticked += 1

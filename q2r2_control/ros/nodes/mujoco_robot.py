@@ -3,7 +3,7 @@
 Joint positions come in on any one of ``joint_trajectory`` (one point), ``joint_commands`` (JointState) and
 ``position_commands`` (Float64MultiArray in the order of the joints in ``joint_states``, all arms). Velocities come in
 on ``velocity_commands`` and torques on ``torque_commands``, in the same order. The newest command counts. Without
-commands the arms brake, and after ``hold_after`` their position servos hold them, whatever commanded them before.
+commands the arms brake, and after ``hold_after`` their position servos hold them, after any kind of commands.
 """
 
 from __future__ import annotations
@@ -173,7 +173,7 @@ class MujocoRobot(BaseNode):
         self._robot = Robot.from_config(config)
         self._cell = SimulatedCell(self._robot, config, hold_after, max_jump)
         self._period = 1.0 / rate
-        self._received = 0.0  # Receipt time of the command in progress [s].
+        self._received = 0.0  # Receipt time of the command that is being processed [s].
         self._refused: dict[str, str] = {}
         self._refusals = 0
         self._delays: dict[tuple[str, ...], DelayWatch] = {}  # The delays of commands, by topic and first joint.
@@ -237,8 +237,8 @@ class MujocoRobot(BaseNode):
         take(message, info)
 
     def _take(self, topic: str, command: Callable[[Any], str | None], message: Any, info: Mapping[str, Any]) -> None:
-        # Delays are watched by topic and first joint. Two controllers, each of one arm, may send on one topic from
-        # hosts with different clocks.
+        # Delays are watched separately for each topic and each first joint, because two controllers, each for one arm,
+        # may send on the same topic from hosts with different clocks.
         names = message.joint_names if topic == _TRAJECTORY else getattr(message, "name", ())
         delays = self._delays.setdefault((topic, *names[:1]), DelayWatch(STREAM_TIMEOUT))
         if late := delays.take(delay(info), time.monotonic()):
@@ -280,7 +280,7 @@ class MujocoRobot(BaseNode):
         tau = state.tau.tolist() + [0.0] * len(cell.fingers)
         self._joint_states.publish(self._measured.fill(q + v + tau, stamp))
         if state.tau_external is not None and now >= self._external_due:
-            # The due times are on a grid, half a tick early, so that a tick that comes early by jitter counts.
+            # Each due time is half a tick before the regular time, so that a tick that comes slightly early publishes.
             self._external_due = max(self._external_due + self._external_period, now - 0.5 * self._period)
             if self._external.get_subscription_count():
                 self._external.publish(self._felt.fill(state.tau_external.tolist(), stamp))

@@ -19,12 +19,13 @@ from q2r2_control.types import SIDES, HandSample
 
 _PERIOD = 0.002  # Time between two polls of an input that is not a script [s].
 _SHORTEST, _LONGEST = 0.001, 0.02  # Shortest and longest time between two checks for due samples [s].
-# Times of the script at which it is decided whether the buttons are pressed, and whether the hands move [s].
+# At the first of these times of the script, the node decides whether the buttons are pressed. At the second time, it
+# decides whether the hands move [s].
 _BEFORE_PRESS, _BEFORE_MOTION = FIRST_PRESS - 0.1, START - 0.05
 # Time after the first motion of the hands in which an arm that stops is engaged again, while other nodes start [s].
 _SETTLES = 6.0
 # After that time, an arm is engaged again only if it can be engaged within this time after it followed last [s]. A node
-# that stood still goes on sooner. A node that was killed counts as a second publisher for this time.
+# that stood still works again within this time. A node that was killed counts as a second publisher for this time.
 _RECOVERS = 3.0
 _MODES = {
     "all": (MessageType.POSE, MessageType.INPUTS, MessageType.TWIST),
@@ -67,7 +68,8 @@ class SimulationInput(BaseNode):
         # Until this time, arms are engaged again after any stop except a request [s].
         self._until = math.inf
         self._followed = -math.inf  # Time at which all arms followed last [s].
-        self._advice: str | None = None  # How a person can engage the arms; None if the script or the arms go on.
+        # How a person can engage the arms; None while the script may still press, or while no arm is lost.
+        self._advice: str | None = None
         self._not_to_press: set[str] | None = None  # Hands that do not press; None if that is not decided yet.
         self._rewind(self.now)
         self._timer = self.create_tick(_LONGEST, self._tick)

@@ -1,4 +1,4 @@
-"""``tcp_endpoint``: the TCP server of the Quest2ROS app; ``CheckTCPconnection``: a live view of what it publishes."""
+"""``tcp_endpoint``: the TCP server for the Quest2ROS app. ``CheckTCPconnection``: a live view of the hands' topics."""
 
 from __future__ import annotations
 

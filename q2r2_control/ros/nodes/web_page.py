@@ -91,7 +91,8 @@ class WebPage(BaseNode):
         self._start: RunStart | None = None
         self._events: list[Event] = []
         self._marks = EpisodeMarks()
-        # The numbers of the newest tick and of the last shown tick, and the longest computation since then [s].
+        # The numbers of the newest tick and of the last shown tick, and the longest computing time of a tick since
+        # then [s].
         self._number, self._shown, self._slowest = -1, -1, 0.0
         self._states, self._notice = NodeStates(self, namespace=self.get_namespace()), ""
         self._controller, self._recorder = self.name_in_set("cartesian_controller"), self.name_in_set(RECORDER)

@@ -23,7 +23,7 @@ from q2r2_control.ros.watching.set_view import DriverView, SetView
 from q2r2_control.wording import sentence
 
 _STATE = "lbr_fri_idl/msg/LBRState"
-_NEAR = 1e-6  # Tolerance of an angle [rad] and of a share.
+_NEAR = 1e-6  # Tolerance of an angle [rad] and of a ratio of velocities.
 _SHUT = "its driver shuts the connection beyond"
 
 

@@ -14,7 +14,7 @@ from q2r2_control.teleop.arm_states import AT_REST, ArmState
 from q2r2_control.wording import sentence
 
 SILENT = 2.0  # A node without a report for this time is silent. Nodes report twice a second [s].
-_SLIPPED = 0.005  # A target that has slipped farther than this is held back [m].
+_SLIPPED = 0.005  # If leash and workspace hold the target back by more than this, the arm counts as held up [m].
 # Texts for states in which the arm moves already, or in which nothing is wrong.
 _MOVES = {
     ArmState.CARRIED: "goes with the other arm",
@@ -156,7 +156,7 @@ def _why(node: NodeView, controller: NodeView | None, cell: Config) -> str:
         bindings = cell.teleop.bindings
         control = bindings.words_of(Action.PAUSE_TOGGLE) or bindings.words_of(Action.DEAD_MAN)
         press = "a press" if control is None else QUEST_WORDS.noun(control)
-        # The state is cut off, because it is shown beside this text.
+        # The name of the state at the beginning of the text is left out, because it is shown beside this text.
         last = str(values.get("last_event", "")).removeprefix(f"{state}: ")
         return f"waits for its operator: {press} of the {values.get('hand')} hand engages (last: {last})"
     return node.message.removeprefix(f"{state}: ")

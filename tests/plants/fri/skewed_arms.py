@@ -1,4 +1,4 @@
-"""Measure how near two arms that move alike side by side come to each other if one of them lags or stops.
+"""Measure how near two arms that swing side by side come to each other if one of them lags or stops.
 
 ``python -m tests.plants.fri.skewed_arms`` prints a table.
 """
@@ -66,7 +66,7 @@ class Case:
         period: float = 0.005,
         apart: float = 0.2,
     ) -> None:
-        """The tools have ``speed`` [m/s] in the middle of the swing to the left, where the left arm moves ahead."""
+        """The tools have ``speed`` [m/s] in the middle of the swing to the left, when the left arm is in front."""
         config = config or load_config("config/dual_iiwa7_fri.yaml")
         robot = Robot.from_config(config)
         start = side_by_side(config, robot, apart)

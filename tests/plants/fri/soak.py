@@ -116,7 +116,7 @@ class Soak:
         self.plant, self.random = self.pipeline.plant, np.random.default_rng(self.seed)
         self._late, self._ends = {"computer freezes"}, list(_ENDS)
         if self.pipeline.drive.mode is CommandMode.TORQUE:
-            self._late.add("loop freezes")  # With torques, the session ends by itself then.
+            self._late.add("loop freezes")  # With torques, a session then ends by itself, because no torques come.
             # The simulated arm keeps its last torque while its cabinet stands still.
             self._ends.remove("cabinet freezes")
         self._returns = False
@@ -207,7 +207,7 @@ class Soak:
             self.pipeline.freeze(pause)
             self.plant.asleep_until = now + pause
             now += pause
-        elif self._end == "cabinet freezes":  # The session lasts, and its arm goes on to rest.
+        elif self._end == "cabinet freezes":  # The session continues, and its arm still brakes to rest.
             self.plant.stands_until[arm] = now = now + _SILENT + 4.0 * pause
         else:
             self._send_garbage()

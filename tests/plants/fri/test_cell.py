@@ -163,7 +163,9 @@ def test_a_loop_with_only_late_ticks_follows_nearly_as_well_as_a_punctual_loop(
     assert run(latest) < bound * run(0.0)
 
 
-def test_until_a_session_is_known_to_follow_each_tick_advances_the_reference_by_one_period(config: Config) -> None:
+def test_each_tick_advances_the_reference_by_one_period_until_the_loop_knows_that_a_session_follows(
+    config: Config,
+) -> None:
     plant = started(make_loop(config))
     plant.reset()
     for tick in range(100):  # In the previous session, the loop's commands came too late.

@@ -78,7 +78,7 @@ def test_a_message_written_by_hand_from_the_field_numbers_is_understood() -> Non
     assert (found.period, found.multiplier, found.ipo_q) == (0.005, 2, None)
 
 
-def test_joints_in_a_packed_field_are_understood_too() -> None:
+def test_joints_in_a_packed_field_are_also_read() -> None:
     packed = _field(1, 2, bytes([56]) + b"".join(map(_double, Q)))
     assert read_monitoring(HEADER + _inner(3, _inner(1, packed)) + CONNECTION).q == Q
 
@@ -141,7 +141,7 @@ def test_the_error_for_invalid_bytes_says_what_is_allowed(case: str) -> None:
         read_monitoring(datagram)
 
 
-def test_a_message_with_a_name_that_is_not_valid_text_is_read_too() -> None:
+def test_a_message_is_read_even_if_a_name_in_it_is_not_valid_text() -> None:
     datagram = write_monitoring(dataclasses.replace(MONITORING, version=1, io={"valve": True}))
     assert read_monitoring(datagram.replace(b"valve", b"val\xff\xfe")).io == {"val\ufffd\ufffd": True}
 
