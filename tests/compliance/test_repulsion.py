@@ -289,7 +289,7 @@ def test_an_arm_that_is_pushed_with_40_newtons_towards_the_other_arm_never_touch
     assert released[-1] < 0.7 * released[0]
 
 
-def test_a_wall_whose_distances_changed_pushes_like_a_wall_made_with_these_distances() -> None:
+def test_a_wall_that_gets_new_kept_distances_pushes_like_a_wall_that_was_made_with_them() -> None:
     wider = ControllerSettings(min_distance=0.04)
     made, told = MeasuredSeparation(ROBOT, wider), MeasuredSeparation(ROBOT, ControllerSettings())
     q = _postures()[0][0]
@@ -327,7 +327,7 @@ def test_an_arm_that_is_pushed_towards_a_new_box_never_touches_the_box_until_it_
 
 
 @pytest.mark.parametrize("with_object", [False, True], ids=["empty hands", "an object in one hand's reach"])
-def test_the_wall_pushes_no_arm_away_from_an_obstacle_that_may_move(with_object: bool) -> None:
+def test_the_wall_pushes_an_arm_away_from_an_obstacle_only_if_its_reported_speed_is_0(with_object: bool) -> None:
     robot = Robot.from_config(object_cell(BLOCK)) if with_object else ROBOT
     controller = CartesianController(robot, ControllerSettings(moving_obstacles=("hand", "box")))
     separation = MeasuredSeparation(robot, controller.settings)
