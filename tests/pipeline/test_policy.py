@@ -46,7 +46,10 @@ class Circle:
 
 
 class Operator(HandsInput):
-    """An operator who presses the lower buttons to take over, and again to give back. The hands always move."""
+    """An operator who presses the lower buttons to take the arms over, and again to give them back to the policy.
+
+    The hands always move.
+    """
 
     def poll(self, now: float) -> list[HandSample]:
         hand = super().poll(now)
