@@ -123,7 +123,9 @@ def test_the_limits_of_joints_come_from_the_file_but_their_velocity_limits_come_
     assert written("turn", "rotor") == {"inertia": "0.2", "gear": "1"}
 
 
-def test_a_capsule_stays_a_capsule_and_a_drawing_is_a_collision_shape_only_if_a_body_has_no_other(arm: Path) -> None:
+def test_a_capsule_stays_a_capsule_and_a_visual_geom_becomes_a_collision_shape_only_if_a_body_has_no_other(
+    arm: Path,
+) -> None:
     urdf, _, geometry = read(arm)
     shapes = {item.name.rpartition("_")[0]: item.geometry for item in geometry.geometryObjects}
     assert isinstance(shapes["shoulder"], coal.Capsule)

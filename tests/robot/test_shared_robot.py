@@ -62,7 +62,7 @@ TIAGO: dict[str, Any] = {
 def _tiago_pairs() -> str:
     """Return an SRDF with pairs that the maker does not list.
 
-    The capsules of forearm and palm overlap, and so do those of torso and shoulder.
+    The capsules of forearm and palm overlap, and the capsules of torso and shoulder overlap too.
     """
     hand = ("safety_box", "palm_link", "index_link", "mrl_link", "thumb_link")
     pairs = [(f"arm_{side}_5_link", f"hand_{side}_{part}") for side in ("left", "right") for part in hand]

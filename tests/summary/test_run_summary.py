@@ -68,7 +68,7 @@ def test_the_largest_slip_of_an_engagement_is_reported(statistics: RunStatistics
     assert figures["left"].slip_deg_max == pytest.approx(60.0)
 
 
-def test_the_time_for_which_a_gripper_was_held_is_reported_with_the_last_pair_that_held_it(
+def test_the_time_for_which_a_gripper_was_not_allowed_to_move_is_reported_with_the_last_pair_that_caused_it(
     statistics: RunStatistics,
 ) -> None:
     for held in ({"left": ("left_finger", "table")}, {"left": ("left_finger", "right_link_5")}, {}):
