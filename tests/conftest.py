@@ -20,8 +20,8 @@ settings.load_profile("repeatable")
 def pytest_collection_finish() -> None:
     """Freeze imported objects. Otherwise each run of a pipeline would collect garbage for a fifth of a second.
 
-    Each run asks whether objects are frozen. Python would count all of them each time, for 20 ms or longer, so the
-    count is kept. Its attribute ``__wrapped__`` is Python's own function.
+    Each run asks how many objects are frozen. Python would count them each time, for 20 ms or longer, so a function
+    that returns a stored count replaces Python's function. Its attribute ``__wrapped__`` is Python's function.
     """
     gc.collect()
     gc.freeze()

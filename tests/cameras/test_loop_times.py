@@ -18,11 +18,11 @@ def times_of(ticks: tuple[tuple[float, float], ...] = TICKS) -> LoopTimes:
 
 
 @pytest.mark.parametrize(("at", "number"), [(10.0, 0), (10.004, 0), (10.03, 1), (10.05, 2), (10.2, 2)])
-def test_in_real_time_the_times_of_the_loop_are_those_of_the_computer(at: float, number: int) -> None:
+def test_in_real_time_the_times_of_the_loop_equal_the_times_of_the_computer(at: float, number: int) -> None:
     assert times_of().at(at) == pytest.approx((at, at, number))
 
 
-def test_before_the_first_tick_the_time_of_the_loop_passes_like_that_of_the_computer() -> None:
+def test_before_the_first_tick_the_time_of_the_loop_passes_as_fast_as_the_time_of_the_computer() -> None:
     assert times_of(((10.0, 0.5), (10.1, 0.6))).at(9.99) == pytest.approx((9.99, 0.49, 0))
 
 

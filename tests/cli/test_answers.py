@@ -1,4 +1,7 @@
-"""Answers outlast a command that was interrupted or failed. They are offered again only for the same subject."""
+"""Answers to a command's questions are kept if the command is interrupted or fails.
+
+Later, they are offered as defaults, but only if the command is about the same subject, such as the same models of arms.
+"""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ from q2r2_control.verification.soak import SoakReport, run_soak
 from tests.cli.command import CELL, FAST, changed_cell, external_cell, one_object, q2r2
 
 
-def test_the_version_is_that_of_the_installed_package() -> None:
+def test_the_printed_version_is_the_version_of_the_installed_package() -> None:
     assert q2r2("--version").stdout == f"q2r2 {version('q2r2_control')}\n"
 
 

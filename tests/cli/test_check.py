@@ -123,7 +123,7 @@ def test_check_and_run_list_all_faults_of_a_file(tmp_path: Path) -> None:
     assert found["verdict"] == "this cell cannot run: 4 faults"
 
 
-def test_check_prints_a_verdict_for_a_model_that_cannot_be_read_too(tmp_path: Path) -> None:
+def test_check_prints_a_verdict_even_if_a_model_cannot_be_read(tmp_path: Path) -> None:
     result = q2r2("check", changed_cell(tmp_path, "model: iiwa7", "model: iiwa8"))
     assert (result.exit_code, result.stdout) == (2, "this cell cannot run: 1 fault\n")
     assert "iiwa8" in result.stderr
@@ -162,7 +162,7 @@ def test_check_refuses_a_filtered_cell_whose_operator_moves_another_frame_than_t
     assert "allowed: a frame at the tool, or null with left_tool_frame on /tf" in result.stderr
 
 
-def test_check_as_json_has_limits_and_distances_in_order() -> None:
+def test_the_json_of_check_has_limits_and_the_distances_of_pairs_in_ascending_order() -> None:
     cell = one_object(q2r2("check", CELL, "--json").stdout)
     assert [arm["name"] for arm in cell["arms"]] == ["left", "right"]
     joint = cell["arms"][0]["joints"][0]
@@ -247,7 +247,7 @@ def test_check_says_how_to_remove_a_floor_that_is_in_the_way(tmp_path: Path) -> 
     assert (result.exit_code, "floor" in result.stdout) == (0, False)
 
 
-def test_a_stop_that_needs_too_much_torque_is_a_note_and_no_fault(tmp_path: Path) -> None:
+def test_a_stop_that_needs_too_much_torque_causes_a_note_and_no_fault(tmp_path: Path) -> None:
     fast = changed_cell(tmp_path, "acceleration_limit: {}", "acceleration_limit: {A1: 10.0, A2: 10.0, A3: 10.0}")
     result = q2r2("check", fast)
     (note,) = (line for line in result.stdout.splitlines() if line.startswith("NOTE "))
@@ -288,7 +288,7 @@ def test_if_gravity_alone_needs_too_much_torque_the_note_does_not_advise_slower_
     )
 
 
-def test_check_notes_a_control_for_grippers_that_do_not_exist() -> None:
+def test_check_prints_a_note_about_a_control_for_grippers_that_do_not_exist() -> None:
     def notes_with(gripper: dict[str, object]) -> list[str]:
         cell = one_arm(tool={"model": "hand_e", "frame": "tool_frame"}, gripper=gripper)
         bindings = BindingSettings(upper=Action.NONE, trigger=Action.GRIPPER_ANALOG)
@@ -318,7 +318,7 @@ def test_check_says_which_pairs_may_touch() -> None:
         ((31.2e-6, 31.1e-6), "320 pairs instead of 193"),
     ],
 )
-def test_the_text_about_additional_shapes_has_times_only_if_ticks_take_longer_with_these_shapes(
+def test_the_text_about_additional_shapes_contains_times_only_if_the_shapes_make_ticks_longer(
     ticks: tuple[float, float], says: str
 ) -> None:
     assert cost_of_shapes((320, 193), ticks) == says
@@ -330,7 +330,7 @@ def test_pairs_that_can_never_meet_are_written_to_new_files_only(tmp_path: Path)
     assert file.read_text(encoding="utf-8") == "mine"
 
 
-def test_a_file_of_pairs_that_cannot_be_written_is_refused_before_the_samples(tmp_path: Path) -> None:
+def test_a_file_of_pairs_that_cannot_be_written_is_refused_before_postures_are_sampled(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     refused = q2r2("check", CELL, "--pairs", str(tmp_path / "file" / "a.srdf"), "--samples", "1000000000")
     assert (refused.exit_code, refused.stderr.count("\n")) == (2, 1)

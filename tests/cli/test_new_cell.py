@@ -72,7 +72,7 @@ def test_a_folder_that_cannot_be_written_is_refused_before_the_models_are_read(m
 
 
 @pytest.mark.slow
-def test_a_fault_of_the_written_cell_names_links_without_masses_as_left_to_do() -> None:
+def test_new_cell_reports_links_without_masses_as_a_fault_that_is_left_to_do() -> None:
     Path("arm.urdf").write_text(re.sub(r"<inertial>.*?</inertial>", "", IIWA, flags=re.DOTALL))
     result = q2r2("new-cell", "cell", "--left", "arm.urdf", "--yes", "--samples", "100")
     assert result.exit_code == 1
@@ -84,7 +84,7 @@ def test_a_fault_of_the_written_cell_names_links_without_masses_as_left_to_do() 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("link", ["link_3", "link_0"], ids=["a link that moves", "the base"])
-def test_drawn_links_without_a_shape_are_monitored_with_capsules_around_their_drawings(
+def test_visible_links_without_collision_shapes_are_monitored_with_capsules_around_their_visual_geometry(
     link: str, tmp_path: Path
 ) -> None:
     Path("arm.urdf").write_text(re.sub(rf'<collision name="{link}.*?</collision>', "", IIWA, flags=re.DOTALL))
@@ -110,7 +110,7 @@ def test_if_a_fixed_part_of_the_robot_is_always_near_an_arm_this_pair_gets_its_o
 
 
 @pytest.mark.slow
-def test_if_a_drawing_cannot_be_enclosed_the_other_drawings_still_get_capsules(tmp_path: Path) -> None:
+def test_if_the_visual_geometry_of_a_link_cannot_be_enclosed_other_links_still_get_capsules(tmp_path: Path) -> None:
     bare = re.sub(r'<collision name="link_[03].*?</collision>', "", IIWA, flags=re.DOTALL)
     Path("points.obj").write_text("v 0 0 0\n")
     drawing = '<link name="link_0"><visual><geometry><mesh filename="points.obj"/></geometry></visual>'
@@ -134,7 +134,7 @@ def test_the_answers_of_the_user_are_written_into_the_cell(tmp_path: Path) -> No
 @pytest.mark.slow
 def test_the_answers_of_an_interrupted_try_are_offered_in_the_next_try() -> None:
     command = ("new-cell", "cell", "--left", "iiwa7", "--right", "iiwa7", "--samples", "100")
-    interrupted = q2r2(*command, typed="0.9\n0.1\n")  # the terminal ends at the third question
+    interrupted = q2r2(*command, typed="0.9\n0.1\n")  # The input ends at the third question.
     assert interrupted.exit_code != 0
     assert not Path("cell.yaml").exists()
     result = q2r2(*command, typed="\n\n\n\n")

@@ -165,7 +165,7 @@ def test_the_summary_is_short_without_verbose_but_never_hides_faults(summary: Ru
         assert figure in wrong
 
 
-def test_the_summary_gives_the_reason_if_anything_but_its_button_paused_an_arm(
+def test_the_summary_gives_the_reason_if_an_arm_was_paused_by_something_else_than_a_press(
     summary: RunSummary,
 ) -> None:
     reason, press = Reason.of(CommonReason.LOOP_STALLED, duration=0.4), Reason.of(TeleopReason.PRESSED, control="lower")

@@ -182,7 +182,7 @@ def test_each_tool_delta_is_the_motion_from_a_target_to_the_next_one_and_the_las
         assert not deltas[-1].any()
 
 
-def test_quaternions_do_not_change_sign_between_frames_and_those_of_targets_have_the_signs_of_the_tools() -> None:
+def test_quaternions_do_not_change_sign_between_frames_and_targets_have_the_signs_of_their_tools() -> None:
     flipped = 0
     for seed in range(5):
         given = frames(seed)

@@ -28,7 +28,7 @@ from tests.support.headset_server import (
     warnings,
 )
 
-HERE, ELSEWHERE = "127.0.0.1", "127.0.0.2"  # Two addresses that a server takes for two hosts.
+HERE, ELSEWHERE = "127.0.0.1", "127.0.0.2"  # The server treats these addresses as two hosts.
 
 
 @contextmanager

@@ -128,7 +128,7 @@ def test_a_pose_that_stays_equal_to_the_last_bit_is_frozen_whatever_its_stamp() 
     assert faults(handed_on(TwoHands(rest, 1, (0.0, 0.0), tremor=False, noise=1e-7).samples(2.0))) == set()
 
 
-def test_a_hand_that_keys_move_does_not_count_as_frozen_if_it_rests_without_noise() -> None:
+def test_a_hand_that_is_moved_with_keys_does_not_count_as_frozen_if_it_rests_without_noise() -> None:
     (_, _, pose), *_ = resting()
     watch = HandsWatch()
     virtual = Reception("q2r_left_hand_pose", "left", pose, virtual=True)
@@ -199,7 +199,7 @@ def test_a_frame_that_turns_with_the_head_is_a_fault_of_both_hands() -> None:
 
 @pytest.mark.parametrize("tremor", [True, False], ids=["trembling", "without tremor"])
 @pytest.mark.parametrize("seed", [0, 1])
-def test_human_hands_that_carry_a_light_box_are_not_taken_for_a_moving_frame(
+def test_human_hands_that_carry_a_light_box_do_not_count_as_a_moving_frame(
     seed: int, tremor: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("_CARRIED_TOLERANCE", "_STEP_TOLERANCE"):
@@ -217,7 +217,7 @@ def snatch(t: float) -> pin.SE3:
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_fast_hands_with_lost_and_late_samples_are_not_taken_for_a_moving_frame(seed: int) -> None:
+def test_fast_hands_with_lost_and_late_samples_do_not_count_as_a_moving_frame(seed: int) -> None:
     random = np.random.default_rng(seed)
     lost = {index for index in range(600) if random.random() < 0.05}
     samples = [
@@ -230,7 +230,7 @@ def test_fast_hands_with_lost_and_late_samples_are_not_taken_for_a_moving_frame(
     assert len(watched) >= len(samples) - 1
 
 
-def test_hands_that_start_together_while_samples_are_lost_are_not_taken_for_a_moved_frame() -> None:
+def test_hands_that_start_together_while_samples_are_lost_do_not_count_as_a_moved_frame() -> None:
     """Both hands accelerate at 16 m/s^2 for 60 ms, exactly like one rigid body. All samples of this time are lost."""
 
     def reach(t: float) -> pin.SE3:

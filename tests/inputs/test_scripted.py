@@ -79,7 +79,7 @@ def test_the_hands_rest_until_the_first_press_has_engaged_the_arms(trajectory: s
     assert np.ptp([s.position for s in samples if s.hand == "left"], axis=0).max() < 1e-12
 
 
-def test_the_rotation_of_the_right_hand_mirrors_that_of_the_left_hand() -> None:
+def test_the_rotation_of_the_right_hand_mirrors_the_rotation_of_the_left_hand() -> None:
     script, reflection = ScriptedInput("rotate"), np.diag([1.0, -1.0, 1.0])
     for t in (0.0, 2.0, 5.0, 9.0, 13.0):
         left, right = (script.hand_pose(hand, 0.0).rotation.T @ script.hand_pose(hand, t).rotation for hand in SIDES)
@@ -144,7 +144,7 @@ def test_shorter_arms_move_shorter_distances_and_turn_by_the_same_angles() -> No
         np.testing.assert_allclose(ways[1], 0.82 / 1.12 * ways[0], rtol=1e-3)
 
 
-def test_the_home_positions_of_the_way_points_equal_those_of_the_tools_in_the_shipped_cell() -> None:
+def test_the_home_positions_of_the_way_points_equal_the_home_positions_of_the_tools_in_the_shipped_cell() -> None:
     robot = Robot.from_config(load_config("config/dual_iiwa7.yaml"))
     for arm, home in HOME.items():
         np.testing.assert_allclose(robot.tool_pose(robot.home, arm).translation, home, atol=1e-4)
@@ -219,7 +219,7 @@ def test_a_motion_reaches_each_way_point_at_its_time_and_rests_there() -> None:
 
 @pytest.mark.slow
 def test_the_headset_loses_shaky_hands_for_a_second_and_they_engage_again_and_complete_the_work() -> None:
-    for seed in (3, 6, 12):  # The loss is early, late, and moved behind a press.
+    for seed in (3, 6, 12):  # The loss is early, late, or moved to a time after a press.
         calm, hasty = trajectory_named("carry"), hurried(trajectory_named("carry"), seed)
         assert hasty.duration is not None
         samples = [s for s in play(ScriptedInput("carry", shaky=True, seed=seed), hasty.duration) if s.hand == "left"]
