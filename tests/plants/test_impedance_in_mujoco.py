@@ -23,7 +23,7 @@ POSTURES = {
     "high": [0.4, 0.3, -0.3, -1.0, 0.5, -0.6, 0.2],
     "elbow out": [0.6, 0.5, -1.2, -1.5, 0.9, 1.2, -0.3],
 }
-# Masses of links 0..7 of an iiwa 7 in Drake's description [kg]. The URDF has those of another public description.
+# Masses of links 0..7 of an iiwa 7 in Drake's description [kg]. The URDF has the masses of another public description.
 OTHER_MASSES = (3.863, 2.7025, 2.7258, 3.175, 2.73, 1.69, 1.8, 0.4)
 SETTINGS = ImpedanceSettings()
 FORCE = 20.0  # [N]

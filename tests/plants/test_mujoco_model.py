@@ -46,7 +46,7 @@ def test_the_rotor_inertia_of_each_joint_is_multiplied_by_the_rotor_share_of_the
     lighter.close()
 
 
-def test_joint_and_torque_limits_are_those_of_the_robot(plant: MujocoPlant, robot: Robot) -> None:
+def test_joint_and_torque_limits_equal_the_limits_of_the_robot(plant: MujocoPlant, robot: Robot) -> None:
     for index, name in enumerate(robot.joint_names):
         np.testing.assert_allclose(
             plant.model.joint(name).range, (robot.position_lower[index], robot.position_upper[index])

@@ -122,7 +122,7 @@ def test_the_tick_of_a_picture_is_the_last_tick_before_its_capture(run: Recorded
         assert picture.tick + 1 == len(ticks) or picture.time < ticks[picture.tick + 1]
 
 
-def test_the_judge_reads_pictures_of_a_real_camera_like_those_of_a_simulated_camera(run: RecordedRun) -> None:
+def test_the_judge_reads_pictures_of_a_real_camera_like_pictures_of_a_simulated_camera(run: RecordedRun) -> None:
     episode = read_episode(Recording(file_of(run.summary)))
     assert len(episode.pictures["front"].t) == run.summary.pictures
     assert 0 <= camera_figures(episode)["front"].missing_pictures <= 1

@@ -50,7 +50,8 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
 
 
 def played(recorded: Recorded, duration: float) -> tuple[Watch, list[str]]:
-    """Let the recorded hands lead the recorded cell's arms. Returns the ticks, and the lines that were said."""
+    """Let the recorded hands move the recorded cell's arms. Return the ticks, and the lines that the input printed."""
+
     said: list[str] = []
     loop = pipeline(source=RecordedHands(recorded.file, cell(), said.append))
     watch = Watch(loop)

@@ -116,7 +116,7 @@ class Soak:
         self.plant, self.random = self.pipeline.plant, np.random.default_rng(self.seed)
         self._late, self._ends = {"computer freezes"}, list(_ENDS)
         if self.pipeline.drive.mode is CommandMode.TORQUE:
-            self._late.add("loop freezes")  # With torques, the session ends by itself then.
+            self._late.add("loop freezes")  # With torques, the session ends by itself if the loop freezes.
             # The simulated arm keeps its last torque while its cabinet stands still.
             self._ends.remove("cabinet freezes")
         self._returns = False
@@ -207,7 +207,7 @@ class Soak:
             self.pipeline.freeze(pause)
             self.plant.asleep_until = now + pause
             now += pause
-        elif self._end == "cabinet freezes":  # The session lasts, and its arm goes on to rest.
+        elif self._end == "cabinet freezes":  # The session goes on, and its arm comes to rest.
             self.plant.stands_until[arm] = now = now + _SILENT + 4.0 * pause
         else:
             self._send_garbage()
@@ -229,7 +229,7 @@ class Soak:
 
 
 def steady(pipeline: FreezingLoop, duration: float) -> bool:
-    """Run sessions that nobody ends for ``duration`` [s], and return whether none ended."""
+    """Let sessions run for ``duration`` [s] without ending them. Return True if no session ended by itself."""
     assert isinstance(pipeline.plant, VirtualCabinets)
     cabinets = pipeline.plant.cabinets
     for cabinet in cabinets.values():

@@ -1,4 +1,4 @@
-"""The process that answers the cabinets obeys the loop's commands. Each of the two notices the end of the other."""
+"""The process that answers the cabinets obeys the loop's commands. The process and the loop notice each other's end."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class BrokenOnTheWay(ArmSession):
 
 
 class Between:
-    """The process that answers cabinets. This test plays its cabinet and its loop."""
+    """The process that answers cabinets. The test takes the roles of its cabinet and of its loop."""
 
     def __init__(self, session: ArmSession) -> None:
         self.cabinet = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -125,7 +125,7 @@ def test_the_process_ends_when_the_loop_ends(between: Between) -> None:
 
 
 @pytest.mark.slow
-def test_the_process_outlives_the_loop_until_the_arms_rest() -> None:
+def test_after_the_end_of_the_loop_the_process_goes_on_until_the_arms_rest() -> None:
     with between_of(LongMotion(ANSWERS)) as between:
         between.process._commands.close()  # This pipe is closed too when the loop's process ends.
         while between.sent < ANSWERS:

@@ -149,7 +149,7 @@ def test_torques_are_refused_for_a_cabinet_whose_period_is_too_long() -> None:
     assert sentence(fault) == "left: the cabinet asks every 10 ms; allowed for torques: 5 at most"
 
 
-def test_the_end_of_a_session_is_a_fault_and_the_arm_follows_no_more() -> None:
+def test_the_end_of_a_session_is_a_fault_and_the_arm_follows_no_further_commands() -> None:
     cabinet = Cabinet()
     cabinet.ask(WAITING)
     cabinet.ask(ACTIVE)
@@ -164,7 +164,7 @@ def test_the_end_of_a_session_is_a_fault_and_the_arm_follows_no_more() -> None:
     assert fault.detail["session"] == "monitoring ready"
 
 
-def test_if_one_arms_command_is_late_the_commands_of_both_are_refused_and_the_arms_stop_as_certified() -> None:
+def test_if_one_arms_command_is_late_both_arms_commands_are_refused_and_the_arms_stop_as_certified() -> None:
     cabinet, still, ones = Cabinet(), (0.0,) * 7, (1.0,) * 7
     cabinet.ask(WAITING)
     cabinet.ask(ACTIVE)
@@ -304,7 +304,7 @@ def test_a_repeated_message_gets_the_same_answer_and_moves_nothing() -> None:
     assert heard[True] == heard[False]
 
 
-def test_if_a_cabinet_has_another_version_than_the_yaml_it_is_reported_and_gets_no_answer() -> None:
+def test_a_cabinet_whose_version_differs_from_the_version_in_the_yaml_is_reported_and_gets_no_answer() -> None:
     cabinet = Cabinet(ArmSession("left", "cabinet", version=1))
     assert cabinet.ask(MONITORING) is None
     fault = cabinet.session.state.fault(cabinet.now)

@@ -29,7 +29,7 @@ def test_the_application_has_no_motion_except_a_hold() -> None:
     assert not re.search(r"\b(?:ptp|lin|circ|spl|batch|ptpHome|handGuiding)\w*\(", code)
 
 
-def test_the_applications_ports_are_those_of_the_shipped_cell_and_its_periods_allow_commands() -> None:
+def test_the_applications_ports_equal_the_ports_of_the_shipped_cell_and_its_periods_allow_commands() -> None:
     cell = yaml.safe_load((CHECKOUT / "config/dual_iiwa7_fri.yaml").read_text(encoding="utf-8"))
     assert choices("PORTS") == [str(cell["fri"][arm]["port"]) for arm in ("left", "right")]
     assert all(1 <= int(period) <= 10 for period in choices("POSITION_PERIODS_MS"))
