@@ -42,7 +42,7 @@ def test_rotation_vector_and_rotation_are_inverse_functions() -> None:
         assert rotation_vector((-a, -b, -c, -w)) == pytest.approx(vector, abs=1e-14)
 
 
-def test_products_and_inverses_equal_those_of_matrices() -> None:
+def test_products_and_inverses_equal_the_products_and_inverses_of_matrices() -> None:
     for one, other in zip(random_vectors(), reversed(random_vectors()), strict=True):
         p, q = rotation_of(one), rotation_of(other)
         assert matrix(product(p, q)) == pytest.approx(matrix(p) @ matrix(q), abs=1e-14)

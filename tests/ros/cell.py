@@ -189,7 +189,7 @@ def shifted(pose: pin.SE3, *by: float) -> pin.SE3:
 SLOW = 0.05
 REST = 0.01  # A joint that is slower than this rests [rad/s].
 REST_TIME = 0.3  # Time for which joints have to be slower than that [s].
-# The window is longer than the time in which a starved robot catches up, and shorter than a jump takes [s].
+# A robot that got no processor time for a while catches up in a shorter time than this window. A jump takes longer [s].
 SPEED_WINDOW = 0.2
 
 

@@ -123,7 +123,7 @@ def test_the_error_of_a_failed_build_names_the_log(tmp_path: Path) -> None:
     assert "broken" in log.read_text()
 
 
-# The fields and their order are those of docs.ros.org/en/jazzy/p/control_msgs. A type hash depends only on the names
+# The fields and their order are taken from docs.ros.org/en/jazzy/p/control_msgs. A type hash depends only on the names
 # and types of fields.
 GRIPPER_STATE = "float64 position\nfloat64 effort\nbool stalled\nbool reached_goal"
 PUBLISHED_FIELDS = {

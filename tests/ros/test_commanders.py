@@ -1,4 +1,4 @@
-"""If another program commands the arms, or a receiver stands still, both arms stop and the culprit is named."""
+"""If another program commands the arms, or a receiver stands still, both arms stop. The fault names its cause."""
 
 from __future__ import annotations
 

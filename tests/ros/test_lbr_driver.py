@@ -49,7 +49,7 @@ def test_no_guard_trips_and_no_command_jumps_however_the_sessions_end(release: s
     assert soak.moved > 1.0
 
 
-def test_if_a_session_begins_while_the_arms_still_brake_it_gets_no_command_of_the_stop(domain: int) -> None:
+def test_a_session_that_begins_while_the_arms_still_brake_gets_no_command_of_the_stop(domain: int) -> None:
     with virtual_lbrs("for Jazzy", domain) as virtual:
         Operator(virtual)
         left, supervisor = virtual.drivers["left"], virtual.node._supervisor
@@ -67,7 +67,7 @@ def test_if_a_session_begins_while_the_arms_still_brake_it_gets_no_command_of_th
 
 
 @pytest.mark.parametrize(("tau", "delay", "speed"), [tuple(map(float, row)) for row in FILTERS])
-def test_the_delay_of_the_drivers_filter_and_its_speed_after_a_double_step_are_those_in_docs_kuka(
+def test_the_delay_of_the_drivers_filter_and_its_speed_after_a_double_step_equal_the_values_in_docs_kuka(
     tau: float, delay: float, speed: float, robot: Robot
 ) -> None:
     driver, ramp = FakeLbr(robot, "left", tau), 0.2  # ``ramp`` is the speed of the commanded joints [rad/s].

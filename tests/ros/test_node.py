@@ -1,4 +1,4 @@
-"""Properties of all nodes: reports, ticks, ends, and discovery with the user's settings."""
+"""Properties of all nodes: how they report, tick and end, and how they are discovered with the user's settings."""
 
 from __future__ import annotations
 
@@ -178,7 +178,7 @@ def test_middleware_settings_of_the_user_are_kept(environment: dict[str, str]) -
 def test_without_settings_of_the_user_the_shipped_profile_is_set_and_kept(ours: dict[str, str]) -> None:
     set_up_middleware(ours)
     assert Path(ours["FASTRTPS_DEFAULT_PROFILES_FILE"]).is_file()
-    # Both settings allow only UDP: one by a variable, the other by its profile, which the range has to keep.
+    # Only UDP is allowed: either by the variable, or by the shipped profile, which this discovery range leaves valid.
     assert (
         ours.get("FASTDDS_BUILTIN_TRANSPORTS") == "UDPv4" or ours["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "SYSTEM_DEFAULT"
     )
@@ -315,7 +315,7 @@ def test_the_executor_answers_services_and_runs_coroutines(ticking: Ticking, exe
 
 
 @pytest.mark.parametrize("make", [BaseNode.create_tick, BaseNode.create_timer], ids=["a tick", "a slow timer"])
-def test_a_timer_that_another_one_destroys_does_not_run(make: Any, ticking: Ticking, executor: TickExecutor) -> None:
+def test_a_timer_that_another_timer_destroys_does_not_run(make: Any, ticking: Ticking, executor: TickExecutor) -> None:
     timers: list[Any] = []
 
     def run() -> None:

@@ -103,7 +103,8 @@ def test_arms_rest_when_the_robot_ends_and_go_on_without_a_jump_from_the_posture
         cell.forget()
         assert np.abs(cell.q - goal).max() > 0.9 * MOVED, "no command from before has moved it"
         wait_until(lambda: np.abs(cell.q - goal).max() < 5e-3, "the arms are there again")
-        # Commands are judged, and not how the robot moves: on a busy machine, two of them may arrive at a time.
+        # The test checks only the commands. On a busy machine, two commands may arrive together, and the robot then
+        # moves fast.
         again = [tick for tick in ticks[lost:] if tick.states["left"] == "policy"]
         assert np.abs(again[0].command.q - again[0].state.q).max() < 0.03
         # The policy moves a joint by at most 0.05 rad, in a twentieth of a second.
@@ -124,7 +125,7 @@ def test_a_new_receiver_gets_no_commands_while_the_arms_are_elsewhere(
         with driven(config, robot, goal) as (ticks, _):
             wait_until(lambda: ticks and np.abs(ticks[-1].reference.q - robot.home).max() > 0.04, "a command is away")
             heard = subscribed(node, JointTrajectory, "joint_trajectory", COMMAND_QOS)
-            # Commands may be on their way between the middleware's notice of the receiver and the loop's.
+            # The middleware notices the receiver before the loop does. Commands that are sent in between may arrive.
             commands = (heard.get(timeout=PATIENCE).points[0].positions for _ in range(UNDER_WAY))
             assert any(np.abs(np.array(command) - robot.home).max() < 0.03 for command in commands)
             assert "a new receiver takes the commands" in caplog.text

@@ -110,7 +110,7 @@ def test_the_file_contains_messages_byte_for_byte_and_can_be_read_without_ros(
 
     # Bytes between a message's fields are arbitrary memory of the sender. Compare with the bytes of another listener.
     heard: list[bytes] = []
-    qos = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)  # The depth is that of the recorder.
+    qos = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)  # The recorder has this depth too.
     node.create_subscription(PoseStamped, HAND, heard.append, qos, raw=True)
     before = time.time_ns()
     strange = node.create_publisher(String, arm_events("left"), RECORDED_QOS)
@@ -155,7 +155,7 @@ def test_presses_and_services_begin_and_end_the_same_episodes(node: Any, process
     felt(rig, EPISODE_ENDS)
     refused = call(node, "/recorder/stop")
     assert not refused.success
-    felt(rig, EPISODE_REJECTED)  # This vibration hides a weaker one, such as that of a discard.
+    felt(rig, EPISODE_REJECTED)  # This vibration hides weaker ones, such as the vibration for a discard.
     squeeze(rig)
     recorder.wait("episode_open", True)
     assert call(node, "/recorder/discard").success
@@ -197,7 +197,7 @@ def felt(rig: ArmRig, pulse: Pulse) -> None:
 
 @pytest.mark.alone
 def test_a_killed_recorder_leaves_a_file_that_its_writer_closes(recorder: RunningRecorder, node: Any) -> None:
-    """A kill costs the messages that the node has not passed on, and those of the chunk that is not written."""
+    """Lost are only messages that the node has not passed on, and messages of the chunk that is not yet written."""
     record_poses(recorder, node, 100)
     folder, (writer,) = recorder.folder, children(recorder.process.pid)
     os.kill(writer, signal.SIGSTOP)
@@ -210,7 +210,7 @@ def test_a_killed_recorder_leaves_a_file_that_its_writer_closes(recorder: Runnin
                 publisher.publish(PoseStamped())
             return int(recorder.state()["messages"]) - taken
 
-        # The count is that of all topics, and the newest messages may still be on the way to the pipe.
+        # The count includes the messages of all topics. The newest messages may still be on the way to the pipe.
         wait_until(lambda: sent() >= 2 * HANDED_OVER, "the node hands over what is not written", patience=600.0)
         recorder.state()  # When this state has come, those messages are in the pipe.
         os.kill(recorder.process.pid, signal.SIGKILL)

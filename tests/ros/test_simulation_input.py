@@ -40,12 +40,14 @@ def subscribe(node: Any, hand: str) -> dict[str, Queue[Any]]:
 
 
 def assert_a_part_of(received: Array, script: Array) -> None:
-    """Assert that ``received`` is a run of rows of ``script``. The first rows may be lost before discovery."""
+    """Assert that ``received`` contains consecutive rows of ``script``. The first rows may be lost before discovery."""
     starts = range(len(script) - len(received) + 1)
     assert min(float(np.abs(script[start : start + len(received)] - received).max()) for start in starts) <= 1e-6
 
 
-def test_poses_inputs_and_twists_equal_those_of_the_script(node: Any, processes: Processes) -> None:
+def test_received_poses_inputs_and_twists_equal_the_poses_inputs_and_twists_of_the_script(
+    node: Any, processes: Processes
+) -> None:
     queues = subscribe(node, "right")
     start(processes, side="right", trajectory="rotate", rate=RATE)
     wait_until(lambda: all(queue.qsize() >= 300 for queue in queues.values()), "six seconds of each topic")
@@ -113,7 +115,7 @@ def test_the_script_waits_for_a_ready_arm_and_presses_until_it_follows(node: Any
     arm["engaged"] = True
     rest = left["pose"].get(timeout=PATIENCE).pose.position.x
     wait_until(lambda: left["pose"].get(timeout=PATIENCE).pose.position.x > rest + 0.02, "the hand moves")
-    arm |= {"engaged": False, "ready": False}  # A fault stops it at once, and it is not ready for a moment.
+    arm |= {"engaged": False, "ready": False}  # A fault stops the arm, which is then not ready for a moment.
     wait_until(lambda: left["pose"].get(timeout=PATIENCE).pose.position.x == rest, "the hand is where it was")
     drained(left["inputs"])
     time.sleep(0.5)
@@ -122,7 +124,8 @@ def test_the_script_waits_for_a_ready_arm_and_presses_until_it_follows(node: Any
     wait_until(lambda: left["inputs"].get(timeout=PATIENCE).button_lower, "the button is pressed")
     arm["engaged"] = True
     time.sleep(7.0)
-    arm["engaged"] = False  # From now on, only a person can engage it.
+    arm["engaged"] = False  # From now on, only a person can engage the arm.
+
     time.sleep(0.5)
     drained(left["inputs"])
     time.sleep(2.0)

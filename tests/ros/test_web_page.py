@@ -51,7 +51,7 @@ CHANGES = {
     "cartesian_controller": {"rate": RATE, "joint_state_timeout": 1.0, "target_timeout": 2.0, "listener_timeout": 3.0},
     "arm_controllers": {"rate": RATE, **PATIENT},
 }
-LENIENT = {"supervision": {"max_deviation": 0.5}}  # The arms of a starved robot are far behind their reference.
+LENIENT = {"supervision": {"max_deviation": 0.5}}  # Arms lag far if the robot gets little processor time.
 CHANGES["mujoco_robot"]["max_jump"] = 1.0  # On a busy machine, commands may come late and several at a time.
 
 
@@ -87,12 +87,12 @@ def test_the_page_of_a_set_shows_its_arms_and_its_buttons_reach_the_nodes(
         page.wait_until(lambda: all("the pause service" in why for why in page.row("why")))
         page.press("Bring both")
         page.wait_until(lambda: page.row("state") == ["homing", "homing"])
-        page.press("Pause both")  # The pause also ends the way home.
+        page.press("Pause both")  # The pause also ends homing.
         page.wait_until(lambda: "homing" not in page.row("state"))
         page.press("Stop")
         page.wait_until(lambda: all("the stop service" in why for why in page.row("why")))
         page.press("Bring both")
-        page.wait_until(lambda: "/cartesian_controller/home: " in page.words)  # It is refused with a reason.
+        page.wait_until(lambda: "/cartesian_controller/home: " in page.words)  # Homing is refused with a reason.
         page.press("Take a stop back")
         page.wait_until(lambda: all("waits for its operator" in why for why in page.row("why")))
         assert "engaged" not in page.row("state")
