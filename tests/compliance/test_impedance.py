@@ -177,7 +177,7 @@ class TestAnImpedanceThatChanges:
             assert [values["damping_ratio"] for values in in_force] == pytest.approx(damping)
             assert [values["nullspace_stiffness"] for values in in_force] == pytest.approx([10.0, 10.0])
 
-    def test_after_a_change_torques_equal_those_of_a_controller_that_was_made_with_the_new_settings(
+    def test_after_a_change_torques_equal_the_torques_of_a_controller_that_was_made_with_the_new_settings(
         self, robot: Robot
     ) -> None:
         soft = {"translational_stiffness": 300.0, "damping_ratio": 0.4, "nullspace_stiffness": 20.0}

@@ -145,7 +145,7 @@ def arm_torque(
 
 
 @pytest.mark.parametrize("spread", [0.02, 0.5], ids=["near", "further than the clip"])
-def test_the_torque_of_the_controller_equals_that_of_the_formulas_in_the_papers(spread: float) -> None:
+def test_the_torque_of_the_controller_equals_the_torque_of_the_formulas_in_the_papers(spread: float) -> None:
     random = np.random.default_rng(7)
     settings = ImpedanceSettings(damping_ratio=0.7, limit_distance=1e-3, torque_rate_limit=1e5)
     controller = ImpedanceController(ROBOT, settings)

@@ -78,12 +78,12 @@ def test_the_torque_at_rest_is_the_negative_gradient_of_the_energy_of_the_wall(
         assert np.abs(report.tau).max() > 0.0
 
 
-def test_the_energy_equals_that_of_springs_compressed_by_the_depths_that_coal_measures() -> None:
+def test_the_energy_equals_the_energy_of_springs_compressed_by_the_depths_that_coal_measures() -> None:
     stiffness = WallSettings().stiffness
     for q, report in _postures()[:100]:
         depth = np.array([max(SHELL - pair.distance, 0.0) for pair in ROBOT.distances(q)])
         spring = 0.5 * stiffness * float((depth**2).sum())
-        # Smooth distances are up to 0.3 mm longer than exact ones.
+        # Smooth distances are up to 0.3 mm longer than exact distances.
         least = 0.5 * stiffness * float((np.maximum(depth - 3e-4, 0.0) ** 2).sum())
         assert least - 1e-9 <= report.energy <= spring + 1e-4
 

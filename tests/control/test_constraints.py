@@ -146,7 +146,7 @@ def test_a_given_solution_that_violates_a_hard_row_is_not_executed(robot: Robot)
 
 
 class NoLess:
-    """A constraint: in the direction of ``along`` (nv,), the next joint velocities must be at least as fast as it."""
+    """A constraint: in the direction of ``along`` (nv,), the next joint velocities are at least ``along``."""
 
     hard = True
     along: Array | None = None

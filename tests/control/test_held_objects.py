@@ -1,4 +1,4 @@
-"""A held object is monitored. Its pairs first keep their present distances. If a pair opens, it keeps a greater one.
+"""A held object is monitored. Its pairs keep their present distances at first, and greater distances when they open.
 
 No arm moves because an object is gripped.
 """

@@ -18,7 +18,7 @@ _LATE = 0.0005  # Largest delay of messages [s].
 
 
 class WeighedArm(StillArm):
-    """An arm whose measured torques are those of a robot with a load. The client does not know this load."""
+    """An arm that measures the torques of a robot with a load. The client does not know this load."""
 
     def __init__(self, robot: Robot, arm: str) -> None:
         self._robot, self._joints, self._data = robot, robot.arms[arm].joints, robot.model.createData()

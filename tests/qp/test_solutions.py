@@ -55,7 +55,7 @@ def _at_hardly_any_cost(random: np.random.Generator) -> QpProblem:
 
 
 def corners() -> dict[str, QpProblem]:
-    """Return special problems, such as one without rows, with contradictory rows, or with only one allowed velocity."""
+    """Return special problems, for example without rows, with contradictory rows, or with only one allowed velocity."""
     random = np.random.default_rng(11)
     return {
         "no rows": small(random, [], []),

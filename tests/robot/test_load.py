@@ -54,7 +54,7 @@ def test_a_wrong_centre_of_mass_is_refused_even_if_the_mass_is_right() -> None:
         LoadReport("left", MODEL, 1.0, 1.0, [0.0, 60.0, 50.0], [0.0, 0.0, 50.0], 0.1).check()
 
 
-def test_torques_minus_those_of_our_model_are_judged_only_if_some_load_fits_them() -> None:
+def test_if_torques_are_compared_with_our_model_a_load_is_judged_only_if_some_load_fits_the_torques() -> None:
     heavy = 4.0, 1.0, [0.0, 0.0, 50.0], [0.0, 0.0, 50.0], 2.0
     LoadReport("left", MODEL, *heavy).check()
     with pytest.raises(

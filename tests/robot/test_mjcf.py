@@ -68,7 +68,7 @@ def read(file: Path) -> tuple[ET.Element, pin.Model, pin.GeometryModel]:
     return urdf, model, pin.buildGeomFromUrdfString(model, text, pin.GeometryType.COLLISION)
 
 
-def test_links_shapes_and_gravity_torques_equal_those_of_mujoco_in_random_postures(arm: Path) -> None:
+def test_links_shapes_and_gravity_torques_equal_the_results_of_mujoco_in_random_postures(arm: Path) -> None:
     urdf, model, geometry = read(arm)
     theirs = mujoco.MjModel.from_xml_path(str(arm))
     assert LinkTree(urdf, "arm").root == "base", "what moves freely and the floor are no part of it"

@@ -117,7 +117,7 @@ def test_a_robot_without_an_srdf_monitors_every_pair_that_some_posture_brings_ap
 
 
 @pytest.mark.parametrize("name", ["baxter", "tiago"])
-def test_the_dynamics_of_a_robot_equal_those_of_the_whole_model_with_locked_joints(
+def test_the_dynamics_of_a_robot_equal_the_dynamics_of_the_whole_model_with_locked_joints(
     name: str, request: pytest.FixtureRequest
 ) -> None:
     robot: Robot = request.getfixturevalue(name)

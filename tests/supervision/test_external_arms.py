@@ -51,7 +51,7 @@ def swing(robot: Robot, angle: float) -> list[Array]:
 
 @pytest.fixture(scope="module")
 def config(robot: Robot, tmp_path_factory: pytest.TempPathFactory) -> Config:
-    """Return the cell with a post. In its swing, the measured left elbow meets it. The reference's elbow does not."""
+    """Return the cell with a post. The swing of the measured left elbow meets the post. The reference does not."""
 
     data = robot.model.createData()
     pin.forwardKinematics(robot.model, data, swing(robot, POST)[-1])

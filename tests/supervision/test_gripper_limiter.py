@@ -98,7 +98,9 @@ def test_a_gripper_opens_as_far_as_is_proven_safe_and_tries_every_5_ms_to_open_f
     assert not gripper.limiter.held
 
 
-def test_without_a_measurement_a_gripper_gets_its_commands_and_its_fingers_count_at_all_openings(gripper: Cell) -> None:
+def test_without_a_measurement_a_gripper_gets_its_commands_and_its_fingers_are_monitored_at_all_openings(
+    gripper: Cell,
+) -> None:
     for wanted in (1.0, 0.0, 0.5):
         gripper.tick(wanted, {})
         assert gripper.granted == {"left": wanted, "right": 1.0}

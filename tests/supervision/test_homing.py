@@ -156,9 +156,7 @@ def test_while_no_path_home_is_known_the_arms_rest_and_a_tick_examines_at_most_t
         at = homing.step(q, np.zeros_like(q), DT).joints
         assert at is not None
         assert np.array_equal(at, q)
-        assert (
-            distances.call_count - before <= 3
-        )  # One call measures distances at the start, and two calls examine postures.
+        assert distances.call_count - before <= 3  # One call measures the start, and two calls examine postures.
         ticks += 1
     assert homing.outcome is CommonReason.HOMING_NO_WAY
     assert ticks > 100
@@ -174,7 +172,7 @@ def test_homing_ends_if_only_the_straight_path_is_allowed_and_this_path_is_not_f
     assert homing.outcome is CommonReason.HOMING_NO_WAY
 
 
-def test_if_an_arm_cannot_move_homing_waits_for_it_and_then_ends_with_the_reason_that_it_is_held_up(
+def test_if_an_arm_cannot_move_homing_waits_for_it_and_then_ends_with_the_reason_homing_held_up(
     robot: Robot,
 ) -> None:
     settings = load_config(CONFIG).control

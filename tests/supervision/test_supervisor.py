@@ -35,7 +35,7 @@ class World:
 
     @property
     def states(self) -> list[str]:
-        """Return the activities of the left arm and the right one."""
+        """Return the activities of the left arm and of the right arm."""
         return [self.supervisor.arm_state(arm) for arm in ("left", "right")]
 
     def measured_tool(self, arm: str) -> pin.SE3:

@@ -147,7 +147,7 @@ def moving() -> Watched:
 
 
 def circle(t: float, radius: float, period: float) -> pin.SE3:
-    """Return the pose at ``t`` [s] on a circle through the origin, which is turned to and fro on the way.
+    """Return the pose at ``t`` [s] on a circle through the origin, which turns to and fro while it moves.
 
     The motion accelerates for half a second.
     """

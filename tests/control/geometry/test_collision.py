@@ -14,7 +14,7 @@ from q2r2_control.robot.robot import Robot
 from q2r2_control.types import Array
 from tests.control.cells import NAMES, CellArrays, arrays_of, cell, distances, placed, random_posture
 
-# Coal computes the distance of two capsules in closed form, and that of a capsule and a box by iteration.
+# Coal computes the distance of two capsules in closed form, and the distance of a capsule and a box by iteration.
 EXACT, ITERATED = 1e-9, 1e-4
 STEP = 1e-6  # Step of finite differences [rad].
 
@@ -76,7 +76,8 @@ def _assert_rows_are_gradients(arrays: CellArrays, q: Array) -> tuple[int, int]:
     data, cores_meet = placed(arrays, q), _core_distance(arrays)
     outside = penetrating = 0
     for p, distance in enumerate(here):
-        # Where the closest points jump, there is no gradient. Two step sizes give different results there.
+        # Where the closest points jump, there is no gradient, and two step sizes give different results. Such pairs are
+        # left out.
         smooth = np.abs(slopes[:, p] - coarse[:, p]).max() < 1e-4
         if distance < cores_meet[p] + 1e-3 or not smooth:
             continue

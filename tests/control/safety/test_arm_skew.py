@@ -26,10 +26,7 @@ def test_no_pair_comes_closer_than_any_proven_distance_wherever_each_arm_is_on_i
     random, robot, model = np.random.default_rng(91), cell(name).robot, kernel_model(name).safety
     right, kept = robot.arms["right"].joints, model.min_distance.copy()
     bound_used: list[float] = []
-    lost: dict[int, list[float]] = {
-        1: [],
-        2: [],
-    }  # For each proof, the true least distance minus the proven distance [m].
+    lost: dict[int, list[float]] = {1: [], 2: []}  # For each proof, true least distance minus proven distance [m].
     for number in range(12):
         # The arms have rested, or have moved at a constant velocity. Then they accelerate for one step.
         v = (number % 2) * 0.3 * random.uniform(-robot.velocity_limit, robot.velocity_limit)

@@ -34,7 +34,7 @@ from tests.control.cells import (
 APPROACH = kernel_model("dual_iiwa7").safety.approach
 STOP_DISTANCE = float(APPROACH.stop_distance[0])
 H = 0.001
-SAME_DISTANCE = 0.002  # Instants of the stop have a row if their distance is at most this much above the least [m].
+SAME_DISTANCE = 0.002  # An instant has a row if its distance exceeds the stop's least distance by at most this [m].
 SAME_POINT = 0.005  # A segment's end has its own row if it is farther than this from the closest point [m].
 CLEAR = 2e-5  # If a condition holds or fails by less than this, the test does not check the row [m].
 
@@ -84,7 +84,9 @@ def test_distances_of_near_pairs_are_exact_and_other_distances_are_never_too_lar
 
 @given(seed=SEEDS, name=st.sampled_from(NAMES), speed=st.floats(0.05, 1.0))
 @settings(derandomize=True, max_examples=80, deadline=None)
-def test_a_pair_that_approaches_fast_is_examined_early_enough(seed: int, name: str, speed: float) -> None:
+def test_a_pair_that_approaches_fast_counts_as_near_before_its_rows_become_necessary(
+    seed: int, name: str, speed: float
+) -> None:
     q, v = _state(name, seed, speed)
     seen, exact = Seen(name, q, v), distances(cell(name), q[None])[0]
     before, after = distances(cell(name), q + 1e-6 * np.array([[-1.0], [1.0]]) * v)
@@ -285,7 +287,7 @@ def _difference(seen: Seen, p: int, candidates: Iterable[_Candidate]) -> str:
 
 
 @pytest.mark.parametrize(("may_touch", "fast"), [(False, range(10, 17)), (True, range(15, 21))])
-def test_the_rows_of_a_pair_are_exactly_those_of_the_documented_rule(may_touch: bool, fast: range) -> None:
+def test_the_rows_of_a_pair_are_exactly_the_rows_of_the_documented_rule(may_touch: bool, fast: range) -> None:
     name = "dual_panda"
     model = behind(kernel_model_of(cell(name).robot, ControllerSettings()))
     if may_touch:

@@ -119,7 +119,7 @@ class UnprintableError(Exception):
 
 
 class Panic(BaseException):
-    """An exception that is not derived from Exception, like those of libraries in Rust."""
+    """An exception that is not derived from Exception, like exceptions of libraries in Rust."""
 
 
 @pytest.mark.parametrize("error", [UnprintableError(), Panic("at the disco")], ids=["unprintable", "panic"])
