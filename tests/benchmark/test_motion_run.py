@@ -59,7 +59,9 @@ class Standing:
         return self._q.copy(), np.zeros(len(self._q))
 
 
-def test_for_a_controller_without_motion_the_figures_equal_those_computed_from_its_targets(robot: Robot) -> None:
+def test_for_a_controller_without_motion_the_figures_equal_figures_that_are_computed_from_its_targets(
+    robot: Robot,
+) -> None:
     ends = round(SHORT.ends / DT)
     figures = run_motion(Standing(jerked=ends - 100, failing=ends - 50), robot, SHORT)
     # The target moves by 10 mm at a constant speed, so the root mean square of the error is 10 / sqrt(3).

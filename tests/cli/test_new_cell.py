@@ -44,7 +44,7 @@ def _in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
         pytest.param("", "--left example-robot-data:go2", "branches at base", id="a robot of legs"),
     ],
 )
-def test_for_a_model_that_makes_no_cell_new_cell_prints_one_line_and_writes_no_file(
+def test_the_command_new_cell_prints_one_line_and_writes_no_file_for_a_model_that_cannot_be_in_a_cell(
     text: str, arguments: str, says: str
 ) -> None:
     Path("arm.urdf").write_text(text)
@@ -159,7 +159,7 @@ def test_arguments_of_xacro_go_into_the_cell(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_an_mjcf_becomes_a_urdf_beside_the_cell_which_runs(tmp_path: Path) -> None:
+def test_an_mjcf_becomes_a_urdf_beside_the_cell_and_the_cell_runs(tmp_path: Path) -> None:
     bodies = "".join(
         f"""<body name="link_{i}" pos="0 0 {0.1 if i == 1 else 0.25}"><joint name="j{i}" axis="{axis}"
         range="-110 110" actuatorfrcrange="-200 200"/><geom type="capsule" fromto="0 0 0.06 0 0 0.19" size="0.05"/>"""

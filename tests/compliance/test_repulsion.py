@@ -289,7 +289,7 @@ def test_an_arm_that_is_pushed_with_40_newtons_towards_the_other_arm_never_touch
     assert released[-1] < 0.7 * released[0]
 
 
-def test_a_wall_that_gets_new_kept_distances_pushes_like_a_wall_that_was_made_with_them() -> None:
+def test_a_wall_that_gets_new_kept_distances_pushes_like_a_wall_that_was_made_with_these_distances() -> None:
     wider = ControllerSettings(min_distance=0.04)
     made, told = MeasuredSeparation(ROBOT, wider), MeasuredSeparation(ROBOT, ControllerSettings())
     q = _postures()[0][0]
@@ -298,7 +298,7 @@ def test_a_wall_that_gets_new_kept_distances_pushes_like_a_wall_that_was_made_wi
     np.testing.assert_array_equal(told.update(q, REST).tau, made.update(q, REST).tau)
 
 
-def test_an_arm_that_is_pushed_towards_a_new_box_never_touches_the_box_until_it_is_removed() -> None:
+def test_an_arm_that_is_pushed_towards_a_new_box_does_not_touch_the_box_until_the_box_is_removed() -> None:
     controller = CartesianController(ROBOT, ControllerSettings(moving_obstacles=("hand", "box")))
     separation, size = MeasuredSeparation(ROBOT, controller.settings), (0.2, 0.05, 0.3)
     at = ROBOT.tool_pose(ROBOT.home, "left").translation + np.array([0.0, 0.14, 0.0])

@@ -109,7 +109,7 @@ class Plane:
         return J, np.array([-5.0 * room])
 
 
-def test_a_hard_constraint_keeps_an_elbow_above_a_plane_that_it_would_otherwise_cross(robot: Robot) -> None:
+def test_a_hard_constraint_keeps_an_elbow_above_a_plane_that_the_elbow_would_otherwise_cross(robot: Robot) -> None:
     _, q = driven(CartesianController(robot), 600)
     plane = Plane(robot, 0.0)
     heights = [plane.elbow(at) for at in q]

@@ -195,7 +195,7 @@ def test_no_attacking_solver_brings_a_pair_closer_than_its_kept_distance(attack:
     assert -ROUNDING <= least < 1e-4, "it has to get there, and no further"
 
 
-def test_if_a_pair_is_too_close_by_a_rounding_error_all_steps_are_certified_and_it_opens_to_its_buffer() -> None:
+def test_if_a_pair_is_too_close_by_a_rounding_error_all_steps_are_certified_and_the_pair_opens_to_its_buffer() -> None:
     robot = robot_of("iiwa7")
     nearest = float(robot.distance_values(robot.home).min())
     settings = ControllerSettings(min_distance=nearest + 1e-15)

@@ -47,7 +47,7 @@ def test_an_invalid_or_contradictory_quaternion_is_refused(origin: str) -> None:
         arm(origin=origin)
 
 
-def test_the_error_about_elements_of_xacro_which_urdf_readers_skip_names_them() -> None:
+def test_the_error_about_xacro_elements_names_these_elements_because_urdf_readers_would_skip_them() -> None:
     text = ARM.format(**USUAL).replace("</robot>", "<xacro:hand xmlns:xacro='http://ros.org/wiki/xacro'/></robot>")
     with pytest.raises(RobotError, match=r"xacro:hand.*allowed.*\.xacro"):
         parse_urdf(text, "arm.urdf")

@@ -275,7 +275,7 @@ def test_without_a_running_clock_an_arm_is_neither_engaged_nor_ready(
     send_time = lambda: publisher.publish(Clock(clock=time_message(1.0 + time.monotonic() - began)))  # noqa: E731
     timer = node.create_timer(0.01, send_time)
     rig.wait(lambda: rig.state["ready"], "it is ready when time comes")
-    assert (rig.state["engaged"], rig.targets) == (False, [])  # The press before has not engaged it.
+    assert (rig.state["engaged"], rig.targets) == (False, [])  # The press before has not engaged the arm.
     rig.engage()
     node.destroy_timer(timer)
     # On a machine with other load, another fault may have paused the arm before. So its present reason is asked for.

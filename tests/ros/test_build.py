@@ -49,7 +49,7 @@ def test_packages_of_a_sourced_install_are_kept_and_a_package_built_beside_it_is
     venv.create(bare_environment := tmp_path / "bare", symlinks=True, with_pip=False)
     python, prefix = bare_environment / "bin" / "python", Path(sys.prefix)
     libraries = [prefix / "lib", *(prefix / SITE_PACKAGES).glob("ros_*.libs")]
-    sourced = {  # These variables are those of a sourced ROS install.
+    sourced = {  # A sourced ROS install sets these variables.
         "AMENT_PREFIX_PATH": str(prefix),
         "PYTHONPATH": os.pathsep.join(map(str, [ROOT, *filter(None, sys.path)])),
         "LD_LIBRARY_PATH": os.pathsep.join(map(str, libraries)),

@@ -258,7 +258,7 @@ def test_a_listener_that_ended_before_the_stream_began_is_not_reported(
     listener.wait()
     publisher.begin()
     assert Stream(publisher, 100.0).run(3.0 * TIMEOUT) is None
-    assert publisher.listeners == 1  # The graph still lists it.
+    assert publisher.listeners == 1  # The graph still lists the listener.
 
 
 def test_an_endpoint_keeps_the_name_of_its_node_after_the_graph_has_lost_this_name() -> None:

@@ -85,7 +85,7 @@ def test_a_driver_that_stops_during_motion_is_found_within_a_tenth_of_a_second(
     assert FROZEN_AT < found < FROZEN_AT + WITHIN + DT
 
 
-def test_if_a_driver_never_begins_to_follow_it_is_found_before_the_command_is_0_1_rad_away() -> None:
+def test_a_driver_that_never_begins_to_follow_is_found_before_the_command_is_0_1_rad_away() -> None:
     asked = ramp(1.2, 8.0)
     found = next(findings(JOINTS, asked, frozen_at=0.0))
     assert float(np.abs(asked(found)).max()) < 0.1

@@ -117,7 +117,9 @@ def _gradient(arrays: CellArrays, q: Array, p: int) -> Array:
 
 @given(seed=SEEDS, name=st.sampled_from(NAMES))
 @settings(derandomize=True, max_examples=80, deadline=None)
-def test_every_pair_that_is_too_close_gets_a_row_that_opens_it_at_bounded_speed(seed: int, name: str) -> None:
+def test_every_pair_that_is_too_close_gets_a_row_that_moves_its_bodies_apart_at_bounded_speed(
+    seed: int, name: str
+) -> None:
     q, v = _state(name, seed, 0.0)
     seen, exact = Seen(name, q, v), distances(cell(name), q[None])[0]
     for p in np.flatnonzero(exact < STOP_DISTANCE - 1e-3).tolist():
