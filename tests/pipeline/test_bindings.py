@@ -108,7 +108,7 @@ def wandering(t: float) -> Array:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("plant", ["kinematic", "mujoco"])
-def test_with_the_control_carry_one_hand_moves_and_turns_both_tools_and_their_relative_pose_stays(plant: str) -> None:
+def test_with_the_action_carry_one_hand_moves_and_turns_both_tools_and_their_relative_pose_stays(plant: str) -> None:
     hands = PlayingHands((0.35, "press_middle"), left=wandering)
     ticks = watched(hands, 5.0, plant, grip="carry").ticks
     carried = [tick for tick in ticks if tick.states["right"] == "carried"]

@@ -72,7 +72,7 @@ def test_if_a_hand_releases_its_arm_the_arm_stops_within_the_certified_stop_plus
 def moments(robot: Robot, on: float, engaged: bool = True) -> list[Moment]:
     """Return a :class:`Moment` for each tick of a motion of the left arm's joint A2 at 0.1 rad/s.
 
-    The arm follows its hand for one second. After the hand has released it, it moves on for ``on`` [s].
+    The arm follows its hand for one second. After its release, the arm moves on for ``on`` [s].
     """
     v = np.zeros(robot.model.nv)
     v[1] = 0.1

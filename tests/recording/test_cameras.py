@@ -63,7 +63,6 @@ def test_in_simulated_time_there_is_a_picture_at_each_multiple_of_a_cameras_peri
 
     def observe(tick: Tick) -> None:
         """Store the tick's time. Check that the joint positions for pictures are the positions in the tick's state."""
-
         np.testing.assert_array_equal(plant.observed_qpos[places], tick.state.q)
         times.append(tick.t)
 

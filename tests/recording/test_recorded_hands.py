@@ -51,7 +51,6 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
 
 def played(recorded: Recorded, duration: float) -> tuple[Watch, list[str]]:
     """Let the recorded hands move the recorded cell's arms. Return the ticks, and the lines that the input printed."""
-
     said: list[str] = []
     loop = pipeline(source=RecordedHands(recorded.file, cell(), said.append))
     watch = Watch(loop)

@@ -138,7 +138,7 @@ def test_the_model_has_the_rotor_inertias_and_gear_ratios_of_the_data_sheet(robo
         ("iiwa14", 6, (0, 0.0697, -0.017), (0, 0.0707, 0.021), 0.0793),
     ],
 )
-def test_the_radius_of_a_capsule_around_a_mesh_exceeds_the_needed_radius_by_at_most_1_5_mm(
+def test_a_capsule_has_the_ends_for_its_mesh_and_its_radius_exceeds_the_needed_radius_by_at_most_1_5_mm(
     model: str, link: int, start: tuple[float, ...], end: tuple[float, ...], radius: float
 ) -> None:
     full = pin.buildModelFromXML(urdf := compose(one_arm(model=model)).urdf)

@@ -22,7 +22,7 @@ def robot() -> Robot:
 
 
 def measured(robot: Robot, count: int, spread: float) -> tuple[Array, Array]:
-    """Return postures (count, nv) [rad], and the torques (count, nv) [Nm] of an additional mass at the right flange."""
+    """Return postures (count, nv) [rad], and the torques (count, nv) [Nm] of an additional mass at the right tool."""
     random, true = np.random.default_rng(1), robot.model.copy()
     base = robot.model.frames[robot.model.getFrameId("right_hand_e_base")]
     true.appendBodyToJoint(base.parentJoint, pin.Inertia(ADDED, AT, np.zeros((3, 3))), base.placement)

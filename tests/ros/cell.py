@@ -189,7 +189,8 @@ def shifted(pose: pin.SE3, *by: float) -> pin.SE3:
 SLOW = 0.05
 REST = 0.01  # A joint that is slower than this rests [rad/s].
 REST_TIME = 0.3  # Time for which joints have to be slower than that [s].
-# A robot that got no processor time for a while catches up in a shorter time than this window. A jump takes longer [s].
+# The window [s] is longer than a robot needs to catch up if it got no processor time for a while. It is shorter than
+# the time that a jump takes.
 SPEED_WINDOW = 0.2
 
 

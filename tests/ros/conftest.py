@@ -151,7 +151,6 @@ def spun_node(domain: int, name: str = "test") -> Iterator[Any]:
         thread.join()
         for server in [one for one in made.waitables if isinstance(one, ActionServer)]:
             server.destroy()  # The server would go on after its node is destroyed, and answer the next test.
-
         made.destroy_node()
         context.try_shutdown()
 

@@ -68,7 +68,6 @@ def test_a_second_publisher_of_commands_stops_both_arms_and_is_named(driven: Dri
     driven.end_streams()
 
     # The second publisher is silent now. After a reset, the controller commands again, and still listens to the topic.
-
     assert driven.call("/cartesian_controller/reset").success
     wait_until(lambda: driven.state("phase") == "active", "it is active again", lambda: driven.states)
     driven.engage("left", "right")

@@ -197,7 +197,7 @@ def felt(rig: ArmRig, pulse: Pulse) -> None:
 
 @pytest.mark.alone
 def test_a_killed_recorder_leaves_a_file_that_its_writer_closes(recorder: RunningRecorder, node: Any) -> None:
-    """Lost are only messages that the node has not passed on, and messages of the chunk that is not yet written."""
+    """A kill loses the messages that the node has not passed on, and the messages of the chunk that is not written."""
     record_poses(recorder, node, 100)
     folder, (writer,) = recorder.folder, children(recorder.process.pid)
     os.kill(writer, signal.SIGSTOP)

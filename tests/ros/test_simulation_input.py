@@ -125,7 +125,6 @@ def test_the_script_waits_for_a_ready_arm_and_presses_until_it_follows(node: Any
     arm["engaged"] = True
     time.sleep(7.0)
     arm["engaged"] = False  # From now on, only a person can engage the arm.
-
     time.sleep(0.5)
     drained(left["inputs"])
     time.sleep(2.0)

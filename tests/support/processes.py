@@ -67,7 +67,7 @@ _OTHER_BLOCKS = {
 
 
 def pipeline_of(changes: Mapping[str, object], source: Input, plant: Plant | str, mode: str) -> Pipeline:
-    """Return a pipeline for the shipped cell. ``changes`` has new contents of blocks of the cell, by their keys.
+    """Return a pipeline for the shipped cell. ``changes`` maps keys of the cell to new blocks.
 
     If no change concerns the robot, the pipeline uses the shared robot of :func:`cell_robot`.
     """

@@ -27,7 +27,6 @@ class Filtered:
 
     ``plain`` contains the poses of the filter alone. ``drawn`` contains poses that are moved towards the mean of the
     samples while the hand rests.
-
     """
 
     def __init__(self, noise: float = NOISE) -> None:

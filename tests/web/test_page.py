@@ -45,7 +45,6 @@ def test_the_page_shows_both_arms_and_its_buttons_end_the_run_with_the_arms_at_r
     wait_for_row(page, "why", 1, "a program asks for a pause")
     assert table(page)["next"] == ["nothing: a script moves the hands"] * 2
     # Events without a change of state, such as the event of a slider, do not hide the reason.
-
     page.get_by_text("Settings", exact=True).click()
     page.locator("input:visible").first.fill("50")
     page.locator("input:visible").first.press("Enter")
